@@ -1,0 +1,106 @@
+"""Every implementation of factorisations against dense matrices; what it has to refuse; proofs of definiteness."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+from vibench.errors import NumericalError, RequestError
+from vibench.linalg.factorisations import IMPLEMENTATIONS, Implementation, implementation, is_proved_definite
+
+EVERY = pytest.mark.parametrize("chosen", [pytest.param(one, id=name) for name, one in IMPLEMENTATIONS.items()])
+
+
+@pytest.fixture(autouse=True)
+def _installed(request: pytest.FixtureRequest) -> None:
+    chosen = request.node.callspec.params.get("chosen") if hasattr(request.node, "callspec") else None
+    if chosen is not None and not chosen.is_installed:
+        pytest.skip(f"{chosen.distribution} is not installed")
+
+
+def membranes(sizes: tuple[int, ...], weight: float = 1.0) -> sp.csc_array:
+    """Stiffnesses of square membranes that do not touch."""
+    blocks = []
+    for n in sizes:
+        line = sp.diags_array([-np.ones(n - 1), 2.1 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1])
+        blocks.append(sp.kron(line, sp.eye_array(n)) + sp.kron(sp.eye_array(n), line))
+    return sp.csc_array(weight * sp.block_diag(blocks))
+
+
+def condensed(A: np.ndarray, last: np.ndarray) -> np.ndarray:
+    rest = np.setdiff1d(np.arange(len(A)), last)
+    return A[np.ix_(last, last)] - A[np.ix_(last, rest)] @ np.linalg.solve(A[np.ix_(rest, rest)], A[np.ix_(rest, last)])
+
+
+@EVERY
+@pytest.mark.parametrize("weight", [1e-9, 2e11])
+@pytest.mark.parametrize("sizes", [(15,), (9, 12)], ids=["one body", "two bodies"])
+def test_solutions_and_schur_complements_are_the_dense_ones(
+    chosen: Implementation, sizes: tuple[int, ...], weight: float
+) -> None:
+    A, rng = membranes(sizes, weight), np.random.default_rng(0)
+    n, dense = A.shape[0], A.toarray()
+    factor = chosen.factorise(A, "A")
+    for right in (rng.standard_normal(n), rng.standard_normal((n, 3)), np.zeros((n, 0)), np.zeros(n)):
+        expected = np.linalg.solve(dense, right)
+        np.testing.assert_allclose(factor.solve(right), expected, atol=1e-12 / weight)
+    last = np.concatenate([np.arange(5), np.arange(n - 4, n)])
+    order = np.concatenate([np.setdiff1d(np.arange(n), last), last])
+    partly = chosen.eliminate(A, order, len(last), "A")
+    schur = partly.schur_blocks()
+    assert len(schur.blocks) == len(sizes)
+    np.testing.assert_allclose(schur.toarray(), condensed(dense, last), atol=1e-12 * weight)
+    for values in (rng.standard_normal(9), rng.standard_normal((9, 2))):
+        u = partly.extend(values)
+        np.testing.assert_array_equal(u[last], values)
+        np.testing.assert_allclose((dense @ u)[order[:-9]], 0.0, atol=1e-12 * weight)
+    right = rng.standard_normal((n, 2))
+    solved, load = partly.eliminate(right)
+    np.testing.assert_allclose(load, schur.toarray() @ np.linalg.solve(dense, right)[last], atol=1e-11)
+    np.testing.assert_allclose(dense[np.ix_(order[:-9], order[:-9])] @ solved, right[order[:-9]], atol=1e-11)
+
+
+@EVERY
+@pytest.mark.parametrize("count", [0, 1, 4], ids=["empty contact", "one unknown left", "nothing eliminated"])
+def test_tiny_matrices_and_empty_contact(chosen: Implementation, count: int) -> None:
+    A = sp.csc_array(np.diag([2.0, 3.0, 4.0, 5.0]) - 0.5 * np.eye(4, k=1) - 0.5 * np.eye(4, k=-1))
+    partly = chosen.eliminate(A, np.arange(4), count, "A")
+    np.testing.assert_allclose(partly.schur_blocks().toarray(), condensed(A.toarray(), np.arange(4 - count, 4)))
+    assert partly.extend(np.ones(count)).shape == (4,)
+    assert chosen.factorise(sp.csc_array([[4.0]]), "A").solve(np.array([2.0])) == pytest.approx(0.5)
+    assert chosen.factorise(sp.csc_array((0, 0)), "A").solve(np.zeros((0, 2))).shape == (0, 2)
+
+
+@EVERY
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        -np.eye(3), np.diag([1.0, 0.0, 1.0]), np.array([[1.0, 2.0], [2.0, 1.0]]), np.array([[1.0, 1.0], [1.0, 1.0]]),
+        np.diag([1.0, np.nan]), np.diag([1.0, np.inf]), np.array([[1.0, np.nan], [np.nan, 1.0]]),
+        membranes((8,)).toarray() - 1.0 * np.eye(64),
+    ],
+    ids=["negative", "zero pivot", "indefinite", "singular", "NaN", "infinite", "NaN off", "indefinite mesh"],
+)  # fmt: skip
+def test_what_is_not_definite_is_refused_by_name(chosen: Implementation, matrix: np.ndarray) -> None:
+    with pytest.raises(NumericalError, match="the thing"):
+        chosen.factorise(sp.csc_array(matrix), "the thing")
+    assert not is_proved_definite(sp.csc_array(matrix), chosen)
+
+
+@EVERY
+def test_a_definite_matrix_is_proved_to_be_one(chosen: Implementation) -> None:
+    A = membranes((12,), 2e11)
+    smallest = float(np.linalg.eigvalsh(A.toarray())[0])
+    assert is_proved_definite(A, chosen) == chosen.is_direct
+    nearly = sp.csc_array(A - sp.eye_array(144) * smallest * (1.0 - 1e-13))
+    if chosen.is_direct:  # it is definite, and factorised, but round-off may have made it so
+        chosen.factorise(nearly, "A")
+    assert not is_proved_definite(nearly, chosen)
+
+
+def test_names() -> None:
+    assert next(iter(IMPLEMENTATIONS)) == "superlu"
+    assert implementation("available").is_installed
+    with pytest.raises(RequestError, match="superlu"):
+        implementation("superlo")

@@ -1,0 +1,251 @@
+"""Factorisations of sparse symmetric positive definite matrices: one interface, and who implements it.
+
+A factor solves; an elimination condenses a matrix on some unknowns. Whether a matrix is positive definite is proved by
+any implementation that factorises without pivoting: see `is_proved_definite`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import import_module
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+
+from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.errors import NumericalError, unknown_name
+from vibench.linalg.cholesky import PartialCholesky, SparseCholesky
+from vibench.linalg.definite import BlockDiagonal
+from vibench.provenance import distribution_version
+
+COLUMNS = 128
+"""Columns of a Schur complement that are solved for at once, where an implementation has no better way to it."""
+
+UNIT = float(np.finfo(float).eps) / 2.0
+
+
+class Factor(ABC):
+    """A factor of a sparse symmetric positive definite X (n×n)."""
+
+    @abstractmethod
+    def solve(self, right: Array) -> Array:
+        """X⁻¹ r for right-hand sides (n,) or (n, k)."""
+
+
+class Elimination(ABC):
+    """A sparse symmetric positive definite X (n×n) of which all unknowns i but the last ones c are eliminated."""
+
+    @property
+    @abstractmethod
+    def nbytes(self) -> int:
+        """Memory of the factors."""
+
+    @abstractmethod
+    def schur_blocks(self) -> BlockDiagonal:
+        """The Schur complement S = X_cc − X_ci X_ii⁻¹ X_ic (c×c), body by body."""
+
+    @abstractmethod
+    def eliminate(self, right: Array) -> tuple[Array, Array]:
+        """For r (n,) or (n, k), X_ii⁻¹ r_i and the load of the Schur complement, r_c − X_ci X_ii⁻¹ r_i."""
+
+    @abstractmethod
+    def extend(self, last: Array) -> Array:
+        """Solution (n,) or (n, k) of X u = 0 in the rows of i, with u (c,) or (c, k) given on the last unknowns."""
+
+
+class _Empty(Factor):
+    """The factor of a matrix without unknowns."""
+
+    def solve(self, right: Array) -> Array:
+        return np.zeros_like(right, dtype=float)
+
+
+Elimination.register(PartialCholesky)
+Factor.register(SparseCholesky)
+
+
+@dataclass(frozen=True)
+class Implementation:
+    """Who factorises.
+
+    Attributes
+    ----------
+    name
+        Its name in studies.
+    summary
+        What it is, in a line.
+    module
+        Defines `factorise(matrix, name)`, and `schur(matrix, count, name)` if there is a better way to the Schur
+        complement (k×k) of all unknowns but the last ones than to solve with X_ii. Both raise a `NumericalError` that
+        calls the matrix by `name` if it is not positive definite.
+    distribution
+        The distribution it needs; "" if vibench needs that anyway.
+    is_direct
+        Whether it factorises, without pivoting: then a factorisation proves that a matrix is definite.
+    """
+
+    name: str
+    summary: str
+    module: str
+    distribution: str = ""
+    is_direct: bool = True
+
+    @property
+    def is_installed(self) -> bool:
+        """Whether it can be used here."""
+        return not self.distribution or bool(distribution_version(self.distribution))
+
+    def factorise(self, matrix: SparseMatrix, name: str) -> Factor:
+        """A factor of a sparse symmetric matrix (n×n), which messages call by `name`.
+
+        Raises a `NumericalError` if it is not positive definite, or has an entry that is not finite.
+        """
+        if not self.module:
+            return SparseCholesky(checked(matrix, name), name)  # type: ignore[return-value]
+        return self._own.factorise(checked(matrix, name), name) if matrix.shape[0] else _Empty()
+
+    def eliminate(self, matrix: SparseMatrix, order: Indices, last: int, name: str) -> Elimination:
+        """`matrix` (n×n) in an `order` (n,) with all unknowns but the last ones eliminated; raises as `factorise`."""
+        if not self.module:
+            return PartialCholesky(matrix, order, last, name)  # type: ignore[return-value]
+        return EliminationBySolutions(self, matrix, order, last, name)
+
+    @cached_property
+    def _own(self) -> _Module:
+        return import_module(self.module)  # type: ignore[return-value]
+
+
+class _Module:
+    """What a module of an implementation has."""
+
+    factorise: Callable[[SparseMatrix, str], Factor]
+    schur: Callable[[SparseMatrix, int, str], Array]
+
+
+IMPLEMENTATIONS = {
+    one.name: one
+    for one in (
+        Implementation("superlu", "SuperLU of SciPy", ""),
+        Implementation("pardiso", "PARDISO of the Intel MKL", "vibench.linalg.pardiso", "pypardiso"),
+        Implementation("cholmod", "CHOLMOD, supernodal", "vibench.linalg.cholmod", "kvxopt"),
+        Implementation(
+            "conjugate-gradients", "conjugate gradients with smoothed aggregation, for what no factor fits in memory",
+            "vibench.linalg.conjugate_gradients", "pyamg", is_direct=False,
+        ),
+    )
+}  # fmt: skip
+"""All implementations by name, the default first."""
+
+DEFAULT = next(iter(IMPLEMENTATIONS))
+
+AVAILABLE = "available"
+"""Asks for the first of `PREFERRED` that is installed."""
+
+PREFERRED = ("pardiso", "cholmod", "superlu")
+
+
+def implementation(name: str) -> Implementation:
+    """The implementation of a name; raises a `RequestError` if there is none."""
+    if name == AVAILABLE:
+        return next(IMPLEMENTATIONS[one] for one in PREFERRED if IMPLEMENTATIONS[one].is_installed)
+    if name not in IMPLEMENTATIONS:
+        raise unknown_name("factorisation", name, [*IMPLEMENTATIONS, AVAILABLE])
+    return IMPLEMENTATIONS[name]
+
+
+def checked(matrix: SparseMatrix, name: str) -> SparseMatrix:
+    """The matrix (CSC); a `NumericalError` if an entry is not finite, or a pivot at sight not positive."""
+    matrix = sp.csc_array(matrix)
+    if not np.all(np.isfinite(matrix.data)):
+        raise NumericalError(f"{name} has entries that are not finite")
+    if not np.all(matrix.diagonal() > 0.0):
+        raise NumericalError(f"{name} is not positive definite")
+    return matrix
+
+
+class EliminationBySolutions(Elimination):
+    """An elimination that solves with a factor of X_ii; arguments are those of `Implementation.eliminate`."""
+
+    def __init__(self, chosen: Implementation, matrix: SparseMatrix, order: Indices, last: int, name: str) -> None:
+        self._chosen, self._order, self._name, self._split = chosen, order, name, len(order) - last
+        self._matrix = checked(sp.csr_array(matrix)[order][:, order], name)
+        split = self._split
+        self._coupling = sp.csr_array(self._matrix[split:, :split])
+        self._factor = chosen.factorise(self._matrix[:split, :split], name) if split else None
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the matrix; that of the factors is not known."""
+        return 12 * int(self._matrix.nnz)
+
+    def schur_blocks(self) -> BlockDiagonal:
+        """The Schur complement, body by body."""
+        split, bodies = self._split, connected_components(self._matrix, directed=False)[1]
+        blocks = []
+        for body in np.unique(bodies[split:]):
+            inside = np.flatnonzero(bodies == body)
+            unknowns = inside[inside >= split] - split
+            blocks.append((unknowns, self._schur(self._matrix[inside][:, inside], len(unknowns))))
+        return BlockDiagonal(len(self._order) - split, tuple(blocks))
+
+    def _schur(self, matrix: SparseMatrix, count: int) -> Array:
+        own = getattr(self._chosen._own, "schur", None)
+        split = matrix.shape[0] - count
+        if own is not None and split:
+            return np.asarray(own(matrix, count, self._name))
+        matrix = sp.csc_array(matrix)
+        schur = matrix[split:, split:].toarray(order="F")
+        if split:
+            factor, coupling = self._chosen.factorise(matrix[:split, :split], self._name), matrix[:split, split:]
+            for columns in _slices(count):
+                schur[:, columns] -= coupling.T @ factor.solve(coupling[:, columns].toarray())
+        return np.asarray(0.5 * (schur + schur.T))
+
+    def eliminate(self, right: Array) -> tuple[Array, Array]:
+        """The solution in i and the load on c."""
+        first, last = np.asarray(right[self._order[: self._split]], float), right[self._order[self._split :]]
+        if self._factor is None or not first.any():
+            return np.zeros_like(first), np.asarray(last, float)
+        solved = self._factor.solve(first)
+        return solved, last - self._coupling @ solved
+
+    def extend(self, last: Array) -> Array:
+        """All unknowns from the last ones."""
+        u = np.empty((len(self._order), *last.shape[1:]))
+        if self._factor is not None:
+            u[self._order[: self._split]] = -self._factor.solve(np.asarray(self._coupling.T @ last))
+        u[self._order[self._split :]] = last
+        return u
+
+
+def _slices(count: int) -> Iterator[slice]:
+    return (slice(first, first + COLUMNS) for first in range(0, count, COLUMNS))
+
+
+def is_proved_definite(matrix: SparseMatrix, chosen: Implementation) -> bool:
+    """Whether a factorisation proves that a symmetric matrix (n×n) is positive definite, whatever the round-off.
+
+    If Cholesky's factorisation of the computed D⁻¹XD⁻¹ − cI ends, D² being the diagonal of X, then X is definite, with
+    c the sum of the round-off of the factorisation, n γ / (1 − γ) with γ = (n + 2)u / (1 − (n + 2)u), and of the
+    scaling (Rump, "Verification of positive definiteness", BIT Numerical Mathematics 46, 2006, Theorem 2.3). No factor
+    is looked at, so that any implementation will do; the smallest eigenvalue that is proved is n²u and not, as that of
+    `vibench.linalg.inertia`, near the round-off that there was.
+    """
+    if not chosen.is_direct:
+        return False
+    try:
+        matrix = checked(matrix, "")
+        scale = sp.diags_array(1.0 / np.sqrt(matrix.diagonal()), format="csc")
+        scaled = sp.csc_array(scale @ matrix @ scale)
+        n = matrix.shape[0]
+        gamma = (n + 2.0) * UNIT / (1.0 - (n + 2.0) * UNIT)
+        rounded = 8.0 * UNIT * float(np.max(abs(scaled).sum(axis=0), initial=0.0))
+        shift = 1.01 * (n * gamma / (1.0 - gamma) + rounded)
+        chosen.factorise(sp.csc_array(scaled - shift * sp.eye_array(n)), "")
+    except NumericalError:
+        return False
+    return True
