@@ -18,6 +18,7 @@ from math import inf
 from pathlib import Path
 
 import numpy as np
+import scipy.sparse as sp
 from rich.table import Table
 from rich.text import Text
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -27,6 +28,7 @@ from vibench.errors import RequestError, in_a_line
 from vibench.execution.solver_trials import solver_trials
 from vibench.files import locked
 from vibench.interfaces.problem import VariationalInequality
+from vibench.linalg.factorisations import IMPLEMENTATIONS
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
@@ -78,7 +80,8 @@ def print_diagnoses(out: Path) -> list[str]:
     """Print the diagnoses of all checks; returns the subjects of those that are broken."""
     console, broken = new_console(), []
     sections = {
-        "versions": check_versions(), "QP solvers": check_solvers(), "plugins": check_plugins(),
+        "versions": check_versions(), "QP solvers": check_solvers(), "factorisations": check_factorisations(),
+        "plugins": check_plugins(),
         "machine": check_machine(), "disk": check_disk(out), "timings": check_timings(),
     }  # fmt: skip
     for title, diagnoses in sections.items():
@@ -128,6 +131,23 @@ def check_solvers() -> Iterator[Diagnosis]:
             yield Diagnosis(name, f"{version}: largest residual {trial.residuals.worst:.0e}")
         else:
             yield Diagnosis(name, f"{version}: {trial.status}, {trial.reason}", Health.BROKEN)
+
+
+def check_factorisations() -> Iterator[Diagnosis]:
+    """All implementations of factorisations; the installed ones solve with a small matrix each."""
+    A = sp.csc_array(wire().A)
+    for name, one in IMPLEMENTATIONS.items():
+        distribution = one.distribution or "scipy"
+        version = f"{distribution} {provenance.distribution_version(distribution)}".strip()
+        if not one.is_installed:
+            yield Diagnosis(name, f"not installed: `pip install {distribution}` ({one.summary})", Health.NOTE)
+            continue
+        try:
+            left = float(np.abs(A @ one.factorise(A, "A").solve(np.ones(UNKNOWNS)) - 1.0).max())
+        except Exception as error:  # noqa: BLE001  a library may raise anything when it is imported
+            yield Diagnosis(name, f"{version}: {in_a_line(error)}", Health.BROKEN)
+        else:
+            yield Diagnosis(name, f"{version}: residual {left:.0e} ({one.summary})")
 
 
 def wire() -> VariationalInequality:

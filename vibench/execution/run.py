@@ -18,6 +18,7 @@ from vibench.execution.offline_plan import OfflinePlan
 from vibench.execution.result_writer import ResultWriter, labels_of
 from vibench.execution.run_folder import LOG, claimed, clear
 from vibench.execution.timing_plan import TimingPlan
+from vibench.linalg.factorisations import DEFAULT, implementation
 from vibench.provenance import solver_distribution
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
@@ -33,7 +34,7 @@ from vibench.study.cells import Cell
 from vibench.study.kinds import SAMPLING, SOLVER
 from vibench.study.matrix import expand
 from vibench.study.plugin import Plugin
-from vibench.study.registry import find, registered
+from vibench.study.registry import FACTORISATION, find, registered
 from vibench.study.spec import Study
 
 CHECK_INTERVAL = 5.0
@@ -356,6 +357,10 @@ def unavailable(cell: Cell) -> str:
         if missing := plugin.missing:
             what = f"the {plugin} needs {', '.join(missing)}, which is not installed"
             return f"{what}: `pip install {' '.join(missing)}`"
+    chosen = implementation(cell.problem.arguments.get(FACTORISATION, DEFAULT))
+    if not chosen.is_installed:
+        what = f"the factorisation '{chosen.name}' needs {chosen.distribution}, which is not installed"
+        return f"{what}: `pip install {chosen.distribution}`"
     if cell.solver in installed_solvers(registered(SOLVER)):
         return ""
     return f"the QP solver '{cell.solver}' is not installed: `pip install {solver_distribution(cell.solver)}`"

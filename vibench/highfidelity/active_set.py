@@ -173,7 +173,7 @@ class HighFidelitySolver:
         if self._pattern is None:
             self._pattern, self._stiffness = self._elimination(vi), None
         if self._stiffness is None or "A" not in self._problem.constant:
-            self._stiffness = condensed_stiffness(vi.A, self._pattern, self._stiffness)
+            self._stiffness = condensed_stiffness(vi.A, self._pattern, self._problem.factorisation, self._stiffness)
         return self._stiffness
 
     def _elimination(self, vi: VariationalInequality) -> EliminationPattern:

@@ -8,14 +8,15 @@ violated (`vibench.highfidelity.active_set`).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import scipy.sparse as sp
 from scipy.optimize import nnls
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from vibench.arrays import Indices, Mask, SparseMatrix
+from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.interfaces.problem import VariationalInequality
-from vibench.linalg.cholesky import SparseCholesky
 
 GROUPS = 64
 """Multipliers of the coarse problem; each takes one solution with A."""
@@ -49,8 +50,8 @@ def watched(B: SparseMatrix, zone: Indices) -> Mask:
     return np.asarray(np.ravel(outside.sum(axis=1)) == 0.0)
 
 
-def coarse_contact(factor: SparseCholesky, vi: VariationalInequality) -> Mask:
-    """Rows (m,) that are pressed in the coarse problem of `vi`, of whose stiffness this is a factor."""
+def coarse_contact(solve: Callable[[Array], Array], vi: VariationalInequality) -> Mask:
+    """Rows (m,) that are pressed in the coarse problem of `vi`, with whose stiffness `solve` solves."""
     B, m = sp.csr_array(vi.B), len(vi.g)
     order = reverse_cuthill_mckee(sp.csr_array(abs(B) @ abs(B).T), symmetric_mode=True)
     group = np.empty(m, np.intp)
@@ -58,7 +59,7 @@ def coarse_contact(factor: SparseCholesky, vi: VariationalInequality) -> Mask:
     finite = np.isfinite(vi.g)
     members = sp.csr_array((finite.astype(float), (group, np.arange(m))), shape=(GROUPS, m))
     coarse, bounds = members @ B, members @ np.where(finite, vi.g, 0.0)
-    displacements = factor.solve(np.column_stack([coarse.toarray().T, vi.f]))
+    displacements = solve(np.column_stack([coarse.toarray().T, vi.f]))
     K, excess = coarse @ displacements[:, :-1], coarse @ displacements[:, -1] - bounds
     values, vectors = np.linalg.eigh(0.5 * (K + K.T))
     kept = values > np.finfo(float).eps * len(values) * np.max(values, initial=0.0)

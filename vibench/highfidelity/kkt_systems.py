@@ -16,6 +16,7 @@ from vibench.highfidelity.contact_zone import coarse_contact, watched, zone_of
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.cholesky import SYMMETRIC, SparseCholesky
 from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal
+from vibench.linalg.factorisations import DEFAULT, Factor, implementation
 from vibench.linalg.schur_complement import EliminationPattern, PrincipalSubmatrix, StaticCondensation
 from vibench.qp.scaling import row_norms
 from vibench.qp.verification import norms_by_solutions
@@ -46,12 +47,16 @@ class CondensedStiffness:
         Sparse SPD (n×n).
     pattern
         Retains at least all unknowns that B touches; by default every unknown is retained.
+    factorisation
+        Who eliminates the others (`vibench.linalg.factorisations`); the sparse systems of active sets are SuperLU's.
     """
 
-    def __init__(self, A: SparseMatrix, pattern: EliminationPattern | None = None) -> None:
+    def __init__(
+        self, A: SparseMatrix, pattern: EliminationPattern | None = None, factorisation: str = DEFAULT
+    ) -> None:
         if pattern is None or (pattern.whole is None and len(pattern.retained) > MAX_RETAINED_SHARE * A.shape[0]):
             pattern = EliminationPattern(np.arange(A.shape[0]), np.zeros(0, np.intp), np.zeros(0, np.intp))
-        self._A, self._pattern = A, pattern
+        self._A, self._pattern, self._factorisation = A, pattern, factorisation
         self._saddle: SaddlePointSolver | None = None
         self._last: tuple[Array, Array] | None = None
         self._condense()
@@ -62,7 +67,7 @@ class CondensedStiffness:
 
     @cached_property
     def _condensed(self) -> StaticCondensation:
-        return StaticCondensation(self._A, self._pattern)
+        return StaticCondensation(self._A, self._pattern, self._factorisation)
 
     @cached_property
     def factor(self) -> SparseCholesky:
@@ -187,27 +192,33 @@ class ZoneStiffness(CondensedStiffness):
 
     Parameters
     ----------
-    A, pattern
+    A, pattern, factorisation
         As for `CondensedStiffness`; the interface is all that is retained.
     zone
         Unknowns of the zone, where another stiffness of the problem has found them.
     """
 
-    def __init__(self, A: SparseMatrix, pattern: EliminationPattern, zone: Indices | None = None) -> None:
+    def __init__(
+        self, A: SparseMatrix, pattern: EliminationPattern, factorisation: str, zone: Indices | None = None
+    ) -> None:
         self.zone = zone
-        super().__init__(A, pattern)
+        super().__init__(A, pattern, factorisation)
 
     def _condense(self) -> None:
         """Eliminate nothing before it is asked for."""
 
     def check_definite(self, name: str) -> None:
         """Raise a `NumericalError` that calls A by `name` if A is not positive definite."""
-        if "factor" not in vars(self):
-            self.factor = SparseCholesky(self._A, name)
+        if "_solver" not in vars(self):
+            self._solver = implementation(self._factorisation).factorise(self._A, name)
 
     def solve(self, right: Array) -> Array:
         """A⁻¹ r for right-hand sides (n, k)."""
-        return self.factor.solve(right)
+        return self._solver.solve(right)
+
+    @cached_property
+    def _solver(self) -> Factor:
+        return implementation(self._factorisation).factorise(self._A, "A")
 
     def dual_norms(self, functionals: Array) -> Array:
         """‖ℓ‖ in A⁻¹ of functionals (n, k)."""
@@ -217,17 +228,16 @@ class ZoneStiffness(CondensedStiffness):
     def _on_zone(self) -> tuple[StaticCondensation, BlockDiagonal]:
         """A condensed on the zone, and its inverse there; others are eliminated in their order in the factor of A."""
         assert self.zone is not None
-        order, positions = self.factor.order, np.arange(len(self.zone))
-        pattern = EliminationPattern(
-            self.zone, np.concatenate([order[~np.isin(order, self.zone)], self.zone]), positions
-        )
-        condensed = StaticCondensation(sp.csr_array(self._A), pattern)
+        order = self._solver.order if isinstance(self._solver, SparseCholesky) else np.arange(self._A.shape[0])
+        rest, positions = order[~np.isin(order, self.zone)], np.arange(len(self.zone))
+        pattern = EliminationPattern(self.zone, np.concatenate([rest, self.zone]), positions)
+        condensed = StaticCondensation(self._A, pattern, self._factorisation)
         return condensed, condensed.dense_blocks.inverse("A")
 
     def active_set_system(self, vi: VariationalInequality) -> ActiveSetSystem:
         """The KKT systems of the active sets of `vi`, whose stiffness must be this one."""
         if self.zone is None:
-            self.zone = zone_of(vi.B, coarse_contact(self.factor, vi))
+            self.zone = zone_of(vi.B, coarse_contact(self.solve, vi))
         zone, inside = self.zone, watched(vi.B, self.zone)
         B, (condensed, compliance) = sp.csr_array(sp.csc_array(vi.B)[:, zone]), self._on_zone
         load, particular = condensed.condense_load(vi.f)
@@ -244,15 +254,15 @@ class ZoneStiffness(CondensedStiffness):
 
 
 def condensed_stiffness(
-    A: SparseMatrix, pattern: EliminationPattern, before: CondensedStiffness | None = None
+    A: SparseMatrix, pattern: EliminationPattern, factorisation: str, before: CondensedStiffness | None = None
 ) -> CondensedStiffness:
     """A condensed on the unknowns that constraints involve, or on the zone of them that contact reaches.
 
     `before` is that of another parameter of the problem, whose zone is the first one of this.
     """
     if not pattern.is_dense or len(pattern.interface) <= MANY_UNKNOWNS:
-        return CondensedStiffness(A, pattern)
-    return ZoneStiffness(A, pattern, before.zone if isinstance(before, ZoneStiffness) else None)
+        return CondensedStiffness(A, pattern, factorisation)
+    return ZoneStiffness(A, pattern, factorisation, before.zone if isinstance(before, ZoneStiffness) else None)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.errors import RequestError, unknown_name
 from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.outputs import Output
+from vibench.linalg.factorisations import DEFAULT
 from vibench.linalg.inner_product import InnerProduct
 from vibench.text import normal_name
 
@@ -242,6 +243,8 @@ class Problem(ABC):
     """Members that `sampler` evaluates entry by entry."""
     licence: str = ""
     """Licence of the data that the problem is made of, "unknown" if it is; "" where that of its distribution holds."""
+    factorisation: str = DEFAULT
+    """Who factorises A and eliminates unknowns of X_V: the option that every problem has, set by `factorised_by`."""
     requires: ClassVar[tuple[str, ...]] = ()
     """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
 
@@ -253,6 +256,10 @@ class Problem(ABC):
         refuses the study before anything is written.
         """
         return ""
+
+    def factorised_by(self, name: str) -> None:
+        """Let an implementation of `vibench.linalg.factorisations` factorise A and eliminate unknowns of X_V."""
+        self.factorisation = self.V.factorisation = name
 
     @abstractmethod
     def training_set(self) -> Array:

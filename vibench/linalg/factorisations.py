@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError, unknown_name
-from vibench.linalg.cholesky import PartialCholesky, SparseCholesky
+from vibench.linalg.cholesky import PartialCholesky, SparseCholesky, elimination_order
 from vibench.linalg.definite import BlockDiagonal
 from vibench.provenance import distribution_version
 
@@ -113,6 +113,12 @@ class Implementation:
         if not self.module:
             return PartialCholesky(matrix, order, last, name)  # type: ignore[return-value]
         return EliminationBySolutions(self, matrix, order, last, name)
+
+    def order(self, matrix: SparseMatrix, last: Indices) -> Indices:
+        """An order (n,) for `eliminate` that ends with the unknowns `last` (c,); of others each has its own."""
+        if self.module:
+            return np.concatenate([np.setdiff1d(np.arange(matrix.shape[0]), last), last])
+        return elimination_order(matrix, last)
 
     @cached_property
     def _own(self) -> _Module:

@@ -14,6 +14,7 @@ import scipy.sparse as sp
 from vibench.arrays import Array, SparseMatrix
 from vibench.errors import NumericalError, RequestError
 from vibench.linalg.cholesky import SparseCholesky
+from vibench.linalg.factorisations import DEFAULT
 from vibench.text import brief
 
 SYMMETRY_RTOL = 1e-12
@@ -47,6 +48,9 @@ class InnerProduct:
         If X is no matrix of real numbers, or what a method is given is not of the space.
     """
 
+    factorisation: str = DEFAULT
+    """Who eliminates unknowns of X (`vibench.linalg.factorisations`); F, which is explicit, is SuperLU's."""
+
     def __init__(self, matrix: SparseMatrix, name: str = "the Gram matrix") -> None:
         is_matrix = (sp.issparse(matrix) or isinstance(matrix, np.ndarray)) and matrix.ndim == 2
         if not is_matrix or matrix.dtype.kind not in "fiub":
@@ -58,7 +62,7 @@ class InnerProduct:
 
     def __getstate__(self) -> dict[str, object]:
         """Drop the factorisation: SuperLU objects cannot be pickled."""
-        return {"matrix": self.matrix, "_name": self._name}
+        return {name: value for name, value in vars(self).items() if name in ("matrix", "_name", "factorisation")}
 
     @property
     def dim(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import weakref
 from importlib.metadata import PackageNotFoundError, files
 
 import numpy as np
@@ -65,18 +66,13 @@ def _call(solver: PyPardisoSolver, phase: int, upper: SparseMatrix, right: Array
 class _Pardiso(Factor):
     def __init__(self, matrix: SparseMatrix, name: str) -> None:
         self._solver, self._upper, self._name = _solver(), _upper(matrix), name
-        self._owner = os.getpid()
+        weakref.finalize(self, self._solver.free_memory, everything=True).atexit = False  # memory that NumPy has not
         _call(self._solver, FACTORISE, self._upper, np.zeros((matrix.shape[0], 1)), name)
 
     def solve(self, right: Array) -> Array:
         if not right.size:
             return np.zeros_like(right, dtype=float)
         return _call(self._solver, SOLVE, self._upper, np.asfortranarray(right, dtype=float), self._name)
-
-    def __del__(self) -> None:
-        solver = self.__dict__.get("_solver")
-        if solver is not None and self._owner == os.getpid():
-            solver.free_memory(everything=True)
 
 
 def factorise(matrix: SparseMatrix, name: str) -> Factor:

@@ -9,8 +9,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.linalg.cholesky import PartialCholesky, elimination_order
+from vibench.linalg.cholesky import elimination_order
 from vibench.linalg.definite import BlockDiagonal
+from vibench.linalg.factorisations import DEFAULT, implementation
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,8 @@ class StaticCondensation:
     ----------
     A, pattern
         The matrix (n×n) and its elimination pattern.
+    factorisation
+        Who eliminates (`vibench.linalg.factorisations`).
 
     Attributes
     ----------
@@ -98,11 +101,12 @@ class StaticCondensation:
         Whether most entries of the Schur complement are non-zero.
     """
 
-    def __init__(self, A: SparseMatrix, pattern: EliminationPattern) -> None:
+    def __init__(self, A: SparseMatrix, pattern: EliminationPattern, factorisation: str = DEFAULT) -> None:
         self._pattern, self._size = pattern, A.shape[0]
         A, count = sp.csr_array(A), len(pattern.interface)
         natural = np.arange(len(pattern.order))
-        self._factor = PartialCholesky(pattern.factorised_block.of(A).T, natural, count, "A") if len(natural) else None
+        eliminate = implementation(factorisation).eliminate
+        self._factor = eliminate(pattern.factorised_block.of(A).T, natural, count, "A") if len(natural) else None
         self.dense = pattern.is_dense
         self._retained_block = pattern.retained_block.of(A)
         self._last_load: tuple[Array, tuple[Array, Array]] | None = None
@@ -114,7 +118,7 @@ class StaticCondensation:
 
     @property
     def _interface_schur(self) -> Array:
-        return self._factor.schur() if self._factor is not None else np.zeros((0, 0))
+        return self._factor.schur_blocks().toarray() if self._factor is not None else np.zeros((0, 0))
 
     @cached_property
     def schur(self) -> SparseMatrix:

@@ -12,8 +12,8 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import ContactLoads
-from vibench.linalg.cholesky import PartialCholesky, elimination_order
 from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal
+from vibench.linalg.factorisations import Elimination, implementation
 from vibench.linalg.inner_product import InnerProduct, orthogonal_factorisation
 
 PROPORTIONAL_RTOL = 1e-12
@@ -207,10 +207,11 @@ def _beside(basis: Array, vectors: Array) -> tuple[Array, Array]:
 
 
 @lru_cache(maxsize=CACHED_FACTORS)  # so that all models of a problem share one factorisation
-def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[PartialCholesky, BlockDiagonal]:
+def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[Elimination, BlockDiagonal]:
     """X_V with all unknowns but some E eliminated, and the factor F_EE (|E|×|E|) of its Schur complement."""
     last = np.frombuffer(dofs, np.intp)
-    factor = PartialCholesky(V.matrix, elimination_order(V.matrix, last), len(last), "X_V")
+    chosen = implementation(V.factorisation)
+    factor = chosen.eliminate(V.matrix, chosen.order(V.matrix, last), len(last), "X_V")
     return factor, factor.schur_blocks().cholesky("X_V")
 
 

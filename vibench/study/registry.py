@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from vibench.study.options import Option
 
 
+FACTORISATION = "factorisation"
+"""The option that every problem has, beside those of its constructor."""
+
+
 @dataclass(frozen=True)
 class RegisteredPlugin:
     """What is registered under a name."""
@@ -174,7 +178,23 @@ class RegisteredPlugin:
         """
         from vibench.study.options import checked_arguments
 
-        return dict(given) if self.conflict else checked_arguments(self.load(), str(self), given)
+        if self.conflict:
+            return dict(given)
+        own, chosen = self._without_factorisation(given)
+        return checked_arguments(self.load(), str(self), own) | chosen
+
+    def _without_factorisation(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+        """Options without `factorisation`, which every problem has, and that one, if it is not the default.
+
+        Raises a `RequestError` if there is none of this name.
+        """
+        if self.kind is not PROBLEM or FACTORISATION not in given or FACTORISATION in self.options:
+            return dict(given), {}
+        from vibench.linalg.factorisations import DEFAULT, implementation
+
+        own, name = dict(given), implementation(given[FACTORISATION]).name
+        del own[FACTORISATION]
+        return own, {} if name == DEFAULT else {FACTORISATION: name}
 
     def canonical_options(self, given: Mapping[str, Any]) -> str:
         """Checked options as canonical JSON, without those that equal their default."""
@@ -192,14 +212,18 @@ class RegisteredPlugin:
         """
         if self.kind not in (PROBLEM, SAMPLING) or self.conflict or self.missing:
             return ""
-        return str(self.load().data_digest(**self.check_options(options)))
+        return str(self.load().data_digest(**self._without_factorisation(self.check_options(options))[0]))
 
     def create(self, options: Mapping[str, Any]) -> Any:
         """An instance, its options checked.
 
         Raises a `RequestError` if there is no such plugin, or it does not take these options.
         """
-        return self.load()(**self.check_options(options))
+        own, chosen = self._without_factorisation(self.check_options(options))
+        made = self.load()(**own)
+        if chosen:
+            made.factorised_by(chosen[FACTORISATION])
+        return made
 
 
 def find(kind: PluginKind, name: str) -> RegisteredPlugin:

@@ -21,6 +21,7 @@ from pydantic import (
 
 from vibench.errors import RequestError, fault_line, unknown_name
 from vibench.interfaces.strategies import Stop
+from vibench.linalg.factorisations import DEFAULT
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.study.entries import (
@@ -37,7 +38,7 @@ from vibench.study.entries import (
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SAMPLING, SOLVER, PluginKind
 from vibench.study.parameter_sets import OWN, ParameterSet, check_sets, is_available
 from vibench.study.plugin import Plugin
-from vibench.study.registry import find, registered
+from vibench.study.registry import FACTORISATION, find, registered
 
 Tolerance: TypeAlias = Annotated[float, Gt(0.0), Lt(1.0), AllowInfNan(False)]
 Seconds: TypeAlias = Annotated[float, Gt(0.0), Le(1e7), AllowInfNan(False)]
@@ -191,6 +192,10 @@ class Study(_Model):
         Lt(1000),
         Field(description="Rounds after which those of a cell end once its comparisons are decided."),
     ] = 6
+    factorisation: Annotated[
+        Literal["superlu", "pardiso", "cholmod", "conjugate-gradients", "available"],
+        Field(description="Who factorises high-fidelity matrices; of a problem its option of that name."),
+    ] = "superlu"
     problem: Annotated[list[ProblemEntry], MinLen(1), Field(description="Problems.")]
     tolerances: Annotated[
         list[ToleranceTable], MinLen(1), Field(description="Grids of tolerances; cells are their union.")
@@ -206,6 +211,8 @@ class Study(_Model):
             raise RequestError(
                 fault_line(error, cls, named=("problem", "dual", "primal", "training", "validation"))
             ) from None
+        if study.factorisation != DEFAULT:
+            study.problem[:] = (_factorised(problem, study.factorisation) for problem in study.problem)
         _check_names(study)
         return study
 
@@ -228,6 +235,11 @@ class Study(_Model):
 
 def _sampling(entry: SamplingEntry) -> Plugin | None:
     return None if entry.name == OWN else entry.plugin(SAMPLING)
+
+
+def _factorised(entry: ProblemEntry, factorisation: str) -> ProblemEntry:
+    """A problem whose options name a factorisation, unless they do so already."""
+    return entry.model_copy(update={"options": {FACTORISATION: factorisation} | entry.options})
 
 
 def _check_names(study: Study) -> None:

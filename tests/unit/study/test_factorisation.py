@@ -1,0 +1,84 @@
+"""Who factorises is chosen by a study, part of the identity of its problem, and changes no number."""
+
+from __future__ import annotations
+
+from unittest import mock
+
+import numpy as np
+import pytest
+
+from vibench import create
+from vibench.errors import RequestError
+from vibench.execution.run import unavailable
+from vibench.highfidelity import kkt_systems
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.linalg import factorisations
+from vibench.linalg.factorisations import IMPLEMENTATIONS
+from vibench.reduction import supremizers
+from vibench.study.kinds import PROBLEM
+from vibench.study.matrix import expand
+from vibench.study.plugin import Plugin
+from vibench.study.registry import find
+from vibench.study.spec import Study
+
+STUDY = {
+    "name": "s", "validation": 2, "solvers": ["piqp"], "dual": ["mcpg"], "primal": ["decorrelated"],
+    "problem": ["obstacle"], "tolerances": [{"N": [2], "R": [2]}],
+}  # fmt: skip
+
+
+def solved(name: str, options: dict[str, object]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    problem = create("problem", name, options)
+    mu = problem.training_set()[3]
+    solver = HighFidelitySolver(problem)
+    with mock.patch.object(kkt_systems, "MANY_UNKNOWNS", 0):
+        solution = solver.solve(mu)
+    B = problem.assemble(mu).B
+    contact = np.unique(B.tocsr().indices)
+    space = supremizers.ContactCoordinates(problem.V, np.zeros((problem.V.dim, 0)), contact)
+    load = (B.T @ solution.lam)[contact]
+    return solution.u, solution.lam, space.vectors(space.supremizers(load[:, None]))
+
+
+@pytest.mark.parametrize("name", ["hertz", "obstacle"])
+@pytest.mark.parametrize("factorisation", [one for one in IMPLEMENTATIONS if one != "superlu"])
+def test_the_numbers_are_those_of_the_default(name: str, factorisation: str) -> None:
+    if not IMPLEMENTATIONS[factorisation].is_installed:
+        pytest.skip("not installed")
+    options = {"resolution": 300}
+    for own, default in zip(
+        solved(name, options | {"factorisation": factorisation}), solved(name, options), strict=True
+    ):
+        np.testing.assert_allclose(own, default, atol=1e-9 * np.abs(default).max())
+
+
+def test_a_study_chooses_for_its_problems_and_a_problem_for_itself() -> None:
+    problems = ["obstacle", {"name": "hertz", "options": {"factorisation": "cholmod"}}]
+    study = Study.model_validate(STUDY | {"problem": problems, "factorisation": "pardiso"})
+    chosen = [problem.plugin(PROBLEM).arguments["factorisation"] for problem in study.problem]
+    assert chosen == ["pardiso", "cholmod"]
+    default = Study.model_validate(STUDY | {"factorisation": "superlu"}).problem[0].plugin(PROBLEM)
+    assert default == Study.model_validate(STUDY).problem[0].plugin(PROBLEM)  # and so are its keys
+    assert default != study.problem[0].plugin(PROBLEM)
+    with pytest.raises(RequestError, match=r"factorisation.*superlo"):
+        Study.model_validate(STUDY | {"factorisation": "superlo"})
+    with pytest.raises(RequestError, match=r"superlo.*superlu"):
+        create("problem", "obstacle", {"factorisation": "superlo"})
+
+
+def test_available_is_the_name_of_what_is_there() -> None:
+    def plugin() -> Plugin:
+        return Plugin.of(find(PROBLEM, "hertz"), {"factorisation": "available"})
+
+    with mock.patch.object(factorisations, "distribution_version", return_value=""):
+        assert "factorisation" not in plugin().arguments  # SuperLU, the default
+    with mock.patch.object(factorisations, "distribution_version", return_value="1.0"):
+        assert plugin().arguments["factorisation"] == "pardiso"
+
+
+def test_what_is_not_installed_is_unavailable_with_the_command_that_installs_it() -> None:
+    (cell,) = expand(Study.model_validate(STUDY | {"factorisation": "pardiso"}))
+    with mock.patch.object(factorisations, "distribution_version", return_value=""):
+        assert "`pip install pypardiso`" in unavailable(cell)
+    with mock.patch.object(factorisations, "distribution_version", return_value="1.0"):
+        assert unavailable(cell) == ""
