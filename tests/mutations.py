@@ -59,10 +59,10 @@ FAULTS = (
     ),
     Fault(
         "cell-after-cell",
-        "vibench/stages/timing_rounds.py",
+        "vibench/rounds/timing_rounds.py",
         "number, within = divmod(item, self.competitors)\n",
         "within, number = divmod(item, self.rounds)\n",
-        ("tests/unit/stages/test_timing_rounds.py",),
+        ("tests/unit/rounds/test_timing_rounds.py",),
     ),
     Fault(
         "timed-alone",

@@ -18,7 +18,7 @@ from typing import TypeAlias
 
 CORE = Path(__file__).parent
 
-CELL = ("vibench.stages.cell_queries:cell_queries", "vibench.stages.timing_rounds:TimingRounds")
+CELL = ("vibench.stages.cell_queries:cell_queries", "vibench.rounds.timing_rounds:TimingRounds")
 """Where the computation of a cell begins: with its last stage, whose inputs lead to all others, and with its timing."""
 
 CARRIERS = (

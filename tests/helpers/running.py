@@ -139,8 +139,9 @@ DECIDED = (
 
 MEASURED = (
     "_s", "peak_memory_mib", "slowdown", "disturbed", "benefit_threshold", "threshold_low", "threshold_high", "meaning",
+    "pace", "gain", "gain_low", "gain_high", "timed_rounds", "rounds_missing", "offline_repeats",
 )  # fmt: skip
-"""How the columns end that hold seconds, memory, or what follows from them."""
+"""How the columns end that hold seconds, memory, or what follows from them, such as how often something was timed."""
 
 
 def numbers(folder: Path) -> dict[str, pd.DataFrame]:

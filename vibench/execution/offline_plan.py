@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from vibench.execution.result_writer import ResultWriter
+from vibench.rounds.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
 from vibench.stages.base import Stage
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
 from vibench.storage.artefacts import Store
 from vibench.study.cells import Cell
 from vibench.timing import Seconds

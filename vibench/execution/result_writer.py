@@ -9,9 +9,9 @@ from typing import Any
 
 from vibench import provenance
 from vibench.results.database import ResultsDatabase
+from vibench.rounds.timed_seconds import TimedRound, seconds_of_cell, seconds_of_queries
 from vibench.stages.base import Row, Stage, value_of
 from vibench.stages.cell_queries import CellRows
-from vibench.stages.timed_seconds import TimedRound, seconds_of_cell, seconds_of_queries
 from vibench.storage.artefacts import History, Store
 from vibench.study.cells import Axes, Cell, digest
 from vibench.study.parameter_sets import ParameterSet

@@ -25,10 +25,10 @@ from vibench.qp.status import Status
 from vibench.results.break_even import break_even_rows
 from vibench.results.database import ResultsDatabase
 from vibench.results.solver_agreement import disagreement_rows
+from vibench.rounds.timing_rounds import SHARE, TimingRounds
 from vibench.stages.base import Done, Failed, Stage, Unstored
 from vibench.stages.cell_queries import CellRows, cell_queries
 from vibench.stages.pictures import PictureStage
-from vibench.stages.timing_rounds import SHARE, TimingRounds
 from vibench.storage.artefacts import Store, usable_store
 from vibench.study.cells import Cell
 from vibench.study.kinds import SAMPLING, SOLVER

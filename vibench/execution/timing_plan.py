@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from vibench.execution.result_writer import ResultWriter
 from vibench.results.break_even import FEWEST_ROUNDS, Comparison, Meaning, compared
 from vibench.results.paired_seconds import FEWEST_BLOCKS, PairedSeconds
+from vibench.rounds.timed_seconds import TimedCell, TimedRound
+from vibench.rounds.timing_rounds import SHARE, TimingRounds, block_rows
 from vibench.stages.base import Failed, Row, Stage
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.timed_seconds import TimedCell, TimedRound
-from vibench.stages.timing_rounds import SHARE, TimingRounds, block_rows
 from vibench.study.cells import Cell
 
 STOPPING_TAIL = 0.005

@@ -65,7 +65,7 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[Ca
                 "retry": False,
                 "executor": "local",
             }
-            | {"scheduler": None, "observer": None, "progress": False},
+            | {"scheduler": None, "observer": None, "progress": False, "repeats": 1},
         ),
         "read_study": (vibench.read_study, {"request": "quick", "overrides": {}}),
         "create": (vibench.create, {"kind": "problem", "name": "radial-obstacle", "options": {}}),

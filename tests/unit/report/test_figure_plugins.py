@@ -231,7 +231,7 @@ def test_figures_of_a_publication_are_drawn_on_request_alone(register: Register,
     assert text.index("## Figure 9") < text.index("## Figure 10")
     assert "What is \\[shown\\]. Run quick, problem obstacle: resolution = coarse.\n\n**Published.** N = 19." in text
     assert "**Here.** Differs: N = " in text
-    assert "![Figure 10](figure-10.png)" in text
+    assert "![What is \\[shown\\].](figure-10.png)" in text  # its alternative text is the first sentence of the caption
 
 
 def test_a_publication_that_raises_is_a_line_and_the_others_are_drawn(

@@ -16,13 +16,13 @@ from samples import SampleStore, small_study
 from vibench import dependencies
 from vibench.dependencies import CARRIERS, CELL, COUNTED, code_used, modules_used
 from vibench.offline.assemblies import assemblies
+from vibench.rounds.offline_repeats import OfflineRepeat
+from vibench.rounds.timing_rounds import TimingRounds
 from vibench.stages import timing_rounds
 from vibench.stages.base import Result, Stage, build_problem
 from vibench.stages.cell_queries import cell_queries
-from vibench.stages.offline_repeats import OfflineRepeat
 from vibench.stages.pictures import PictureStage
 from vibench.stages.snapshots import fingerprint_here
-from vibench.stages.timing_rounds import TimingRounds
 from vibench.storage.artefacts import Artefact, Store
 from vibench.study import registry
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SAMPLING

@@ -19,13 +19,13 @@ from vibench.offline.correction import corrected_in_full
 from vibench.provenance import machine
 from vibench.qp.repeats import check_answer
 from vibench.results.paired_seconds import paces
+from vibench.rounds.marginal_solutions import MarginalSolutions, parts_alike
+from vibench.rounds.timed_seconds import TimedCell, TimedRound, round_columns
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, build_problem, value_of
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.marginal_solutions import MarginalSolutions, parts_alike
 from vibench.stages.query import Queries, Watch
 from vibench.stages.snapshots import TimedSnapshots, gather
-from vibench.stages.timed_seconds import TimedCell, TimedRound, round_columns
 from vibench.storage.artefacts import Store
 from vibench.timing import NO_TIME, Seconds, calibration, timed
 

@@ -1,0 +1,1 @@
+"""Seconds of queries, high-fidelity solutions and short offline stages, timed in rounds."""
