@@ -45,17 +45,17 @@ class Fault:
 FAULTS = (
     Fault(
         "decided-whatever-the-rounds-say",
-        "vibench/results/break_even.py",
+        "vibench/results/costs/break_even.py",
         "if np.mean(drawn[measured.meaning]) < 1.0 - tail:",
         "if np.mean(drawn[measured.meaning]) < 0.0:",
-        ("tests/unit/results/test_break_even.py",),
+        ("tests/unit/results/costs/test_break_even.py",),
     ),
     Fault(
         "rounds-drawn-apart",
-        "vibench/results/paired_seconds.py",
+        "vibench/results/costs/paired_seconds.py",
         "[mine[name].online - others[name].online for name in common]",
         "[x.online - y.online for x, y in zip(mine.values(), reversed(others.values()), strict=False)]",
-        ("tests/unit/results/test_break_even.py",),
+        ("tests/unit/results/costs/test_break_even.py",),
     ),
     Fault(
         "cell-after-cell",
@@ -466,10 +466,10 @@ FAULTS = (
     ),
     Fault(
         "threshold-the-other-way-round",
-        "vibench/results/break_even.py",
+        "vibench/results/costs/break_even.py",
         "Meaning.FROM if dearer > 0.0 else Meaning.UNTIL",
         "Meaning.UNTIL if dearer > 0.0 else Meaning.FROM",
-        ("tests/unit/results/test_break_even.py",),
+        ("tests/unit/results/costs/test_break_even.py",),
     ),
     Fault(
         "warm-up-counted",

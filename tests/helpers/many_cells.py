@@ -13,7 +13,7 @@ from typing import Any
 
 from running import seal
 
-from vibench.results.break_even import HIGH_FIDELITY
+from vibench.results.costs.break_even import HIGH_FIDELITY
 from vibench.results.sqlite.reading import FILE
 
 CLONED = ("cells", "queries", "histories", "thresholds")

@@ -212,14 +212,14 @@ def column_names(context: typer.Context, incomplete: str) -> list[str]:
 
 def _added(table: str) -> Iterable[str]:
     """Columns that a table for reading has beside those of the results file."""
-    from vibench.results import ranking
+    from vibench.results.costs import ranking
 
     return {"best": [ranking.BAND], "benefits": ranking.ERROR_COLUMNS}.get(table, ())
 
 
 def error_measures(incomplete: str) -> list[str]:
     """Completes measures of errors; names of outputs are those of a run."""
-    from vibench.results.ranking import OF_SOLUTION, OUTPUT
+    from vibench.results.costs.ranking import OF_SOLUTION, OUTPUT
 
     return _beginning(incomplete, [*OF_SOLUTION, OUTPUT])
 

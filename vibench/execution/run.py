@@ -22,7 +22,7 @@ from vibench.linalg.factorisations import DEFAULT, implementation
 from vibench.provenance import solver_distribution
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
-from vibench.results.break_even import break_even_rows
+from vibench.results.costs.break_even import break_even_rows
 from vibench.results.database import ResultsDatabase
 from vibench.results.solver_agreement import disagreement_rows
 from vibench.rounds.timing_rounds import SHARE, TimingRounds

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from vibench.execution.result_writer import ResultWriter
-from vibench.results.break_even import FEWEST_ROUNDS, Comparison, Meaning, compared
-from vibench.results.paired_seconds import FEWEST_BLOCKS, PairedSeconds
+from vibench.results.costs.break_even import FEWEST_ROUNDS, Comparison, Meaning, compared
+from vibench.results.costs.paired_seconds import FEWEST_BLOCKS, PairedSeconds
 from vibench.rounds.timed_seconds import TimedCell, TimedRound
 from vibench.rounds.timing_rounds import SHARE, TimingRounds, block_rows
 from vibench.stages.base import Failed, Row, Stage

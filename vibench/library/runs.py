@@ -20,8 +20,9 @@ from vibench.execution.run_folder import REPORT
 from vibench.files import writing
 from vibench.model.error_bounds import CorrectionMode
 from vibench.offline.models import Model
-from vibench.results import ranking, tables, views
+from vibench.results import tables, views
 from vibench.results.columns import TABLES
+from vibench.results.costs import ranking
 from vibench.results.plugin_columns import Extended
 from vibench.results.sqlite.reading import read_meta, study_of
 from vibench.study.cells import NOT_MOVED

@@ -28,8 +28,8 @@ from vibench.report.figures.data import (
 )
 from vibench.results import formats, invariants, tables
 from vibench.results.columns import KEYS
-from vibench.results.paired_seconds import PairedSeconds
-from vibench.results.ranking import (
+from vibench.results.costs.paired_seconds import PairedSeconds
+from vibench.results.costs.ranking import (
     LARGEST_BAND,
     LARGEST_SHARE,
     Criterion,

@@ -25,10 +25,11 @@ from vibench.report.figures.data import TABLES, Data, Extent, label_of, problems
 from vibench.report.page import plots
 from vibench.report.page.grids import TableGrid, grid_of, grid_of_cells, grid_of_thresholds, script_safe, to_json
 from vibench.report.page.images import image_of
-from vibench.results import best, pictures, tables
-from vibench.results.paired_seconds import PairedSeconds
+from vibench.results import pictures, tables
+from vibench.results.costs import best
+from vibench.results.costs.paired_seconds import PairedSeconds
+from vibench.results.costs.ranking import LARGEST_BAND, Criterion, Winner, leaderboard
 from vibench.results.plugin_columns import Extended, faults_of
-from vibench.results.ranking import LARGEST_BAND, Criterion, Winner, leaderboard
 from vibench.results.selection import short_keys
 from vibench.results.sqlite.reading import read_meta, study_of
 from vibench.stability.infsup import VANISHES

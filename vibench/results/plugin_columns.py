@@ -17,8 +17,8 @@ import pandas as pd
 
 from vibench.errors import RequestError, VibenchError, in_a_line
 from vibench.interfaces.figures import EXTENSIBLE, DerivedColumn, FigurePlugin
-from vibench.results import ranking
 from vibench.results.columns import INTEGER, REAL, STORED, TEXT, THRESHOLDS, Column
+from vibench.results.costs import ranking
 from vibench.results.sqlite.values import stored
 from vibench.study.kinds import FIGURE
 from vibench.study.registry import find, registered

@@ -14,8 +14,7 @@ import pandas as pd
 from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.qp.status import Status
-from vibench.results import plugin_columns, ranking
-from vibench.results.break_even import Meaning
+from vibench.results import plugin_columns
 from vibench.results.columns import (
     BLOB,
     CELLS,
@@ -31,6 +30,8 @@ from vibench.results.columns import (
     Column,
     shown_columns,
 )
+from vibench.results.costs import ranking
+from vibench.results.costs.break_even import Meaning
 from vibench.results.formats import asked, break_even, csv_lines, decimal_interval, interval, to_csv, to_markdown
 from vibench.results.plugin_columns import Extended
 from vibench.results.sqlite.reading import FILE, Part, read_meta, read_parts, read_rows

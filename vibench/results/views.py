@@ -13,12 +13,13 @@ from typing import NoReturn
 import pandas as pd
 
 from vibench.errors import RequestError, unknown_name
-from vibench.results import best, plugin_columns, ranking, selection, tables
+from vibench.results import plugin_columns, selection, tables
 from vibench.results.columns import CELLS, STORED, THRESHOLDS, Column
+from vibench.results.costs import best, ranking
+from vibench.results.costs.paired_seconds import PairedSeconds
+from vibench.results.costs.ranking import BAND
 from vibench.results.formats import cell_text
-from vibench.results.paired_seconds import PairedSeconds
 from vibench.results.plugin_columns import Extended
-from vibench.results.ranking import BAND
 from vibench.results.sqlite.reading import parameters_of
 from vibench.text import json_object
 

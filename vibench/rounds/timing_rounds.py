@@ -18,7 +18,7 @@ from vibench.offline.assemblies import Assemblies
 from vibench.offline.correction import corrected_in_full
 from vibench.provenance import machine
 from vibench.qp.repeats import check_answer
-from vibench.results.paired_seconds import paces
+from vibench.results.costs.paired_seconds import paces
 from vibench.rounds.marginal_solutions import MarginalSolutions, parts_alike
 from vibench.rounds.timed_seconds import TimedCell, TimedRound, round_columns
 from vibench.stages.assembly import AssemblyStage

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from vibench.interfaces.strategies import Kind
-from vibench.results.break_even import break_even_rows
 from vibench.results.columns import CELLS, HISTORY_KEYS, INTEGER, OUTPUTS, QUERIES, REAL, TEXT, TIMINGS, Column
+from vibench.results.costs.break_even import break_even_rows
 from vibench.results.database import ResultsDatabase
 from vibench.results.sqlite.reading import FILE
 

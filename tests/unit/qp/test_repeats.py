@@ -21,8 +21,9 @@ from vibench.model.hyperreduced import HyperReducedModel
 from vibench.qp.repeats import APART, in_units, nearby, units
 from vibench.qp.solve import solve_qp
 from vibench.qp.verification import QPSolution
+from vibench.rounds import timing_rounds
 from vibench.rounds.timing_rounds import TimingRounds
-from vibench.stages import snapshots, timing_rounds
+from vibench.stages import snapshots
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment

@@ -18,7 +18,7 @@ from vibench.report.findings import MOST, findings
 from vibench.report.page.grids import FIRST
 from vibench.results import tables
 from vibench.results.columns import CELLS, TABLES
-from vibench.results.ranking import leaderboard
+from vibench.results.costs.ranking import leaderboard
 from vibench.results.sqlite.reading import FILE
 from vibench.text import brief
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import cells_of, row_of
 
-from vibench.results.paired_seconds import PairedSeconds
-from vibench.results.ranking import COMPARED, LARGEST_BAND, Criterion, Standings, leaderboard
+from vibench.results.costs.paired_seconds import PairedSeconds
+from vibench.results.costs.ranking import COMPARED, LARGEST_BAND, Criterion, Standings, leaderboard
 
 
 def won(standings: Standings, criterion: Criterion) -> list[tuple[float, str]]:

@@ -20,9 +20,9 @@ from vibench.report import figures, html
 from vibench.report.comparison.compare import compare
 from vibench.report.page.grids import grid_of_cells
 from vibench.results import tables
+from vibench.results.costs.ranking import fastest
 from vibench.results.database import ResultsDatabase
 from vibench.results.plugin_columns import extended_tables
-from vibench.results.ranking import fastest
 from vibench.results.sqlite.reading import FILE
 from vibench.testing.sample_run import write_sample_run
 

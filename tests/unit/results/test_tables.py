@@ -22,8 +22,8 @@ from samples import QUICK_ROUNDS, cell_row, query_rows
 
 from vibench.errors import RequestError
 from vibench.results import tables
-from vibench.results.break_even import break_even_rows
 from vibench.results.columns import CELLS, HISTORIES, KEYS, QUERIES, TABLES, THRESHOLDS, VERSION
+from vibench.results.costs.break_even import break_even_rows
 from vibench.results.database import ResultsDatabase
 from vibench.results.formats import cell_text, to_csv, to_json, to_latex, to_markdown
 from vibench.results.sqlite import digests

@@ -16,7 +16,7 @@ from vibench.model.affine import Evaluation
 from vibench.model.galerkin import ReducedModel, project
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.results.columns import CELLS as CELL_COLUMNS
-from vibench.results.ranking import too_loose
+from vibench.results.costs.ranking import too_loose
 from vibench.stages.assembly import AffineDecomposition, AssemblyStage
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries

@@ -16,9 +16,9 @@ from samples import SampleStore, small_study
 from vibench import dependencies
 from vibench.dependencies import CARRIERS, CELL, COUNTED, code_used, modules_used
 from vibench.offline.assemblies import assemblies
+from vibench.rounds import timing_rounds
 from vibench.rounds.offline_repeats import OfflineRepeat
 from vibench.rounds.timing_rounds import TimingRounds
-from vibench.stages import timing_rounds
 from vibench.stages.base import Result, Stage, build_problem
 from vibench.stages.cell_queries import cell_queries
 from vibench.stages.pictures import PictureStage
@@ -170,7 +170,7 @@ def test_no_code_counts_that_only_requests_records_or_shows() -> None:
 
 SOLUTIONS, MATRICES, CONSTANTS = "high-fidelity solutions", "constraint matrices", "high-fidelity constants"
 SHOWN = (
-    "report.html", "results.columns", "results.break_even", "study.spec", "study.registry", "errors", "text",
+    "report.html", "results.columns", "results.costs.break_even", "study.spec", "study.registry", "errors", "text",
     "storage.artefacts", "storage.serialisation", "stages.base", "provenance", "execution.run", "cli.main",
     "library.runs",
 )  # fmt: skip

@@ -12,8 +12,8 @@ from running import Main
 from samples import cell_row
 
 from vibench.cli.main import app
+from vibench.results.costs.ranking import NO_BEST_CELL
 from vibench.results.database import ResultsDatabase
-from vibench.results.ranking import NO_BEST_CELL
 from vibench.results.sqlite.reading import FILE
 from vibench.terminal.output import run_argument
 from vibench.terminal.run_summary import REASONS, WHOLE, failures, next_steps, print_summary

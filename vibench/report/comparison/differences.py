@@ -11,8 +11,8 @@ import pandas as pd
 
 from vibench.qp.status import Status
 from vibench.report.comparison.runs import ComparedRun
-from vibench.results.break_even import DRAWS, FEWEST_ROUNDS, TAIL, BreakEven, Meaning
 from vibench.results.columns import THRESHOLDS
+from vibench.results.costs.break_even import DRAWS, FEWEST_ROUNDS, TAIL, BreakEven, Meaning
 from vibench.stability.infsup import VANISHES
 
 ERROR_FLOOR = 1e-10

@@ -16,8 +16,8 @@ import pandas as pd
 
 from vibench.report.figures.looks import Series
 from vibench.results import pictures, tables
+from vibench.results.costs.ranking import too_loose
 from vibench.results.plugin_columns import faults_of
-from vibench.results.ranking import too_loose
 from vibench.text import json_object
 
 TABLES = ("cells", "queries", "histories", "thresholds", "outputs")

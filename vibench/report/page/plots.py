@@ -20,9 +20,9 @@ from vibench.report.figures.costs import ERRORS
 from vibench.report.figures.data import Data, best_solver, label
 from vibench.report.figures.looks import Look, Looks, Series
 from vibench.report.page.grids import short
-from vibench.results import best, ranking
-from vibench.results.break_even import HIGH_FIDELITY, TAIL
-from vibench.results.paired_seconds import PairedSeconds
+from vibench.results.costs import best, ranking
+from vibench.results.costs.break_even import HIGH_FIDELITY, TAIL
+from vibench.results.costs.paired_seconds import PairedSeconds
 from vibench.text import printable
 
 MARKERS = {

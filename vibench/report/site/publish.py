@@ -20,8 +20,8 @@ from vibench.report.site.citation import Citation, requirements
 from vibench.report.site.identifying import cleaned, left
 from vibench.report.site.published_run import FILTERED, SHOWN_CELLS, PublishedRun, folder_names
 from vibench.results import formats, tables
+from vibench.results.costs.ranking import Criterion, Standings, leaderboard
 from vibench.results.plugin_columns import faults_of
-from vibench.results.ranking import Criterion, Standings, leaderboard
 from vibench.results.sqlite.reading import FILE, open_read_only
 
 TABLES = ("cells", "thresholds", "disagreements")

@@ -12,9 +12,9 @@ import pandas as pd
 
 from vibench.errors import RequestError, unknown_name
 from vibench.qp.status import Status
-from vibench.results.break_even import HIGH_FIDELITY, TAIL, offline_draws, shared_offline
 from vibench.results.columns import CELLS, Column, integer, real
-from vibench.results.paired_seconds import PairedSeconds
+from vibench.results.costs.break_even import HIGH_FIDELITY, TAIL, offline_draws, shared_offline
+from vibench.results.costs.paired_seconds import PairedSeconds
 from vibench.stability.infsup import VANISHES
 
 SOLUTION = "solution"

@@ -17,9 +17,9 @@ from samples import cells_of, row_of
 
 import vibench
 from vibench.errors import RequestError
-from vibench.results.best import certified_errors, cheapest
-from vibench.results.paired_seconds import PairedSeconds
-from vibench.results.ranking import BAND, Criterion, leaderboard
+from vibench.results.costs.best import certified_errors, cheapest
+from vibench.results.costs.paired_seconds import PairedSeconds
+from vibench.results.costs.ranking import BAND, Criterion, leaderboard
 
 TOO_MUCH = 0.1
 """Errors, and shares of the solver and of assembly in them, from which a model wins nothing."""

@@ -12,8 +12,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from samples import cell_row
 
-from vibench.results.break_even import FEWEST_ROUNDS, BreakEven, Meaning, break_even, break_even_rows
 from vibench.results.columns import THRESHOLDS
+from vibench.results.costs.break_even import FEWEST_ROUNDS, BreakEven, Meaning, break_even, break_even_rows
 
 PAPER = {
     # (N, R): offline and online seconds of the online and of the offline enrichment, benefit threshold

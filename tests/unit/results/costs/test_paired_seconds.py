@@ -14,8 +14,8 @@ import pytest
 from scipy.stats import t as student
 
 from vibench.execution.timing_plan import STOPPING_TAIL
-from vibench.results.break_even import TAIL, compared
-from vibench.results.paired_seconds import CommonVariance, Estimate, PairedSeconds, blocks_of, paces
+from vibench.results.costs.break_even import TAIL, compared
+from vibench.results.costs.paired_seconds import CommonVariance, Estimate, PairedSeconds, blocks_of, paces
 
 CELLS, ROUNDS, SECONDS = 6, 3, 0.08
 """Cells of a group, rounds of a block, and seconds of a cell's part of a round."""

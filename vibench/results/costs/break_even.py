@@ -14,7 +14,7 @@ from vibench.arrays import Array
 from vibench.errors import requested
 from vibench.interfaces.strategies import Kind
 from vibench.results.columns import KEYS, THRESHOLDS
-from vibench.results.paired_seconds import PairedSeconds
+from vibench.results.costs.paired_seconds import PairedSeconds
 from vibench.study.cells import CERTIFIED
 
 DRAWS = 2000

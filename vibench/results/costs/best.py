@@ -11,10 +11,10 @@ import pandas as pd
 
 from vibench.arrays import Array
 from vibench.errors import RequestError
-from vibench.results.break_even import DRAWS, TAIL, offline_draws, shared_offline
 from vibench.results.columns import CELLS, Column, integer, real
-from vibench.results.paired_seconds import Estimate, PairedSeconds
-from vibench.results.ranking import BAND, HEADINGS, errors_of_solution, excluded, model_row, reached_errors
+from vibench.results.costs.break_even import DRAWS, TAIL, offline_draws, shared_offline
+from vibench.results.costs.paired_seconds import Estimate, PairedSeconds
+from vibench.results.costs.ranking import BAND, HEADINGS, errors_of_solution, excluded, model_row, reached_errors
 
 CERTIFIED_BOUNDS: Mapping[str, str] = {"u_energy": "u", "lambda_natural": "λ"}
 """Errors that have bounds at online cost."""

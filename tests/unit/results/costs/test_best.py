@@ -5,7 +5,7 @@ from __future__ import annotations
 from samples import cells_of, row_of
 
 from vibench.results import tables
-from vibench.results.ranking import BAND, HEADINGS, fastest
+from vibench.results.costs.ranking import BAND, HEADINGS, fastest
 
 
 def test_every_error_that_is_reached_has_its_fastest_cell() -> None:
