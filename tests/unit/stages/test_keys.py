@@ -136,7 +136,7 @@ def test_what_runs_in_a_stage_is_what_its_code_is_read_from(
 
 def concrete(kind: type) -> Iterator[type[Stage]]:
     for one in kind.__subclasses__():
-        if one.__module__.startswith("vibench.stages") and not inspect.isabstract(one):
+        if one.__module__.startswith(("vibench.stages", "vibench.rounds")) and not inspect.isabstract(one):
             yield one
         yield from concrete(one)
 
@@ -149,7 +149,7 @@ def test_every_sort_of_stage_is_among_them() -> None:
 
 
 NUMERICAL = (
-    "linalg", "interfaces", "qp", "reduction", "stability", "highfidelity", "model", "offline", "stages", "fem",
+    "linalg", "interfaces", "qp", "reduction", "stability", "highfidelity", "model", "offline", "stages", "rounds", "fem",
     "arrays", "timing", "packs", "study.parameter_sets",
     "results.solver_agreement", "results.pictures",  # what is kept of a solution and of a picture
 )  # fmt: skip
