@@ -149,8 +149,8 @@ def test_every_sort_of_stage_is_among_them() -> None:
 
 
 NUMERICAL = (
-    "linalg", "interfaces", "qp", "reduction", "stability", "highfidelity", "model", "offline", "stages", "rounds", "fem",
-    "arrays", "timing", "packs", "study.parameter_sets",
+    "linalg", "interfaces", "qp", "reduction", "stability", "highfidelity", "model", "offline", "stages", "rounds",
+    "fem", "arrays", "timing", "packs", "study.parameter_sets",
     "results.solver_agreement", "results.pictures",  # what is kept of a solution and of a picture
 )  # fmt: skip
 
