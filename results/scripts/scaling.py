@@ -29,6 +29,7 @@ from matplotlib.figure import Figure
 from page import SECONDS, Page, made_by, start
 
 from vibench import Reduction, Stop, create, provenance, solve_qp
+from vibench.linalg.factorisations import IMPLEMENTATIONS
 from vibench.report.figures.style import STYLE, CaptionedFigure
 from vibench.timing import median_seconds, timed
 
@@ -62,25 +63,38 @@ CASES = {
     "obstacle": Case((400, 1200, "paper", "fine", 30_000, 60_000), 14, 43, 1e-3),
     "hertz": Case((300, 1000, 3000, "paper", "fine", 30_000), 20, 12, 0.3),  # 300 nodes: 21 snapshots are independent
 }
+FACTORISED = ("hertz", (3000, "paper", "fine", 30_000))
+"""A problem and its numbers of nodes at which the factorisations are compared, those that are installed."""
+
+COMPARED = ("mesh and forms", "snapshots", "POD", "mCPG", "PGA")
+"""Stages up to the last one of that comparison."""
+
 SIZES = (10, 20, 40, 60, 80)
 """R at the paper's mesh."""
 
 
-def measure(name: str, nodes: int | str, R: int, delta: float, N: int) -> Iterator[dict[str, Any]]:
-    """Rows of one problem and mesh: stage, seconds, peak memory."""
+def measure(
+    name: str, nodes: int | str, R: int, delta: float, N: int, factorisation: str = ""
+) -> Iterator[dict[str, Any]]:
+    """Rows of one problem and mesh: stage, seconds, peak memory; with a factorisation those of `COMPARED` alone."""
     about: dict[str, Any] = {"problem": name, "R": R, "N": N}
+    options: dict[str, Any] = {"resolution": nodes}
+    if factorisation:
+        about["factorisation"] = options["factorisation"] = factorisation
 
     def row(stage: str, work: Callable[[], Any], repeated: bool = False) -> tuple[Any, dict[str, Any]]:
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # resets the peak
         result, seconds = (median_seconds if repeated else timed)(work)
         return result, about | {"stage": stage, "seconds": seconds.cpu, "memory_mib": _peak_memory()}
 
-    problem, measured = row("mesh and forms", lambda: create("problem", name, {"resolution": nodes}))
+    problem, measured = row("mesh and forms", lambda: create("problem", name, options))
     about |= {"n": problem.V.dim, "m": problem.W.dim}
     yield measured | about
     strategies = create("dual strategy", "mcpg"), create("primal strategy", "offline-pga")
     reduction = Reduction(problem, *strategies, Stop(size=N), Stop(size=R), delta, assembly="reduced")
     for stage, step in STEPS.items():
+        if factorisation and stage not in COMPARED:
+            return
         getattr(reduction, UNTIMED.get(stage, "problem"))
         result, measured = row(stage, lambda: getattr(reduction, step))  # noqa: B023  called at once
         yield measured | ({"added": result.vectors.shape[1]} if stage == "PGA" else {})
@@ -108,6 +122,11 @@ def all_rows() -> Iterator[dict[str, Any]]:
             yield from _in_a_process("mesh", name, nodes, case.R, case.delta, case.N)
         for R in SIZES:
             yield from _in_a_process("R", name, "paper", R, case.delta, case.N)
+    name, meshes = FACTORISED
+    case = CASES[name]
+    for one in IMPLEMENTATIONS.values():
+        for nodes in meshes if one.is_direct and one.is_installed else ():
+            yield from _in_a_process("factorisation", name, nodes, case.R, case.delta, case.N, one.name)
 
 
 def _in_a_process(over: str, *arguments: Any) -> Iterator[dict[str, Any]]:
@@ -123,7 +142,7 @@ def table(rows: pd.DataFrame, what: str) -> pd.DataFrame:
     """One line per problem and stage, one column per size, and the exponents between neighbouring sizes."""
     lines = []
     for (name, stage), group in rows.groupby(["problem", "stage"], sort=False):
-        size = "n" if group["over"].iloc[0] == "mesh" else "R"
+        size = "R" if group["over"].iloc[0] == "R" else "n"
         points = group.groupby(size)[what].median()
         values = {f"{size} = {k}": value for k, value in points.items()}
         lines.append(
@@ -193,6 +212,16 @@ def write_page(rows: pd.DataFrame, target: str) -> None:
             offline = group[group["stage"].isin(OFFLINE)]
             page.section(f"{name}: seconds", table(group, "seconds"), level=3)
             page.section(f"{name}: peak memory [MiB]", table(offline, "memory_mib"), level=3)
+    compared = rows[(rows["over"] == "factorisation") & rows["stage"].isin(("snapshots", "PGA"))]
+    if len(compared):
+        page.section("Factorisations")
+        for what, title in (("seconds", "seconds"), ("memory_mib", "peak memory [MiB]")):
+            by_name = [
+                table(group, what).assign(problem=name) for name, group in compared.groupby("factorisation", sort=False)
+            ]
+            page.section(
+                f"{FACTORISED[0]}: {title}", pd.concat(by_name).rename(columns={"problem": "factorisation"}), level=3
+            )
     page.add(f"All measurements: {page.link('rows', rows)}.")
     page.write()
 

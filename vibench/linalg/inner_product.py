@@ -129,7 +129,7 @@ def orthogonal_factorisation(X: SparseMatrix, y: Array) -> tuple[Array, Array]:
 
     No factor of X is needed. Householder's factorisation in units of single unknowns leaves columns that are
     independent in the norm of X, too, and two passes of Cholesky's factorisation of their Gram matrix make them
-    orthonormal to round-off (CholeskyQR2: Yamamoto, Nakatsukasa, Yanagisawa and Fukaya 2015).
+    orthonormal to round-off (CholeskyQR2: Fukaya, Nakatsukasa, Yanagisawa and Yamamoto 2014).
     """
     units = np.sqrt(X.diagonal())[:, None]
     q, r = np.linalg.qr(units * y)
