@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from running import Vibench
+from running import MEASURED, Vibench
 from samples import write_study
 
 from vibench.results import tables
@@ -26,9 +26,6 @@ STUDY = {
 ORIGIN = {"cell", "problem_options", "model", "study_hash", "code", "definition", "artefact", "cell_a", "cell_b"}
 """Columns that name the problem or its code."""
 
-MEASURED = {"peak_memory_mib", "slowdown", "disturbed", "benefit_threshold", "threshold_low", "threshold_high", "sign"}
-"""Columns that depend on the machine."""
-
 RESOLUTION = {"obstacle": 160, "hertz": 300}
 
 
@@ -45,8 +42,7 @@ def numbers(folder: Path, table: str, problem: str) -> pd.DataFrame:
     if table == "queries":
         found = found.drop(columns="outputs")
     found = found[found["problem"] == problem]
-    seconds = {name for name in found if name.endswith("_s")}
-    kept = found[[name for name in found if name not in ORIGIN | MEASURED | seconds]]
+    kept = found[[name for name in found if name not in ORIGIN and not name.endswith((*MEASURED, "sign"))]]
     keys = ["primal", "assembly", "output", "query", "stage", "quantity", "step", "dual_tol"]
     return kept.sort_values([key for key in keys if key in kept]).reset_index(drop=True)
 
