@@ -225,6 +225,11 @@ class ZoneStiffness(CondensedStiffness):
         return norms_by_solutions(functionals, self.solve(functionals))
 
     @cached_property
+    def factor(self) -> SparseCholesky:
+        """The Cholesky factor of all of A: that of solutions, where this is one."""
+        return self._solver if isinstance(self._solver, SparseCholesky) else SparseCholesky(self._A, "A")
+
+    @cached_property
     def _on_zone(self) -> tuple[StaticCondensation, BlockDiagonal]:
         """A condensed on the zone, and its inverse there; others are eliminated in their order in the factor of A."""
         assert self.zone is not None
