@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import os
 import platform
+import subprocess
 import sys
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -77,9 +78,26 @@ def cores() -> int:
 
 
 def versions(solver: str) -> dict[str, str]:
-    """Versions of the benchmark protocol, of Python, the numerical libraries, vibench and one solver."""
+    """Versions of the benchmark protocol, of Python, the numerical libraries, vibench and one solver.
+
+    That of vibench has the commit, "0.1.0 at 1a2b3c4d5e", where it runs from a checkout.
+    """
     numerical = {name: distribution_version(name) for name in ("numpy", "scipy", "scikit-fem", "qpsolvers", "vibench")}
+    numerical["vibench"] += f" at {commit()}" if commit() else ""
     return {"protocol": PROTOCOL, "python": platform.python_version(), **numerical, solver: solver_version(solver)}
+
+
+@cache
+def commit(checkout: Path = Path(__file__).parents[1]) -> str:
+    """The commit of a checkout, "+" after it if its tracked files were changed since; "" elsewhere and without git."""
+    if not (checkout / ".git").exists():
+        return ""
+    command = ["git", "-C", str(checkout), "describe", "--always", "--exclude=*", "--abbrev=10", "--dirty=+"]
+    try:
+        said = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError:  # there is no git
+        return ""
+    return said.stdout.strip() if said.returncode == 0 else ""
 
 
 @cache

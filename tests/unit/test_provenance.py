@@ -6,6 +6,7 @@ import importlib.metadata
 import os
 import platform
 import shutil
+import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -76,7 +77,7 @@ def test_there_is_a_core() -> None:
 @pytest.mark.parametrize("name", ["numpy", "scipy", "qpsolvers", "vibench"])
 def test_versions_are_those_installed(name: str) -> None:
     found = versions("piqp")
-    assert found[name] == importlib.metadata.version(name)
+    assert found[name].partition(" at ")[0] == importlib.metadata.version(name)
     assert found["python"] == platform.python_version()
     assert found["protocol"] == provenance.PROTOCOL
     assert found["piqp"] == importlib.metadata.version("piqp")
@@ -162,3 +163,25 @@ def test_the_processor_is_named_without_cpuinfo(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(provenance.Path, "is_file", lambda _: False)
     text = machine.__wrapped__()
     assert text.split(",")[0].strip() in (platform.processor(), platform.machine())
+
+
+def test_versions_name_the_commit_of_a_checkout_and_whether_it_was_changed(tmp_path: Path) -> None:
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b", *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    assert provenance.commit(tmp_path) == ""
+    git("init", "-q")
+    (tmp_path / "a.py").write_text("a = 1\n")
+    git("add", "a.py")
+    git("commit", "-q", "-m", "a")
+    commit = git("rev-parse", "HEAD")[:10]
+    provenance.commit.cache_clear()
+    assert provenance.commit(tmp_path) == commit
+    (tmp_path / "a.py").write_text("a = 2\n")
+    provenance.commit.cache_clear()
+    assert provenance.commit(tmp_path) == commit + "+"
+    shutil.rmtree(tmp_path / ".git")
+    (tmp_path / ".git").write_text("no repository")
+    provenance.commit.cache_clear()
+    assert provenance.commit(tmp_path) == ""
