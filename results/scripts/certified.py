@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import pandas as pd
 from matplotlib.figure import Figure
-from page import SECONDS, Page, machines, made_by, read, start
+from page import SECONDS, Page, made_by, origin, read, start
 
 from vibench.report.figures.looks import look_of
 from vibench.report.figures.style import Sheet, scatter, styled
@@ -164,7 +164,7 @@ def main(certified: str, training: str, target: str) -> None:
         made_by("certified", "certified", "certified", "training", options=" --no-figures"),
         SECONDS,
         f"{counts[0]} cells of `certified` and {counts[1]} of `training` are marked as disturbed.",
-        machine=machines(cells, trained),
+        machine=origin(cells, trained),
     )
     page.section(
         "Effectivities",
@@ -194,6 +194,8 @@ def main(certified: str, training: str, target: str) -> None:
         "whether Niakh et al. (2022) use these tolerances for the problem.",
         equal_errors(trained).rename(columns=HEADINGS),
     )
+    linked = {"effectivities": effectivities(cells, queries, "max"), "training": equal_errors(trained)}
+    page.add(f"Largest effectivities, and models of equal error: {', '.join(map(page.link, linked, linked.values()))}.")
     failed = pd.concat(frame[frame["status"] != "ok"] for frame in (cells, trained))
     page.add(*(f"- {row.cell}: {row.status}, {row.reason}" for row in failed.itertuples()))
     page.write()

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from page import SECONDS, Page, machines, made_by, read, start
+from page import SECONDS, Page, made_by, origin, read, start
 
 from vibench.report.figures.data import label
 from vibench.report.figures.looks import MARKERS, Looks, Series, look_of
@@ -241,7 +241,7 @@ def main(run: str, target: str) -> None:
         SECONDS,
         f"{len(field.cells)} cells, {int((field.cells['status'] == 'ok').sum())} with every query ok. `vibench run "
         "field` leaves the tables of all queries and histories under `runs/field/tables`.",
-        machine=machines(field.cells),
+        machine=origin(field.cells),
     )
     with styled():
         page.draw("field-shares", draw_shares(field))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from page import Page, machines, made_by, read, start
+from page import Page, made_by, origin, read, start
 
 from vibench import Reduction, Stop, create, project_on_cone
 from vibench.reduction import TIE
@@ -120,7 +120,7 @@ def main(run: str, target: str) -> None:
         "ours, symmetric as the training grid is, and the same one with nodes displaced at random (`asymmetric`). For "
         "Hertz contact: layers of nodes shifted by half a spacing (ours), not shifted and cut by diagonals that all "
         "point one way, and displaced at random (`triangulation`).",
-        machine=machines(cells),
+        machine=origin(cells),
     )
     page.section("Dimensions", dimensions([*obstacle, *hertz]))
     page.section(

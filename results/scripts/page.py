@@ -138,15 +138,15 @@ def read(run: str | Path, table: str) -> pd.DataFrame:
     return tables.in_order(tables.read(tables.results_file(str(run)), table))
 
 
-def machines(*cells: pd.DataFrame) -> str:
-    """The machines that measured the cells of some runs."""
-    return "; ".join(pd.concat(cells)["machine"].dropna().unique())
-
-
-def versions(cells: pd.DataFrame) -> str:
-    """The libraries that computed the cells of a run, with their versions."""
-    named = {name: text for row in cells["versions"] for name, text in json.loads(row).items()}
-    return ", ".join(f"{name} {text}" for name, text in named.items())
+def origin(*cells: pd.DataFrame) -> str:
+    """The machines that measured the cells of some runs, the libraries that computed them, and the commit."""
+    every = pd.concat(cells)
+    named: dict[str, set[str]] = {}
+    for row in every["versions"].dropna().unique():
+        for name, text in json.loads(row).items():
+            named.setdefault(name, set()).add(text)
+    versions = ", ".join(f"{name} {' and '.join(sorted(texts))}" for name, texts in named.items())
+    return "; ".join([*every["machine"].dropna().unique(), versions])
 
 
 def start(main: Callable[..., None]) -> None:

@@ -10,11 +10,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pandas as pd
-from page import SECONDS, Page, alternative, escaped, machines, made_by, read, start, versions, write_figure
+from page import SECONDS, Page, alternative, escaped, made_by, origin, read, start, write_figure
 
 from vibench.report import figures
 from vibench.report.figures.style import caption_of, styled
 from vibench.results import tables
+from vibench.results.costs.best import CERTIFIED_BOUNDS
+from vibench.study.cells import CERTIFIED
 from vibench_problems.paper.evidence import SOLVER, Evidence
 from vibench_problems.paper.tables import columns
 
@@ -42,7 +44,7 @@ def main(run: str, target: str) -> None:
         SECONDS,
         f"`vibench run {name}` leaves the tables of all queries and histories under `runs/{name}/tables` and all "
         f"figures under `runs/{name}/figures`.",
-        machine=f"{machines(cells)}; {versions(cells)}",
+        machine=origin(cells),
     )
     if name in PAPER:
         ((_, data),) = figures.problems(path)
@@ -60,8 +62,23 @@ def main(run: str, target: str) -> None:
         page.section("Break-even of fixed enrichments", tables.benefits(of_enrichments))
     page.section("Figures", *dict(sorted(drawn(path, page.folder))).values())
     written = {table: frame for table in TABLES if len(frame := read(run, table))}
+    if (cells["assembly"] == CERTIFIED).any():
+        written["bounds"] = bounds(cells, read(run, "queries"))
     page.add(f"Full tables: {', '.join(page.link(table, frame) for table, frame in written.items())}.")
     page.write()
+
+
+def bounds(cells: pd.DataFrame, queries: pd.DataFrame) -> pd.DataFrame:
+    """Of every certified model the means over its ok queries of the relative bounds at online cost, and violations."""
+    fine = queries[(queries["status"] == "ok") & queries["cell"].isin(cells["cell"][cells["assembly"] == CERTIFIED])]
+    relative = {
+        f"bound_{name}_mean": fine[f"bound_online_{name}"] * fine[f"error_{name}"] / fine[f"error_{name}_absolute"]
+        for name in CERTIFIED_BOUNDS
+    }
+    found = pd.DataFrame(relative).groupby(fine["cell"]).mean()
+    of_cell = fine.groupby("cell")
+    found["queries"], found["violations"] = of_cell.size(), of_cell["bound_online_violated"].sum()
+    return found.reset_index()
 
 
 def outcomes(cells: pd.DataFrame) -> tuple[str, str]:

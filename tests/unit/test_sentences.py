@@ -1,11 +1,13 @@
 """Sentences of README and documentation that sum up tables under `results/`: they are written here from the tables.
 
-Numbers that no committed table has are not checked here: those of the pages on export, limits, packs, reports, and what
+The first page and "What to use" are made whole by their scripts. Numbers that no committed table has are not
+checked here: those of the pages on export, limits, packs, reports, and what
 is said of runs whose queries are not committed. The commands beside them print them.
 """
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,32 +16,12 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 MODEL = ["problem", "dual", "primal", "primal_options", "pod_tol", "pod_size", "dual_tol", "dual_size", "primal_tol"]
-CONE = ["dual", "pod_tol", "pod_size", "dual_tol", "dual_size"]
 
 
 def cells(study: str) -> pd.DataFrame:
     """The cells of a study, with the solver of the pages."""
     table = pd.read_csv(ROOT / "results" / study / "cells.csv")
     return table[table["solver"] == "piqp"]
-
-
-def span(values: pd.Series, digits: int = 2) -> tuple[str, str]:
-    low, high = (f"{float(f'{value:.{digits}g}'):g}" for value in (values.min(), values.max()))
-    return low, high
-
-
-def one(value: float) -> str:
-    """A factor with one digit after the point, with none from twenty on."""
-    return f"{value:.0f}" if value >= 20.0 else f"{value:.1f}"
-
-
-def gains(study: str, dual: str) -> pd.Series:
-    """The mean error of λ without enrichment over that with one, for every enriched model of a cone."""
-    table = cells(study)
-    table = table[(table["dual"] == dual) & (table["assembly"] == "full")]
-    plain = table[table["primal"] == "decorrelated"].set_index(CONE)["error_lambda_mean"]
-    enriched = table[table["primal"] != "decorrelated"].set_index(CONE)["error_lambda_mean"]
-    return plain.reindex(enriched.index) / enriched
 
 
 def misses(study: str, problem: str) -> tuple[int, pd.DataFrame]:
@@ -65,34 +47,31 @@ def of_guarantees() -> Sequence[str]:
     )
 
 
-def of_enrichments() -> Sequence[str]:
-    """What README says of errors with and without enrichment."""
-    cpg, mcpg = (gains("paper-obstacle", dual) for dual in ("cpg", "mcpg"))
-    plain, modified = (gains("paper-hertz", dual) for dual in ("cpg", "mcpg"))
-    return (
-        f"by a factor of {one(mcpg.max())}, with N = 87 by a factor of {one(mcpg.min())}",
-        f"Over all {len(cpg) + len(mcpg)} enriched models of the study the error of λ becomes smaller by factors of "
-        f"{one(cpg.min())} to {one(cpg.max())} with CPG and of {one(mcpg.min())} to {one(mcpg.max())} with mCPG; over "
-        f"the {len(plain) + len(modified)} of the same study for Hertz contact, {one(plain.min())} to "
-        f"{one(plain.max())} and {one(modified.min())} to {one(modified.max())}.",
-    )
-
-
-def of_queries() -> Sequence[str]:
-    """What README says of the seconds of a query against those of a high-fidelity solution."""
-    table = cells("benefit").assign(gain=lambda rows: rows["hf_s"] / rows["online_s"])
-    ends = {assembly: span(rows["gain"]) for assembly, rows in table.groupby("assembly")}
-    return (
-        f"Over the {len(table)} models of the study `benefit` a query gains a factor of "
-        f"{' to '.join(ends['reduced'])} with reduced assembly, and of {' to '.join(ends['full'])} with full assembly",
-    )
-
-
 @pytest.mark.parametrize(
     ("page", "sentences"),
-    [("README.md", of_enrichments), ("README.md", of_queries), ("docs/field.md", of_guarantees)],
+    [("docs/field.md", of_guarantees)],
 )
 def test_a_page_says_what_the_tables_say(page: str, sentences: object) -> None:
     assert callable(sentences)
     text = " ".join((ROOT / page).read_text(encoding="utf-8").split())
     assert [sentence for sentence in sentences() if sentence not in text] == []
+
+
+@pytest.fixture
+def scripts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "results" / "scripts"))
+
+
+@pytest.mark.usefixtures("scripts")
+def test_the_results_on_the_first_page_are_made_from_the_tables() -> None:
+    committed, first_page = map(importlib.import_module, ("committed", "first_page"))
+    page = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert first_page.PLACE.search(page)
+    assert first_page.filled(page, committed.Results(ROOT / "results")) == page
+
+
+@pytest.mark.usefixtures("scripts")
+def test_the_page_what_to_use_is_made_from_the_tables() -> None:
+    committed, what_to_use = map(importlib.import_module, ("committed", "what_to_use"))
+    page = (ROOT / "docs" / "what-to-use.md").read_text(encoding="utf-8")
+    assert what_to_use.what_to_use(committed.Results(ROOT / "results")) == page

@@ -1,0 +1,131 @@
+"""The results on the first page: a table of both problems, and what holds over all models of the studies.
+
+python results/scripts/first_page.py results README.md
+
+Everything is computed from the tables that are committed below `results/`. Of README the part between the marks
+`<!-- generated: results -->` and `<!-- end: results -->` is replaced.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pandas as pd
+from committed import ASSEMBLIES, MODEL, PROBLEMS, Results, enriched, interval, number, of, span, unavailable, when
+from page import start
+
+from vibench.report.figures.data import label
+from vibench.results import formats
+
+PLACE = re.compile(r"(<!-- generated: results -->\n).*?(<!-- end: results -->)", re.DOTALL)
+
+
+def factors(results: Results) -> Iterator[str]:
+    """Factors by which enrichments reduce the error of λ, by problem and cone."""
+    for problem, cells in results.papers.items():
+        for dual, mine in cells.groupby("dual"):
+            lambdas, us = enriched(mine, "error_lambda_mean"), enriched(mine, "error_u_mean")
+            yield (
+                f"{problem}, {dual}: {span(lambdas)} for λ ({of(int((lambdas > 1.1).sum()), len(lambdas))} above 1.1), "
+                f"{span(us)} for u"
+            )
+
+
+def models(results: Results) -> pd.DataFrame:
+    """One row per model of `benefit`: errors, bounds, gains in every assembly, break-even in reduced assembly."""
+    bounds = results.table("benefit", "bounds").set_index("cell")
+    rows = []
+    for key, mine in results.gains.groupby(MODEL, dropna=False, sort=False):
+        by = mine.set_index("assembly")
+        named = dict(zip(MODEL, key, strict=True))
+        reduced, bound = by.loc["reduced"], bounds.loc[by.loc["certified", "cell"]]
+        gains = {
+            f"gain, {how}": interval(*by.loc[how, ["gain", "gain_low", "gain_high"]].astype(float))
+            for how in ASSEMBLIES
+        }
+        rows.append(
+            {
+                "problem": named["problem"], "N, R": f"{reduced['N']}, {reduced['R']}",
+                "enrichment": label(named["primal"], named["primal_tol"]), "error of u": reduced["error_u_mean"],
+                "bound": bound["bound_u_energy_mean"], "error of λ": reduced["error_lambda_mean"],
+                "bound ": bound["bound_lambda_natural_mean"], **gains, "cheaper than high-fidelity": when(reduced),
+            }
+        )  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def first_page(results: Results) -> str:
+    """What README says of results."""
+    gains, bounds = results.gains, results.table("benefit", "bounds")
+    effectivities = results.table("certified", "effectivities")
+    tally = re.findall(r"^\| all \| (\d+) \| (\d+) \| (\d+) \|", _reproduction(results), re.MULTILINE)[0]
+    decorrelated = {p: cells[cells["primal"] == "decorrelated"] for p, cells in results.papers.items()}
+    supplied = {p: cells[cells["primal"] != "decorrelated"] for p, cells in results.papers.items()}
+    lines = [
+        "Two problems at the size of the paper, mCPG, PIQP; means over 64 validation parameters. Errors are relative, "
+        "in V and W; bounds are certified ones of these queries, in the energy and the natural norm. A *gain* is the "
+        "seconds of a high-fidelity solution that starts from the nearest contact set over those of a query, with the "
+        "95 % interval of what another run would measure, from three cold processes. The last column counts queries in "
+        "reduced assembly, offline seconds included.",
+        formats.to_markdown(models(results)).strip(),
+        "What holds over all models of these studies, and what does not:",
+        "\n".join(
+            [
+                *(
+                    f"- **{how} assembly, {problem}:** gains of {span(mine['gain'])}; {of(*faster(mine))} models are "
+                    f"faster than what they replace."
+                    for (problem, how), mine in gains.groupby(["problem", "assembly"], sort=False)
+                    if mine["gain"].notna().any()
+                ),
+                *(f"- **{problem} as a C program:** {reason}." for problem, reason in unavailable(gains)),
+                "- **Enrichment** divides the error of λ by these factors (`paper-obstacle`, `paper-hertz`): "
+                + "; ".join(factors(results))
+                + ".",
+                "- **β over the span** is at most "
+                + ", ".join(f"{number(mine['beta_span_min'].max())} ({p})" for p, mine in decorrelated.items())
+                + " without enrichment where N ≤ R, and "
+                + ", ".join(f"{span(mine['beta_span_min'])} ({p})" for p, mine in supplied.items())
+                + " with one; **over the cone** it is "
+                + ", ".join(
+                    f"{span(decorrelated[p]['beta_cone_lower_min'])} without and "
+                    f"{span(supplied[p]['beta_cone_lower_min'])} with one ({p})"
+                    for p in PROBLEMS
+                )
+                + ".",
+                f"- **Bounds** are violated in {of(int(bounds['violations'].sum()), int(bounds['queries'].sum()))} "
+                f"queries of `benefit`; at online cost the largest effectivities of a model of `certified` are "
+                f"{span(effectivities['u in the energy norm, (ii) online'])} for u and "
+                f"{span(effectivities['λ in the natural norm, (ii) online'])} for λ.",
+                f"- **Of the paper** {tally[0]} claims agree with our runs, {tally[1]} differ, and {tally[2]} "
+                "cannot be compared: [claim by claim](docs/reproduction.md).",
+            ]
+        ),
+        "Text and table are made by `python results/scripts/first_page.py results README.md` from "
+        "tables that name their commands and the machine.",
+    ]
+    return "\n\n".join(lines)
+
+
+def faster(mine: pd.DataFrame) -> tuple[int, int]:
+    """How many models are surely faster than the high-fidelity model, and how many there are."""
+    return int((mine["gain_low"] > 1.0).sum()), len(mine)
+
+
+def _reproduction(results: Results) -> str:
+    return (results.folder.parent / "docs" / "reproduction.md").read_text(encoding="utf-8")
+
+
+def filled(text: str, results: Results) -> str:
+    """A page with its generated part as it is made from the tables."""
+    return PLACE.sub(lambda place: f"{place[1]}\n{first_page(results)}\n\n{place[2]}", text)
+
+
+def main(results: str, readme: str) -> None:
+    path = Path(readme)
+    path.write_text(filled(path.read_text(encoding="utf-8"), Results(results)), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    start(main)

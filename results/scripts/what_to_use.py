@@ -1,0 +1,244 @@
+"""The page "What to use": six questions, answered from the tables that are committed below `results/`.
+
+python results/scripts/what_to_use.py results docs/what-to-use.md
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from committed import ASSEMBLIES, CONTROL, MODEL, PROBLEMS, Results, enriched, number, of, span, unavailable
+from page import start
+
+from vibench.results import formats
+
+
+def question(heading: str, answer: str, fails: str, *more: str) -> str:
+    """A section of the page: the answer, where it fails, and a table if it needs one."""
+    return "\n\n".join([f"## {heading}", answer, f"*Where this fails:* {fails}", *more])
+
+
+def enrich(results: Results) -> str:
+    """Enrich or not, and which enrichment."""
+    pairs = pd.concat(
+        [results.table("benefit", "thresholds"), *(results.table(f"paper-{p}", "thresholds") for p in PROBLEMS)]
+    )
+    pairs = pairs[pairs["cell_a"].notna() & pairs["assembly_a"].isin(["full", "reduced"])]
+    cheaper = (pairs["gain_low"] > 1.0).sum()
+    worse = {p: enriched(cells, "error_u_mean") for p, cells in results.papers.items()}
+    return question(
+        "Enrich or not?",
+        f"With mCPG, enrich offline: it divides the error of λ by {_factor(results, 'mcpg')}. "
+        f"A query with a fixed enrichment is faster than one with online supremizers in {of(int(cheaper), len(pairs))} "
+        f"comparisons (the 95 % interval above 1), by a factor of {span(pairs['gain'])} "
+        "([paper-obstacle](../results/paper-obstacle/README.md), [paper-hertz](../results/paper-hertz/README.md), "
+        "[benefit](../results/benefit/README.md)).",
+        f"with CPG the factor is {_factor(results, 'cpg')}, so that there may be nothing to gain; the error of u "
+        "becomes larger in "
+        + " and ".join(f"{of(int((w < 1.0).sum()), len(w))} models ({p})" for p, w in worse.items())
+        + "; a stability that PGA guarantees on the training set is missed elsewhere at times "
+        "([comparison of strategies](field.md)).",
+    )
+
+
+def _factor(results: Results, dual: str) -> str:
+    by = {p: enriched(cells[cells["dual"] == dual], "error_lambda_mean") for p, cells in results.papers.items()}
+    return " and ".join(f"{span(values)} ({p})" for p, values in by.items())
+
+
+def cones(results: Results) -> pd.DataFrame:
+    """Of every cone of the study `field` with online supremizers: ranges over the two tolerances, by problem."""
+    cells = results.table("field")
+    chosen = cells[
+        (cells["primal"] == "online-supremizers") & (cells["assembly"] == "reduced") & (cells["dual"] != CONTROL)
+    ]
+    rows = []
+    for dual, mine in chosen.groupby("dual", sort=False):
+        row: dict[str, str] = {"cone": f"`{dual}`"}
+        for problem in PROBLEMS:
+            one = mine[mine["problem"] == problem]
+            row |= {
+                f"R, {problem}": span(one["R"], 3), f"error of λ, {problem}": span(one["error_lambda_mean"]),
+                f"query [ms], {problem}": span(1e3 * one["online_s"]),
+                f"offline [s], {problem}": span(one["offline_cone_s"]),
+            }  # fmt: skip
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def which_cone(results: Results) -> str:
+    """Which dual strategy."""
+    cells = results.table("field")
+    chosen = cells[
+        (cells["primal"] == "online-supremizers") & (cells["assembly"] == "reduced") & (cells["dual"] != CONTROL)
+    ]
+    tight = chosen[chosen["pod_tol"] == chosen["pod_tol"].min()]
+    best, few, cheap = (_least(tight, column) for column in ("error_lambda_mean", "R", "offline_cone_s"))
+    pairs = chosen.set_index(["problem", "pod_tol", "dual"]).sort_index()
+    mine = pairs.xs("mcpg", level="dual")
+    others = {dual: pairs.xs(dual, level="dual") for dual in chosen["dual"].unique() if dual != "mcpg"}
+    never = [
+        f"`{d}`"
+        for d, o in others.items()
+        if ((o["R"] < mine["R"]) & (o["error_lambda_mean"] < mine["error_lambda_mean"])).any()
+    ]
+    smallest = pairs.groupby(level=[0, 1])["R"].min()
+    return question(
+        "Which cone?",
+        f"`mcpg` to begin with: {span(mine['R'] / smallest)} times the generators of the smallest cone, and offline "
+        f"{span(mine['offline_cone_s'])} s ([field](../results/field/README.md), two problems, two tolerances).",
+        (
+            "at one of these tolerances " + " and ".join(never) + " have fewer generators and a smaller error. "
+            if never
+            else ""
+        )
+        + f"At the tighter tolerances the smallest error of λ has {best}, the fewest generators {few}, the fastest "
+        f"offline phase {cheap}.",
+        "Ranges over the two tolerances, online supremizers, reduced assembly; offline seconds are those of the cone:",
+        formats.to_markdown(cones(results)).strip(),
+    )
+
+
+def _least(cells: pd.DataFrame, column: str) -> str:
+    rows = cells.loc[cells.groupby("problem")[column].idxmin()]
+    return " and ".join(f"`{row['dual']}` ({number(row[column])}, {row['problem']})" for _, row in rows.iterrows())
+
+
+def solvers(results: Results) -> pd.DataFrame:
+    """Of every accuracy the solvers with every query ok, the fastest first: times the fastest one, cell by cell."""
+    cells, rows = results.table("solvers"), []
+    for accuracy, mine in cells.groupby("accuracy"):
+        seconds = mine.assign(model=mine[MODEL].astype(str).agg(" ".join, axis=1))
+        ratios = seconds["online_solve_s"] / seconds.groupby("model")["online_solve_s"].transform("min")
+        for solver, group in seconds.assign(ratio=ratios.where(seconds["status"] == "ok")).groupby("solver"):
+            fine = int((group["status"] == "ok").sum())
+            rows.append(
+                {
+                    "accuracy": f"{accuracy:g}", "solver": f"`{solver}`", "cells ok": f"{fine} of {len(group)}",
+                    "seconds, in those of the fastest": span(group["ratio"]) if fine else "–",
+                    "mean": float(np.exp(np.log(group["ratio"]).mean())) if fine else np.nan, "all": fine == len(group),
+                }
+            )  # fmt: skip
+    table = pd.DataFrame(rows)
+    table["order"] = -table["accuracy"].astype(float)
+    return table.sort_values(["order", "all", "mean"], ascending=[True, False, True], kind="stable").drop(
+        columns="order"
+    )
+
+
+def which_solver(results: Results) -> str:
+    """Which QP solver at which accuracy."""
+    table = solvers(results)
+    fine = table[table["all"]]
+    first = fine.drop_duplicates("accuracy")
+    answers = [f"{row['solver']} at {row['accuracy']} ({number(row['mean'])} times the fastest of each model in the "
+               f"mean, {row['seconds, in those of the fastest']} over all)" for _, row in first.iterrows()]  # fmt: skip
+    failed = table[~table["all"]]
+    return question(
+        "Which solver, at which accuracy?",
+        f"Of the solvers that solve every query: {'; '.join(answers)} ([solvers](../results/solvers/README.md)).",
+        "these are small dense programs. Not every query is solved by "
+        + "; ".join(
+            f"{', '.join(group['solver'])} at {accuracy}" for accuracy, group in failed.groupby("accuracy", sort=False)
+        )
+        + ".",
+        "Seconds of the solver alone; the column mean is geometric, over the models in which all queries are ok:",
+        formats.to_markdown(table.drop(columns="all")).strip(),
+    )
+
+
+def which_assembly(results: Results) -> str:
+    """Full, reduced or compiled."""
+    gains = results.gains
+    by = {key: span(mine) for key, mine in gains.dropna(subset="gain").groupby(["assembly", "problem"])["gain"]}
+    said = "; ".join(
+        f"{how} {', '.join(f'{by[how, p]} ({p})' for p in PROBLEMS if (how, p) in by)}" for how in ASSEMBLIES
+    )
+    none = [f"{problem}: {reason}" for problem, reason in unavailable(gains)]
+    slow = gains[(gains["assembly"] == "full") & (gains["gain_high"] < 1.0)]
+    return question(
+        "Full, reduced or compiled?",
+        f"Reduced, compiled where there is a program. Gains against high-fidelity solutions over the models of "
+        f"[benefit](../results/benefit/README.md), errors unchanged: {said}.",
+        f"in full assembly {of(len(slow), int((gains['assembly'] == 'full').sum()))} models are surely slower than "
+        "what they replace; problems that declare neither affine members nor entries are assembled in full"
+        + ("; there is no C program of " + "; ".join(none) if none else "")
+        + ".",
+    )
+
+
+def which_training(results: Results) -> str:
+    """Greedy or fixed training sets."""
+    table = results.table("certified", "training")
+    table = table.assign(
+        seconds=table["greedy offline_s"] / table["fixed offline_s"],
+        solutions=table["greedy snapshots"] / table["fixed snapshots"],
+    )
+    equal = table[table["largest ratio of errors"] <= 1.0]
+    said = "; ".join(
+        f"{p}: {span(mine['seconds'])} times the offline seconds with {span(mine['solutions'])} times the solutions"
+        for p, mine in equal.groupby("problem")
+    )
+    return question(
+        "Greedy or fixed training?",
+        f"Fixed, unless a solution costs much more than here: at equal error, {said} "
+        "([certified](../results/certified/README.md)).",
+        f"where solutions take minutes, fewer of them decide; in {of(len(table) - len(equal), len(table))} comparisons "
+        "no greedy model reaches all four errors of the fixed one.",
+    )
+
+
+def when_not(results: Results) -> str:
+    """When not to reduce at all."""
+    every = pd.concat([results.gains, *(_against(results, p) for p in PROBLEMS)])
+    parts = []
+    for problem, mine in every.groupby("problem", sort=False):
+        for how, group in mine[mine["meaning"].notna()].groupby("assembly", sort=False):
+            begins = group[group["meaning"] == "from"]["benefit_threshold"]
+            never = int(group["meaning"].isin(["never", "until"]).sum())
+            unknown = int((group["meaning"] == "undecided").sum())
+            said = f"from {span(begins)} queries" if len(begins) else "at no number"
+            parts.append(f"| {problem} | {how} | {len(group)} | {said} | {never} | {unknown} |")
+    least = every[every["meaning"] == "from"].groupby("problem")["threshold_low"].min()
+    return question(
+        "When not to reduce at all?",
+        "For fewer queries than "
+        + " and ".join(f"{number(value)} ({p})" for p, value in least.items())
+        + ", the smallest lower end of the intervals of all break-evens with the high-fidelity model, no model pays "
+        "([benefit](../results/benefit/README.md), [paper-obstacle](../results/paper-obstacle/README.md), "
+        "[paper-hertz](../results/paper-hertz/README.md)).",
+        "seconds are those of small plane problems on one core; high-fidelity solutions start from the nearest contact "
+        "set that is known. `vibench show RUN --table best --queries N` says it for yours.",
+        "| problem | assembly | models | cheaper than high-fidelity solutions | never | undecided |\n"
+        "| --- | --- | --- | --- | --- | --- |\n" + "\n".join(parts),
+    )
+
+
+def _against(results: Results, problem: str) -> pd.DataFrame:
+    table = results.table(f"paper-{problem}", "thresholds")
+    return table[table["cell_a"].isna()].assign(assembly=lambda rows: rows["assembly_b"])
+
+
+QUESTIONS = (enrich, which_cone, which_solver, which_assembly, which_training, when_not)
+
+
+def what_to_use(results: Results) -> str:
+    """The page "What to use"."""
+    head = (
+        "# What to use\n\nSix questions, answered from the tables of [all results](../results/README.md) by\n\n"
+        "```\npython results/scripts/what_to_use.py results docs/what-to-use.md\n```\n\n"
+        "Ranges are over all models of the studies that are linked; intervals are those of 95 % of [measured "
+        "seconds](measurement.md#seconds). All of it is measured on two plane contact problems of 3,400 to 12,200 "
+        "unknowns, on one machine: run your own problem before you rely on an answer."
+    )
+    return "\n\n".join([head, *(ask(results) for ask in QUESTIONS)]) + "\n"
+
+
+def main(results: str, page: str) -> None:
+    Path(page).write_text(what_to_use(Results(results)), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    start(main)
