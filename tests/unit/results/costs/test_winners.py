@@ -1,9 +1,13 @@
-"""Winners of the leaderboard and of `best`, computed again from raw rows of a run by other code."""
+"""Winners of the leaderboard and of `best`, computed again from raw rows of runs by other code.
+
+The run of the suite is one of the study `quick`; `VIBENCH_RUNS` may name more, as a list of folders like PATH.
+"""
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import sqlite3
 from collections import defaultdict
 from pathlib import Path
@@ -63,13 +67,21 @@ class Raw:
         return mine
 
 
+RUNS = [Path(name) for name in os.environ.get("VIBENCH_RUNS", "").split(os.pathsep) if name]
+
+
+@pytest.fixture(scope="module", params=[None, *RUNS], ids=str)
+def folder(request: pytest.FixtureRequest, quick_run: Path) -> Path:
+    return quick_run if request.param is None else Path(request.param)
+
+
 @pytest.fixture(scope="module")
-def raw(quick_run: Path) -> Raw:
-    return Raw(quick_run / "results.sqlite")
+def raw(folder: Path) -> Raw:
+    return Raw(folder / "results.sqlite")
 
 
-def test_the_winners_of_the_leaderboard_are_those_of_the_raw_rows(raw: Raw, quick_run: Path) -> None:
-    run = vibench.open_run(quick_run)
+def test_the_winners_of_the_leaderboard_are_those_of_the_raw_rows(raw: Raw, folder: Path) -> None:
+    run = vibench.open_run(folder)
     checked = 0
     for standings in leaderboard(run.cells):
         mine = raw.problems()[standings.problem]
@@ -91,8 +103,8 @@ def test_the_winners_of_the_leaderboard_are_those_of_the_raw_rows(raw: Raw, quic
 
 
 @pytest.mark.parametrize("queries", [1, 100, 10**6])
-def test_the_cheapest_models_are_those_of_the_raw_rows(raw: Raw, quick_run: Path, queries: int) -> None:
-    found = vibench.open_run(quick_run).best(queries=queries, error=0.05)
+def test_the_cheapest_models_are_those_of_the_raw_rows(raw: Raw, folder: Path, queries: int) -> None:
+    found = vibench.open_run(folder).best(queries=queries, error=0.05)
     assert len(found) == len(raw.problems())
     for row in found.to_dict("records"):
         mine = [cell for cell in raw.cells if cell["problem"] == row["problem"] and raw.takes_part(cell)]
