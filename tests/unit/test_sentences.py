@@ -24,6 +24,42 @@ def cells(study: str) -> pd.DataFrame:
     return table[table["solver"] == "piqp"]
 
 
+def of_cones() -> Sequence[str]:
+    """What the page on the study `field` says of cones: sizes, errors, conditioning."""
+    table = cells("field")
+    chosen = table[
+        (table["primal"] == "online-supremizers") & (table["assembly"] == "full") & (table["pod_tol"] == 1e-3)
+    ]
+    by = {key: rows.iloc[0] for key, rows in chosen.groupby(["problem", "dual"])}
+
+    def error(problem: str, dual: str, digits: int = 3) -> str:
+        return f"{by[problem, dual]['error_lambda_mean']:.{digits}g}"
+
+    greedy = ("cpg", "mcpg", "enlarged-cpg", "angle-greedy")
+    assert {by["hertz", dual]["R"] for dual in greedy} == {9}
+    assert by["obstacle", "nmf"]["offline_cone_s"] == max(row["offline_cone_s"] for row in by.values())
+    size = {dual: by["obstacle", dual]["R"] for _, dual in by}
+    return (
+        f"it has {size['mcpg']} generators, where `cpg` needs {size['cpg']} that span no more than "
+        f"{by['obstacle', 'cpg']['rank']} dimensions; the errors of λ are {error('obstacle', 'mcpg')} and "
+        f"{error('obstacle', 'cpg')}",
+        f"{error('hertz', 'cpg', 2)} where `mcpg` has {error('hertz', 'mcpg', 2)}",
+        f"with {size['nmf']} generators there, and its error of {error('obstacle', 'nmf', 2)} is "
+        f"{float(error('obstacle', 'mcpg')) / float(error('obstacle', 'nmf')):.0f} times smaller",
+        f"{size['orthant']} single coordinates are hardly more than the {size['mcpg']} generators of `mcpg` and give "
+        f"an error of {error('obstacle', 'orthant', 2)}, "
+        f"{float(error('obstacle', 'nmf')) / float(error('obstacle', 'orthant')):.0f} times smaller "
+        f"than that of `nmf`. On Hertz it needs {by['hertz', 'orthant']['R']} directions",
+        ", compared with ".join(f"{by['hertz', dual]['gram_condition']:.3g}" for dual in ("enlarged-cpg", "mcpg"))
+        + f" for `mcpg` and {by['hertz', 'cpg']['gram_condition']:.2g} for `cpg`",
+        f"from {error('obstacle', 'cpg')} to {by['obstacle', 'enlarged-cpg']['error_lambda_mean']:.4f}",
+        f"All {by['hertz', 'dictionary']['R']} snapshots give the smallest error on Hertz, "
+        f"{error('hertz', 'dictionary', 2)}",
+        f"{size['dictionary']} snapshots, with an error of {error('obstacle', 'dictionary', 2)}, are less accurate",
+        f"{size['angle-greedy']} and {size['cpg']}",
+    )
+
+
 def misses(study: str, problem: str) -> tuple[int, pd.DataFrame]:
     """How many enrichments of a problem record a guarantee, and those that miss it at a validation parameter."""
     table = cells(study)
@@ -49,7 +85,7 @@ def of_guarantees() -> Sequence[str]:
 
 @pytest.mark.parametrize(
     ("page", "sentences"),
-    [("docs/field.md", of_guarantees)],
+    [("docs/field.md", of_cones), ("docs/field.md", of_guarantees)],
 )
 def test_a_page_says_what_the_tables_say(page: str, sentences: object) -> None:
     assert callable(sentences)
