@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from types import MappingProxyType
 from typing import Any
@@ -69,7 +69,11 @@ def member_polynomials(
         if rotated:
             terms |= {"A": _stiffness_terms(queried, box.lower)} | {name: of.T for name, of in rotated.items()}
         theta_of = {name: "A" if name in rotated else name for name in terms}
-        evaluate = partial(_evaluated, queried, len(first.f), theta_of, beside)
+        # Of a constant member nothing is sampled: thousands of copies of A take gigabytes.
+        packed = _packed(queried, len(first.f), box.lower, coefficients_of(queried, box.lower))
+        constant = {name: packed[name][None, :] for name in reduced.problem.constant if name not in terms}
+        terms |= constant
+        evaluate = partial(_evaluated, queried, len(first.f), theta_of, tuple(constant), beside)
         alike = ["A", *rotated] if rotated else []
         polynomials = interpolate_on_box(
             evaluate, box.lower, box.upper, tolerance, evaluations, terms=terms, alike=alike
@@ -153,13 +157,19 @@ def members_of(queried: AnyReducedModel, mu: Array, theta: Mapping[str, Array]) 
 
 
 def _evaluated(
-    queried: AnyReducedModel, size: int, theta_of: Mapping[str, str], beside: Beside | None, mu: Array
+    queried: AnyReducedModel,
+    size: int,
+    theta_of: Mapping[str, str],
+    constant: Collection[str],
+    beside: Beside | None,
+    mu: Array,
 ) -> dict[str, Array]:
     """The members as flat arrays, and what is interpolated beside them; of sums of known terms the θ of a member."""
     theta = coefficients_of(queried, mu)
     found = _packed(queried, size, mu, theta)
     others = dict(beside(theta) if beside is not None else {})
-    return found | others | {name: theta[member] for name, member in theta_of.items()}
+    sums = {name: theta[member] for name, member in theta_of.items()}
+    return found | others | sums | {name: np.ones(1) for name in constant}
 
 
 def _packed(queried: AnyReducedModel, size: int, mu: Array, theta: Mapping[str, Array]) -> dict[str, Array]:

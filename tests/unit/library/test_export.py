@@ -511,8 +511,30 @@ def test_coefficients_are_evaluated_once_per_parameter(run: vibench.Run, monkeyp
         return evaluate(at)
 
     monkeypatch.setattr(model.reduced, "coefficients", count)
-    assert polynomials._evaluated(model.reduced, size, {}, None, mu).keys() == {"A", "f", "B", "g"}
+    assert polynomials._evaluated(model.reduced, size, {}, (), None, mu).keys() == {"A", "f", "B", "g"}
     assert len(points) == 1
+
+
+def test_a_constant_member_is_not_sampled(run: vibench.Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thousands of copies of a constant A of 281 unknowns took 6 GiB."""
+    reduced, sampled = model_of(run, "radial-obstacle").reduced, []
+    interpolate = polynomials.interpolate_on_box
+
+    def sizes(evaluate: Any, lower: np.ndarray, *given: Any, **named: Any) -> Any:
+        sampled.append({name: array.size for name, array in evaluate(lower).items()})
+        return interpolate(evaluate, lower, *given, **named)
+
+    monkeypatch.setattr(polynomials, "interpolate_on_box", sizes)
+    _, found = polynomials.member_polynomials(reduced, 1e-11, 4096, fixed=True)
+    assert reduced.problem.constant
+    assert {sampled[0][name] for name in reduced.problem.constant} == {1}
+    (mu,) = reduced.problem.parameters.sample(1, seed=5)
+    box, program = reduced.problem.parameters, reduced.assemble(mu).program
+    unit = ((mu - box.lower) / (box.upper - box.lower))[None, :]
+    for name in reduced.problem.constant:
+        expected = np.asarray(getattr(program, name))
+        packed = expected[np.triu_indices(len(expected))] if name == "A" else expected.ravel()
+        assert found[name].at(unit)[0] == pytest.approx(packed, abs=1e-12 * np.abs(packed).max())
 
 
 def test_the_command(run: vibench.Run, main: Main, tmp_path: Path) -> None:
