@@ -50,8 +50,11 @@ def commands() -> Iterator[str]:
     parts = [SMALLER.get(part.strip(), part.strip()) for line in lines for part in line.split("&&")]
     # what reads runs comes after all of them, since a page may need those of several studies
     runs = [part for part in parts if part.startswith("vibench run ")]
-    plain = {part.removesuffix(" --no-figures"): part for part in runs}
-    yield from plain.values()
+    studies: dict[str, str] = {}
+    for run in runs:  # pages that need the same study may ask for less of it; no page needs its figures
+        study = run.split()[2]
+        studies[study] = max(studies.get(study, ""), run, key=len)
+    yield from studies.values()
     yield from dict.fromkeys(part for part in parts if not part.startswith("vibench run "))
 
 
