@@ -16,6 +16,7 @@ from .arrays import Mask as Mask
 from .arrays import SparseMatrix as SparseMatrix
 from .errors import NumericalError as NumericalError
 from .errors import RequestError as RequestError
+from .errors import UnsupportedError as UnsupportedError
 from .errors import VibenchError as VibenchError
 from .highfidelity.active_set import HighFidelitySolution as HighFidelitySolution
 from .highfidelity.active_set import HighFidelitySolver as HighFidelitySolver
@@ -25,6 +26,12 @@ from .interfaces.figures import DerivedColumn as DerivedColumn
 from .interfaces.figures import FigurePlugin as FigurePlugin
 from .interfaces.figures import ProblemTables as ProblemTables
 from .interfaces.figures import RunTables as RunTables
+from .interfaces.formulations import Asked as Asked
+from .interfaces.formulations import Formulation as Formulation
+from .interfaces.formulations import FormulationAnswer as FormulationAnswer
+from .interfaces.formulations import FormulationModel as FormulationModel
+from .interfaces.formulations import Multiplier as Multiplier
+from .interfaces.formulations import Outcome as Outcome
 from .interfaces.outputs import Output as Output
 from .interfaces.problem import MEMBERS as MEMBERS
 from .interfaces.problem import Contact as Contact

@@ -39,6 +39,10 @@ class PluginKind(StrEnum):
     DUAL = (
         "dual strategy", "dual", "dual_strategies", "dual", "strategy", "vibench.interfaces.strategies:DualStrategy",
     )  # fmt: skip
+    FORMULATION = (
+        "formulation", "formulations", "formulations", "", "formulation",
+        "vibench.interfaces.formulations:Formulation",
+    )  # fmt: skip
     FIGURE = "figure plugin", "figures", "figures", "figure", "figures", "vibench.interfaces.figures:FigurePlugin"
     STUDY = "study", "studies", "studies"
     SOLVER = "QP solver", "solvers", "qp_solvers", "solver", "solver"
@@ -49,7 +53,7 @@ class PluginKind(StrEnum):
         return resolve_name(self._base) if self._base else None
 
 
-PROBLEM, SAMPLING, PRIMAL, DUAL, FIGURE, STUDY, SOLVER = PluginKind
+PROBLEM, SAMPLING, PRIMAL, DUAL, FORMULATION, FIGURE, STUDY, SOLVER = PluginKind
 
 CHECKED = {kind.cli_name: kind for kind in PluginKind if kind.cli_name}
 """The kinds whose plugins `vibench check` examines and `vibench new` writes, by their names on the command line."""

@@ -1,0 +1,206 @@
+"""The interface of formulation plugins: what a reduced model solves at a parameter, and what answers it gives.
+
+A study's matrix is made of mixed quadratic programs: u_N in V_N and its enrichment, λ_N in the reduced cone. That
+formulation, `MIXED`, is vibench's own. A plugin replaces everything between the offline phase and the answer, as a
+penalty method, a regression or a model with local bases does; what is measured of the answer is the same for all.
+
+The life of a formulation in a study:
+
+1. `Formulation.build` prepares it, offline and timed. What it returns is stored under a key and shared by cells.
+2. `Formulation.model` makes the model from the stored data, in every process that needs one; not timed.
+3. `FormulationModel.solve` answers a query, timed: whatever it assembles is part of the query.
+4. `FormulationModel.reconstruct` turns the answer into u (n,) and λ (m,), not timed. Errors, the bounds of the errors,
+   the residuals of the high-fidelity problem and everything that follows from them are taken of this pair.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+from vibench.arrays import Array
+from vibench.interfaces.problem import VariationalInequality
+
+if TYPE_CHECKING:  # both are above this layer; a formulation is handed objects of theirs
+    from vibench.offline.reduction import Reduction
+    from vibench.qp.verification import QPSolution
+
+MIXED = "mixed"
+"""The formulation that is no plugin: the quadratic program of V_N, its enrichment, and the cone."""
+
+AXES = ("pod", "dual", "primal", "solvers", "accuracy", "assembly")
+"""The axes of a study that a formulation may have; it is not repeated over those that it does not have."""
+
+
+class Outcome(StrEnum):
+    """What a formulation says of its own answer; the status of the row is never better than this."""
+
+    OK = "ok"
+    INACCURATE = "inaccurate"
+    INFEASIBLE = "infeasible"
+    FAILED = "failed"
+
+
+class Multiplier(StrEnum):
+    """Where the λ of an answer comes from; a column of the results."""
+
+    SOLVED = "solved"
+    """Its coefficients are among the unknowns of the query."""
+    RECOVERED = "recovered"
+    """The formulation computes it from u, in `solve` or in `reconstruct`, as a penalty method does."""
+    RESIDUAL = "residual"
+    """The formulation has none. vibench takes the λ ≥ 0 that minimises ‖f − A u − Bᵀλ‖ in the norm of A⁻¹, at
+    high-fidelity cost and outside all seconds: of all multipliers it has the smallest residual beside u."""
+
+
+@dataclass(frozen=True)
+class FormulationAnswer:
+    """What a query found.
+
+    Attributes
+    ----------
+    x
+        Coefficients of u (N',), of whatever length at this parameter; `None` if there is no answer.
+    alpha
+        Coefficients of λ (R,), or `None` where u determines it. Their signs are free, those of λ (m,) are not.
+    outcome, reason
+        Whether its own iteration converged to the accuracy asked for, and why not.
+    iterations
+        Steps that it took, where it counts any.
+    uncertainty
+        Its own estimate of ‖u − u_N‖_V, where it makes one; shown beside the error and the proved bound.
+    """
+
+    x: Array | None
+    alpha: Array | None = None
+    outcome: Outcome = Outcome.OK
+    reason: str = ""
+    iterations: int | None = None
+    uncertainty: float | None = None
+
+    @classmethod
+    def none(cls, reason: str, outcome: Outcome = Outcome.FAILED) -> FormulationAnswer:
+        """No answer, and why."""
+        return cls(None, None, outcome, reason)
+
+
+class SolveQP(Protocol):
+    """The QP solver of the cell."""
+
+    def __call__(
+        self,
+        program: VariationalInequality,
+        *,
+        factor: Array | None = None,
+        start: tuple[Array, Array] | None = None,
+    ) -> QPSolution:
+        """The solution x (n,), α (m,) ≥ 0 of min ½xᵀA x − fᵀx, B x ≤ g, dense; either is `None` if it has found none.
+
+        `factor` is the Cholesky factor (lower) of A where it is known, `start` a solution to start from where the
+        solver can. The solution of the last program of a query is verified as those of `MIXED` are, outside its
+        seconds: the row of the query is not ok if its natural residuals exceed the accuracy.
+        """
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a query is asked for beside its parameter.
+
+    Attributes
+    ----------
+    accuracy
+        Relative accuracy to be reached: of a quadratic program the natural residuals of its KKT conditions.
+        Formulations without the axis "accuracy" get 1e-7.
+    solve_qp
+        The QP solver of the cell, for formulations with the axis "solvers".
+    start
+        The answer at a neighbouring parameter to start from, if the formulation `takes_start` and the study asks for
+        warm starts.
+    """
+
+    accuracy: float
+    solve_qp: SolveQP
+    start: FormulationAnswer | None = None
+
+
+class FormulationModel(ABC):
+    """A model that answers queries. It remembers nothing from one query to the next.
+
+    A query must not depend on those before it, and what is timed is repeated at parameters next to the queries' own.
+    """
+
+    @property
+    @abstractmethod
+    def dimension(self) -> int:
+        """Largest number N' of coefficients of u in a query."""
+
+    @property
+    def generators(self) -> int | None:
+        """Largest number R of coefficients of λ in a query; `None` where λ has none."""
+        return None
+
+    @property
+    def fallbacks(self) -> tuple[str, ...]:
+        """One line for every step that deviates from the algorithm."""
+        return ()
+
+    @abstractmethod
+    def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
+        """The answer at mu (d,); its seconds are those of the query."""
+
+    @abstractmethod
+    def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
+        """The pair u (n,) and λ (m,) ≥ 0 of an answer at mu (d,), not timed; bases may depend on the parameter.
+
+        λ is `None` for `Multiplier.RESIDUAL`, and for no other. A negative coefficient of λ is a broken answer, be it
+        round-off: every bound needs λ ≥ 0.
+        """
+
+
+class Formulation(ABC):
+    """Makes models of a problem from its offline phase. Constructor arguments are the plugin's options."""
+
+    requires: ClassVar[tuple[str, ...]] = ()
+    """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
+    uses: ClassVar[tuple[str, ...]] = AXES
+    """The `AXES` of a study that it has. Without "pod" there is no V_N, without "dual" no cone and without "primal" no
+    enrichment in the offline phase; "primal" needs "pod" and "dual". Without "solvers" the cell has no QP solver,
+    without "accuracy" the answer has none to reach, without "assembly" queries are always assembled in full."""
+    multiplier: ClassVar[Multiplier] = Multiplier.SOLVED
+    """Where λ comes from."""
+    takes_start: ClassVar[bool] = False
+    """Whether queries can start from the answer at a neighbouring parameter."""
+
+    @abstractmethod
+    def build(self, offline: Reduction) -> Mapping[str, Any]:
+        """What the formulation adds to the offline phase, prepared once; its seconds are offline seconds of their own.
+
+        Parameters
+        ----------
+        offline
+            The offline phase: `problem`, `snapshots` (`mu` (P×d), `u` (n×P), `lam` (m×P)), and of the axes that the
+            formulation has `pod`, `cone`, `enrichment` and the model `assembled`, whose `assemble(mu)` has the reduced
+            `program`; with assembly = "reduced" `members`, A, f, B and g as sums of terms, and `operators`. Other
+            spaces come from `replace(offline, …).given(snapshots=…)`.
+
+        Returns
+        -------
+        What `model` needs and `offline` does not have, by name: numbers, texts, `None`, arrays, sparse matrices, and
+        tuples, lists and dictionaries of these. It is stored as arrays and JSON, so nothing else is taken, and must be
+        the same whenever it is built. {} if there is nothing.
+
+        Raises
+        ------
+        UnsupportedError
+            If the problem does not have what the formulation needs; its cells say so.
+        """
+
+    @abstractmethod
+    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+        """The model, from the offline phase and from what `build` returned, which may have been stored in between.
+
+        Steps of `offline` are read from where they are stored, and not computed again.
+        """
