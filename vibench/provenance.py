@@ -77,14 +77,15 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def versions(solver: str) -> dict[str, str]:
-    """Versions of the benchmark protocol, of Python, the numerical libraries, vibench and one solver.
+def versions(solver: str | None) -> dict[str, str]:
+    """Versions of the benchmark protocol, of Python, the numerical libraries, vibench and a solver, if any.
 
     That of vibench has the commit, "0.1.0 at 1a2b3c4d5e", where it runs from a checkout.
     """
     numerical = {name: distribution_version(name) for name in ("numpy", "scipy", "scikit-fem", "qpsolvers", "vibench")}
     numerical["vibench"] += f" at {commit()}" if commit() else ""
-    return {"protocol": PROTOCOL, "python": platform.python_version(), **numerical, solver: solver_version(solver)}
+    found = {"protocol": PROTOCOL, "python": platform.python_version(), **numerical}
+    return found if solver is None else found | {solver: solver_version(solver)}
 
 
 @cache

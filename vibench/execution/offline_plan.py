@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from vibench.execution.result_writer import ResultWriter
 from vibench.rounds.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
 from vibench.stages.base import Stage
-from vibench.stages.cell_queries import CellQueries
+from vibench.stages.cell_goal import CellGoal
 from vibench.storage.artefacts import Store
 from vibench.study.cells import Cell
 from vibench.timing import Seconds
@@ -46,14 +46,14 @@ class OfflinePlan:
     """What it takes to run the stage again, by key."""
     _planned: set[str] = field(default_factory=set)
     _spent: float = 0.0
-    _cells: dict[Cell, CellQueries] = field(default_factory=dict)
+    _cells: dict[Cell, CellGoal] = field(default_factory=dict)
 
     def note(self, stage: Stage, seconds: Seconds, wall: float = 0.0) -> None:
         """Take note of a stage that was run, in so many wall seconds, or whose artefact is there."""
         self._seconds[stage.key] = seconds
         self._costs[stage.key] = seconds.cpu or wall
 
-    def repeats(self, cells: Iterable[tuple[Cell, CellQueries]]) -> list[OfflineRepeat]:
+    def repeats(self, cells: Iterable[tuple[Cell, CellGoal]]) -> list[OfflineRepeat]:
         """The repeats to be run for some cells that have their rows, the cheapest first."""
         mine = dict(cells)
         self._cells |= mine

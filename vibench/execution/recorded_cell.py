@@ -17,8 +17,10 @@ from vibench.errors import RequestError
 from vibench.execution.graph import Graph
 from vibench.execution.jobs import Job
 from vibench.execution.supervisor import Supervisor
+from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.problem import VariationalInequality
 from vibench.model.certificates.bounds import OnlineCertificate
+from vibench.offline.formulated import Formulated
 from vibench.offline.models import AnyReducedModel
 from vibench.results import tables
 from vibench.results.selection import key_of
@@ -26,7 +28,8 @@ from vibench.results.sqlite.reading import read_meta, read_rows, study_of
 from vibench.results.tables import results_file
 from vibench.stages.assembly import assembly_stage
 from vibench.stages.base import Done, Stage, value_of
-from vibench.stages.cell_queries import cell_queries
+from vibench.stages.cell_queries import CellQueries, cell_queries
+from vibench.stages.formulations import formulation_queries
 from vibench.storage.artefacts import Store, usable_store
 from vibench.study.cells import NOT_MOVED, Cell
 from vibench.study.matrix import study_of_cell
@@ -66,16 +69,41 @@ class RecordedCell:
         Raises
         ------
         RequestError
-            If other code computed the row: its model cannot be reproduced.
+            If other code computed the row, so that its model cannot be reproduced, or its formulation is not mixed.
         """
+        self._refuse_other_code()
+        if self.cell.formulation is not None:
+            raise RequestError(
+                f"cell {self.row['cell']} has the formulation '{self.cell.formulation_label}', whose answers are no "
+                "solutions of a quadratic program that could be replayed or exported: `open_run(…).formulated(cell)` "
+                "answers its queries"
+            )
+        store, assembly = usable_store(), assembly_stage(self.cell)
+        _provide(assembly.model_inputs, store)
+        return assembly.model(store)[0]
+
+    @cached_property
+    def formulated(self) -> Formulated:
+        """The model of a cell whose formulation is a plugin; stages whose artefacts are missing are run again.
+
+        Raises
+        ------
+        RequestError
+            If other code computed the row, or its formulation is mixed.
+        """
+        self._refuse_other_code()
+        if self.cell.formulation is None:
+            raise RequestError(f"cell {self.row['cell']} has the mixed formulation: see `open_run(…).model(cell)`")
+        store, stage = usable_store(), formulation_queries(self.cell, UNLIMITED[0])
+        _provide(stage.timed_inputs, store)
+        return stage.built.formulated(store, stage.solver, stage.accuracy)
+
+    def _refuse_other_code(self) -> None:
         if self.cell.code != self.row["code"]:
             raise RequestError(
                 f"cell {self.row['cell']} was computed by other code, with another version of its solver, or from "
                 "files that were changed since; run its study again"
             )
-        store, assembly = usable_store(), assembly_stage(self.cell)
-        _provide(assembly.model_inputs, store)
-        return assembly.model(store)[0]
 
     @cached_property
     def certificate(self) -> OnlineCertificate | None:
@@ -87,7 +115,8 @@ class RecordedCell:
             As for `model`.
         """
         self.model  # noqa: B018  refuses other code
-        stage = cell_queries(self.cell, UNLIMITED[0]).certificate
+        goal = cell_queries(self.cell, UNLIMITED[0])
+        stage = goal.certificate if isinstance(goal, CellQueries) else None
         if stage is None:
             return None
         store = usable_store()
@@ -144,7 +173,7 @@ def _rows(run: str) -> tuple[Path, list[dict[str, Any]]]:
 
 
 def recorded_cells(run: str, places: Mapping[str, str] = NOT_MOVED) -> list[RecordedCell]:
-    """All cells of a run that have a reduced model.
+    """All cells of a run that have a reduced model, of the mixed formulation: others have no quadratic programs.
 
     Raises
     ------
@@ -152,7 +181,7 @@ def recorded_cells(run: str, places: Mapping[str, str] = NOT_MOVED) -> list[Reco
         If there is no such run.
     """
     path, rows = _rows(run)
-    return [RecordedCell(path, row, places) for row in rows if row["model"]]
+    return [RecordedCell(path, row, places) for row in rows if row["model"] and row["formulation"] == MIXED]
 
 
 def recorded_cell(run: str, cell: str, places: Mapping[str, str] = NOT_MOVED) -> RecordedCell:

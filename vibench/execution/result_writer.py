@@ -11,9 +11,9 @@ from vibench import provenance
 from vibench.results.database import ResultsDatabase
 from vibench.rounds.timed_seconds import TimedRound, seconds_of_cell, seconds_of_queries
 from vibench.stages.base import Row, Stage, value_of
-from vibench.stages.cell_queries import CellRows
+from vibench.stages.cell_goal import CellRows
 from vibench.storage.artefacts import History, Store
-from vibench.study.cells import Axes, Cell, digest
+from vibench.study.cells import NO_SUCH_AXIS, Axes, Cell, digest
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.study.spec import Study
@@ -90,10 +90,14 @@ class ResultWriter:
 
 def cell_columns(cell: Cell) -> dict[str, Any]:
     """The key columns of a cell."""
-    labels = labels_of([cell])
-    how = {"solver": cell.solver, "accuracy": cell.accuracy, "assembly": cell.assembly}
-    how["correction"] = cell.correction
-    return axis_columns(cell.axes, labels) | how
+    without: dict[str, Any] = {}
+    for name, plugin in (("dual", cell.dual), ("primal", cell.primal)):
+        without |= {name: NO_SUCH_AXIS, f"{name}_options": "{}"} if plugin is None else {}
+    how = {"formulation": cell.formulation_label, "formulation_options": "{}"}
+    if cell.formulation is not None:
+        how["formulation_options"] = cell.formulation.options
+    solved = {"solver": cell.solver or NO_SUCH_AXIS, "accuracy": cell.accuracy, "assembly": cell.assembly}
+    return axis_columns(cell.axes, labels_of([cell])) | without | how | solved | {"correction": cell.correction}
 
 
 def labels_of(cells: Iterable[Cell]) -> dict[Plugin, str]:
@@ -101,7 +105,8 @@ def labels_of(cells: Iterable[Cell]) -> dict[Plugin, str]:
     labels: dict[Plugin, str] = {}
     for cell in cells:
         for plugin, label in zip((cell.problem, cell.dual, cell.primal), cell.labels, strict=True):
-            labels.setdefault(plugin, label)
+            if plugin is not None:
+                labels.setdefault(plugin, label)
     return labels
 
 

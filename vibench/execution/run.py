@@ -27,7 +27,8 @@ from vibench.results.database import ResultsDatabase
 from vibench.results.solver_agreement import disagreement_rows
 from vibench.rounds.timing_rounds import SHARE, TimingRounds
 from vibench.stages.base import Done, Failed, Stage, Unstored
-from vibench.stages.cell_queries import CellRows, cell_queries
+from vibench.stages.cell_goal import CellRows
+from vibench.stages.cell_queries import cell_queries
 from vibench.stages.pictures import PictureStage
 from vibench.storage.artefacts import Store, usable_store
 from vibench.study.cells import Cell
@@ -350,7 +351,7 @@ def unavailable(cell: Cell) -> str:
     A name that several packages use is as good as none.
     """
     plugins = [plugin.registered for plugin in cell.plugins]
-    for plugin in (*plugins, find(SOLVER, cell.solver)):
+    for plugin in (*plugins, *([] if cell.solver is None else [find(SOLVER, cell.solver)])):
         if plugin.conflict:
             return plugin.conflict
     for plugin in plugins:
@@ -361,7 +362,7 @@ def unavailable(cell: Cell) -> str:
     if not chosen.is_installed:
         what = f"the factorisation '{chosen.name}' needs {chosen.distribution}, which is not installed"
         return f"{what}: `pip install {chosen.distribution}`"
-    if cell.solver in installed_solvers(registered(SOLVER)):
+    if cell.solver is None or cell.solver in installed_solvers(registered(SOLVER)):
         return ""
     return f"the QP solver '{cell.solver}' is not installed: `pip install {solver_distribution(cell.solver)}`"
 

@@ -11,7 +11,7 @@ from vibench.results.costs.paired_seconds import FEWEST_BLOCKS, PairedSeconds
 from vibench.rounds.timed_seconds import TimedCell, TimedRound
 from vibench.rounds.timing_rounds import SHARE, TimingRounds, block_rows
 from vibench.stages.base import Failed, Row, Stage
-from vibench.stages.cell_queries import CellQueries
+from vibench.stages.cell_goal import CellGoal
 from vibench.study.cells import Cell
 
 STOPPING_TAIL = 0.005
@@ -26,7 +26,7 @@ HOPELESS = 2.0
 class _Group:
     """Cells that are timed together, and what was measured so far, by the key of a goal."""
 
-    members: dict[Cell, CellQueries]
+    members: dict[Cell, CellGoal]
     queries: dict[str, tuple[int, ...]]
     rows: dict[str, list[Row]] = field(default_factory=dict)
     rounds: dict[str, list[TimedRound]] = field(default_factory=dict)
@@ -58,7 +58,7 @@ class TimingPlan:
         Rounds that every cell gets, if so many are allowed.
     """
 
-    goals: Mapping[Cell, CellQueries]
+    goals: Mapping[Cell, CellGoal]
     rounds: int
     writer: ResultWriter
     fewest: int = 0
@@ -90,7 +90,7 @@ class TimingPlan:
         self._open[group].discard(cell)
         return None if self._open[group] else self._begin(group)
 
-    def members(self, stage: TimingRounds) -> Iterable[tuple[Cell, CellQueries]]:
+    def members(self, stage: TimingRounds) -> Iterable[tuple[Cell, CellGoal]]:
         """The cells of the group of a planned stage, with their goals."""
         return self._planned[stage.key].members.items()
 
@@ -102,7 +102,7 @@ class TimingPlan:
         fine = {goal.key: self.writer.database.fine_queries(cell.key) for cell, goal in members.items()}
         return self._block(_Group(members, fine), self._session, members.values())
 
-    def _block(self, group: _Group, session: int, goals: Iterable[CellQueries]) -> TimingRounds:
+    def _block(self, group: _Group, session: int, goals: Iterable[CellGoal]) -> TimingRounds:
         """The next block of a group, of some of its goals."""
         # Cells that differ in their labels alone have one goal.
         mine = tuple({goal.key: goal for goal in goals}.values())
@@ -145,20 +145,20 @@ class TimingPlan:
         count, reason = group.lost.get(goal, (0, ""))
         group.lost[goal] = count + timed.lost, reason or timed.reason
 
-    def _write(self, group: _Group, cell: Cell, goal: CellQueries, asked: int | None) -> None:
+    def _write(self, group: _Group, cell: Cell, goal: CellGoal, asked: int | None) -> None:
         count, reason = group.lost[goal.key]
         rows, rounds = group.rows[goal.key], group.rounds[goal.key]
         everything = len(rows) + count
         lost = f"{'all' if count == everything else f'{count} of {everything}'} rounds: {reason}" if count else ""
         self.writer.seconds(cell, rows, rounds, group.machines[goal.key], asked, lost)
 
-    def _undecided(self, group: _Group) -> list[CellQueries]:
+    def _undecided(self, group: _Group) -> list[CellGoal]:
         """The goals that further rounds may decide a comparison of."""
         if group.first < min(max(self.fewest, FEWEST_ROUNDS), self.rounds) or group.blocks < FEWEST_BLOCKS:
             return list(group.members.values())
         cells = {cell.key: goal for cell, goal in group.members.items()}
         rows = [row for key in cells if (row := self.writer.database.cell(key)) is not None]
-        undecided: dict[str, CellQueries] = {}
+        undecided: dict[str, CellGoal] = {}
         for one in compared(rows, self.paired, STOPPING_TAIL):
             if one.result.meaning is Meaning.UNDECIDED and self._would_help(one, group.first):
                 both = [one.b["cell"]] if one.a is None else [one.a["cell"], one.b["cell"]]

@@ -22,6 +22,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from vibench.arrays import Array
+from vibench.errors import RequestError
 from vibench.interfaces.problem import VariationalInequality
 
 if TYPE_CHECKING:  # both are above this layer; a formulation is handed objects of theirs
@@ -33,6 +34,10 @@ MIXED = "mixed"
 
 AXES = ("pod", "dual", "primal", "solvers", "accuracy", "assembly")
 """The axes of a study that a formulation may have; it is not repeated over those that it does not have."""
+
+
+NEEDED_BY_PRIMAL = ("pod", "dual")
+"""What an enrichment is an enrichment of, and what for."""
 
 
 class Outcome(StrEnum):
@@ -132,20 +137,12 @@ class FormulationModel(ABC):
     A query must not depend on those before it, and what is timed is repeated at parameters next to the queries' own.
     """
 
-    @property
-    @abstractmethod
-    def dimension(self) -> int:
-        """Largest number N' of coefficients of u in a query."""
-
-    @property
-    def generators(self) -> int | None:
-        """Largest number R of coefficients of λ in a query; `None` where λ has none."""
-        return None
-
-    @property
-    def fallbacks(self) -> tuple[str, ...]:
-        """One line for every step that deviates from the algorithm."""
-        return ()
+    dimension: int
+    """Largest number N' of coefficients of u in a query."""
+    generators: int | None = None
+    """Largest number R of coefficients of λ in a query; `None` where λ has none."""
+    fallbacks: tuple[str, ...] = ()
+    """One line for every step that deviates from the algorithm."""
 
     @abstractmethod
     def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
@@ -155,7 +152,7 @@ class FormulationModel(ABC):
     def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
         """The pair u (n,) and λ (m,) ≥ 0 of an answer at mu (d,), not timed; bases may depend on the parameter.
 
-        λ is `None` for `Multiplier.RESIDUAL`, and for no other. A negative coefficient of λ is a broken answer, be it
+        Of the answer `x` and `alpha` alone are kept in results, and given here. λ is `None` for `Multiplier.RESIDUAL`, and for no other. A negative coefficient of λ is a broken answer, be it
         round-off: every bound needs λ ≥ 0.
         """
 
@@ -204,3 +201,19 @@ class Formulation(ABC):
 
         Steps of `offline` are read from where they are stored, and not computed again.
         """
+
+
+def axes_of(formulation: type[Formulation] | Formulation, title: str) -> tuple[str, ...]:
+    """The axes that a formulation declares, in the order of `AXES`.
+
+    Raises
+    ------
+    RequestError
+        If there is no such axis, or an enrichment without V_N and cone.
+    """
+    declared = formulation.uses
+    if not isinstance(declared, tuple) or not set(declared) <= set(AXES):
+        raise RequestError(f"the {title} declares uses = {declared!r}, expected a tuple of some of {', '.join(AXES)}")
+    if "primal" in declared and not set(NEEDED_BY_PRIMAL) <= set(declared):
+        raise RequestError(f"the {title} declares uses = {declared!r}: 'primal' needs 'pod' and 'dual'")
+    return tuple(axis for axis in AXES if axis in declared)

@@ -19,6 +19,7 @@ from vibench.execution.run import Observer, Options, run_study
 from vibench.execution.run_folder import REPORT
 from vibench.files import writing
 from vibench.model.error_bounds import CorrectionMode
+from vibench.offline.formulated import Formulated
 from vibench.offline.models import Model
 from vibench.results import tables, views
 from vibench.results.columns import TABLES
@@ -224,9 +225,22 @@ class Run:
             If there is no such cell, it failed before it had a model, or other code computed it.
         """
         recorded = recorded_cell(str(self.path), cell, self._at)
-        asked = recorded.cell
+        reduced, asked = recorded.model, recorded.cell
         certificate, mode = recorded.certificate, CorrectionMode(asked.correction)
-        return Model(recorded.model, asked.solver, asked.accuracy, certificate, recorded.row, mode)
+        assert asked.solver is not None  # the mixed formulation has all axes
+        assert asked.accuracy is not None
+        return Model(reduced, asked.solver, asked.accuracy, certificate, recorded.row, mode)
+
+    @requested
+    def formulated(self, cell: str) -> Formulated:
+        """The model of a cell whose formulation is a plugin, likewise: `formulated(cell).solve(mu)`.
+
+        Raises
+        ------
+        RequestError
+            As `model`, or if the formulation of the cell is mixed.
+        """
+        return recorded_cell(str(self.path), cell, self._at).formulated
 
 
 def _following(observer: Observer | None, progress: bool) -> AbstractContextManager[Observer]:

@@ -350,23 +350,31 @@ class Model:
 
     def _parameter(self, mu: Parameters) -> Array:
         """A parameter as an array (d,)."""
-        box = self.parameters
-        if isinstance(mu, Mapping):
-            names = [normal_name(name) for name in box.names]
-            given = {normal_name(str(name)): value for name, value in mu.items()}
-            if set(given) != set(names) or len(mu) != len(names):
-                raise RequestError(f"mu has the components {sorted(map(str, mu))}, expected {sorted(box.names)}")
-            mu = [given[name] for name in names]
-        try:
-            at = np.asarray(mu, dtype=float)
-        except (TypeError, ValueError):
-            raise RequestError(f"mu is {brief(repr(mu), 80)}, expected numbers ({', '.join(box.names)})") from None
-        if at.ndim == 2:
-            raise RequestError(f"mu has the shape {at.shape}: `solve_all` takes an array of parameters (P, {box.dim})")
-        if at.shape != (box.dim,) or not np.all(np.isfinite(at)):
-            raise RequestError(f"mu is {np.asarray(mu).tolist()}, expected finite numbers ({', '.join(box.names)})")
-        if outside := [name for name, out in zip(box.names, box.outside(at), strict=True) if out]:
-            warnings.warn(
-                f"{', '.join(outside)}: outside the parameter domain, where the model was not trained", stacklevel=3
-            )
-        return at
+        return parameter_in(self.parameters, mu, stacklevel=4)
+
+
+def parameter_in(box: ParameterBox, mu: Parameters, stacklevel: int = 3) -> Array:
+    """A parameter as an array (d,); outside the box there is a warning of the caller so many calls above.
+
+    Raises a `RequestError` if it is no parameter of the box.
+    """
+    if isinstance(mu, Mapping):
+        names = [normal_name(name) for name in box.names]
+        given = {normal_name(str(name)): value for name, value in mu.items()}
+        if set(given) != set(names) or len(mu) != len(names):
+            raise RequestError(f"mu has the components {sorted(map(str, mu))}, expected {sorted(box.names)}")
+        mu = [given[name] for name in names]
+    try:
+        at = np.asarray(mu, dtype=float)
+    except (TypeError, ValueError):
+        raise RequestError(f"mu is {brief(repr(mu), 80)}, expected numbers ({', '.join(box.names)})") from None
+    if at.ndim == 2:
+        raise RequestError(f"mu has the shape {at.shape}: `solve_all` takes an array of parameters (P, {box.dim})")
+    if at.shape != (box.dim,) or not np.all(np.isfinite(at)):
+        raise RequestError(f"mu is {np.asarray(mu).tolist()}, expected finite numbers ({', '.join(box.names)})")
+    if outside := [name for name, out in zip(box.names, box.outside(at), strict=True) if out]:
+        warnings.warn(
+            f"{', '.join(outside)}: outside the parameter domain, where the model was not trained",
+            stacklevel=stacklevel,
+        )
+    return at

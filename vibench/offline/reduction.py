@@ -11,6 +11,7 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import RequestError, UnsupportedError
+from vibench.interfaces.formulations import Formulation, axes_of
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import (
     AdaptiveSampling,
@@ -22,6 +23,7 @@ from vibench.interfaces.strategies import (
     PrimalStrategy,
     Sampling,
     Stop,
+    no_free,
 )
 from vibench.interfaces.validation import check_cone, check_enrichment, reference_assembly, training_parameters
 from vibench.model.affine import INTERPOLATION_RTOL, AffineMember, affine_decomposition
@@ -31,6 +33,7 @@ from vibench.model.certificates.preparation import prepare
 from vibench.model.galerkin import ReducedModel
 from vibench.model.growing import GrowingTrainer
 from vibench.model.hyperreduced import HyperReducedModel, ReducedOperators, hyper_reduce, reason_for_full_assembly
+from vibench.offline.formulated import Formulated, check_built
 from vibench.offline.models import AnyReducedModel, Model
 from vibench.offline.sweep import Snapshots, high_fidelity_sweep
 from vibench.reduction.pod import POD, pod
@@ -53,9 +56,9 @@ class Reduction:
     problem
         The high-fidelity problem.
     dual, primal
-        The strategies that make the cone and enrich V_N; with `None` for the latter nothing is added.
+        The strategies that make the cone and enrich V_N; with `None` the cone is empty, or nothing is added.
     modes, generators
-        Where V_N and the cone stop, at a tolerance or at a size.
+        Where V_N and the cone stop, at a tolerance or at a size; `None` where there is no V_N or no dual strategy.
     tolerance
         Of the primal strategy, where it takes one.
     training
@@ -72,10 +75,10 @@ class Reduction:
     """
 
     problem: Problem
-    dual: DualStrategy
+    dual: DualStrategy | None
     primal: PrimalStrategy | None
-    modes: Stop
-    generators: Stop
+    modes: Stop | None
+    generators: Stop | None
     tolerance: float | None = None
     training: Sampling | None = None
     assembly: Assembly = "full"
@@ -86,11 +89,11 @@ class Reduction:
     def __post_init__(self) -> None:
         for name, kind in (("problem", Problem), ("dual", DualStrategy), ("primal", PrimalStrategy)):
             value = getattr(self, name)
-            if not isinstance(value, kind) and not (name == "primal" and value is None):
+            if not isinstance(value, kind) and not (name != "problem" and value is None):
                 got = f"the class {value.__qualname__}" if isinstance(value, type) else brief(repr(value), 80)
                 raise RequestError(f"{name} is {got}, expected an instance of a subclass of {kind.__name__}")
-        for name in ("modes", "generators"):
-            if not isinstance(value := getattr(self, name), Stop):
+        for name, by in (("modes", self.primal), ("generators", self.dual)):
+            if not isinstance(value := getattr(self, name), Stop) and not (value is None and by is None):
                 raise RequestError(
                     f"{name} is {brief(repr(value), 80)}, expected a Stop: Stop(tolerance=…) or Stop(size=…)"
                 )
@@ -136,13 +139,23 @@ class Reduction:
 
     @cached_property
     def pod(self) -> POD:
-        """V_N, and the error of the POD for every number of modes (paper, (10) and (11))."""
+        """V_N, and the error of the POD for every number of modes (paper, (10) and (11)).
+
+        Raises
+        ------
+        RequestError
+            If `modes` is `None`.
+        """
+        if self.modes is None:
+            raise RequestError("the offline phase has no V_N: modes is None")
         return pod(self.snapshots.u, self.problem.V, self.modes)
 
     @cached_property
     def cone(self) -> Cone:
         """The reduced cone K_R (paper, (12))."""
         W = self.problem.W
+        if self.dual is None or self.generators is None:
+            return Cone(np.zeros((W.dim, 0)), np.ones(1), no_free(0))
         return check_cone(self.dual.reduce(self.snapshots.lam, W, self.generators), W)
 
     @cached_property
@@ -216,3 +229,24 @@ class Reduction:
         """The reduced model, for queries at any parameter: `model.solve(mu)`."""
         certificate = self.certificate if self.assembly == "certified" else None
         return Model(self.assembled, self.solver, self.accuracy, certificate)
+
+    def formulated(self, formulation: Formulation) -> Formulated:
+        """A model of another formulation on this offline phase, which is built now: `formulated(…).solve(mu)`.
+
+        Raises
+        ------
+        RequestError
+            If it is no instance of a formulation, or uses steps that the offline phase does not have.
+        UnsupportedError
+            If the problem does not have what it needs.
+        """
+        if not isinstance(formulation, Formulation):
+            kind = formulation.__qualname__ if isinstance(formulation, type) else brief(repr(formulation), 80)
+            raise RequestError(f"formulation is {kind}, expected an instance of a subclass of Formulation")
+        uses = axes_of(formulation, f"formulation {type(formulation).__qualname__}")
+        for axis, given in (("pod", self.modes), ("dual", self.dual)):
+            if axis in uses and given is None:
+                what = {"pod": "modes", "dual": "a dual strategy"}[axis]
+                raise RequestError(f"{type(formulation).__qualname__} uses '{axis}': the offline phase needs {what}")
+        built = check_built(formulation.build(self))
+        return Formulated(formulation, self, built, self.solver if "solvers" in uses else None, self.accuracy)

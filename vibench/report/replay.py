@@ -57,6 +57,7 @@ def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
     if query not in rows:
         raise RequestError(f"cell {recorded.row['cell']} has no query {query}; it has 0 to {len(rows) - 1}")
     program, accuracy = recorded.program(query), recorded.cell.accuracy
+    assert accuracy is not None  # it has a quadratic program
     with writing(file):
         write_program(program, file)
     recorded_x: Array | None = None

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-VERSION = 17
+VERSION = 18
 """Schema version of a results file; a file of another version is refused."""
 
 TEXT, REAL, INTEGER, BLOB = "TEXT", "REAL", "INTEGER", "BLOB"
@@ -80,17 +80,21 @@ KEYS: Mapping[str, Column] = {
     "problem_options": as_json("Options of the problem that are not at their default, as JSON."),
     "training": text("Training set: own, or the label or name of its sampling strategy.", "training", 2),
     "training_options": as_json("Options of the sampling strategy that are not at their default, as JSON."),
-    "dual": text("Dual strategy: its label in the study, or its name.", "dual", 4),
+    "formulation": text("Formulation: mixed, or the label or name of a plugin.", "formulation", 3),
+    "formulation_options": as_json("Options of the formulation that are not at their default, as JSON."),
+    "dual": text("Dual strategy: its label in the study, or its name; – where there is no cone.", "dual", 4),
     "dual_options": as_json("Options of the dual strategy that are not at their default, as JSON."),
-    "primal": text("Primal strategy: its label in the study, or its name.", "primal", 5),
+    "primal": text("Primal strategy: its label in the study, or its name; – where nothing is enriched.", "primal", 5),
     "primal_options": as_json("Options of the primal strategy that are not at their default, as JSON."),
     "pod_tol": real("1", "Tolerance δ_POD of the POD; empty where the study prescribes N.", "δ_POD", 2),
     "pod_size": integer("Prescribed N; empty where the study gives a tolerance."),
     "dual_tol": real("1", "Tolerance δ_dual of the cone; empty where the study prescribes R.", "δ_dual", 3),
     "dual_size": integer("Prescribed R; empty where the study gives a tolerance."),
     "primal_tol": real("1", "Tolerance δ of the primal strategy; empty for strategies that take none.", "δ", 6),
-    "solver": text("QP solver; compiled programs use none.", "solver", 7),
-    "accuracy": real("1", "Relative accuracy prescribed to the solver.", "accuracy", 8),
+    "solver": text("QP solver; compiled programs use none, and – stands for that of a formulation.", "solver", 7),
+    "accuracy": real(
+        "1", "Relative accuracy prescribed to the solver; empty for formulations that reach none.", "accuracy", 8
+    ),
     "assembly": text("Assembly of queries: full, reduced, certified (reduced with bounds), compiled.", "assembly", 9),
     "correction": text(
         "Which solutions are corrected: none, feasible: all, or auto: where ω > ρ; rows judge the corrected pair.",
@@ -125,8 +129,8 @@ CELLS: Mapping[str, Column] = {
     ),
     "dim_V": integer("Dimension n of V."),
     "dim_W": integer("Dimension m of W."),
-    "N": integer("Dimension N of V_N.", "N", 11),
-    "R": integer("Number R of generators of the cone.", "R", 12),
+    "N": integer("Dimension N of V_N; of other formulations most coefficients of u, those added apart.", "N", 11),
+    "R": integer("Number R of generators of the cone; of other formulations most coefficients of λ.", "R", 12),
     "rank": integer("Numerical rank of the generators: dimension of their span."),
     "rank_gap": real(
         "1",
@@ -140,6 +144,10 @@ CELLS: Mapping[str, Column] = {
         "Vectors added to V_N; for an enrichment per parameter, the rank of the generators.", "added", 13
     ),
     "enrichment_kind": text("none, fixed or per-parameter."),
+    "multiplier": text(
+        "Where λ comes from: solved (unknowns of the query), recovered from u, or residual: the λ ≥ 0 with the "
+        "smallest residual, found outside the seconds of the query."
+    ),
     "interpolation_tol": real("1", "Tolerance of the interpolation in reduced assembly; empty with full assembly."),
     "interpolation_error": real("1", "Largest relative interpolation error of a member over the training set."),
     "terms_A": integer(
@@ -159,6 +167,7 @@ CELLS: Mapping[str, Column] = {
     "offline_pod_s": real("s", "POD."),
     "offline_cone_s": real("s", "Dual strategy, with the orthonormal basis of the span."),
     "offline_enrichment_s": real("s", "Primal strategy."),
+    "offline_formulation_s": real("s", "What a formulation builds; 0 for mixed."),
     "offline_assembly_s": real(
         "s", "Preparation of reduced assembly, and of a compiled program; 0 with full assembly."
     ),
@@ -253,7 +262,9 @@ CELLS: Mapping[str, Column] = {
         "Mean contribution of reduced assembly divided by the mean error of u or λ; cells are compared only below 0.1.",
     ),
     "violation_max": real("u", "Largest constraint violation of a reduced solution."),
-    "residual_max": real("1", "Largest of all natural residuals."),
+    "residual_max": real("1", "Largest of all natural residuals of quadratic programs."),
+    "hf_residual_max": real("1", "Largest natural residual of the high-fidelity problem over the ok queries."),
+    "error_u_predicted_mean": real("V", "Mean of error_u_predicted over the ok queries."),
     "fallbacks": text("Steps that deviate from their algorithm, and what was done instead."),
     "peak_memory_mib": real("MiB", "Peak resident memory of the worker process."),
     "slowdown": real(
@@ -305,7 +316,7 @@ QUERIES: Mapping[str, Column] = {
     "cell": text("The cell it belongs to.", kind=MEMBER),
     **KEYS,
     "query": integer("Number of the validation parameter, from 0."),
-    "form": text("Form in which the program was solved: primal, dual, or compiled."),
+    "form": text("Form in which the program was solved: primal, dual, or compiled; formulation for plugins."),
     "started_from": integer("Query from whose solution the solver started; empty for a cold start."),
     "assembly_error": real("1", "Largest relative difference of a member of the program from its projection."),
     "assemble_s": real("s", "Assembly of the reduced program: median over the rounds."),
@@ -420,6 +431,12 @@ QUERIES: Mapping[str, Column] = {
     "primal_residual": real("1", "Natural primal residual: a correction of one row over the solution, in energy."),
     "dual_residual": real("1", "Natural dual residual: its norm in A⁻¹ over the energy norm of the solution."),
     "gap": real("1", "Natural gap: |αᵀs| over the energy of the solution."),
+    "hf_primal_residual": real(
+        "1", "Natural primal residual of u_N in the high-fidelity problem, whatever the formulation."
+    ),
+    "hf_dual_residual": real("1", "Natural dual residual of u_N and λ_N in the high-fidelity problem."),
+    "hf_gap": real("1", "Natural gap of u_N and λ_N in the high-fidelity problem."),
+    "error_u_predicted": real("V", "The formulation's own estimate of error_u_absolute; empty where it makes none."),
     "iterations": integer("Iterations reported by the solver."),
     "repeatable": integer("1 if a second solution was identical to the last bit, else 0; empty if there was none."),
 }
@@ -448,7 +465,7 @@ def _without(*names: str) -> dict[str, Column]:
     return {name: column for name, column in KEYS.items() if name not in names}
 
 
-HISTORY_KEYS = _without("solver", "accuracy", "assembly", "correction")
+HISTORY_KEYS = _without("formulation", "formulation_options", "solver", "accuracy", "assembly", "correction")
 
 HISTORIES: Mapping[str, Column] = {
     "artefact": text("Hash of the stage it comes from."),

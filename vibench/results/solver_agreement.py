@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vibench.arrays import Array
+from vibench.interfaces.formulations import MIXED
 from vibench.qp.verification import Slack, allowed
 from vibench.results.columns import DISAGREEMENTS, KEYS
 from vibench.study.cells import COMPILED
@@ -25,6 +26,16 @@ def solution_row(x: Array, alpha: Array, left_open: Slack) -> dict[str, Any]:
         "alpha": np.asarray(alpha, "<f8").tobytes(),
         "slack_linear": left_open.linear,
         "slack_constant": left_open.constant,
+    }
+
+
+def answer_row(x: Array, alpha: Array | None) -> dict[str, Any]:
+    """The same columns of the answer of a formulation, whose accuracy leaves nothing open that could be compared."""
+    return {
+        "x": np.asarray(x, "<f8").tobytes(),
+        "alpha": None if alpha is None else np.asarray(alpha, "<f8").tobytes(),
+        "slack_linear": None,
+        "slack_constant": None,
     }
 
 
@@ -53,7 +64,8 @@ def disagreement_rows(
     """
     programs: dict[tuple[str, float], list[Mapping[str, Any]]] = {}
     for cell in cells:
-        if cell["model"] and cell["assembly"] != COMPILED:  # whose answers are no solver's
+        # answers of compiled programs and of formulations are no solver's
+        if cell["model"] and cell["assembly"] != COMPILED and cell["formulation"] == MIXED:
             programs.setdefault((cell["model"], cell["accuracy"]), []).append(cell)
     for same in programs.values():
         if len({cell["solver"] for cell in same}) < 2:

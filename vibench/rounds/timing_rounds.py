@@ -17,13 +17,14 @@ from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline.assemblies import Assemblies
 from vibench.offline.correction import corrected_in_full
 from vibench.provenance import machine
-from vibench.qp.repeats import check_answer
 from vibench.results.costs.paired_seconds import paces
 from vibench.rounds.marginal_solutions import MarginalSolutions, parts_alike
 from vibench.rounds.timed_seconds import TimedCell, TimedRound, round_columns
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, build_problem, value_of
+from vibench.stages.cell_goal import CellGoal
 from vibench.stages.cell_queries import CellQueries
+from vibench.stages.formulations import FormulationModels, FormulationQueries
 from vibench.stages.query import Queries, Watch
 from vibench.stages.snapshots import TimedSnapshots, gather
 from vibench.storage.artefacts import Store
@@ -50,7 +51,7 @@ class TimingRounds(ItemwiseStage):
 
     label = "timing"
 
-    cells: tuple[CellQueries, ...]
+    cells: tuple[CellGoal, ...]
     queries: tuple[tuple[int, ...], ...]
     """The queries of every cell that are ok."""
     rounds: int
@@ -81,8 +82,7 @@ class TimingRounds(ItemwiseStage):
 
     def inputs(self) -> tuple[Stage, ...]:
         """The models and the programs of the cells, and the solutions that high-fidelity ones start from."""
-        read = [stage for cell in self.cells for stage in (*cell.assembly.model_inputs, cell.assembly)]
-        read += [stage for cell in self.cells for stage in (cell.certificate, cell.compilation) if stage is not None]
+        read = [stage for cell in self.cells for stage in cell.timed_inputs]
         return tuple(dict.fromkeys((*read, *self.solutions)))
 
     def place(self, item: int) -> tuple[int, int]:
@@ -111,6 +111,7 @@ class _Rounds(Items):
     def __init__(self, stage: TimingRounds, store: Store) -> None:
         self._stage, self._store = stage, store
         self._models: dict[str, Queries] = {}
+        self._formulations: dict[str, FormulationModels] = {}
         self._certificates: dict[str, OnlineCertificate] = {}
         self._factors: dict[str, Assemblies] = {}
         self._warm: set[int] = set()
@@ -128,9 +129,8 @@ class _Rounds(Items):
 
     @cached_property
     def _marginal(self) -> MarginalSolutions:
-        assembly = self._stage.cells[0].assembly
-        problem = build_problem(assembly.enrichment.pod.problem)
-        return MarginalSolutions(problem, self._reference, assembly.validation.seed)
+        one = self._stage.cells[0]
+        return MarginalSolutions(build_problem(one.problem), self._reference, one.validation_set.seed)
 
     def item(self, number: int, watch: Watch) -> TimedRound:
         """One round of one cell, after a warm-up if it is the cell's first one in this process."""
@@ -170,18 +170,21 @@ class _Rounds(Items):
 
         What is timed is equivalent to the queries and nowhere the same: nothing is gained by remembering it.
         """
-        stage = self._stage.cells[cell]
-        queries, fine = self._queries(stage.assembly), self._stage.queries[cell]
+        stage, fine = self._stage.cells[cell], self._stage.queries[cell]
         mine = [k for k in fine if k in self._parts[at % SHARE]] or [fine[at % len(fine)]]
         order = mine[: 1 if warm_up else None]
-        assemble = self._assemblies(queries, order, at, cell, warm_up=warm_up)
         solve: dict[int, Seconds] = {}
         certify: dict[int, Seconds] = {}
+        if isinstance(stage, FormulationQueries):
+            return self._formulated(stage, order, watch, at, cell, int(warm_up))
+        assert isinstance(stage, CellQueries)
+        queries = self._queries(stage.assembly)
+        assemble = self._assemblies(queries, order, at, cell, stage, warm_up=warm_up)
         for k in order:
             seed = (stage.assembly.validation.seed, k, at, cell, int(warm_up))
             query = stage.query(queries, k).repeated(*seed)
             answer, solve[k] = query.prepare(watch)()
-            check_answer(query.program, answer, query.accuracy)
+            query.check(answer)
             asked = stage.certificate is not None or stage.correction is not CorrectionMode.NONE
             if asked and answer.x is not None and answer.alpha is not None:
                 near = queries.near(k, at, cell, int(warm_up))
@@ -189,6 +192,21 @@ class _Rounds(Items):
             if sum(seconds.wall for seconds in solve.values()) > ROUND_SECONDS:
                 break
         return assemble, solve, certify
+
+    def _formulated(
+        self, stage: FormulationQueries, order: Sequence[int], watch: Watch, *seed: int
+    ) -> tuple[dict[int, Seconds], dict[int, Seconds], dict[int, Seconds]]:
+        """Seconds of queries of a formulation, whose assembly is a part of the solution."""
+        if stage.key not in self._formulations:
+            self._formulations[stage.key] = FormulationModels(self._store, stage)
+        solve: dict[int, Seconds] = {}
+        for k in order:
+            query = self._formulations[stage.key].query(k).repeated(*seed)
+            answer, solve[k] = query.prepare(watch)()
+            query.check(answer)
+            if sum(seconds.wall for seconds in solve.values()) > ROUND_SECONDS:
+                break
+        return dict.fromkeys(solve, NO_TIME), solve, {}
 
     def _certified(self, stage: CellQueries, queries: Queries, near: Array, solution: tuple[Array, Array]) -> Seconds:
         """Seconds of the certificate of a solution at a parameter and of its correction, or of that in full."""
@@ -211,14 +229,14 @@ class _Rounds(Items):
         return self._models[assembly.key]
 
     def _assemblies(
-        self, queries: Queries, order: Sequence[int], at: int, cell: int, *, warm_up: bool
+        self, queries: Queries, order: Sequence[int], at: int, cell: int, stage: CellQueries, *, warm_up: bool
     ) -> dict[int, Seconds]:
         """Seconds of the assembly of every query; in full, which costs the same at each parameter, of the first one.
 
         High-fidelity matrices are the same for all models: they are assembled once in a round.
         """
         model = queries.model
-        if self._stage.cells[cell].compilation is not None:
+        if stage.compilation is not None:
             return dict.fromkeys(order, NO_TIME)  # it is part of the solution
         if isinstance(model, HyperReducedModel):
             return {k: timed(partial(model.assemble, queries.near(k, at, cell, int(warm_up))))[1] for k in order}

@@ -17,6 +17,9 @@ BOUNDS = (
 )  # fmt: skip
 """Error bounds, as in the names of their columns."""
 
+HIGH_FIDELITY = ("hf_primal_residual", "hf_dual_residual", "hf_gap")
+"""Residuals of the high-fidelity problem, as in the names of their columns."""
+
 
 def summarise(rows: Sequence[Row]) -> Row:
     """The columns of a cell from those of its queries; means and maxima are over the queries with status ok.
@@ -40,6 +43,9 @@ def summarise(rows: Sequence[Row]) -> Row:
     def largest(name: str, among: Sequence[Row] = fine) -> float | None:
         values = column(name, among)
         return float(values.max()) if values.size else None
+
+    def smallest(name: str) -> float | None:
+        return min((row[name] for row in rows if row.get(name) is not None), default=None)
 
     def share(source: str, name: str) -> float | None:
         measured = [row for row in fine if row.get(f"{source}_error_{name}") is not None]
@@ -78,10 +84,12 @@ def summarise(rows: Sequence[Row]) -> Row:
         **contributions("assembly"),
         "assembly_error_max": largest("assembly_error"),
         "violation_max": largest("violation"),
+        "hf_residual_max": max((r for name in HIGH_FIDELITY if (r := largest(name)) is not None), default=None),
+        "error_u_predicted_mean": mean("error_u_predicted"),
         "residual_max": max((r for r in residuals if r is not None), default=None),
-        "beta_span_min": min(row["beta_span"] for row in rows),
-        "beta_cone_lower_min": min(row["beta_cone_lower"] for row in rows),
-        "beta_cone_upper_min": min(row["beta_cone_upper"] for row in rows),
+        "beta_span_min": smallest("beta_span"),
+        "beta_cone_lower_min": smallest("beta_cone_lower"),
+        "beta_cone_upper_min": smallest("beta_cone_upper"),
     }
 
 

@@ -234,13 +234,25 @@ class NestedEnrichment(EnrichmentStage):
         return stored
 
 
-def enrichment_stage(cell: Cell) -> EnrichmentStage:
-    """The stage that completes the reduced model of a cell."""
-    pods = PODStage(cell.problem, cell.pod, cell.training)
-    cone = ConeStage(cell.problem, cell.dual, cell.cone, cell.training)
+def spaces_of(cell: Cell) -> tuple[PODStage | None, ConeStage | None, EnrichmentStage | None]:
+    """The stages of V_N, cone and enrichment of a cell; `None` of what its formulation does not have."""
+    pod = cone = None
+    if cell.pod is not None:
+        pod = PODStage(cell.problem, cell.pod, cell.training)
+    if cell.dual is not None and cell.cone is not None:
+        cone = ConeStage(cell.problem, cell.dual, cell.cone, cell.training)
+    if pod is None or cone is None or cell.primal is None:
+        return pod, cone, None
     if cell.nested_tolerances:
-        return NestedEnrichment(pods, cone, cell.primal, cell.primal_tol, cell.nested_tolerances)
-    return SingleEnrichment(pods, cone, cell.primal, cell.primal_tol)
+        return pod, cone, NestedEnrichment(pod, cone, cell.primal, cell.primal_tol, cell.nested_tolerances)
+    return pod, cone, SingleEnrichment(pod, cone, cell.primal, cell.primal_tol)
+
+
+def enrichment_stage(cell: Cell) -> EnrichmentStage:
+    """The stage that completes the reduced model of a cell with the mixed formulation."""
+    enrichment = spaces_of(cell)[2]
+    assert enrichment is not None  # the mixed formulation has all axes
+    return enrichment
 
 
 def _histories(quantities: Mapping[str, Array]) -> tuple[History, ...]:

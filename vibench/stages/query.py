@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -12,16 +12,13 @@ from vibench.arrays import Array
 from vibench.errors import in_a_line
 from vibench.interfaces.problem import ParameterBox, VariationalInequality
 from vibench.interfaces.strategies import Kind
-from vibench.model.certificates.base import Guarantee
-from vibench.model.certificates.bounds import OnlineBound
-from vibench.model.error_bounds import CorrectionMode, ErrorBounds, error_bounds
-from vibench.model.errors import UNMEASURABLE, Errors, ReferenceSolutions, errors, output_errors
-from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
+from vibench.model.error_bounds import CorrectionMode
+from vibench.model.errors import UNMEASURABLE, ReferenceSolutions
 from vibench.offline.assemblies import assemblies
 from vibench.offline.correction import Answer, Corrector
 from vibench.offline.models import AnyReducedModel
 from vibench.qp.exact import ExactSolution
-from vibench.qp.repeats import in_units, nearby, units
+from vibench.qp.repeats import check_answer, in_units, nearby, units
 from vibench.qp.scaling import ratio
 from vibench.qp.solve import solve_qp, takes_start
 from vibench.qp.status import Status
@@ -30,12 +27,10 @@ from vibench.results.solver_agreement import solution_row
 from vibench.stability.coercivity import Stability
 from vibench.stages.assembly import AssemblyStage, ReducedPrograms
 from vibench.stages.base import Row, value_of
+from vibench.stages.judging import online_columns, pair_columns
 from vibench.storage.artefacts import Store
 from vibench.study import registry
 from vibench.timing import SLOW, Seconds, timed
-
-VIOLATION = 1e-10
-"""An error above its bound by more than this share of the solution violates it; less is round-off."""
 
 Watch = Callable[[bool], None]
 """Called with True before an operation that has a time limit of its own, and with False after it."""
@@ -75,6 +70,10 @@ class Query:
             start=None if self.start is None else (self.start[0], in_units(self.start[1], d)),
             units=d,
         )
+
+    def check(self, answer: QPSolution) -> None:
+        """Refuse the answer of a timed repetition that is none; raises a `NumericalError`."""
+        check_answer(self.program, answer, self.accuracy)
 
     def prepare(self, watch: Watch) -> Callable[[], tuple[QPSolution, Seconds]]:
         """Solve the query to start from, whose seconds are not those of this one; returns the timed solution itself."""
@@ -208,23 +207,13 @@ def error_columns(
     answers = [corrector.answer(mu, *solution, *pair) for mu, solution, *pair in queries]
     if any(answer.is_corrected for answer in answers):
         u, lam = (np.column_stack([getattr(answer, name) for answer in answers]) for name in ("u", "lam"))
-    energies = [assemblies(problem).energy_at(mu) for mu in mus]
-    measured = zip(
-        errors(problem, vis, energies, reference, u, lam),
-        error_bounds(vis, energies, constants, u, lam),
-        hsw_bounds(problem, vis, constants, u, lam),
-        strict=True,
-    )
-    rows = [_columns(*one) for one in measured]
-    compared = (u, lam), (reference.u, reference.lam), reference.scale_outputs
-    for row, of_query in zip(rows, output_errors(problem.outputs, mus, *compared), strict=True):
-        row["outputs"] = of_query
+    rows = pair_columns(problem, mus, vis, u, lam, reference, constants)
     for row, answer in zip(rows, answers, strict=True):
         if corrector.mode is not CorrectionMode.NONE:
             row["corrected"], row["correction_share"] = int(answer.is_corrected), answer.share
             row["correction_note"] = answer.note
         if answer.bound is not None:
-            row.update(_online_columns(answer.bound, row))
+            row.update(online_columns(answer.bound, row))
     contributions = _Contributions(corrector, problem.V.norm(reference.u), problem.W.norm(reference.lam))
     full = projected or [None] * len(rows)
     for k, (row, (x, alpha), own, galerkin) in enumerate(zip(rows, solutions, exact, full, strict=True)):
@@ -287,51 +276,3 @@ class _Contributions:
         u = np.asarray(model.reconstruct(mu, vi, solution.x[:, None])[:, 0])
         alpha = np.maximum(solution.alpha, 0.0)
         return corrector.answer(mu, solution.x, alpha, u, model.generators @ alpha)
-
-
-def _columns(error: Errors, bounds: ErrorBounds, hsw: HSWBounds | None) -> Row:
-    row: Row = asdict(error) | {"bound_note": bounds.note}
-    of_u = _measured(error.error_u, error.error_u_scaled) > UNMEASURABLE
-    of_lam = _measured(error.error_lambda, error.error_lambda_scaled) > UNMEASURABLE
-    checked: dict[str, tuple[float, bool, float]] = {}  # a bound, the error, and whether that is measurable
-    if np.isfinite(bounds.u_energy):
-        row |= {f"bound_{name}": getattr(bounds, name) for name in ("rho", "rho_range", "omega", "kappa")}
-        checked |= {
-            "u_energy": (bounds.u_energy, of_u, error.error_u_energy_absolute),
-            "u": (bounds.u, of_u, error.error_u_absolute),
-            "lambda_natural": (bounds.lambda_natural, of_lam, error.error_lambda_natural_absolute),
-            "lambda": (bounds.lam, of_lam, error.error_lambda_absolute),
-        }
-    if hsw is not None:
-        checked["hsw_u"] = hsw.u, of_u, error.error_u_absolute
-        checked["hsw_lambda"] = hsw.lam, of_lam, error.error_lambda_absolute
-    for name, (bound, measurable, absolute) in checked.items():
-        row[f"bound_{name}"] = bound
-        if measurable:
-            row[f"effectivity_{name}"] = ratio(bound, absolute)
-    return row
-
-
-def _online_columns(bound: OnlineBound, error: Row) -> Row:
-    """The bounds at online cost, and the effectivities of those whose bounds at high-fidelity cost have one."""
-    row: Row = {"certificate": bound.guarantee.value, "bound_online_note": bound.note}
-    if bound.guarantee is Guarantee.NONE:
-        return row
-    violated, bounds = False, {"u_energy": bound.u_energy, "lambda_natural": bound.lambda_natural}
-    if bound.inf_sup > 0.0:
-        bounds["lambda"] = bound.lam
-    for name, value in bounds.items():
-        absolute, relative = error[f"error_{name}_absolute"], error[f"error_{name}"]
-        row[f"bound_online_{name}"] = value
-        if f"effectivity_{name}" in error:
-            row[f"effectivity_online_{name}"] = ratio(value, absolute)
-        size = absolute / relative if relative else value
-        violated |= not absolute <= value + VIOLATION * size
-    row |= {"bound_online_rho": bound.rho, "bound_online_omega": bound.omega, "bound_online_kappa": bound.kappa}
-    row |= {"beta_energy_online": bound.inf_sup, "beta_energy_online_note": bound.inf_sup_note}
-    return row | {"coercivity_online": bound.coercivity, "bound_online_violated": int(violated)}
-
-
-def _measured(relative: float | None, scaled: float) -> float:
-    """An error relative to its solution, or where that is zero to the largest training solution."""
-    return scaled if relative is None else relative

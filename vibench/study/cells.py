@@ -11,6 +11,7 @@ from typing import Any
 
 from vibench.dependencies import CELL, code_used
 from vibench.errors import RequestError, unknown_name
+from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Stop
 from vibench.study.kinds import SOLVER
 from vibench.study.parameter_sets import OWN, OWN_TRAINING, ParameterSet
@@ -37,8 +38,11 @@ UNCORRECTED, FEASIBLE = "none", "feasible"
 NOT_MOVED: Mapping[str, str] = {}
 """Files and folders of a cell are where they were."""
 
-PLUGINS = ("problem", "dual", "primal", "training", "validation_sampling")
-"""Names of plugins in the definition of a cell; the last two, of sampling strategies, may be `None`."""
+PLUGINS = ("problem", "dual", "primal", "formulation", "training", "validation_sampling")
+"""Names of plugins in the definition of a cell; all but the first may be `None`."""
+
+NO_SUCH_AXIS = "–"
+"""What tables show of an axis that the formulation of a cell does not have."""
 
 
 @dataclass(frozen=True)
@@ -59,36 +63,40 @@ class Cell:
     """One cell: a problem, strategies, tolerances, a QP solver, and how queries are assembled and corrected.
 
     `interpolation` is the tolerance of reduced assembly, `None` for full assembly; certified queries are assembled as
-    reduced ones, and compiled programs are made of them. `labels` of problem, dual and primal strategy are no part of
+    reduced ones, and compiled programs are made of them. Without a `formulation` it is the mixed one; what another does
+    not use is `None`. `labels` of problem, dual and primal strategy are no part of
     the identity, nor are those of the parameter sets; nor are `nested_tolerances`, all tolerances of a nested primal
     strategy in the study, whose enrichments are stages of one.
     """
 
     problem: Plugin
-    dual: Plugin
-    primal: Plugin
-    pod: Stop
-    cone: Stop
+    dual: Plugin | None
+    primal: Plugin | None
+    pod: Stop | None
+    cone: Stop | None
     primal_tol: float | None
-    solver: str
+    solver: str | None
     assembly: str
     interpolation: float | None
     warm_start: bool
-    accuracy: float
+    accuracy: float | None
     validation: ParameterSet
     labels: tuple[str, str, str]
     nested_tolerances: tuple[float, ...] = ()
     training: ParameterSet = OWN_TRAINING
     correction: str = UNCORRECTED
+    formulation: Plugin | None = None
+    formulation_label: str = MIXED
 
     @cached_property
     def key(self) -> str:
         """Hash of everything but the code that determines the cell's numbers."""
         content = self._content()
         del content["labels"], content["nested_tolerances"], content["set_labels"]
+        content.pop("formulation_label", None)
         for name in PLUGINS:
-            if content[name] is None:
-                del content[name]
+            if content.get(name) is None:
+                content.pop(name, None)
             else:
                 del content[name]["code"], content[name]["places"]
         return digest(content)
@@ -104,6 +112,8 @@ class Cell:
         training, validation = content.pop("training"), content.pop("validation")
         if self.correction == UNCORRECTED:  # as before there was a choice
             del content["correction"]
+        if self.formulation is None:  # likewise
+            del content["formulation"], content["formulation_label"]
         return content | {
             "seed": validation["seed"],
             "validation": validation["count"],
@@ -129,7 +139,7 @@ class Cell:
         for name in PLUGINS:
             content[name] = _found(plugins[name].moved(places)) if name in plugins else None
         for axis in ("pod", "cone"):
-            content[axis] = Stop(**content[axis])
+            content[axis] = None if content[axis] is None else Stop(**content[axis])
         for name in ("labels", "nested_tolerances"):
             content[name] = tuple(content.get(name, ()))
         trained, validated = content.pop("set_labels", (OWN, OWN))
@@ -148,25 +158,37 @@ class Cell:
     def plugins(self) -> tuple[Plugin, ...]:
         """Its plugins, the solver aside."""
         samplings = (one.sampling for one in (self.training, self.validation) if one.sampling is not None)
-        return (self.problem, self.dual, self.primal, *samplings)
+        chosen = (one for one in (self.dual, self.primal, self.formulation) if one is not None)
+        return (self.problem, *chosen, *samplings)
 
     @property
     def code(self) -> str:
         """Hash of the code that computes the cell: that of all stages, of its plugins and of its solver."""
-        codes = [*(plugin.code for plugin in self.plugins), find(SOLVER, self.solver).code]
+        codes = [plugin.code for plugin in self.plugins]
+        codes += [] if self.solver is None else [find(SOLVER, self.solver).code]
         return digest([code_used(*CELL, whole=True), *codes])
 
     def __str__(self) -> str:
         problem, dual, primal = self.labels
         problem += f" ({self.training.label})" if self.training.sampling is not None else ""
         tolerance = "" if self.primal_tol is None else f" {self.primal_tol:g}"
-        pod, cone = (
+        stops = ", ".join(
             f"{size}={stop.size}" if stop.tolerance is None else f"{stop.tolerance:g}"
             for size, stop in (("N", self.pod), ("R", self.cone))
+            if stop is not None
         )
+        solver = " ".join([*filter(None, [self.solver]), *([] if self.accuracy is None else [f"{self.accuracy:g}"])])
+        chosen = [
+            problem,
+            "" if self.formulation is None else self.formulation_label,
+            "" if self.dual is None else dual,
+            "" if self.primal is None else f"{primal}{tolerance}",
+            stops,
+            solver,
+        ]
         way = "" if self.assembly == "full" else f" · {self.assembly}"
         way += "" if self.correction == UNCORRECTED else f" · corrected: {self.correction}"
-        return f"{problem} · {dual} · {primal}{tolerance} · {pod}, {cone} · {self.solver} {self.accuracy:g}{way}"
+        return " · ".join(filter(None, chosen)) + way
 
 
 def _found(plugin: Plugin) -> Plugin:

@@ -20,7 +20,8 @@ from pydantic import (
     model_validator,
 )
 
-from vibench.study.kinds import PluginKind
+from vibench.interfaces.formulations import AXES, MIXED, axes_of
+from vibench.study.kinds import FORMULATION, PluginKind
 from vibench.study.parameter_sets import OWN
 from vibench.study.plugin import GivenPlugin, Plugin, give
 from vibench.study.registry import RegisteredPlugin, find
@@ -106,6 +107,38 @@ class Entry(BaseModel):
     def title(self) -> str:
         """Label, or name."""
         return self.label or self.name
+
+
+class FormulationEntry(Entry):
+    """One entry of the axis of formulations: `mixed`, which is no plugin, or one that is."""
+
+    @model_validator(mode="after")
+    def _no_options_of_mixed(self) -> FormulationEntry:
+        if self.name == MIXED and self.options:
+            raise ValueError(f"'{MIXED}' has no options (found {', '.join(map(repr, self.options))})")
+        if self.label == MIXED != self.name:
+            raise ValueError(f"'{MIXED}' is the formulation of vibench itself and no label of another")
+        return self
+
+    @property
+    def is_mixed(self) -> bool:
+        """Whether it is the mixed formulation, which is no plugin."""
+        return self.is_registered and self.name == MIXED
+
+    @property
+    def uses(self) -> tuple[str, ...]:
+        """The axes of a study that it has; all of them where several packages use its name, so that it cannot be run.
+
+        Raises a `RequestError` if it declares axes that there are not.
+        """
+        if self.is_mixed or (plugin := self.registered(FORMULATION)).conflict:
+            return AXES
+        return axes_of(plugin.load(), str(plugin))
+
+    @property
+    def takes_start(self) -> bool:
+        """Whether its queries can start from another answer."""
+        return self.is_mixed or (not (plugin := self.registered(FORMULATION)).conflict and plugin.load().takes_start)
 
 
 class SamplingEntry(Entry):

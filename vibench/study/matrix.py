@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -14,9 +14,9 @@ from vibench.errors import RequestError, requested
 from vibench.files import read_regular
 from vibench.interfaces.strategies import Stop
 from vibench.reduction.nested import NestedStrategy
-from vibench.study.cells import COMPILED, Cell
-from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
-from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SAMPLING, STUDY, PluginKind
+from vibench.study.cells import COMPILED, NO_SUCH_AXIS, UNCORRECTED, Cell
+from vibench.study.entries import Entry, FormulationEntry, ProblemEntry, SamplingEntry
+from vibench.study.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SAMPLING, STUDY, PluginKind
 from vibench.study.options import BESIDE
 from vibench.study.parameter_sets import OWN, ParameterSet
 from vibench.study.plugin import GivenPlugin, Plugin
@@ -152,30 +152,35 @@ def expand(study: Study) -> list[Cell]:
         for entry, plugin in _made(PROBLEM, study.problem)
     ]
     duals, primals = _made(DUAL, study.dual), _made(PRIMAL, study.primal)
+    formulations = [(one, None if one.is_mixed else one.plugin(FORMULATION)) for one in study.formulation]
     for (problem, plugin, sets, validation), table in product(problems, study.tolerances):
         nested = {entry.title: _nested_tolerances(entry, table) for entry in study.primal}
-        for training, (dual, pod, cone, primal, tolerance) in product(sets, _combinations(duals, primals, table)):
-            solved = product(study.assembly, study.correction, study.solver_names(), study.accuracy)
-            for assembly, correction, solver, accuracy in solved:
+        for training, (entry, formulation) in product(sets, formulations):
+            uses = entry.uses
+            offline = _combinations(duals, primals, table, uses)
+            for (dual, pod, cone, primal, tolerance), solved in product(offline, _solved(study, entry)):
+                assembly, correction, solver, accuracy = solved
                 if assembly == COMPILED and solver != study.solver_names()[0]:
                     continue  # the answer is that of the program, whatever the solver is
                 cell = Cell(
                     problem=plugin,
-                    dual=dual[1],
-                    primal=primal[1],
+                    dual=None if dual is None else dual[1],
+                    primal=None if primal is None else primal[1],
                     pod=pod,
                     cone=cone,
                     primal_tol=tolerance,
                     solver=solver,
                     assembly=assembly,
                     interpolation=None if assembly == "full" else study.interpolation,
-                    warm_start=study.warm_start,
+                    warm_start=study.warm_start and entry.takes_start,
                     accuracy=accuracy,
                     correction=correction,
                     training=training,
                     validation=validation,
-                    labels=(problem.title, dual[0].title, primal[0].title),
-                    nested_tolerances=nested[primal[0].title],
+                    labels=(problem.title, _title(dual), _title(primal)),
+                    nested_tolerances=() if primal is None else nested[primal[0].title],
+                    formulation=formulation,
+                    formulation_label=entry.title,
                 )
                 if (same := cells.setdefault(cell.key, cell)) is not cell and same.code != cell.code:
                     raise RequestError(
@@ -203,13 +208,42 @@ def _nested_tolerances(primal: Entry, table: ToleranceTable) -> tuple[float, ...
     return tuple(sorted({value for value in table.of_primal(primal) if value is not None}, reverse=True))
 
 
+def _title(made: _Made[Entry] | None) -> str:
+    return NO_SUCH_AXIS if made is None else made[0].title
+
+
+_Offline: TypeAlias = tuple[_Made[Entry] | None, Stop | None, Stop | None, _Made[Entry] | None, float | None]
+
+
 def _combinations(
-    duals: Sequence[_Made[Entry]], primals: Sequence[_Made[Entry]], table: ToleranceTable
-) -> Iterator[tuple[_Made[Entry], Stop, Stop, _Made[Entry], float | None]]:
+    duals: Sequence[_Made[Entry]], primals: Sequence[_Made[Entry]], table: ToleranceTable, uses: Sequence[str]
+) -> list[_Offline]:
+    """Strategies and tolerances of the offline phase; one `None` on each axis that a formulation does not use."""
     pods = [Stop(tolerance=value) for value in table.pod or []] + [Stop(size=value) for value in table.N or []]
-    for pod, dual, primal in product(pods, duals, primals):
-        for cone, tolerance in product(table.of_dual(dual[0]), table.of_primal(primal[0])):
-            yield dual, pod, cone, primal, tolerance
+    chosen = product(
+        pods if "pod" in uses else [None], duals if "dual" in uses else [None], primals if "primal" in uses else [None]
+    )
+    return [
+        (dual, pod, cone, primal, tolerance)
+        for pod, dual, primal in chosen
+        for cone in ([None] if dual is None else table.of_dual(dual[0]))
+        for tolerance in ([None] if primal is None else table.of_primal(primal[0]))
+    ]
+
+
+def _solved(study: Study, entry: FormulationEntry) -> list[tuple[str, str, str | None, float | None]]:
+    """Assembly, correction, solver and accuracy of the queries of a formulation, as far as it has these axes.
+
+    Certificates, corrections and compiled programs are made of mixed models alone.
+    """
+    assemblies, corrections = list[str](study.assembly), list[str](study.correction)
+    if not entry.is_mixed:
+        reduced = "reduced" if "assembly" in entry.uses else "full"
+        assemblies = list(dict.fromkeys("full" if asked == "full" else reduced for asked in assemblies))
+        corrections = [UNCORRECTED]
+    solvers = study.solver_names() if "solvers" in entry.uses else [None]
+    accuracies = study.accuracy if "accuracy" in entry.uses else [None]
+    return list(product(assemblies, corrections, solvers, accuracies))
 
 
 def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
@@ -219,10 +253,14 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
 
     Raises a `RequestError` if a plugin of the cell is not installed, or the name is none of a study.
     """
-    problem, dual, primal = (
-        _plugin_entry(plugin, label)
-        for plugin, label in zip((cell.problem, cell.dual, cell.primal), cell.labels, strict=True)
-    )
+    axes = {"problem": cell.problem, "dual": cell.dual, "primal": cell.primal}
+    chosen = {
+        axis: [_plugin_entry(plugin, label)]
+        for (axis, plugin), label in zip(axes.items(), cell.labels, strict=True)
+        if plugin is not None
+    }
+    if cell.formulation is not None:
+        chosen["formulation"] = [_plugin_entry(cell.formulation, cell.formulation_label)]
     tolerances: dict[str, Any] = dict([_stop("pod", "N", cell.pod), _stop("dual", "R", cell.cone)])
     if cell.primal_tol is not None:
         tolerances["primal"] = {cell.labels[2]: [cell.primal_tol]}
@@ -231,11 +269,9 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
         "name": name,
         "seed": cell.validation.seed,
         "validation": _entry_of_set(cell.validation) or cell.validation.count,
-        "accuracy": [cell.accuracy],
-        "solvers": [cell.solver],
-        "problem": [problem],
-        "dual": [dual],
-        "primal": [primal],
+        **({} if cell.accuracy is None else {"accuracy": [cell.accuracy]}),
+        **({} if cell.solver is None else {"solvers": [cell.solver]}),
+        **chosen,
         "assembly": [cell.assembly],
         "correction": [cell.correction],
         "warm_start": cell.warm_start,
@@ -249,7 +285,9 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
 def _plugin_entry(plugin: Plugin, label: str) -> Any:
     given = plugin.registered
     name = given.given if isinstance(given, GivenPlugin) else plugin.name
-    entries: dict[PluginKind, type[Entry]] = {PROBLEM: ProblemEntry, SAMPLING: SamplingEntry}
+    entries: dict[PluginKind, type[Entry]] = {
+        PROBLEM: ProblemEntry, SAMPLING: SamplingEntry, FORMULATION: FormulationEntry,
+    }  # fmt: skip
     content = {"name": name, "label": label, "options": json.loads(plugin.options)}
     return entries.get(plugin.kind, Entry).model_validate(content).at(json.loads(plugin.places))
 
@@ -259,8 +297,13 @@ def _entry_of_set(parameters: ParameterSet) -> Any:
     return None if parameters.sampling is None else _plugin_entry(parameters.sampling, parameters.label)
 
 
-def _stop(tolerance: str, size: str, stop: Stop) -> tuple[str, list[float] | list[int]]:
-    """Key and value of a grid of tolerances for a basis that stops at a tolerance or at a size."""
+def _stop(tolerance: str, size: str, stop: Stop | None) -> tuple[str, list[float] | list[int]]:
+    """Key and value of a grid of tolerances for a basis that stops at a tolerance or at a size.
+
+    A grid needs one; where there is no basis it is any.
+    """
+    if stop is None:
+        return size, [1]
     return (tolerance, [stop.tolerance]) if stop.tolerance is not None else (size, [stop.size or 0])
 
 

@@ -20,6 +20,7 @@ from pydantic import (
 )
 
 from vibench.errors import RequestError, fault_line, unknown_name
+from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Stop
 from vibench.linalg.factorisations import DEFAULT
 from vibench.qp.settings import SETTINGS
@@ -27,6 +28,7 @@ from vibench.qp.solve import installed_solvers
 from vibench.study.entries import (
     STRICT,
     Entry,
+    FormulationEntry,
     Name,
     ProblemEntry,
     SamplingEntry,
@@ -35,7 +37,7 @@ from vibench.study.entries import (
     Validation,
     as_list,
 )
-from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SAMPLING, SOLVER, PluginKind
+from vibench.study.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SAMPLING, SOLVER, PluginKind
 from vibench.study.parameter_sets import OWN, ParameterSet, check_sets, is_available
 from vibench.study.plugin import Plugin
 from vibench.study.registry import FACTORISATION, find, registered
@@ -161,9 +163,18 @@ class Study(_Model):
     accuracy: Annotated[
         Accuracies, Field(description="Relative accuracy prescribed to QP solvers, or a list of accuracies: an axis.")
     ] = [1e-7]
-    solvers: Annotated[Solvers, Field(description="QP solvers; `available` for all that are installed.")]
-    dual: Annotated[list[Entry], MinLen(1), Field(description="Dual strategies.")]
-    primal: Annotated[list[Entry], MinLen(1), Field(description="Primal strategies.")]
+    formulation: Annotated[
+        list[FormulationEntry],
+        MinLen(1),
+        Field(
+            description="Formulations; `mixed` is the program of V_N and the cone. None has axes that it does not use."
+        ),
+    ] = [FormulationEntry(name=MIXED)]
+    solvers: Annotated[
+        Solvers, Field(description="QP solvers; `available` for all installed ones. Required by `mixed`.")
+    ] = []
+    dual: Annotated[list[Entry], MinLen(1), Field(description="Dual strategies. Required by `mixed`.")] = []
+    primal: Annotated[list[Entry], MinLen(1), Field(description="Primal strategies. Required by `mixed`.")] = []
     assembly: Annotated[
         list[Literal["full", "reduced", "certified", "compiled"]],
         MinLen(1),
@@ -209,7 +220,7 @@ class Study(_Model):
             study = build(given)
         except ValidationError as error:
             raise RequestError(
-                fault_line(error, cls, named=("problem", "dual", "primal", "training", "validation"))
+                fault_line(error, cls, named=("problem", "formulation", "dual", "primal", "training", "validation"))
             ) from None
         if study.factorisation != DEFAULT:
             study.problem[:] = (_factorised(problem, study.factorisation) for problem in study.problem)
@@ -246,11 +257,13 @@ def _check_names(study: Study) -> None:
     """Check names and options of plugins, and that exactly the strategies which take a tolerance have one."""
     axes: tuple[tuple[PluginKind, Sequence[Entry]], ...] = (
         (PROBLEM, study.problem), (DUAL, study.dual), (PRIMAL, study.primal),
+        (FORMULATION, [entry for entry in study.formulation if not entry.is_mixed]),
     )  # fmt: skip
     for kind, axis in axes:
         for entry in axis:
             entry.registered(kind).check_options(entry.options)
         _check_given(kind, axis)
+    _check_axes(study)
     for problem in study.problem:
         _check_sets(study, problem)
     solvers = {*SETTINGS, *registered(SOLVER)}
@@ -262,6 +275,14 @@ def _check_names(study: Study) -> None:
             plugin.load()
     for table in study.tolerances:
         _check_tolerances(study, table)
+
+
+def _check_axes(study: Study) -> None:
+    """Refuse an empty axis that a formulation uses."""
+    for formulation in study.formulation:
+        for axis in formulation.uses:
+            if not getattr(study, axis, True):
+                raise RequestError(f"{axis}: required, but not given")
 
 
 def _check_given(kind: PluginKind, axis: Sequence[Entry]) -> None:

@@ -1,0 +1,402 @@
+"""Formulations in a study: built on the offline phase as a stage of its own, and the queries that they answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.errors import in_a_line
+from vibench.interfaces.formulations import Formulation, FormulationAnswer
+from vibench.interfaces.strategies import Kind
+from vibench.model.affine import AffineMember
+from vibench.model.certificates.base import Guarantee
+from vibench.model.hyperreduced import ReducedOperators
+from vibench.offline.assemblies import assemblies
+from vibench.offline.formulated import ACCURACY, CellSolver, Formulated, check_built
+from vibench.offline.reduction import Reduction
+from vibench.offline.sweep import Snapshots
+from vibench.qp.repeats import nearby
+from vibench.qp.status import Status
+from vibench.results.solver_agreement import answer_row
+from vibench.stages.assembly import AffineDecomposition, HyperReduction
+from vibench.stages.base import Result, Row, Stage, build_problem, faults_of, value_of
+from vibench.stages.cell_goal import CellGoal, CellItems, QueryRows
+from vibench.stages.enrichment import EnrichmentStage, spaces_of
+from vibench.stages.judging import pair_columns
+from vibench.stages.offline import ConeStage, PODStage, ReducedCone
+from vibench.stages.query import Watch, path_before
+from vibench.stages.snapshots import gather, solution_stages
+from vibench.storage.artefacts import Store
+from vibench.storage.serialisation import storable
+from vibench.study.cells import Cell
+from vibench.study.parameter_sets import ParameterSet
+from vibench.study.plugin import Plugin
+from vibench.timing import SLOW, Seconds, timed
+
+
+@storable
+@dataclass(frozen=True)
+class BuiltFormulation:
+    """What a formulation has built, and the reduced operators, where no other stage has made those it uses."""
+
+    built: Mapping[str, Any]
+    operators: ReducedOperators | str | None
+
+
+@dataclass(frozen=True, eq=False)
+class _StoredReduction(Reduction):
+    """An offline phase whose snapshots and members are read when they are asked for, and not computed again."""
+
+    read: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
+
+    @cached_property
+    def snapshots(self) -> Snapshots:
+        """The stored training snapshots."""
+        found: Snapshots = self.read["snapshots"]()
+        return found
+
+    @cached_property
+    def members(self) -> Mapping[str, AffineMember]:
+        """The stored members, of a phase with assembly in reduced form."""
+        if "members" not in self.read:
+            return super().members
+        found: Mapping[str, AffineMember] = self.read["members"]()
+        return found
+
+
+@dataclass(frozen=True)
+class FormulationStage(Stage):
+    """A formulation built on the offline phase, `None` being what that does not have; a `BuiltFormulation`."""
+
+    label = "formulation"
+
+    problem: Plugin
+    formulation: Plugin
+    training: ParameterSet
+    pod: PODStage | None
+    cone: ConeStage | None
+    enrichment: EnrichmentStage | None
+    interpolation: float | None
+
+    @property
+    def decomposition(self) -> AffineDecomposition | None:
+        """The stage of the members; `None` for assembly in full."""
+        if self.interpolation is None:
+            return None
+        return AffineDecomposition(self.problem, self.interpolation, self.training)
+
+    @property
+    def reduction(self) -> HyperReduction | None:
+        """The stage that projects the members on an enriched space; without enrichment this stage does it itself."""
+        if self.enrichment is None or self.decomposition is None:
+            return None
+        return HyperReduction(self.enrichment, self.decomposition)
+
+    @property
+    def phases(self) -> tuple[Stage, ...]:
+        """The stages of V_N, cone and enrichment."""
+        enriched = () if self.enrichment is None else self.enrichment.model_inputs
+        return tuple(dict.fromkeys(stage for stage in (self.pod, self.cone, *enriched) if stage is not None))
+
+    @property
+    def model_inputs(self) -> tuple[Stage, ...]:
+        """The stages whose artefacts `formulated` reads: snapshots and members among them, if the model needs these."""
+        made = (stage for stage in (self.decomposition, self.reduction) if stage is not None)
+        return (*solution_stages(self.problem, self.training), *self.phases, *made)
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """The offline phase."""
+        return self.model_inputs
+
+    def run(self, store: Store) -> Result:
+        """Build the formulation and make its model, timed: a model may have something to compute, too.
+
+        Raises an `UnsupportedError` if the problem does not have what it needs.
+        """
+        offline, formulation = self.offline(store), self.create()
+        offline.snapshots  # noqa: B018  the clock begins after they are read
+        if self.decomposition is not None:
+            offline.members  # noqa: B018  likewise
+
+        def work() -> Mapping[str, Any]:
+            built = check_built(formulation.build(offline))
+            self.of(formulation, offline, built, None, ACCURACY).model  # noqa: B018  is made, and dropped
+            return built
+
+        with faults_of(self.formulation):
+            built, seconds = timed(work)
+        operators = offline.__dict__.get("operators") if self.reduction is None else None
+        return Result(BuiltFormulation(dict(built), operators), seconds)
+
+    def create(self) -> Formulation:
+        """A new instance of the formulation."""
+        made = self.formulation.create()
+        assert isinstance(made, Formulation)  # `RegisteredPlugin.load` refuses anything else
+        return made
+
+    def offline(self, store: Store) -> Reduction:
+        """The offline phase, whose steps are stored."""
+        pod, cone, enrichment = self.pod, self.cone, self.enrichment
+        snapshots = solution_stages(self.problem, self.training)
+        read: dict[str, Callable[[], Any]] = {"snapshots": lambda: gather(store, snapshots)}
+        if (decomposition := self.decomposition) is not None:
+            read["members"] = lambda: value_of(store, decomposition)
+        steps: dict[str, Any] = {}
+        if pod is not None:
+            steps["pod"] = value_of(store, pod)
+        if cone is not None:
+            reduced: ReducedCone = value_of(store, cone)
+            steps |= {"cone": reduced.cone, "multipliers": reduced.prepared}
+        if enrichment is not None:
+            steps["enrichment"] = enrichment.enrichment(store)
+        if self.reduction is not None:
+            steps["operators"] = value_of(store, self.reduction)
+        return _StoredReduction(
+            build_problem(self.problem),
+            None if cone is None else cone.dual.create(),
+            None if enrichment is None else enrichment.primal.create(),
+            None if pod is None else pod.stop,
+            None if cone is None else cone.stop,
+            None if enrichment is None else enrichment.tolerance,
+            training=self.training.strategy(),
+            assembly="full" if self.interpolation is None else "reduced",
+            interpolation=self.interpolation or Reduction.interpolation,
+            read=read,
+        ).given(**steps)
+
+    @staticmethod
+    def of(
+        formulation: Formulation, offline: Reduction, built: Mapping[str, Any], solver: str | None, accuracy: float
+    ) -> Formulated:
+        """The model of a formulation for a solver."""
+        return Formulated(formulation, offline, built, solver, accuracy)
+
+    def formulated(self, store: Store, solver: str | None, accuracy: float | None) -> Formulated:
+        """The model, once the stage has been run."""
+        stored: BuiltFormulation = value_of(store, self)
+        offline = self.offline(store)
+        if stored.operators is not None:
+            offline = offline.given(operators=stored.operators)
+        return self.of(self.create(), offline, stored.built, solver, ACCURACY if accuracy is None else accuracy)
+
+
+@dataclass(frozen=True)
+class FormulationQuery:
+    """A query of a formulation at a parameter mu (d,); `start` is that of the query whose answer it starts from."""
+
+    formulated: Formulated
+    mu: Array
+    near: Callable[..., Array]
+    """A parameter next to that of the query, for every seed."""
+    start: tuple[int, Array] | None = None
+
+    def repeated(self, *seed: int) -> FormulationQuery:
+        """The query at a parameter next to its own: whoever remembers answers would be timed at looking them up."""
+        return replace(self, mu=self.near(*seed))
+
+    def prepare(self, watch: Watch) -> Callable[[], tuple[tuple[FormulationAnswer, CellSolver], Seconds]]:
+        """Solve the query to start from, whose seconds are not those of this one; returns the timed solution itself."""
+        formulated, start = self.formulated, None
+        if self.start is not None:
+            watch(True)
+            start = formulated.model.solve(self.start[1], formulated.asked()[0])
+            watch(False)
+
+        def solution() -> tuple[tuple[FormulationAnswer, CellSolver], Seconds]:
+            asked, solver = formulated.asked(start)
+            watch(True)
+            answer, seconds = timed(lambda: formulated.model.solve(self.mu, asked))
+            watch(False)
+            return (answer, solver), seconds
+
+        return solution
+
+    def check(self, found: tuple[FormulationAnswer, CellSolver]) -> None:
+        """Refuse the answer of a timed repetition that is none; raises a `NumericalError`."""
+        self.formulated.check_repeated(self.mu, *found)
+
+
+class FormulationModels:
+    """The queries of a formulation, one per validation parameter, once its stage has been run."""
+
+    def __init__(self, store: Store, stage: FormulationQueries) -> None:
+        self.formulated = stage.built.formulated(store, stage.solver, stage.accuracy)
+        self.problem = self.formulated.offline.problem
+        self.mus, self._seed = stage.validation_set.of(self.problem), stage.validation_set.seed
+        self._warm = stage.warm_start
+
+    @cached_property
+    def _before(self) -> list[int | None]:
+        return path_before(self.mus, self.problem.parameters)
+
+    def near(self, number: int, *seed: int) -> Array:
+        """A parameter (d,) next to that of a query, which depends on the seed."""
+        return nearby(self.problem.parameters, self.mus[number], self._seed, number, *seed)
+
+    def query(self, number: int) -> FormulationQuery:
+        """One query; for a warm start with the one before it on a path through the parameters."""
+        before = self._before[number] if self._warm else None
+        start = None if before is None else (before, self.mus[before])
+        return FormulationQuery(self.formulated, self.mus[number], lambda *seed: self.near(number, *seed), start)
+
+
+@dataclass(frozen=True)
+class FormulationQueries(CellGoal):
+    """All queries of one cell whose formulation is a plugin."""
+
+    built: FormulationStage
+    validated: ParameterSet
+    solver: str | None
+    accuracy: float | None
+    query_seconds: float
+    warm_start: bool = False
+
+    @property
+    def problem(self) -> Plugin:
+        """That of the formulation."""
+        return self.built.problem
+
+    @property
+    def training_set(self) -> ParameterSet:
+        """That of the formulation."""
+        return self.built.training
+
+    @property
+    def validation_set(self) -> ParameterSet:
+        """That of the study."""
+        return self.validated
+
+    @property
+    def model(self) -> str:
+        """The key of the formulation on its offline phase."""
+        return self.built.key
+
+    @property
+    def offline(self) -> Mapping[str, tuple[Stage, ...]]:
+        """The stages whose seconds add up to the offline time of the cell, by column."""
+        built = self.built
+        made = (built.decomposition, built.reduction)
+        return {
+            "snapshots": self.training,
+            "pod": () if built.pod is None else (built.pod,),
+            "cone": () if built.cone is None else (built.cone,),
+            "enrichment": () if built.enrichment is None else (built.enrichment,),
+            "formulation": (built,),
+            "assembly": tuple(stage for stage in made if stage is not None),
+            "certificate": (),
+        }
+
+    @property
+    def timed_inputs(self) -> tuple[Stage, ...]:
+        """The formulation and its offline phase."""
+        return (*self.built.model_inputs, self.built)
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """All stages whose artefacts enter the rows of the cell."""
+        timed = (stage for stages in self.offline.values() for stage in stages)
+        return tuple(dict.fromkeys((*self.timed_inputs, *timed, self.reference, *self.validation)))
+
+    def begin(self, store: Store) -> _FormulationItems:
+        """Load the model and the reference solutions."""
+        return _FormulationItems(self, store)
+
+
+class _FormulationItems(CellItems):
+    """The queries of a formulation in progress."""
+
+    def __init__(self, stage: FormulationQueries, store: Store) -> None:
+        super().__init__(stage, store)
+        self._stage, self._models = stage, FormulationModels(store, stage)
+
+    def item(self, number: int, watch: Watch) -> QueryRows:
+        """The rows of one query; u and λ are reconstructed here, too, where a broken answer costs one query."""
+        row, solution = self._run(self._models.query(number), watch)
+        return self.known(number) | row, solution and {"query": number} | solution
+
+    def _run(self, query: FormulationQuery, watch: Watch) -> tuple[Row, Row | None]:
+        row: Row = {"form": "formulation"}
+        if query.start is not None:
+            row["started_from"] = query.start[0]
+        try:
+            solve = query.prepare(watch)
+            (answer, solver), seconds = solve()
+            watch(True)
+            verdict = query.formulated.judged(query.mu, answer, solver)
+            watch(False)
+            again = solve()[0][0] if verdict.status is Status.OK and seconds.wall <= SLOW else None
+        except MemoryError:
+            raise
+        except (Exception, SystemExit) as error:  # noqa: BLE001  a plugin may raise anything; recorded in the row
+            return row | {"status": Status.ERROR.value, "reason": in_a_line(error)}, None
+        status, reason = verdict.status, verdict.reason
+        if seconds.wall > self._stage.query_seconds:
+            status, reason = Status.TIMEOUT, f"took {seconds.wall:.1f} s, the limit is {self._stage.query_seconds:g} s"
+        row |= {
+            "status": status.value,
+            "reason": reason,
+            "solver_status": "" if solver.last is None else solver.last[1].solver_status,
+            "iterations": answer.iterations,
+            "repeatable": None if again is None else int(_same(answer, again)),
+            "error_u_predicted": answer.uncertainty,
+        }
+        if (found := verdict.residuals) is not None:
+            row |= {"primal_residual": found.primal, "dual_residual": found.dual, "gap": found.gap}
+        return row, None if verdict.pair is None or answer.x is None else answer_row(answer.x, answer.alpha)
+
+    def assess(self, solutions: Mapping[int, Row]) -> list[Row]:
+        """Error columns of some queries."""
+        numbers, formulated, mus = list(solutions), self._models.formulated, self._models.mus
+        pairs = [formulated.pair(mus[k], answer_of(solution)) for k, solution in solutions.items()]
+        if not pairs:
+            return []
+        u, lam = (np.column_stack(of_all) for of_all in zip(*pairs, strict=True))
+        vis = [assemblies(self._problem).at(mus[k]) for k in numbers]
+        constants = [self._stability[k] for k in numbers]
+        return pair_columns(self._problem, mus[numbers], vis, u, lam, self._compared.at(numbers), constants)
+
+    def sizes(self, rows: Sequence[Row]) -> tuple[Row, list[str]]:  # noqa: ARG002
+        """Dimensions, and the fallbacks of the offline phase and of the model."""
+        built, model = self._stage.built, self._models.formulated.model
+        offline = self._models.formulated.offline
+        fallbacks = [*model.fallbacks]
+        kind, added = Kind.NONE, None
+        if built.cone is not None:
+            fallbacks += offline.cone.fallbacks
+        if built.enrichment is not None:
+            fallbacks += offline.enrichment.fallbacks
+            kind, vectors = offline.enrichment.kind, offline.enrichment.vectors
+            fixed = 0 if vectors is None else vectors.shape[1]
+            added = offline.multipliers.rank if kind is Kind.PER_PARAMETER else fixed
+        return {
+            "enrichment_kind": kind.value,
+            "N": model.dimension - (added or 0),
+            "R": model.generators,
+            "enrichment": added,
+            "multiplier": self._models.formulated.formulation.multiplier.value,
+            "correction_cost": "",
+            "certificate": Guarantee.NONE.value,
+        }, fallbacks
+
+
+def answer_of(solution: Mapping[str, Any]) -> FormulationAnswer:
+    """The answer of a row of the solutions table: its coefficients, which are all that is kept of it."""
+    x, alpha = (None if solution[name] is None else np.frombuffer(solution[name], "<f8") for name in ("x", "alpha"))
+    return FormulationAnswer(x, alpha)
+
+
+def _same(one: FormulationAnswer, other: FormulationAnswer) -> bool:
+    """Whether two answers are the same to the last bit."""
+    pairs = ((one.x, other.x), (one.alpha, other.alpha))
+    return all((a is b) if a is None or b is None else a.tobytes() == b.tobytes() for a, b in pairs)
+
+
+def formulation_queries(cell: Cell, query_seconds: float) -> FormulationQueries:
+    """The last stage of a cell whose formulation is a plugin."""
+    assert cell.formulation is not None  # otherwise it is `mixed`
+    built = FormulationStage(cell.problem, cell.formulation, cell.training, *spaces_of(cell), cell.interpolation)
+    return FormulationQueries(built, cell.validation, cell.solver, cell.accuracy, query_seconds, cell.warm_start)
