@@ -152,8 +152,8 @@ class FormulationModel(ABC):
     def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
         """The pair u (n,) and λ (m,) ≥ 0 of an answer at mu (d,), not timed; bases may depend on the parameter.
 
-        Of the answer `x` and `alpha` alone are kept in results, and given here. λ is `None` for `Multiplier.RESIDUAL`, and for no other. A negative coefficient of λ is a broken answer, be it
-        round-off: every bound needs λ ≥ 0.
+        Of the answer `x` and `alpha` alone are kept in results, and given here. λ is `None` for `Multiplier.RESIDUAL`,
+        and for no other. A negative coefficient of λ is a broken answer, be it round-off: every bound needs λ ≥ 0.
         """
 
 

@@ -52,4 +52,6 @@ class _Interpolant(FormulationModel):
         return FormulationAnswer(self._x @ weights, weights)
 
     def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:  # noqa: ARG002
+        assert answer.x is not None  # `solve` always answers
+        assert answer.alpha is not None
         return self._basis @ answer.x, self._lam @ answer.alpha
