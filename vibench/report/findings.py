@@ -25,6 +25,7 @@ from vibench.report.figures.data import (
     label,
     label_of,
     problems,
+    whole,
 )
 from vibench.results import formats, invariants, tables
 from vibench.results.columns import KEYS
@@ -216,7 +217,7 @@ def _way(cell: Any) -> str:
 
 
 def _sizes(cell: Any) -> str:
-    return f"(N, R) = ({cell['N']:.0f}, {cell['R']:.0f}), {cell['solver']}"
+    return f"(N, R) = ({whole(cell['N'])}, {whole(cell['R'])}), {cell['solver']}"
 
 
 def _share(error: float) -> str:

@@ -21,7 +21,7 @@ from vibench.files import write_atomically
 from vibench.qp.status import Status
 from vibench.report import findings
 from vibench.report.figures import FigureTask, figures_of, processes, render
-from vibench.report.figures.data import TABLES, Data, Extent, label_of, problems
+from vibench.report.figures.data import TABLES, Data, Extent, label_of, problems, whole
 from vibench.report.page import plots
 from vibench.report.page.grids import TableGrid, grid_of, grid_of_cells, grid_of_thresholds, script_safe, to_json
 from vibench.report.page.images import image_of
@@ -47,7 +47,18 @@ READ = tuple(dict.fromkeys((*TABLES, *findings.READ)))
 FOLDED = 300
 """Findings that can be unfolded; thousands of a large study would be read by nobody."""
 
-IDENTITY = ["problem", "dual", "primal", "primal_tol", "solver", "accuracy", "assembly", "correction", "status"]
+IDENTITY = [
+    "problem",
+    "formulation",
+    "dual",
+    "primal",
+    "primal_tol",
+    "solver",
+    "accuracy",
+    "assembly",
+    "correction",
+    "status",
+]
 """Columns that cells and queries share in the tables of failures."""
 
 
@@ -163,14 +174,14 @@ def _way(winner: Winner) -> str:
     cell = winner.cell
     if not cell["cell"]:
         return "the high-fidelity model"
-    size = f"N = {cell['N']:.0f}, R = {cell['R']:.0f}"
+    size = f"N = {whole(cell['N'])}, R = {whole(cell['R'])}"
     solver = "" if winner.criterion is Criterion.OFFLINE else f"; {cell['solver']}"  # no solver has a part in it
     return f"{label_of(cell)}; {cell['dual']}, {size}{solver}"
 
 
 def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, str]]:
     yield "study", ", ".join(f"{key} {value}" for key, value in study.items())
-    for axis in ("problem", "dual", "primal", "solver", "accuracy", "assembly", "correction"):
+    for axis in ("problem", "formulation", "dual", "primal", "solver", "accuracy", "assembly", "correction"):
         yield axis, ", ".join(str(name) for name in cells[axis].unique())
     yield "cells", f"{len(cells)}, {int(cells['queries'].fillna(0).sum())} queries"
     yield "machine", "; ".join(str(name) for name in cells["machine"].unique())

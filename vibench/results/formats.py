@@ -13,6 +13,8 @@ from typing import Any
 
 import pandas as pd
 
+from vibench.interfaces.formulations import MIXED
+from vibench.study.cells import NO_SUCH_AXIS
 from vibench.text import printable_lines, unbroken
 
 
@@ -122,18 +124,28 @@ def cell_text(value: Any) -> str:
 def asked(row: Mapping[str, Any] | pd.Series, axis: str) -> str:
     """The tolerance of `axis`, "pod" or "dual", or the dimension where the study prescribes one."""
     tolerance, count = row[f"{axis}_tol"], row[f"{axis}_size"]
-    return f"{'N' if axis == 'pod' else 'R'}={int(count)}" if pd.notna(count) else f"{tolerance:g}"
+    if pd.notna(count):
+        return f"{'N' if axis == 'pod' else 'R'}={int(count)}"
+    return NO_SUCH_AXIS if pd.isna(tolerance) else f"{tolerance:g}"
+
+
+def solver_text(row: Mapping[str, Any] | pd.Series) -> str:
+    """QP solver and accuracy, as far as the formulation of a cell has them; "" without either."""
+    solver = "" if row["solver"] == NO_SUCH_AXIS else str(row["solver"])
+    return " ".join(filter(None, [solver, "" if pd.isna(row["accuracy"]) else f"{row['accuracy']:g}"]))
 
 
 def name_of_cell(row: Mapping[str, Any] | pd.Series) -> str:
     """A cell by all its axes, as `Cell` prints itself."""
     tolerance = "" if pd.isna(row["primal_tol"]) else f" {row['primal_tol']:g}"
-    sizes = ", ".join(asked(row, axis) for axis in ("pod", "dual"))
+    sizes = ", ".join(text for axis in ("pod", "dual") if (text := asked(row, axis)) != NO_SUCH_AXIS)
     how = "" if row["assembly"] == "full" else f" · {row['assembly']}"
     how += "" if row["correction"] == "none" else f" · corrected: {row['correction']}"
     trained = "" if row["training"] == "own" else f" ({row['training']})"
-    way = f"{row['problem']}{trained} · {row['dual']} · {row['primal']}{tolerance}"
-    return f"{way} · {sizes} · {row['solver']} {row['accuracy']:g}{how}"
+    formulation = "" if row["formulation"] == MIXED else row["formulation"]
+    spaces = [name for name in (row["dual"], f"{row['primal']}{tolerance}") if name != NO_SUCH_AXIS]
+    parts = [f"{row['problem']}{trained}", formulation, *spaces, sizes, solver_text(row)]
+    return " · ".join(filter(None, parts)) + how
 
 
 def break_even(meaning: str, number: float | None) -> str:

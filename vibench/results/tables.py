@@ -13,6 +13,7 @@ import pandas as pd
 
 from vibench.errors import RequestError
 from vibench.files import write_atomically
+from vibench.interfaces.formulations import MIXED
 from vibench.qp.status import Status
 from vibench.results import plugin_columns
 from vibench.results.columns import (
@@ -217,12 +218,16 @@ def _for_reading(frame: pd.DataFrame, table: Mapping[str, Column]) -> pd.DataFra
     return under_headings(frame, [name for name in shown_columns(table) if says_something(frame, name)], table)
 
 
+USUAL = {"correction": UNCORRECTED, "formulation": MIXED}
+"""Values that say nothing unasked: those of every cell before there was a choice."""
+
+
 def says_something(frame: pd.DataFrame, name: str) -> bool:
     """Whether to show a column unasked: accuracy and training sets if they vary, corrections and zeros if any."""
     if name == "accuracy":
         return bool(frame[name].nunique() > 1)
-    if name == "correction":
-        return bool((frame[name] != UNCORRECTED).any())
+    if name in USUAL:
+        return bool((~frame[name].isin([USUAL[name], ""])).any())
     if name in ("training", "snapshots"):
         return bool(frame["training"].nunique() > 1)
     if name == "rounds_missing":

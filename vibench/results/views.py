@@ -24,8 +24,8 @@ from vibench.results.sqlite.reading import parameters_of
 from vibench.text import json_object
 
 AXES = (
-    "problem", "training", "dual", "primal", "primal_tol", "solver", "pod_tol", "dual_tol", "accuracy", "assembly",
-    "correction",
+    "problem", "training", "formulation", "dual", "primal", "primal_tol", "solver", "pod_tol", "dual_tol", "accuracy",
+    "assembly", "correction",
 )  # fmt: skip
 """Columns that tell rows apart; where all rows have one value, it stands in the title and takes no room."""
 
@@ -35,16 +35,16 @@ OF_CELLS = (
 )  # fmt: skip
 
 OF_BENEFITS = (
-    "problem", "dual", "primal_a", "primal_b", "benefit_threshold", "primal_tol_b", "solver", "assembly_a",
-    "assembly_b", "correction", "threshold_high", "gain", "rounds_missing", "pod_tol",
+    "problem", "formulation", "dual", "primal_a", "primal_b", "benefit_threshold", "primal_tol_b", "solver",
+    "assembly_a", "assembly_b", "correction", "threshold_high", "gain", "rounds_missing", "pod_tol",
     "dual_tol", "accuracy", "online_b_s", "online_a_s",
     "offline_b_s", "offline_a_s",
 )  # fmt: skip
 
 
 OF_TOTALS = (
-    "problem", ranking.BAND, "primal", "primal_tol", "dual", "total_s", "probability", "cheapest_from", "ties", "cell",
-    "error_lambda_mean", "certified_error", "error_u_mean", "assembly", "total_high_s", "cheapest_until", "solver", "N",
+    "problem", ranking.BAND, "formulation", "primal", "primal_tol", "dual", "total_s", "probability", "cheapest_from", "ties",
+    "cell", "error_lambda_mean", "certified_error", "error_u_mean", "assembly", "total_high_s", "cheapest_until", "solver", "N",
     "R", "correction", "offline_s", "online_s", "training", "accuracy",
 )  # fmt: skip
 
@@ -69,7 +69,7 @@ class View:
 VIEWS: Mapping[str, View] = {
     "summary": View("cells", (*OF_CELLS, *(name for name in CELLS if CELLS[name].heading)), CELLS),
     "best": View(
-        "cells", ("problem", BAND, *OF_CELLS[:13], "ties", *OF_CELLS[13:]), ranking.HEADINGS, ranking.fastest,
+        "cells", ("problem", BAND, *OF_CELLS[:14], "ties", *OF_CELLS[14:]), ranking.HEADINGS, ranking.fastest,
         ranking.NO_BEST_CELL,
     ),
     "benefits": View("thresholds", (*OF_BENEFITS, *(n for n in THRESHOLDS if THRESHOLDS[n].heading)), THRESHOLDS),
@@ -89,7 +89,8 @@ VIEWS: Mapping[str, View] = {
     "thresholds": View("thresholds", OF_BENEFITS),
     "outputs": View(
         "outputs",
-        ("problem", "training", "dual", "primal", "primal_tol", "solver", "assembly", "correction", "output", "unit",
+        ("problem", "training", "formulation", "dual", "primal", "primal_tol", "solver", "assembly", "correction",
+         "output", "unit",
          "error_mean", "error_max", "error_scaled_mean", "scale", "queries_ok", "queries_zero", "pod_tol", "dual_tol",
          "accuracy", "cell"),
     ),

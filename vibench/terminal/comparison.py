@@ -18,9 +18,9 @@ REST = "--format csv"
 
 PRIORITY = (
     "run", "what", "verdict", "before", "after", "ratio", "cells", "equal", "worse", "better", "changed", "problem",
-    "dual", "primal", "solver", "asked", "interval", "within accuracy", "within limit", "undecided", "farthest ratio",
-    "against", "accuracy", "assembly", "correction", "cell", "study", "ok", "only here", "same code", "in all runs",
-    "machine", "seed", "validation",
+    "formulation", "dual", "primal", "solver", "asked", "interval", "within accuracy", "within limit", "undecided",
+    "farthest ratio", "against", "accuracy", "assembly", "correction", "cell", "study", "ok", "only here", "same code",
+    "in all runs", "machine", "seed", "validation",
 )  # fmt: skip
 """Columns of the tables, those that matter most first."""
 

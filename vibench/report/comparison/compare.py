@@ -33,8 +33,8 @@ from vibench.results.costs.break_even import FEWEST_ROUNDS
 from vibench.timing import median_interval
 
 COLUMNS = [
-    "run", "against", "problem", "dual", "primal", "asked", "solver", "accuracy", "assembly", "correction", "what",
-    "before", "after", "ratio", "ratio_low", "ratio_high", "verdict", "cell",
+    "run", "against", "problem", "formulation", "dual", "primal", "asked", "solver", "accuracy", "assembly",
+    "correction", "what", "before", "after", "ratio", "ratio_low", "ratio_high", "verdict", "cell",
 ]  # fmt: skip
 """Columns of the changes."""
 

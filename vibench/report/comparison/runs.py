@@ -16,7 +16,7 @@ from vibench.results import tables
 from vibench.results.plugin_columns import Extended
 from vibench.results.sqlite.reading import FILE, read_meta, study_of
 
-AXES = ("problem", "dual", "primal", "asked", "solver", "accuracy", "assembly", "correction")
+AXES = ("problem", "formulation", "dual", "primal", "asked", "solver", "accuracy", "assembly", "correction")
 """Columns that tell cells apart in a comparison; "asked" has all tolerances, or sizes."""
 
 

@@ -14,10 +14,12 @@ from typing import Any, TypeVar
 import numpy as np
 import pandas as pd
 
+from vibench.interfaces.formulations import MIXED
 from vibench.report.figures.looks import Series
 from vibench.results import pictures, tables
 from vibench.results.costs.ranking import too_loose
 from vibench.results.plugin_columns import faults_of
+from vibench.study.cells import NO_SUCH_AXIS
 from vibench.text import json_object
 
 TABLES = ("cells", "queries", "histories", "thresholds", "outputs")
@@ -26,6 +28,9 @@ PAIR = ["pod_tol", "pod_size", "dual_tol", "dual_size"]
 """Tolerances or prescribed sizes that determine the dimensions (N, R)."""
 
 PROBLEM = ["problem", "problem_options"]
+
+NO_CONE = "no cone"
+"""What stands for a dual strategy where a formulation has none."""
 
 PRIMAL = ["primal", "primal_options", "primal_tol"]
 
@@ -117,8 +122,10 @@ def problems(
     read = {name: tables.in_order(given[name] if name in given else extended.pop(name).frame) for name in TABLES}
     if read["queries"].empty:
         return
-    for axis in ("training", "dual", "primal"):
+    for axis in ("training", "formulation", "dual", "primal"):
         _tell_apart(axis, read["cells"], [frame for frame in read.values() if axis in frame])
+    for frame in read.values():
+        _name_formulations(frame)
     read["queries"] = read["queries"].merge(read["cells"][["cell", "enrichment_kind", "N", "R"]], "left", "cell")
     for frame in read.values():
         if "assembly" in frame:
@@ -157,6 +164,21 @@ def _tell_apart(axis: str, cells: pd.DataFrame, frames: list[pd.DataFrame]) -> N
     for frame in frames if labels else ():
         made = _per_combination(frame[columns], lambda *key: labels.get(key, key[0]))
         frame[axis] = made.astype(frame[axis].dtype)
+
+
+def _name_formulations(frame: pd.DataFrame) -> None:
+    """Name other formulations than the mixed one with their primal strategies, which curves and points are told by."""
+    if "formulation" not in frame or not (other := frame["formulation"] != MIXED).any():
+        return
+    for column in ("primal", "primal_b"):
+        if column in frame:
+            made = _per_combination(frame[["formulation", column]], _model_name)
+            frame[column] = frame[column].where(~other, made)
+    frame["dual"] = frame["dual"].where(frame["dual"] != NO_SUCH_AXIS, NO_CONE)
+
+
+def _model_name(formulation: str, primal: str) -> str:
+    return formulation if primal == NO_SUCH_AXIS else f"{formulation} ({primal})"
 
 
 def _per_combination(frame: pd.DataFrame, value: Callable[..., Any]) -> pd.Series:
@@ -238,6 +260,11 @@ def label(name: Any, tolerance: Any = None, way: str = "") -> str:
     return f"{with_tolerance}, {way}" if way else with_tolerance
 
 
+def whole(number: Any) -> str:
+    """A dimension of a model, "–" where it has none."""
+    return NO_SUCH_AXIS if pd.isna(number) else f"{number:.0f}"
+
+
 def label_of(row: Any) -> str:
     """The same of a row of the cells or the queries table."""
     return label(row["primal"], row["primal_tol"], way(row["assembly"], row["correction"]))
@@ -247,7 +274,7 @@ def point_names(cells: pd.DataFrame) -> dict[Any, str]:
     """(N, R) and δ of cells, for labels at their points, by index; of several tolerances only the first has (N, R)."""
     names, named = {}, set()
     for index, cell in cells.iterrows():
-        size = f"({cell['N']:.0f}, {cell['R']:.0f})"
+        size = f"({whole(cell['N'])}, {whole(cell['R'])})"
         tolerance = "" if pd.isna(cell["primal_tol"]) else f"{cell['primal_tol']:g}"
         key = (cell["primal"], cell["dual"], size)
         names[index] = tolerance if tolerance and key in named else size + f", δ = {tolerance}" * bool(tolerance)

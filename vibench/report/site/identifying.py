@@ -26,7 +26,7 @@ PATH = re.compile(r"""(?<![\w./])(?:/[^/\s'"`\\:;,<>|()\[\]{}]+){2,}/?""")
 
 SHOWN = {
     "machines": ("machine",),
-    "labels": ("problem", "training", "dual", "primal", "validation"),
+    "labels": ("problem", "training", "formulation", "dual", "primal", "validation"),
     "options": (*(name for name in KEYS if name.endswith("_options")), "validation_options"),
 }
 """Columns that are said, by what they are called."""

@@ -11,9 +11,10 @@ from typing import Any
 
 import pandas as pd
 
+from vibench.interfaces.formulations import MIXED
 from vibench.report.comparison.runs import ComparedRun
 from vibench.report.figures.data import way
-from vibench.results.formats import asked, cell_text
+from vibench.results.formats import asked, cell_text, solver_text
 from vibench.results.sqlite.reading import FILE
 from vibench.study.kinds import STUDY
 from vibench.study.registry import registered
@@ -102,8 +103,8 @@ class PublishedRun:
             {
                 "key": key,
                 "axes": [
-                    str(row["problem"]), str(row["dual"]), f"{row['primal']}{_tolerance(row)}",
-                    f"{asked(row, 'pod')}, {asked(row, 'dual')}", f"{row['solver']} {row['accuracy']:g}",
+                    str(row["problem"]), str(row["dual"]), f"{_formulation(row)}{row['primal']}{_tolerance(row)}",
+                    f"{asked(row, 'pod')}, {asked(row, 'dual')}", solver_text(row),
                     way(row["assembly"], row["correction"]) or "full",
                 ],
                 "status": str(row["status"]),
@@ -112,6 +113,10 @@ class PublishedRun:
             }
             for key, row in self.run.cells.items()
         ]  # fmt: skip
+
+
+def _formulation(row: Mapping[str, Any]) -> str:
+    return "" if row["formulation"] == MIXED else f"{row['formulation']}: "
 
 
 def _tolerance(row: Mapping[str, Any]) -> str:

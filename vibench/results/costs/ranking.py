@@ -319,6 +319,7 @@ def model_row(cell: Mapping[str, Any], setup: float, solution: float) -> dict[st
     same = ("problem", "problem_options", "machine", "status", "queries", "queries_ok", "accuracy")
     row = dict.fromkeys(cell) | {name: cell.get(name) for name in same}
     row |= {"N": cell.get("dim_V"), "R": cell.get("dim_W"), "primal_options": "{}", "training_options": "{}"}
+    row |= {"formulation": "", "formulation_options": "{}"}
     row |= {"dual_options": "{}", "cell": "", "primal": HIGH_FIDELITY, "dual": "", "training": cell.get("training")}
     row |= {"error_u_mean": 0.0, "error_lambda_mean": 0.0, "offline_s": setup, "online_s": solution, "hf_s": solution}
     return row | {"solver": "", "assembly": "", "correction": "none", "disturbed": 0}
