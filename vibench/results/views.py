@@ -43,9 +43,9 @@ OF_BENEFITS = (
 
 
 OF_TOTALS = (
-    "problem", ranking.BAND, "formulation", "primal", "primal_tol", "dual", "total_s", "probability", "cheapest_from", "ties",
-    "cell", "error_lambda_mean", "certified_error", "error_u_mean", "assembly", "total_high_s", "cheapest_until", "solver", "N",
-    "R", "correction", "offline_s", "online_s", "training", "accuracy",
+    "problem", ranking.BAND, "formulation", "primal", "primal_tol", "dual", "total_s", "probability", "cheapest_from",
+    "ties", "cell", "error_lambda_mean", "certified_error", "error_u_mean", "assembly", "total_high_s",
+    "cheapest_until", "solver", "N", "R", "correction", "offline_s", "online_s", "training", "accuracy",
 )  # fmt: skip
 
 

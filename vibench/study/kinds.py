@@ -40,7 +40,7 @@ class PluginKind(StrEnum):
         "dual strategy", "dual", "dual_strategies", "dual", "strategy", "vibench.interfaces.strategies:DualStrategy",
     )  # fmt: skip
     FORMULATION = (
-        "formulation", "formulations", "formulations", "", "formulation",
+        "formulation", "formulations", "formulations", "formulation", "formulation",
         "vibench.interfaces.formulations:Formulation",
     )  # fmt: skip
     FIGURE = "figure plugin", "figures", "figures", "figure", "figures", "vibench.interfaces.figures:FigurePlugin"

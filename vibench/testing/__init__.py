@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 from vibench.testing.checks import SECONDS, CheckResult, ConformanceError, Verdict
 from vibench.testing.duals import DUAL
+from vibench.testing.formulations import FORMULATION
 from vibench.testing.primals import PRIMAL
 from vibench.testing.problems import PROBLEM
-from vibench.testing.sample_problem import MovingSupport, sample_offline, sample_snapshots
+from vibench.testing.sample_problem import MovingSupport, sample_offline, sample_reduction, sample_snapshots
 from vibench.testing.samplings import SAMPLING
 from vibench.testing.solvers import SOLVER
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     check_figure, examine_figure = FIGURE.check, FIGURE.examine
 
 check_dual, examine_dual = DUAL.check, DUAL.examine
+check_formulation, examine_formulation = FORMULATION.check, FORMULATION.examine
 check_primal, examine_primal = PRIMAL.check, PRIMAL.examine
 check_problem, examine_problem = PROBLEM.check, PROBLEM.examine
 check_sampling, examine_sampling = SAMPLING.check, SAMPLING.examine
@@ -36,8 +38,9 @@ check_solver, examine_solver = SOLVER.check, SOLVER.examine
 
 __all__ = [
     "SECONDS", "CheckResult", "ConformanceError", "MovingSupport", "Verdict", "check_dual", "check_figure",
-    "check_primal", "check_problem", "check_sampling", "check_solver", "examine_dual", "examine_figure",
-    "examine_primal", "examine_problem", "examine_sampling", "examine_solver", "sample_offline", "sample_snapshots",
+    "check_formulation", "check_primal", "check_problem", "check_sampling", "check_solver", "examine_dual",
+    "examine_figure", "examine_formulation", "examine_primal", "examine_problem", "examine_sampling", "examine_solver",
+    "sample_offline", "sample_reduction", "sample_snapshots",
 ]  # fmt: skip
 
 

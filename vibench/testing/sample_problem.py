@@ -11,11 +11,12 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, SparseMatrix
 from vibench.interfaces.problem import ParameterBox, Problem, VariationalInequality
-from vibench.interfaces.strategies import Cone, DualStrategy, Offline, Stop
+from vibench.interfaces.strategies import Cone, DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, Stop
 from vibench.linalg.inner_product import InnerProduct
 from vibench.offline.reduction import Reduction
 from vibench.offline.sweep import Snapshots, high_fidelity_sweep
 from vibench.reduction.cones import greedy_cone
+from vibench.reduction.supremizers import supremizers
 from vibench.testing.comparisons import Arrays
 
 NODES, CONSTRAINTS = 40, 14
@@ -79,6 +80,19 @@ def sample_offline(modes: int = 4, generators: int = 6) -> Offline:
     """A reduced model of the sample problem to enrich: N POD modes and a greedy cone of R generators."""
     reduction = Reduction(MovingSupport(), _Greedy(), None, Stop(size=modes), Stop(size=generators))
     return reduction.given(snapshots=_snapshots()).offline
+
+
+class _Supremizers(PrimalStrategy):
+    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:  # noqa: ARG002
+        """The supremizers of one training parameter."""
+        V, B = offline.problem.V, offline.problem.constraint(offline.training[0])[0]
+        return Enrichment(Kind.FIXED, vectors=V.orthonormalise(supremizers(V, B, offline.span), offline.basis))
+
+
+def sample_reduction(modes: int = 8, generators: int = 8) -> Reduction:
+    """An offline phase of the sample problem with all its steps, for formulations: N modes, R generators, enriched."""
+    stops = Stop(size=modes), Stop(size=generators)
+    return Reduction(MovingSupport(), _Greedy(), _Supremizers(), *stops).given(snapshots=_snapshots())
 
 
 def copy_of(offline: Offline) -> Offline:

@@ -1,0 +1,340 @@
+"""The conformance checks of formulations: axes, what is built, answers, the pairs that they stand for, and status."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import KW_ONLY, dataclass, replace
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.errors import NumericalError, RequestError, VibenchError
+from vibench.interfaces.formulations import (
+    Formulation,
+    FormulationAnswer,
+    FormulationModel,
+    Multiplier,
+    Outcome,
+    axes_of,
+)
+from vibench.interfaces.strategies import Cone, no_free
+from vibench.model.high_fidelity_residuals import residual_multiplier
+from vibench.offline.assemblies import assemblies
+from vibench.offline.formulated import ACCURACY, CellSolver, Formulated, check_built
+from vibench.offline.reduction import Reduction
+from vibench.qp.status import Status
+from vibench.storage.serialisation import dumps, loads
+from vibench.testing.case import Case
+from vibench.testing.checks import Check, Conformance, ConformanceError, Note
+from vibench.testing.comparisons import Arrays, at, difference, differences, largest_entry, unmutated
+from vibench.testing.sample_problem import sample_reduction
+
+SOLVER = "piqp"
+"""The QP solver of the queries."""
+
+POINTS = 4
+"""Random parameters beside the centre of the box and a training parameter."""
+
+AGREEMENT = 1e-3
+"""Largest difference of u, relative to its largest entry, of an answer that started from another one."""
+
+STEPS = {
+    "pod": ("pod",), "dual": ("cone", "multipliers"), "primal": ("enrichment",), "assembly": ("assembled", "operators",
+    "members"),
+}  # fmt: skip
+"""Attributes of an offline phase whose use shows that a formulation has an axis."""
+
+
+@dataclass(frozen=True)
+class Answered:
+    """The answer of a query with the solver that it was given, and its pair u (n,), λ (m,)."""
+
+    answer: FormulationAnswer
+    solver: CellSolver
+    pair: tuple[Array, Array | None]
+
+
+@dataclass(eq=False)
+class FormulationCase(Case[Formulation, Array, Answered]):
+    """A formulation, parameters, and what it answers there on an offline phase.
+
+    Parameters
+    ----------
+    create
+        Class, or `partial` of it with options; an instance is refused with a `TypeError`.
+    offline
+        The offline phase; by default one of a sample problem.
+    seconds
+        Longest wall time [s] of one call.
+    """
+
+    base = Formulation
+    offline: Reduction | None = None
+    _: KW_ONLY
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._made: dict[int, tuple[Formulation, Formulated]] = {}
+
+    @cached_property
+    def whole(self) -> Reduction:
+        """The offline phase with all axes."""
+        return self.offline or sample_reduction()
+
+    def phase(self, plugin: Formulation) -> _Seen:
+        """The offline phase that a formulation gets: without what it does not use."""
+        uses, whole = axes_of(plugin, f"{type(plugin).__name__}"), self.whole
+        pod, dual, primal = (axis in uses for axis in ("pod", "dual", "primal"))
+        given: dict[str, Any] = {"snapshots": whole.snapshots}
+        given |= {"pod": whole.pod} if pod else {}
+        given |= {"cone": whole.cone, "multipliers": whole.multipliers} if dual else {}
+        given |= {"enrichment": whole.enrichment} if primal else {}
+        return _Seen(
+            whole.problem,
+            whole.dual if dual else None,
+            whole.primal if primal else None,
+            whole.modes if pod else None,
+            whole.generators if dual else None,
+            whole.tolerance if primal else None,
+        ).given(**given)  # type: ignore[return-value]  # it makes one of its own class
+
+    @cached_property
+    def arguments(self) -> dict[str, Array]:
+        """A training parameter, the centre of the box, and random parameters."""
+        box = self.whole.problem.parameters
+        fixed = np.stack([self.whole.snapshots.mu[0], 0.5 * (box.lower + box.upper)])
+        return {at(mu): mu for mu in np.concatenate([fixed, box.sample(POINTS, self.seed)])}
+
+    def formulated(self, plugin: Formulation) -> Formulated:
+        """The model of an instance, from what it has built once that was stored."""
+        if id(plugin) not in self._made:
+            offline = self.phase(plugin)
+            built = self.clocked("building", lambda: check_built(plugin.build(offline)))
+            self._made[id(plugin)] = plugin, self._of(plugin, offline, loads(dumps(dict(built))))
+        return self._made[id(plugin)][1]
+
+    @staticmethod
+    def _of(plugin: Formulation, offline: Reduction, built: Mapping[str, Any]) -> Formulated:
+        uses = axes_of(plugin, type(plugin).__name__)
+        return Formulated(plugin, offline, built, SOLVER if "solvers" in uses else None, ACCURACY)
+
+    def evaluate(self, argument: Array, plugin: Formulation | None = None) -> Answered:
+        """The answer at a parameter (d,), and its pair."""
+        of, mu = self.formulated(plugin or self.plugin), argument.copy()
+        asked, solver = of.asked()
+        answer = self.clocked("a query", lambda: of.model.solve(mu, asked))
+        return Answered(answer, solver, of.model.reconstruct(argument.copy(), answer))
+
+    def arrays(self, result: Answered) -> Arrays:
+        """Coefficients and pair."""
+        named = {"x": result.answer.x, "alpha": result.answer.alpha, "u": result.pair[0], "λ": result.pair[1]}
+        return {name: value for name, value in named.items() if value is not None}
+
+    def stored(self, result: Answered) -> Answered:
+        """A result as results have it: the coefficients of the answer alone."""
+        answer = result.answer
+        coefficients = loads(dumps({"x": answer.x, "alpha": answer.alpha}))
+        return replace(result, answer=replace(answer, **coefficients))
+
+    def axes(self) -> Iterator[str]:
+        """`uses`, `multiplier` and `takes_start` are declared as they should be."""
+        plugin = self.plugin
+        try:
+            uses = axes_of(plugin, type(plugin).__name__)
+        except RequestError as error:
+            raise ConformanceError(str(error)) from None
+        if not isinstance(plugin.multiplier, Multiplier):
+            yield f"multiplier is {plugin.multiplier!r}; expected a vibench.Multiplier"
+        if not isinstance(plugin.takes_start, bool):
+            yield f"takes_start is {plugin.takes_start!r}; expected True or False"
+        yield Note(f"uses {', '.join(uses) or 'no axis'}; λ is {plugin.multiplier}")
+
+    def build(self) -> Iterator[str]:
+        """`build` returns a dictionary of what can be stored."""
+        try:
+            built = check_built(self.plugin.build(self.phase(self.plugin)))
+        except NumericalError as error:
+            raise ConformanceError(str(error)) from None
+        for name, value in built.items():
+            try:
+                dumps(value)
+            except NumericalError as error:
+                yield f"what `build` returns as '{name}' cannot be stored: {error}"
+
+    def model(self) -> None:
+        """`model` makes a `FormulationModel` that says how many coefficients its answers have."""
+        try:
+            self.formulated(self.plugin).model  # noqa: B018  is made and checked
+        except NumericalError as error:
+            raise ConformanceError(str(error)) from None
+
+    def answers(self) -> Iterator[str]:
+        """Answers are finite vectors of at most the sizes declared, with an outcome, and most are ok."""
+        model, outcomes = self.formulated(self.plugin).model, list[Outcome]()
+        for name, mu in self.arguments.items():
+            of = self.formulated(self.plugin)
+            answer: object = of.model.solve(mu.copy(), of.asked()[0])
+            if not isinstance(answer, FormulationAnswer):
+                yield f"{name}: `solve` returns a {type(answer).__name__}; expected a vibench.FormulationAnswer"
+                return
+            yield from (f"{name}: {fault}" for fault in _faults_of(answer, model))
+            outcomes.append(answer.outcome)
+        if Outcome.OK not in outcomes:
+            yield f"no answer at {len(outcomes)} parameters is ok: the outcomes are {', '.join(map(str, outcomes))}"
+
+    def pairs(self) -> Iterator[str]:
+        """`reconstruct` gives u (n,) and λ (m,) ≥ 0; λ is `None` exactly for `Multiplier.RESIDUAL`."""
+        for name, mu in self.arguments.items():
+            of = self.formulated(self.plugin)
+            asked, solver = of.asked()
+            answer = of.model.solve(mu.copy(), asked)
+            if answer.outcome is not Outcome.OK:
+                continue
+            try:
+                found = of.judged(mu, answer, solver)
+            except NumericalError as error:
+                yield f"{name}: {error}"
+                continue
+            if found.status is not Status.OK:
+                yield f"{name}: {found.reason}"
+
+    def coefficients(self) -> Iterator[str]:
+        """`reconstruct` needs x and alpha alone: another model gives the same pair, which has solved nothing."""
+        offline = self.formulated(self.plugin).offline
+        for name, result in self.results.items():
+            fresh = self._of(self.plugin, offline, self.formulated(self.plugin).built).model
+            kept = FormulationAnswer(result.answer.x, result.answer.alpha)
+            again = replace(result, pair=fresh.reconstruct(self.arguments[name].copy(), kept))
+            for array, what in differences(self.arrays(again), self.arrays(result)):
+                yield f"{name}: reconstructed from x and alpha by another model, {array} differs: {what}"
+
+    def plausible(self) -> Iterator[str]:
+        """At a training parameter an ok answer is nearer to the solution than u = 0 and λ = 0 are."""
+        name, result = next(iter(self.results.items()))
+        if result.answer.outcome is not Outcome.OK:
+            yield Note(f"not compared: the outcome {name} is {result.answer.outcome}")
+            return
+        problem, snapshots, mu = self.whole.problem, self.whole.snapshots, self.arguments[name]
+        kept = assemblies(problem)
+        energy, vi, u = kept.energy_at(mu), kept.at(mu), result.pair[0]
+        lam = residual_multiplier(vi, energy, u) if result.pair[1] is None else result.pair[1]
+        on = energy.on_contact(vi)
+        of_u = energy.norm(u - snapshots.u[:, 0]) / energy.norm(snapshots.u[:, 0])
+        of_lam = on.of_force(lam - snapshots.lam[:, 0]).norm / on.of_force(snapshots.lam[:, 0]).norm
+        for what, error in (("u", of_u), ("λ", of_lam)):
+            if not error < 1.0:
+                yield f"{name}, a training parameter, the error of {what} is {error:.2g} of it: zero would be nearer"
+        yield Note(f"at a training parameter, errors of {of_u:.1e} (u) and {of_lam:.1e} (λ)")
+
+    def axes_used(self) -> Iterator[str]:
+        """What `uses` declares is used: cells would be repeated over an axis on which nothing depends."""
+        self.results  # noqa: B018  the first use builds and asks
+        of = self.formulated(self.plugin)
+        assert isinstance(of.offline, _Seen)
+        for axis in axes_of(self.plugin, type(self.plugin).__name__):
+            if axis == "solvers" and all(result.solver.last is None for result in self.results.values()):
+                yield "uses declares 'solvers', but no query calls `asked.solve_qp`"
+            elif axis in STEPS and of.offline.seen.isdisjoint(STEPS[axis]):
+                yield f"uses declares '{axis}', but nothing is made of offline.{STEPS[axis][0]}"
+
+    def starts(self) -> Iterator[str]:
+        """An answer that starts from another one is the same up to the accuracy."""
+        if not self.plugin.takes_start:
+            yield Note("not declared")
+            return
+        of, (first, *others) = self.formulated(self.plugin), self.results.items()
+        for name, result in others:
+            warm = of.model.solve(self.arguments[name].copy(), of.asked(first[1].answer)[0])
+            u = of.model.reconstruct(self.arguments[name].copy(), warm)[0]
+            if what := difference(u, result.pair[0], AGREEMENT * largest_entry(result.pair[0])):
+                yield f"{name}: started from the answer {first[0]}, u differs: {what}"
+
+    def no_mutation(self) -> None:
+        """Neither `build` nor a query changes what it is given."""
+        plugin, offline = self.plugin, self.phase(self.plugin)
+        watched = {"offline.snapshots.u": offline.snapshots.u, "offline.snapshots.lam": offline.snapshots.lam}
+        built = unmutated("build", watched, partial(plugin.build, offline))
+        of = self._of(plugin, offline, built)
+        for mu in self.arguments.values():
+            given = mu.copy()
+            asked, _ = of.asked()
+            answer = unmutated("solve", {"its argument mu": given}, lambda: of.model.solve(given, asked))  # noqa: B023
+            arrays = {name: array for name in ("x", "alpha") if (array := getattr(answer, name)) is not None}
+            unmutated("reconstruct", arrays | {"its argument mu": given}, lambda: of.model.reconstruct(given, answer))  # noqa: B023
+
+    def without_contact(self) -> Iterator[str]:
+        """Snapshots without contact are accepted, or refused in one line."""
+        offline, m = self.phase(self.plugin), self.whole.problem.W.dim
+        none = replace(offline.snapshots, lam=np.zeros_like(offline.snapshots.lam))
+        empty = {"cone": Cone(np.zeros((m, 0)), np.zeros(1), no_free(0))} if offline.dual is not None else {}
+        steps = {"snapshots": none} | ({"pod": self.whole.pod} if offline.modes is not None else {}) | empty
+        mu = next(iter(self.arguments.values())).copy()
+        try:
+            given = replace(offline, primal=None, tolerance=None).given(**steps)
+            of = self._of(self.plugin, given, check_built(self.plugin.build(given)))
+            asked, solver = of.asked()
+            found = of.judged(mu, of.model.solve(mu.copy(), asked), solver)
+        except VibenchError:  # a formulation may refuse it in one line
+            return
+        if found.status in (Status.NONFINITE, Status.ERROR) or "broken" in found.reason:
+            yield f"from snapshots without contact, {found.status}: {found.reason}"
+
+
+class _Seen(Reduction):
+    """An offline phase that notes which of its attributes were asked for."""
+
+    @property
+    def seen(self) -> set[str]:
+        """Names of the attributes."""
+        noted: set[str] = self.__dict__.setdefault("_noted", set())
+        return noted
+
+    def __getattribute__(self, name: str) -> Any:
+        if not name.startswith("_") and name != "seen":
+            self.seen.add(name)
+        return super().__getattribute__(name)
+
+
+def _faults_of(answer: FormulationAnswer, model: FormulationModel) -> Iterator[str]:
+    """What is wrong with an answer, but for the pair that it stands for."""
+    if not isinstance(answer.outcome, Outcome):
+        yield f"the outcome is {answer.outcome!r}; expected a vibench.Outcome"
+        return
+    if answer.outcome is Outcome.OK and answer.x is None:
+        yield "the outcome is ok, and there is no x"
+    if answer.outcome is not Outcome.OK and not answer.reason:
+        yield f"the outcome is {answer.outcome}, without a reason"
+    for name, vector, most in (("x", answer.x, model.dimension), ("alpha", answer.alpha, model.generators or 0)):
+        if vector is None:
+            continue
+        if not isinstance(vector, np.ndarray) or vector.ndim != 1 or vector.dtype != np.float64:
+            yield f"{name} is {type(vector).__name__} of shape {np.shape(vector)}; expected a vector of float64"
+        elif len(vector) > most:
+            declared = "dimension" if name == "x" else "generators"
+            yield f"{name} has {len(vector)} coefficients, more than `{declared}` of the model, {most}"
+        elif answer.outcome is Outcome.OK and not np.all(np.isfinite(vector)):
+            yield f"{name} is not finite: entry {int(np.argmin(np.isfinite(vector)))}"
+
+
+FORMULATION = Conformance("formulation", FormulationCase, (
+    Check("construction", FormulationCase.construction),
+    Check("options", FormulationCase.options, ("construction",)),
+    Check("axes", FormulationCase.axes, ("construction",)),
+    Check("build", FormulationCase.build, ("axes",)),
+    Check("model", FormulationCase.model, ("build",)),
+    Check("answers", FormulationCase.answers, ("model",)),
+    Check("pairs", FormulationCase.pairs, ("answers",)),
+    Check("determinism", FormulationCase.determinism, ("pairs",)),
+    Check("coefficients", FormulationCase.coefficients, ("determinism",)),
+    Check("errors", FormulationCase.plausible, ("pairs",)),
+    Check("axes in use", FormulationCase.axes_used, ("pairs",)),
+    Check("starts", FormulationCase.starts, ("pairs",)),
+    Check("no mutation", FormulationCase.no_mutation, ("pairs",)),
+    Check("snapshots without contact", FormulationCase.without_contact, ("pairs",)),
+    Check("another process", FormulationCase.another_process, ("determinism",)),
+    Check("pickling", FormulationCase.pickling, ("determinism",)),
+    Check("time", FormulationCase.duration, ("answers",)),
+))  # fmt: skip
