@@ -18,7 +18,7 @@ import typer
 
 from vibench.errors import VibenchError
 from vibench.results.columns import TABLES
-from vibench.study.kinds import CHECKED, SOLVER, STUDY, PluginKind
+from vibench.study.kinds import CHECKED, FORMULATION, SOLVER, STUDY, PluginKind
 
 SHOWN = ("summary", "best", "benefits", *TABLES)
 """Tables that `vibench show` prints."""
@@ -139,6 +139,13 @@ def words(choices: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
 def names(*kinds: PluginKind) -> Callable[[str], list[str]]:
     """Completes names of plugins of some kinds."""
     return words(lambda: _registered(*kinds))
+
+
+def formulations(incomplete: str) -> list[str]:
+    """Completes names of formulations, `mixed` among them."""
+    from vibench.interfaces.formulations import MIXED
+
+    return _beginning(incomplete, [MIXED, *_registered(FORMULATION)])
 
 
 def plugins(incomplete: str) -> list[str]:

@@ -18,7 +18,7 @@ from typer import Argument, Option
 
 from vibench.cli import output_commands
 from vibench.cli.bench_command import bench_plugins
-from vibench.cli.completion import CORRECTIONS, examples, names, solvers, studies, whole_words, words
+from vibench.cli.completion import CORRECTIONS, examples, formulations, names, solvers, studies, whole_words, words
 from vibench.cli.output_commands import draw_figures, export_qps, export_reduced_model, publish_runs, write_report
 from vibench.cli.pack_commands import import_pack, pack_problem, reduce_cones
 from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
@@ -78,6 +78,7 @@ def run_study_command(
     problem: Annotated[
         Names, Option(help="Replace the problems of the study (repeatable).", autocompletion=names(PROBLEM))
     ] = None,
+    formulation: Annotated[Names, Option(help="Replace the formulations.", autocompletion=formulations)] = None,
     dual: Annotated[Names, Option(help="Replace the dual strategies.", autocompletion=names(DUAL))] = None,
     primal: Annotated[Names, Option(help="Replace the primal strategies.", autocompletion=names(PRIMAL))] = None,
     solver: Annotated[Names, Option(help="Replace the QP solvers.", autocompletion=solvers)] = None,
@@ -113,8 +114,8 @@ def run_study_command(
         from vibench.terminal.progress import ProgressDisplay
 
         overrides = {
-            "problem": problem, "dual": dual, "primal": primal, "solvers": solver, "correction": correction,
-            "pod": pod_tol, "dual_tol": dual_tol, "primal_tol": primal_tol,
+            "problem": problem, "formulation": formulation, "dual": dual, "primal": primal, "solvers": solver,
+            "correction": correction, "pod": pod_tol, "dual_tol": dual_tol, "primal_tol": primal_tol,
         }  # fmt: skip
         loaded = _study(study, cell, {axis: values for axis, values in overrides.items() if values}, at)
     if dry_run:

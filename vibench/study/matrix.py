@@ -50,8 +50,9 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
     request
         Path of a TOML file, or the name of a registered study.
     overrides
-        Values that replace those of the file: of the axes "problem", "dual", "primal", "solvers" and "correction", and
-        of the tolerances "pod", "dual_tol" and "primal_tol" in every table. Empty sequences replace nothing.
+        Values that replace those of the file: of the axes "problem", "formulation", "dual", "primal", "solvers" and
+        "correction", and of the tolerances "pod", "dual_tol" and "primal_tol" in every table. Empty sequences replace
+        nothing.
 
     Raises
     ------
@@ -105,7 +106,7 @@ def _anchor_options(kind: PluginKind, entry: dict[str, Any], folder: Path) -> No
 
 def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> dict[str, Any]:
     """The content of a study file, not checked yet, with the axes and tolerances given on the command line."""
-    for axis in ("problem", "dual", "primal", "solvers"):
+    for axis in ("problem", "formulation", "dual", "primal", "solvers"):
         if axis in given:
             content[axis] = [entry for name in given[axis] for entry in _entries_in(content.get(axis), name)]
     content |= {axis: given[axis] for axis in ("correction",) if axis in given}

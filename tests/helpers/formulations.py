@@ -1,0 +1,70 @@
+"""Formulations that are right, for tests: the mixed one as a plugin, and one that has no multiplier."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+
+from vibench import Array, Asked, Formulation, FormulationAnswer, FormulationModel, Multiplier, Reduction
+
+
+class Program(Formulation):
+    """The quadratic program of the mixed formulation, as a third party would write it."""
+
+    takes_start: ClassVar[bool] = False
+
+    def build(self, offline: Reduction) -> Mapping[str, Any]:
+        return {}
+
+    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+        return ProgramModel(offline)
+
+
+class ProgramModel(FormulationModel):
+    def __init__(self, offline: Reduction) -> None:
+        self.assembled = offline.assembled
+        self.dimension = self.assembled.fixed_basis.shape[1] + offline.multipliers.rank
+        self.generators = self.assembled.generators.shape[1]
+
+    def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
+        reduced = self.assembled.assemble(mu)
+        found = asked.solve_qp(reduced.program, factor=reduced.factor)
+        if found.x is None or found.alpha is None:
+            return FormulationAnswer.none(found.solver_status)
+        return FormulationAnswer(found.x, found.alpha, iterations=found.iterations)
+
+    def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
+        assert answer.x is not None
+        assert answer.alpha is not None
+        u = self.assembled.assemble(mu).reconstruct(answer.x[:, None])[:, 0]
+        return np.asarray(u), np.asarray(self.assembled.generators @ answer.alpha)
+
+
+class Nearest(Formulation):
+    """The displacement of the nearest training parameter; λ is what is left to balance its residual."""
+
+    uses: ClassVar[tuple[str, ...]] = ()
+    multiplier: ClassVar[Multiplier] = Multiplier.RESIDUAL
+
+    def build(self, offline: Reduction) -> Mapping[str, Any]:
+        return {"u": offline.snapshots.u, "mus": offline.snapshots.mu}
+
+    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+        return NearestModel(built["u"], built["mus"], offline.problem.parameters.widths)
+
+
+class NearestModel(FormulationModel):
+    dimension = 1
+
+    def __init__(self, u: Array, mus: Array, widths: Array) -> None:
+        self.u, self.mus, self.widths = u, mus, widths
+
+    def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
+        nearest = int(np.argmin(np.linalg.norm((self.mus - mu) / self.widths, axis=1)))
+        return FormulationAnswer(np.array([float(nearest)]), uncertainty=0.5)
+
+    def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
+        assert answer.x is not None
+        return self.u[:, int(answer.x[0])].copy(), None
