@@ -180,6 +180,8 @@ class Unpicklable(Program):
 class Misbehaves(Program):
     """Misbehaves at every parameter whose first component is in the upper half of the box."""
 
+    uses: ClassVar[tuple[str, ...]] = ("pod", "dual", "primal", "solvers", "accuracy")
+
     def __init__(self, how: str = "nan") -> None:
         self.how = how
 

@@ -91,7 +91,12 @@ def cell_row(cell: str = "c1", **columns: Any) -> dict[str, Any]:
     """A row of the cells table in which every column is filled."""
     samples = {"TEXT": "text", "REAL": 0.5, "INTEGER": 3}
     row = {name: samples[column.kind.split()[0]] for name, column in CELLS.items()}
-    return row | {"cell": cell, "status": "ok", "enrichment_kind": "fixed", "versions": "{}"} | columns
+    return (
+        row
+        | {"cell": cell, "status": "ok", "enrichment_kind": "fixed", "versions": "{}"}
+        | {"formulation": "mixed"}
+        | columns
+    )
 
 
 def row_of(cell: str, error: float | None, online: float | None, **more: Any) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vibench import provenance
+from vibench.results.columns import KEYS
 from vibench.results.database import ResultsDatabase
 from vibench.rounds.timed_seconds import TimedRound, seconds_of_cell, seconds_of_queries
 from vibench.stages.base import Row, Stage, value_of
@@ -97,7 +98,8 @@ def cell_columns(cell: Cell) -> dict[str, Any]:
     if cell.formulation is not None:
         how["formulation_options"] = cell.formulation.options
     solved = {"solver": cell.solver or NO_SUCH_AXIS, "accuracy": cell.accuracy, "assembly": cell.assembly}
-    return axis_columns(cell.axes, labels_of([cell])) | without | how | solved | {"correction": cell.correction}
+    columns = axis_columns(cell.axes, labels_of([cell])) | without | how | solved | {"correction": cell.correction}
+    return {name: columns.get(name) for name in KEYS}
 
 
 def labels_of(cells: Iterable[Cell]) -> dict[Plugin, str]:

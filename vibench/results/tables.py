@@ -227,7 +227,7 @@ def says_something(frame: pd.DataFrame, name: str) -> bool:
     if name == "accuracy":
         return bool(frame[name].nunique() > 1)
     if name in USUAL:
-        return bool((~frame[name].isin([USUAL[name], ""])).any())
+        return bool((~frame[name].dropna().isin([USUAL[name], ""])).any())
     if name in ("training", "snapshots"):
         return bool(frame["training"].nunique() > 1)
     if name == "rounds_missing":

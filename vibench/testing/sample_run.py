@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Kind
 from vibench.results.columns import CELLS, HISTORY_KEYS, INTEGER, OUTPUTS, QUERIES, REAL, TEXT, TIMINGS, Column
 from vibench.results.costs.break_even import break_even_rows
@@ -70,8 +71,9 @@ HISTORIES = (
 
 
 def _keys(problem: str, dual: str, primal: str, tolerance: float | None) -> Row:
-    options = {f"{axis}_options": "{}" for axis in ("problem", "training", "dual", "primal")}
+    options = {f"{axis}_options": "{}" for axis in ("problem", "training", "formulation", "dual", "primal")}
     own = {"problem": problem, "training": "own", "dual": dual, "primal": primal, "primal_tol": tolerance}
+    own["formulation"] = MIXED
     stops = {"pod_tol": 1e-3, "pod_size": None, "dual_tol": 1e-2, "dual_size": None}
     return options | own | stops | {"solver": "piqp", "accuracy": 1e-8, "assembly": "full", "correction": "none"}
 

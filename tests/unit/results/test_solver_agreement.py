@@ -67,6 +67,7 @@ def test_two_solvers_far_apart_are_flagged_at_their_query() -> None:
 def test_only_ok_answers_of_the_same_reduced_model_are_compared() -> None:
     def cell(key: str, solver: str, model: str | None) -> dict[str, object]:
         names = {"cell": key, "solver": solver, "model": model, "dual": f"of {model}", "accuracy": 1e-7}
+        names["formulation"] = "mixed"
         return dict.fromkeys(KEYS) | names
 
     cells = [cell("1", "a", "m"), cell("2", "b", "m"), cell("3", "b", "other"), cell("4", "c", None)]

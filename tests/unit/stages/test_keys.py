@@ -21,6 +21,7 @@ from vibench.rounds.offline_repeats import OfflineRepeat
 from vibench.rounds.timing_rounds import TimingRounds
 from vibench.stages.base import Result, Stage, build_problem
 from vibench.stages.cell_queries import cell_queries
+from vibench.stages.formulations import FormulationQueries, FormulationStage
 from vibench.stages.pictures import PictureStage
 from vibench.stages.snapshots import fingerprint_here
 from vibench.storage.artefacts import Artefact, Store
@@ -141,10 +142,16 @@ def concrete(kind: type) -> Iterator[type[Stage]]:
         yield from concrete(one)
 
 
+def test_the_key_of_a_formulation_has_the_code_that_makes_its_model() -> None:
+    """The plugin's own code, and what that uses, is in its version."""
+    used = modules_used(*FormulationStage.code())
+    assert {f"vibench.{name}" for name in ("offline.formulated", "offline.reduction", "stages.formulations")} <= used
+
+
 @pytest.mark.skipif(not COMPILED, reason="NO C COMPILER (cc): programs are not compiled")
 def test_every_sort_of_stage_is_among_them() -> None:
-    """But repeats, which run the code of the stages in their keys."""
-    kinds = set(concrete(Stage)) - {OfflineRepeat}
+    """But repeats, which run the code of the stages in their keys, and formulations, which are plugins."""
+    kinds = set(concrete(Stage)) - {OfflineRepeat, FormulationStage, FormulationQueries}
     assert {type(stage) for stage in [*stages_of(TRAINED), *stages_of(ADAPTIVE)]} == kinds
 
 

@@ -163,6 +163,7 @@ SAMPLE = Cell(
 )
 
 SAMPLING = Plugin("sampling strategy", "s", "{}", "package 1")
+FORMULATION = Plugin("formulation", "f", "{}", "package 1")
 
 OTHER: Mapping[str, Mapping[str, Any]] = {
     "problem": {"problem": replace(SAMPLE.problem, name="other")},
@@ -188,12 +189,14 @@ OTHER: Mapping[str, Mapping[str, Any]] = {
     "training": {"training": ParameterSet("training", sampling=SAMPLING)},
     "training options": {"training": ParameterSet("training", sampling=replace(SAMPLING, options='{"a": 1}'))},
     "validation sampling": {"validation": ParameterSet("validation", 8, 1, SAMPLING)},
+    "formulation": {"formulation": FORMULATION},
+    "formulation options": {"formulation": replace(FORMULATION, options='{"a": 1}')},
 }
 
 
 def test_the_cases_cover_every_member_of_a_cell() -> None:
     covered = {name for change in OTHER.values() for name in change}
-    assert covered | {"labels", "nested_tolerances"} == {field.name for field in fields(Cell)}
+    assert covered | {"labels", "nested_tolerances", "formulation_label"} == {field.name for field in fields(Cell)}
 
 
 @pytest.mark.parametrize("case", OTHER)
@@ -223,9 +226,11 @@ def test_the_key_of_a_cell_with_the_sets_of_its_problem_is_what_it_was_before_th
     })  # fmt: skip
 
 
-@pytest.mark.parametrize("axis", ["problem", "dual", "primal", "training", "validation"])
+@pytest.mark.parametrize("axis", ["problem", "dual", "primal", "formulation", "training", "validation"])
 def test_the_code_changes_with_every_plugin(axis: str) -> None:
     def code(version: str) -> str:
+        if axis == "formulation":
+            return replace(SAMPLE, formulation=replace(FORMULATION, code=version)).code
         part = getattr(SAMPLE, axis)
         if isinstance(part, ParameterSet):
             return replace(SAMPLE, **{axis: replace(part, sampling=replace(SAMPLING, code=version))}).code

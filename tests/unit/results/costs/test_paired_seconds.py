@@ -108,7 +108,8 @@ def test_intervals_of_cells_whose_rounds_end_when_they_are_decided_contain_the_t
 def runs_of_break_even(kind: str, offline_noise: float, rng: np.random.Generator) -> Iterator[bool]:
     """Whether the intervals of break-even numbers contain the true ones, in a run whose offline noise is known."""
     rows, truth = measured(kind, 4, 6, rng)
-    keys = ("problem", "problem_options", "training", "training_options", "dual", "dual_options", "pod_tol", "pod_size",
+    keys = ("problem", "problem_options", "training", "training_options", "formulation",
+            "formulation_options", "dual", "dual_options", "pod_tol", "pod_size",
             "dual_tol", "dual_size", "solver", "accuracy", "correction", "primal_options", "validation",
             "validation_options", "machine")  # fmt: skip
     cells, numbers = [], {}

@@ -1,0 +1,142 @@
+"""Formulations in studies: the mixed one as a plugin gives its numbers, and misbehaviour costs its own rows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from broken_formulations import Misbehaves
+from fake_plugins import Wire
+from formulations import Nearest, Program
+
+from vibench import RequestError, Run, Study, open_run, run
+from vibench.study.cells import Cell
+from vibench.study.matrix import expand, study_of_cell
+
+SECONDS = ("offline", "online", "hf_s", "total", "solve", "assemble", "certify")
+
+HOW = ("nan", "raises", "size", "pulls", "hangs", "dies")
+"""What `Misbehaves` does at forces above 6, those of queries 0 and 2."""
+
+REASONS = {
+    "nan": ("nonfinite", "x of the answer is not finite"),
+    "raises": ("error", "ArithmeticError: no pivot"),
+    "size": ("error", "`reconstruct` returned a u of float64 and the shape (11,), expected float64 and (12,)"),
+    "pulls": ("failed", "a broken answer: λ has negative coefficients, as -"),
+    "hangs": ("timeout", "stopped after query_seconds = 0.5 s"),
+    "dies": ("crashed", "the worker process died with signal SIGKILL"),
+}
+
+
+def study(**axes: Any) -> Study:
+    """A study of the wire."""
+    content = {
+        "name": "formulations", "seed": 3, "validation": 4, "problem": [Wire], "dual": ["cpg", "mcpg"],
+        "primal": ["decorrelated", "online-supremizers"], "solvers": ["piqp", "osqp"], "timing_rounds": 2,
+        "timing_rounds_min": 1, "tolerances": [{"pod": [1e-3], "dual": [1e-2, 1e-3]}],
+    }  # fmt: skip
+    return Study(**content | axes)
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """The mixed formulation, the same as a plugin, one without axes, and one of every way to misbehave."""
+    bad = [{"name": Misbehaves, "label": how, "options": {"how": how}} for how in HOW]
+    asked = study(
+        formulation=["mixed", Program, Nearest, *bad], dual=["cpg"], primal=["online-supremizers"], solvers=["piqp"],
+        assembly=["full", "reduced"], tolerances=[{"pod": [1e-3], "dual": [1e-2]}], limits={"query_seconds": 0.5},
+    )  # fmt: skip
+    return run(asked, tmp_path_factory.mktemp("formulations"), jobs=1)
+
+
+def test_a_formulation_is_not_repeated_over_axes_that_it_does_not_have() -> None:
+    asked = study(formulation=["mixed", Program, Nearest], assembly=["full", "certified"], correction=["none", "auto"])
+    cells = expand(asked)
+    count = {label: sum(cell.formulation_label == label for cell in cells) for label in ("mixed", "Program", "Nearest")}
+    assert count == {"mixed": 2 * 2 * 2 * 2 * 2 * 2, "Program": 2 * 2 * 2 * 2 * 2, "Nearest": 1}
+    (nearest,) = (cell for cell in cells if cell.formulation_label == "Nearest")
+    assert (nearest.dual, nearest.primal, nearest.pod, nearest.cone, nearest.solver, nearest.accuracy) == (None,) * 6
+    assert str(nearest) == "Wire · Nearest"
+    assert {cell.assembly for cell in cells if cell.formulation_label == "Program"} == {"full", "reduced"}
+
+
+def test_axes_that_no_formulation_uses_need_not_be_given() -> None:
+    tolerances: Any = [{"pod": [1e-3], "dual": [1e-2]}]
+    content: Any = {"name": "one", "validation": 4, "problem": [Wire], "tolerances": tolerances}
+    assert len(expand(Study(formulation=[Nearest], **content))) == 1
+    with pytest.raises(RequestError, match="dual: required, but not given"):
+        Study(formulation=["mixed", Nearest], **content)
+
+
+def test_the_mixed_formulation_as_a_plugin_gives_its_numbers(found: Run) -> None:
+    queries = found.table("queries").set_index(["formulation", "assembly", "query"]).sort_index()
+    own, other = queries.loc["mixed"], queries.loc["Program"]
+    assert (own["status"] == "ok").all()
+    assert (other["status"] == "ok").all()
+    names = [name for name in own if name.startswith(("error_", "bound_", "hf_", "effectivity_", "primal_r", "dual_r"))]
+    kept = [name for name in names if name not in ("hf_s", "bound_note") and own[name].notna().all()]
+    assert {"error_u", "error_lambda_natural", "bound_u_energy", "hf_dual_residual", "primal_residual"} <= set(kept)
+    for name in kept:
+        np.testing.assert_allclose(other[name].astype(float), own[name].astype(float), rtol=1e-9, atol=1e-14)
+
+
+def test_all_are_judged_by_the_same_bounds(found: Run) -> None:
+    queries = found.table("queries")
+    ok = queries[queries["status"] == "ok"]
+    assert set(ok["formulation"]) == {"mixed", "Program", "Nearest", *HOW}
+    for error, bound in (("u_energy", "u_energy"), ("lambda_natural", "lambda_natural"), ("u", "u")):
+        assert (ok[f"error_{error}_absolute"] <= ok[f"bound_{bound}"] * (1.0 + 1e-9)).all()
+    (nearest,) = found.table("cells").query("formulation == 'Nearest'").to_dict("records")
+    assert (nearest["dual"], nearest["primal"], nearest["solver"]) == ("–", "–", "–")
+    assert (nearest["multiplier"], nearest["error_u_predicted_mean"]) == ("residual", 0.5)
+    assert np.isnan(nearest["beta_span_min"])
+
+
+@pytest.mark.parametrize("how", HOW)
+def test_what_misbehaves_costs_its_own_rows(how: str, found: Run) -> None:
+    rows = found.table("queries").query("formulation == @how and assembly == 'full'").set_index("query")
+    upper = rows["mu_1"] >= 6.0
+    assert 0 < upper.sum() < len(rows)
+    assert (rows.loc[~upper, "status"] == "ok").all()
+    status, reason = REASONS[how]
+    assert set(rows.loc[upper, "status"]) == {status}
+    assert all(reason in text for text in rows.loc[upper, "reason"])
+
+
+def test_a_formulation_is_timed_in_the_rounds_with_all_of_it(found: Run) -> None:
+    cells = found.table("cells").set_index(["formulation", "assembly"])
+    for key in (("mixed", "full"), ("Program", "full"), ("Nearest", "full")):
+        assert cells.loc[key, "timed_rounds"] == 2
+        assert cells.loc[key, "online_s"] > 0.0
+    assert cells.loc[("mixed", "full"), "offline_formulation_s"] == 0.0
+    assert cells.loc[("Nearest", "full"), "offline_formulation_s"] > 0.0
+    compared = found.table("thresholds")
+    assert set(compared.loc[compared["primal_a"] == "high-fidelity", "formulation"]) >= {"mixed", "Program", "Nearest"}
+
+
+def test_a_recorded_formulation_answers_and_is_refused_where_it_makes_no_sense(found: Run) -> None:
+    cells = found.table("cells").set_index("formulation")
+    key, mixed = cells.loc["Nearest", "cell"], cells.loc["mixed", "cell"].iloc[0]
+    again = open_run(found.path).formulated(key).solve([5.0])
+    exact = open_run(found.path).model(mixed).high_fidelity([5.0])
+    assert again.status == "ok"
+    assert again.residuals.worst < 1.0
+    problem = Wire()
+    assert problem.V.norm(again.u - exact.u) <= again.error_bounds.u
+    with pytest.raises(RequestError, match=r"has the formulation 'Nearest', whose answers are no solutions of a quad"):
+        open_run(found.path).model(key)
+    with pytest.raises(RequestError, match="has the mixed formulation"):
+        open_run(found.path).formulated(mixed)
+
+
+def test_the_study_of_a_cell_is_the_same_cell(found: Run) -> None:
+    for row in found.table("cells").to_dict("records"):
+        cell = Cell.from_definition(row["definition"])
+        assert [one.key for one in expand(study_of_cell(cell, "again"))] == [row["cell"]]
+
+
+def test_the_report_and_the_figures_take_them(found: Run, tmp_path: Path) -> None:
+    assert "Nearest" in found.report(tmp_path / "report.html", figures=False).read_text()
+    assert found.write_figures(tmp_path / "figures", ["svg"])
