@@ -151,8 +151,14 @@ def test_the_plugins_of_the_pages_run_through_the_whole_benchmark(
     assert done.returncode == 0, done.stderr
     assert "invariants of the constants and the error bounds hold in all" in done.stdout
     cells = rows(tmp_path / "runs" / "mine")
-    assert len(cells) == 3 * 2 * 4 * 2
     assert {(cell["status"], cell["reason"]) for cell in cells} == {("ok", "")}
+    penalised = [cell for cell in cells if cell["formulation"] == "penalised"]
+    assert {cell["problem"] for cell in penalised} == {"cable", "declared-cable", "separable-cable"}
+    assert {(cell["dual"], cell["primal"], cell["solver"], cell["assembly"]) for cell in penalised} == {
+        ("–", "–", "–", "full")
+    }
+    cells = [cell for cell in cells if cell["formulation"] == "mixed"]
+    assert len(cells) == 3 * 2 * 4 * 2
     assert {cell["primal"]: cell["enrichment_kind"] for cell in cells} == {
         "centre": "fixed",
         "pivoted": "fixed",
@@ -182,7 +188,13 @@ def test_seconds_are_in_seconds(name: str) -> None:
 def test_the_tables_for_reading_have_the_columns_that_are_described(table: str, reference: ModuleType) -> None:
     zero = {name: [0, 1] for name in ("queries_zero_u", "queries_zero_lambda") if table == "cells"}
     several = pd.DataFrame(
-        {"accuracy": [1e-7, 1e-10], "training": ["own", "another"], "meaning": "undecided", **zero}
+        {
+            "accuracy": [1e-7, 1e-10],
+            "training": ["own", "another"],
+            "meaning": "undecided",
+            "formulation": ["mixed", "another"],
+            **zero,
+        }
     )  # with one for all, or none, they have no columns
     empty = several.reindex(columns=list(columns.STORED[table])).astype({"accuracy": float})
     name, view = {"cells": ("summary", tables.summary), "thresholds": ("benefits", tables.benefits)}[table]
