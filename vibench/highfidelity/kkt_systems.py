@@ -14,7 +14,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.highfidelity.contact_zone import coarse_contact, watched, zone_of
 from vibench.interfaces.problem import VariationalInequality
-from vibench.linalg.cholesky import SYMMETRIC, SparseCholesky
+from vibench.linalg.cholesky import SparseCholesky, symmetric_lu
 from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal
 from vibench.linalg.factorisations import DEFAULT, Factor, implementation
 from vibench.linalg.schur_complement import EliminationPattern, PrincipalSubmatrix, StaticCondensation
@@ -118,6 +118,11 @@ class CondensedStiffness:
         return self._pattern.order[: len(self._pattern.order) - len(self._pattern.interface)]
 
     @property
+    def order(self) -> Indices:
+        """All unknowns (n,) in an order of little fill-in."""
+        return np.concatenate([self._pattern.order, np.setdiff1d(self.retained, self._pattern.order)])
+
+    @property
     def dense(self) -> bool:
         """Whether the Schur complement Ŝ is treated as a dense matrix."""
         return self._condensed.dense
@@ -132,6 +137,13 @@ class CondensedStiffness:
     def load(self, retained: Array) -> Array:
         """Ŝ times retained unknowns (c,), where it is sparse."""
         return np.asarray(self._condensed.schur @ retained)
+
+    def schur_with_round_off(self, squares: Array) -> tuple[BlockDiagonal | SparseMatrix, float]:
+        """A computed Ŝ, and its `StaticCondensation.round_off` against S² = diag(`squares`) (n,)."""
+        condensed = self._condensed
+        if self._factorisation != DEFAULT:  # of whose factors nothing is known
+            condensed = StaticCondensation(self._A, self._pattern)
+        return condensed.dense_blocks if condensed.dense else condensed.schur, condensed.round_off(squares)
 
     def liftings(self, B: SparseMatrix) -> Array:
         """B Ŝ⁻¹ (m×c) for rows B (m×c) of the retained unknowns."""
@@ -434,7 +446,7 @@ class _BorderedFactorisation:
         self._unbordered: Array | None = None
         self._columns = dict[int, Array]()
         if last is not None:
-            self._factor = splu(matrix, permc_spec="NATURAL", **SYMMETRIC)
+            self._factor = symmetric_lu(matrix, "NATURAL")
             self.pivots = _definite_pivots(self._factor, last)
         if self.pivots is None:
             self._factor = splu(matrix)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
@@ -16,9 +18,9 @@ from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.linalg.definite import BlockDiagonal, dense_cholesky, mirrored
 
-SYMMETRIC = {"diag_pivot_thresh": 0.0, "panel_size": 1, "options": {"SymmetricMode": True}}
-"""SuperLU without off-diagonal pivoting is a Cholesky factorisation; SciPy has no sparse one of its own. Panels of one
-column are the fastest for matrices of plane meshes."""
+SPACE, PANEL = 32, 20
+"""Entries of a row from which on factors are so full that SuperLU is the fastest with panels of so many columns, as
+those of displacements in space; of other matrices it is with panels of one."""
 
 UNIT = float(np.finfo(float).eps) / 2.0
 """The unit round-off."""
@@ -29,6 +31,20 @@ SPARSE_COLUMN = 256
 DENSE_COLUMNS = 256
 """Number of consecutive longer columns that are multiplied as one dense matrix, on the rows that they have entries in:
 they belong to neighbouring separators, whose rows are nearly the same."""
+
+GROUP = 2**18
+"""Entries of factors that are compared at once."""
+
+
+def symmetric_lu(matrix: SparseMatrix, permutation: str) -> SuperLU:
+    """LU of a symmetric matrix (CSC) without off-diagonal pivoting; raises a `RuntimeError` if it is exactly singular.
+
+    Of a definite matrix it is a Cholesky factorisation; SciPy has no sparse one of its own.
+    """
+    panel = PANEL if matrix.nnz > SPACE * matrix.shape[0] else 1
+    return splu(
+        matrix, permc_spec=permutation, diag_pivot_thresh=0.0, panel_size=panel, options={"SymmetricMode": True}
+    )
 
 
 class SparseCholesky:
@@ -192,24 +208,9 @@ class PartialCholesky:
     def round_off(self, weights: Array) -> Array:
         """Row sums Σ_j |X − P|_ij w_j (n,) with weights w (n,), both in elimination order, or upper bounds of them.
 
-        P is the matrix whose factors are exactly the computed L_ii, L_ci and D, with the computed S as its complement:
-        |X − P| ≤ γ|L||U| + |L||U − D Lᵀ| in the columns of i (Higham 2002, Theorem 9.3), and the round-off in S.
+        P is the matrix whose factors are exactly the computed L_ii, L_ci and D, with the computed S as its complement.
         """
-        split = self._split
-        lower, upper = sp.csc_array(self._lu.L)[:, :split], sp.csc_array(self._lu.U)[:split, :split]
-        terms = int(np.max(np.bincount(lower.indices), initial=0)) + 8
-        gamma = terms * UNIT / (1.0 - terms * UNIT)
-        missing = abs(upper - sp.csc_array(sp.diags_array(self._root**2) @ lower[:split].T))
-        lower, upper = abs(lower), abs(upper)
-        (of_i, of_c), corner = (lower[:split], lower[split:]), abs(self._corner)
-        w_i, w_c = weights[:split], weights[split:]
-        inner = gamma * (upper @ w_i) + (1.0 + gamma) * (missing @ w_i)
-        back = of_c.T @ w_c  # the columns of c are those of i mirrored
-        sums = np.concatenate([
-            of_i @ inner + gamma * (upper.T @ back) + (1.0 + gamma) * (missing.T @ back),
-            of_c @ inner + gamma * (corner @ w_c + of_c @ (self._root**2 * back)),
-        ])  # fmt: skip
-        return np.asarray(1.01 * sums)
+        return round_off_of_factors(self._lu, self._split, self._corner, weights)
 
     def eliminate(self, right: Array) -> tuple[Array, Array]:
         """For r (n,) or (n, k), X_ii⁻¹ r_i and the load of the Schur complement, r_c − X_ci X_ii⁻¹ r_i."""
@@ -283,7 +284,7 @@ def _less_products(corner: SparseMatrix, columns: SparseMatrix) -> Array:
 def _pivots(matrix: SparseMatrix, permutation: str, name: str) -> tuple[SuperLU, Array]:
     """Factors without pivoting off the diagonal, and the pivots (n,), which are positive."""
     try:
-        lu = splu(matrix, permc_spec=permutation, **SYMMETRIC)
+        lu = symmetric_lu(matrix, permutation)
     except RuntimeError as error:
         raise NumericalError(f"{name} cannot be factorised: {error}") from None
     pivots = lu.U.diagonal()
@@ -292,6 +293,51 @@ def _pivots(matrix: SparseMatrix, permutation: str, name: str) -> tuple[SuperLU,
     if permutation == "NATURAL" and not np.array_equal(lu.perm_c, np.arange(len(pivots))):
         raise NumericalError(f"{name} was not factorised in the requested order")
     return lu, pivots
+
+
+def round_off_of_factors(lu: SuperLU, split: int, corner: SparseMatrix, weights: Array) -> Array:
+    """Row sums Σ_j |X − P|_ij w_j (n,) with weights w (n,), both in elimination order, or upper bounds of them.
+
+    P has the first `split` columns L_i and pivots D of the computed factors exactly, and a computed Schur complement of
+    X_cc, the `corner`: in the columns of i, |X − P| ≤ γ|L||U| + |L||U − D Lᵀ| (Higham 2002, Theorem 9.3). Where all
+    columns are taken, P is L D Lᵀ.
+    """
+    lower, upper = lu.L.tocsr(), lu.U  # sorted rows of the one; columns of the other are rows of its transpose
+    terms = int(np.max(np.diff(lower.indptr), initial=0)) + 8
+    gamma, pivots = terms * UNIT / (1.0 - terms * UNIT), upper.diagonal()[:split]
+    w_i, w_c = weights[:split], weights[split:]
+    back = abs(lower[split:, :split]).T @ w_c
+    inner, across = np.zeros(split), np.zeros(split)
+    for few in _groups(upper.indptr[: split + 1]):
+        product = _rows_of(lower, few, split)
+        product.data = product.data * pivots[product.indices]
+        mirrored = _rows_of(upper, few, split).tocsc().tocsr()  # sorted, which is a copy
+        missing = mirrored - product
+        for part in (mirrored, missing):
+            np.abs(part.data, out=part.data)
+        inner += gamma * (mirrored.T @ w_i[few]) + (1.0 + gamma) * (missing.T @ w_i[few])
+        across[few] = gamma * (mirrored @ back) + (1.0 + gamma) * (missing @ back)
+    np.abs(lower.data, out=lower.data)
+    sums = lower @ np.concatenate([inner, np.zeros_like(w_c)])
+    sums[:split] += across
+    if len(w_c):
+        sums[split:] += gamma * (abs(corner) @ w_c + lower[split:, :split] @ (np.abs(pivots) * back))
+    return np.asarray(1.01 * sums)
+
+
+def _groups(pointers: Indices) -> Iterator[slice]:
+    """Consecutive rows with about `GROUP` entries: many large arrays would take longer to allocate than to fill."""
+    places = np.arange(GROUP, int(pointers[-1]) + GROUP, GROUP)
+    edges = np.unique(np.concatenate([[0], np.searchsorted(pointers[:-1], places), [len(pointers) - 1]]))
+    return (slice(first, last) for first, last in itertools.pairwise(edges.tolist()))
+
+
+def _rows_of(matrix: SparseMatrix, rows: slice, columns: int) -> SparseMatrix:
+    """Some rows (CSR) of a matrix (CSR), or of the transpose of one (CSC), whose entries are in the first columns."""
+    pointers = matrix.indptr[rows.start : rows.stop + 1]
+    inside = slice(int(pointers[0]), int(pointers[-1]))
+    entries = matrix.data[inside], matrix.indices[inside], pointers - pointers[0]
+    return sp.csr_array(entries, shape=(rows.stop - rows.start, columns))
 
 
 def _scale_rows(factors: Array, values: Array) -> Array:
@@ -304,5 +350,5 @@ def elimination_order(matrix: SparseMatrix, last: Indices) -> Indices:
     rest = np.setdiff1d(np.arange(matrix.shape[0]), last)
     if not len(rest):
         return np.asarray(last)
-    lu = splu(sp.csc_array(matrix[rest][:, rest]), permc_spec="MMD_AT_PLUS_A", **SYMMETRIC)
+    lu = symmetric_lu(sp.csc_array(matrix[rest][:, rest]), "MMD_AT_PLUS_A")
     return np.concatenate([rest[np.argsort(lu.perm_c)], last])

@@ -19,17 +19,14 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse.linalg import SuperLU
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.linalg.cholesky import SYMMETRIC, UNIT
+from vibench.linalg.cholesky import UNIT, round_off_of_factors, symmetric_lu
 
 FIRST_SHIFT, PLANE = 1e-11, 16.0
 """τ of the first attempt, and the entries of a row from which on it is larger by their share: factors of matrices of
 meshes in space have longer sums. Where the round-off exceeds it, τ becomes twice the round-off."""
-
-SPACE, PANEL = 32.0, 20
-"""Entries of a row from which on factors are so full that SuperLU is the fastest with panels of so many columns."""
 
 ATTEMPTS = 3
 
@@ -46,24 +43,23 @@ def proved_positive(parts: Sequence[SparseMatrix], scale: Array, order: Indices 
     order
         Elimination order (n,); by default minimum degree.
     """
-    halves = [0.5 * sp.csc_array(part) for part in parts]
-    halves += [sp.csc_array(half.T) for half in halves]
-    total, size, squares = sum(halves), sum(abs(half) for half in halves), scale**2
+    total, squares = sum(sp.csc_array(part) for part in parts), scale**2
+    total, absolute = 0.5 * (total + sp.csc_array(total.T)), [abs(sp.csc_array(part)) for part in parts]
+    inverse = 1.0 / scale
+    sizes = 0.5 * sum(part @ inverse + part.T @ inverse for part in absolute)
     if order is not None:
-        total, size, squares = sp.csc_array(total[order][:, order]), size[order][:, order], squares[order]
+        total, sizes, squares = sp.csc_array(total[order][:, order]), sizes[order], squares[order]
     permutation, inverse = "MMD_AT_PLUS_A" if order is None else "NATURAL", 1.0 / np.sqrt(squares)
-    shift, options = first_shift(total), SYMMETRIC
-    if total.nnz > SPACE * total.shape[0]:
-        options = options | {"panel_size": PANEL}
+    shift = first_shift(total)
     for _ in range(ATTEMPTS):
         try:
-            lu = splu(total - sp.diags_array(shift * squares, format="csc"), permc_spec=permutation, **options)
+            lu = symmetric_lu(total - sp.diags_array(shift * squares, format="csc"), permutation)
         except RuntimeError:  # exactly singular
             return 0
         pivots = lu.U.diagonal()
         if not np.array_equal(lu.perm_r, lu.perm_c) or not np.all(np.isfinite(pivots)):
             return 0
-        added = (len(halves) + 2) * UNIT * (inverse * (size @ inverse) + shift)
+        added = (2 * len(parts) + 2) * UNIT * (inverse * sizes + shift)
         error = float(np.max(_factorisation_error(lu, inverse) + added, initial=0.0))
         if error <= shift:
             return int(np.sum(pivots > 0.0))
@@ -81,11 +77,6 @@ def first_shift(matrix: SparseMatrix) -> float:
 def _factorisation_error(lu: SuperLU, inverse: Array) -> Array:
     """Row sums (n,) of S⁻¹(γ|L||U| + |L||U − D Lᵀ|)S⁻¹ in the order of the matrix; `inverse` is 1/s (n,)."""
     back = np.argsort(lu.perm_c)  # row k of the factors is this unknown
-    lower, upper, weights = sp.csc_array(lu.L), sp.csc_array(lu.U), inverse[back]
-    terms = int(np.max(np.bincount(lower.indices), initial=0)) + 4
-    gamma = terms * UNIT / (1.0 - terms * UNIT)
-    mirrored = sp.csc_array(sp.diags_array(upper.diagonal()) @ lower.T)
-    inner = gamma * (abs(upper) @ weights) + (1.0 + gamma) * (abs(upper - mirrored) @ weights)
-    sums = np.empty_like(inverse)
-    sums[back] = 1.01 * weights * (abs(lower) @ inner)  # these sums are rounded, too
+    weights, sums = inverse[back], np.empty_like(inverse)
+    sums[back] = weights * round_off_of_factors(lu, len(inverse), sp.csc_array((0, 0)), weights)
     return sums

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.linalg.cholesky import elimination_order
+from vibench.linalg.cholesky import PartialCholesky, elimination_order
 from vibench.linalg.definite import BlockDiagonal
 from vibench.linalg.factorisations import DEFAULT, implementation
 
@@ -146,6 +146,17 @@ class StaticCondensation:
         schur, interface = self._retained_block.toarray(), self._pattern.interface
         schur[np.ix_(interface, interface)] = self._interface_schur
         return np.asarray(schur)
+
+    def round_off(self, squares: Array) -> float:
+        """A δ such that A differs by a matrix between −δS² and δS² from one whose exact complement is the computed one.
+
+        S² = diag(`squares`) (n,). Of eliminations of SuperLU alone (`PartialCholesky.round_off`).
+        """
+        if self._factor is None:
+            return 0.0
+        assert isinstance(self._factor, PartialCholesky)  # nothing is known of others
+        inverse = 1.0 / np.sqrt(squares[self._pattern.order])
+        return float(np.max(inverse * self._factor.round_off(inverse), initial=0.0))
 
     def eliminate(self, f: Array) -> tuple[Array, Array]:
         """Condensed loads (c,) or (c, k) of f (n,) or (n, k), and what `recover` needs of the eliminated unknowns."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from cachetools import LRUCache
@@ -13,8 +13,8 @@ from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.errors import Energy
-from vibench.stability.coercivity import Constant, coercivity, continuity, energy_inf_sup
-from vibench.stability.contact_infsup import SchurFromAbove
+from vibench.stability.coercivity import Constant, coercivity, continuity, energy_inf_sup, share_of_diagonal
+from vibench.stability.contact_infsup import ContactInfSup
 
 LIMIT = 2**28
 """Size limit of the assemblies in bytes; the least recently used one is dropped first."""
@@ -22,6 +22,9 @@ LIMIT = 2**28
 FACTORS = 3 * 2**28
 """The same of factors of A and of compliances. Cells use the same parameters in the same order: too small a cache is
 none."""
+
+MANY = 1000
+"""Constants of so many parameters are kept."""
 
 
 class Assemblies:
@@ -32,8 +35,9 @@ class Assemblies:
         self._kept: LRUCache[bytes, VariationalInequality] = LRUCache(limit, getsizeof=_bytes)
         self._energies: LRUCache[bytes, Energy] = LRUCache(FACTORS, getsizeof=self._own_bytes)
         self._solver = HighFidelitySolver(problem, condensing=True)
-        self._above: SchurFromAbove | None = None
-        self._alpha: Constant | None = None
+        self._contact: ContactInfSup | None = None
+        self._alphas: LRUCache[bytes, Constant] = LRUCache(MANY)
+        self._lowest: Array | None = None
         self._gamma: Constant | None = None
 
     def at(self, mu: Array) -> VariationalInequality:
@@ -60,10 +64,16 @@ class Assemblies:
         return Energy(vi.A, self._solver.condensed(vi))
 
     def coercivity_at(self, mu: Array) -> Constant:
-        """Lower bound of α at mu (d,), with the factorisation of `energy_at`; that of a constant A is computed once."""
-        if self._alpha is None or "A" not in self._problem.constant:
-            self._alpha = coercivity(self.at(mu).A, self._problem.V, self.energy_at(mu).stiffness.solve)
-        return self._alpha
+        """Lower bound of α at mu (d,), with the factorisation of `energy_at`; that of a constant A is computed once.
+
+        Lanczos iterations start from the vector of the parameter before, as those of β_A do.
+        """
+        key = b"" if "A" in self._problem.constant else _key(mu)
+        if key not in self._alphas:
+            stiffness = self.energy_at(mu).stiffness
+            given = stiffness.solve, self._lowest, stiffness.order
+            self._alphas[key], self._lowest = coercivity(self.at(mu).A, self._problem.V, *given)
+        return self._alphas[key]
 
     def continuity_at(self, mu: Array) -> Constant:
         """Upper bound of γ_a, likewise."""
@@ -77,9 +87,24 @@ class Assemblies:
         on, stiffness = energy.on_contact(vi), energy.stiffness
         if not on.is_dense:
             return energy_inf_sup(vi.A, vi.B, W)
-        if self._above is None or "A" not in self._problem.constant:
-            self._above = SchurFromAbove(vi.A, stiffness.eliminated, stiffness.retained)
-        return self._above.energy_inf_sup(on.B, on.liftings, W)
+        if self._contact is None or "A" not in self._problem.constant:
+            squares, before = vi.A.diagonal(), self._contact
+            schur, round_off = stiffness.schur_with_round_off(squares)
+            lost = round_off / share if (share := self._share_at(mu)) > 0.0 else np.inf
+            self._contact = ContactInfSup(
+                schur, squares[stiffness.retained], lost, None if before is None else before.start
+            )
+        return self._contact.energy_inf_sup(on.B, on.liftings, W)
+
+    def _share_at(self, mu: Array) -> float:
+        """A σ with A ≽ σ diag(A) at mu (d,), proved by α; 0 where α is not."""
+        alpha, X = self.coercivity_at(mu), self._problem.V.matrix
+        smallest = float(np.min(X.diagonal() / self.at(mu).A.diagonal()))
+        return alpha.value * self._norm_share * smallest if alpha.proved else 0.0
+
+    @cached_property
+    def _norm_share(self) -> float:
+        return share_of_diagonal(self._problem.V)
 
     def _own_bytes(self, energy: Energy) -> int:
         """Memory of what is of one parameter alone."""

@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
-from scipy.sparse.linalg import LinearOperator, eigsh, splu
+from scipy.sparse.linalg import LinearOperator, eigsh
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.linalg.cholesky import SYMMETRIC, SparseCholesky
+from vibench.linalg.cholesky import SparseCholesky, symmetric_lu
 from vibench.linalg.inertia import proved_positive
 from vibench.linalg.inner_product import InnerProduct
 from vibench.stability.infsup import InfSup
@@ -35,8 +35,12 @@ MARGINS = (1e-3, 1e-2, 1e-1, 0.5)
 
 Lanczos iterations are accurate to 1e-4."""
 
-ROUGH = 1e-2
-"""Relative accuracy of the estimate of an operator norm, which enters bounds with a small factor."""
+TOLERANCE, ROUGH = 1e-4, 1e-2
+"""Relative residuals of Lanczos iterations; the second one for operator norms, which enter bounds with a small factor,
+and for what is moved by the last of `MARGINS`."""
+
+WITH_START = 6
+"""Lanczos vectors where the first one is an eigenvector of a similar matrix, which few of them improve."""
 
 FEW = 30
 """Spaces of at most this dimension have their eigenvalues from a dense matrix; Lanczos needs more than two."""
@@ -72,22 +76,39 @@ def coercivity_and_continuity(
     A: SparseMatrix, V: InnerProduct, solve: Solve | None = None
 ) -> tuple[Constant, Constant]:
     """Lower bound of α and upper bound of γ_a for A (n×n); see `coercivity` and `continuity`."""
-    return coercivity(A, V, solve), continuity(A, V)
+    return coercivity(A, V, solve)[0], continuity(A, V)
 
 
-def coercivity(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None) -> Constant:
-    """Lower bound of α for A (n×n).
+def coercivity(
+    A: SparseMatrix,
+    V: InnerProduct,
+    solve: Solve | None = None,
+    start: Array | None = None,
+    order: Indices | None = None,
+) -> tuple[Constant, Array | None]:
+    """Lower bound of α for A (n×n), and the vector (n,) that a later `start` may be.
 
-    `solve` solves with a factorisation of A that exists; by default A is factorised. Raises a `NumericalError` if A is
-    not symmetric positive definite.
+    `solve` solves with a factorisation of A that exists; by default A is factorised. `order` (n,) is one for the
+    elimination of its unknowns; by default of minimum degree. Raises a `NumericalError` if A is not symmetric positive
+    definite.
     """
-    lowest = lowest_quotient(A, V, solve)  # refuses a matrix that is not positive definite
+    lowest, vector = lowest_quotient(A, V, solve, start)  # refuses a matrix that is not positive definite
     root = np.sqrt(A.diagonal())
 
     def coercive(a: float) -> bool:
-        return proved_positive([A, -a * V.matrix], root) == V.dim
+        return proved_positive([A, -a * V.matrix], root, order) == V.dim
 
-    return moved(lowest, -1.0, coercive)
+    return moved(lowest, -1.0, coercive), vector
+
+
+def share_of_diagonal(X: InnerProduct) -> float:
+    """A ξ with X ≽ ξ diag(X), proved, of the order of the largest one; 0 where none is."""
+    diagonal = X.matrix.diagonal()
+    units = InnerProduct(sp.diags_array(diagonal))
+    estimate, _ = lowest_quotient(X.matrix, units, X.riesz, tolerance=ROUGH)
+    share = estimate / (1.0 + MARGINS[-1])
+    scaled = sp.diags_array(-share * diagonal)
+    return share if proved_positive([X.matrix, scaled], np.sqrt(diagonal)) == X.dim else 0.0
 
 
 def continuity(A: SparseMatrix, V: InnerProduct) -> Constant:
@@ -127,15 +148,22 @@ def moved(estimate: float, sign: float, proves: Callable[[float], bool]) -> Cons
     return Constant(candidates[0], False)
 
 
-def lowest_quotient(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None) -> float:
-    """Estimate of α for A (n×n), the smallest eigenvalue of A against X_V, by Lanczos iterations.
+def lowest_quotient(
+    A: SparseMatrix,
+    V: InnerProduct,
+    solve: Solve | None = None,
+    start: Array | None = None,
+    tolerance: float = TOLERANCE,
+) -> tuple[float, Array | None]:
+    """Estimate of α for A (n×n), the smallest eigenvalue of A against X_V, by Lanczos iterations, and its vector (n,).
 
-    Raises a `NumericalError` if A is not symmetric positive definite and no `solve` is given.
+    There is no vector of few unknowns. Raises a `NumericalError` if A is not symmetric positive definite and no `solve`
+    is given.
     """
     solve = solve or SparseCholesky(A, "A").solve
     if V.dim <= FEW:
-        return float(scipy.linalg.eigvalsh(A.toarray(), V.matrix.toarray())[0])
-    return _smallest(A, V.matrix, solve)
+        return float(scipy.linalg.eigvalsh(A.toarray(), V.matrix.toarray())[0]), None
+    return _smallest(A, V.matrix, solve, start, tolerance)
 
 
 def highest_quotient(A: SparseMatrix, V: InnerProduct) -> float:
@@ -150,7 +178,7 @@ def extreme_quotients(A: SparseMatrix, V: InnerProduct) -> tuple[float, float]:
 
     Raises a `NumericalError` if A is not symmetric positive definite.
     """
-    return lowest_quotient(A, V), highest_quotient(A, V)
+    return lowest_quotient(A, V)[0], highest_quotient(A, V)
 
 
 def energy_inf_sup(A: SparseMatrix, B: SparseMatrix, W: InnerProduct) -> Constant:
@@ -185,7 +213,7 @@ def _smallest_compliance(
         return float(scipy.linalg.eigvalsh(compliance, W.matrix.toarray())[0])
     saddle = _saddle_point(A, B, sp.csc_array((m, m)))[order][:, order]
     try:
-        solve = splu(sp.csc_array(saddle), permc_spec="NATURAL", **SYMMETRIC).solve
+        solve = symmetric_lu(sp.csc_array(saddle), "NATURAL").solve
     except RuntimeError:
         return 0.0
 
@@ -194,39 +222,51 @@ def _smallest_compliance(
         return np.asarray(-solve(np.concatenate([np.zeros(n), y]))[n:])
 
     compliance = _operator(m, lambda y: B @ factor.solve(B.T @ y))
-    return _smallest(compliance, W.matrix, inverse)
+    return _smallest(compliance, W.matrix, inverse)[0]
 
 
 def _saddle_point(A: SparseMatrix, B: SparseMatrix, corner: SparseMatrix) -> SparseMatrix:
     return sp.csc_array(sp.block_array([[A, B.T], [B, corner]]))
 
 
-def smallest_quotient(matrix: Array, X: InnerProduct) -> float:
-    """Estimate of the smallest eigenvalue of a symmetric matrix (m×m) against that of X; 0 if it is not positive."""
+def smallest_quotient(matrix: Array, X: InnerProduct, start: Array | None = None) -> tuple[float, Array | None]:
+    """Estimate of the smallest eigenvalue of a symmetric matrix (m×m) against that of X, and its vector (m,).
+
+    It is 0 if it is not positive; there is no vector of few unknowns. `start` may be the vector of a similar matrix.
+    """
     if len(matrix) <= FEW:
-        return max(0.0, float(scipy.linalg.eigvalsh(matrix, X.matrix.toarray())[0]))
+        return max(0.0, float(scipy.linalg.eigvalsh(matrix, X.matrix.toarray())[0])), None
     try:
         factor = scipy.linalg.cho_factor(matrix)
     except np.linalg.LinAlgError:
-        return 0.0
+        return 0.0, start
 
     def inverse(y: Array) -> Array:
         return np.asarray(scipy.linalg.cho_solve(factor, y, check_finite=False))
 
-    return _smallest(_operator(len(matrix), lambda y: matrix @ y), X.matrix, inverse)
+    return _smallest(_operator(len(matrix), lambda y: matrix @ y), X.matrix, inverse, start)
 
 
-def _smallest(matrix: SparseMatrix | LinearOperator, product: SparseMatrix, inverse: Callable[[Array], Array]) -> float:
-    """Estimate of the smallest eigenvalue of a positive definite matrix (k×k) with this inverse."""
+def _smallest(
+    matrix: SparseMatrix | LinearOperator,
+    product: SparseMatrix,
+    inverse: Callable[[Array], Array],
+    start: Array | None = None,
+    tolerance: float = TOLERANCE,
+) -> tuple[float, Array]:
+    """Estimate of the smallest eigenvalue of a definite matrix (k×k) with this inverse, and its vector (k,)."""
     size = matrix.shape[0]
-    values = eigsh(matrix, M=product, sigma=0.0, OPinv=_operator(size, inverse), which="LM", **_lanczos(size))
-    return float(values[0])
+    options = _lanczos(size, tolerance) | {"return_eigenvectors": True}
+    if start is not None:
+        options |= {"v0": start, "ncv": min(WITH_START, size)}
+    values, vectors = eigsh(matrix, M=product, sigma=0.0, OPinv=_operator(size, inverse), which="LM", **options)
+    return float(values[0]), np.asarray(vectors[:, 0])
 
 
 def _operator(size: int, apply: Callable[[Array], Array]) -> LinearOperator:
     return LinearOperator((size, size), matvec=apply)
 
 
-def _lanczos(size: int, tolerance: float = 1e-4) -> dict[str, Any]:
+def _lanczos(size: int, tolerance: float = TOLERANCE) -> dict[str, Any]:
     start = np.random.default_rng(0).standard_normal(size)
     return {"k": 1, "v0": start, "tol": tolerance, "return_eigenvectors": False}

@@ -1,111 +1,110 @@
-"""β_A at contact size: proved from a Schur complement that is bounded from above, for all constraints with one A.
+"""β_A at contact size: proved from the Schur complement that a factorisation of A has, for all constraints with one A.
 
-With c the unknowns that B touches, i the others and Ŝ the Schur complement of A on c, B A⁻¹Bᵀ = B Ŝ⁻¹Bᵀ, and for any
-matrix D (c×m), such as a computed Ŝ⁻¹Bᵀ,
+With c the unknowns that B touches, and S² = diag(A), a factorisation of A has computed factors, and with them the Schur
+complement Ŝ on c, which are the exact ones of a P with −δS² ≼ A − P ≼ δS² (`PartialCholesky.round_off`). Where
+A ≽ σS² is proved, A ≼ P + δS² ≼ P / (1 − δ/σ), hence
 
-    0 ≼ (B − DᵀŜ) Ŝ⁻¹ (Bᵀ − Ŝ D),    hence    B A⁻¹Bᵀ ≽ B D + DᵀBᵀ − DᵀŜ D ≽ T := B D + DᵀBᵀ − (F D)ᵀ(F D)
+    B A⁻¹Bᵀ ≽ (1 − δ/σ) B Ŝ⁻¹Bᵀ.
 
-where FᵀF ≽ Ŝ. Such an F comes from a factorisation P of A + τS², S² = diag(A), with the part of i in sparse factors and
-FᵀF in the block of c: where the round-off in A + τS² − P is bounded by δS² with δ ≤ τ, A ≼ P, and Schur complements
-keep the order. T takes products of matrices with bounded round-off (Higham 2002, §3.5) and none with an inverse:
-T − b²X_W ≽ 0 proves b ≤ β_A, by a Cholesky factorisation of it that succeeds after a shift (Rump 2006). τ is far below
-what a margin of b costs, for the smallest eigenvalues of B A⁻¹Bᵀ belong to forces that displace little.
+σ follows from α and a constant of the norm alone: A ≽ αX_V and X_V ≽ ξ diag(X_V) make it αξ min_i (X_V)_ii / A_ii. It
+may be rough, since δ is round-off. For any matrix D (c×m), such as a computed Ŝ⁻¹Bᵀ, and R = Bᵀ − ŜD,
+
+    B Ŝ⁻¹Bᵀ = BD + DᵀR + RᵀŜ⁻¹R ≽ BD + DᵀR,
+
+where DᵀR is round-off: its entries are at most |S d_i||S⁻¹r_j|. So K − b²/(1 − δ/σ) X_W ≽ 0 proves b ≤ β_A, with the
+symmetric part K of the computed BD, by a Cholesky factorisation of it that succeeds after a shift by all that was left
+out (Rump 2006). Products of matrices have bounded round-off (Higham 2002, §3.5), and there is none with an inverse.
 """
 
 from __future__ import annotations
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.errors import NumericalError
-from vibench.linalg.cholesky import UNIT, PartialCholesky
-from vibench.linalg.inertia import ATTEMPTS, first_shift
+from vibench.arrays import Array, SparseMatrix
+from vibench.linalg.cholesky import UNIT
+from vibench.linalg.definite import BlockDiagonal
 from vibench.linalg.inner_product import InnerProduct
 from vibench.stability.coercivity import Constant, moved, smallest_quotient
 
+MOST_LOST = 0.5
+"""Largest δ/σ: beyond, the factorisation of A is too inaccurate to say anything."""
 
-class SchurFromAbove:
-    """An F with FᵀF ≽ Ŝ, proved.
+
+class ContactInfSup:
+    """Lower bounds of β_A for constraints with one A.
 
     Parameters
     ----------
-    A
-        Sparse SPD (n×n).
-    eliminated, retained
-        The unknowns i in the order of their elimination, and the unknowns c (c,).
+    schur
+        Ŝ (c×c), computed.
+    squares
+        The diagonal of A on the retained unknowns (c,).
+    lost
+        δ/σ.
+    start
+        That of constraints with another A.
 
     Attributes
     ----------
-    factor
-        F (c×c), upper triangular.
-
-    Raises
-    ------
-    NumericalError
-        If nothing is proved, as where A is not positive definite.
+    start
+        Where Lanczos iterations begin, from the constraints before (m,); of their choice where it is `None`.
     """
 
-    def __init__(self, A: SparseMatrix, eliminated: Indices, retained: Indices) -> None:
-        order, last = np.concatenate([eliminated, retained]), len(retained)
-        A, squares = sp.csc_array(A), A.diagonal()
-        if not np.all(squares > 0.0):
-            raise NumericalError("A is not positive definite")
-        inverse = 1.0 / np.sqrt(squares[order])
-        shift = first_shift(A)
-        for _ in range(ATTEMPTS):
-            partial = PartialCholesky(A + sp.diags_array(shift * squares, format="csc"), order, last, "A")
-            try:
-                self.factor: Array = np.asarray(scipy.linalg.cholesky(partial.schur()))
-            except (np.linalg.LinAlgError, ValueError):
-                raise NumericalError("A is not positive definite") from None
-            errors = inverse * partial.round_off(inverse) + 2.0 * UNIT * (1.0 + shift)  # and that of the shift itself
-            sizes = np.abs(self.factor)
-            errors[-last:] += inverse[-last:] * _gamma(last) * (sizes.T @ (sizes @ inverse[-last:]))
-            error = 1.01 * float(np.max(errors, initial=0.0))
-            if error <= shift:
-                return
-            shift = 2.0 * error
-        raise NumericalError("the round-off in a factorisation of A is not bounded")
+    def __init__(
+        self, schur: BlockDiagonal | SparseMatrix, squares: Array, lost: float, start: Array | None = None
+    ) -> None:
+        self._schur, self._scale, self._lost, self.start = schur, np.sqrt(squares), lost, start
+        # the largest row sum of S⁻¹|Ŝ|S⁻¹, which bounds its norm, and the terms of an inner product with Ŝ
+        parts = schur.blocks if isinstance(schur, BlockDiagonal) else ((np.arange(len(squares)), schur),)
+        sums = [np.max((abs(part) @ (1.0 / self._scale[c])) / self._scale[c], initial=0.0) for c, part in parts]
+        self._norm = float(max(sums, default=0.0))
+        self._terms = max((int(np.max(np.sum(part != 0.0, axis=0), initial=0)) for _, part in parts), default=0)
 
     def energy_inf_sup(self, B: SparseMatrix, liftings: Array, W: InnerProduct) -> Constant:
         """Lower bound of β_A for B (m×c) on the retained unknowns, from Dᵀ (m×c); 0 where no other is proved."""
         if not B.shape[0]:
             return Constant(float("inf"), True)
+        if not self._lost <= MOST_LOST:
+            return Constant(0.0, True)
         compliance = np.asarray(B @ liftings.T)
-        square = smallest_quotient(0.5 * (compliance + compliance.T), W)
+        compliance = 0.5 * (compliance + compliance.T)
+        square, self.start = smallest_quotient(compliance, W, self.start)
         if square <= 0.0:
             return Constant(0.0, True)
-        pressed = self.factor @ liftings.T
-        sizes = np.linalg.norm(pressed, axis=0)
-        lower = compliance + compliance.T - pressed.T @ pressed
-        lost = self._round_off(B, liftings, sizes)
+        sizes = np.sqrt(np.diag(compliance))
+        scaled, mass = compliance / sizes / sizes[:, None], _scaled(W.matrix, sizes)
+        lost, of_mass = self._left_out(B, liftings, sizes), float(np.max(abs(mass).sum(axis=0), initial=0.0))
 
         def stable(beta: float) -> bool:
-            return _proved_positive(lower - beta**2 * W.matrix.toarray(), sizes, lost)
+            weight = beta**2 / (1.0 - 1.01 * self._lost)
+            return _proved_positive(scaled - weight * mass.toarray(), lost + 8.0 * UNIT * weight * of_mass)
 
         found = moved(float(np.sqrt(square)), -1.0, stable)
         return found if found.proved else Constant(0.0, True)
 
-    def _round_off(self, B: SparseMatrix, liftings: Array, sizes: Array) -> float:
-        """A δ such that the round-off in T is between −δ diag(t²) and δ diag(t²), with t (m,) the norms of F D."""
-        c, entries = len(self.factor), int(np.max(np.diff(sp.csr_array(B).indptr), initial=0))
-        lengths = np.linalg.norm(liftings, axis=1)
-        of_products = _gamma(c) * np.linalg.norm(self.factor) * lengths / sizes  # of F D, column by column
-        rows = sp.linalg.norm(B, axis=1) / sizes
-        m, ones = len(sizes), np.ones(len(sizes))
-        # row sums of the bound of each entry over t_i t_j, which bound the largest eigenvalue
-        sums = _gamma(entries + 2) * (rows * np.sum(lengths / sizes) + (lengths / sizes) * np.sum(rows))
-        sums += of_products * m + ones * np.sum(of_products) + of_products * np.sum(of_products)
-        sums += (_gamma(c) + 8.0 * UNIT) * (1.0 + np.max(of_products)) ** 2 * m
-        return 1.01 * float(np.max(sums))
+    def _left_out(self, B: SparseMatrix, liftings: Array, sizes: Array) -> float:
+        """A bound of the norm of DᵀR and of the round-off in K, both in units of t (m,), the roots of diag(K)."""
+        left = np.asarray(sp.csr_array(B).T.toarray() - self._schur @ liftings.T)
+        lifted, entries = np.linalg.norm(self._scale * liftings, axis=1), int(np.max(np.diff(sp.csr_array(B).indptr)))
+        forces = sp.linalg.norm(sp.csr_array(B / self._scale), axis=1)
+        residuals = np.linalg.norm(left / self._scale[:, None], axis=0)
+        residuals = residuals + _gamma(self._terms + 4) * (forces + self._norm * lifted)
+        # |x_i y_j| and its transpose, by whose mean each entry is bounded, have at most the norm |x||y|
+        of_products = np.linalg.norm(lifted / sizes) * np.linalg.norm(
+            (residuals + _gamma(entries + 4) * forces) / sizes
+        )
+        return 1.01 * float(of_products + 8.0 * UNIT * len(sizes))
 
 
-def _proved_positive(matrix: Array, sizes: Array, lost: float) -> bool:
-    """Whether a symmetric matrix (m×m) is positive definite, of which δ diag(t²) may be round-off."""
-    m = len(sizes)
-    scaled = matrix / sizes / sizes[:, None]
+def _scaled(matrix: SparseMatrix, sizes: Array) -> SparseMatrix:
+    unit = sp.diags_array(1.0 / sizes)
+    return sp.csr_array(unit @ matrix @ unit)
+
+
+def _proved_positive(scaled: Array, lost: float) -> bool:
+    """Whether a symmetric matrix (m×m) is positive definite of which a matrix of norm `lost` may be round-off."""
+    m = len(scaled)
     if not np.all(np.diag(scaled) <= 2.0):  # entries are then at most 2, and what a Cholesky factorisation loses is
         return False
     shifted = scaled - (lost + 4.0 * m * _gamma(m + 8)) * np.eye(m)
