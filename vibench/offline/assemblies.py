@@ -37,7 +37,6 @@ class Assemblies:
         self._solver = HighFidelitySolver(problem, condensing=True)
         self._contact: ContactInfSup | None = None
         self._alphas: LRUCache[bytes, Constant] = LRUCache(MANY)
-        self._lowest: Array | None = None
         self._gamma: Constant | None = None
 
     def at(self, mu: Array) -> VariationalInequality:
@@ -64,15 +63,11 @@ class Assemblies:
         return Energy(vi.A, self._solver.condensed(vi))
 
     def coercivity_at(self, mu: Array) -> Constant:
-        """Lower bound of α at mu (d,), with the factorisation of `energy_at`; that of a constant A is computed once.
-
-        Lanczos iterations start from the vector of the parameter before, as those of β_A do.
-        """
+        """Lower bound of α at mu (d,), with the factorisation of `energy_at`; that of a constant A is computed once."""
         key = b"" if "A" in self._problem.constant else _key(mu)
         if key not in self._alphas:
             stiffness = self.energy_at(mu).stiffness
-            given = stiffness.solve, self._lowest, stiffness.order
-            self._alphas[key], self._lowest = coercivity(self.at(mu).A, self._problem.V, *given)
+            self._alphas[key] = coercivity(self.at(mu).A, self._problem.V, stiffness.solve, stiffness.order)
         return self._alphas[key]
 
     def continuity_at(self, mu: Array) -> Constant:
@@ -88,12 +83,10 @@ class Assemblies:
         if not on.is_dense:
             return energy_inf_sup(vi.A, vi.B, W)
         if self._contact is None or "A" not in self._problem.constant:
-            squares, before = vi.A.diagonal(), self._contact
+            squares = vi.A.diagonal()
             schur, round_off = stiffness.schur_with_round_off(squares)
             lost = round_off / share if (share := self._share_at(mu)) > 0.0 else np.inf
-            self._contact = ContactInfSup(
-                schur, squares[stiffness.retained], lost, None if before is None else before.start
-            )
+            self._contact = ContactInfSup(schur, squares[stiffness.retained], lost)
         return self._contact.energy_inf_sup(on.B, on.liftings, W)
 
     def _share_at(self, mu: Array) -> float:

@@ -39,8 +39,8 @@ TOLERANCE, ROUGH = 1e-4, 1e-2
 """Relative residuals of Lanczos iterations; the second one for operator norms, which enter bounds with a small factor,
 and for what is moved by the last of `MARGINS`."""
 
-WITH_START = 6
-"""Lanczos vectors where the first one is an eigenvector of a similar matrix, which few of them improve."""
+NCV = 10
+"""Lanczos vectors with the inverse of a matrix. More cost solutions that the largest eigenvalue of it does not need."""
 
 FEW = 30
 """Spaces of at most this dimension have their eigenvalues from a dense matrix; Lanczos needs more than two."""
@@ -76,36 +76,30 @@ def coercivity_and_continuity(
     A: SparseMatrix, V: InnerProduct, solve: Solve | None = None
 ) -> tuple[Constant, Constant]:
     """Lower bound of α and upper bound of γ_a for A (n×n); see `coercivity` and `continuity`."""
-    return coercivity(A, V, solve)[0], continuity(A, V)
+    return coercivity(A, V, solve), continuity(A, V)
 
 
-def coercivity(
-    A: SparseMatrix,
-    V: InnerProduct,
-    solve: Solve | None = None,
-    start: Array | None = None,
-    order: Indices | None = None,
-) -> tuple[Constant, Array | None]:
-    """Lower bound of α for A (n×n), and the vector (n,) that a later `start` may be.
+def coercivity(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None, order: Indices | None = None) -> Constant:
+    """Lower bound of α for A (n×n).
 
     `solve` solves with a factorisation of A that exists; by default A is factorised. `order` (n,) is one for the
     elimination of its unknowns; by default of minimum degree. Raises a `NumericalError` if A is not symmetric positive
     definite.
     """
-    lowest, vector = lowest_quotient(A, V, solve, start)  # refuses a matrix that is not positive definite
+    lowest = lowest_quotient(A, V, solve)  # refuses a matrix that is not positive definite
     root = np.sqrt(A.diagonal())
 
     def coercive(a: float) -> bool:
         return proved_positive([A, -a * V.matrix], root, order) == V.dim
 
-    return moved(lowest, -1.0, coercive), vector
+    return moved(lowest, -1.0, coercive)
 
 
 def share_of_diagonal(X: InnerProduct) -> float:
     """A ξ with X ≽ ξ diag(X), proved, of the order of the largest one; 0 where none is."""
     diagonal = X.matrix.diagonal()
     units = InnerProduct(sp.diags_array(diagonal))
-    estimate, _ = lowest_quotient(X.matrix, units, X.riesz, tolerance=ROUGH)
+    estimate = lowest_quotient(X.matrix, units, X.riesz, ROUGH)
     share = estimate / (1.0 + MARGINS[-1])
     scaled = sp.diags_array(-share * diagonal)
     return share if proved_positive([X.matrix, scaled], np.sqrt(diagonal)) == X.dim else 0.0
@@ -149,21 +143,16 @@ def moved(estimate: float, sign: float, proves: Callable[[float], bool]) -> Cons
 
 
 def lowest_quotient(
-    A: SparseMatrix,
-    V: InnerProduct,
-    solve: Solve | None = None,
-    start: Array | None = None,
-    tolerance: float = TOLERANCE,
-) -> tuple[float, Array | None]:
-    """Estimate of α for A (n×n), the smallest eigenvalue of A against X_V, by Lanczos iterations, and its vector (n,).
+    A: SparseMatrix, V: InnerProduct, solve: Solve | None = None, tolerance: float = TOLERANCE
+) -> float:
+    """Estimate of α for A (n×n), the smallest eigenvalue of A against X_V, by Lanczos iterations.
 
-    There is no vector of few unknowns. Raises a `NumericalError` if A is not symmetric positive definite and no `solve`
-    is given.
+    Raises a `NumericalError` if A is not symmetric positive definite and no `solve` is given.
     """
     solve = solve or SparseCholesky(A, "A").solve
     if V.dim <= FEW:
-        return float(scipy.linalg.eigvalsh(A.toarray(), V.matrix.toarray())[0]), None
-    return _smallest(A, V.matrix, solve, start, tolerance)
+        return float(scipy.linalg.eigvalsh(A.toarray(), V.matrix.toarray())[0])
+    return _smallest(A, V.matrix, solve, tolerance)
 
 
 def highest_quotient(A: SparseMatrix, V: InnerProduct) -> float:
@@ -178,7 +167,7 @@ def extreme_quotients(A: SparseMatrix, V: InnerProduct) -> tuple[float, float]:
 
     Raises a `NumericalError` if A is not symmetric positive definite.
     """
-    return lowest_quotient(A, V)[0], highest_quotient(A, V)
+    return lowest_quotient(A, V), highest_quotient(A, V)
 
 
 def energy_inf_sup(A: SparseMatrix, B: SparseMatrix, W: InnerProduct) -> Constant:
@@ -222,45 +211,39 @@ def _smallest_compliance(
         return np.asarray(-solve(np.concatenate([np.zeros(n), y]))[n:])
 
     compliance = _operator(m, lambda y: B @ factor.solve(B.T @ y))
-    return _smallest(compliance, W.matrix, inverse)[0]
+    return _smallest(compliance, W.matrix, inverse)
 
 
 def _saddle_point(A: SparseMatrix, B: SparseMatrix, corner: SparseMatrix) -> SparseMatrix:
     return sp.csc_array(sp.block_array([[A, B.T], [B, corner]]))
 
 
-def smallest_quotient(matrix: Array, X: InnerProduct, start: Array | None = None) -> tuple[float, Array | None]:
-    """Estimate of the smallest eigenvalue of a symmetric matrix (m×m) against that of X, and its vector (m,).
-
-    It is 0 if it is not positive; there is no vector of few unknowns. `start` may be the vector of a similar matrix.
-    """
+def smallest_quotient(matrix: Array, X: InnerProduct) -> float:
+    """Estimate of the smallest eigenvalue of a symmetric matrix (m×m) against that of X; 0 if it is not positive."""
     if len(matrix) <= FEW:
-        return max(0.0, float(scipy.linalg.eigvalsh(matrix, X.matrix.toarray())[0])), None
+        return max(0.0, float(scipy.linalg.eigvalsh(matrix, X.matrix.toarray())[0]))
     try:
         factor = scipy.linalg.cho_factor(matrix)
     except np.linalg.LinAlgError:
-        return 0.0, start
+        return 0.0
 
     def inverse(y: Array) -> Array:
         return np.asarray(scipy.linalg.cho_solve(factor, y, check_finite=False))
 
-    return _smallest(_operator(len(matrix), lambda y: matrix @ y), X.matrix, inverse, start)
+    return _smallest(_operator(len(matrix), lambda y: matrix @ y), X.matrix, inverse)
 
 
 def _smallest(
     matrix: SparseMatrix | LinearOperator,
     product: SparseMatrix,
     inverse: Callable[[Array], Array],
-    start: Array | None = None,
     tolerance: float = TOLERANCE,
-) -> tuple[float, Array]:
-    """Estimate of the smallest eigenvalue of a definite matrix (k×k) with this inverse, and its vector (k,)."""
+) -> float:
+    """Estimate of the smallest eigenvalue of a positive definite matrix (k×k) with this inverse."""
     size = matrix.shape[0]
-    options = _lanczos(size, tolerance) | {"return_eigenvectors": True}
-    if start is not None:
-        options |= {"v0": start, "ncv": min(WITH_START, size)}
-    values, vectors = eigsh(matrix, M=product, sigma=0.0, OPinv=_operator(size, inverse), which="LM", **options)
-    return float(values[0]), np.asarray(vectors[:, 0])
+    operator = _operator(size, inverse)
+    values = eigsh(matrix, M=product, sigma=0.0, OPinv=operator, which="LM", ncv=NCV, **_lanczos(size, tolerance))
+    return float(values[0])
 
 
 def _operator(size: int, apply: Callable[[Array], Array]) -> LinearOperator:

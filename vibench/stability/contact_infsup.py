@@ -42,19 +42,10 @@ class ContactInfSup:
         The diagonal of A on the retained unknowns (c,).
     lost
         δ/σ.
-    start
-        That of constraints with another A.
-
-    Attributes
-    ----------
-    start
-        Where Lanczos iterations begin, from the constraints before (m,); of their choice where it is `None`.
     """
 
-    def __init__(
-        self, schur: BlockDiagonal | SparseMatrix, squares: Array, lost: float, start: Array | None = None
-    ) -> None:
-        self._schur, self._scale, self._lost, self.start = schur, np.sqrt(squares), lost, start
+    def __init__(self, schur: BlockDiagonal | SparseMatrix, squares: Array, lost: float) -> None:
+        self._schur, self._scale, self._lost = schur, np.sqrt(squares), lost
         # the largest row sum of S⁻¹|Ŝ|S⁻¹, which bounds its norm, and the terms of an inner product with Ŝ
         parts = schur.blocks if isinstance(schur, BlockDiagonal) else ((np.arange(len(squares)), schur),)
         sums = [np.max((abs(part) @ (1.0 / self._scale[c])) / self._scale[c], initial=0.0) for c, part in parts]
@@ -69,7 +60,7 @@ class ContactInfSup:
             return Constant(0.0, True)
         compliance = np.asarray(B @ liftings.T)
         compliance = 0.5 * (compliance + compliance.T)
-        square, self.start = smallest_quotient(compliance, W, self.start)
+        square = smallest_quotient(compliance, W)
         if square <= 0.0:
             return Constant(0.0, True)
         sizes = np.sqrt(np.diag(compliance))

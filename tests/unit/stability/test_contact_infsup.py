@@ -63,8 +63,6 @@ def test_the_constant_is_proved_as_closely_as_by_sparse_matrices(monkeypatch: py
     assert found.proved
     assert (1.0 - 2.0 * MARGINS[0]) * exact <= found.value <= exact
     assert found.value == pytest.approx(energy_inf_sup(vi.A, vi.B, W).value, rel=1e-6)
-    again = contact.energy_inf_sup(B, stiffness.liftings(B), W)  # from the vector before
-    assert again.value == pytest.approx(found.value, rel=1e-7)
     # whatever D is, nothing above β_A is proved
     for size in (1e-8, 1e-4, 0.05):
         rough = stiffness.liftings(B) * (1.0 + size * np.random.default_rng(0).standard_normal(B.shape))
@@ -93,7 +91,7 @@ def test_an_estimate_that_is_too_large_costs_sharpness_or_the_proof(monkeypatch:
     for factor, expected in ((1.05, close * 1.05 / 1.1 * (1.0 + MARGINS[0])), (1.6, 0.0)):
         monkeypatch.setattr(
             "vibench.stability.contact_infsup.smallest_quotient",
-            lambda K, W, start, f=factor: (f**2 * estimate(K, W)[0], start),
+            lambda K, W, f=factor: f**2 * estimate(K, W),
         )
         found = contact.energy_inf_sup(B, stiffness.liftings(B), W)
         assert found == Constant(pytest.approx(expected), True)
