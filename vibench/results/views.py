@@ -30,7 +30,7 @@ AXES = (
 """Columns that tell rows apart; where all rows have one value, it stands in the title and takes no room."""
 
 OF_CELLS = (
-    *AXES, "cell", "error_lambda_mean", "online_s", "beta_cone_lower_min", "error_u_mean", "offline_s",
+    *AXES, "cell", "error_lambda_mean", "online_s", "error_u_mean", "offline_s", "beta_cone_lower_min",
     "queries_ok", "N", "R", "status", "beta_span_min", "enrichment",
 )  # fmt: skip
 
