@@ -139,7 +139,8 @@ IMPLEMENTATIONS = {
         Implementation("pardiso", "PARDISO of the Intel MKL", "vibench.linalg.pardiso", "pypardiso"),
         Implementation("cholmod", "CHOLMOD, supernodal", "vibench.linalg.cholmod", "kvxopt"),
         Implementation(
-            "conjugate-gradients", "conjugate gradients with smoothed aggregation, for what no factor fits in memory",
+            "conjugate-gradients",
+            "conjugate gradients with smoothed aggregation, for matrices whose factors do not fit in memory",
             "vibench.linalg.conjugate_gradients", "pyamg", is_direct=False,
         ),
     )

@@ -97,7 +97,7 @@ KEYS: Mapping[str, Column] = {
     ),
     "assembly": text("Assembly of queries: full, reduced, certified (reduced with bounds), compiled.", "assembly", 9),
     "correction": text(
-        "Which solutions are corrected: none, feasible: all, or auto: where ω > ρ; rows judge the corrected pair.",
+        "Which solutions are corrected: none, feasible (all), auto (where ω > ρ); errors are of the corrected pair.",
         "correction",
         10,
     ),
@@ -125,7 +125,7 @@ CELLS: Mapping[str, Column] = {
     "queries": integer("Number of queries, one per validation parameter."),
     "queries_ok": integer("Number of queries with status ok; means and maxima are over these.", "ok", 10),
     "snapshots": integer(
-        "High-fidelity solutions that the training took: parameters of the training set.", "solved", 11
+        "Number of high-fidelity solutions of the training, one per parameter of the training set.", "solved", 11
     ),
     "dim_V": integer("Dimension n of V."),
     "dim_W": integer("Dimension m of W."),
@@ -162,7 +162,7 @@ CELLS: Mapping[str, Column] = {
     "corrected_share": real("1", "Share of the ok queries that are corrected; empty without corrections."),
     "offline_snapshots_s": real("s", "High-fidelity solutions at the training parameters, with one set-up."),
     "offline_selection_s": real(
-        "s", "Choice of the training parameters by error bounds, a part of the time before; 0 for fixed sets."
+        "s", "Choice of the training parameters by error bounds, a part of offline_snapshots_s; 0 for fixed sets."
     ),
     "offline_pod_s": real("s", "POD."),
     "offline_cone_s": real("s", "Dual strategy, with the orthonormal basis of the span."),
@@ -203,7 +203,7 @@ CELLS: Mapping[str, Column] = {
         "s", "Certificate and correction of a query: median over the rounds; empty without either."
     ),
     "timing_rounds": integer(
-        "Most timing rounds that were asked for; empty if the cell has not been timed yet, or not to the end."
+        "Maximal number of timing rounds of the study; empty if the timing of the cell is not finished."
     ),
     "timed_rounds": integer("Rounds that were timed: they end when all comparisons of the cell are decided."),
     "timing_reason": text("Why rounds are missing."),
@@ -324,9 +324,9 @@ QUERIES: Mapping[str, Column] = {
     "certify_s": real("s", "The certificate and the correction: median over the rounds; empty without either."),
     "total_s": real("s", "Sum of the three."),
     "total_wall_s": real("s", "The same in wall seconds."),
-    "corrected": integer("1 if the answer is the corrected pair, 0 if the reduced solution; empty if none was asked."),
+    "corrected": integer("1 if the corrected pair is returned, 0 if the reduced solution; empty without corrections."),
     "correction_share": real("1", "ω/ρ of the reduced solution, above which auto corrects at 1; empty if unknown."),
-    "correction_note": text("Why the answer is not corrected although that was asked for."),
+    "correction_note": text("Why the solution is not corrected although a correction was requested."),
     "reference_bound": real(
         "1",
         "Bound of the energy error of the high-fidelity solution, relative to ‖u‖_A and ‖Bᵀλ‖_A⁻¹; at most 1e-6, or "
@@ -344,7 +344,9 @@ QUERIES: Mapping[str, Column] = {
     "error_u_absolute": real("V", "‖u − u_N‖ in V."),
     "error_lambda_absolute": real("W", "‖λ − λ_N‖ in W."),
     "error_u_energy_absolute": real("A", "‖u − u_N‖ in the norm of A(µ)."),
-    "error_lambda_natural_absolute": real("A", "‖Bᵀ(λ − λ_N)‖ in the norm of A(µ)⁻¹, an energy norm, too."),
+    "error_lambda_natural_absolute": real(
+        "A", "‖Bᵀ(λ − λ_N)‖ in the norm of A(µ)⁻¹, which has the unit of the energy norm."
+    ),
     "error_u_scaled": real("1", "‖u − u_N‖ over the largest ‖u‖ of the training set."),
     "error_lambda_scaled": real("1", "‖λ − λ_N‖ over the largest ‖λ‖ of the training set."),
     "solver_error_u": real(
@@ -453,8 +455,12 @@ TIMINGS: Mapping[str, Column] = {
     "total_wall_s": real("s", "The same in wall seconds."),
     "block": text("Block of rounds, which cells that were timed together share; each block is a process of its own."),
     "hf_s": real("s", "High-fidelity solution in the round, mean over the parameters that it takes."),
-    "pace": real("1", "How much slower than in the other rounds of the block all that was timed was: the median."),
-    "slowdown": real("1", "CPU time of the calibration next to the round, divided by that on a calm machine."),
+    "pace": real(
+        "1", "Factor by which the timings of this round exceed those of the other rounds of the block: the median."
+    ),
+    "slowdown": real(
+        "1", "CPU time of the calibration next to the round, divided by the lowest tenth of it in that process."
+    ),
 }
 
 PARAMETER = real("µ", "The k-th parameter; tables for reading have its name as heading.")
@@ -498,11 +504,9 @@ THRESHOLDS: Mapping[str, Column] = {
     ),
     "threshold_low": real("1", "Lower end of the 95 % interval of n*; if undecided, the smallest n*."),
     "threshold_high": real("1", "Upper end of the 95 % interval of n*.", "interval", 21),
-    "meaning": text(
-        "Queries for which b is cheaper than a in total: from n* on, until n*, never or at once; or undecided."
-    ),
+    "meaning": text("When b is cheaper than a in total: from n* on, until n*, never or at once; or undecided."),
     "rounds_missing": integer(
-        "If undecided, how many more rounds would decide it; empty where none would: offline seconds are as close.",
+        "If undecided, how many more rounds would decide it; empty where the offline seconds are too close.",
         "more rounds",
         22,
     ),
@@ -536,7 +540,7 @@ OUTPUTS: Mapping[str, Column] = {
     "unit": text("Its unit.", "unit", 11),
     "linear": integer("1 where it is linear in u and λ with fixed coefficients, else 0."),
     "scale": real("o", "Its largest absolute value over the training set.", "scale", 12),
-    "queries_ok": integer("Ok queries, over which means and maxima are."),
+    "queries_ok": integer("Number of ok queries; means and maxima are over these."),
     "error_mean": real("1", "Mean relative error, where the output is not zero.", "error", 13),
     "error_max": real("1", "Largest relative error, likewise.", "largest", 14),
     "queries_zero": integer("Ok queries where it is at most 1e-8 of its scale: no contact, for instance."),

@@ -195,17 +195,17 @@ class Study(_Model):
         int,
         Ge(1),
         Lt(1000),
-        Field(description="Most rounds of timing of a cell; break-even is undecided with fewer than six."),
+        Field(description="Maximal number of timing rounds of a cell; with fewer than six, break-even is undecided."),
     ] = 18
     timing_rounds_min: Annotated[
         int,
         Ge(1),
         Lt(1000),
-        Field(description="Rounds after which those of a cell end once its comparisons are decided."),
+        Field(description="Minimal number of timing rounds, after which a cell with decided comparisons ends."),
     ] = 6
     factorisation: Annotated[
         Literal["superlu", "pardiso", "cholmod", "conjugate-gradients", "available"],
-        Field(description="Who factorises high-fidelity matrices; of a problem its option of that name."),
+        Field(description="Factorisation of high-fidelity matrices; a problem may have an option of the same name."),
     ] = "superlu"
     problem: Annotated[list[ProblemEntry], MinLen(1), Field(description="Problems.")]
     tolerances: Annotated[
