@@ -116,7 +116,7 @@ def main(run: str, target: str) -> None:
         target,
         "Conclusions and meshes",
         made_by("meshes", "meshes", "meshes", options=" --no-figures"),
-        "The problems of the paper on meshes of one size that differ in their triangulation alone. For the obstacle: "
+        "The problems of the paper on meshes of one size that differ only in their triangulation. For the obstacle: "
         "ours, symmetric as the training grid is, and the same one with nodes displaced at random (`asymmetric`). For "
         "Hertz contact: layers of nodes shifted by half a spacing (ours), not shifted and cut by diagonals that all "
         "point one way, and displaced at random (`triangulation`).",

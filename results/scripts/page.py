@@ -16,22 +16,22 @@ from PIL import Image, PngImagePlugin
 from vibench.report.figures.style import caption_of, first_sentence, save
 from vibench.results import formats, tables
 
-ONE_MACHINE = "One machine measured all seconds; offline seconds are measured once."
+ONE_MACHINE = "All seconds were measured on one machine."
 
 LIMITATIONS = {
-    "paper-obstacle": f"{ONE_MACHINE} The norm of V and the map of the mesh are not published and are ours. Every query of full assembly projects matrices of mesh size in Python.",  # noqa: E501
-    "paper-hertz": f"{ONE_MACHINE} Quadrature and master mesh of the paper are not published; with others N and R are different ones (page hertz-quadrature). A is constant, which full assembly does not use.",  # noqa: E501
-    "benefit": f"{ONE_MACHINE} One cone (mCPG), two pairs of dimensions and one solver for each problem. Gains are those of queries at different errors: compare rows of equal errors.",  # noqa: E501
+    "paper-obstacle": f"{ONE_MACHINE} The norm of V and the map of the mesh are not published; ours may differ. With full assembly, every query projects matrices of mesh size in Python.",  # noqa: E501
+    "paper-hertz": f"{ONE_MACHINE} Quadrature and master mesh of the paper are not published; N and R depend on them (page hertz-quadrature). Full assembly does not make use of A being constant.",  # noqa: E501
+    "benefit": f"{ONE_MACHINE} One cone (mCPG), two pairs of dimensions and one solver for each problem. Gains are those of models with different errors: compare rows with equal errors.",  # noqa: E501
     "field": f"{ONE_MACHINE} One mesh of medium size for each problem, one solver, 32 validation parameters. Strategies of others are our implementations, with their default options.",  # noqa: E501
-    "certified": f"{ONE_MACHINE} One cone (mCPG) in `certified`. Effectivities are those at 64 parameters; bounds of the obstacle rest on interpolation errors that were measured at other parameters.",  # noqa: E501
+    "certified": f"{ONE_MACHINE} One cone (mCPG) in `certified`. Effectivities are those at 64 parameters; bounds of the obstacle rely on interpolation errors that were measured at other parameters.",  # noqa: E501
     "hertz-quadrature": "One problem; eight validation parameters. Variants that are not in the table, such as other pairings, were not tried.",  # noqa: E501
     "meshes": "Two obstacle meshes and three of Hertz contact, all of one size: what holds on finer ones is not shown.",
     "solvers": f"{ONE_MACHINE} Solvers have their default options but for the accuracy, and solve small dense programs; larger or sparse ones may order them differently.",  # noqa: E501
-    "scaling": "Each mesh was measured once, on one machine. Exponents between two sizes carry the noise of both.",
+    "scaling": "Each mesh was measured once, on one machine. Exponents between two sizes contain the noise of both measurements.",
     "speed": f"{ONE_MACHINE} The transcription is ours and not the code of the authors.",
     "stability-per-vector": "One mesh and one pair of N and R for each problem; the counts are those of the training set.",  # noqa: E501
-    "exact-answers": "A problem with radial symmetry, whose solution is smoother than those of the other problems.",
-    "hertz-theory": "The theory is of small deformations and half-planes, the problem of discs of finite size: deviations of some per cent are those of the models, and not of the discretisation alone.",  # noqa: E501
+    "exact-answers": "The problem has radial symmetry, and its solution is smoother than those of the other problems.",
+    "hertz-theory": "The theory assumes small deformations and half-planes, whereas the problem has discs of finite size: deviations of some per cent are due to the difference of the models, and not to the discretisation alone.",  # noqa: E501
 }
 """What a page does not show, by its folder; it is said at its end."""
 

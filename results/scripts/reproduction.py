@@ -37,29 +37,29 @@ vibench run paper-obstacle && vibench run paper-hertz && vibench run hertz-direc
 python results/scripts/reproduction.py runs/paper-obstacle runs/paper-hertz runs/hertz-direct > docs/reproduction.md
 ```
 
-Seconds were measured on {machine}.{disturbed} Equations, sections and figures are those of the paper. *On* and *off* are its online and offline enrichment; our numbers are those of the cone of mCPG, PIQP and assembly in full, unless a row says otherwise. Curves are not read off the figures: of a figure, the page compares what the text and the caption say.
+Seconds were measured on {machine}.{disturbed} Equations, sections and figures are those of the paper. *On* and *off* are its online and offline enrichment; our numbers are those of the cone of mCPG, PIQP and assembly in full, unless a row says otherwise. Curves are not read off the figures; of a figure, the page compares the statements of text and caption.
 
-The verdict is computed from the numbers. Dimensions agree within {dimension:.0f} %, sizes of meshes within {mesh:.0f} %, ratios of seconds within {ratio:.0f} %, orders of magnitude within a factor {order:.2g}. A benefit threshold n\\* agrees if the value of the paper lies in our [95 % interval](measurement.md#seconds) and the ends of this are at most a factor {widest:g} apart; a wider interval that contains it decides nothing. An inequality agrees if it holds at every step and parameter. What the paper observes on a figure is judged at the parameters and tolerances of that figure, and a constant over the cone by the bound that proves something. Seconds on different machines cannot be compared, nor what the paper does not give or gives only in a figure, nor what a run does not reach. What agrees *by construction* is no outcome: an input that is copied from the paper, a size that a study prescribes, arithmetic on numbers that the paper prints. `vibench figures --paper` judges by the same rules below each figure.
+The verdict is computed from the numbers. Dimensions agree within {dimension:.0f} %, sizes of meshes within {mesh:.0f} %, ratios of seconds within {ratio:.0f} %, orders of magnitude within a factor {order:.2g}. A benefit threshold n\\* agrees if the value of the paper lies in our [95 % interval](measurement.md#seconds) and the ends of this are at most a factor {widest:g} apart; a wider interval that contains it is inconclusive. An inequality agrees if it holds at every step and parameter. Observations of the paper on a figure are judged at the parameters and tolerances of that figure, and constants over the cone by the bound from which a conclusion follows. Seconds on different machines cannot be compared, nor can quantities that the paper does not give or gives only in a figure, nor those that a run does not reach. Agreement *by construction* is not a result: inputs copied from the paper, sizes that a study prescribes, arithmetic on numbers that the paper prints. `vibench figures --paper` judges by the same rules below each figure.
 """  # noqa: E501
 
 CAUSES = """## Causes of differences
 
 - **Two definitions of β.** The paper defines β over the cone and states what holds over the span ([Mathematics](mathematics.md#inf-sup-constants)).
-- **What is not published.** The norm of V and the map h of the obstacle, the quadrature and the master mesh of Hertz contact. The reduced bases of the paper contain the oscillations that direct projection causes. With one of {count} variants of a direct projection N and R come close to the published ones; it was chosen for that.
-- **Proportional constraints.** For the obstacle all parameters share one space of supremizers. PGA uses this; the offline enrichment then adds little to the offline time.
-- **Assembly in full.** Every query projects matrices of mesh size, and A of Hertz contact although it is constant. A larger space makes a query slower. [Reduced assembly](mathematics.md#reduced-assembly) does not have this cost.
+- **What is not published.** The norm of V and the map h of the obstacle, the quadrature and the master mesh of Hertz contact. The reduced bases of the paper contain the oscillations that direct projection causes. With one of {count} variants of a direct projection N and R come close to the published ones; it was chosen for this reason.
+- **Proportional constraints.** For the obstacle all parameters share one space of supremizers. PGA makes use of this, so that the offline enrichment adds little to the offline time.
+- **Assembly in full.** Every query projects matrices of mesh size, for Hertz contact also A, although it is constant. Queries in a larger space are slower. [Reduced assembly](mathematics.md#reduced-assembly) does not have this cost.
 - **Statements about greedy algorithms.** The errors of two greedy algorithms that select different snapshots are not ordered, neither along the steps nor at other parameters.
 - **Signs and misprints.** They are listed under [Differences from the paper](mathematics.md#differences-from-the-paper).
 """  # noqa: E501
 
-FIT = """This section is a fit and no independent confirmation: of the {count} variants of a direct projection in [`hertz-quadrature`](../results/hertz-quadrature/README.md) (one to three Gauss points, meshes that differ in their triangulation and in the fineness of the master surface) its run has the one whose N and R come closest to the published ones. Over all of them N for δ_POD = 0.001 goes from {low} to {high}, published are {published}; R of mCPG for δ = 0.01 goes from {fewest} to {most}, published are {generators}."""  # noqa: E501
+FIT = """This section is a fit and no independent confirmation: of the {count} variants of a direct projection in [`hertz-quadrature`](../results/hertz-quadrature/README.md) (one to three Gauss points, meshes that differ in their triangulation and in the fineness of the master surface) its run has the one whose N and R come closest to the published ones. Over all variants N for δ_POD = 0.001 goes from {low} to {high}, published are {published}; R of mCPG for δ = 0.01 goes from {fewest} to {most}, published are {generators}."""  # noqa: E501
 
-DEVIATIONS = """## What is not done as published
+DEVIATIONS = """## Deviations from the published procedure
 
 - *Assembly in full* means, as in the paper, that the matrices are assembled on the mesh and projected at every query. Online supremizers, however, are orthonormalised in coordinates on the contact unknowns and not on the mesh; the space is the same.
 - PGA treats parameters with proportional B(µ) once, keeps the bounds of σ from earlier steps, and works in coordinates on the contact unknowns. CPG and mCPG keep the bounds of distances from earlier steps. The selected vectors are the same.
 - The high-fidelity solver is a primal–dual active set method that starts from the contact set at the nearest parameter solved before. A constant A is factorised once.
-- Seconds are CPU seconds of one thread, medians over rounds ([How things are measured](measurement.md)).
+- Seconds are CPU seconds of one thread, measured in rounds ([How things are measured](measurement.md)).
 """  # noqa: E501
 
 
