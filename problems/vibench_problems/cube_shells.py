@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 from skfem import MeshHex
@@ -72,7 +72,7 @@ def graded_block(cells: int, layers: int, width: float, length: float) -> Graded
     inside = np.vstack(
         [number[i : i + cells, j : j + cells, k : k + cells].ravel() for i, j, k in product((0, 1), repeat=3)]
     )
-    shells = [np.vstack(pair) for pair in zip(levels[:-1], levels[1:], strict=True)]
+    shells = [np.vstack(pair) for pair in pairwise(levels)]
     # `product` counts corners in another order than the reference hexahedron does.
     order = MeshHex.elem.refdom.p.T.astype(int) @ np.array([4, 2, 1])
     points = np.ascontiguousarray(width * (unit * np.array([1.0, 1.0, -1.0])).T)

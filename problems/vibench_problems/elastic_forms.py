@@ -18,7 +18,7 @@ Gradients = Sequence[Sequence[SparseMatrix]]
 """∫ ∂_a u ∂_b v of scalar functions, for a and then b."""
 
 
-class ElementSurfaceBubble(ElementH1):
+class ElementSurfaceBubble(ElementH1):  # type: ignore[misc]
     """The function 16 x (1 − x) y (1 − y) (1 − z) of the reference hexahedron: it vanishes on all sides but z = 0."""
 
     interior_dofs = 1

@@ -43,8 +43,9 @@ class EllipticContact:
 def elliptic_contact(radius_x: float, radius_y: float, approach: float, modulus: float) -> EllipticContact:
     """The contact under z = x²/(2 R_x) + y²/(2 R_y) − δ (Hertz 1882; Johnson, Contact Mechanics, 1985, §4.2).
 
-    The pressure on an ellipse displaces its inside by (P/2) ∫₀^∞ (1 − x²/(a² + w) − y²/(b² + w)) dw / √((a² + w)(b² + w) w)
-    with P = p₀ a b / E*, which is δ − x²/(2 R_x) − y²/(2 R_y) for
+    Inside the ellipse the pressure moves the surface by
+    ½ P ∫₀^∞ (1 − x²/(a² + w) − y²/(b² + w)) / √((a² + w)(b² + w) w) dw with P = p₀ a b / E*. This is the depth of the
+    paraboloid, δ − x²/(2 R_x) − y²/(2 R_y), for
 
         δ = P R_F(0, a², b²),    1/R_x = ⅔ P R_D(0, b², a²),    1/R_y = ⅔ P R_D(0, a², b²)
 

@@ -55,7 +55,7 @@ class FarField:
 
 
 def fields(points: Array) -> tuple[Array, Array]:
-    """k and m (2×3×p) at points (3×p) of z ≤ 0 other than the origin, and their gradients ∂_b u_a (2×3×3×p)."""
+    """The fields k and m (2×3×p) at points (3×p) of z ≤ 0 but the origin, and their gradients ∂_b u_a (2×3×3×p)."""
     downwards = np.array([1.0, 1.0, -1.0])[:, None]
     x = downwards * points
     r, depth, unit = np.linalg.norm(x, axis=0), x[2], np.eye(3)

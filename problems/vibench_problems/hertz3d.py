@@ -53,8 +53,8 @@ class Hertz3D(AffineProblem):
     a share of (1 − 2ν)/(π(1 − ν)) a/R, up to 1 %.
 
     Of the block one quarter is meshed. Q1 displacements on hexahedra; on each surface facet of the zone a constant
-    multiplier and, for its sake, a bubble of the vertical displacement: without bubbles the pressure oscillates by 15 %.
-    Contact is that of gaps integrated over facets.
+    multiplier and, for its sake, a bubble of the vertical displacement: without bubbles the pressure oscillates by
+    15 %. Contact is that of gaps integrated over facets.
 
     Parameters
     ----------
@@ -87,8 +87,8 @@ class Hertz3D(AffineProblem):
         growth: Annotated[float, Gt(1.0), Le(2.0)] = 1.15,
         young: Annotated[float, Gt(0.0)] = 1.0,
     ) -> None:
-        named = isinstance(resolution, str)
-        cells = CELLS[resolution] if named else round((resolution / UNKNOWNS_PER_CELL) ** (1.0 / 3.0))
+        number = CELLS[resolution] if isinstance(resolution, str) else (resolution / UNKNOWNS_PER_CELL) ** (1.0 / 3.0)
+        cells = round(number)
         self.young, length = young, distance * LARGEST
         layers = round(np.log(length / WIDTH) / np.log(growth) * cells / CELLS["medium"])
         self.block = graded_block(cells, layers, WIDTH, length)
@@ -96,8 +96,8 @@ class Hertz3D(AffineProblem):
         # Facets of the zone and the hexahedra below them have one order, that of rows of B and of bubbles.
         self._below = np.asarray(self.block.mesh.f2t[0, self.block.zone])
         self.areas = self._integrals(lambda x: np.ones_like(x[0]))
-        self._squares = np.stack([self._integrals(lambda x, axis=axis: x[axis] ** 2) for axis in (0, 1)])
-        self.middles = np.stack([self._integrals(lambda x, axis=axis: x[axis]) for axis in (0, 1)]) / self.areas
+        self._squares = np.stack([self._integrals(lambda x: x[0] ** 2), self._integrals(lambda x: x[1] ** 2)])
+        self.middles = np.stack([self._integrals(lambda x: x[0]), self._integrals(lambda x: x[1])]) / self.areas
         outside = self._restrict(far)
         lame, shear, gram = self._interior()
         if outside is not None:

@@ -181,10 +181,11 @@ class HighFidelitySolver:
 
         One factorisation per parameter serves all then: the first system, its borders and the verification.
         """
-        pattern = EliminationPattern.of(vi.A, self._constrained)
+        factorisation = self._problem.factorisation
+        pattern = EliminationPattern.of(vi.A, self._constrained, factorisation)
         if self._condensing or "A" in self._problem.constant or pattern.is_dense or len(vi.g) > FEW_ROWS:
             return pattern
-        return EliminationPattern.of_none(vi.A)
+        return EliminationPattern.of_none(vi.A, factorisation)
 
 
 def solve_high_fidelity(

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.linalg.cholesky import PartialCholesky, elimination_order
+from vibench.linalg.cholesky import PartialCholesky
 from vibench.linalg.definite import BlockDiagonal
 from vibench.linalg.factorisations import DEFAULT, implementation
 
@@ -43,19 +43,20 @@ class EliminationPattern:
         return PrincipalSubmatrix(self.retained)
 
     @classmethod
-    def of(cls, A: SparseMatrix, retained: Indices) -> EliminationPattern:
-        """Pattern for matrices with the sparsity of A (n×n), symmetric positive definite."""
+    def of(cls, A: SparseMatrix, retained: Indices, factorisation: str = DEFAULT) -> EliminationPattern:
+        """Pattern for matrices with the sparsity of A (n×n), symmetric positive definite, to be factorised so."""
         others = np.setdiff1d(np.arange(A.shape[0]), retained)
         interface = np.unique(sp.csr_array(A)[others][:, retained].indices)
         inside = np.union1d(others, retained[interface])
-        order = elimination_order(sp.csr_array(A)[inside][:, inside], np.searchsorted(inside, retained[interface]))
+        last = np.searchsorted(inside, retained[interface])
+        order = implementation(factorisation).order(sp.csr_array(A)[inside][:, inside], last)
         return cls(retained, inside[order], interface)
 
     @classmethod
-    def of_none(cls, A: SparseMatrix) -> EliminationPattern:
+    def of_none(cls, A: SparseMatrix, factorisation: str = DEFAULT) -> EliminationPattern:
         """The pattern that eliminates no unknown of matrices with the sparsity of A (n×n), and orders all."""
         none = np.zeros(0, np.intp)
-        return cls(np.arange(A.shape[0]), none, none, PrincipalSubmatrix(elimination_order(A, none)))
+        return cls(np.arange(A.shape[0]), none, none, PrincipalSubmatrix(implementation(factorisation).order(A, none)))
 
 
 class PrincipalSubmatrix:
