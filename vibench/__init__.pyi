@@ -33,11 +33,12 @@ from .interfaces.formulations import FormulationModel as FormulationModel
 from .interfaces.formulations import Multiplier as Multiplier
 from .interfaces.formulations import Outcome as Outcome
 from .interfaces.outputs import Output as Output
+from .interfaces.pictures import MeshFields as MeshFields
+from .interfaces.pictures import Picture as Picture
 from .interfaces.problem import MEMBERS as MEMBERS
 from .interfaces.problem import Contact as Contact
 from .interfaces.problem import ContactLoads as ContactLoads
 from .interfaces.problem import ParameterBox as ParameterBox
-from .interfaces.problem import Picture as Picture
 from .interfaces.problem import Problem as Problem
 from .interfaces.problem import Sampler as Sampler
 from .interfaces.problem import VariationalInequality as VariationalInequality
@@ -60,6 +61,7 @@ from .library.export import export_model as export_model
 from .library.runs import Run as Run
 from .library.runs import open_run as open_run
 from .library.runs import run as run
+from .library.vtu import export_vtu as export_vtu
 from .linalg.inner_product import InnerProduct as InnerProduct
 from .offline.checked_tools import greedy_cone as greedy_cone
 from .offline.checked_tools import pod as pod

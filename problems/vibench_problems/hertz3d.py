@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from annotated_types import Ge, Gt, Le
 from skfem import Basis, BilinearForm, ElementHex0, ElementHex1, FacetBasis
 
-from vibench import AffineProblem, Array, InnerProduct, Output, ParameterBox, Picture, SparseMatrix
+from vibench import AffineProblem, Array, InnerProduct, MeshFields, Output, ParameterBox, Picture, SparseMatrix
 from vibench_problems.cube_shells import graded_block
 from vibench_problems.elastic_forms import (
     AXES,
@@ -227,4 +227,18 @@ class Hertz3D(AffineProblem):
         return Picture(
             self.block.mesh.p[:2, nodes], triangles, settled, "vertical displacement [m]", self.middles, lam,
             "contact pressure [Pa]", "m",
+        )  # fmt: skip
+
+    def mesh_fields(self, mu: Array, u: Array, lam: Array) -> MeshFields:  # noqa: ARG002
+        """Displacements of the block's nodes, without bubbles, and the contact pressure on facets of the zone."""
+        mesh = self.block.mesh
+        reference = mesh.elem.refdom.p.T.astype(int) @ np.array([4, 2, 1])  # the corner x, y, z is 4x + 2y + z
+        around = np.array([0, 4, 6, 2, 1, 5, 7, 3])  # the order of VTK
+        corners = mesh.t[np.argsort(reference)[around]].T
+        top = mesh.facets[:, self.block.zone]
+        x, y = mesh.p[:2, top] - mesh.p[:2, top].mean(axis=1)[:, None]
+        zone = np.take_along_axis(top, np.argsort(np.arctan2(y, x), axis=0), axis=0).T
+        return MeshFields(
+            mesh.p.T.copy(), {"hexahedron": corners, "quad": zone}, {"u [m]": self.displacement(u).T.copy()},
+            {"quad": {"contact pressure [Pa]": lam}},
         )  # fmt: skip

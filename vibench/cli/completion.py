@@ -58,6 +58,7 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench export-model quick 3f9a membrane.npz",
         "vibench export-model quick 3f9a membrane.npz --interpolate 1e-6 --c",
     ),
+    "export-vtu": ("vibench export-vtu quick 3f9a 1.0,0.02,-0.01 --out membrane.vtu",),
     "check": (
         "vibench check my-problem --option resolution=medium",
         "vibench check primal:mine",

@@ -19,7 +19,14 @@ from typer import Argument, Option
 from vibench.cli import output_commands
 from vibench.cli.bench_command import bench_plugins
 from vibench.cli.completion import CORRECTIONS, examples, formulations, names, solvers, studies, whole_words, words
-from vibench.cli.output_commands import draw_figures, export_qps, export_reduced_model, publish_runs, write_report
+from vibench.cli.output_commands import (
+    draw_figures,
+    export_mesh_fields,
+    export_qps,
+    export_reduced_model,
+    publish_runs,
+    write_report,
+)
 from vibench.cli.pack_commands import import_pack, pack_problem, reduce_cones
 from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
 from vibench.cli.result_commands import At, compare_runs, diff_runs, places_of, replay_query, show
@@ -258,7 +265,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "run": run_study_command, "list": list_plugins, "show": show, "report": write_report, "figures": draw_figures,
     "diff": diff_runs, "compare": compare_runs, "publish": publish_runs,
     "replay": replay_query, "export-qps": export_qps,
-    "export-model": export_reduced_model, "clean": clean, "doctor": doctor,
+    "export-model": export_reduced_model, "export-vtu": export_mesh_fields, "clean": clean, "doctor": doctor,
     "check": check_plugin, "bench": bench_plugins, "new": new_plugin,
     "import": import_pack, "pack": pack_problem, "cones": reduce_cones, "help": help_on,
 }  # fmt: skip

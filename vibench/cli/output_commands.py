@@ -197,6 +197,27 @@ def export_reduced_model(
     echo(f"{written}: `from {script} import Model`, then `Model({str(file)!r}).solve(mu)`")
 
 
+def export_mesh_fields(
+    run: RunArgument,
+    cell: Annotated[str, Argument(metavar="CELL", help="Key of a cell, or its beginning.", autocompletion=cells)],
+    mu: Annotated[str, Argument(metavar="MU", help="The parameter: its components, separated by commas.")],
+    out: Annotated[Path | None, Option(metavar="FILE", help="A new file; RUN/vtu/CELL.vtu by default.")] = None,
+    at: At = None,
+) -> None:
+    """Export u, λ and their errors at a parameter for ParaView."""
+    from vibench.library.runs import open_run
+    from vibench.library.vtu import export_vtu
+
+    try:
+        components = [float(each) for each in mu.split(",")]
+    except ValueError:
+        raise RequestError(f"MU is {mu!r}, expected numbers separated by commas, such as 1.2,0.05") from None
+    opened = open_run(run, at=places_of(at))
+    model = opened.model(cell)
+    file = export_vtu(model, components, out or opened.path.parent / "vtu" / f"{model.row['cell']}.vtu")
+    echo(f"u, λ and their errors at mu = {components}: {file}")
+
+
 def _outputs_in_words(outputs: Mapping[str, Any]) -> list[str]:
     """A line on which quantities of interest are exported, none where there are none."""
     names, others = ", ".join(output["name"] for output in outputs["linear"]), ", ".join(outputs["left_out"])

@@ -15,6 +15,7 @@ from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.errors import RequestError, unknown_name
 from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.outputs import Output
+from vibench.interfaces.pictures import MeshFields, Picture
 from vibench.linalg.factorisations import DEFAULT
 from vibench.linalg.inner_product import InnerProduct
 from vibench.text import normal_name
@@ -184,34 +185,6 @@ class ContactLoads:
         return slice(self.first, len(self.fixed) if self.reach is None else self.first + self.reach)
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A solution to be drawn.
-
-    Attributes
-    ----------
-    points, triangles
-        Mesh in the configuration to be drawn (2×p), (3×t); on a line points (1×p) and no triangles.
-    values, name
-        Nodal values of the colour map (p,), and their name with its unit.
-    positions, multiplier
-        Points of the multiplier (1×m on a line, 2×m in the plane) and its values (m,).
-    multiplier_name
-        Name of the multiplier, with its unit.
-    length_unit
-        Unit of the coordinates; "" where it is not said.
-    """
-
-    points: Array
-    triangles: Indices
-    values: Array
-    name: str
-    positions: Array
-    multiplier: Array
-    multiplier_name: str
-    length_unit: str = ""
-
-
 MEMBERS = ("A", "f", "B", "g")
 """The members of a `VariationalInequality` that depend on the parameter."""
 
@@ -339,6 +312,11 @@ class Problem(ABC):
     def picture(self, mu: Array, u: Array, lam: Array) -> Picture | None:  # noqa: ARG002
         """The picture of a solution u (n,), λ (m,) at mu (d,); `None` if not implemented."""
         return None
+
+    def mesh_fields(self, mu: Array, u: Array, lam: Array) -> MeshFields | None:
+        """A solution u (n,), λ (m,) at mu (d,) on its mesh, for programs that show meshes; by default its picture."""
+        picture = self.picture(mu, u, lam)
+        return None if picture is None else MeshFields.of_picture(picture)
 
     def diagnostics(self, mu: Array) -> Mapping[str, float]:  # noqa: ARG002
         """Scalars recorded with a high-fidelity solution at mu (d,), such as mesh quality; none by default."""

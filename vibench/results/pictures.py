@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vibench.interfaces.problem import Picture
+from vibench.interfaces.pictures import Picture
 from vibench.results.sqlite.reading import read_rows
 from vibench.text import printable
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
-from vibench.interfaces.problem import ParameterBox, Picture
+from vibench.interfaces.pictures import Picture
+from vibench.interfaces.problem import ParameterBox
 from vibench.results.pictures import ARRAYS, TEXTS, failure_rows, picture_rows
 from vibench.stages.base import Result, Row, Stage, build_problem
 from vibench.stages.snapshots import gather, solution_stages

@@ -12,7 +12,7 @@ from samples import SampleStore, carry_out
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
-from vibench.interfaces.problem import Picture
+from vibench.interfaces.pictures import Picture
 from vibench.results import pictures
 from vibench.results.database import ResultsDatabase
 from vibench.results.pictures import Shown

@@ -11,7 +11,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.tri import Triangulation
 
 from vibench.arrays import Array
-from vibench.interfaces.problem import Picture
+from vibench.interfaces.pictures import Picture
 from vibench.report.figures.data import Data
 from vibench.report.figures.looks import BLACK, COLOURS
 from vibench.report.figures.style import ABREAST, CaptionedFigure, Layout, Pages, Sheet

@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vibench
+from vibench import Reduction, RequestError, Stop, create
+from vibench.library.vtu import export_vtu
+from vibench.offline.sweep import high_fidelity_sweep
+
+meshio = pytest.importorskip("meshio")
+
+SMALL = {"hertz3d": {"resolution": 1350}, "hertz": {"resolution": 300}, "obstacle": {"resolution": 200}}
+
+
+def model_of(name: str) -> vibench.Model:
+    """A model of few snapshots, whose errors are large."""
+    problem = create("problem", name, SMALL[name])
+    box = problem.parameters
+    training = box.lower + np.array([[0.1], [0.5], [0.9]]) * box.widths
+    strategies = create("dual strategy", "mcpg"), create("primal strategy", "offline-pga")
+    reduction = Reduction(problem, *strategies, Stop(size=3), Stop(size=3), tolerance=0.5)
+    return reduction.given(snapshots=high_fidelity_sweep(problem, training)).model
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_the_file_has_both_solutions_and_their_differences(name: str, tmp_path: Path) -> None:
+    model = model_of(name)
+    mu = model.parameters.lower + 0.3 * model.parameters.widths
+    written = meshio.read(export_vtu(model, mu, tmp_path / "deep" / "fields.vtu"))
+    answer, exact = model.solve(mu), model.high_fidelity(mu)
+    fields = model.problem.mesh_fields(mu, exact.u, exact.lam)
+    assert np.array_equal(written.points, fields.points)
+    assert {block.type: len(block.data) for block in written.cells} == {k: len(v) for k, v in fields.cells.items()}
+    for kind, u, lam in (("high fidelity", exact.u, exact.lam), ("reduced", answer.u, answer.lam)):
+        expected = model.problem.mesh_fields(mu, u, lam)
+        for quantity, values in expected.at_points.items():
+            assert np.array_equal(written.point_data[f"{quantity}, {kind}"], values, equal_nan=True)
+        for owner, named in expected.in_cells.items():
+            for quantity, values in named.items():
+                blocks = dict(zip(fields.cells, written.cell_data[f"{quantity}, {kind}"], strict=True))
+                assert np.array_equal(blocks.pop(owner), values)
+                assert all(np.isnan(others).all() for others in blocks.values())
+    for quantity in fields.at_points:
+        high, low, error = (written.point_data[f"{quantity}, {kind}"] for kind in ("high fidelity", "reduced", "error"))
+        assert np.array_equal(error, low - high, equal_nan=True)
+        assert np.nanmax(np.abs(error)) > 0.0
+
+
+def test_hexahedra_and_facets_have_the_order_of_vtk(tmp_path: Path) -> None:
+    problem = create("problem", "hertz3d", SMALL["hertz3d"])
+    zero = np.zeros(problem.V.dim), np.zeros(problem.W.dim)
+    fields = problem.mesh_fields(problem.parameters.lower, *zero)
+    corners = fields.points[fields.cells["hexahedron"]]
+    edges = np.stack([corners[:, k] - corners[:, 0] for k in (1, 3, 4)], axis=1)
+    volumes = np.abs(np.linalg.det(edges))
+    diagonal = np.linalg.norm(corners[:, 6] - corners[:, 0], axis=1)  # opposite corners are the farthest
+    assert np.all(volumes > 0.0)
+    assert np.all(diagonal >= np.linalg.norm(corners - corners[:, :1], axis=2).max(axis=1) * (1.0 - 1e-12))
+    square = fields.points[fields.cells["quad"]]
+    sides = np.linalg.norm(square - np.roll(square, 1, axis=1), axis=2)
+    assert np.allclose(sides, sides[0, 0])
+
+
+def test_requests_that_cannot_be_met_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = model_of("obstacle")
+    mu = model.parameters.lower
+    with pytest.raises(RequestError, match=r"must end in \.vtu"):
+        export_vtu(model, mu, tmp_path / "fields.vtk")
+    (tmp_path / "there.vtu").touch()
+    with pytest.raises(RequestError, match="exists"):
+        export_vtu(model, mu, tmp_path / "there.vtu")
+    monkeypatch.setattr(type(model.problem), "picture", lambda *_: None)
+    with pytest.raises(RequestError, match="neither mesh_fields nor a picture"):
+        export_vtu(model, mu, tmp_path / "fields.vtu")
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    with pytest.raises(RequestError, match="needs meshio"):
+        export_vtu(model, mu, tmp_path / "fields.vtu")

@@ -1,0 +1,87 @@
+"""Solutions of a reduced model and of its high-fidelity problem, side by side in a file for ParaView."""
+
+from __future__ import annotations
+
+import importlib.util
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.errors import RequestError, requested
+from vibench.files import write_atomically, writing
+from vibench.interfaces.pictures import MeshFields
+from vibench.offline.models import Model, Parameters
+
+KINDS = ("high fidelity", "reduced", "error")
+"""What every field is written of; the error is reduced minus high fidelity."""
+
+
+@requested
+def export_vtu(model: Model, mu: Parameters, file: Path | str) -> Path:
+    """Write u and λ of a reduced model and of the high-fidelity problem at one parameter, and their differences.
+
+    The file is one of VTK's unstructured grids, which ParaView and meshio read, on the mesh of the high-fidelity
+    solution; fields of cells are NaN in cells that do not have them.
+
+    Parameters
+    ----------
+    model
+        The reduced model.
+    mu
+        The parameter (d,).
+    file
+        Its name ends in .vtu.
+
+    Raises
+    ------
+    RequestError
+        If meshio is not installed, the problem has neither `mesh_fields` nor a picture, the parameter is outside the
+        box, a solution fails, or the file exists or cannot be written.
+    """
+    file = Path(file)
+    if file.suffix != ".vtu":
+        raise RequestError(f"'{file}': the fields are written as a vtu file, whose name must end in .vtu")
+    if importlib.util.find_spec("meshio") is None:
+        raise RequestError("a vtu file needs meshio: pip install 'vibench[mesh]'")
+    with writing(file):
+        if file.exists():
+            raise RequestError(f"'{file}' exists; choose another name, or remove it")
+    answer, reference = model.solve(mu), model.high_fidelity(mu)
+    found = [
+        model.problem.mesh_fields(answer.mu, *each) for each in ((reference.u, reference.lam), (answer.u, answer.lam))
+    ]
+    exact, reduced = found
+    if exact is None or reduced is None:
+        raise RequestError(f"the problem '{type(model.problem).__name__}' has neither mesh_fields nor a picture")
+    with writing(file):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(file, _written(exact, reduced))
+    return file
+
+
+def _written(exact: MeshFields, reduced: MeshFields) -> bytes:
+    """The file of two solutions on the mesh of the first one."""
+    import meshio  # noqa: PLC0415  an extra
+
+    at_points = {
+        f"{name}, {kind}": values
+        for name, first in exact.at_points.items()
+        for kind, values in _compared(first, reduced.at_points[name])
+    }
+    in_cells: dict[str, list[Array]] = {}
+    for owner, named in exact.in_cells.items():
+        for name, first in named.items():
+            for kind, values in _compared(first, reduced.in_cells[owner][name]):
+                in_cells[f"{name}, {kind}"] = [
+                    values if each == owner else np.full(len(corners), np.nan) for each, corners in exact.cells.items()
+                ]
+    mesh = meshio.Mesh(exact.points, list(exact.cells.items()), point_data=at_points, cell_data=in_cells)
+    with tempfile.TemporaryDirectory() as scratch:  # meshio writes to names of files alone
+        mesh.write(Path(scratch) / "fields.vtu")
+        return (Path(scratch) / "fields.vtu").read_bytes()
+
+
+def _compared(exact: Array, reduced: Array) -> list[tuple[str, Array]]:
+    return list(zip(KINDS, (exact, reduced, reduced - exact), strict=True))
