@@ -1,0 +1,171 @@
+"""Contact in three dimensions: the problem against its closed form on four meshes, and the study `three-dimensions`.
+
+vibench run three-dimensions --no-figures
+python results/scripts/three_dimensions.py runs/three-dimensions results/three-dimensions
+
+PARDISO factorises where the extra `fast` is installed; the finest mesh has 198,000 unknowns and takes about 4 GiB.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.tri import Triangulation
+from page import SECONDS, Page, machines, made_by, read, start
+
+from vibench import HighFidelitySolver, create
+from vibench.linalg.factorisations import DEFAULT, IMPLEMENTATIONS
+from vibench.report.figures.style import STYLE, CaptionedFigure
+from vibench.study.cells import CERTIFIED
+from vibench.timing import timed
+
+RESOLUTIONS = ("coarse", "medium", "paper", "fine")
+
+MUS = np.array([[1.0, 1.0, 0.00125, 0.3], [1.3, 0.8, 0.0014, 0.25], [0.7, 0.8, 0.001, 0.35]])
+"""Where the closed form is compared: a round contact, a large elliptic one, a small one."""
+
+FLAT = 50.0
+"""Factor on radii, and divisor of approaches, that leaves the closed form's axes and takes away the slopes."""
+
+MODEL = ["problem", "dual", "primal", "pod_tol", "dual_tol", "assembly"]
+
+SHOWN = {
+    "N": "N", "R": "R", "enrichment": "added", "beta_span_min": "min β span", "beta_cone_lower_min": "min β cone",
+    "error_u_mean": "error u", "error_lambda_mean": "error λ", "queries_ok": "queries ok",
+}  # fmt: skip
+
+OFFLINE = ["snapshots", "pod", "cone", "enrichment", "assembly", "certificate"]
+
+
+def against_theory(resolutions: tuple[str, ...] = RESOLUTIONS) -> pd.DataFrame:
+    """Relative differences from Hertz's elliptic contact on every mesh, and the CPU seconds of the solutions.
+
+    "force, flat" is that of paraboloids of the same contact without slopes, where the closed form has no error.
+    """
+    return pd.DataFrame([row for resolution in resolutions for row in _on_mesh(resolution)])
+
+
+def _on_mesh(resolution: str) -> Iterator[dict[str, object]]:
+    problem = create("problem", "hertz3d", {"resolution": resolution})
+    problem.factorised_by("pardiso" if IMPLEMENTATIONS["pardiso"].is_installed else DEFAULT)
+    solver = HighFidelitySolver(problem)
+    for mu in MUS:
+        solution, seconds = timed(lambda mu=mu: solver.solve(mu))
+        flat = mu * np.array([FLAT, FLAT, 1.0 / FLAT, 1.0])
+        theory, found = problem.theory(mu), problem.measured(solution.lam)
+        yield {
+            "mesh": resolution, "unknowns": problem.V.dim, "multipliers": problem.W.dim,
+            "mu": ", ".join(f"{each:g}" for each in mu),
+            "force": problem.force(solution.lam) / theory.force - 1.0,
+            "force, flat": problem.force(solver.solve(flat).lam) / problem.theory(flat).force - 1.0,
+            "peak": found.peak / theory.peak - 1.0,
+            "a": found.a / theory.a - 1.0, "b": found.b / theory.b - 1.0,
+            "in contact": int(np.sum(solution.lam > 0.0)), "active sets": solution.iterations,
+            "seconds": seconds.cpu,
+        }  # fmt: skip
+
+
+def rates(compared: pd.DataFrame) -> pd.DataFrame:
+    """Orders of the force without slopes in the size of the cells, from every mesh to the next; two by theory."""
+    force = compared.pivot_table(index="mu", columns="multipliers", values="force, flat")
+    sizes = np.sqrt(force.columns.to_numpy(float))  # cells along the zone
+    orders = np.log(force.to_numpy()[:, :-1] / force.to_numpy()[:, 1:]) / np.log(sizes[1:] / sizes[:-1])
+    names = [f"{first:g} → {second:g} cells" for first, second in pairwise(sizes)]
+    return pd.DataFrame(orders, columns=names).assign(mu=list(force.index))[["mu", *names]]
+
+
+def models(cells: pd.DataFrame) -> pd.DataFrame:
+    """Dimensions, constants and errors of every model; those of certified queries are the same."""
+    plain = cells[cells["assembly"] != CERTIFIED]
+    return plain[[*MODEL[:-1], *SHOWN]].rename(columns=SHOWN)
+
+
+def effectivities(cells: pd.DataFrame) -> pd.DataFrame:
+    """Median effectivities of the bounds, at online cost, too, and how often one was below an error."""
+    names = {
+        "effectivity_u_energy_median": "u, energy", "effectivity_lambda_natural_median": "λ, natural",
+        "effectivity_online_u_energy_median": "u, energy, online",
+        "effectivity_online_lambda_natural_median": "λ, natural, online", "certificate": "certificate",
+        "bound_online_violations": "violations",
+    }  # fmt: skip
+    return cells.loc[cells["assembly"] == CERTIFIED, [*MODEL[:-1], *names]].rename(columns=names)
+
+
+def seconds(cells: pd.DataFrame) -> pd.DataFrame:
+    """CPU seconds offline by stage, of a query, and of a high-fidelity solution."""
+    named = {f"offline_{stage}_s": f"{stage} [s]" for stage in OFFLINE}
+    table = cells[[*MODEL, *named]].rename(columns=named)
+    return table.assign(**{"query [ms]": 1e3 * cells["online_s"], "high fidelity [ms]": 1e3 * cells["hf_s"]})
+
+
+def growth(cells: pd.DataFrame) -> pd.DataFrame:
+    """Queries on the finest mesh over those on the coarsest, where N, R and what was added agree."""
+    of_model = cells.set_index([*MODEL[1:], "N", "R", "enrichment"])
+    first, last = (of_model[of_model["dim_V"] == edge] for edge in (cells["dim_V"].min(), cells["dim_V"].max()))
+    both = first[["online_s"]].join(last[["online_s"]], how="inner", lsuffix=" first", rsuffix=" last")
+    return (both["online_s last"] / both["online_s first"]).rename("ratio").reset_index()
+
+
+def pressed(resolution: str = "medium") -> Figure:
+    """The surface pressed by an elliptic paraboloid, and the contact pressure beside that of Hertz."""
+    problem, mu = create("problem", "hertz3d", {"resolution": resolution}), MUS[1]
+    problem.factorised_by("pardiso" if IMPLEMENTATIONS["pardiso"].is_installed else DEFAULT)
+    solution = HighFidelitySolver(problem).solve(mu)
+    picture = problem.picture(mu, solution.u, solution.lam)
+    with mpl.rc_context(STYLE):
+        figure = CaptionedFigure(figsize=(9.0, 3.6), layout="constrained")
+        figure.caption = (
+            f"A quarter of the surface pressed by a rigid paraboloid of the radii {mu[0]:g} m and {mu[1]:g} m, its "
+            "vertical displacement exaggerated, and the pressure along both axes of the contact beside Hertz's."
+        )
+        surface = figure.add_subplot(1, 2, 1, projection="3d")
+        mesh = Triangulation(*picture.points, picture.triangles.T)
+        surface.plot_trisurf(mesh, 1e3 * picture.values, cmap="viridis", linewidth=0.1)
+        surface.set(xlabel="x [m]", ylabel="y [m]", zlabel="displacement [mm]")
+        axes = figure.add_subplot(1, 2, 2)
+        theory, along = problem.theory(mu), np.linspace(0.0, 0.06, 200)
+        for axis, name in enumerate("xy"):
+            near = np.isclose(picture.positions[1 - axis], picture.positions[1 - axis].min())
+            offset = np.full_like(along, picture.positions[1 - axis].min())
+            exact = theory.pressure(*((along, offset) if axis == 0 else (offset, along)))
+            (line,) = axes.plot(along, exact, label=f"along {name}, Hertz")
+            axes.plot(picture.positions[axis][near], picture.multiplier[near], "o", color=line.get_color(),
+                      label=f"along {name}, computed")  # fmt: skip
+        axes.set(xlabel="distance from the apex [m]", ylabel="contact pressure [Pa]")
+        axes.legend()
+    return figure
+
+
+def main(run: str, target: str) -> None:
+    cells = read(run, "cells")
+    page = Page(
+        target, "Three dimensions", made_by("three_dimensions", "three-dimensions", "three-dimensions",
+                                            options=" --no-figures"),
+        f"A half-space pressed by a rigid elliptic paraboloid (`hertz3d`). {SECONDS}", machine=machines(cells),
+    )  # fmt: skip
+    compared = against_theory()
+    page.section(
+        "Against Hertz",
+        "Relative differences from the closed form at parameters (R_x, R_y, δ, ν). Its normals are vertical: the force "
+        "of the problem is larger by (1 − 2ν)/(π(1 − ν)) a/R, which paraboloids of fifty times the radii do not show. "
+        "Axes are √5 times the radii of inertia of the pressure, the peak is the largest pressure.",
+        compared,
+        "Orders of convergence of the force without slopes, two by theory:",
+        rates(compared),
+    )
+    page.draw("pressed", pressed())
+    page.section("Models", models(cells))
+    page.section("Bounds", effectivities(cells))
+    page.section("Seconds", seconds(cells))
+    page.section("Queries and meshes", "Seconds of a query, the finer mesh over the coarser one.", growth(cells))
+    page.add(f"Full table of the cells: {page.link('cells', cells)}.")
+    page.write()
+
+
+if __name__ == "__main__":
+    start(main)
