@@ -1,0 +1,197 @@
+"""Local bases: clusters of training parameters or of contact sets, each with spaces and a cone of its own."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from annotated_types import Ge
+from scipy.cluster.vq import kmeans2
+
+from vibench import (
+    Array,
+    Asked,
+    Cone,
+    Enrichment,
+    Formulation,
+    FormulationAnswer,
+    FormulationModel,
+    Indices,
+    POD,
+    Kind,
+    Outcome,
+    ParameterBox,
+    Problem,
+    Snapshots,
+    UnsupportedError,
+)
+from vibench_strategies.formulations.reduced_programs import largest_dimension, reconstructed
+
+if TYPE_CHECKING:
+    from vibench import Reduction
+
+
+class Local(Formulation):
+    """Mixed models with local bases, as Amsallem, Zahr and Farhat (2012) and Le Berre et al. (2022) have them.
+
+    k-means makes clusters of the training parameters, or of the contact sets of their solutions. A polynomial of the
+    parameter for each cluster, linear or quadratic, the largest of which names the cluster, chooses at the query:
+    nearest centroids, or a least squares fit of the clusters of contact sets. The snapshots of a cluster are those that
+    the polynomials give it, so that queries are answered by the spaces trained around them. POD, cone and enrichment
+    are those of the study for the snapshots of one cluster.
+
+    Parameters
+    ----------
+    clusters
+        Their number; those without a snapshot are left out.
+    by
+        What is clustered: "parameters", by their distance relative to the box, or "contact" sets, by the size of their
+        symmetric difference.
+    seed
+        Of the first centroids.
+    """
+
+    def __init__(
+        self,
+        clusters: Annotated[int, Ge(1)] = 4,
+        by: Literal["parameters", "contact"] = "parameters",
+        seed: Annotated[int, Ge(0)] = 0,
+    ) -> None:
+        self.clusters, self.by, self.seed = clusters, by, seed
+
+    def build(self, offline: Reduction) -> Mapping[str, Any]:
+        """The polynomials, and POD, cone and enrichment of every cluster."""
+        weights, owners = self._chosen(offline.problem, offline.snapshots)
+        spaces = []
+        for number in range(weights.shape[1]):
+            part = _restricted(offline, owners == number)
+            if part.enrichment.supply is not None:
+                raise UnsupportedError("local bases cannot be stored for an enrichment that supplies its own vectors")
+            part.assembled  # noqa: B018  reduced operators are prepared offline
+            spaces.append(
+                {
+                    "basis": part.pod.basis,
+                    "generators": part.cone.generators,
+                    "free": part.cone.free.astype(float),
+                    "fallbacks": [*part.cone.fallbacks, *part.enrichment.fallbacks],
+                    "kind": part.enrichment.kind.value,
+                    "added": part.enrichment.vectors if part.enrichment.eta is None else part.enrichment.eta,
+                }
+            )
+        return {"weights": weights, "owners": owners.astype(float), "spaces": spaces}
+
+    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+        """The models of the clusters."""
+        parts = [
+            _restored(_restricted(offline, built["owners"] == number), space)
+            for number, space in enumerate(built["spaces"])
+        ]
+        return LocalModel(offline.problem.parameters, built["weights"], parts)
+
+    def _chosen(self, problem: Problem, snapshots: Snapshots) -> tuple[Array, Indices]:
+        """Coefficients (features×K) of the polynomials, and which of them is the largest at training parameters (P,)."""
+        places = _scaled(problem.parameters, snapshots.mu)
+        count = min(self.clusters, len(places))
+        if self.by == "parameters":
+            centroids = _clusters(places, count, self.seed)[0]
+            # |µ − c|² is smallest where µ·c − |c|²/2 is largest
+            weights = np.vstack([-0.5 * np.sum(centroids**2, axis=1), centroids.T])
+        else:
+            measures = np.sqrt(np.maximum(problem.multiplier_integrals(), 0.0))
+            labels = _clusters((snapshots.lam.T > 0.0) * measures, count, self.seed)[1]
+            one_hot = (labels[:, None] == np.unique(labels)).astype(float)
+            features = _features(places, _quadratic(places.shape[1]))
+            weights = np.linalg.lstsq(features, one_hot, rcond=None)[0]
+        owners = np.argmax(_features(places, len(weights)) @ weights, axis=1)
+        present, owners = np.unique(owners, return_inverse=True)
+        return np.ascontiguousarray(weights[:, present]), owners
+
+
+class LocalModel(FormulationModel):
+    """Models of clusters, one of which answers a query."""
+
+    def __init__(self, box: ParameterBox, weights: Array, parts: Sequence[Reduction]) -> None:
+        self._box, self._weights, self._parts = box, weights, parts
+        self._models = [part.assembled for part in parts]
+
+    @property
+    def dimension(self) -> int:
+        """Dimension of the largest space."""
+        return max(map(largest_dimension, self._parts))
+
+    @property
+    def generators(self) -> int:
+        """Generators of the largest cone."""
+        return max(part.cone.size for part in self._parts)
+
+    @property
+    def fallbacks(self) -> tuple[str, ...]:
+        """Those of all clusters."""
+        return tuple(
+            f"cluster {number}: {line}" for number, part in enumerate(self._parts) for line in part.cone.fallbacks
+        )
+
+    def cluster(self, mu: Array) -> int:
+        """The cluster that answers at mu (d,), at the cost of one polynomial for each."""
+        return int(np.argmax(_features(_scaled(self._box, mu[None]), len(self._weights))[0] @ self._weights))
+
+    def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
+        """The mixed program of the cluster, solved by the QP solver of the cell."""
+        reduced = self._models[self.cluster(mu)].assemble(mu)
+        found = asked.solve_qp(reduced.program, factor=reduced.factor)
+        if found.x is None or found.alpha is None:
+            return FormulationAnswer.none(found.solver_status)
+        return FormulationAnswer(found.x, found.alpha, Outcome.OK, "", found.iterations)
+
+    def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:
+        """The pair in the spaces of the cluster."""
+        return reconstructed(self._models[self.cluster(mu)], mu, answer)
+
+
+def _scaled(box: ParameterBox, mus: Array) -> Array:
+    """Places (P×d) of parameters in the unit cube."""
+    return np.asarray((mus - box.lower) / box.widths)
+
+
+def _quadratic(d: int) -> int:
+    return 1 + d + d * (d + 1) // 2
+
+
+def _features(places: Array, count: int) -> Array:
+    """1, the places (P×d), and their products if `count` says so (P×count)."""
+    features = np.hstack([np.ones((len(places), 1)), places])
+    if count > features.shape[1]:
+        i, j = np.triu_indices(places.shape[1])
+        features = np.hstack([features, places[:, i] * places[:, j]])
+    return features
+
+
+def _clusters(points: Array, count: int, seed: int) -> tuple[Array, Indices]:
+    """Centroids and the number (P,) of the nearest one, by k-means; as many as there are different points at most."""
+    count = min(count, len(np.unique(points, axis=0)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a cluster without points is left out
+        centroids, labels = kmeans2(points, count, 100, minit="++", rng=np.random.default_rng(seed))
+    kept = np.unique(labels)
+    return centroids[kept], np.searchsorted(kept, labels)
+
+
+def _restricted(offline: Reduction, mask: Any) -> Reduction:
+    """The reduction for some of the snapshots; sums of terms are those of all."""
+    all_of = offline.snapshots
+    known = {"snapshots": Snapshots(all_of.mu[mask], all_of.u[:, mask], all_of.lam[:, mask])}
+    if offline.assembly != "full":
+        known |= {"members": offline.members}
+    return replace(offline).given(**known)
+
+
+def _restored(part: Reduction, space: Mapping[str, Any]) -> Reduction:
+    """A reduction whose spaces were stored."""
+    kind, added = Kind(space["kind"]), space["added"]
+    enrichment = Enrichment(kind, **({} if added is None else {"vectors" if kind is Kind.FIXED else "eta": added}))
+    free = np.asarray(space["free"]) > 0.0
+    cone = Cone(space["generators"], np.zeros(len(free) + 1), free, tuple(space["fallbacks"]))
+    return part.given(pod=POD(space["basis"], np.zeros(1)), cone=cone, enrichment=enrichment)
