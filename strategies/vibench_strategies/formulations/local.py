@@ -12,6 +12,7 @@ from annotated_types import Ge
 from scipy.cluster.vq import kmeans2
 
 from vibench import (
+    POD,
     Array,
     Asked,
     Cone,
@@ -20,7 +21,6 @@ from vibench import (
     FormulationAnswer,
     FormulationModel,
     Indices,
-    POD,
     Kind,
     Outcome,
     ParameterBox,
@@ -92,7 +92,7 @@ class Local(Formulation):
         return LocalModel(offline.problem.parameters, built["weights"], parts)
 
     def _chosen(self, problem: Problem, snapshots: Snapshots) -> tuple[Array, Indices]:
-        """Coefficients (features×K) of the polynomials, and which of them is the largest at training parameters (P,)."""
+        """Coefficients (features×K) of the polynomials, and the largest of them at training parameters (P,)."""
         places = _scaled(problem.parameters, snapshots.mu)
         count = min(self.clusters, len(places))
         if self.by == "parameters":

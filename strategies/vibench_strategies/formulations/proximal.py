@@ -12,10 +12,13 @@ from vibench import Array
 from vibench_strategies.formulations.reduced_programs import ProgramFormulation
 from vibench_strategies.formulations.whitened import Whitened
 
-PROXIMAL_STEPS = 100
+PROXIMAL_STEPS = 200
 NEWTON_STEPS = 15
 """Of one proximal step; each costs one Cholesky factorisation of the size of the constraints. A proximal step that
-takes more is repeated with a smaller a_k."""
+takes more is repeated with a smaller a_k, unless it is as small as at first."""
+
+PATIENCE = 20
+"""How many times as many Newton steps the smallest a_k may take."""
 
 EASY = 5
 """Newton steps up to which a_k grows."""
@@ -25,6 +28,9 @@ RIDGE = 1e-12
 
 INEXACT = 0.1
 """Accuracy of a proximal point relative to the residual of the one before, which it has to reduce."""
+
+ROUND_OFF = 1e-14
+"""Of the minimised function, relative."""
 
 RISE = 3.0
 """Largest rise of a latent variable in a Newton step, beyond which exp is no longer what its linearisation says."""
@@ -49,7 +55,7 @@ class Proximal(ProgramFormulation):
     """
 
     def __init__(
-        self, step: Annotated[float, Gt(0.0), Le(1e3)] = 1.0, growth: Annotated[float, Gt(1.0), Le(10.0)] = 3.0
+        self, step: Annotated[float, Gt(0.0), Le(1e3)] = 1.0, growth: Annotated[float, Gt(1.0), Le(10.0)] = 2.0
     ) -> None:
         self.step, self.growth = step, growth
 
@@ -77,10 +83,11 @@ def latent_proximal(program: Whitened, tolerance: float, step: float, growth: fl
     psi, nu, a, residual = np.log(np.maximum(1.0, -b)), np.zeros(len(b)), step, 1.0
     lowest, z, positive = np.log(CENTRE * tolerance), program.y, nu
     for _ in range(PROXIMAL_STEPS):
-        found, count = _newton(C, b, psi, nu, a, INEXACT * max(tolerance, min(residual, 1.0)))
+        most = NEWTON_STEPS * (1 if a > step else PATIENCE)
+        found, count = _newton(C, b, psi, nu, a, INEXACT * max(tolerance, min(residual, 1.0)), most)
         steps += count
         if found is None:
-            a /= growth
+            a = max(a / growth, step)
             continue
         nu, psi, positive = found, psi - a * found, np.maximum(found, 0.0)
         a *= growth if count <= EASY else 1.0
@@ -94,30 +101,30 @@ def latent_proximal(program: Whitened, tolerance: float, step: float, growth: fl
     return z, positive, steps, residual
 
 
-def _newton(C: Array, b: Array, psi: Array, nu: Array, a: float, tolerance: float) -> tuple[Array | None, int]:
-    """Minimise Σ exp(ψ_i − a ν_i)/a + ½νᵀCν − bᵀν, from ν (k,) or 0; the minimiser and the number of steps."""
+def _newton(
+    C: Array, b: Array, psi: Array, nu: Array, a: float, tolerance: float, most: int
+) -> tuple[Array | None, int]:
+    """Minimise Σ exp(ψ_i − a ν_i)/a + ½νᵀCν − bᵀν, from ν (k,) or 0.
+
+    Returns the minimiser, or `None` where `most` steps are not enough, and the number of steps.
+    """
 
     def value(at: Array) -> float:
         with np.errstate(over="ignore"):
             return float(np.exp(psi - a * at).sum() / a + at @ (0.5 * (C @ at) - b))
 
     nu = min(nu, np.maximum(nu, 0.0), np.zeros_like(nu), key=value)
-    slack = np.exp(psi - a * nu)
-    gradient = C @ nu - b - slack
-    for count in range(1, NEWTON_STEPS + 1):
+    present = value(nu)
+    for count in range(1, most + 1):
+        slack = np.exp(psi - a * nu)
+        gradient = C @ nu - b - slack
         factor = scipy.linalg.cho_factor(C + np.diag(a * slack + RIDGE), lower=True, check_finite=False)
         direction = -scipy.linalg.cho_solve(factor, gradient, check_finite=False)
         slope, rise = float(gradient @ direction), a * float(np.max(-direction))
-        t = min(1.0, RISE / rise) if rise > 0.0 else 1.0
-        close = -slope <= tolerance**2 * float(nu @ (C @ nu))
-        while True:
-            following = nu + t * direction
-            slack = np.exp(psi - a * following)
-            gradient = C @ following - b - slack
-            if gradient @ direction <= -0.5 * slope or close:  # convex: not far beyond the minimum on the line
-                break
+        t = RISE / max(RISE, rise)
+        while (found := value(nu + t * direction)) > present + 1e-4 * t * slope + ROUND_OFF * abs(present):
             t *= 0.5
-        nu = following
-        if close:
+        nu, present = nu + t * direction, found
+        if rise <= RISE and -slope <= tolerance**2 * float(nu @ (C @ nu)):
             return nu, count
-    return None, NEWTON_STEPS
+    return None, most

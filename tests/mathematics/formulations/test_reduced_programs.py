@@ -30,7 +30,7 @@ def by_penalty(of: Whitened) -> Solved:
 
 
 def by_proximal_points(of: Whitened) -> Solved:
-    return latent_proximal(of, 1e-11, 1.0, 3.0)[:2]
+    return latent_proximal(of, 1e-11, 1.0, 2.0)[:2]
 
 
 def by_greedy(of: Whitened) -> Solved:
@@ -144,7 +144,7 @@ def test_proximal_points_keep_their_tolerance_in_few_steps(seed: int) -> None:
     whitened = Whitened.of(vi)
     residuals = []
     for tolerance in (1e-2, 1e-4, 1e-8):
-        z, nu, steps, residual = latent_proximal(whitened, tolerance, 1.0, 3.0)
+        z, nu, steps, residual = latent_proximal(whitened, tolerance, 1.0, 2.0)
         assert (whitened.Y @ z < whitened.g + tolerance * whitened.energy(z, nu)).all()
         assert nu.min() >= 0.0
         assert residual <= tolerance
