@@ -101,7 +101,7 @@ class Local(Formulation):
             weights = np.vstack([-0.5 * np.sum(centroids**2, axis=1), centroids.T])
         else:
             measures = np.sqrt(np.maximum(problem.multiplier_integrals(), 0.0))
-            labels = _clusters((snapshots.lam.T > 0.0) * measures, count, self.seed)[1]
+            labels = _clusters(np.where(snapshots.lam.T > 0.0, measures, 0.0), count, self.seed)[1]
             one_hot = (labels[:, None] == np.unique(labels)).astype(float)
             features = _features(places, _quadratic(places.shape[1]))
             weights = np.linalg.lstsq(features, one_hot, rcond=None)[0]
@@ -114,24 +114,12 @@ class LocalModel(FormulationModel):
     """Models of clusters, one of which answers a query."""
 
     def __init__(self, box: ParameterBox, weights: Array, parts: Sequence[Reduction]) -> None:
-        self._box, self._weights, self._parts = box, weights, parts
+        self._box, self._weights = box, weights
         self._models = [part.assembled for part in parts]
 
-    @property
-    def dimension(self) -> int:
-        """Dimension of the largest space."""
-        return max(map(largest_dimension, self._parts))
-
-    @property
-    def generators(self) -> int:
-        """Generators of the largest cone."""
-        return max(part.cone.size for part in self._parts)
-
-    @property
-    def fallbacks(self) -> tuple[str, ...]:
-        """Those of all clusters."""
-        return tuple(
-            f"cluster {number}: {line}" for number, part in enumerate(self._parts) for line in part.cone.fallbacks
+        self.dimension, self.generators = max(map(largest_dimension, parts)), max(part.cone.size for part in parts)
+        self.fallbacks = tuple(
+            f"cluster {number}: {line}" for number, part in enumerate(parts) for line in part.cone.fallbacks
         )
 
     def cluster(self, mu: Array) -> int:
@@ -182,7 +170,7 @@ def _clusters(points: Array, count: int, seed: int) -> tuple[Array, Indices]:
 def _restricted(offline: Reduction, mask: Any) -> Reduction:
     """The reduction for some of the snapshots; sums of terms are those of all."""
     all_of = offline.snapshots
-    known = {"snapshots": Snapshots(all_of.mu[mask], all_of.u[:, mask], all_of.lam[:, mask])}
+    known: dict[str, Any] = {"snapshots": Snapshots(all_of.mu[mask], all_of.u[:, mask], all_of.lam[:, mask])}
     if offline.assembly != "full":
         known |= {"members": offline.members}
     return replace(offline).given(**known)

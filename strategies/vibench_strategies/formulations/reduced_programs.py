@@ -53,17 +53,7 @@ class ProgramModel(FormulationModel):
 
     def __init__(self, offline: Reduction, formulation: ProgramFormulation) -> None:
         self._assembled, self._formulation = offline.assembled, formulation
-        self._dimension = largest_dimension(offline)
-
-    @property
-    def dimension(self) -> int:
-        """Dimension of the primal space, the largest one of spaces that depend on the parameter."""
-        return self._dimension
-
-    @property
-    def generators(self) -> int:
-        """Number of generators."""
-        return int(self._assembled.generators.shape[1])
+        self.dimension, self.generators = largest_dimension(offline), int(self._assembled.generators.shape[1])
 
     def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
         """Assemble, whiten, solve, and return to the coordinates of the model."""

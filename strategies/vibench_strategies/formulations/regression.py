@@ -104,23 +104,10 @@ class RegressionModel(FormulationModel):
     """Evaluates the processes at a parameter."""
 
     def __init__(self, offline: Reduction, built: Mapping[str, Any]) -> None:
-        self._box, self._basis, self._generators = (
-            offline.problem.parameters,
-            offline.pod.basis,
-            offline.cone.generators,
-        )
+        self._box, self._basis, self._chi = offline.problem.parameters, offline.pod.basis, offline.cone.generators
+        self.dimension, self.generators = int(self._basis.shape[1]), int(self._chi.shape[1])
         self._places, self._left_out, self._rays = built["places"], built["left_out"], built["rays"]
         self._u, self._lam = built["u"], built["lam"]
-
-    @property
-    def dimension(self) -> int:
-        """N."""
-        return int(self._basis.shape[1])
-
-    @property
-    def generators(self) -> int:
-        """R."""
-        return int(self._generators.shape[1])
 
     def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:  # noqa: ARG002
         """Means of the coefficients, those of λ projected on the cone, and the uncertainty of u."""
@@ -129,12 +116,14 @@ class RegressionModel(FormulationModel):
         x, lam = _mean(self._u, covariances), _mean(self._lam, self._covariances(self._lam, place))
         explained = np.einsum("kpq,kq->kp", self._u["inverses"], covariances)
         variances = np.maximum(self._u["variances"] - np.sum(explained**2, axis=1), 0.0) * self._u["spreads"] ** 2
-        alpha = nnls(self._rays, lam)[0] if self._rays.size else np.zeros(self.generators)
+        alpha = nnls(self._rays, lam)[0] if self._rays.size else np.zeros(self._rays.shape[1])
         return FormulationAnswer(x, alpha, uncertainty=float(np.sqrt(variances.sum() + self._left_out)))
 
     def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:  # noqa: ARG002
         """The pair in V_N and in the cone."""
-        return self._basis @ answer.x, self._generators @ answer.alpha
+        assert answer.x is not None
+        assert answer.alpha is not None
+        return self._basis @ answer.x, self._chi @ answer.alpha
 
     def _covariances(self, of: Mapping[str, Array], place: Array) -> Array:
         """Covariances (k×P) of the values at a place (d,) with those at the training parameters."""
