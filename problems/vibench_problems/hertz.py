@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -20,6 +21,7 @@ from vibench import (
     ParameterBox,
     Picture,
     Problem,
+    Sampler,
     VariationalInequality,
     fem,
 )
@@ -93,6 +95,7 @@ class Hertz(Problem):
 
     parameters = ParameterBox(names=("radius",), lower=np.array([0.7]), upper=np.array([1.3]), units=("m",))
     constant: ClassVar[frozenset[str]] = frozenset({"A", "f"})
+    elementwise: ClassVar[frozenset[str]] = frozenset({"A", "f"})
 
     def __init__(
         self,
@@ -118,15 +121,18 @@ class Hertz(Problem):
         self.master = quarter_disc(masters, MASTER_ANGLE, growth, triangulation)
         lame = young * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
         shear = young / (2.0 * (1.0 + poisson))
-        blocks, norms, fixed, offset = [], [], [], 0
+        blocks, norms, fixed, elements, offset = [], [], [], [], 0
         for disc in (self.slave, self.master):
             basis = Basis(disc.mesh, ElementVector(ElementTriP1()))
             blocks.append(elasticity.assemble(basis, lame=lame, shear=shear))
+            elements.append((basis.element_dofs + offset, elasticity.coo_data(basis, lame=lame, shear=shear)))
             norms.append(fem.h1_gram(basis, length=length))
             fixed += [offset + 2 * disc.axis, offset + 2 * disc.flat + 1]
             fixed += [offset + 2 * disc.flat] if flats == "clamped" else []
             offset += basis.N
         self.free = np.setdiff1d(np.arange(offset), np.concatenate(fixed))
+        self._element_dofs = np.hstack([dofs for dofs, _ in elements])
+        self._element_stiffness = np.vstack([data.tolocal() for _, data in elements])
         self._all_stiffness = sp.csr_array(sp.block_diag(blocks))
         self._stiffness = self._all_stiffness[self.free][:, self.free]
         self._second = 2 * self.slave.mesh.p.shape[1]  # first degree of freedom of disc 2
@@ -181,6 +187,22 @@ class Hertz(Problem):
         return VariationalInequality(
             A=self._stiffness, f=np.zeros(len(self.free)), B=B, g=g, dirichlet_lift=self._lift(mu)
         )
+
+    @property
+    def element_dofs(self) -> Indices:
+        """Displacements of the corners of the triangles, those of disc 1 first."""
+        number = np.full(len(self._unit_lift), -1)
+        number[self.free] = np.arange(len(self.free))
+        return np.asarray(number[self._element_dofs])
+
+    def element_sampler(self, elements: Indices) -> Sampler:
+        """The same at every parameter, as A and f are."""
+        chosen = self._element_stiffness[elements]
+
+        def sample(_: Array) -> Mapping[str, Array]:
+            return {"A": chosen, "f": np.zeros(chosen.shape[:2])}
+
+        return sample
 
     @property
     def contact_dofs(self) -> Indices:

@@ -27,7 +27,7 @@ from vibench import (
 )
 from vibench_problems.disc_map import DiscMap
 from vibench_problems.disc_mesh import aspect_ratios, disc_in_square, displaced_around_disc
-from vibench_problems.p1_entries import LoadEntries, MovedMesh, StiffnessEntries
+from vibench_problems.p1_entries import LoadEntries, MovedMesh, StiffnessEntries, TriangleForms
 
 RADIUS = 0.2
 """Radius of the reference disc ω̂ [m]."""
@@ -96,6 +96,7 @@ class Obstacle(Problem):
     )
 
     entrywise: ClassVar[frozenset[str]] = frozenset({"A", "f"})
+    elementwise: ClassVar[frozenset[str]] = frozenset({"A", "f"})
 
     def __init__(
         self,
@@ -182,6 +183,23 @@ class Obstacle(Problem):
         def sample(mu: Array) -> Mapping[str, Array]:
             weights = self._map.weights(mu)
             return {name: entries(weights) for name, entries in evaluated.items()}
+
+        return sample
+
+    @property
+    def element_dofs(self) -> Indices:
+        """The unknowns at the corners of the triangles."""
+        number = np.full(self.nodes, -1)
+        number[self.free] = np.arange(len(self.free))
+        return np.asarray(number[self.mesh.t])
+
+    def element_sampler(self, elements: Indices) -> Sampler:
+        """A and f on triangles, of which only the corners are moved."""
+        forms = TriangleForms(self._map.modes, self.mesh.t[:, elements])
+
+        def sample(mu: Array) -> Mapping[str, Array]:
+            stiffness, integrals = forms(self._map.weights(mu))
+            return {"A": stiffness, "f": self.load * integrals}
 
         return sample
 

@@ -38,11 +38,7 @@ class MovedMesh:
 
     def forms(self, points: Array) -> tuple[SparseMatrix, Array]:
         """The stiffness matrix (n×n) and the load vector (n,) of nodes at `points` (2×nodes)."""
-        corners = points[:, self._triangles]
-        edges = np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1)
-        (x, y) = edges
-        areas = 0.5 * np.abs(x[0] * y[1] - x[1] * y[0])
-        products = (x[:, None] * x + y[:, None] * y) / (4.0 * areas)
+        products, areas = _on_triangles(points[:, self._triangles])
         stiffness = np.add.reduceat(products.ravel()[self._pairs], self._starts)
         load = np.add.reduceat(np.tile(areas / 3.0, 3)[self._corners], self._first)
         # copies, since libraries sort indices in place
@@ -56,6 +52,33 @@ def _gathered(keys: Indices, kept: NDArray[np.bool_]) -> tuple[Indices, Indices,
     positions = positions[np.argsort(keys[positions], kind="stable")]
     distinct, starts = np.unique(keys[positions], return_index=True)
     return positions, starts, distinct
+
+
+class TriangleForms:
+    """∫ ∇φ_i · ∇φ_j and ∫ φ_i over single triangles.
+
+    Parameters
+    ----------
+    modes
+        Positions of the nodes by weight (weights×2×nodes).
+    triangles
+        Nodes of the triangles (3×t).
+    """
+
+    def __init__(self, modes: Array, triangles: NDArray[np.integer]) -> None:
+        self._corners = modes[:, :, triangles]
+
+    def __call__(self, weights: Array) -> tuple[Array, Array]:
+        """The matrices (t×3×3) and the vectors (t×3) at some weights."""
+        products, areas = _on_triangles(np.tensordot(weights, self._corners, axes=1))
+        return np.moveaxis(products, 2, 0), np.repeat(areas[:, None] / 3.0, 3, axis=1)
+
+
+def _on_triangles(corners: Array) -> tuple[Array, Array]:
+    """e_i · e_j / (4 |T|) (3×3×t) and |T| (t,) of triangles with these corners (2×3×t)."""
+    x, y = np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1)
+    areas = 0.5 * np.abs(x[0] * y[1] - x[1] * y[0])
+    return (x[:, None] * x + y[:, None] * y) / (4.0 * areas), areas
 
 
 class StiffnessEntries:

@@ -84,6 +84,42 @@ class Cube(Problem):
         return lambda mu: {"g": self.bound(mu)[rows]}
 
 
+class ByElements(Option):
+    """The put, whose stiffness is integrated interval by interval."""
+
+    elementwise: ClassVar[frozenset[str]] = frozenset({"A"})
+
+    @property
+    def element_dofs(self) -> Indices:
+        left = np.arange(-1, self.V.dim)
+        return np.stack([left, np.where(left + 1 < self.V.dim, left + 1, -1)])
+
+    def element_sampler(self, elements: Indices) -> Sampler:
+        step = self.x[1] - self.x[0]
+        K, M = np.array([[1.0, -1.0], [-1.0, 1.0]]) / step, np.array([[2.0, 1.0], [1.0, 2.0]]) * (step / 6.0)
+
+        def sample(mu: Array) -> dict[str, Array]:
+            half, kappa = 0.5 * mu[0] ** 2, mu[1] / mu[0] ** 2 - 0.5
+            return {"A": np.tile(half * K + (mu[1] + half * kappa**2) * M, (len(elements), 1, 1))}
+
+        return sample
+
+
+class OtherElements(ByElements):
+    """The prescribed values at both ends have the number of an unknown."""
+
+    @property
+    def element_dofs(self) -> Indices:
+        return np.maximum(super().element_dofs, 0)
+
+
+class AllElements(ByElements):
+    """Whatever elements are asked for, it integrates over all."""
+
+    def element_sampler(self, elements: Indices) -> Sampler:
+        return super().element_sampler(np.arange(self.V.dim + 1))
+
+
 class SkewStiffness(Option):
     """The Black–Scholes operator with its first derivative, not symmetrised."""
 

@@ -214,6 +214,8 @@ class Problem(ABC):
     """
     entrywise: ClassVar[frozenset[str]] = frozenset()
     """Members that `sampler` evaluates entry by entry."""
+    elementwise: ClassVar[frozenset[str]] = frozenset()
+    """Members, "A" and "f" or one of them, that `element_sampler` integrates element by element."""
     licence: str = ""
     """Licence of the data that the problem is made of, "unknown" if it is; "" where that of its distribution holds."""
     factorisation: str = DEFAULT
@@ -282,6 +284,19 @@ class Problem(ABC):
         zero for the vectors f and g.
         """
         raise NotImplementedError(f"{type(self).__name__} declares {sorted(self.entrywise)} and has no sampler")
+
+    @property
+    def element_dofs(self) -> Indices:
+        """Unknowns of the elements (k×e), -1 where a value is prescribed; of problems with members in `elementwise`."""
+        raise NotImplementedError(f"{type(self).__name__} declares {sorted(self.elementwise)} and has no element_dofs")
+
+    def element_sampler(self, elements: Indices) -> Sampler:
+        """Function that integrates the members in `elementwise` over chosen elements (j,), at the cost of these alone.
+
+        It maps mu (d,) to the matrices (j×k×k) of A and the vectors (j×k) of f, by member, in the unknowns of
+        `element_dofs`; what they have where that is -1 is ignored. Their sums over all elements are the members.
+        """
+        raise NotImplementedError(f"{type(self).__name__} declares {sorted(self.elementwise)} and has no elements")
 
     def constraint(self, mu: Array) -> tuple[SparseMatrix, Array]:
         """B (m×n) and g (m,) at mu (d,), from `contact` if implemented, else from `assemble`."""

@@ -1,4 +1,4 @@
-"""Checks of what a problem assembles: A, f, B and g, in full, on the contact alone, and entry by entry."""
+"""Checks of what a problem assembles: A, f, B and g, in full, on the contact alone, by entries and by elements."""
 
 from __future__ import annotations
 
@@ -237,6 +237,48 @@ def by_entries(case: ProblemCase) -> Iterator[str]:
         _check_sampler(case, {name: wanted[name] for name in chosen})
 
 
+def by_elements(case: ProblemCase) -> Iterator[str]:
+    """`element_sampler` agrees with `assemble`: summed over all elements, and on some of them with those of all."""
+    problem = case.plugin
+    yield from _undeclarable("elementwise", problem.elementwise)
+    names = [name for name in MEMBERS if name in problem.elementwise]
+    if not names:
+        yield Note("not declared")
+        return
+    if set(names) - {"A", "f"}:
+        yield f"`elementwise` names {', '.join(names)}; only A and f are integrated element by element"
+        return
+    dofs, n = problem.element_dofs, problem.V.dim
+    if dofs.ndim != 2 or dofs.dtype.kind not in "iu" or dofs.min(initial=0) < -1 or dofs.max(initial=0) >= n:
+        yield f"element_dofs has shape {dofs.shape} and dtype {dofs.dtype}; expected (k, e), whole, from -1 to {n - 1}"
+        return
+    k, count = dofs.shape
+    some = np.arange(0, count, max(2, count // ENTRIES))
+    of_all, of_some = problem.element_sampler(np.arange(count)), problem.element_sampler(some)
+    for where, mu in case.arguments.items():
+        full, parts = of_all(mu.copy()), of_some(mu.copy())
+        for name in names:
+            shape = (k, k) if name == "A" else (k,)
+            for sampled, number in ((full, count), (parts, len(some))):
+                if name not in sampled:
+                    raise ConformanceError(f"the element sampler returns no {name}, which `elementwise` names")
+                if fault := array_fault(f"{name} of the element sampler", sampled[name], (number, *shape)):
+                    raise ConformanceError(f"{fault} ({at(mu)})")
+            _compare("element_sampler", mu, {name: _summed(name, full[name], dofs, n)}, case.results[where])
+            if what := difference(parts[name], full[name][some], PARTIAL_RTOL * largest_entry(full[name])):
+                raise ConformanceError(f"{name} on some elements differs from that on all of them {at(mu)}: {what}")
+
+
+def _summed(name: str, parts: Array, dofs: Indices, n: int) -> object:
+    """The matrix (n×n) or the vector (n,) of parts (e×k×k) or (e×k) on elements."""
+    if name == "f":
+        kept = dofs.T >= 0
+        return np.bincount(dofs.T[kept], weights=parts[kept], minlength=n)
+    rows, columns = np.broadcast_arrays(dofs.T[:, :, None], dofs.T[:, None, :])
+    kept = (rows >= 0) & (columns >= 0)
+    return sp.csr_array(sp.coo_array((parts[kept], (rows[kept], columns[kept])), shape=(n, n)))
+
+
 def _places(name: str, values: object, rng: np.random.Generator) -> tuple[Indices, Indices]:
     """Rows and columns of entries in the pattern of a member; of the symmetric A on and above the diagonal."""
     if isinstance(values, np.ndarray):
@@ -274,7 +316,7 @@ def _compare(function: str, mu: Array, arrays: Arrays, full: Arrays) -> None:
 
 
 def _undeclarable(declaration: str, names: Iterable[str]) -> Iterator[str]:
-    """Faults of `constant` or `entrywise`: names that are not members."""
+    """Faults of `constant`, `entrywise` or `elementwise`: names that are not members."""
     if isinstance(names, str):
         raise ConformanceError(f"`{declaration}` is the string {names!r}; expected a set: frozenset({{{names!r}}})")
     for name in sorted(set(names) - set(MEMBERS)):

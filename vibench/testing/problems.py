@@ -271,6 +271,7 @@ PROBLEM = Conformance("problem", ProblemCase, (
     Check("assembly on the contact", assembly.on_contact, ("determinism",)),
     Check("affine sums", assembly.affine, ("determinism",)),
     Check("assembly by entries", assembly.by_entries, ("determinism",)),
+    Check("assembly by elements", assembly.by_elements, ("determinism",)),
     Check("interpolation", interpolation,
           ("training set", "validation set", "independence of mu", "assembly by entries")),
     Check("pickling", ProblemCase.pickling, ("determinism",)),

@@ -42,6 +42,8 @@ PROBLEMS: Mapping[str, tuple[str, str]] = {
     "ComplexStiffness": ("assembly", "A has dtype complex128; expected float64"),
     "IntegerBound": ("assembly", "f has dtype int64; expected float64"),
     "OtherSamples": ("assembly by entries", "g of `sampler` differs from that of `assemble`"),
+    "OtherElements": ("assembly by elements", "A of `element_sampler` differs from that of `assemble`"),
+    "AllElements": ("assembly by elements", "A of the element sampler has shape (24, 2, 2); expected (12, 2, 2)"),
     "OtherContact": ("assembly on the contact", "of `contact` differs from that of `assemble`"),
     "DependsOnTheCallBefore": ("determinism", "a second call gives different values of f"),
     "ShiftsTheParameter": ("no mutation", "assemble changes its argument mu"),
