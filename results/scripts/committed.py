@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
 
@@ -86,8 +86,6 @@ def enriched(cells: pd.DataFrame, error: str) -> pd.Series:
     return plain.reindex(others.index) / others[error]
 
 
-def unavailable(gains: pd.DataFrame) -> Iterator[tuple[str, str]]:
-    """Problems without a C program, with the reason."""
-    for problem, mine in gains[gains["assembly"] == "compiled"].groupby("problem", sort=False):
-        if mine["gain"].isna().all():
-            yield str(problem), str(mine["reason"].iloc[0])
+def unavailable(cells: pd.DataFrame) -> str:
+    """Why some cells have no program: the reason of the first one, without the stage that gave it."""
+    return str(cells["reason"].iloc[0]).partition(": the model ")[2] or str(cells["reason"].iloc[0])

@@ -84,19 +84,15 @@ def first_page(results: Results) -> str:
         "What holds over all models of these studies, and what does not:",
         "\n".join(
             [
-                *(
-                    f"- **{how} assembly, {problem}:** gains of {span(mine['gain'])}; {of(*faster(mine))} models are "
-                    f"faster than what they replace."
-                    for (problem, how), mine in gains.groupby(["problem", "assembly"], sort=False)
-                    if mine["gain"].notna().any()
-                ),
-                *(f"- **{problem} as a C program:** {reason}." for problem, reason in unavailable(gains)),
+                "- **Gains**, and how many models are faster than what they replace: "
+                + "; ".join(f"{how} {', '.join(_gain(gains, how, p) for p in PROBLEMS)}" for how in ASSEMBLIES)
+                + ".",
                 "- **Enrichment** divides the error of λ by these factors (`paper-obstacle`, `paper-hertz`): "
                 + "; ".join(factors(results))
                 + ".",
                 "- **β over the span** is at most "
                 + ", ".join(f"{number(mine['beta_span_min'].max())} ({p})" for p, mine in decorrelated.items())
-                + " without enrichment where N ≤ R, and "
+                + " without enrichment, and "
                 + ", ".join(f"{span(mine['beta_span_min'])} ({p})" for p, mine in supplied.items())
                 + " with one; **over the cone** it is "
                 + ", ".join(
@@ -119,9 +115,11 @@ def first_page(results: Results) -> str:
     return "\n\n".join(lines)
 
 
-def faster(mine: pd.DataFrame) -> tuple[int, int]:
-    """How many models are surely faster than the high-fidelity model, and how many there are."""
-    return int((mine["gain_low"] > 1.0).sum()), len(mine)
+def _gain(gains: pd.DataFrame, assembly: str, problem: str) -> str:
+    mine = gains[(gains["assembly"] == assembly) & (gains["problem"] == problem)]
+    if mine["gain"].isna().all():
+        return f"none ({problem}: {unavailable(mine)})"
+    return f"{span(mine['gain'])} ({problem}, {of(int((mine['gain_low'] > 1.0).sum()), len(mine))})"
 
 
 def _reproduction(results: Results) -> str:

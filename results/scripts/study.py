@@ -57,8 +57,7 @@ def main(run: str, target: str) -> None:
             f"Comparison with Table {evidence.paper.table} of Niakh, Drouet, Ehrlacher and Ern (2022), δ_PGA = "
             f"{evidence.paper.tight:g}",
             comparison(evidence),
-            f"Columns of vibench: {SOLVER}, full assembly; break-even by the paper's formula, with its 95 % "
-            "interval.",
+            f"Columns of vibench: {SOLVER}, full assembly; break-even by the paper's formula, with its 95 % interval.",
         )
     page.section("All cells", *outcomes(cells), tables.summary(cells))
     of_enrichments = tables.read(path, "thresholds").dropna(subset="cell_a")

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
-from page import SECONDS, Page, machines, made_by, read, start
+from page import SECONDS, Page, made_by, origin, read, start
 
 from vibench import HighFidelitySolver, create
 from vibench.linalg.factorisations import DEFAULT, IMPLEMENTATIONS
@@ -146,7 +146,7 @@ def main(run: str, target: str) -> None:
     page = Page(
         target, "Three dimensions", made_by("three_dimensions", "three-dimensions", "three-dimensions",
                                             options=" --no-figures"),
-        f"A half-space pressed by a rigid elliptic paraboloid (`hertz3d`). {SECONDS}", machine=machines(cells),
+        f"A half-space pressed by a rigid elliptic paraboloid (`hertz3d`). {SECONDS}", machine=origin(cells),
     )  # fmt: skip
     compared = against_theory()
     page.section(

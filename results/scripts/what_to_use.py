@@ -163,7 +163,11 @@ def which_assembly(results: Results) -> str:
     said = "; ".join(
         f"{how} {', '.join(f'{by[how, p]} ({p})' for p in PROBLEMS if (how, p) in by)}" for how in ASSEMBLIES
     )
-    none = [f"{problem}: {reason}" for problem, reason in unavailable(gains)]
+    none = [
+        f"of {problem} ({unavailable(mine)})"
+        for problem, mine in gains[gains["assembly"] == "compiled"].groupby("problem", sort=False)
+        if mine["gain"].isna().all()
+    ]
     slow = gains[(gains["assembly"] == "full") & (gains["gain_high"] < 1.0)]
     return question(
         "Full, reduced or compiled?",
@@ -171,7 +175,7 @@ def which_assembly(results: Results) -> str:
         f"[benefit](../results/benefit/README.md), errors unchanged: {said}.",
         f"in full assembly {of(len(slow), int((gains['assembly'] == 'full').sum()))} models are surely slower than "
         "what they replace; problems that declare neither affine members nor entries are assembled in full"
-        + ("; there is no C program of " + "; ".join(none) if none else "")
+        + ("; there is no C program " + "; ".join(none) if none else "")
         + ".",
     )
 
