@@ -13,7 +13,7 @@ GOOD |= {"bounds": "L0/U0"}
 KINDS = pd.Series({"a": "fixed", "b": "per-parameter"})
 
 
-def rows(**changed: float | str) -> pd.DataFrame:
+def rows(**changed: float | str | None) -> pd.DataFrame:
     online = GOOD | {f"beta_{what}": 0.2 for what in ("span", "cone_lower", "cone_upper")}
     return pd.DataFrame([{"cell": "a", **GOOD, **changed}, {"cell": "b", **online}])
 
@@ -43,6 +43,13 @@ def test_every_violation_is_found_and_named(changed: dict[str, float], names: st
     found = violations(rows(**changed), KINDS)
     assert names in [violation.invariant for violation in found]
     assert all(violation.rows == 1 for violation in found)
+
+
+def test_a_formulation_without_constants_is_judged_by_its_bounds_alone() -> None:
+    without = dict.fromkeys(name for name in CONSTANTS if "hf" not in name)
+    assert violations(rows(**without, bounds=None), KINDS) == []
+    found = violations(rows(**without, bounds=None, effectivity_u=0.999), KINDS)
+    assert [violation.invariant for violation in found] == ["effectivity_u ≥ 1"]
 
 
 def test_per_parameter_enrichments_must_reach_the_whole_space() -> None:
