@@ -12,6 +12,7 @@ from fake_plugins import Wire
 from formulations import Nearest, Program
 
 from vibench import RequestError, Run, Study, open_run, run
+from vibench.results.invariants import violations
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, study_of_cell
 
@@ -86,6 +87,7 @@ def test_all_are_judged_by_the_same_bounds(found: Run) -> None:
     queries = found.table("queries")
     ok = queries[queries["status"] == "ok"]
     assert set(ok["formulation"]) == {"mixed", "Program", "Nearest", *HOW}
+    assert violations(queries, found.table("cells").set_index("cell")["enrichment_kind"]) == []
     for error, bound in (("u_energy", "u_energy"), ("lambda_natural", "lambda_natural"), ("u", "u")):
         assert (ok[f"error_{error}_absolute"] <= ok[f"bound_{bound}"] * (1.0 + 1e-9)).all()
     (nearest,) = found.table("cells").query("formulation == 'Nearest'").to_dict("records")

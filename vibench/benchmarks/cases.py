@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
 from vibench.qp.solve import installed_solvers
-from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SOLVER
+from vibench.study.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SOLVER
 from vibench.study.matrix import read_study
 from vibench.study.registry import find, find_named, registered
 
@@ -134,7 +134,7 @@ def _tolerances(primal: str) -> tuple[float | None, ...]:
         return (None,)
 
 
-TIMED = {kind.cli_name: kind for kind in (PROBLEM, PRIMAL, DUAL, SOLVER)}
+TIMED = {kind.cli_name: kind for kind in (PROBLEM, PRIMAL, DUAL, FORMULATION, SOLVER)}
 """Kinds of plugins that benchmarks time, by the word for each."""
 
 

@@ -25,8 +25,8 @@ REST = "--format csv"
 """Option that prints the columns for which a terminal is too narrow."""
 
 PRIORITY = (
-    "verdict", "problem", "dual", "primal", "size", "solver", "accuracy", "median [ms]", "before [ms]", "after [ms]",
-    "ratio", "quartiles [ms]", "reached", "status", "rounds", "apart",
+    "verdict", "problem", "dual", "primal", "formulation", "size", "solver", "accuracy", "median [ms]", "before [ms]",
+    "after [ms]", "ratio", "quartiles [ms]", "reached", "status", "rounds", "apart",
 )  # fmt: skip
 """Columns, those that matter most first."""
 

@@ -20,7 +20,7 @@ from vibench.text import parsed_json, unbroken
 if TYPE_CHECKING:
     from vibench.benchmarks.running import Benchmark
 
-AXES = ("problem", "dual", "primal", "size", "solver", "accuracy")
+AXES = ("problem", "dual", "primal", "formulation", "size", "solver", "accuracy")
 """What a benchmark is about: its columns, as far as it has them."""
 
 FUNCTIONS = "vibench/benchmarks::test_"

@@ -67,7 +67,7 @@ def _check_reduced(inputs: StageInputs, primal: PrimalChoice) -> None:
 
 
 def _assembly(inputs: StageInputs, group: str, model: AnyReducedModel) -> Timing:
-    mus = _in_turn(inputs)
+    mus = in_turn(inputs)
     return Timing(group, lambda: model.assemble(next(mus)), lambda _: _judge_programs(inputs, model), together=QUERIES)
 
 
@@ -87,7 +87,7 @@ def time_query(inputs: StageInputs, primal: PrimalChoice) -> Timing:
     """Assembly in the quickest way there is, and solution; reached are errors against high-fidelity solutions."""
     reduction = inputs.online(inputs.usual, primal).given()
     model, why = reduction.model, reduction.operators
-    mus = _in_turn(inputs)
+    mus = in_turn(inputs)
 
     def query() -> QPSolution:
         reduced = model.reduced.assemble(next(mus))
@@ -97,7 +97,7 @@ def time_query(inputs: StageInputs, primal: PrimalChoice) -> Timing:
         answers = [model.solve(query.mu) for query in inputs.queries]
         worst = max(answers, key=lambda answer: answer.status.severity)
         figures = [
-            residual_figures(answer.residuals) | _errors(inputs, query, answer.u, answer.lam)
+            residual_figures(answer.residuals) | errors_of(inputs, query, answer.u, answer.lam)
             for query, answer in zip(inputs.queries, answers, strict=True)
             if answer.residuals is not None
         ]
@@ -111,12 +111,12 @@ def time_query(inputs: StageInputs, primal: PrimalChoice) -> Timing:
     return Timing("query", query, judge, together=QUERIES)
 
 
-def _in_turn(inputs: StageInputs) -> Iterator[Array]:
+def in_turn(inputs: StageInputs) -> Iterator[Array]:
     """The validation parameters, again and again."""
     return cycle([query.mu for query in inputs.queries])
 
 
-def _errors(inputs: StageInputs, query: ValidationQuery, u: Array, lam: Array) -> dict[str, float]:
+def errors_of(inputs: StageInputs, query: ValidationQuery, u: Array, lam: Array) -> dict[str, float]:
     """Relative errors of u and λ, scaled ones where the high-fidelity u or λ is zero."""
     energy = assemblies(inputs.problem).energy_at(query.mu)
     (error,) = errors(inputs.problem, [query.vi], [energy], query.exact, u[:, None], lam[:, None])

@@ -22,6 +22,7 @@ from vibench.benchmarks.cases import (
     at_tolerances,
     takes_no_option,
 )
+from vibench.benchmarks.formulations import FORMULATIONS
 from vibench.benchmarks.inputs import StageInputs
 from vibench.benchmarks.measure import PASSES, PassTimes, Timing, measure
 from vibench.benchmarks.offline import OFFLINE
@@ -31,11 +32,11 @@ from vibench.execution.watched import WatchedWork, watched
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.stages.base import Failed
-from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SOLVER
+from vibench.study.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SOLVER
 from vibench.study.registry import registered
 
 BENCHMARKS: Mapping[str, Callable[..., Timing]] = {
-    function.__name__.removeprefix("time_"): function for function in OFFLINE + ONLINE
+    function.__name__.removeprefix("time_"): function for function in OFFLINE + ONLINE + FORMULATIONS
 }
 """What is timed, by the names of the benchmarks."""
 
@@ -75,6 +76,7 @@ def planned(
         "size": SIZES,
         "dual": chosen.get("dual", [*registered(DUAL)]),
         "primal": at_tolerances(chosen.get("primal", [*registered(PRIMAL)])),
+        "formulation": chosen.get("formulation", [*registered(FORMULATION)]),
         "solver": chosen.get("solver", installed_solvers(registered(SOLVER))),
         "accuracy": ACCURACIES,
     }

@@ -21,7 +21,9 @@ def bench_plugins(
     plugin: Annotated[
         list[str] | None,
         Argument(
-            metavar="PLUGIN", help="Names, or problem|primal|dual|solver:NAME; all by default.", autocompletion=plugins
+            metavar="PLUGIN",
+            help="Names, or problem|primal|dual|formulation|solver:NAME; all by default.",
+            autocompletion=plugins,
         ),
     ] = None,
     out: Annotated[Path | None, Option(metavar="FILE", help="Keep the JSON file of pytest-benchmark.")] = None,

@@ -24,7 +24,7 @@ from vibench.study.registry import registered
 
 NAMES = {
     "problem": "my-rope", "primal": "tied", "dual": "cone", "solver": "for-rope", "sampling": "strata",
-    "figure": "faster",
+    "figure": "faster", "formulation": "program",
 }  # fmt: skip
 
 
@@ -64,7 +64,7 @@ def test_the_tests_of_new_packages_are_green(written: dict[str, Path], installed
     tests = [str(folder / "tests") for folder in written.values()]
     done = installed("-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error", *tests, folder=tmp_path)
     assert done.returncode == 0, done.stdout
-    assert "12 passed" in done.stdout
+    assert "14 passed" in done.stdout
 
 
 @pytest.mark.parametrize(("kind", "name"), NAMES.items())
@@ -79,7 +79,14 @@ def test_a_new_plugin_passes_its_checks_as_it_is(
 
 def test_new_plugins_give_rows_without_an_edit(vibench: Vibench, site: Path, tmp_path: Path) -> None:
     tolerances = [{"pod": [1e-3], "dual": [1e-2], "primal": {"tied": [0.5]}}]
-    study = wire_study(problem=["my-rope"], dual=["cone"], primal=["tied"], solvers=["for-rope"], tolerances=tolerances)
+    study = wire_study(
+        problem=["my-rope"],
+        dual=["cone"],
+        primal=["tied"],
+        solvers=["for-rope"],
+        formulation=["program"],
+        tolerances=tolerances,
+    )
     done = vibench(tmp_path, "run", write_study(tmp_path, study), "--out", "out", "--jobs", "1", plugins=site)
     assert done.returncode == 0, done.stdout + done.stderr
     (row,) = rows(tmp_path / "out")

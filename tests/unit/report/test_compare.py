@@ -234,7 +234,7 @@ def test_the_command_ends_with_one_where_something_got_worse(
     assert getattr(ended.value, "exit_code", None) == 1
     assert "1 for the worse" in capsys.readouterr().out
     diff_runs(str(quick_run), str(quick_run), 1.25, "csv")
-    assert capsys.readouterr().out.startswith("run,against,problem,dual,primal,asked")
+    assert capsys.readouterr().out.startswith("run,against,problem,formulation,dual,primal,asked")
     with pytest.raises(RequestError, match="no results in 'nowhere'"):
         diff_runs(str(quick_run), "nowhere")
 

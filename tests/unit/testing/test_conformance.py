@@ -362,7 +362,7 @@ class TestRequests:
             (["broken_problems:Jmups"], ["no plugin of the module broken_problems", "did you mean 'Jumps'"]),
             (
                 ["running:Path"],
-                ["'running:Path'", "no subclass of Problem, Sampling, PrimalStrategy, DualStrategy, Fig"],
+                ["'running:Path'", "no subclass of Problem, Sampling, PrimalStrategy, DualStrategy, Form"],
             ),
             (["some thing:Rope"], ["neither KIND:NAME", "solver", "MODULE:NAME"]),
             (["broken_variants:UnknownAnnotation"], ["annotations that fail: NameError", "'Depth'"]),
