@@ -135,10 +135,16 @@ def error_bounds(
     constants: Sequence[Stability],
     u: Array,
     lam: Array,
+    pressed: Mask | None = None,
 ) -> list[ErrorBounds]:
-    """Bounds (ii) of reduced u (n×P) and λ (m×P), column by column at the parameters of `vis`."""
+    """Bounds (ii) of reduced u (n×P) and λ (m×P), column by column at the parameters of `vis`.
+
+    `pressed` (m×P) are rows that multipliers press where these are known: ν is nearly λ, so that corrections of all
+    pairs at one parameter start there, and from one factor.
+    """
     residuals = [residual(vi, u[:, k], lam[:, k]) for k, vi in enumerate(vis)]
-    given = zip(vis, energies, constants, u.T, lam.T, rieszes(energies, residuals), strict=True)
+    starts = [None] * len(vis) if pressed is None else pressed.T
+    given = zip(vis, energies, constants, u.T, lam.T, rieszes(energies, residuals), starts, strict=True)
     return [_bounds(vi, energy, c.coercivity, c.energy_inf_sup, *one) for vi, energy, c, *one in given]
 
 
@@ -163,13 +169,14 @@ def _bounds(
     u: Array,
     lam: Array,
     riesz: Representer,
+    pressed: Mask | None = None,
 ) -> ErrorBounds:
-    """Bounds (ii), with the representer A⁻¹r."""
+    """Bounds (ii), with the representer A⁻¹r, and rows (m,) that the multiplier presses."""
     if np.min(lam, initial=0.0) < 0.0:
         return ErrorBounds.none(NOT_IN_CONE)
     if np.any(lam[is_absent(vi.g)]):
         return ErrorBounds.none(ON_ABSENT_ROW)
-    correction = find_correction(vi, energy, u, lam)
+    correction = find_correction(vi, energy, u, lam, pressed)
     if correction is None:
         return ErrorBounds.none(NO_CORRECTION)
     of_u = terms(correction, u, lam, riesz)
@@ -366,7 +373,9 @@ def _with_constrained_residual(correction: Correction, u: Array, lam: Array, rie
         yield _terms(replace(correction, eta=eta), moved, lam, held, riesz.norm)
 
 
-def find_correction(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Correction | None:
+def find_correction(
+    vi: VariationalInequality, energy: Energy, u: Array, lam: Array, pressed: Mask | None = None
+) -> Correction | None:
     """A correction of s = B u − g that is close to the best one; `None` if none was found.
 
     Parameters
@@ -375,6 +384,8 @@ def find_correction(vi: VariationalInequality, energy: Energy, u: Array, lam: Ar
         A, f, B and g at one parameter, and the factorisations of A.
     u, lam
         u_N (n,) and λ_N ≥ 0 (m,).
+    pressed
+        Rows (m,) where active sets start; those that λ_N presses by default.
     """
     on = energy.on_contact(vi)
     u = on.values(u)
@@ -385,10 +396,10 @@ def find_correction(vi: VariationalInequality, energy: Energy, u: Array, lam: Ar
     # the largest multiplier s / b A⁻¹bᵀ that a row b w ≥ s would have alone, from above
     alone = float(np.max(excess * on.stiffnesses[kept], initial=0.0))
     largest = IMPLAUSIBLE * max(np.max(lam, initial=0.0), alone)
-    doubtful = None
+    starts, doubtful = [chosen[kept] for chosen in (pressed, lam > 0.0) if chosen is not None], None
     for _ in range(ATTEMPTS):
-        least, start = excess + margin, (equal, lam[kept] > 0.0)
-        for values, forces in _minimisers(on, energy, kept, lam, least, *start, largest):
+        least = excess + margin
+        for values, forces in _minimisers(on, energy, kept, lam, least, equal, starts, largest):
             multipliers = np.zeros(len(vi.g))
             multipliers[kept] = forces
             w, multipliers = constraints.moved(u, values, multipliers)
@@ -406,7 +417,14 @@ def find_correction(vi: VariationalInequality, energy: Energy, u: Array, lam: Ar
 
 
 def _minimisers(
-    on: OnContact, energy: Energy, kept: Indices, lam: Array, least: Array, equal: Mask, start: Mask, largest: float
+    on: OnContact,
+    energy: Energy,
+    kept: Indices,
+    lam: Array,
+    least: Array,
+    equal: Mask,
+    starts: Sequence[Mask],
+    largest: float,
 ) -> Iterator[tuple[Array, Array]]:
     """Minimisers of ½‖w‖²_A + λᵀB w with B w ≥ s in the rows `kept` (k,), on retained unknowns (c,), and forces (k,).
 
@@ -414,7 +432,7 @@ def _minimisers(
     for round-off may have a w that is feasible and huge, with a multiplier above `largest`. `least` is s (k,).
     """
     system = on.correction_system(kept, lam, least)
-    for active in (start, np.zeros_like(start)):
+    for active in (*starts, np.zeros_like(equal)):
         settled = active_set_iterations(system, active, equal)
         if settled is not None:
             yield settled[:2]
@@ -422,7 +440,7 @@ def _minimisers(
                 return
     vi = on.vi
     program = VariationalInequality(vi.A, -(vi.B.T @ lam), -sp.csr_array(vi.B)[kept], -least)
-    if (nearest := least_distance_solution(program, energy.factor, equal, start)) is not None:
+    if (nearest := least_distance_solution(program, energy.factor, equal, starts[-1])) is not None:
         yield on.values(nearest[0]), nearest[1]
 
 

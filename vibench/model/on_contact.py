@@ -18,6 +18,7 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
+from cachetools import LRUCache
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness
@@ -26,6 +27,9 @@ from vibench.qp.scaling import near_rows
 
 SMALL = 2**18
 """Entries of D up to which it is computed for a sparse Ŝ; beyond, systems are solved for every set."""
+
+KEPT = 4
+"""Factors of compliances that are kept: of all rows that matter, and of active sets, whose first one pairs share."""
 
 CANCELLED = 1e-4
 """A representer A⁻¹ℓ that is a sum of terms, whose norm is below this share of theirs, is computed anew from ℓ."""
@@ -76,13 +80,13 @@ class OnContact:
         self.sizes: SparseMatrix = abs(self.B)
         m, c = self.B.shape
         self.is_dense = stiffness.dense or (shared and m * c <= SMALL)
-        self._factor: tuple[bytes, _Factor] | None = None
+        self._factors: LRUCache[bytes, _Factor] = LRUCache(KEPT)
 
     @property
     def nbytes(self) -> int:
-        """Memory, about, once everything is computed: B and |B|, D, K, and a factor of K."""
+        """Memory, about, once everything is computed: B and |B|, D, K, and factors of K."""
         m, c = self.B.shape
-        return 24 * int(self.B.nnz) + (8 * m * (c + 2 * m) if self.is_dense else 0)
+        return 24 * int(self.B.nnz) + (8 * m * (c + 3 * m) if self.is_dense else 0)
 
     def values(self, u: Array) -> Array:
         """The retained unknowns (c,) of u (n,)."""
@@ -153,7 +157,7 @@ class OnContact:
             released[chosen] = 0.0
             w = -self._displaced(released)
             if len(active):
-                added = _Factor(self._compliance[np.ix_(chosen, chosen)]).solve(least[active] + (B @ w)[active])
+                added = self._factor(chosen).solve(least[active] + (B @ w)[active])
                 forces[active] = pressed[chosen] + added
                 w += added @ self.liftings[chosen]
             return w, forces
@@ -170,20 +174,20 @@ class OnContact:
         """
         given, multiplier = (self.B @ values)[rows], np.zeros(self.B.shape[0])
         if self.is_dense:
-            multiplier[rows] = self._forces(rows, given)
+            multiplier[rows] = self._factor(rows).solve(given)
             return self.of_force(multiplier)
         vi = self.vi
         program = VariationalInequality(vi.A, np.zeros_like(vi.f), sp.csr_array(vi.B)[rows], -given)
         moved, multiplier[rows] = self._stiffness.active_set_system(program).solve_active(np.arange(len(rows)))
         return Representer(-moved, -self.load(moved, -multiplier))
 
-    def _forces(self, rows: Indices, given: Array) -> Array:
-        """Solution of K ξ = r in some rows (k,); the last factor is kept."""
-        if self._factor is None or self._factor[0] != rows.tobytes():
+    def _factor(self, rows: Indices) -> _Factor:
+        """A factor of K in some rows (k,): active sets and kept rows are often those of the pair before."""
+        key = rows.tobytes()
+        if key not in self._factors:
             all_of_them = len(rows) == len(self._compliance)
-            compliance = self._compliance if all_of_them else self._compliance[np.ix_(rows, rows)]
-            self._factor = rows.tobytes(), _Factor(compliance)
-        return self._factor[1].solve(given)
+            self._factors[key] = _Factor(self._compliance if all_of_them else self._compliance[np.ix_(rows, rows)])
+        return self._factors[key]
 
 
 def representers(stiffness: CondensedStiffness, functionals: Array) -> list[Representer]:

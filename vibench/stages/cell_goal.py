@@ -7,8 +7,9 @@ import math
 import resource
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from pathlib import Path
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from vibench.stages.infsup_constants import ReferenceConstants
 from vibench.stages.offline import ConstraintMatrices
 from vibench.stages.snapshots import TimedSnapshots, gather, solution_stages
 from vibench.storage.artefacts import Artefact, Store
-from vibench.study.kinds import SOLVER
+from vibench.study.kinds import PROBLEM, SOLVER
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.study.registry import find
@@ -125,17 +126,9 @@ class CellItems(Items):
     def __init__(self, stage: CellGoal, store: Store) -> None:
         self._goal, self._store = stage, store
         self._problem: Problem = build_problem(stage.problem)
-        self._training: TimedSnapshots = gather(store, stage.training)
-        self._reference: TimedSnapshots = gather(store, stage.validation)
-        problem, trained = self._problem, self._training
-        self._compared = ReferenceSolutions(
-            self._reference.u,
-            self._reference.lam,
-            float(np.max(problem.V.norm(trained.u), initial=0.0)),
-            float(np.max(problem.W.norm(trained.lam), initial=0.0)),
-            output_scales(problem.outputs, trained.mu, trained.u, trained.lam),
-        )
-        self._zeros = zeros(problem, self._compared)
+        solved = _solutions(_Solutions(stage.training, stage.validation, store.folder, store))
+        self._training, self._reference, self._compared = solved
+        self._zeros = zeros(self._problem, self._compared)
         self._stability: list[Stability] = value_of(store, stage.reference)
 
     @abstractmethod
@@ -230,6 +223,35 @@ class CellItems(Items):
         artefact = self._store.get(stage.key)
         assert artefact is not None  # an input of this stage
         return artefact
+
+
+@dataclass(frozen=True)
+class _Solutions:
+    """The stages of the solutions that queries are compared with, and the store in a folder that has them."""
+
+    training: tuple[Stage, ...]
+    validation: tuple[Stage, ...]
+    folder: Path
+    store: Store = field(compare=False)
+
+
+@lru_cache(maxsize=1)
+def _solutions(of: _Solutions) -> tuple[TimedSnapshots, TimedSnapshots, ReferenceSolutions]:
+    """Training and validation solutions, and the latter with what is largest of the former; cells share them."""
+    trained, reference = gather(of.store, of.training), gather(of.store, of.validation)
+    (plugin,) = {plugin for stage in of.training for plugin in stage.plugins() if plugin.kind is PROBLEM}
+    problem = build_problem(plugin)
+    return (
+        trained,
+        reference,
+        ReferenceSolutions(
+            reference.u,
+            reference.lam,
+            float(np.max(problem.V.norm(trained.u), initial=0.0)),
+            float(np.max(problem.W.norm(trained.lam), initial=0.0)),
+            output_scales(problem.outputs, trained.mu, trained.u, trained.lam),
+        ),
+    )
 
 
 def _finite(bound: float) -> float | None:

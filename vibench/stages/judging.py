@@ -35,7 +35,7 @@ def pair_columns(
 ) -> list[Row]:
     """Columns of answers u (n×P), λ (m×P) at parameters (P×d): errors, their bounds, residuals and outputs."""
     energies = [assemblies(problem).energy_at(mu) for mu in mus]
-    bounds = error_bounds(vis, energies, constants, u, lam)
+    bounds = error_bounds(vis, energies, constants, u, lam, reference.lam > 0.0)
     measured = zip(
         errors(problem, vis, energies, reference, u, lam),
         bounds,
