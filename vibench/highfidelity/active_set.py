@@ -141,6 +141,11 @@ class HighFidelitySolver:
         self._solved.append(mu)
         self._active.append(solution.lam > 0.0)
 
+    def forget(self) -> None:
+        """Let no later solution start from those that are remembered; factorisations stay."""
+        self._solved.clear()
+        self._active.clear()
+
     def check_coercive(self, mu: Array, vi: VariationalInequality) -> None:
         """Refuse a stiffness that is not symmetric positive definite.
 

@@ -206,7 +206,7 @@ class CellItems(Items):
         """Offline seconds as if the cell had been run alone, and the machines that measured them."""
         artefacts = {name: [self._artefact(stage) for stage in parts] for name, parts in self._goal.offline.items()}
         spent = {name: [artefact.seconds for artefact in read] for name, read in artefacts.items()}
-        # The chunks of a parameter set have a set-up each, for the sake of parallel runs: one counts.
+        # Every chunk has the set-up of the process that solved it, for the sake of parallel runs: one counts.
         setup = median_of([*self._training.setups, *self._reference.setups])
         spent["snapshots"].append(setup)
         row: Row = {f"offline_{name}_s": sum(s.cpu for s in parts) for name, parts in spent.items()}

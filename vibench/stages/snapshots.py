@@ -19,7 +19,7 @@ from vibench.interfaces.validation import Fingerprint, checked_assembly, referen
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.error_bounds import reference_bound
 from vibench.model.growing import GrowingTrainer
-from vibench.offline.assemblies import Assemblies
+from vibench.offline.assemblies import assemblies
 from vibench.offline.sweep import Snapshots
 from vibench.qp.repeats import nearby
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
@@ -59,6 +59,20 @@ class TimedSnapshots(Snapshots):
     """Relative error bounds of validation solutions, infinite where there is none; none of training solutions."""
 
 
+@dataclass
+class _SetUp:
+    """A solver of a problem, and the seconds of its set-up once that is done."""
+
+    solver: HighFidelitySolver
+    seconds: Seconds | None = None
+
+
+@lru_cache(maxsize=1)
+def _set_up(problem: Problem) -> _SetUp:
+    """The solver of the problem that this process works on: chunks in one process share the set-up."""
+    return _SetUp(HighFidelitySolver(problem))
+
+
 @dataclass(frozen=True)
 class SnapshotStage(Stage):
     """High-fidelity solutions at one chunk of a parameter set."""
@@ -84,7 +98,9 @@ class SnapshotStage(Stage):
         first, mus = self.part(self.parameters.of(problem))
         given, reference = mus.copy(), reference_assembly(problem)
         u, lam = np.zeros((problem.V.dim, len(mus))), np.zeros((problem.W.dim, len(mus)))
-        seconds, setups, fallbacks, solver = [], [], [], HighFidelitySolver(problem)
+        seconds, fallbacks, kept = [], [], _set_up(problem)
+        solver = kept.solver
+        solver.forget()  # no solution may depend on what this process has solved before
 
         def refuse_shifted() -> None:
             if not np.array_equal(mus, given):
@@ -108,10 +124,10 @@ class SnapshotStage(Stage):
 
         for k, mu in enumerate(mus):
             near = (nearby(problem.parameters, mu, self.parameters.seed, k, repeat) for repeat in itertools.count())
-            if k == 0:  # with the set-up; what it costs without is measured next to it
+            if kept.seconds is None:  # with the set-up; what it costs without is measured next to it
                 (vi, unverified), beginning = timed(partial(solve, mu))
                 _, marginal = self._measure(solve, near)
-                setups.append(beginning.beyond(marginal))
+                kept.seconds = beginning.beyond(marginal)
             else:
                 (vi, unverified), marginal = self._measure(solve, itertools.chain([mu], near))
             seconds.append(marginal)  # verification, which is what follows, is not timed
@@ -127,17 +143,17 @@ class SnapshotStage(Stage):
             fallbacks.append(solution.fallback)
         reference.refuse_rewritten_constants()
         refuse_shifted()
-        measured = tuple(seconds), tuple(setups), tuple(fallbacks), reference.fingerprint
+        setups = () if kept.seconds is None else (kept.seconds,)
+        measured = tuple(seconds), setups, tuple(fallbacks), reference.fingerprint
         swept = TimedSnapshots(mus, u, lam, *measured, bounds=tuple(self._bounds(problem, mus, u, lam)))
         return Result(swept, sum(seconds, NO_TIME), self._diagnostics(problem, mus, first))
 
     def _bounds(self, problem: Problem, mus: Array, u: Array, lam: Array) -> Iterator[float]:
         """Verify the references by their error bounds; training solutions are none."""
-        assembled = Assemblies(problem)
+        kept = assemblies(problem)
         for k, mu in enumerate(mus if self.parameters.role != "training" else ()):
             try:
-                vi = assembled.at(mu)
-                yield reference_bound(vi, assembled.energy_of(vi), u[:, k], lam[:, k])
+                yield reference_bound(kept.at(mu), kept.energy_at(mu), u[:, k], lam[:, k])
             except NumericalError as error:
                 raise NumericalError(f"at mu = {mu.tolist()}: {error}") from error
 

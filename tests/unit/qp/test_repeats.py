@@ -115,6 +115,7 @@ def test_a_high_fidelity_solution_is_repeated_next_to_its_parameter(
     role: Literal["training", "validation"], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     visited = visits(monkeypatch, snapshots, "checked_assembly")
+    snapshots._set_up.cache_clear()  # with the set-up, beside which a training solution is repeated
     found = SnapshotStage(PROBLEM, ParameterSet(role, 6, 3), 0).run(Store(tmp_path)).value
     repeated = {mu for mu in visited if visited.count(mu) > 1}
     repeated -= {tuple(PROBLEM.create().training_set()[0])}  # where the fingerprint is taken

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from statistics import mean, median
 from typing import Literal
@@ -227,13 +228,19 @@ def test_the_set_up_is_no_part_of_the_seconds_of_a_solution(
     role: Literal["training", "validation"], count: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Whatever the number of parameters that share it: break-even would depend on the number of queries otherwise."""
-    monkeypatch.setattr(snapshots, "HighFidelitySolver", Factorising)
+    made = []
+    monkeypatch.setattr(snapshots, "HighFidelitySolver", lambda problem: made.append(1) or Factorising(problem))
+    monkeypatch.setattr(snapshots, "_set_up", lru_cache(snapshots._set_up.__wrapped__))
     for clock in ("process_time", "perf_counter"):
         monkeypatch.setattr(timing, clock, lambda: Factorising.now)
-    found = SnapshotStage(PROBLEM, ParameterSet(role, count, 3), 1).run(SampleStore(tmp_path))
-    assert found.value.setups == (Seconds(10.0, 10.0),)
-    assert set(found.value.seconds) == {Seconds(1.0, 1.0)}
-    assert found.seconds == Seconds(float(len(found.value.mu)), float(len(found.value.mu)))
+    alone = SnapshotStage(PROBLEM, ParameterSet(role, count, 3), 0).run(SampleStore(tmp_path))
+    for chunk in (1, 0):  # which share the set-up of this process
+        found = SnapshotStage(PROBLEM, ParameterSet(role, count, 3), chunk).run(SampleStore(tmp_path))
+        assert found.value.setups == alone.value.setups == (Seconds(10.0, 10.0),)
+        assert set(found.value.seconds) == {Seconds(1.0, 1.0)}
+        assert found.seconds == Seconds(float(len(found.value.mu)), float(len(found.value.mu)))
+    assert len(made) == 1
+    np.testing.assert_array_equal(found.value.u, alone.value.u)  # whatever was solved before
 
 
 def test_a_slow_query_is_a_timeout(store: SampleStore) -> None:
