@@ -1,13 +1,13 @@
 """Factorisations of sparse symmetric positive definite matrices: one interface, and who implements it.
 
 A factor solves; an elimination condenses a matrix on some unknowns. Whether a matrix is positive definite is proved by
-any implementation that factorises without pivoting: see `is_proved_definite`.
+any implementation that factorises: see `is_proved_definite`.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
@@ -20,6 +20,7 @@ from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError, unknown_name
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky, elimination_order
 from vibench.linalg.definite import BlockDiagonal
+from vibench.linalg.inertia import ATTEMPTS, first_shift, proved_positive
 from vibench.provenance import distribution_version
 
 COLUMNS = 128
@@ -34,6 +35,10 @@ class Factor(ABC):
     @abstractmethod
     def solve(self, right: Array) -> Array:
         """X⁻¹ r for right-hand sides (n,) or (n, k)."""
+
+    def entries(self, n: int) -> float:
+        """At most how many entries the triangular factor of a matrix (n×n) has."""
+        return n * (n + 1.0) / 2.0
 
 
 class Elimination(ABC):
@@ -233,26 +238,32 @@ def _slices(count: int) -> Iterator[slice]:
     return (slice(first, first + COLUMNS) for first in range(0, count, COLUMNS))
 
 
-def is_proved_definite(matrix: SparseMatrix, chosen: Implementation) -> bool:
-    """Whether a factorisation proves that a symmetric matrix (n×n) is positive definite, whatever the round-off.
+def is_proved_definite(parts: Sequence[SparseMatrix], chosen: Implementation, order: Indices | None = None) -> bool:
+    """Whether the sum of symmetric matrices (n×n) is proved to be positive definite, whatever the round-off.
 
-    If Cholesky's factorisation of the computed D⁻¹XD⁻¹ − cI ends, D² being the diagonal of X, then X is definite, with
-    c the sum of the round-off of the factorisation, n γ / (1 − γ) with γ = (n + 2)u / (1 − (n + 2)u), and of the
-    scaling (Rump, "Verification of positive definiteness", BIT Numerical Mathematics 46, 2006, Theorem 2.3). No factor
-    is looked at, so that any implementation will do; the smallest eigenvalue that is proved is n²u and not, as that of
-    `vibench.linalg.inertia`, near the round-off that there was.
+    Factors of SuperLU, which stands in for what factorises nothing, are looked at (`vibench.linalg.inertia`); `order`
+    (n,) is one for it. Of the others nothing is known but that they compute a Cholesky factorisation. If it ends for
+    the computed D⁻¹XD⁻¹ − cI, D² being the diagonal of X, then X is definite, with c the sum of the round-off of
+    summing and scaling and of the factorisation, Σ_j γ / (1 − γ) with γ_k of k = t_j + 1 and t_j entries in column j of
+    the factor (Rump, "Verification of positive definiteness", BIT Numerical Mathematics 46, 2006, §2): about u times
+    the number of all entries. An LU factorisation has no such bound, since its two factors differ by round-off.
     """
-    if not chosen.is_direct:
-        return False
+    if not chosen.module or not chosen.is_direct:
+        diagonal = np.asarray(sum(part.diagonal() for part in parts))
+        return bool(np.all(diagonal > 0.0)) and proved_positive(parts, np.sqrt(diagonal), order) == len(diagonal)
     try:
-        matrix = checked(matrix, "")
+        matrix = checked(sum(sp.csc_array(part) for part in parts), "")
         scale = sp.diags_array(1.0 / np.sqrt(matrix.diagonal()), format="csc")
-        scaled = sp.csc_array(scale @ matrix @ scale)
-        n = matrix.shape[0]
-        gamma = (n + 2.0) * UNIT / (1.0 - (n + 2.0) * UNIT)
-        rounded = 8.0 * UNIT * float(np.max(abs(scaled).sum(axis=0), initial=0.0))
-        shift = 1.01 * (n * gamma / (1.0 - gamma) + rounded)
-        chosen.factorise(sp.csc_array(scaled - shift * sp.eye_array(n)), "")
+        sizes = scale @ sum(abs(sp.csc_array(part)) for part in parts) @ scale
+        scaled = sp.csc_array(scale @ (0.5 * (matrix + matrix.T)) @ scale)
+        rounded = (8.0 + 2.0 * len(parts)) * UNIT * float(np.max(sizes.sum(axis=0), initial=0.0))
+        shift, identity = first_shift(scaled), sp.eye_array(matrix.shape[0], format="csc")
+        for _ in range(ATTEMPTS):
+            factor = chosen.factorise(sp.csc_array(scaled - shift * identity), "")
+            error = 1.01 * (2.0 * UNIT * (factor.entries(matrix.shape[0]) + matrix.shape[0]) + rounded)
+            if error <= shift:
+                return True
+            shift = 1.01 * error
     except NumericalError:
-        return False
-    return True
+        pass
+    return False

@@ -33,12 +33,13 @@ from pypardiso.pardiso_wrapper import PyPardisoError  # noqa: E402
 FACTORISE, SOLVE = 12, 33
 """Phases."""
 
-PARAMETERS = {1: 1, 2: 2, 8: 0, 10: 8, 21: 1, 27: 0, 35: 0}
+PARAMETERS = {1: 1, 2: 2, 8: 0, 10: 8, 18: -1, 21: 1, 27: 0, 35: 0}
 """`iparm` by number, all others are 0. None is a default of the MKL: those of `iparm(1) = 0` are wrong since 2025. The
-order is that of METIS; definite matrices need no scaling, no matching and no refinement; indices begin with one."""
+order is that of METIS; entries of factors are counted; definite matrices need no scaling, matching or refinement;
+indices begin with one."""
 
-SCHUR = 36
-"""`iparm` of the Schur complement of the unknowns that `perm` marks."""
+ENTRIES, SCHUR = 18, 36
+"""`iparm` of the number of entries of a factor, and of the Schur complement of the unknowns that `perm` marks."""
 
 
 def _solver() -> PyPardisoSolver:
@@ -68,6 +69,10 @@ class _Pardiso(Factor):
         self._solver, self._upper, self._name = _solver(), _upper(matrix), name
         weakref.finalize(self, self._solver.free_memory, everything=True).atexit = False  # memory that NumPy has not
         _call(self._solver, FACTORISE, self._upper, np.zeros((matrix.shape[0], 1)), name)
+        self._entries = int(self._solver.iparm[ENTRIES - 1])
+
+    def entries(self, n: int) -> float:
+        return self._entries if self._entries > 0 else super().entries(n)
 
     def solve(self, right: Array) -> Array:
         if not right.size:

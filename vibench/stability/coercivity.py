@@ -26,6 +26,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.linalg.cholesky import SparseCholesky, symmetric_lu
+from vibench.linalg.factorisations import implementation, is_proved_definite
 from vibench.linalg.inertia import proved_positive
 from vibench.linalg.inner_product import InnerProduct
 from vibench.stability.infsup import InfSup
@@ -87,10 +88,10 @@ def coercivity(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None, ord
     definite.
     """
     lowest = lowest_quotient(A, V, solve)  # refuses a matrix that is not positive definite
-    root = np.sqrt(A.diagonal())
+    chosen = implementation(V.factorisation)
 
     def coercive(a: float) -> bool:
-        return proved_positive([A, -a * V.matrix], root, order) == V.dim
+        return is_proved_definite([A, -a * V.matrix], chosen, order)
 
     return moved(lowest, -1.0, coercive)
 
@@ -107,10 +108,10 @@ def share_of_diagonal(X: InnerProduct) -> float:
 
 def continuity(A: SparseMatrix, V: InnerProduct) -> Constant:
     """Upper bound of γ_a for A (n×n), symmetric positive definite."""
-    root = np.sqrt(V.matrix.diagonal())
+    chosen = implementation(V.factorisation)
 
     def continuous(c: float) -> bool:
-        return proved_positive([c * V.matrix, -A], np.sqrt(c) * root) == V.dim
+        return is_proved_definite([c * V.matrix, -A], chosen)
 
     return moved(highest_quotient(A, V), 1.0, continuous)
 
@@ -122,8 +123,8 @@ def operator_norm(M: SparseMatrix, X: InnerProduct) -> Constant:
     if X.dim <= FEW:
         estimate = float(np.abs(scipy.linalg.eigvalsh(M.toarray(), X.matrix.toarray())).max())
     else:
-        whitened = _operator(X.dim, lambda v: X.whiten_functional(M @ X.unwhiten(v)))
-        estimate = float(np.abs(eigsh(whitened, which="LM", **_lanczos(X.dim, ROUGH))[0]))
+        inverse, options = _operator(X.dim, X.riesz), _lanczos(X.dim, ROUGH)
+        estimate = float(np.abs(eigsh(M, M=X.matrix, Minv=inverse, which="LM", **options)[0]))
     root = np.sqrt(estimate * X.matrix.diagonal())
 
     def above(c: float) -> bool:

@@ -85,18 +85,22 @@ def test_tiny_matrices_and_empty_contact(chosen: Implementation, count: int) -> 
 def test_what_is_not_definite_is_refused_by_name(chosen: Implementation, matrix: np.ndarray) -> None:
     with pytest.raises(NumericalError, match="the thing"):
         chosen.factorise(sp.csc_array(matrix), "the thing")
-    assert not is_proved_definite(sp.csc_array(matrix), chosen)
+    assert not is_proved_definite([sp.csc_array(matrix)], chosen)
 
 
 @EVERY
-def test_a_definite_matrix_is_proved_to_be_one(chosen: Implementation) -> None:
-    A = membranes((12,), 2e11)
+@pytest.mark.parametrize("weight", [1.0, 2e11])
+def test_a_definite_matrix_is_proved_to_be_one(chosen: Implementation, weight: float) -> None:
+    """As a sum, too; and what is definite, and factorised, but may be so by round-off, is not."""
+    A = membranes((12,), weight)
     smallest = float(np.linalg.eigvalsh(A.toarray())[0])
-    assert is_proved_definite(A, chosen) == chosen.is_direct
-    nearly = sp.csc_array(A - sp.eye_array(144) * smallest * (1.0 - 1e-13))
-    if chosen.is_direct:  # it is definite, and factorised, but round-off may have made it so
-        chosen.factorise(nearly, "A")
-    assert not is_proved_definite(nearly, chosen)
+    assert is_proved_definite([A], chosen)
+    norm = sp.eye_array(144, format="csc")
+    assert is_proved_definite([A, -(1.0 - 1e-7) * smallest * norm], chosen)
+    assert not is_proved_definite([A, -(1.0 + 1e-7) * smallest * norm], chosen)
+    if chosen.is_direct:
+        chosen.factorise(sp.csc_array(A - smallest * (1.0 - 1e-13) * norm), "A")
+    assert not is_proved_definite([A, -(1.0 - 1e-13) * smallest * norm], chosen)
 
 
 def test_names() -> None:
