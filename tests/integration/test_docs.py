@@ -193,6 +193,8 @@ def test_the_tables_for_reading_have_the_columns_that_are_described(table: str, 
             "training": ["own", "another"],
             "meaning": "undecided",
             "formulation": ["mixed", "another"],
+            "correction": "auto",
+            "certificate": "certified",
             **zero,
         }
     )  # with one for all, or none, they have no columns

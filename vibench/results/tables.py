@@ -218,8 +218,8 @@ def _for_reading(frame: pd.DataFrame, table: Mapping[str, Column]) -> pd.DataFra
     return under_headings(frame, [name for name in shown_columns(table) if says_something(frame, name)], table)
 
 
-USUAL = {"correction": UNCORRECTED, "formulation": MIXED}
-"""Values that say nothing unasked: those of every cell before there was a choice."""
+USUAL = {"correction": UNCORRECTED, "formulation": MIXED, "certificate": "none"}
+"""Values of columns that say nothing where all cells have them."""
 
 
 def says_something(frame: pd.DataFrame, name: str) -> bool:
