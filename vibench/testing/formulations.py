@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -283,17 +283,14 @@ class FormulationCase(Case[Formulation, Array, Answered]):
             yield f"from snapshots without contact, {found.status}: {found.reason}"
 
 
+@dataclass(frozen=True, eq=False)
 class _Seen(Reduction):
-    """An offline phase that notes which of its attributes were asked for."""
+    """An offline phase that notes which of its attributes, or of those of phases made from it, were asked for."""
 
-    @property
-    def seen(self) -> set[str]:
-        """Names of the attributes."""
-        noted: set[str] = self.__dict__.setdefault("_noted", set())
-        return noted
+    seen: set[str] = field(default_factory=set)
 
     def __getattribute__(self, name: str) -> Any:
-        if not name.startswith("_") and name != "seen":
+        if not name.startswith("_") and name != "seen" and "seen" in self.__dict__:
             self.seen.add(name)
         return super().__getattribute__(name)
 

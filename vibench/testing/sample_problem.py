@@ -5,12 +5,13 @@ from __future__ import annotations
 from copy import deepcopy
 from functools import cache
 from operator import attrgetter
+from typing import ClassVar
 
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, SparseMatrix
-from vibench.interfaces.problem import ParameterBox, Problem, VariationalInequality
+from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.interfaces.problem import ParameterBox, Problem, Sampler, VariationalInequality
 from vibench.interfaces.strategies import Cone, DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, Stop
 from vibench.linalg.inner_product import InnerProduct
 from vibench.offline.reduction import Reduction
@@ -30,6 +31,7 @@ class MovingSupport(Problem):
     supremizer, depends on mu.
     """
 
+    elementwise: ClassVar[frozenset[str]] = frozenset({"A", "f"})
     parameters = ParameterBox(("position", "height"), np.array([-0.1, 0.0]), np.array([0.1, 0.04]), ("m", "m"))
 
     def __init__(self) -> None:
@@ -52,6 +54,18 @@ class MovingSupport(Problem):
         weights = hats / NODES
         support = -0.2 + mu[1] - 0.8 * (self._x - 0.5 - mu[0]) ** 2
         return VariationalInequality(self._stiffness, self._load, sp.csr_array(-weights), -weights @ support)
+
+    @property
+    def element_dofs(self) -> Indices:
+        """The nodes at both ends of the intervals."""
+        left = np.arange(-1, NODES)
+        return np.stack([left, np.where(left + 1 < NODES, left + 1, -1)])
+
+    def element_sampler(self, elements: Indices) -> Sampler:
+        """The same on every interval."""
+        h = 1.0 / (NODES + 1)
+        stiffness = np.tile(np.array([[1.0, -1.0], [-1.0, 1.0]]) / h, (len(elements), 1, 1))
+        return lambda _: {"A": stiffness, "f": np.full((len(elements), 2), -2.0 * h)}
 
 
 def _tridiagonal(off: float, diagonal: float, n: int) -> SparseMatrix:

@@ -114,14 +114,15 @@ class HyperReduced(Formulation):
             sigma = np.linalg.svd(units[-1], compute_uv=False)
             limits.append(self.condition * float(sigma[0] / sigma[-1]) if len(sigma) else np.inf)
         space = V.whiten(basis)
-        while True:
+        while any(each.size for each in units):
             found = [_worst(each, space) for each in units]
             excess = [condition / limit for (condition, _), limit in zip(found, limits, strict=True)]
             number = int(np.argmax(excess))
             if excess[number] <= 1.0:
-                return V.unwhiten(space)
+                break
             added = project_out(space, units[number] @ found[number][1])
             space = np.column_stack([space, added / np.linalg.norm(added)])
+        return V.unwhiten(space)
 
     def _domain(
         self, problem: Problem, vectors: Array, mus: Array, u: Array, rng: np.random.Generator
@@ -184,6 +185,8 @@ class HyperReducedContact(FormulationModel):
                 members["A"] = self._integrals.energy(self._weights[:, None, None] * sampled["A"])
             if "f" not in members:
                 members["f"] = self._integrals.tested(sampled["f"]) @ self._weights
+        if not len(self._rows):  # no snapshot has contact
+            return FormulationAnswer(scipy.linalg.solve(members["A"], members["f"], assume_a="pos"), np.zeros(0))
         if self._loads is None:
             B, g = self._problem.constraint(mu)
             program = VariationalInequality(members["A"], members["f"], B[self._rows] @ self._vectors, g[self._rows])
@@ -260,8 +263,8 @@ def _combined(conditions: Array, size: float, rng: np.random.Generator) -> Array
 def _worst(units: Array, space: Array) -> tuple[float, Array]:
     """Condition number of rows, unit columns (n×j) here, in a space, and the combination (j,) that it feels least."""
     left, sigma, _ = np.linalg.svd(units.T @ space)
-    smallest = float(sigma[-1]) if len(sigma) == units.shape[1] else 0.0
-    return float(np.divide(sigma.max(initial=0.0), smallest)) if smallest else np.inf, left[:, -1]
+    smallest = float(sigma.min(initial=np.inf)) if len(sigma) == units.shape[1] else 0.0
+    return float(sigma.max(initial=0.0)) / smallest if smallest else np.inf, left[:, -1:].sum(axis=1)
 
 
 def cubature(conditions: Array, tolerance: float) -> tuple[Indices, Array]:

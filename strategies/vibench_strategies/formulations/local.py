@@ -26,12 +26,17 @@ from vibench import (
     ParameterBox,
     Problem,
     Snapshots,
+    Stop,
     UnsupportedError,
+    pod,
 )
 from vibench_strategies.formulations.reduced_programs import largest_dimension, reconstructed
 
 if TYPE_CHECKING:
     from vibench import Reduction
+
+INDEPENDENT = 1e-10
+"""Relative tail of the POD of a cluster below which there are no further modes."""
 
 
 class Local(Formulation):
@@ -68,6 +73,10 @@ class Local(Formulation):
         spaces = []
         for number in range(weights.shape[1]):
             part = _restricted(offline, owners == number)
+            if part.modes is not None and part.modes.size is not None:
+                # a cluster may have fewer modes than asked for
+                all_modes = pod(part.snapshots.u, part.problem.V, Stop(tolerance=INDEPENDENT))
+                part = part.given(pod=POD(all_modes.basis[:, : part.modes.size], all_modes.errors))
             if part.enrichment.supply is not None:
                 raise UnsupportedError("local bases cannot be stored for an enrichment that supplies its own vectors")
             part.assembled  # noqa: B018  reduced operators are prepared offline
