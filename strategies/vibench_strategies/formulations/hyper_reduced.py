@@ -83,7 +83,7 @@ class HyperReduced(Formulation):
         if names - problem.elementwise:
             missing = " and ".join(sorted(names - problem.elementwise))
             raise UnsupportedError(
-                f"hyper-reduction integrates {missing} by elements; the problem has not `elementwise`"
+                f"hyper-reduction integrates {missing} by elements, the problem does not"
             )
         chosen = np.unique(np.linspace(0, len(mus) - 1, PARAMETERS).round().astype(int))
         rng, known = np.random.default_rng(self.seed), mus[chosen]
@@ -207,6 +207,8 @@ class HyperReducedContact(FormulationModel):
         assert answer.alpha is not None
         if len(self._rows) == self._problem.W.dim:  # in their order
             return self._vectors @ answer.x, answer.alpha
+        if not (len(self._rows) and self._pressures.size):
+            return self._vectors @ answer.x, np.zeros(self._problem.W.dim)
         measure = np.sqrt(self._shares * np.maximum(self._problem.multiplier_integrals()[self._rows], 0.0))
         local = measure[:, None] * self._pressures[self._rows]
         scales = np.linalg.norm(local, axis=0)

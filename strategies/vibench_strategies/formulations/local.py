@@ -114,7 +114,7 @@ class Local(Formulation):
             one_hot = (labels[:, None] == np.unique(labels)).astype(float)
             features = _features(places, _quadratic(places.shape[1]))
             weights = np.linalg.lstsq(features, one_hot, rcond=None)[0]
-        owners = np.argmax(_features(places, len(weights)) @ weights, axis=1)
+        owners = np.array([_largest(place, weights) for place in places])
         present, owners = np.unique(owners, return_inverse=True)
         return np.ascontiguousarray(weights[:, present]), owners
 
@@ -133,7 +133,7 @@ class LocalModel(FormulationModel):
 
     def cluster(self, mu: Array) -> int:
         """The cluster that answers at mu (d,), at the cost of one polynomial for each."""
-        return int(np.argmax(_features(_scaled(self._box, mu[None]), len(self._weights))[0] @ self._weights))
+        return _largest(_scaled(self._box, mu), self._weights)
 
     def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
         """The mixed program of the cluster, solved by the QP solver of the cell."""
@@ -149,12 +149,17 @@ class LocalModel(FormulationModel):
 
 
 def _scaled(box: ParameterBox, mus: Array) -> Array:
-    """Places (P×d) of parameters in the unit cube."""
+    """Places (P×d) or (d,) of parameters in the unit cube."""
     return np.asarray((mus - box.lower) / box.widths)
 
 
 def _quadratic(d: int) -> int:
     return 1 + d + d * (d + 1) // 2
+
+
+def _largest(place: Array, weights: Array) -> int:
+    """Which polynomial is the largest at a place (d,)."""
+    return int(np.argmax(_features(place[None], len(weights))[0] @ weights))
 
 
 def _features(places: Array, count: int) -> Array:

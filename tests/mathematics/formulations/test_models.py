@@ -1,0 +1,199 @@
+"""Formulations as models of whole problems: the identities with the mixed one, and what each says of itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numerics import Varying
+from other_problems import Torsion
+from transformed import Transformed
+
+import vibench
+from vibench import Array, Enrichment, Formulation, Kind, Reduction, Stop, UnsupportedError
+from vibench.model.galerkin import ReducedModel
+from vibench.offline.sweep import high_fidelity_sweep
+from vibench.qp.solve import solve_qp
+from vibench_problems.obstacle import Obstacle
+from vibench_strategies.cpg import CPG
+from vibench_strategies.dictionary import Dictionary
+from vibench_strategies.formulations.hyper_reduced import HyperReduced, cubature
+from vibench_strategies.formulations.local import Local, LocalModel
+from vibench_strategies.formulations.penalty import Penalty
+from vibench_strategies.formulations.proximal import Proximal
+from vibench_strategies.formulations.regression import Regression
+from vibench_strategies.formulations.sparse_dictionary import SparseDictionary
+from vibench_strategies.online_supremizers import OnlineSupremizers
+
+MU = np.array([0.43])
+
+STRING = Reduction(
+    Varying(count=15), CPG(), OnlineSupremizers(), Stop(tolerance=1e-6), Stop(tolerance=1e-3), accuracy=1e-11
+)
+
+
+@pytest.fixture(scope="module")
+def membrane() -> Reduction:
+    problem = Obstacle(resolution=150)
+    mus = problem.training_set()[::4]
+    found = Reduction(problem, CPG(), None, Stop(tolerance=1e-3), Stop(tolerance=1e-2), accuracy=1e-10)
+    return found.given(snapshots=high_fidelity_sweep(problem, mus))
+
+
+@pytest.mark.parametrize("formulation", [Penalty(1e-11), Proximal(), SparseDictionary()])
+def test_other_ways_to_solve_the_reduced_program_give_the_mixed_answer(formulation: Formulation) -> None:
+    mixed, other = STRING.model.solve(MU), STRING.formulated(formulation).solve(MU)
+    assert other.status == "ok"
+    assert np.allclose(other.u, mixed.u, atol=1e-8 * np.abs(mixed.u).max())
+    assert np.allclose(other.lam, mixed.lam, atol=1e-6 * mixed.lam.max())
+    assert other.answer.iterations is not None
+    assert 0 < other.answer.iterations < 100
+
+
+def test_all_entries_of_a_sparse_dictionary_are_the_cone_dictionary() -> None:
+    whole = replace(STRING, dual=Dictionary())
+    mixed, sparse = whole.model.solve(MU), whole.formulated(SparseDictionary()).solve(MU)
+    assert np.allclose(sparse.u, mixed.u, atol=1e-7 * np.abs(mixed.u).max())
+    vi = STRING.problem.assemble(MU)
+    assert np.allclose(vi.B.T @ sparse.lam, vi.B.T @ mixed.lam, atol=1e-6 * np.abs(vi.f).max())
+    few = whole.formulated(SparseDictionary(entries=1)).solve(MU)
+    assert few.status == "inaccurate"
+    assert "1 entries leave the violation" in few.reason
+    assert np.count_nonzero(few.answer.alpha) == 1
+    rough = whole.formulated(SparseDictionary(tolerance=0.5)).solve(MU)
+    assert rough.status == "ok"
+
+
+@pytest.mark.parametrize("by", ["parameters", "contact"])
+def test_one_cluster_is_the_mixed_model_and_several_have_smaller_spaces(by: str) -> None:
+    mixed = STRING.model.solve(MU)
+    one = STRING.formulated(Local(clusters=1, by=by)).solve(MU)
+    assert np.allclose(one.u, mixed.u, atol=1e-9)
+    assert np.allclose(one.lam, mixed.lam, atol=1e-6 * mixed.lam.max())
+    several = STRING.formulated(Local(clusters=3, by=by))
+    assert isinstance(several.model, LocalModel)
+    assert several.model.dimension < STRING.pod.basis.shape[1] + STRING.cone.size
+    owners, spaces = several.built["owners"], several.built["spaces"]
+    assert set(owners) == set(range(len(spaces)))
+    assert 1 < len(spaces) <= 3
+    for number, space in enumerate(spaces):
+        members = np.flatnonzero(owners == number)
+        # the query chooses what the training chose, and each space keeps the tolerance for its own snapshots
+        assert all(several.model.cluster(STRING.snapshots.mu[k]) == number for k in members)
+        u, V = STRING.snapshots.u[:, members], STRING.problem.V
+        rest = V.norm(u - space["basis"] @ V.gram(space["basis"], u))
+        assert np.linalg.norm(rest) <= 1e-6 * np.linalg.norm(V.norm(u)) + 1e-12
+    assert several.solve(MU).status == "ok"
+
+
+def test_regression_interpolates_the_snapshots_and_its_uncertainty_has_the_size_of_the_error() -> None:
+    pytest.importorskip("sklearn")
+    problem, V, W = STRING.problem, STRING.problem.V, STRING.problem.W
+    fitted = STRING.formulated(Regression())
+    for k in (0, 7):
+        known = STRING.snapshots.u[:, k], STRING.snapshots.lam[:, k]
+        found = fitted.solve(STRING.snapshots.mu[k])
+        assert V.norm(found.u - known[0]) <= 1e-3 * V.norm(known[0])
+        assert W.norm(found.lam - known[1]) <= 1e-2 * W.norm(known[1])
+        assert found.lam.min() >= 0.0
+    ratios = []
+    for mu in problem.validation_set(12, 0):
+        found, exact = fitted.solve(mu), vibench.solve_high_fidelity(problem.assemble(mu))
+        assert found.answer.uncertainty is not None
+        ratios.append(V.norm(found.u - exact.u) / found.answer.uncertainty)
+        assert V.norm(found.u - exact.u) <= found.error_bounds.u  # the proved bound knows nothing of the regression
+    assert 0.1 < np.median(ratios) < 10.0
+
+
+def test_the_whole_domain_is_the_mixed_formulation_with_all_multipliers(membrane: Reduction) -> None:
+    problem, mu = membrane.problem, np.array([0.93, 0.01, -0.02])
+    whole = membrane.formulated(HyperReduced(tolerance=0.0))
+    found, vectors = whole.solve(mu), whole.built["vectors"]
+    every = np.eye(problem.W.dim)
+    model = ReducedModel(problem, vectors, Enrichment(Kind.NONE), every, every)
+    program = model.assemble(mu).program
+    mixed = solve_qp(program, "piqp", 1e-10)
+    assert np.allclose(found.u, vectors @ mixed.x, atol=1e-9)
+    assert np.allclose(found.lam, mixed.alpha, atol=1e-6 * mixed.alpha.max())
+
+
+@pytest.mark.parametrize("integrate", ["varying", "all"])
+def test_a_reduced_domain_converges_to_the_whole_one(membrane: Reduction, integrate: str) -> None:
+    problem, mu = membrane.problem, np.array([0.93, 0.01, -0.02])
+    exact = vibench.solve_high_fidelity(problem.assemble(mu))
+    errors, elements = [], []
+    for tolerance in (1e-1, 1e-3, 1e-5):
+        reduced = membrane.formulated(HyperReduced(tolerance, integrate=integrate))
+        found = reduced.solve(mu)
+        assert found.status == "ok"
+        assert reduced.built["weights"].min() > 0.0
+        elements.append(len(reduced.built["elements"]))
+        assert len(reduced.built["rows"]) < problem.W.dim
+        errors.append(problem.V.norm(found.u - exact.u) / problem.V.norm(exact.u))
+    assert elements == sorted(elements)
+    assert elements[-1] < problem.mesh.nelements
+    assert errors[2] < 0.3 * errors[0]
+    assert errors[2] < 0.02
+
+
+def test_the_enrichment_keeps_the_condition_of_the_chosen_rows(membrane: Reduction) -> None:
+    V = membrane.problem.V
+    tight, loose = (membrane.formulated(HyperReduced(1e-3, condition=c)).built for c in (1.5, 100.0))
+    assert np.array_equal(tight["rows"], loose["rows"])
+    assert tight["vectors"].shape[1] >= loose["vectors"].shape[1] >= len(loose["rows"])
+    for built, limit in ((tight, 1.5), (loose, 100.0)):
+        assert np.allclose(V.gram(built["vectors"], built["vectors"]), np.eye(built["vectors"].shape[1]), atol=1e-10)
+        loads = V.whiten_functional(
+            membrane.problem.constraint(np.array([1.0, 0.0, 0.0]))[0][built["rows"]].T.toarray()
+        )
+        units = loads / np.linalg.norm(loads, axis=0)
+        within = np.linalg.cond(units.T @ V.whiten(built["vectors"]))
+        assert within <= limit * np.linalg.cond(units) * (1.0 + 1e-9)
+
+
+def test_problems_without_elements_say_so_unless_nothing_has_to_be_integrated() -> None:
+    with pytest.raises(UnsupportedError, match="integrates A and f by elements, the problem does not"):
+        STRING.formulated(HyperReduced())
+    bar = Reduction(Torsion(), CPG(), None, Stop(tolerance=1e-4), Stop(tolerance=1e-2), accuracy=1e-10)
+    found = bar.formulated(HyperReduced(1e-4)).solve([6.3])
+    exact = vibench.solve_high_fidelity(bar.problem.assemble(np.array([6.3])))
+    assert bar.problem.V.norm(found.u - exact.u) <= 0.03 * bar.problem.V.norm(exact.u)
+
+
+def test_a_cubature_has_few_positive_weights_and_keeps_its_tolerance() -> None:
+    rng = np.random.default_rng(0)
+    conditions: Array = rng.standard_normal((12, 300)) + 1.0
+    for tolerance in (1e-1, 1e-3, 1e-9):
+        columns, weights = cubature(conditions, tolerance)
+        assert len(columns) <= 12
+        assert weights.min() > 0.0
+        residual = conditions.sum(axis=1) - conditions[:, columns] @ weights
+        assert np.linalg.norm(residual) <= tolerance * np.linalg.norm(conditions.sum(axis=1))
+    assert np.array_equal(cubature(np.zeros((3, 4)), 0.1)[0], np.zeros(0))
+
+
+LENGTH = 1e4
+
+
+@pytest.fixture(scope="module")
+def discs() -> list[Reduction]:
+    """Hertz contact in its own units and in others."""
+    made = []
+    for units in ({}, {"length": 4, "force": -3}):
+        of = Transformed("hertz", {"resolution": 300}, **units)
+        stops = Stop(tolerance=1e-4), Stop(tolerance=1e-1)
+        made.append(Reduction(of, CPG(), OnlineSupremizers(), *stops, accuracy=1e-10))
+    return made
+
+
+@pytest.mark.parametrize(
+    "formulation",
+    [Penalty(), Proximal(), SparseDictionary(), Local(2), Regression(), HyperReduced(1e-2)],
+    ids=lambda formulation: type(formulation).__name__,
+)
+def test_units_have_no_part_in_any_formulation(discs: list[Reduction], formulation: Formulation) -> None:
+    first, second = (offline.formulated(formulation).solve([1.04]) for offline in discs)
+    assert (first.status, second.status) == ("ok", "ok")
+    assert np.allclose(first.u, second.u * LENGTH, rtol=1e-5, atol=1e-6 * np.abs(first.u).max())
+    assert np.allclose(first.lam / first.lam.max(), second.lam / second.lam.max(), atol=1e-4)
