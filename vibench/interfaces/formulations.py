@@ -141,6 +141,8 @@ class FormulationModel(ABC):
     """Largest number N' of coefficients of u in a query."""
     generators: int | None = None
     """Largest number R of coefficients of λ in a query; `None` where λ has none."""
+    enrichment: int | None = None
+    """How many of the coefficients of u are not of V_N, where it is not the enrichment of the offline phase."""
     fallbacks: tuple[str, ...] = ()
     """One line for every step that deviates from the algorithm."""
 

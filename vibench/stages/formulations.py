@@ -372,6 +372,7 @@ class _FormulationItems(CellItems):
             kind, vectors = offline.enrichment.kind, offline.enrichment.vectors
             fixed = 0 if vectors is None else vectors.shape[1]
             added = offline.multipliers.rank if kind is Kind.PER_PARAMETER else fixed
+        added = added if model.enrichment is None else model.enrichment
         return {
             "enrichment_kind": kind.value,
             "N": model.dimension - (added or 0),

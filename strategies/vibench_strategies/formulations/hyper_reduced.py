@@ -82,9 +82,7 @@ class HyperReduced(Formulation):
         names = self.integrated(problem)
         if names - problem.elementwise:
             missing = " and ".join(sorted(names - problem.elementwise))
-            raise UnsupportedError(
-                f"hyper-reduction integrates {missing} by elements, the problem does not"
-            )
+            raise UnsupportedError(f"hyper-reduction integrates {missing} by elements, the problem does not")
         chosen = np.unique(np.linspace(0, len(mus) - 1, PARAMETERS).round().astype(int))
         rng, known = np.random.default_rng(self.seed), mus[chosen]
         constraints = [problem.constraint(mu)[0].copy() for mu in known]
@@ -169,6 +167,7 @@ class HyperReducedContact(FormulationModel):
         problem, vectors, rows = offline.problem, built["vectors"], built["rows"]
         self._problem, self._vectors, self._rows, self._shares = problem, vectors, rows, built["shares"]
         self.dimension, self.generators = int(vectors.shape[1]), len(rows)
+        self.enrichment = self.dimension - int(offline.pod.basis.shape[1])
         self._weights, self._fixed = built["weights"], projected
         if len(built["elements"]):
             self._integrals = Integrals(problem, vectors, built["elements"])

@@ -126,7 +126,9 @@ class LocalModel(FormulationModel):
         self._box, self._weights = box, weights
         self._models = [part.assembled for part in parts]
 
-        self.dimension, self.generators = max(map(largest_dimension, parts)), max(part.cone.size for part in parts)
+        largest = max(parts, key=largest_dimension)
+        self.dimension, self.generators = largest_dimension(largest), max(part.cone.size for part in parts)
+        self.enrichment = self.dimension - largest.pod.basis.shape[1]
         self.fallbacks = tuple(
             f"cluster {number}: {line}" for number, part in enumerate(parts) for line in part.cone.fallbacks
         )
