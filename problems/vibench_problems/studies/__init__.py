@@ -7,6 +7,7 @@ from pathlib import Path
 benefit = Path(__file__).with_name("benefit.toml")
 certified = Path(__file__).with_name("certified.toml")
 field = Path(__file__).with_name("field.toml")
+formulations = Path(__file__).with_name("formulations.toml")
 quick = Path(__file__).with_name("quick.toml")
 hertz_quadrature = Path(__file__).with_name("hertz-quadrature.toml")
 meshes = Path(__file__).with_name("meshes.toml")

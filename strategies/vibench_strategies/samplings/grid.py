@@ -1,11 +1,11 @@
-"""A regular grid in the parameter box."""
+"""A regular grid in the parameter box, or around its middle."""
 
 from __future__ import annotations
 
 from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge, Le, MinLen
+from annotated_types import Ge, Gt, Le, MinLen
 
 from vibench import Array, ParameterBox, RequestError, Sampling
 
@@ -14,7 +14,7 @@ MOST = 100_000
 
 
 class Grid(Sampling):
-    """Regular grid with the corners of the box; the last parameter varies fastest.
+    """Regular grid with the corners of the box, or of a part of it; the last parameter varies fastest.
 
     Parameters
     ----------
@@ -22,14 +22,18 @@ class Grid(Sampling):
         Points per parameter. A single count is for every parameter.
     log
         Names of the parameters on a logarithmic scale.
+    share
+        Share of the width of every parameter, on its scale, that the grid spans around the middle of the box: trained
+        on less than all of it, models are asked outside of where they were trained.
     """
 
     def __init__(
         self,
         counts: Annotated[list[Annotated[int, Ge(1), Le(MOST)]], MinLen(1)],
         log: list[str] = [],  # noqa: B006  never changed
+        share: Annotated[float, Gt(0.0), Le(1.0)] = 1.0,
     ) -> None:
-        self.counts, self.log = counts, log
+        self.counts, self.log, self.share = counts, log, share
 
     def parameters(self, box: ParameterBox) -> Array:
         """The product of the points on every axis."""
@@ -41,8 +45,9 @@ class Grid(Sampling):
         total = int(np.prod(counts, dtype=float))
         if total > MOST:
             raise RequestError(f"a grid of {total} points; expected at most {MOST}")
-        points, unit = box.grid(*counts), np.meshgrid(*(np.linspace(0.0, 1.0, k) for k in counts), indexing="ij")
+        low, high = 0.5 * (1.0 - self.share), 0.5 * (1.0 + self.share)
+        points, unit = box.grid(*counts), np.meshgrid(*(np.linspace(low, high, k) for k in counts), indexing="ij")
         scaled = box.from_unit(np.stack([places.ravel() for places in unit], axis=1), self.log)
-        chosen = box.logarithmic(self.log)
+        chosen = box.logarithmic(self.log) if self.share == 1.0 else slice(None)
         points[:, chosen] = scaled[:, chosen]
         return points

@@ -67,6 +67,12 @@ def test_a_grid_is_that_of_the_box_and_geometric_on_a_log_scale() -> None:
     assert np.array_equal(found[:, 2], [5.0, 5.5] * 7)
 
 
+def test_a_grid_of_a_share_is_around_the_middle() -> None:
+    whole, part = points("grid", counts=[3]), points("grid", counts=[3], share=0.5)
+    middle = 0.5 * (BOX.lower + BOX.upper)
+    assert np.allclose(part - middle, 0.5 * (whole - middle))
+
+
 def test_a_list_keeps_its_order_and_a_single_parameter_needs_no_brackets() -> None:
     assert points("list", points=[[2, 0.5, 5.5], [1, 0, 5]]).tolist() == [[2, 0.5, 5.5], [1, 0, 5]]
     line = ParameterBox(("a",), np.zeros(1), np.ones(1), ("1",))

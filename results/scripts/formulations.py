@@ -1,0 +1,173 @@
+"""Results of the study `formulations`: who is how accurate at which query time, and what is left with less training.
+
+vibench run formulations --no-figures && python results/scripts/formulations.py runs/formulations results/formulations
+
+Everything comes from the results file: all formulations are judged by the errors, the residuals and the bounds of the
+high-fidelity problem.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from page import SECONDS, Page, machines, made_by, read, start
+
+from vibench.report.figures.looks import Looks, Series
+from vibench.report.figures.style import Sheet, scatter, styled
+
+ROUND_OFF = 1e-10
+"""An error above its bound by more than this share of the solution violates it; less is round-off."""
+
+BOUNDED = {
+    "u (A)": ("error_u_energy_absolute", "bound_u_energy", "error_u_energy"),
+    "u (V)": ("error_u_absolute", "bound_u", "error_u"),
+    "λ (natural)": ("error_lambda_natural_absolute", "bound_lambda_natural", "error_lambda_natural"),
+    "λ (W)": ("error_lambda_absolute", "bound_lambda", "error_lambda"),
+}
+"""Absolute errors, their bounds, and relative errors, by norm."""
+
+BUDGETS = (1.0, 2.0, 5.0, 10.0)
+"""Multiples of the fastest query of a problem at which the smallest errors are compared."""
+
+KEY = ["problem", "formulation", "dual", "pod_tol"]
+
+
+def table(cells: pd.DataFrame) -> pd.DataFrame:
+    """Sizes, errors, violation and seconds of every cell with the problem's own training set."""
+    return pd.DataFrame(
+        {
+            **{name: cells[name].fillna("–") for name in KEY},
+            **{name: cells[name] for name in ("N", "enrichment", "R")},
+            "ok": cells["queries_ok"].astype(str) + "/" + cells["queries"].astype(str),
+            "error u": cells["error_u_mean"],
+            "error λ": cells["error_lambda_mean"],
+            "largest violation": cells["violation_max"],
+            "KKT residual": cells["hf_residual_max"],
+            "offline [s]": cells["offline_s"],
+            "query [ms]": 1e3 * cells["online_s"],
+            "reason": cells["reason"].fillna(""),
+        }
+    )
+
+
+def answered(cells: pd.DataFrame) -> pd.DataFrame:
+    """Cells with every query ok, whose seconds were measured."""
+    return cells[(cells["queries_ok"] == cells["queries"]) & cells["online_s"].notna()]
+
+
+def winners(cells: pd.DataFrame, error: str) -> pd.DataFrame:
+    """The smallest error of every problem within some multiples of its fastest query, and whose it is."""
+    rows = []
+    for problem, all_of in answered(cells).groupby("problem", sort=False):
+        fastest = all_of["online_s"].min()
+        for budget in BUDGETS:
+            within = all_of[all_of["online_s"] <= budget * fastest]
+            best = within.loc[within[error].idxmin()]
+            rows.append(
+                {
+                    "problem": problem,
+                    "query ≤ [ms]": 1e3 * budget * fastest,
+                    "smallest error": best[error],
+                    "formulation": best["formulation"],
+                    "dual": best["dual"] or "–",
+                    "query [ms]": 1e3 * best["online_s"],
+                    "offline [s]": best["offline_s"],
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def robustness(cells: pd.DataFrame) -> pd.DataFrame:
+    """Factors by which mean errors grow with half of the training set, and outside of the trained part of the box.
+
+    Geometric means over dual strategies and tolerances of cells that answered all queries with both training sets.
+    """
+    errors = answered(cells).set_index([*KEY, "training"])[["error_u_mean", "error_lambda_mean"]].unstack("training")
+    rows = {}
+    for quantity, name in (("error_u_mean", "u"), ("error_lambda_mean", "λ")):
+        for training in ("half", "inner"):
+            if training in errors[quantity]:
+                grown = np.log(errors[quantity][training] / errors[quantity]["own"])
+                rows[f"{name}, {training}"] = np.exp(grown.groupby(["problem", "formulation"], sort=False).mean())
+    return pd.DataFrame(rows).reset_index()
+
+
+def violated(queries: pd.DataFrame) -> pd.DataFrame:
+    """Numbers of errors that were compared with their bounds, and of those above them, by formulation and norm."""
+    fine, rows = queries[queries["status"] == "ok"], {}
+    for norm, (error, bound, relative) in BOUNDED.items():
+        both = fine[fine[error].notna() & fine[bound].notna()]
+        size = (both[error] / both[relative]).replace([np.inf, -np.inf], np.nan).fillna(0.0)
+        above = both[error] > both[bound] + (ROUND_OFF + both["reference_bound"].fillna(0.0)) * size
+        counts = above.groupby(both["formulation"], sort=False).agg(["sum", "count"])
+        rows[norm] = counts["sum"].astype(str) + " of " + counts["count"].astype(str)
+    return pd.DataFrame(rows).reset_index()
+
+
+def uncertainty(queries: pd.DataFrame) -> pd.DataFrame:
+    """What formulations say of their own error beside the error and the proved bound of u in V: medians of ratios."""
+    stated = queries[queries["error_u_predicted"].notna() & (queries["status"] == "ok")]
+    ratios = pd.DataFrame(
+        {
+            "problem": stated["problem"],
+            "training": stated["training"],
+            "formulation": stated["formulation"],
+            "stated / error": stated["error_u_predicted"] / stated["error_u_absolute"],
+            "bound / error": stated["bound_u"] / stated["error_u_absolute"],
+            "below": stated["error_u_predicted"] < stated["error_u_absolute"],
+        }
+    )
+    grouped = ratios.groupby(["problem", "training", "formulation"], sort=False)
+    medians = grouped[["stated / error", "bound / error"]].median()
+    return medians.assign(**{"share of errors above what is stated": grouped["below"].mean()}).reset_index()
+
+
+def figure(cells: pd.DataFrame) -> Figure:
+    """Errors of λ over the time of a query, a look for each formulation."""
+    problems, title = list(dict.fromkeys(cells["problem"])), "Error of λ against online time"
+    sheet = Sheet(1, len(problems), title)
+    looks = Looks(Series(name) for name in cells["formulation"])
+    for panel, problem in zip(sheet.panels, problems, strict=True):
+        for name, mine in answered(cells[cells["problem"] == problem]).groupby("formulation", sort=False):
+            scatter(panel, 1e3 * mine["online_s"], mine["error_lambda_mean"], looks[Series(name)], name)
+        panel.set(title=problem, xlabel="query [ms]", ylabel="mean relative error of λ", xscale="log", yscale="log")
+    return sheet.finish(
+        f"{title}: one point per cell with every query ok and the problem's own training set, a colour and a marker "
+        "for every formulation; several points of one are those of cones and tolerances."
+    )
+
+
+def main(run: str, target: str) -> None:
+    cells, queries = read(run, "cells"), read(run, "queries")
+    own = cells[cells["training"] == "own"]
+    command = made_by("formulations", "formulations", "formulations", options=" --no-figures")
+    page = Page(
+        target,
+        "Formulations",
+        command,
+        SECONDS,
+        f"{len(cells)} cells, {len(answered(cells))} with every query ok, at {int(own['queries'].max())} parameters. "
+        "All rows are judged by the errors, the residuals and the bounds of the high-fidelity problem. Errors are "
+        "relative means.",
+        machine=machines(cells),
+    )
+    page.section("Error of λ at equal query time", winners(own, "error_lambda_mean"))
+    page.section("Error of u at equal query time", winners(own, "error_u_mean"))
+    with styled():
+        page.draw("formulations-time", figure(own))
+    page.section("All cells", table(own))
+    page.section(
+        "Half of the training set, and outside of it",
+        "Factors of the mean errors against those with the own training set: with half as many solutions (`half`), and "
+        "with solutions of the inner 70 per cent of the box alone (`inner`), at parameters of the whole box.",
+        robustness(cells),
+    )
+    page.section("Bounds", "Errors above their bounds, of those compared.", violated(queries))
+    page.section("Uncertainty that formulations state", uncertainty(queries))
+    page.add(f"All columns of the cells: {page.link('cells', cells.drop(columns=['definition', 'versions']))}.")
+    page.write()
+
+
+if __name__ == "__main__":
+    start(main)
