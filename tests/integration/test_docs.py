@@ -34,7 +34,7 @@ from vibench.errors import RequestError
 from vibench.results import columns, tables
 from vibench.study import registry
 from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
-from vibench.study.kinds import FORMULATION, DUAL, PRIMAL, SAMPLING, STUDY, PluginKind
+from vibench.study.kinds import DUAL, FORMULATION, PRIMAL, SAMPLING, STUDY, PluginKind
 from vibench.study.matrix import expand, read_study
 from vibench.study.registry import registered
 from vibench.study.spec import Limits, Study, ToleranceTable
