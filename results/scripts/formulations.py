@@ -83,7 +83,8 @@ def robustness(cells: pd.DataFrame) -> pd.DataFrame:
 
     Geometric means over dual strategies and tolerances of cells that answered all queries with both training sets.
     """
-    errors = answered(cells).set_index([*KEY, "training"])[["error_u_mean", "error_lambda_mean"]].unstack("training")
+    all_ok = cells[cells["queries_ok"] == cells["queries"]]
+    errors = all_ok.set_index([*KEY, "training"])[["error_u_mean", "error_lambda_mean"]].unstack("training")
     rows = {}
     for quantity, name in (("error_u_mean", "u"), ("error_lambda_mean", "λ")):
         for training in ("half", "inner"):
