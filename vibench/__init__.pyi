@@ -20,6 +20,7 @@ from .errors import UnsupportedError as UnsupportedError
 from .errors import VibenchError as VibenchError
 from .highfidelity.active_set import HighFidelitySolution as HighFidelitySolution
 from .highfidelity.active_set import HighFidelitySolver as HighFidelitySolver
+from .highfidelity.nested_start import NestedStart as NestedStart
 from .interfaces.affine import AffineSum as AffineSum
 from .interfaces.affine_problem import AffineProblem as AffineProblem
 from .interfaces.figures import DerivedColumn as DerivedColumn

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -17,6 +18,8 @@ from vibench import (
     Contact,
     Indices,
     InnerProduct,
+    Mask,
+    NestedStart,
     Output,
     ParameterBox,
     Picture,
@@ -34,6 +37,9 @@ RADIUS = 0.2
 
 NODES = {"coarse": 400, "medium": 1200, "paper": 3594, "fine": 4 * 3594}
 """Number of nodes behind each named resolution, Dirichlet nodes included."""
+
+NESTED = 10_000
+"""From so many nodes on a first contact set comes from a coarser mesh, of a quarter of the nodes."""
 
 WITH_BULGE = ParameterBox(
     names=("scale", "centre_x", "centre_y", "bulge"),
@@ -111,6 +117,7 @@ class Obstacle(Problem):
         self.load = load
         self.obstacle = obstacle
         self.bulge = bulge
+        self._options = length, load, obstacle, bulge, asymmetric
         if bulge:
             self.parameters = WITH_BULGE
         self.mesh = disc_in_square(nodes, RADIUS)
@@ -160,6 +167,17 @@ class Obstacle(Problem):
         stiffness, areas = self._moved.forms(self.points(mu))
         B, g = self.constraint(mu)
         return VariationalInequality(A=stiffness, f=self.load * areas, B=B, g=g)
+
+    def start(self, mu: Array, nearest: Mask | None) -> Mask | None:
+        """The contact set of the nearest parameter; without one, on fine meshes, that of a coarser mesh."""
+        return nearest if nearest is not None or self._on_coarser_mesh is None else self._on_coarser_mesh(mu)
+
+    @cached_property
+    def _on_coarser_mesh(self) -> NestedStart | None:
+        if self.nodes < NESTED:
+            return None
+        coarser = Obstacle(self.nodes // 4, *self._options)
+        return NestedStart(coarser, coarser.mesh.p[:, coarser.disc_nodes], self.mesh.p[:, self.disc_nodes])
 
     @property
     def contact_dofs(self) -> Indices:

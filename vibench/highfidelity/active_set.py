@@ -39,6 +39,9 @@ NO_ROOM = 1e-14
 FEW_ROWS = 1000
 """Of so many constraints the multipliers are the last unknowns of a sparse factorisation, which is dense there."""
 
+SMALL_SHARE = 0.25
+"""And of so many per unknown: with more that dense part is most of the factorisation."""
+
 MAX_ITERATIONS = 100
 """Largest number of iterations, or the number of constraints if larger: the contact set may move node by node."""
 
@@ -79,7 +82,7 @@ class HighFidelitySolution(ActiveSetSolution):
 
 
 class HighFidelitySolver:
-    """Solves one problem at many parameters, starting each from the contact set of the nearest parameter solved so far.
+    """Solves one problem at many parameters, each from the contact set of the nearest one solved, or its `start`.
 
     The primal–dual active set method (Hintermüller, Ito, Kunisch 2002) solves the equality-constrained system of the
     current active set until the set no longer changes. If the sets cycle, the method restarts from the active set of an
@@ -120,7 +123,7 @@ class HighFidelitySolver:
 
     def solve_assembled(self, mu: Array, vi: VariationalInequality) -> ActiveSetSolution:
         """Solve the variational inequality `vi` assembled at mu (d,); unless remembered, no other starts from it."""
-        return solve_unverified(vi, self.condensed(vi), self._nearest_contact_set(mu))
+        return solve_unverified(vi, self.condensed(vi), self._start(mu))
 
     def verify(self, mu: Array, vi: VariationalInequality, found: ActiveSetSolution) -> HighFidelitySolution:
         """The solution of `vi`, which has to be the variational inequality solved last, at mu (d,), verified.
@@ -160,6 +163,14 @@ class HighFidelitySolver:
         check_symmetric(vi.A, name)
         (self._stiffness or self.condensed(vi)).check_definite(name)
 
+    def _start(self, mu: Array) -> Mask | None:
+        """The initial active set: what the problem makes of the contact set of the nearest parameter."""
+        start, m = self._problem.start(mu.copy(), self._nearest_contact_set(mu)), self._problem.W.dim
+        if start is not None and (np.shape(start) != (m,) or np.asarray(start).dtype != bool):
+            got = f"the shape {np.shape(start)} and the type {np.asarray(start).dtype}"
+            raise NumericalError(f"start returns an array of {got}; expected ({m},) and bool, or None")
+        return start
+
     def _nearest_contact_set(self, mu: Array) -> Mask | None:
         """Contact set of the nearest parameter solved so far; distances are relative to the widths of the box."""
         if not self._active:
@@ -188,7 +199,8 @@ class HighFidelitySolver:
         """
         factorisation = self._problem.factorisation
         pattern = EliminationPattern.of(vi.A, self._constrained, factorisation)
-        if self._condensing or "A" in self._problem.constant or pattern.is_dense or len(vi.g) > FEW_ROWS:
+        few = len(vi.g) <= min(FEW_ROWS, SMALL_SHARE * len(vi.f))
+        if self._condensing or "A" in self._problem.constant or pattern.is_dense or not few:
             return pattern
         return EliminationPattern.of_none(vi.A, factorisation)
 

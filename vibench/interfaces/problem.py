@@ -308,6 +308,15 @@ class Problem(ABC):
         entries = (B.data, self.contact_dofs[B.indices], B.indptr)
         return sp.csr_array(entries, shape=(B.shape[0], self.V.dim)), contact.g
 
+    def start(self, mu: Array, nearest: Mask | None) -> Mask | None:  # noqa: ARG002
+        """Initial active set (m,) of the high-fidelity solver at mu (d,); `None` for an empty one.
+
+        Solutions do not depend on it. By default it is the contact set of the nearest parameter solved so far, `None`
+        if there is none. Where contact sets move far between parameters, or meshes are so fine that moving there takes
+        many iterations, a problem may know a better one: `vibench.NestedStart` takes it from a coarser mesh.
+        """
+        return nearest
+
     def multiplier_integrals(self) -> Array:
         """Integrals (m,) of the multiplier basis functions; a constraint violation divided by them is a length.
 

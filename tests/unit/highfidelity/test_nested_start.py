@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from vibench import HighFidelitySolver, NestedStart
+from vibench.arrays import Array, Mask
+from vibench.errors import NumericalError
+from vibench_problems import obstacle
+from vibench_problems.obstacle import Obstacle
+
+MU = np.array([1.1, 0.02, -0.03])
+
+
+def places(problem: Obstacle) -> Array:
+    return problem.mesh.p[:, problem.disc_nodes]
+
+
+def test_a_coarser_mesh_saves_iterations_and_changes_no_solution() -> None:
+    coarse, fine = Obstacle(700), Obstacle(2800)
+    cold = HighFidelitySolver(fine).solve(MU)
+    nested = NestedStart(coarse, places(coarse), places(fine))
+    start, contact, spacing = nested(MU), cold.lam > 0.0, 1.1 / np.sqrt(coarse.nodes)
+    for wrong, others in ((start & ~contact, contact), (~start & contact, ~contact)):  # near the edge of the contact
+        distances, _ = KDTree(places(fine)[:, others].T).query(places(fine)[:, wrong].T)
+        assert np.max(distances, initial=0.0) < 1.5 * spacing
+    fine.start = lambda mu, nearest: nested(mu)  # type: ignore[method-assign]
+    found = HighFidelitySolver(fine).solve(MU)
+    assert found.iterations < 0.6 * cold.iterations
+    assert found.fallback == ""
+    assert np.array_equal(found.lam > 0.0, cold.lam > 0.0)
+    assert np.allclose(found.u, cold.u, rtol=0.0, atol=1e-12)
+
+
+def test_a_start_depends_on_the_parameter_alone_and_can_be_copied_after_use() -> None:
+    coarse, fine = Obstacle(300), Obstacle(700)
+    nested = NestedStart(coarse, places(coarse), places(fine))
+    first = nested(MU)
+    nested(fine.parameters.lower)
+    assert np.array_equal(nested(MU), first)
+    assert np.array_equal(pickle.loads(pickle.dumps(nested))(MU), first)
+
+
+def test_the_obstacle_starts_from_a_coarser_mesh_where_its_own_is_fine_and_nothing_is_solved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    cold = HighFidelitySolver(Obstacle(1500)).solve(MU)
+    monkeypatch.setattr(obstacle, "NESTED", 1000)
+    problem = Obstacle(1500)
+    solver = HighFidelitySolver(problem)
+    first = solver.solve(MU)
+    assert first.iterations < cold.iterations
+    assert np.allclose(first.u, cold.u, rtol=0.0, atol=1e-12)
+    nearest = first.lam > 0.0
+    assert problem.start(MU, nearest) is nearest
+    assert solver.solve(MU).iterations == 1  # from its own contact set
+
+
+@pytest.mark.parametrize("start", [np.zeros(3, bool), np.zeros(100)], ids=["too short", "not of booleans"])
+def test_a_start_of_the_wrong_kind_is_named(start: Mask) -> None:
+    problem = Obstacle(400)
+    problem.start = lambda mu, nearest: start  # type: ignore[method-assign]
+    with pytest.raises(NumericalError, match=rf"start returns .*; expected \({problem.W.dim},\) and bool, or None"):
+        HighFidelitySolver(problem).solve(MU)
