@@ -279,7 +279,7 @@ def test_there_are_rules() -> None:
     [
         ("library.md", 13, {"runs", "tables", "decision.html", "inf-sup.svg"}),
         ("tolerances.md", 2, {"runs"}),
-        ("methods.md", 33, {"runs", "points.npy"}),
+        ("methods.md", 34, {"runs", "points.npy"}),
     ],
 )
 def test_a_page_prints_what_it_says(

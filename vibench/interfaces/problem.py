@@ -87,14 +87,18 @@ class ParameterBox:
 
     def logarithmic(self, log: Sequence[str]) -> list[int]:
         """Numbers of the parameters that `log` names; with the errors of `from_unit`."""
-        known = {normal_name(name): number for number, name in enumerate(self.names)}
-        for name in log:
-            if normal_name(name) not in known:
-                raise unknown_name("parameter", name, self.names)
-            low = self.lower[known[normal_name(name)]]
+        chosen = list(dict.fromkeys(map(self.index, log)))
+        for name, low in ((self.names[i], self.lower[i]) for i in chosen):
             if low <= 0.0:
                 raise RequestError(f"'{name}' cannot have a log scale: its lower bound is {low:g}, expected > 0")
-        return [known[name] for name in dict.fromkeys(map(normal_name, log))]
+        return chosen
+
+    def index(self, name: str) -> int:
+        """Number of the parameter with this name; raises a `RequestError` if there is none."""
+        known = {normal_name(one): number for number, one in enumerate(self.names)}
+        if normal_name(name) not in known:
+            raise unknown_name("parameter", name, self.names)
+        return known[normal_name(name)]
 
 
 ABSENT = 1e100

@@ -210,6 +210,8 @@ class Sampling(ABC):
 
     requires: ClassVar[tuple[str, ...]] = ()
     """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
+    ordered: ClassVar[bool] = False
+    """Whether the points are a path: then QP solvers that can start from a solution start from the one before."""
 
     @classmethod
     def data_digest(cls, **options: Any) -> str:  # noqa: ARG003

@@ -105,11 +105,14 @@ class Queries:
     def __init__(self, store: Store, assembly: AssemblyStage) -> None:
         self.model, self.note = assembly.model(store)
         self.mus, self._seed = assembly.validation.of(self.model.problem), assembly.validation.seed
+        self._ordered = assembly.validation.is_ordered
         self.reduced: ReducedPrograms = value_of(store, assembly)
         self.store = store
 
     @cached_property
     def _before(self) -> list[int | None]:
+        if self._ordered:
+            return [None, *range(len(self.mus) - 1)]
         return path_before(self.mus, self.model.problem.parameters)
 
     def near(self, number: int, *seed: int) -> Array:
@@ -118,6 +121,8 @@ class Queries:
 
     def query(self, number: int, solver: str, accuracy: float, warm_start: bool) -> Query:
         """One query of a solver; for a warm start with the one before it on a path through the parameters.
+
+        That is the path of the validation set itself where it is ordered, else one through nearest neighbours.
 
         That one is solved again for this purpose, so that a start does not depend on what the process solved before. A
         primal basis that changes with the parameter allows none: coordinates of two queries are not comparable.

@@ -40,6 +40,12 @@ class ParameterSet:
         return self.sampling is not None and issubclass(self.sampling.registered.load(), AdaptiveSampling)
 
     @property
+    def is_ordered(self) -> bool:
+        """Whether its parameters are a path, along which every solution is the start of the next one."""
+        kind = None if self.sampling is None else self.sampling.registered.load()
+        return kind is not None and issubclass(kind, Sampling) and kind.ordered
+
+    @property
     def options(self) -> str:
         """The options of the sampling strategy as canonical JSON."""
         return "{}" if self.sampling is None else self.sampling.options

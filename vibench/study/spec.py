@@ -189,7 +189,11 @@ class Study(_Model):
         Tolerance, Field(description="Tolerance of empirical interpolation in reduced assembly.")
     ] = 1e-6
     warm_start: Annotated[
-        bool, Field(description="Whether QP solvers start from the solution at a neighbouring parameter if they can.")
+        bool,
+        Field(
+            description="Whether QP solvers start from a solution at another parameter if they can: the one before it "
+            "in an ordered validation set, else a neighbour."
+        ),
     ] = False
     timing_rounds: Annotated[
         int,

@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vibench import Array, ParameterBox, Sampling, create
+from vibench import Array, ParameterBox, RequestError, Sampling, create
 from vibench.interfaces.strategies import check_sample
+from vibench.study.kinds import SAMPLING
+from vibench.study.registry import registered
 
 BOX = ParameterBox(("a", "b", "c"), np.array([1e-3, -2.0, 5.0]), np.array([1e3, 3.0, 5.5]), ("m", "1", "N"))
 DRAWN = ("random", "sobol", "latin-hypercube")
@@ -77,3 +79,50 @@ def test_a_list_keeps_its_order_and_a_single_parameter_needs_no_brackets() -> No
     assert points("list", points=[[2, 0.5, 5.5], [1, 0, 5]]).tolist() == [[2, 0.5, 5.5], [1, 0, 5]]
     line = ParameterBox(("a",), np.zeros(1), np.ones(1), ("1",))
     assert points("list", line, points=[0.5, 0.25]).tolist() == [[0.5], [0.25]]
+
+
+def places(found: Array) -> Array:
+    return (found - BOX.lower) / (BOX.upper - BOX.lower)
+
+
+def test_a_sweep_goes_from_one_end_to_the_other() -> None:
+    along = places(points("sweep", size=9))
+    np.testing.assert_allclose(along, np.linspace(0.0, 1.0, 9)[:, None].repeat(3, axis=1), atol=1e-12)
+    one = places(points("sweep", size=5, parameter="b"))
+    np.testing.assert_allclose(one[:, 1], np.linspace(0.0, 1.0, 5), atol=1e-12)
+    np.testing.assert_allclose(one[:, [0, 2]], 0.5, atol=1e-12)
+    np.testing.assert_allclose(points("sweep", size=7, log=["a"])[:, 0], np.geomspace(1e-3, 1e3, 7))
+    thin = ParameterBox(("a", "b"), np.zeros(2), np.array([1.0, 0.0]), ("1", "1"))
+    with pytest.raises(RequestError, match="'b' has one value only; there is no path along it"):
+        points("sweep", thin, size=3, parameter="b")
+    with pytest.raises(RequestError, match="no parameter is called 'd'"):
+        points("sweep", size=3, parameter="d")
+
+
+@given(seed=st.integers(0, 1000), step=st.sampled_from([0.01, 0.2, 1.0]))
+@settings(max_examples=20, deadline=None)
+def test_a_random_walk_starts_in_the_middle_and_makes_steps_of_the_given_size(seed: int, step: float) -> None:
+    walk = places(points("random-walk", size=400, seed=seed, step=step))
+    np.testing.assert_allclose(walk[0], 0.5, atol=1e-12)
+    steps = np.diff(walk, axis=0)
+    drawn = step * np.random.default_rng(seed).standard_normal((400, 3))[1:]
+    assert np.all(np.abs(steps) <= np.abs(drawn) + 1e-12)  # a reflection shortens a step
+    inside = np.all((walk[:-1] + steps > 5 * step) & (walk[1:] < 1.0 - 5 * step), axis=1)
+    if step == 0.01:
+        np.testing.assert_allclose(np.abs(steps[inside]), np.abs(drawn[inside]), atol=1e-12)
+    assert (
+        points("random-walk", size=40, seed=seed, step=step).tobytes()
+        == points("random-walk", size=400, seed=seed, step=step)[:40].tobytes()
+    )
+
+
+def test_a_loading_rises_in_equal_steps_while_the_other_parameters_stay() -> None:
+    found = places(points("load-steps", parameter="b", loadings=3, steps=4, seed=1)).reshape(3, 4, 3)
+    np.testing.assert_allclose(found[:, :, 1], np.linspace(0.0, 1.0, 4)[None].repeat(3, axis=0), atol=1e-12)
+    assert np.ptp(found[:, :, [0, 2]], axis=1).max() == 0.0
+    assert len(np.unique(found[:, 0, 0])) == 3
+
+
+def test_only_paths_are_ordered() -> None:
+    ordered = {name for name, plugin in registered(SAMPLING).items() if plugin.load().ordered}
+    assert ordered == {"sweep", "random-walk", "load-steps"}
