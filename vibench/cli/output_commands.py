@@ -147,12 +147,17 @@ def publish_runs(
 
 
 def export_qps(
-    run: RunArgument, folder: Annotated[Path, Argument(metavar="DIR", help="A new or empty folder.")], at: At = None
+    run: RunArgument,
+    folder: Annotated[Path, Argument(metavar="DIR", help="A new or empty folder.")],
+    sequence: Annotated[
+        bool, Option("--sequence", help="Only ordered validation sets, as sequences: a test set of qpbenchmark.")
+    ] = False,
+    at: At = None,
 ) -> None:
     """Export the programs of a run as a test set for QP solvers. The set includes their solutions."""
     from vibench.report import replay
 
-    count = replay.export(run, folder, places_of(at))
+    count = replay.export(run, folder, places_of(at), sequence=sequence)
     echo(f"{count} programs in {folder / 'programs'}; `python {folder / replay.CHECKER}` rechecks every solution")
 
 

@@ -33,6 +33,9 @@ from vibench.study.registry import registered
 CHECKER = "check.py"
 """Script in an exported test set that recomputes its residuals; it needs only NumPy."""
 
+SEQUENCES = "sequences"
+"""Name of the table of the sequences in an exported test set, and of the Python file that reads it."""
+
 KEPT = ("status", "primal_residual", "dual_residual", "gap", "solver_status")
 """Columns of a query that an exported test set repeats."""
 
@@ -99,29 +102,36 @@ def write_program(program: VariationalInequality, file: Path) -> None:
     write_atomically(file, content.getvalue())
 
 
-def export(run: str, folder: Path, places: Mapping[str, str] = NOT_MOVED) -> int:
+def export(run: str, folder: Path, places: Mapping[str, str] = NOT_MOVED, *, sequence: bool = False) -> int:
     """Write every reduced program of a run, with its solutions and their verification; returns their number.
 
     The folder holds `programs/NAME.npz` (P, q, G, h), `solutions/NAME.npz` (x_CELL, z_CELL for every cell with a
     solution: a solver at an accuracy), `rows.csv` (a line per solution: status, accuracy, residuals) and `check.py`,
     which recomputes the residuals of every solution. It gets its name when it is complete.
 
-    Raises a `RequestError` if there is no such run, the folder is not empty or cannot be written, or other code
-    computed the run.
+    With `sequence` it has the programs along the ordered validation sets alone, one sequence per reduced model, and
+    `sequences.csv` (a line per program: sequence, position, parameter) with `sequences.py`, a test set of qpbenchmark.
+
+    Raises a `RequestError` if there is no such run, the folder is not empty or cannot be written, other code computed
+    the run, or no validation set is ordered where sequences are asked for.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise RequestError(f"'{folder}' exists and is not an empty folder; choose another")
     models: dict[str, list[RecordedCell]] = {}
     for recorded in recorded_cells(run, places):
-        models.setdefault(recorded.row["model"], []).append(recorded)
+        if not sequence or recorded.cell.validation.is_ordered:
+            models.setdefault(recorded.row["model"], []).append(recorded)
     if not models:
-        raise RequestError(f"no cell of '{run}' has a reduced program")
+        which = " along an ordered validation set, such as that of random-walk" if sequence else ""
+        raise RequestError(f"no cell of '{run}' has a reduced program{which}")
     with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=TEMPORARY, suffix=PART) as scratch:
             new = Path(scratch) / folder.name
             new.mkdir()
             count = _write_set(list(models.values()), new)
+            if sequence:
+                _write_sequences([cells[0] for cells in models.values()], new)
             new.replace(folder)
     return count
 
@@ -135,11 +145,29 @@ def _write_set(models: Sequence[list[RecordedCell]], folder: Path) -> int:
     return len(programs)
 
 
+def _write_sequences(models: Sequence[RecordedCell], folder: Path) -> None:
+    """Write the order of the programs of some reduced models, each given by its first cell."""
+    rows = [
+        {"sequence": model.row["cell"], "position": query, "program": _name(model, query)}
+        | dict(zip(model.model.problem.parameters.names, map(float, mu), strict=True))
+        for model in models
+        for query, mu in enumerate(model.parameters)
+    ]
+    (folder / f"{SEQUENCES}.csv").write_text(to_csv(pd.DataFrame(rows)), encoding="utf-8")
+    template = files("vibench.report") / "templates" / f"{SEQUENCES}.py.template"
+    (folder / f"{SEQUENCES}.py").write_bytes(template.read_bytes())
+
+
+def _name(model: RecordedCell, query: int) -> str:
+    """Name of a program of a reduced model, given by its first cell."""
+    return f"{model.row['cell']}-{query}"
+
+
 def _exported(cells: list[RecordedCell], folder: Path) -> Iterator[list[dict[str, Any]]]:
     """Write the programs of one reduced model; yields the rows of every program, one per solution."""
     tables = [(recorded, recorded.rows("queries"), recorded.rows("solutions")) for recorded in cells]
     for query in sorted(set().union(*(queries for _, queries, _ in tables))):
-        name = f"{cells[0].row['cell']}-{query}"
+        name = _name(cells[0], query)
         write_program(cells[0].program(query), folder / "programs" / f"{name}.npz")
         rows: list[dict[str, Any]] = []
         arrays: dict[str, Any] = {}
