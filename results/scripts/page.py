@@ -28,6 +28,7 @@ LIMITATIONS = {
     "hertz-quadrature": "One problem; eight validation parameters. Variants that are not in the table, such as other pairings, were not tried.",  # noqa: E501
     "meshes": "Two obstacle meshes and three of Hertz contact, all of one size: what holds on finer ones is not shown.",
     "solvers": f"{ONE_MACHINE} Solvers have their default options but for the accuracy, and solve small dense programs; larger or sparse ones may order them differently.",  # noqa: E501
+    "sequences": f"{ONE_MACHINE} One path, one cone and one enrichment for each problem; programs are small and dense. Starts are those that qpsolvers passes on.",  # noqa: E501
     "scaling": "Each mesh was measured once, on one machine. Exponents between two sizes contain the noise of both measurements.",  # noqa: E501
     "speed": f"{ONE_MACHINE} The transcription is ours and not the code of the authors.",
     "stability-per-vector": "One mesh and one pair of N and R for each problem; the counts are those of the training set.",  # noqa: E501

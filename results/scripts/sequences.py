@@ -1,0 +1,65 @@
+"""What a start from the solution before saves QP solvers: the page of the studies `sequences` and `sequences-warm`.
+
+vibench run sequences && vibench run sequences-warm && python results/scripts/sequences.py COLD WARM results/sequences
+"""
+
+from __future__ import annotations
+
+import pandas as pd
+from page import SECONDS, Page, machines, made_by, read, start
+
+from vibench.qp.solve import takes_start
+
+STUDIES = "sequences", "sequences-warm"
+KEY = ["problem", "solver"]
+
+
+def main(cold: str, warm: str, target: str) -> None:
+    runs = [read(run, "queries") for run in (cold, warm)]
+    cells = [read(run, "cells") for run in (cold, warm)]
+    command = made_by("sequences", "sequences", *STUDIES, options=" --no-figures")
+    about = "Every program of a path is solved cold, and from the solution of the one before where the solver can."
+    page = Page(target, "Warm starts along paths", command, about, SECONDS, machine=machines(*cells))
+    table = compared(*(summary(run) for run in runs))
+    sizes = cells[0].drop_duplicates("problem").set_index("problem")
+    for problem, rows in table.groupby("problem", sort=False):
+        of = sizes.loc[problem]
+        added = f"{of['N']} modes, {of['enrichment']} vectors added, {of['R']} generators; {of['queries']} programs."
+        page.section(str(problem), added, rows.drop(columns="problem"))
+    page.section(
+        "How to read it",
+        "Seconds and iterations are medians over the programs of the path, without the first one. `start` says whether "
+        "the solver can start from a solution. Where it cannot, both runs solve the same programs cold, and the ratio "
+        "is what two runs differ by.",
+        page.link("sequences", table),
+    )
+    page.write()
+
+
+def summary(queries: pd.DataFrame) -> pd.DataFrame:
+    """Medians of the queries but the first one, and the share that is ok, by problem and solver."""
+    later = queries[queries["query"] > 0].assign(ok=queries["status"] == "ok")
+    return later.groupby(KEY).agg(ms=("solve_s", "median"), iterations=("iterations", "median"), ok=("ok", "mean"))
+
+
+def compared(cold: pd.DataFrame, warm: pd.DataFrame) -> pd.DataFrame:
+    """One row per problem and solver: both runs side by side."""
+    both = cold.add_suffix("_cold").join(warm.add_suffix("_warm")).reset_index()
+    return pd.DataFrame(
+        {
+            "problem": both["problem"],
+            "solver": both["solver"],
+            "start": ["yes" if takes_start(solver) else "no" for solver in both["solver"]],
+            "cold [ms]": 1e3 * both["ms_cold"],
+            "warm [ms]": 1e3 * both["ms_warm"],
+            "cold/warm": both["ms_cold"] / both["ms_warm"],
+            "iterations, cold": both["iterations_cold"],
+            "iterations, warm": both["iterations_warm"],
+            "ok, cold": both["ok_cold"],
+            "ok, warm": both["ok_warm"],
+        }
+    )
+
+
+if __name__ == "__main__":
+    start(main)
