@@ -263,6 +263,8 @@ def _combined(conditions: Array, size: float, rng: np.random.Generator) -> Array
 
 def _worst(units: Array, space: Array) -> tuple[float, Array]:
     """Condition number of rows, unit columns (n×j) here, in a space, and the combination (j,) that it feels least."""
+    if not units.shape[1]:  # without contact there is nothing to feel
+        return 1.0, np.zeros(0)
     left, sigma, _ = np.linalg.svd(units.T @ space)
     smallest = float(sigma.min(initial=np.inf)) if len(sigma) == units.shape[1] else 0.0
     return float(sigma.max(initial=0.0)) / smallest if smallest else np.inf, left[:, -1:].sum(axis=1)
