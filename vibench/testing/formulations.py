@@ -41,8 +41,8 @@ AGREEMENT = 1e-3
 """Largest difference of u, relative to its largest entry, of an answer that started from another one."""
 
 STEPS = {
-    "pod": ("pod",), "dual": ("cone", "multipliers"), "primal": ("enrichment",), "assembly": ("assembled", "operators",
-    "members"),
+    "pod": ("pod", "modes"), "dual": ("cone", "multipliers", "dual", "generators"), "primal": ("enrichment", "primal"),
+    "assembly": ("assembled", "operators", "members", "assembly"),
 }  # fmt: skip
 """Attributes of an offline phase whose use shows that a formulation has an axis."""
 
@@ -92,14 +92,17 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         given |= {"pod": whole.pod} if pod else {}
         given |= {"cone": whole.cone, "multipliers": whole.multipliers} if dual else {}
         given |= {"enrichment": whole.enrichment} if primal else {}
-        return _Seen(
+        phase = _Seen(
             whole.problem,
             whole.dual if dual else None,
             whole.primal if primal else None,
             whole.modes if pod else None,
             whole.generators if dual else None,
             whole.tolerance if primal else None,
-        ).given(**given)  # type: ignore[return-value]  # it makes one of its own class
+        ).given(**given)
+        assert isinstance(phase, _Seen)  # as what it was made of
+        phase.seen.clear()
+        return phase
 
     @cached_property
     def arguments(self) -> dict[str, Array]:

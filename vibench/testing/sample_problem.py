@@ -103,9 +103,9 @@ class _Supremizers(PrimalStrategy):
         return Enrichment(Kind.FIXED, vectors=V.orthonormalise(supremizers(V, B, offline.span), offline.basis))
 
 
-def sample_reduction(modes: int = 8, generators: int = 8) -> Reduction:
-    """An offline phase of the sample problem with all its steps, for formulations: N modes, R generators, enriched."""
-    stops = Stop(size=modes), Stop(size=generators)
+def sample_reduction(modes: float = 1e-3, generators: float = 1e-2) -> Reduction:
+    """An offline phase of the sample problem with all its steps, for formulations: tolerances of V_N and the cone."""
+    stops = Stop(tolerance=modes), Stop(tolerance=generators)
     return Reduction(MovingSupport(), _Greedy(), _Supremizers(), *stops).given(snapshots=_snapshots())
 
 
