@@ -73,7 +73,8 @@ class Bearing(AffineProblem):
     """Journal bearing with cavitation; parameters: eccentricity of the shaft, length over diameter of the bearing.
 
     The oil film between shaft and bearing has the thickness h = 1 + ε cos θ in units of the clearance. Its pressure
-    p ≥ 0, in units of 6ηω(R/c)², satisfies Reynolds' equation as a variational inequality (Cimatti 1976),
+    p ≥ 0, in units of 6ηω(R/c)², satisfies Reynolds' equation as a variational inequality (Kinderlehrer
+    and Stampacchia 2000),
 
         ∂θ(h³ ∂θ p) + (D/L)² ∂ζ(h³ ∂ζ p) ≤ ∂θ h,
 
