@@ -142,7 +142,7 @@ class CondensedStiffness:
         """A computed Ŝ, and its `StaticCondensation.round_off` against S² = diag(`squares`) (n,)."""
         condensed = self._condensed
         if self._factorisation != DEFAULT:  # of whose factors nothing is known
-            condensed = StaticCondensation(self._A, self._pattern)
+            condensed = StaticCondensation(self._A, self._pattern.ordered_by_default(self._A))
         return condensed.dense_blocks if condensed.dense else condensed.schur, condensed.round_off(squares)
 
     def liftings(self, B: SparseMatrix) -> Array:
