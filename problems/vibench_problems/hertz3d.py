@@ -25,7 +25,7 @@ from vibench_problems.elliptic_contact import EllipticContact, elliptic_contact
 from vibench_problems.far_field import FarField
 
 CELLS = {"coarse": 6, "medium": 10, "paper": 14, "fine": 21}
-"""Cells along the potential contact zone behind each named resolution: 5, 22, 59 and 198 thousand unknowns."""
+"""Cells along the potential contact zone behind each named resolution: 5, 22, 58 and 194 thousand unknowns."""
 
 UNKNOWNS_PER_CELL = 21.0
 """Unknowns divided by the cube of the number of cells, at large ones."""
@@ -59,7 +59,7 @@ class Hertz3D(AffineProblem):
     Parameters
     ----------
     resolution
-        "coarse" (5 thousand unknowns), "medium" (22), "paper" (59), "fine" (198), or a number of unknowns.
+        "coarse" (5 thousand unknowns), "medium" (22), "paper" (58), "fine" (194), or a number of unknowns.
     far
         What is outside the block: "boussinesq", the half-space, where displacements are in the span of two fields whose
         amplitudes are unknowns (`far_field`); or "clamped", nothing moves, which adds about 0.9 a/L to the force.

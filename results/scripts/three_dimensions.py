@@ -3,7 +3,7 @@
 vibench run three-dimensions --no-figures
 python results/scripts/three_dimensions.py runs/three-dimensions results/three-dimensions
 
-PARDISO factorises where the extra `fast` is installed; the finest mesh has 198,000 unknowns and takes about 4 GiB.
+PARDISO factorises where the extra `fast` is installed; the finest mesh has 194,000 unknowns and takes about 4 GiB.
 """
 
 from __future__ import annotations
