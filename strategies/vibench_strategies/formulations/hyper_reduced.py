@@ -212,6 +212,8 @@ class HyperReducedContact(FormulationModel):
         local = measure[:, None] * self._pressures[self._rows]
         scales = np.linalg.norm(local, axis=0)
         kept = scales > 0.0
+        if not kept.any():  # nonnegative least squares without a column ends the process (SciPy 1.17)
+            return self._vectors @ answer.x, np.zeros(self._problem.W.dim)
         shares = nnls(local[:, kept] / scales[kept], measure * answer.alpha / self._shares)[0]
         return self._vectors @ answer.x, self._pressures[:, kept] @ (shares / scales[kept])
 
