@@ -29,6 +29,7 @@ Python = Callable[..., "subprocess.CompletedProcess[str]"]
 
 BUILT_IN = ("decorrelated", "online-supremizers", "offline-pga")
 OWN = "fixed-supremizers"
+FORMULATION = "shepard"
 
 STUDY: dict[str, Any] = {
     "name": "rope-here",
@@ -37,6 +38,7 @@ STUDY: dict[str, Any] = {
     "solvers": ["piqp"],
     "dual": ["cpg", "mcpg"],
     "primal": [*BUILT_IN, OWN],
+    "formulation": ["mixed", FORMULATION],
     "assembly": ["full", "reduced"],
     "problem": [{"name": "rope", "options": {"half": 16}}],
     "tolerances": [{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
@@ -84,20 +86,27 @@ def cells(python: Python, command: str, example: Path) -> tuple[pd.DataFrame, pd
 
 def test_the_package_is_found_through_its_entry_points_alone(python: Python, command: str) -> None:
     *cells, last = python(command, "run", "rope", "--dry-run").stdout.splitlines()
-    assert last == "32 cells"
+    assert last == "33 cells"
+    assert sum(f"· {FORMULATION} ·" in cell for cell in cells) == 1
     assert sum(f" {OWN} " in cell for cell in cells) == 8
-    assert [source.stem for source in SOURCES for name in ("rope", OWN) if mentions(name, source.read_text())] == []
+    assert [
+        source.stem for source in SOURCES for name in ("rope", OWN, FORMULATION) if mentions(name, source.read_text())
+    ] == []
 
 
 def test_every_cell_of_the_rope_is_ok_and_has_its_row(cells: tuple[pd.DataFrame, pd.DataFrame, str]) -> None:
     found, queries, printed = cells
     assert set(found["status"]) == {"ok"}
+    (interpolated,) = found[found["formulation"] == FORMULATION].to_dict("records")
+    assert (interpolated["dual"], interpolated["primal"], interpolated["solver"]) == ("–", "–", "–")
+    assert interpolated["offline_formulation_s"] > 0.0
+    found = found[found["formulation"] == "mixed"]
     assert set(zip(found["dual"], found["primal"], found["assembly"], strict=True)) == {
         (dual, primal, way) for dual in STUDY["dual"] for primal in STUDY["primal"] for way in STUDY["assembly"]
     }
     assert len(found) == 16
-    assert len(queries) == 16 * STUDY["validation"]
-    assert "invariants of the constants and the error bounds hold in all 48 queries" in printed
+    assert len(queries) == 17 * STUDY["validation"]
+    assert "invariants of the constants and the error bounds hold in all 51 queries" in printed
     reduced = found[found["assembly"] == "reduced"]
     assert {name: set(reduced[f"terms_{name}"]) for name in MEMBERS} == {"A": {2}, "f": {0}, "B": {0}, "g": {2}}
     assert set(reduced["fallbacks"]) == {""}
@@ -131,12 +140,16 @@ def test_the_tables_have_the_strategy_of_the_package(
     )
 
 
+def test_the_formulation_of_the_package_passes_the_checks(python: Python, command: str) -> None:
+    assert " passed, 0 failed, 0 skipped" in python(command, "check", FORMULATION).stdout
+
+
 def test_the_tests_of_the_package_pass_where_it_is_installed(python: Python, example: Path) -> None:
     done = python("-m", "pytest", "-p", "no:cacheprovider", where=example)
     assert " passed" in done.stdout
 
 
-@pytest.mark.parametrize(("file", "limit"), [("rope", 80), ("fixed_supremizers", 50)])
+@pytest.mark.parametrize(("file", "limit"), [("rope", 80), ("fixed_supremizers", 50), ("shepard", 61)])
 def test_a_plugin_stays_as_short_as_it_is_said_to_be(file: str, limit: int) -> None:
     count = len((EXAMPLE / "vibench_rope" / f"{file}.py").read_text(encoding="utf-8").splitlines())
     assert count < limit

@@ -59,8 +59,8 @@ def list_plugins(
     if what is None:
         for kind in PluginKind:
             print_rows(_solvers_by_version() if kind is SOLVER else _read_rows(kind), HEADINGS, kind.plural)
-        echo("", "what the options of one kind are, and whether its plugins can be loaded: vibench list KIND,")
-        echo(f"  KIND one of {', '.join(LISTS)}")
+        echo("", "what the options of one kind are, and whether its plugins can be loaded:")
+        echo(f"  vibench list KIND, such as {PROBLEM.plural}")
     elif what in LISTS:
         print_rows(_solver_rows() if LISTS[what] is SOLVER else _loaded_rows(LISTS[what], sizes), HEADINGS, what)
     else:

@@ -246,7 +246,7 @@ def test_one_error_lists_all_failures() -> None:
     with pytest.raises(testing.ConformanceError) as caught:
         testing.check_problem(broken_problems.Worse)
     lines = str(caught.value).splitlines()
-    assert lines[0] == "Worse fails 2 of 25 checks"
+    assert lines[0] == "Worse fails 2 of 26 checks"
     assert [line.split(":")[0] for line in lines[1:]] == ["training set", "pickling"]
 
 
