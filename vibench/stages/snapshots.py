@@ -61,16 +61,16 @@ class TimedSnapshots(Snapshots):
 
 @dataclass
 class _SetUp:
-    """A solver of a problem, and the seconds of its set-up once that is done."""
+    """A solver of a problem whose set-up is done, and the seconds of that; `None` before."""
 
-    solver: HighFidelitySolver
+    solver: HighFidelitySolver | None = None
     seconds: Seconds | None = None
 
 
 @lru_cache(maxsize=1)
-def _set_up(problem: Problem) -> _SetUp:
-    """The solver of the problem that this process works on: chunks in one process share the set-up."""
-    return _SetUp(HighFidelitySolver(problem))
+def _set_up(problem: Problem) -> _SetUp:  # noqa: ARG001
+    """That of the problem that this process works on: chunks in one process share it."""
+    return _SetUp()
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class SnapshotStage(Stage):
         given, reference = mus.copy(), reference_assembly(problem)
         u, lam = np.zeros((problem.V.dim, len(mus))), np.zeros((problem.W.dim, len(mus)))
         seconds, fallbacks, kept = [], [], _set_up(problem)
-        solver = kept.solver
+        solver = kept.solver or HighFidelitySolver(problem)
         solver.forget()  # no solution may depend on what this process has solved before
 
         def refuse_shifted() -> None:
@@ -127,7 +127,7 @@ class SnapshotStage(Stage):
             if kept.seconds is None:  # with the set-up; what it costs without is measured next to it
                 (vi, unverified), beginning = timed(partial(solve, mu))
                 _, marginal = self._measure(solve, near)
-                kept.seconds = beginning.beyond(marginal)
+                kept.solver, kept.seconds = solver, beginning.beyond(marginal)
             else:
                 (vi, unverified), marginal = self._measure(solve, itertools.chain([mu], near))
             seconds.append(marginal)  # verification, which is what follows, is not timed
