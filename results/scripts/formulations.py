@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from page import SECONDS, Page, machines, made_by, read, start
+from page import SECONDS, Page, made_by, origin, read, start
 
 from vibench.report.figures.looks import Looks, Series
 from vibench.report.figures.style import Sheet, scatter, styled
@@ -151,7 +151,7 @@ def main(run: str, target: str) -> None:
         f"{len(cells)} cells, {len(answered(cells))} with every query ok, at {int(own['queries'].max())} parameters. "
         "All rows are judged by the errors, the residuals and the bounds of the high-fidelity problem. Errors are "
         "relative means.",
-        machine=machines(cells),
+        machine=origin(cells),
     )
     page.section("Error of λ at equal query time", winners(own, "error_lambda_mean"))
     page.section("Error of u at equal query time", winners(own, "error_u_mean"))
