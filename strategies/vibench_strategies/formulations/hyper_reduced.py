@@ -206,8 +206,6 @@ class HyperReducedContact(FormulationModel):
         assert answer.alpha is not None
         if len(self._rows) == self._problem.W.dim:  # in their order
             return self._vectors @ answer.x, answer.alpha
-        if not (len(self._rows) and self._pressures.size):
-            return self._vectors @ answer.x, np.zeros(self._problem.W.dim)
         measure = np.sqrt(self._shares * np.maximum(self._problem.multiplier_integrals()[self._rows], 0.0))
         local = measure[:, None] * self._pressures[self._rows]
         scales = np.linalg.norm(local, axis=0)
