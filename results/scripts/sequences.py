@@ -6,7 +6,7 @@ vibench run sequences && vibench run sequences-warm && python results/scripts/se
 from __future__ import annotations
 
 import pandas as pd
-from page import SECONDS, Page, machines, made_by, read, start
+from page import SECONDS, Page, made_by, origin, read, start
 
 from vibench.qp.solve import takes_start
 
@@ -19,7 +19,7 @@ def main(cold: str, warm: str, target: str) -> None:
     cells = [read(run, "cells") for run in (cold, warm)]
     command = made_by("sequences", "sequences", *STUDIES, options=" --no-figures")
     about = "Every program of a path is solved cold, and from the solution of the one before where the solver can."
-    page = Page(target, "Warm starts along paths", command, about, SECONDS, machine=machines(*cells))
+    page = Page(target, "Warm starts along paths", command, about, SECONDS, machine=origin(*cells))
     table = compared(*(summary(run) for run in runs))
     sizes = cells[0].drop_duplicates("problem").set_index("problem")
     for problem, rows in table.groupby("problem", sort=False):
