@@ -20,7 +20,6 @@ from .errors import UnsupportedError as UnsupportedError
 from .errors import VibenchError as VibenchError
 from .highfidelity.active_set import HighFidelitySolution as HighFidelitySolution
 from .highfidelity.active_set import HighFidelitySolver as HighFidelitySolver
-from .highfidelity.nested_start import NestedStart as NestedStart
 from .interfaces.affine import AffineSum as AffineSum
 from .interfaces.affine_problem import AffineProblem as AffineProblem
 from .interfaces.figures import DerivedColumn as DerivedColumn
@@ -33,6 +32,7 @@ from .interfaces.formulations import FormulationAnswer as FormulationAnswer
 from .interfaces.formulations import FormulationModel as FormulationModel
 from .interfaces.formulations import Multiplier as Multiplier
 from .interfaces.formulations import Outcome as Outcome
+from .interfaces.nested_start import NestedStart as NestedStart
 from .interfaces.outputs import Output as Output
 from .interfaces.pictures import MeshFields as MeshFields
 from .interfaces.pictures import Picture as Picture

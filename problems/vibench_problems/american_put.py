@@ -187,9 +187,9 @@ class Put(AffineProblem):
         ends = [np.where(sign > 0.0, self.parameters.upper, self.parameters.lower) for sign in (signs, -signs)]
         return float(np.prod([self.exact(mu).c for mu in ends]) ** -0.5)
 
-    def start(self, mu: Array, nearest: Mask | None) -> Mask | None:
+    def start(self, mu: Array, nearest: Mask | None) -> Mask | NestedStart | None:  # noqa: ARG002
         """The contact set on a coarser mesh, from which the exercise boundary has a few nodes to go, and not many."""
-        return nearest if self._on_coarser_mesh is None else self._on_coarser_mesh(mu)
+        return nearest if self._on_coarser_mesh is None else self._on_coarser_mesh
 
     @cached_property
     def _on_coarser_mesh(self) -> NestedStart | None:

@@ -168,9 +168,9 @@ class Obstacle(Problem):
         B, g = self.constraint(mu)
         return VariationalInequality(A=stiffness, f=self.load * areas, B=B, g=g)
 
-    def start(self, mu: Array, nearest: Mask | None) -> Mask | None:
+    def start(self, mu: Array, nearest: Mask | None) -> Mask | NestedStart | None:  # noqa: ARG002
         """The contact set of the nearest parameter; without one, on fine meshes, that of a coarser mesh."""
-        return nearest if nearest is not None or self._on_coarser_mesh is None else self._on_coarser_mesh(mu)
+        return self._on_coarser_mesh if nearest is None else nearest
 
     @cached_property
     def _on_coarser_mesh(self) -> NestedStart | None:

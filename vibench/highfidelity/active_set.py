@@ -10,6 +10,7 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Mask, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness, condensed_stiffness
+from vibench.interfaces.nested_start import NestedStart
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.cholesky import SparseCholesky
@@ -104,6 +105,7 @@ class HighFidelitySolver:
         self._pattern: EliminationPattern | None = None
         self._stiffness: CondensedStiffness | None = None
         self._width = np.maximum(problem.parameters.upper - problem.parameters.lower, np.finfo(float).tiny)
+        self._coarse: HighFidelitySolver | None = None
         self._solved: list[Array] = []
         self._active: list[Mask] = []
 
@@ -166,9 +168,15 @@ class HighFidelitySolver:
     def _start(self, mu: Array) -> Mask | None:
         """The initial active set: what the problem makes of the contact set of the nearest parameter."""
         start, m = self._problem.start(mu.copy(), self._nearest_contact_set(mu)), self._problem.W.dim
+        if isinstance(start, NestedStart):
+            if self._coarse is None or self._coarse._problem is not start.coarse:
+                self._coarse = HighFidelitySolver(start.coarse)
+            # nothing is remembered there: the start depends on the parameter alone
+            found = self._coarse.solve_assembled(mu, checked_assembly(start.coarse, mu))
+            return np.asarray((found.lam > 0.0)[start.nearest])
         if start is not None and (np.shape(start) != (m,) or np.asarray(start).dtype != bool):
             got = f"the shape {np.shape(start)} and the type {np.asarray(start).dtype}"
-            raise NumericalError(f"start returns an array of {got}; expected ({m},) and bool, or None")
+            raise NumericalError(f"start returns an array of {got}; expected ({m},) and bool, a NestedStart, or None")
         return start
 
     def _nearest_contact_set(self, mu: Array) -> Mask | None:

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,6 +19,9 @@ from vibench.interfaces.pictures import MeshFields, Picture
 from vibench.linalg.factorisations import DEFAULT
 from vibench.linalg.inner_product import InnerProduct
 from vibench.text import normal_name
+
+if TYPE_CHECKING:
+    from vibench.interfaces.nested_start import NestedStart
 
 OUTSIDE_RTOL = 1e-12
 """Largest distance of a parameter from the box, relative to its bounds."""
@@ -312,7 +315,7 @@ class Problem(ABC):
         entries = (B.data, self.contact_dofs[B.indices], B.indptr)
         return sp.csr_array(entries, shape=(B.shape[0], self.V.dim)), contact.g
 
-    def start(self, mu: Array, nearest: Mask | None) -> Mask | None:  # noqa: ARG002
+    def start(self, mu: Array, nearest: Mask | None) -> Mask | NestedStart | None:  # noqa: ARG002
         """Initial active set (m,) of the high-fidelity solver at mu (d,); `None` for an empty one.
 
         Solutions do not depend on it. By default it is the contact set of the nearest parameter solved so far, `None`
