@@ -38,7 +38,9 @@ def main(cold: str, warm: str, target: str) -> None:
 
 def summary(queries: pd.DataFrame) -> pd.DataFrame:
     """Medians of the queries but the first one, and the share that is ok, by problem and solver."""
-    later = queries[queries["query"] > 0].assign(ok=queries["status"] == "ok")
+    later = queries.loc[queries["query"] > 0, [*KEY, "status", "solve_s", "iterations"]].assign(
+        ok=lambda rows: rows["status"] == "ok"
+    )
     return later.groupby(KEY).agg(ms=("solve_s", "median"), iterations=("iterations", "median"), ok=("ok", "mean"))
 
 
