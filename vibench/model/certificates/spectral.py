@@ -28,7 +28,7 @@ from vibench.arrays import Array, SparseMatrix
 from vibench.interfaces.problem import ParameterBox, Problem
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct
-from vibench.stability.coercivity import coercivity_and_continuity, operator_norm
+from vibench.stability.coercivity import Constant, coercivity_and_continuity, operator_norm
 
 ANCHORS = 81
 """Largest number of anchors; a grid has from 2 to 9 points per direction, or one point alone where 2^d are too many."""
@@ -109,7 +109,14 @@ def spectral_bounds(
 ) -> SpectralBounds:
     """Bounds from the terms A_q (n×n) of A, their coefficients θ (Q,) as a function of mu, and η."""
     points, count = anchors(problem.parameters)
-    constants = [coercivity_and_continuity(checked_assembly(problem, mu).A, X) for mu in points]
+    found: dict[bytes, tuple[Constant, Constant]] = {}  # A often depends on a few of the parameters alone
+    constants = []
+    for mu in points:
+        A = checked_assembly(problem, mu).A
+        key = b"".join(array.tobytes() for array in (A.indptr, A.indices, A.data))
+        if key not in found:
+            found[key] = coercivity_and_continuity(A, X)
+        constants.append(found[key])
     norms = [operator_norm(term, X) for term in terms]
     return SpectralBounds(
         lower=problem.parameters.lower,

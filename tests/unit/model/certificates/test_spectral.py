@@ -8,9 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import space, spd
 
+from vibench import InnerProduct, create
 from vibench.interfaces.problem import ParameterBox, Problem, VariationalInequality
+from vibench.model.certificates import spectral
 from vibench.model.certificates.spectral import ANCHORS, anchors, rotated, spectral_bounds
-from vibench.stability.coercivity import operator_norm
+from vibench.stability.coercivity import Constant, operator_norm
 
 N, Q = 6, 3
 rng = np.random.default_rng(7)
@@ -97,3 +99,18 @@ def test_the_norm_of_an_operator_is_not_below_its_largest_eigenvalue_in_modulus(
         assert found.proved
         assert exact <= found.value <= 1.01 * exact
     assert operator_norm(sp.csc_array((N, N)), X).value == 0.0
+
+
+def test_anchors_at_which_a_is_the_same_share_their_constants(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A of `hertz3d` depends on one of four parameters."""
+    problem, calls = create("problem", "hertz3d", {"resolution": 1000}), []
+
+    def counted(A: sp.csr_array, X: InnerProduct) -> tuple[Constant, Constant]:
+        calls.append(A)
+        return Constant(0.5, True), Constant(2.0, True)
+
+    monkeypatch.setattr(spectral, "coercivity_and_continuity", counted)
+    A = problem.affine["A"]
+    bounds = spectral.spectral_bounds(problem, problem.V, list(A.terms), A.coefficients, 0.0)
+    assert len(bounds.alpha) == bounds.count**4
+    assert len(calls) == bounds.count
