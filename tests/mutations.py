@@ -236,8 +236,8 @@ FAULTS = (
     Fault(
         "correction-of-another-violation",
         "vibench/model/error_bounds.py",
-        "least, start = excess + margin,",
-        "least, start = 0.5 * excess + margin,",
+        "least = excess + margin",
+        "least = 0.5 * excess + margin",
         ("tests/unit/model/test_error_bounds.py",),
     ),
     Fault(

@@ -43,6 +43,7 @@ from .interfaces.problem import ParameterBox as ParameterBox
 from .interfaces.problem import Problem as Problem
 from .interfaces.problem import Sampler as Sampler
 from .interfaces.problem import VariationalInequality as VariationalInequality
+from .interfaces.problem import is_absent as is_absent
 from .interfaces.strategies import AdaptiveSampling as AdaptiveSampling
 from .interfaces.strategies import Cone as Cone
 from .interfaces.strategies import DualStrategy as DualStrategy

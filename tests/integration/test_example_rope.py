@@ -133,7 +133,7 @@ def test_the_tables_have_the_strategy_of_the_package(
     cells: tuple[pd.DataFrame, pd.DataFrame, str], example: Path
 ) -> None:
     shown = [line.split() for line in cells[2].splitlines()]
-    assert sum(OWN in words[:4] for words in shown) == 4
+    assert sum(OWN in words[:6] for words in shown) == 4
     compared = pd.read_csv(example.parent / "runs" / STUDY["name"] / "tables" / "thresholds.csv")
     assert {("online-supremizers", OWN), ("online-supremizers", "offline-pga")} <= set(
         zip(compared["primal_a"], compared["primal_b"], strict=True)

@@ -13,8 +13,9 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Stop
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
-from vibench.stages.cell_queries import CellQueries, CellRows
+from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
+from vibench.stages.judging.cell_goal import CellRows
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.study.kinds import PROBLEM
 from vibench.study.parameter_sets import ParameterSet

@@ -23,8 +23,9 @@ from vibench.results.invariants import EFFECTIVITIES, violations
 from vibench.stability.infsup import inf_sup, multipliers
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
-from vibench.stages.cell_queries import CellQueries, CellRows
+from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
+from vibench.stages.judging.cell_goal import CellRows
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.study.kinds import PluginKind
 from vibench.study.parameter_sets import ParameterSet

@@ -19,9 +19,10 @@ from transformed import Transformed
 from vibench.interfaces.strategies import Stop
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
-from vibench.stages.cell_queries import CellQueries, CellRows
+from vibench.stages.cell_queries import CellQueries
 from vibench.stages.certification import CertificateStage
 from vibench.stages.enrichment import SingleEnrichment
+from vibench.stages.judging.cell_goal import CellRows
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin

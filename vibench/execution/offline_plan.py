@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from vibench.execution.result_writer import ResultWriter
 from vibench.rounds.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
 from vibench.stages.base import Stage
-from vibench.stages.cell_goal import CellGoal
+from vibench.stages.judging.cell_goal import CellGoal
 from vibench.storage.artefacts import Store
 from vibench.study.cells import Cell
 from vibench.timing import Seconds

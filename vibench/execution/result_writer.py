@@ -12,7 +12,7 @@ from vibench.results.columns import KEYS
 from vibench.results.database import ResultsDatabase
 from vibench.rounds.timed_seconds import TimedRound, seconds_of_cell, seconds_of_queries
 from vibench.stages.base import Row, Stage, value_of
-from vibench.stages.cell_goal import CellRows
+from vibench.stages.judging.cell_goal import CellRows
 from vibench.storage.artefacts import History, Store
 from vibench.study.cells import NO_SUCH_AXIS, Axes, Cell, digest
 from vibench.study.parameter_sets import ParameterSet

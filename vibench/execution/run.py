@@ -27,8 +27,8 @@ from vibench.results.database import ResultsDatabase
 from vibench.results.solver_agreement import disagreement_rows
 from vibench.rounds.timing_rounds import SHARE, TimingRounds
 from vibench.stages.base import Done, Failed, Stage, Unstored
-from vibench.stages.cell_goal import CellRows
 from vibench.stages.cell_queries import cell_queries
+from vibench.stages.judging.cell_goal import CellRows
 from vibench.stages.pictures import PictureStage
 from vibench.storage.artefacts import Store, usable_store
 from vibench.study.cells import Cell

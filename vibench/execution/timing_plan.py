@@ -11,7 +11,7 @@ from vibench.results.costs.paired_seconds import FEWEST_BLOCKS, PairedSeconds
 from vibench.rounds.timed_seconds import TimedCell, TimedRound
 from vibench.rounds.timing_rounds import SHARE, TimingRounds, block_rows
 from vibench.stages.base import Failed, Row, Stage
-from vibench.stages.cell_goal import CellGoal
+from vibench.stages.judging.cell_goal import CellGoal
 from vibench.study.cells import Cell
 
 STOPPING_TAIL = 0.005

@@ -266,7 +266,7 @@ def check_built(built: object) -> Mapping[str, Any]:
         Naming what it is.
     """
     if not isinstance(built, Mapping) or not all(isinstance(name, str) for name in built):
-        raise NumericalError(f"`build` returned a {type(built).__name__}, expected a dictionary whose names are texts")
+        raise NumericalError(f"`build` returned a {type(built).__name__}, expected a mapping whose names are texts")
     return built
 
 

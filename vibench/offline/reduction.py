@@ -29,9 +29,9 @@ from vibench.interfaces.validation import check_cone, check_enrichment, referenc
 from vibench.model.affine import INTERPOLATION_RTOL, AffineMember, affine_decomposition
 from vibench.model.certificates.base import CertificateBase, certificate_base
 from vibench.model.certificates.bounds import OnlineCertificate
+from vibench.model.certificates.growing import GrowingTrainer
 from vibench.model.certificates.preparation import prepare
 from vibench.model.galerkin import ReducedModel
-from vibench.model.growing import GrowingTrainer
 from vibench.model.hyperreduced import HyperReducedModel, ReducedOperators, hyper_reduce, reason_for_full_assembly
 from vibench.offline.formulated import Formulated, check_built
 from vibench.offline.models import AnyReducedModel, Model

@@ -9,7 +9,7 @@ import numpy as np
 
 from vibench.results.costs.break_even import NORMAL_95, SCATTER
 from vibench.stages.base import Result, Row, Stage
-from vibench.stages.cell_goal import CellGoal
+from vibench.stages.judging.cell_goal import CellGoal
 from vibench.storage.artefacts import Store
 from vibench.timing import Seconds
 

@@ -18,11 +18,11 @@ from vibench.results.solver_agreement import vectors
 from vibench.stability.infsup import share
 from vibench.stages.assembly import AssemblyStage, ExactSolutions, assembly_stage
 from vibench.stages.base import Row, Stage, value_of
-from vibench.stages.cell_goal import CellGoal, CellItems, QueryRows, inf_sup_columns
 from vibench.stages.certification import CertificateStage
 from vibench.stages.compilation import CompilationStage, compiled_query, loaded_program
 from vibench.stages.formulations import formulation_queries
 from vibench.stages.infsup_constants import InfSupConstants
+from vibench.stages.judging.cell_goal import CellGoal, CellItems, QueryRows, inf_sup_columns
 from vibench.stages.offline import ReducedCone
 from vibench.stages.query import Queries, Query, error_columns, run_query
 from vibench.storage.artefacts import Store

@@ -25,9 +25,9 @@ from vibench.qp.status import Status
 from vibench.results.solver_agreement import answer_row
 from vibench.stages.assembly import AffineDecomposition, HyperReduction
 from vibench.stages.base import Result, Row, Stage, build_problem, faults_of, value_of
-from vibench.stages.cell_goal import CellGoal, CellItems, QueryRows
 from vibench.stages.enrichment import EnrichmentStage, spaces_of
-from vibench.stages.judging import pair_columns
+from vibench.stages.judging.cell_goal import CellGoal, CellItems, QueryRows
+from vibench.stages.judging.pairs import pair_columns
 from vibench.stages.offline import ConeStage, PODStage, ReducedCone
 from vibench.stages.query import Watch, path_before
 from vibench.stages.snapshots import gather, solution_stages

@@ -27,7 +27,7 @@ from vibench.results.solver_agreement import solution_row
 from vibench.stability.coercivity import Stability
 from vibench.stages.assembly import AssemblyStage, ReducedPrograms
 from vibench.stages.base import Row, value_of
-from vibench.stages.judging import online_columns, pair_columns
+from vibench.stages.judging.pairs import online_columns, pair_columns
 from vibench.storage.artefacts import Store
 from vibench.study import registry
 from vibench.timing import SLOW, Seconds, timed

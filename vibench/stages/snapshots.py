@@ -17,8 +17,8 @@ from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolve
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import Fingerprint, checked_assembly, reference_assembly
 from vibench.linalg.inner_product import InnerProduct
+from vibench.model.certificates.growing import GrowingTrainer
 from vibench.model.error_bounds import reference_bound
-from vibench.model.growing import GrowingTrainer
 from vibench.offline.assemblies import assemblies
 from vibench.offline.sweep import Snapshots
 from vibench.qp.repeats import nearby

@@ -20,7 +20,7 @@ from vibench.testing.duals import DUAL
 from vibench.testing.formulations import FORMULATION
 from vibench.testing.primals import PRIMAL
 from vibench.testing.problems import PROBLEM
-from vibench.testing.sample_problem import MovingSupport, sample_offline, sample_reduction, sample_snapshots
+from vibench.testing.samples.sample_problem import MovingSupport, sample_offline, sample_reduction, sample_snapshots
 from vibench.testing.samplings import SAMPLING
 from vibench.testing.solvers import SOLVER
 

@@ -17,7 +17,7 @@ from vibench.reduction.cones import project_on_cone
 from vibench.testing.case import Case
 from vibench.testing.checks import Check, Conformance, Note
 from vibench.testing.comparisons import Arrays, array_fault, unmutated
-from vibench.testing.sample_problem import sample_snapshots
+from vibench.testing.samples.sample_problem import sample_snapshots
 
 TOLERANCES = (0.3, 0.1, 0.01)
 SIZES = (1, 3)

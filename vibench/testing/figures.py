@@ -21,7 +21,7 @@ from vibench.results import tables
 from vibench.results.plugin_columns import Copies, column_values, declared, name_faults
 from vibench.testing.case import Examined
 from vibench.testing.checks import Check, Conformance, Doubt, Note
-from vibench.testing.sample_run import write_sample_run
+from vibench.testing.samples.sample_run import write_sample_run
 
 NAME = "examined"
 """What the plugin is called in messages of the functions that draw."""

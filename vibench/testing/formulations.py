@@ -29,7 +29,7 @@ from vibench.storage.serialisation import dumps, loads
 from vibench.testing.case import Case
 from vibench.testing.checks import Check, Conformance, ConformanceError, Note
 from vibench.testing.comparisons import Arrays, at, difference, differences, largest_entry, unmutated
-from vibench.testing.sample_problem import sample_reduction
+from vibench.testing.samples.sample_problem import sample_reduction
 
 SOLVER = "piqp"
 """The QP solver of the queries."""
@@ -156,7 +156,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         yield Note(f"uses {', '.join(uses) or 'no axis'}; λ is {plugin.multiplier}")
 
     def build(self) -> Iterator[str]:
-        """`build` returns a dictionary of what can be stored."""
+        """`build` returns a mapping of what can be stored."""
         try:
             built = check_built(self.plugin.build(self.phase(self.plugin)))
         except NumericalError as error:

@@ -20,7 +20,7 @@ from vibench.storage.serialisation import dumps, loads
 from vibench.testing.case import Case
 from vibench.testing.checks import Check, Conformance, ConformanceError, Note, raised
 from vibench.testing.comparisons import Arrays, array_fault, at, difference, unmutated
-from vibench.testing.sample_problem import arrays_of, copy_of, sample_offline
+from vibench.testing.samples.sample_problem import arrays_of, copy_of, sample_offline
 
 TOLERANCES = (0.9, 0.5, 0.1)
 

@@ -22,7 +22,6 @@ from vibench_strategies.formulations.whitened import Whitened
 
 if TYPE_CHECKING:
     from vibench import Reduction
-    from vibench.offline.models import AnyReducedModel
 
 
 class ProgramFormulation(Formulation):
@@ -82,7 +81,7 @@ def largest_dimension(offline: Reduction) -> int:
     return int(offline.pod.basis.shape[1] + added.shape[1])
 
 
-def reconstructed(assembled: AnyReducedModel, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:
+def reconstructed(assembled: Any, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:
     """The pair u (n,), λ (m,) of coefficients in the spaces of a reduced model at mu (d,)."""
     assert answer.x is not None
     assert answer.alpha is not None

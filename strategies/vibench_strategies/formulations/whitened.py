@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from vibench import Array, Mask, NumericalError, VariationalInequality
-from vibench.interfaces.problem import is_absent
+from vibench import Array, Mask, NumericalError, VariationalInequality, is_absent
 
 FEASIBLE = 1e-12
 """Violations below this share of the solution are round-off; the scale is that of `Whitened.energy`."""

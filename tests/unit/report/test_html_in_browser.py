@@ -29,7 +29,7 @@ GEOMETRY = """
 const outside = [], wide = document.documentElement.scrollWidth;
 for (const one of document.querySelectorAll("main *, header *")) {
   const box = one.getBoundingClientRect();
-  if (!box.width || one.closest(".wide, .picker div, .panels")) continue;
+  if (!box.width || one.closest(".wide, .picker div, .panels, figure:not(.screen)")) continue;
   if (box.right > innerWidth + 0.5 || box.left < -0.5) outside.push(one.outerHTML.slice(0, 80));
 }
 const wrapped = [...document.querySelectorAll("td.number, .n")].filter(one => {

@@ -22,7 +22,7 @@ from vibench.results.columns import CELLS, KEYS, OUTPUTS
 from vibench.results.costs.break_even import break_even_rows
 from vibench.results.costs.ranking import BAND, errors_of, fastest, measures, with_errors, within
 from vibench.results.database import FILE, ResultsDatabase
-from vibench.testing.sample_run import write_sample_run
+from vibench.testing.samples.sample_run import write_sample_run
 
 MODELS = {
     # offline seconds, seconds of a query, errors of u, of λ, of the force, and of the area

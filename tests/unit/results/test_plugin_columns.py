@@ -24,7 +24,7 @@ from vibench.results.costs.ranking import fastest
 from vibench.results.database import ResultsDatabase
 from vibench.results.plugin_columns import extended_tables
 from vibench.results.sqlite.reading import FILE
-from vibench.testing.sample_run import write_sample_run
+from vibench.testing.samples.sample_run import write_sample_run
 
 GROUP, HERE = "vibench.figures", __name__
 

@@ -207,6 +207,8 @@ def sampling_options(name: str, folder: Path) -> dict[str, object]:
         "list": {"points": [0.5, 2.0]},
         "file": {"path": str(folder / "points.csv")},
         "greedy": {"candidates": 64, "tolerance": 0.2},
+        "sweep": {"size": 7},
+        "load-steps": {"parameter": "height", "loadings": 3, "steps": 4, "seed": 3},
     }.get(name, {"size": 7, "seed": 3, "log": []})
 
 

@@ -16,7 +16,7 @@ from vibench import DerivedColumn, FigurePlugin, ProblemTables, testing
 from vibench.report.figures import OF_DUAL, OF_PROBLEM, drawings
 from vibench.results import tables
 from vibench.results.columns import TABLES
-from vibench.testing.sample_run import write_sample_run
+from vibench.testing.samples.sample_run import write_sample_run
 
 counter = itertools.count()
 

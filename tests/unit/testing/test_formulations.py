@@ -15,7 +15,7 @@ FAULTS: Mapping[str, tuple[str, list[str]]] = {
     "AxisThatIsNone": ("axes", ["uses = ('pod', 'cones')", "expected a tuple of some of pod, dual, primal"]),
     "EnrichesNothing": ("axes", ["'primal' needs 'pod' and 'dual'"]),
     "MultiplierInWords": ("axes", ["multiplier is 'somehow'", "vibench.Multiplier"]),
-    "BuildsAList": ("build", ["`build` returned a list, expected a dictionary"]),
+    "BuildsAList": ("build", ["`build` returned a list, expected a mapping"]),
     "BuildsAFunction": ("build", ["what `build` returns as 'tangent' cannot be stored", "function"]),
     "MakesADictionary": ("model", ["made a dict, expected a FormulationModel"]),
     "WithoutDimension": ("model", ["`dimension` of the model is None, expected a whole number"]),

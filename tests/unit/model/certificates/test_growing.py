@@ -13,7 +13,7 @@ from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.validation import ReferenceAssembly
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.model.growing import GrowingModel, GrowingTrainer
+from vibench.model.certificates.growing import GrowingModel, GrowingTrainer
 from vibench.reduction import part_in_cone
 
 PROBLEMS = {

@@ -14,7 +14,7 @@ from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Trainer
 from vibench.interfaces.validation import ReferenceAssembly, checked_assembly
 from vibench.linalg.inner_product import orthonormal_range
-from vibench.model.contact_estimates import ContactEstimates
+from vibench.model.certificates.contact_estimates import ContactEstimates
 from vibench.model.error_bounds import find_correction, residual, terms
 from vibench.model.errors import Energy, rieszes
 from vibench.model.galerkin import project

@@ -1,6 +1,6 @@
 """Results of the study `formulations`: who is how accurate at which query time, and what is left with less training.
 
-vibench run formulations --no-figures && python results/scripts/formulations.py runs/formulations results/formulations
+vibench run formulations --no-figures && python results/scripts/by_formulation.py runs/formulations results/formulations
 
 Everything comes from the results file: all formulations are judged by the errors, the residuals and the bounds of the
 high-fidelity problem.
@@ -142,7 +142,7 @@ def figure(cells: pd.DataFrame) -> Figure:
 def main(run: str, target: str) -> None:
     cells, queries = read(run, "cells"), read(run, "queries")
     own = cells[cells["training"] == "own"]
-    command = made_by("formulations", "formulations", "formulations", options=" --no-figures")
+    command = made_by("by_formulation", "formulations", "formulations", options=" --no-figures")
     page = Page(
         target,
         "Formulations",

@@ -21,8 +21,8 @@ from vibench.qp.status import Status
 from vibench.stability.coercivity import Stability
 from vibench.stability.infsup import InfSup
 from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, build_problem, value_of
-from vibench.stages.cell_summary import summarise
 from vibench.stages.infsup_constants import ReferenceConstants
+from vibench.stages.judging.cell_summary import summarise
 from vibench.stages.offline import ConstraintMatrices
 from vibench.stages.snapshots import TimedSnapshots, gather, solution_stages
 from vibench.storage.artefacts import Artefact, Store
