@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,9 @@ NCV = 10
 
 FEW = 30
 """Spaces of at most this dimension have their eigenvalues from a dense matrix; Lanczos needs more than two."""
+
+FEW_SHARE = 0.25
+"""Constraints per unknown up to which multipliers are eliminated last."""
 
 
 @dataclass(frozen=True)
@@ -179,18 +183,29 @@ def energy_inf_sup(A: SparseMatrix, B: SparseMatrix, W: InnerProduct) -> Constan
     factor, (m, n) = SparseCholesky(A, "A"), B.shape
     if not m:
         return Constant(float("inf"), True)
-    order = np.concatenate([factor.order, n + np.arange(m)])  # multipliers last: their pivots are a Schur complement's
-    square = _smallest_compliance(A, sp.csc_array(B), W, factor, order)
-    if square <= 0.0:
-        return Constant(0.0, True)
+    last = np.concatenate([factor.order, n + np.arange(m)])
+    # Multipliers last have the pivots of a Schur complement, which is dense: with many of them that is all the work.
+    orders = [last] if m <= FEW_SHARE * n else [_after_their_unknowns(factor.order, B), last]
     roots = np.sqrt(A.diagonal()), np.sqrt(W.matrix.diagonal())
 
-    def stable(beta: float) -> bool:
+    def stable(order: Indices, beta: float) -> bool:
         saddle = -_saddle_point(A, B, beta**2 * W.matrix)
         return bool(proved_positive([saddle], np.concatenate([roots[0], beta * roots[1]]), order) >= m)
 
-    constant = moved(float(np.sqrt(square)), -1.0, stable)
-    return constant if constant.proved else Constant(0.0, True)
+    for order in orders:
+        square = _smallest_compliance(A, sp.csc_array(B), W, factor, order)
+        constant = moved(float(np.sqrt(square)), -1.0, partial(stable, order)) if square > 0.0 else Constant(0.0, False)
+        if constant.proved:
+            return constant
+    return Constant(0.0, True)
+
+
+def _after_their_unknowns(order: Indices, B: SparseMatrix) -> Indices:
+    """An elimination order of the saddle point: of A (n,), every multiplier after the last unknown of its row."""
+    place, rows = np.empty(len(order)), sp.csr_array(B)
+    place[order] = np.arange(len(order))
+    ends = [np.max(place[row], initial=-1.0) for row in np.split(rows.indices, rows.indptr[1:-1])]
+    return np.argsort(np.concatenate([place, np.array(ends) + 0.5]), kind="stable")
 
 
 def _smallest_compliance(
@@ -209,7 +224,9 @@ def _smallest_compliance(
 
     def inverse(y: Array) -> Array:
         """−(BA⁻¹Bᵀ)⁻¹ is the last block of the inverse."""
-        return np.asarray(-solve(np.concatenate([np.zeros(n), y]))[n:])
+        found = np.empty(n + m)
+        found[order] = solve(np.concatenate([np.zeros(n), y])[order])
+        return -found[n:]
 
     compliance = _operator(m, lambda y: B @ factor.solve(B.T @ y))
     return _smallest(compliance, W.matrix, inverse)
