@@ -39,7 +39,7 @@ return [...(wide ? ["the page"] : []), ...named];
 
 def main(site: str) -> None:
     """Print what does not fit."""
-    lines = list(faults(Path(site)))
+    lines = list(faults(Path(site).resolve()))
     print("\n".join(lines) or f"{site}: every page fits {' and '.join(map(str, WIDTHS))} pixels")
     sys.exit(bool(lines))
 
