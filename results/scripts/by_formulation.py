@@ -91,7 +91,7 @@ def robustness(cells: pd.DataFrame) -> pd.DataFrame:
             if training in errors[quantity]:
                 grown = np.log(errors[quantity][training] / errors[quantity]["own"])
                 rows[f"{name}, {training}"] = np.exp(grown.groupby(["problem", "formulation"], sort=False).mean())
-    return pd.DataFrame(rows).reset_index()
+    return pd.DataFrame(rows).dropna(how="all").reset_index()  # problems with their own training set alone
 
 
 def violated(queries: pd.DataFrame) -> pd.DataFrame:
@@ -127,7 +127,7 @@ def uncertainty(queries: pd.DataFrame) -> pd.DataFrame:
 def figure(cells: pd.DataFrame) -> Figure:
     """Errors of λ over the time of a query, a look for each formulation."""
     problems, title = list(dict.fromkeys(cells["problem"])), "Error of λ against online time"
-    sheet = Sheet(1, len(problems), title)
+    sheet = Sheet(-(-len(problems) // 2), 2, title)
     looks = Looks(Series(name) for name in cells["formulation"])
     for panel, problem in zip(sheet.panels, problems, strict=True):
         for name, mine in answered(cells[cells["problem"] == problem]).groupby("formulation", sort=False):
