@@ -301,8 +301,9 @@ def test_artefacts_are_shared_by_studies_and_seconds_only_on_their_machine(
     assert stages("one.toml", "--out", "again") == 2
     assert stages("one.toml", "--out", "anew", "--fresh") == made + 2
     assert_same_numbers(tmp_path / "again", tmp_path / "anew")
-    again, anew = (rows(tmp_path / folder)[0]["offline_s"] for folder in ("again", "anew"))
-    assert again == rows(tmp_path / "runs" / "wire")[0]["offline_s"] != anew  # measured again only where made anew
+    # wall seconds are those of the stages alone: how often short ones are repeated depends on what they take
+    again, anew = (rows(tmp_path / folder)[0]["offline_wall_s"] for folder in ("again", "anew"))
+    assert again == rows(tmp_path / "runs" / "wire")[0]["offline_wall_s"] != anew  # measured only where made anew
     of_another_machine(tmp_path / "cache" / "artefacts")
     assert stages("one.toml", "--out", "here") == made + 2
     assert rows(tmp_path / "here")[0]["machine"] == rows(tmp_path / "again")[0]["machine"]
