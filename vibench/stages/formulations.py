@@ -29,7 +29,7 @@ from vibench.stages.enrichment import EnrichmentStage, spaces_of
 from vibench.stages.judging.cell_goal import CellGoal, CellItems, QueryRows
 from vibench.stages.judging.pairs import pair_columns
 from vibench.stages.offline import ConeStage, PODStage, ReducedCone
-from vibench.stages.query import Watch, path_before
+from vibench.stages.query import Watch, query_before
 from vibench.stages.snapshots import gather, solution_stages
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
@@ -228,18 +228,18 @@ class FormulationModels:
         self.formulated = stage.built.formulated(store, stage.solver, stage.accuracy)
         self.problem = self.formulated.offline.problem
         self.mus, self._seed = stage.validation_set.of(self.problem), stage.validation_set.seed
-        self._warm = stage.warm_start
+        self._validation, self._warm = stage.validation_set, stage.warm_start
 
     @cached_property
     def _before(self) -> list[int | None]:
-        return path_before(self.mus, self.problem.parameters)
+        return query_before(self._validation, self.problem)
 
     def near(self, number: int, *seed: int) -> Array:
         """A parameter (d,) next to that of a query, which depends on the seed."""
         return nearby(self.problem.parameters, self.mus[number], self._seed, number, *seed)
 
     def query(self, number: int) -> FormulationQuery:
-        """One query; for a warm start with the one before it on a path through the parameters."""
+        """One query; for a warm start with the one before it on the path of `query_before`."""
         before = self._before[number] if self._warm else None
         start = None if before is None else (before, self.mus[before])
         return FormulationQuery(self.formulated, self.mus[number], lambda *seed: self.near(number, *seed), start)

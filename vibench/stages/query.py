@@ -10,7 +10,7 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import in_a_line
-from vibench.interfaces.problem import ParameterBox, VariationalInequality
+from vibench.interfaces.problem import ParameterBox, Problem, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.model.error_bounds import CorrectionMode
 from vibench.model.errors import UNMEASURABLE, ReferenceSolutions
@@ -30,6 +30,7 @@ from vibench.stages.base import Row, value_of
 from vibench.stages.judging.pairs import online_columns, pair_columns
 from vibench.storage.artefacts import Store
 from vibench.study import registry
+from vibench.study.parameter_sets import ParameterSet
 from vibench.timing import SLOW, Seconds, timed
 
 Watch = Callable[[bool], None]
@@ -105,24 +106,20 @@ class Queries:
     def __init__(self, store: Store, assembly: AssemblyStage) -> None:
         self.model, self.note = assembly.model(store)
         self.mus, self._seed = assembly.validation.of(self.model.problem), assembly.validation.seed
-        self._ordered = assembly.validation.is_ordered
+        self._validation = assembly.validation
         self.reduced: ReducedPrograms = value_of(store, assembly)
         self.store = store
 
     @cached_property
     def _before(self) -> list[int | None]:
-        if self._ordered:
-            return [None, *range(len(self.mus) - 1)]
-        return path_before(self.mus, self.model.problem.parameters)
+        return query_before(self._validation, self.model.problem)
 
     def near(self, number: int, *seed: int) -> Array:
         """A parameter (d,) next to that of a query, which depends on the seed: what a timed assembly assembles at."""
         return nearby(self.model.problem.parameters, self.mus[number], self._seed, number, *seed)
 
     def query(self, number: int, solver: str, accuracy: float, warm_start: bool) -> Query:
-        """One query of a solver; for a warm start with the one before it on a path through the parameters.
-
-        That is the path of the validation set itself where it is ordered, else one through nearest neighbours.
+        """One query of a solver; for a warm start with the one before it on the path of `query_before`.
 
         That one is solved again for this purpose, so that a start does not depend on what the process solved before. A
         primal basis that changes with the parameter allows none: coordinates of two queries are not comparable.
@@ -132,6 +129,15 @@ class Queries:
             before = self._before[number]
             start = None if before is None else (before, programs[before])
         return Query(programs[number], self.reduced.factor, solver, accuracy, start)
+
+
+def query_before(validation: ParameterSet, problem: Problem) -> list[int | None]:
+    """The query whose solution every query of a validation set starts from: the one before it on the path.
+
+    That is the path of the set itself where it is ordered, else one through nearest neighbours.
+    """
+    mus = validation.of(problem)
+    return [None, *range(len(mus) - 1)] if validation.is_ordered else path_before(mus, problem.parameters)
 
 
 def path_before(mus: Array, box: ParameterBox) -> list[int | None]:

@@ -22,7 +22,7 @@ from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
-from vibench.stages.query import error_columns, path_before
+from vibench.stages.query import error_columns, path_before, query_before
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 
@@ -44,6 +44,14 @@ def test_a_path_visits_every_parameter_once_and_goes_on_to_the_nearest(seed: int
     for step, (here, there) in enumerate(pairwise(path)):
         apart = np.linalg.norm(scaled[path[step + 1 :]] - scaled[here], axis=1)
         assert np.linalg.norm(scaled[there] - scaled[here]) == pytest.approx(apart.min())
+
+
+def test_an_ordered_set_is_its_own_path() -> None:
+    problem = PROBLEM.create()
+    walk = Plugin("sampling", "random-walk", "{}", "test")
+    assert query_before(ParameterSet("validation", 5, 1, walk), problem) == [None, 0, 1, 2, 3]
+    own = ParameterSet("validation", 5, 1)
+    assert query_before(own, problem) == path_before(own.of(problem), problem.parameters) != [None, 0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])
