@@ -13,6 +13,7 @@ PROBLEMS = ("obstacle", "hertz")
 CONE = ["dual", "pod_tol", "pod_size", "dual_tol", "dual_size"]
 MODEL = ["problem", *CONE, "primal", "primal_tol"]
 CONTROL = "pod-dual (negative control)"
+GAINS = ["gain", "gain_low", "gain_high", "benefit_threshold", "threshold_low", "threshold_high", "meaning"]
 ASSEMBLIES = ("full", "reduced", "certified", "compiled")
 
 
@@ -21,11 +22,15 @@ class Results:
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
+        self._read: dict[tuple[str, str], pd.DataFrame] = {}
 
     def table(self, study: str, name: str = "cells") -> pd.DataFrame:
         """A table of a page, "cells" or another CSV file beside it."""
-        frame = pd.read_csv(self.folder / study / f"{name}.csv")
-        return frame if "solver" not in frame or study == "solvers" else frame[frame["solver"] == "piqp"]
+        if (study, name) not in self._read:
+            frame = pd.read_csv(self.folder / study / f"{name}.csv")
+            everything = "solver" not in frame or study == "solvers"
+            self._read[study, name] = frame if everything else frame[frame["solver"] == "piqp"]
+        return self._read[study, name]
 
     @cached_property
     def papers(self) -> dict[str, pd.DataFrame]:
@@ -35,12 +40,20 @@ class Results:
     @cached_property
     def gains(self) -> pd.DataFrame:
         """The models of `benefit` against the high-fidelity model: errors, gains, break-evens, with intervals."""
-        against = self.table("benefit", "thresholds")
-        against = against[against["cell_a"].isna()].drop(
-            columns=["problem", "solver", "accuracy", "pod_tol", "pod_size"]
-        )
-        named = against.drop(columns=[name for name in against if name in ("training", "correction", *CONE)])
-        return self.table("benefit").merge(named, left_on="cell", right_on="cell_b", how="left", suffixes=("", "_pair"))
+        against = self.against("benefit")[["cell_b", *GAINS]]
+        return self.table("benefit").merge(against, left_on="cell", right_on="cell_b", how="left")
+
+    @cached_property
+    def cones(self) -> pd.DataFrame:
+        """The cells of `field` with cones in W⁺, online supremizers and reduced assembly."""
+        cells = self.table("field")
+        kept = (cells["primal"] == "online-supremizers") & (cells["assembly"] == "reduced")
+        return cells[kept & (cells["dual"] != CONTROL)]
+
+    def against(self, study: str) -> pd.DataFrame:
+        """The break-evens of a study with the high-fidelity model."""
+        pairs = self.table(study, "thresholds")
+        return pairs[pairs["cell_a"].isna()]
 
 
 def number(value: float, digits: int = 2) -> str:
@@ -62,6 +75,11 @@ def span(values: Iterable[float], digits: int = 2) -> str:
 def of(part: int, whole: int) -> str:
     """How many of how many."""
     return f"all {whole}" if part == whole else f"none of {whole}" if part == 0 else f"{part} of {whole}"
+
+
+def surely_above_one(pairs: pd.DataFrame) -> str:
+    """In how many of some comparisons the 95 % interval of the gain is above 1."""
+    return of(int((pairs["gain_low"] > 1.0).sum()), len(pairs))
 
 
 def interval(middle: float, low: float, high: float) -> str:

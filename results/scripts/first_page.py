@@ -13,7 +13,20 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pandas as pd
-from committed import ASSEMBLIES, MODEL, PROBLEMS, Results, enriched, interval, number, of, span, unavailable, when
+from committed import (
+    ASSEMBLIES,
+    MODEL,
+    PROBLEMS,
+    Results,
+    enriched,
+    interval,
+    number,
+    of,
+    span,
+    surely_above_one,
+    unavailable,
+    when,
+)
 from page import start
 
 from vibench.report.figures.data import label
@@ -119,7 +132,7 @@ def _gain(gains: pd.DataFrame, assembly: str, problem: str) -> str:
     mine = gains[(gains["assembly"] == assembly) & (gains["problem"] == problem)]
     if mine["gain"].isna().all():
         return f"none ({problem}: {unavailable(mine)})"
-    return f"{span(mine['gain'])} ({problem}, {of(int((mine['gain_low'] > 1.0).sum()), len(mine))})"
+    return f"{span(mine['gain'])} ({problem}, {surely_above_one(mine)})"
 
 
 def _reproduction(results: Results) -> str:

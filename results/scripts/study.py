@@ -15,7 +15,7 @@ from page import SECONDS, Page, alternative, escaped, made_by, origin, read, sta
 from vibench.report import figures
 from vibench.report.figures.style import caption_of, styled
 from vibench.results import tables
-from vibench.results.costs.best import CERTIFIED_BOUNDS
+from vibench.results.costs.best import CERTIFIED_BOUNDS, relative_bounds
 from vibench.study.cells import CERTIFIED
 from vibench_problems.paper.evidence import SOLVER, Evidence
 from vibench_problems.paper.tables import columns
@@ -74,12 +74,10 @@ def main(run: str, target: str) -> None:
 def bounds(cells: pd.DataFrame, queries: pd.DataFrame) -> pd.DataFrame:
     """Of every certified model the mean relative errors and bounds at online cost over its ok queries; violations."""
     fine = queries[(queries["status"] == "ok") & queries["cell"].isin(cells["cell"][cells["assembly"] == CERTIFIED])]
-    relative = {
-        f"bound_{name}_mean": fine[f"bound_online_{name}"] * fine[f"error_{name}"] / fine[f"error_{name}_absolute"]
-        for name in CERTIFIED_BOUNDS
-    }
-    relative |= {f"error_{name}_mean": fine[f"error_{name}"] for name in CERTIFIED_BOUNDS}
-    found = pd.DataFrame(relative).groupby(fine["cell"]).mean()
+    relative = relative_bounds(fine)
+    columns = {f"bound_{name}_mean": relative[name] for name in CERTIFIED_BOUNDS}
+    columns |= {f"error_{name}_mean": fine[f"error_{name}"] for name in CERTIFIED_BOUNDS}
+    found = pd.DataFrame(columns).groupby(fine["cell"]).mean()
     of_cell = fine.groupby("cell")
     found["queries"], found["violations"] = of_cell.size(), of_cell["bound_online_violated"].sum()
     return found.reset_index()

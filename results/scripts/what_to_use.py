@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from committed import ASSEMBLIES, CONTROL, MODEL, PROBLEMS, Results, enriched, number, of, span, unavailable
+from committed import ASSEMBLIES, MODEL, PROBLEMS, Results, enriched, number, of, span, surely_above_one, unavailable
 from page import start
 
 from vibench.results import formats
@@ -27,7 +27,7 @@ def enrich(results: Results) -> str:
     )
     pairs = pairs[pairs["cell_a"].notna() & (pairs["assembly_a"] == pairs["assembly_b"])]
     compared = [
-        f"{how} assembly {span(mine['gain'])} ({p}; surely above 1 in {_surely(mine)})"
+        f"{how} assembly {span(mine['gain'])} ({p}; surely above 1 in {surely_above_one(mine)})"
         for (how, p), mine in pairs.groupby(["assembly_a", "problem"], sort=False)
         if how in ("full", "reduced")
     ]
@@ -46,10 +46,6 @@ def enrich(results: Results) -> str:
     )
 
 
-def _surely(mine: pd.DataFrame) -> str:
-    return of(int((mine["gain_low"] > 1.0).sum()), len(mine))
-
-
 def _factor(results: Results, dual: str) -> str:
     by = {p: enriched(cells[cells["dual"] == dual], "error_lambda_mean") for p, cells in results.papers.items()}
     return " and ".join(f"{span(values)} ({p})" for p, values in by.items())
@@ -57,12 +53,8 @@ def _factor(results: Results, dual: str) -> str:
 
 def cones(results: Results) -> pd.DataFrame:
     """Of every cone of the study `field` with online supremizers: ranges over the two tolerances, by problem."""
-    cells = results.table("field")
-    chosen = cells[
-        (cells["primal"] == "online-supremizers") & (cells["assembly"] == "reduced") & (cells["dual"] != CONTROL)
-    ]
     rows = []
-    for dual, mine in chosen.groupby("dual", sort=False):
+    for dual, mine in results.cones.groupby("dual", sort=False):
         row: dict[str, str] = {"cone": str(dual)}
         for problem in PROBLEMS:
             one = mine[mine["problem"] == problem]
@@ -77,16 +69,13 @@ def cones(results: Results) -> pd.DataFrame:
 
 def which_cone(results: Results) -> str:
     """Which dual strategy."""
-    cells = results.table("field")
-    chosen = cells[
-        (cells["primal"] == "online-supremizers") & (cells["assembly"] == "reduced") & (cells["dual"] != CONTROL)
-    ]
+    chosen = results.cones
     tight = chosen[chosen["pod_tol"] == chosen["pod_tol"].min()]
     best, few, cheap = (_least(tight, column) for column in ("error_lambda_mean", "R", "offline_cone_s"))
     pairs = chosen.set_index(["problem", "pod_tol", "dual"]).sort_index()
     mine = pairs.xs("mcpg", level="dual")
     others = {dual: pairs.xs(dual, level="dual") for dual in chosen["dual"].unique() if dual != "mcpg"}
-    never = [
+    better = [
         d
         for d, o in others.items()
         if ((o["R"] < mine["R"]) & (o["error_lambda_mean"] < mine["error_lambda_mean"])).any()
@@ -97,8 +86,8 @@ def which_cone(results: Results) -> str:
         f"`mcpg` to begin with: {span(mine['R'] / smallest)} times the generators of the smallest cone, and offline "
         f"{span(mine['offline_cone_s'])} s ([field](../results/field/README.md), two problems, two tolerances).",
         (
-            f"fewer generators and a smaller error on a problem, at one of the tolerances: {', '.join(never)}. "
-            if never
+            f"fewer generators and a smaller error on a problem, at one of the tolerances: {', '.join(better)}. "
+            if better
             else ""
         )
         + f"At the tighter tolerances the smallest error of λ has {best}, the fewest generators {few}, the fastest "
@@ -203,7 +192,8 @@ def which_training(results: Results) -> str:
 
 def when_not(results: Results) -> str:
     """When not to reduce at all."""
-    every = pd.concat([results.gains, *(_against(results, p) for p in PROBLEMS)])
+    every = pd.concat([results.gains, *map(results.against, (f"paper-{p}" for p in PROBLEMS))])
+    every["assembly"] = every["assembly"].fillna(every["assembly_b"])
     parts = []
     for problem, mine in every.groupby("problem", sort=False):
         for how, group in mine[mine["meaning"].notna()].groupby("assembly", sort=False):
@@ -225,11 +215,6 @@ def when_not(results: Results) -> str:
         "| problem | assembly | models | cheaper than high-fidelity solutions | never | undecided |\n"
         "| --- | --- | --- | --- | --- | --- |\n" + "\n".join(parts),
     )
-
-
-def _against(results: Results, problem: str) -> pd.DataFrame:
-    table = results.table(f"paper-{problem}", "thresholds")
-    return table[table["cell_a"].isna()].assign(assembly=lambda rows: rows["assembly_b"])
 
 
 QUESTIONS = (enrich, which_cone, which_solver, which_assembly, which_training, when_not)

@@ -174,14 +174,17 @@ def _ties(best: Candidate, other: Candidate, paired: PairedSeconds, queries: flo
 
 
 def certified_errors(queries: pd.DataFrame) -> pd.Series:
-    """Bounds of the mean relative errors of the cells with certificates, by cell: the larger one of u and λ, in energy.
+    """Bounds of the mean relative errors of cells with certificates, by cell: the larger one of u and λ, in energy."""
+    fine = queries[queries["status"] == "ok"]
+    return relative_bounds(fine).groupby(fine["cell"]).mean().max(axis=1, skipna=False)
+
+
+def relative_bounds(queries: pd.DataFrame) -> pd.DataFrame:
+    """Relative bounds of u and λ at online cost, by the names of `CERTIFIED_BOUNDS`, of every query.
 
     A query without a relative error, where the solution is zero, has no relative bound.
     """
-    fine = queries[queries["status"] == "ok"]
-    bounds = {
-        name: fine[f"bound_online_{name}"].astype(float)
-        / (fine[f"error_{name}_absolute"] / fine[f"error_{name}"]).astype(float)
-        for name in CERTIFIED_BOUNDS
-    }
-    return pd.DataFrame(bounds).groupby(fine["cell"]).mean().max(axis=1, skipna=False)
+    sizes = {name: queries[f"error_{name}_absolute"] / queries[f"error_{name}"] for name in CERTIFIED_BOUNDS}
+    return pd.DataFrame(
+        {name: queries[f"bound_online_{name}"].astype(float) / size.astype(float) for name, size in sizes.items()}
+    )
