@@ -59,10 +59,8 @@ class TriangleForms:
 
     Parameters
     ----------
-    modes
-        Positions of the nodes by weight (weights×2×nodes).
-    triangles
-        Nodes of the triangles (3×t).
+    modes, triangles
+        As for `StiffnessEntries`.
     """
 
     def __init__(self, modes: Array, triangles: NDArray[np.integer]) -> None:

@@ -163,12 +163,12 @@ def wire() -> VariationalInequality:
 
 def _is_required(solver: str) -> bool:
     """Whether vibench depends on a solver: one that it does not depend on may work and reach a lower accuracy."""
-    return required_distributions().get(provenance.SOLVER_DISTRIBUTIONS.get(solver, solver)) == []
+    return required_distributions().get(provenance.solver_distribution(solver)) == []
 
 
 def _unavailable(solver: str, version: str) -> Diagnosis:
     """Why a solver cannot be run."""
-    distribution = provenance.SOLVER_DISTRIBUTIONS.get(solver, solver)
+    distribution = provenance.solver_distribution(solver)
     if version:
         try:
             importlib.import_module(distribution)

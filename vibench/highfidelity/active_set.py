@@ -15,7 +15,7 @@ from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import check_symmetric
-from vibench.linalg.schur_complement import EliminationPattern
+from vibench.linalg.schur_complement import FEW_PER_UNKNOWN, EliminationPattern
 from vibench.qp import verification
 from vibench.qp.exact import least_distance_solution
 from vibench.qp.rows import rows_that_matter
@@ -38,10 +38,8 @@ NO_ROOM = 1e-14
 """Opposite rows whose bounds differ by less than this share of them are an equality."""
 
 FEW_ROWS = 1000
-"""Of so many constraints the multipliers are the last unknowns of a sparse factorisation, which is dense there."""
-
-SMALL_SHARE = 0.25
-"""And of so many per unknown: with more that dense part is most of the factorisation."""
+"""Of so many constraints the multipliers are the last unknowns of a sparse factorisation, which is dense there, if they
+are no more than `FEW_PER_UNKNOWN`, too."""
 
 MAX_ITERATIONS = 100
 """Largest number of iterations, or the number of constraints if larger: the contact set may move node by node."""
@@ -207,7 +205,7 @@ class HighFidelitySolver:
         """
         factorisation = self._problem.factorisation
         pattern = EliminationPattern.of(vi.A, self._constrained, factorisation)
-        few = len(vi.g) <= min(FEW_ROWS, SMALL_SHARE * len(vi.f))
+        few = len(vi.g) <= min(FEW_ROWS, FEW_PER_UNKNOWN * len(vi.f))
         if self._condensing or "A" in self._problem.constant or pattern.is_dense or not few:
             return pattern
         return EliminationPattern.of_none(vi.A, factorisation)

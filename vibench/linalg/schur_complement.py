@@ -13,6 +13,10 @@ from vibench.linalg.cholesky import PartialCholesky
 from vibench.linalg.definite import BlockDiagonal
 from vibench.linalg.factorisations import DEFAULT, implementation
 
+FEW_PER_UNKNOWN = 0.25
+"""Constraints per unknown up to which multipliers come last in an elimination: with more of them their dense Schur
+complement is most of the work."""
+
 
 @dataclass(frozen=True)
 class EliminationPattern:

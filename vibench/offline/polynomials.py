@@ -70,7 +70,7 @@ def member_polynomials(
             terms |= {"A": _stiffness_terms(queried, box.lower)} | {name: of.T for name, of in rotated.items()}
         theta_of = {name: "A" if name in rotated else name for name in terms}
         # Of a constant member nothing is sampled: thousands of copies of A take gigabytes.
-        packed = _packed(queried, len(first.f), box.lower, coefficients_of(queried, box.lower))
+        packed = _packed(first, len(first.f), box.lower)
         constant = {name: packed[name][None, :] for name in reduced.problem.constant if name not in terms}
         terms |= constant
         evaluate = partial(_evaluated, queried, len(first.f), theta_of, tuple(constant), beside)
@@ -166,15 +166,14 @@ def _evaluated(
 ) -> dict[str, Array]:
     """The members as flat arrays, and what is interpolated beside them; of sums of known terms the θ of a member."""
     theta = coefficients_of(queried, mu)
-    found = _packed(queried, size, mu, theta)
+    found = _packed(members_of(queried, mu, theta), size, mu)
     others = dict(beside(theta) if beside is not None else {})
     sums = {name: theta[member] for name, member in theta_of.items()}
     return found | others | sums | {name: np.ones(1) for name in constant}
 
 
-def _packed(queried: AnyReducedModel, size: int, mu: Array, theta: Mapping[str, Array]) -> dict[str, Array]:
-    """The members as flat arrays; of A the upper triangle."""
-    found = members_of(queried, mu, theta)
+def _packed(found: VariationalInequality, size: int, mu: Array) -> dict[str, Array]:
+    """Members at mu (d,) as flat arrays; of A the upper triangle."""
     if len(found.f) != size:
         raise RequestError(f"the reduced program has {len(found.f)} unknowns at mu = {mu.tolist()}, {size} elsewhere")
     arrays = {name: np.asarray(getattr(found, name)) for name in MEMBERS}

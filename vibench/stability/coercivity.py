@@ -30,6 +30,7 @@ from vibench.linalg.cholesky import SparseCholesky, symmetric_lu
 from vibench.linalg.factorisations import implementation, is_proved_definite
 from vibench.linalg.inertia import proved_positive
 from vibench.linalg.inner_product import InnerProduct
+from vibench.linalg.schur_complement import FEW_PER_UNKNOWN
 from vibench.stability.infsup import InfSup
 
 MARGINS = (1e-3, 1e-2, 1e-1, 0.5)
@@ -46,9 +47,6 @@ NCV = 10
 
 FEW = 30
 """Spaces of at most this dimension have their eigenvalues from a dense matrix; Lanczos needs more than two."""
-
-FEW_SHARE = 0.25
-"""Constraints per unknown up to which multipliers are eliminated last."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +183,7 @@ def energy_inf_sup(A: SparseMatrix, B: SparseMatrix, W: InnerProduct) -> Constan
         return Constant(float("inf"), True)
     last = np.concatenate([factor.order, n + np.arange(m)])
     # Multipliers last have the pivots of a Schur complement, which is dense: with many of them that is all the work.
-    orders = [last] if m <= FEW_SHARE * n else [_after_their_unknowns(factor.order, B), last]
+    orders = [last] if m <= FEW_PER_UNKNOWN * n else [_after_their_unknowns(factor.order, B), last]
     roots = np.sqrt(A.diagonal()), np.sqrt(W.matrix.diagonal())
 
     def stable(order: Indices, beta: float) -> bool:

@@ -96,6 +96,6 @@ def test_multipliers_of_a_constraint_on_everything_are_eliminated_beside_their_u
     assert found.proved
     assert (1.0 - 2.0 * MARGINS[0]) * exact <= found.value <= exact
     beside = max(entries)
-    monkeypatch.setattr(coercivity, "FEW_SHARE", 1.0)
+    monkeypatch.setattr(coercivity, "FEW_PER_UNKNOWN", 1.0)
     assert energy_inf_sup(A, B, W).value == pytest.approx(found.value, rel=1e-9)
     assert 3 * beside < max(entries)

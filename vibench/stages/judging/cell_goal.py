@@ -26,7 +26,7 @@ from vibench.stages.judging.cell_summary import summarise
 from vibench.stages.offline import ConstraintMatrices
 from vibench.stages.snapshots import TimedSnapshots, gather, solution_stages
 from vibench.storage.artefacts import Artefact, Store
-from vibench.study.kinds import PROBLEM, SOLVER
+from vibench.study.kinds import SOLVER
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.study.registry import find
@@ -126,7 +126,7 @@ class CellItems(Items):
     def __init__(self, stage: CellGoal, store: Store) -> None:
         self._goal, self._store = stage, store
         self._problem: Problem = build_problem(stage.problem)
-        solved = _solutions(_Solutions(stage.training, stage.validation, store.folder, store))
+        solved = _solutions(_Solutions(stage.problem, stage.training, stage.validation, store.folder, store))
         self._training, self._reference, self._compared = solved
         self._zeros = zeros(self._problem, self._compared)
         self._stability: list[Stability] = value_of(store, stage.reference)
@@ -227,8 +227,9 @@ class CellItems(Items):
 
 @dataclass(frozen=True)
 class _Solutions:
-    """The stages of the solutions that queries are compared with, and the store in a folder that has them."""
+    """The stages of the solutions of a problem that queries are compared with, and the store that has them."""
 
+    problem: Plugin
     training: tuple[Stage, ...]
     validation: tuple[Stage, ...]
     folder: Path
@@ -239,8 +240,7 @@ class _Solutions:
 def _solutions(of: _Solutions) -> tuple[TimedSnapshots, TimedSnapshots, ReferenceSolutions]:
     """Training and validation solutions, and the latter with what is largest of the former; cells share them."""
     trained, reference = gather(of.store, of.training), gather(of.store, of.validation)
-    (plugin,) = {plugin for stage in of.training for plugin in stage.plugins() if plugin.kind is PROBLEM}
-    problem = build_problem(plugin)
+    problem = build_problem(of.problem)
     return (
         trained,
         reference,
