@@ -48,7 +48,7 @@ def test_a_path_visits_every_parameter_once_and_goes_on_to_the_nearest(seed: int
 
 def test_an_ordered_set_is_its_own_path() -> None:
     problem = PROBLEM.create()
-    walk = Plugin("sampling", "random-walk", "{}", "test")
+    walk = Plugin("sampling strategy", "random-walk", '{"size": 5, "seed": 1}', "test")
     assert query_before(ParameterSet("validation", 5, 1, walk), problem) == [None, 0, 1, 2, 3]
     own = ParameterSet("validation", 5, 1)
     assert query_before(own, problem) == path_before(own.of(problem), problem.parameters) != [None, 0, 1, 2, 3]
