@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from typer.testing import CliRunner
 
+from vibench.cli.main import app
 from vibench.results.columns import KEYS, STORED, TABLES
 from vibench.results.sqlite.digests import Digests
 from vibench.results.sqlite.reading import FILE, read_text
@@ -32,6 +34,15 @@ Shared = Callable[[str, Callable[[Path], object]], Path]
 
 Changed = Callable[..., Path]
 """Gives a copy of the results of a real run, changed by SQL."""
+
+
+def run_of(study: str, folder: Path) -> Path:
+    """The run of a study, given as the text of its file, in a folder: by one process, without figures."""
+    (folder / "study.toml").write_text(study)
+    options = ["--out", str(folder / "run"), "--jobs", "1", "--no-figures"]
+    done = CliRunner().invoke(app, ["run", str(folder / "study.toml"), *options])
+    assert done.exit_code == 0, done.output
+    return folder / "run"
 
 
 @contextlib.contextmanager

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -269,9 +270,13 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "check": check_plugin, "bench": bench_plugins, "new": new_plugin,
     "import": import_pack, "pack": pack_problem, "cones": reduce_cones, "help": help_on,
 }  # fmt: skip
+NEGATIVE = ("export-vtu",)
+"""Commands with a parameter of a problem as an argument, whose first component may be negative: -0.1 is no option."""
+
 for _name, _command in COMMANDS.items():
     # a command would take the default above of the option of its name, as that of --help, for its own
-    app.command(_name, epilog=examples(_name), context_settings={"default_map": {}})(interruptible(_command))
+    _settings = {"default_map": {}, "ignore_unknown_options": _name in NEGATIVE}
+    app.command(_name, epilog=examples(_name), context_settings=_settings)(interruptible(_command))
 
 
 def run_command_line() -> None:
@@ -282,6 +287,7 @@ def run_command_line() -> None:
     usage_error = typer.BadParameter.__mro__[2]  # click's ClickException, whichever copy of click typer brings
     try:
         _print_any_text()
+        warnings.showwarning = _warning
         _search_working_directory_last()
         with whole_words():
             code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
@@ -317,6 +323,14 @@ def _search_working_directory_last() -> None:
     if more and "" in (first, *more):
         here = os.path.realpath(os.curdir)
         sys.path[:] = [*(folder for folder in sys.path if folder != here), here]
+
+
+def _warning(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: Any, **__: Any) -> None:
+    """Show a warning for users as one line, without the line of code that it is from; others as Python does."""
+    if category is UserWarning:
+        warn(unbroken(str(message)))
+    else:
+        sys.stderr.write(warnings.formatwarning(message, category, filename, lineno))
 
 
 def _print_error(error: object, code: int) -> int:

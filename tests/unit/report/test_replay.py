@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import qpsolvers
-from running import Vibench
+from running import Vibench, run_of
 from typer.testing import CliRunner
 
 import vibench
@@ -43,12 +43,7 @@ primal = { offline-pga = [0.5] }
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("replayed")
-    (folder / "study.toml").write_text(STUDY)
-    options = ["--out", str(folder / "run"), "--jobs", "1", "--no-figures"]
-    done = CliRunner().invoke(app, ["run", str(folder / "study.toml"), *options])
-    assert done.exit_code == 0, done.output
-    return folder / "run"
+    return run_of(STUDY, tmp_path_factory.mktemp("replayed"))
 
 
 def key(run: Path, solver: str = "piqp") -> str:

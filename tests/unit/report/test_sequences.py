@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import qpsolvers
+from running import run_of
 from typer.testing import CliRunner
 
 from vibench import create, open_run
@@ -61,12 +62,7 @@ class Problem(qpsolvers.Problem):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("walked")
-    (folder / "study.toml").write_text(STUDY)
-    options = ["--out", str(folder / "run"), "--jobs", "1", "--no-figures"]
-    done = CliRunner().invoke(app, ["run", str(folder / "study.toml"), *options])
-    assert done.exit_code == 0, done.output
-    return folder / "run"
+    return run_of(STUDY, tmp_path_factory.mktemp("walked"))
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,51 @@
+"""The command that exports a solution for ParaView."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from running import Main, Vibench
+
+from vibench import open_run
+
+meshio = pytest.importorskip("meshio")
+
+
+def test_a_solution_of_a_run_is_exported(quick_run: Path, main: Main) -> None:
+    cell = str(pd.read_csv(quick_run / "tables" / "cells.csv")["cell"].iloc[0])
+    model = open_run(quick_run).model(cell)
+    mu = 0.5 * (model.parameters.lower + model.parameters.upper)
+    text = ",".join(map(repr, mu.tolist()))
+    code, out, err = main("export-vtu", str(quick_run), cell, text, "--out", "fields.vtu")
+    assert (code, err) == (0, "")
+    assert "fields.vtu" in out
+    written = meshio.read("fields.vtu")
+    expected = model.problem.mesh_fields(mu, model.solve(mu).u, model.solve(mu).lam)
+    for quantity, values in expected.at_points.items():
+        assert np.allclose(written.point_data[f"{quantity}, reduced"], values, rtol=1e-9, atol=1e-12, equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("mu", "said"),
+    [
+        ("-1e9,-.5", "mu is [-1000000000.0, -0.5], expected finite numbers (radius)"),
+        ("-x,0.1", "MU is '-x,0.1', expected numbers separated by commas"),
+    ],
+)
+def test_a_component_may_be_negative(mu: str, said: str, quick_run: Path, main: Main) -> None:
+    cell = str(pd.read_csv(quick_run / "tables" / "cells.csv")["cell"].iloc[0])
+    code, _, err = main("export-vtu", str(quick_run), cell, mu)
+    assert code == 2
+    assert said in err
+
+
+def test_a_parameter_outside_the_box_is_one_line(quick_run: Path, vibench: Vibench, tmp_path: Path) -> None:
+    cell = str(pd.read_csv(quick_run / "tables" / "cells.csv")["cell"].iloc[0])
+    upper = open_run(quick_run).model(cell).parameters.upper
+    done = vibench(tmp_path, "export-vtu", str(quick_run), cell, str(1.001 * upper[0]), "--out", "out.vtu")
+    assert done.returncode == 0, done.stderr
+    said = "vibench: radius: outside the parameter domain, where the model was not trained"
+    assert set(done.stderr.splitlines()) == {said}
