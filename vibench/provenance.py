@@ -88,17 +88,28 @@ def versions(solver: str | None) -> dict[str, str]:
     return found if solver is None else found | {solver: solver_version(solver)}
 
 
+CODE = ("*.py", "*.toml", "*.template")
+"""Files that determine what is computed and written."""
+
+
 @cache
 def commit(checkout: Path = Path(__file__).parents[1]) -> str:
-    """The commit of a checkout, "+" after it if its tracked files were changed since; "" elsewhere and without git."""
+    """The commit of a checkout, "+" after it if tracked code was changed since; "" elsewhere and without git.
+
+    Pages that a run wrote are no change: those written after them name the same commit.
+    """
     if not (checkout / ".git").exists():
         return ""
-    command = ["git", "-C", str(checkout), "describe", "--always", "--exclude=*", "--abbrev=10", "--dirty=+"]
+
+    def said(*arguments: str) -> str:
+        command = ["git", "-C", str(checkout), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
     try:
-        said = subprocess.run(command, capture_output=True, text=True, check=False)
-    except OSError:  # there is no git
+        changed = said("diff", "--name-only", "HEAD", "--", *CODE)
+        return said("rev-parse", "--short=10", "HEAD") + "+" * bool(changed)
+    except (OSError, subprocess.CalledProcessError):  # there is no git, or no repository
         return ""
-    return said.stdout.strip() if said.returncode == 0 else ""
 
 
 @cache

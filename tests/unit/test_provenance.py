@@ -173,9 +173,13 @@ def test_versions_name_the_commit_of_a_checkout_and_whether_it_was_changed(tmp_p
     assert provenance.commit(tmp_path) == ""
     git("init", "-q")
     (tmp_path / "a.py").write_text("a = 1\n")
-    git("add", "a.py")
+    (tmp_path / "page.md").write_text("1\n")
+    git("add", "a.py", "page.md")
     git("commit", "-q", "-m", "a")
     commit = git("rev-parse", "HEAD")[:10]
+    provenance.commit.cache_clear()
+    assert provenance.commit(tmp_path) == commit
+    (tmp_path / "page.md").write_text("2\n")
     provenance.commit.cache_clear()
     assert provenance.commit(tmp_path) == commit
     (tmp_path / "a.py").write_text("a = 2\n")
