@@ -1,6 +1,7 @@
 """Results of the study `formulations`: who is how accurate at which query time, and what is left with less training.
 
-vibench run formulations --no-figures && python results/scripts/by_formulation.py runs/formulations results/formulations
+vibench run formulations --no-figures && vibench run formulations-compiled --no-figures
+python results/scripts/by_formulation.py runs/formulations runs/formulations-compiled results/formulations
 
 Everything comes from the results file: all formulations are judged by the errors, the residuals and the bounds of the
 high-fidelity problem.
@@ -29,6 +30,8 @@ BOUNDED = {
 
 BUDGETS = (1.0, 2.0, 5.0, 10.0)
 """Multiples of the fastest query of a problem at which the smallest errors are compared."""
+
+STUDIES = "formulations", "formulations-compiled"
 
 KEY = ["problem", "formulation", "dual", "pod_tol"]
 
@@ -139,10 +142,27 @@ def figure(cells: pd.DataFrame) -> Figure:
     )
 
 
-def main(run: str, target: str) -> None:
-    cells, queries = read(run, "cells"), read(run, "queries")
+def compiled(cells: pd.DataFrame) -> pd.DataFrame:
+    """Errors and seconds of the exported C program beside those of the same model in Python."""
+    of = {assembly: mine.set_index(["problem", "pod_tol"]) for assembly, mine in cells.groupby("assembly")}
+    ours, exported = of["reduced"], of["compiled"].reindex(of["reduced"].index)
+    return pd.DataFrame(
+        {
+            **{name: ours[name] for name in ("N", "enrichment", "R")},
+            "error λ": ours["error_lambda_mean"],
+            "error λ, compiled": exported["error_lambda_mean"],
+            "query [ms]": 1e3 * ours["online_s"],
+            "query, compiled [ms]": 1e3 * exported["online_s"],
+            "query / compiled": ours["online_s"] / exported["online_s"],
+            "reason": exported["reason"].fillna(""),
+        }
+    ).reset_index()
+
+
+def main(run: str, run_compiled: str, target: str) -> None:
+    cells, queries, exported = read(run, "cells"), read(run, "queries"), read(run_compiled, "cells")
     own = cells[cells["training"] == "own"]
-    command = made_by("by_formulation", "formulations", "formulations", options=" --no-figures")
+    command = made_by("by_formulation", "formulations", *STUDIES, options=" --no-figures")
     page = Page(
         target,
         "Formulations",
@@ -151,13 +171,18 @@ def main(run: str, target: str) -> None:
         f"{len(cells)} cells, {len(answered(cells))} with every query ok, at {int(own['queries'].max())} parameters. "
         "All rows are judged by the errors, the residuals and the bounds of the high-fidelity problem. Errors are "
         "relative means.",
-        machine=origin(cells),
+        machine=origin(cells, exported),
     )
     page.section("Error of λ at equal query time", winners(own, "error_lambda_mean"))
     page.section("Error of u at equal query time", winners(own, "error_u_mean"))
     with styled():
         page.draw("formulations-time", figure(own))
     page.section("All cells", table(own))
+    page.section(
+        "Compiled",
+        "The cells of `mixed` with `mcpg` as programs in C, from a run of their own. No other formulation is exported.",
+        compiled(exported),
+    )
     page.section(
         "Half of the training set, and outside of it",
         "Factors of the mean errors against those with the own training set: with half as many solutions (`half`), and "
