@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hashlib import sha256
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -18,3 +19,8 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 SparseMatrix: TypeAlias = Any
 """A SciPy sparse array or matrix (SciPy ships no types)."""
+
+
+def digest(matrix: SparseMatrix) -> bytes:
+    """What two sparse matrices (CSR or CSC) of one format have in common exactly if their arrays are equal."""
+    return sha256(b"".join(array.tobytes() for array in (matrix.indptr, matrix.indices, matrix.data))).digest()

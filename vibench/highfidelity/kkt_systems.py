@@ -138,11 +138,14 @@ class CondensedStiffness:
         """Ŝ times retained unknowns (c,), where it is sparse."""
         return np.asarray(self._condensed.schur @ retained)
 
+    @property
+    def has_known_round_off(self) -> bool:
+        """Whether there is a `schur_with_round_off`: nothing is known of factors that are not SuperLU's."""
+        return self._factorisation == DEFAULT
+
     def schur_with_round_off(self, squares: Array) -> tuple[BlockDiagonal | SparseMatrix, float]:
         """A computed Ŝ, and its `StaticCondensation.round_off` against S² = diag(`squares`) (n,)."""
         condensed = self._condensed
-        if self._factorisation != DEFAULT:  # of whose factors nothing is known
-            condensed = StaticCondensation(self._A, self._pattern.ordered_by_default(self._A))
         return condensed.dense_blocks if condensed.dense else condensed.schur, condensed.round_off(squares)
 
     def liftings(self, B: SparseMatrix) -> Array:

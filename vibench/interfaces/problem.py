@@ -241,7 +241,8 @@ class Problem(ABC):
 
     def factorised_by(self, name: str) -> None:
         """Let an implementation of `vibench.linalg.factorisations` factorise A and eliminate unknowns of X_V."""
-        self.factorisation = self.V.factorisation = name
+        self.factorisation = name
+        self.V.factorised_by(name)
 
     @abstractmethod
     def training_set(self) -> Array:

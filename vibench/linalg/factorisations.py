@@ -62,6 +62,26 @@ class Elimination(ABC):
         """Solution (n,) or (n, k) of X u = 0 in the rows of i, with u (c,) or (c, k) given on the last unknowns."""
 
 
+class FactoredElimination(Elimination):
+    """An elimination with a factor F of X = FᵀF that is upper triangular in its order; the last unknowns end that."""
+
+    @property
+    @abstractmethod
+    def trailing_factor(self) -> Array:
+        """The trailing block F_cc (c×c) of F, upper triangular, with F_ccᵀF_cc = S.
+
+        Raises a `NumericalError` if S, and with it X, is not positive definite.
+        """
+
+    @abstractmethod
+    def apply_factor(self, u: Array) -> Array:
+        """F u, for u (n,) or (n, k): first the entries of i."""
+
+    @abstractmethod
+    def solve_factor_transposed(self, right: Array) -> Array:
+        """F⁻ᵀ r, for r (n,) or (n, k); of a functional on the last unknowns only the last entries are not zero."""
+
+
 class _Empty(Factor):
     """The factor of a matrix without unknowns."""
 
@@ -69,7 +89,7 @@ class _Empty(Factor):
         return np.zeros_like(right, dtype=float)
 
 
-Elimination.register(PartialCholesky)
+FactoredElimination.register(PartialCholesky)
 Factor.register(SparseCholesky)
 
 
@@ -84,9 +104,9 @@ class Implementation:
     summary
         What it is, in a line.
     module
-        Defines `factorise(matrix, name)`, and `schur(matrix, count, name)` if there is a better way to the Schur
-        complement (k×k) of all unknowns but the last ones than to solve with X_ii. Both raise a `NumericalError` that
-        calls the matrix by `name` if it is not positive definite.
+        Defines `factorise(matrix, name)`, and `eliminate(matrix, order, last, name)`, a `FactoredElimination`, if there
+        is a better one than by solutions with X_ii. Both raise a `NumericalError` that calls the matrix by `name` if it
+        is not positive definite.
     distribution
         The distribution it needs; "" if vibench needs that anyway.
     is_direct
@@ -117,7 +137,20 @@ class Implementation:
         """`matrix` (n×n) in an `order` (n,) with all unknowns but the last ones eliminated; raises as `factorise`."""
         if not self.module:
             return PartialCholesky(matrix, order, last, name)  # type: ignore[return-value]
+        if self._has_factor(len(order), last):
+            return self._own.eliminate(matrix, order, last, name)
         return EliminationBySolutions(self, matrix, order, last, name)
+
+    def eliminate_with_factor(self, matrix: SparseMatrix, last: Indices, name: str) -> FactoredElimination:
+        """`matrix` (n×n) with all unknowns but `last` (c,) eliminated; by the default where this one shows no factor.
+
+        Raises as `factorise`.
+        """
+        chosen = self if self._has_factor(matrix.shape[0], len(last)) else IMPLEMENTATIONS[DEFAULT]
+        return chosen.eliminate(matrix, chosen.order(matrix, last), len(last), name)  # type: ignore[return-value]
+
+    def _has_factor(self, n: int, last: int) -> bool:
+        return not self.module or (0 < last < n and hasattr(self._own, "eliminate"))
 
     def order(self, matrix: SparseMatrix, last: Indices) -> Indices:
         """An order (n,) for `eliminate` that ends with the unknowns `last` (c,); of others each has its own."""
@@ -134,7 +167,7 @@ class _Module:
     """What a module of an implementation has."""
 
     factorise: Callable[[SparseMatrix, str], Factor]
-    schur: Callable[[SparseMatrix, int, str], Array]
+    eliminate: Callable[[SparseMatrix, Indices, int, str], FactoredElimination]
 
 
 IMPLEMENTATIONS = {
@@ -201,15 +234,11 @@ class EliminationBySolutions(Elimination):
         for body in np.unique(bodies[split:]):
             inside = np.flatnonzero(bodies == body)
             unknowns = inside[inside >= split] - split
-            blocks.append((unknowns, self._schur(self._matrix[inside][:, inside], len(unknowns))))
+            blocks.append((unknowns, self._schur(sp.csc_array(self._matrix[inside][:, inside]), len(unknowns))))
         return BlockDiagonal(len(self._order) - split, tuple(blocks))
 
     def _schur(self, matrix: SparseMatrix, count: int) -> Array:
-        own = getattr(self._chosen._own, "schur", None)
         split = matrix.shape[0] - count
-        if own is not None and split:
-            return np.asarray(own(matrix, count, self._name))
-        matrix = sp.csc_array(matrix)
         schur = matrix[split:, split:].toarray(order="F")
         if split:
             factor, coupling = self._chosen.factorise(matrix[:split, :split], self._name), matrix[:split, split:]

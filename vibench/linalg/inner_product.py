@@ -14,7 +14,7 @@ import scipy.sparse as sp
 from vibench.arrays import Array, SparseMatrix
 from vibench.errors import NumericalError, RequestError
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.linalg.factorisations import DEFAULT
+from vibench.linalg.factorisations import DEFAULT, Factor, implementation
 from vibench.text import brief
 
 SYMMETRY_RTOL = 1e-12
@@ -39,6 +39,8 @@ class InnerProduct:
         X, sparse (n×n).
     name
         Its name in error messages.
+    factorisation
+        Who factorises X where no explicit F is asked for, see `factorised_by`.
 
     Raises
     ------
@@ -48,17 +50,14 @@ class InnerProduct:
         If X is no matrix of real numbers, or what a method is given is not of the space.
     """
 
-    factorisation: str = DEFAULT
-    """Who eliminates unknowns of X (`vibench.linalg.factorisations`); F, which is explicit, is SuperLU's."""
-
-    def __init__(self, matrix: SparseMatrix, name: str = "the Gram matrix") -> None:
+    def __init__(self, matrix: SparseMatrix, name: str = "the Gram matrix", factorisation: str = DEFAULT) -> None:
         is_matrix = (sp.issparse(matrix) or isinstance(matrix, np.ndarray)) and matrix.ndim == 2
         if not is_matrix or matrix.dtype.kind not in "fiub":
             raise RequestError(f"{name} is {brief(repr(matrix), 80)}, expected a matrix of real numbers")
         self.matrix = sp.csc_array(matrix)
-        self._name = name
+        self._name, self.factorisation = name, factorisation
         check_symmetric(self.matrix, name)
-        self._factor  # noqa: B018  refuses an indefinite matrix here and not at its first use
+        self._solver  # noqa: B018  refuses an indefinite matrix here and not at its first use
 
     def __getstate__(self) -> dict[str, object]:
         """Drop the factorisation: SuperLU objects cannot be pickled."""
@@ -69,9 +68,22 @@ class InnerProduct:
         """Dimension n of the space."""
         return int(self.matrix.shape[0])
 
+    def factorised_by(self, name: str) -> None:
+        """Let an implementation solve with X and eliminate unknowns of it (`vibench.linalg.factorisations`).
+
+        F, which is explicit, is SuperLU's, which solves, too, in place of one that is not direct.
+        """
+        self.factorisation = name
+        self.__dict__.pop("_solver", None)
+
     @cached_property
     def _factor(self) -> SparseCholesky:
         return SparseCholesky(self.matrix, self._name)
+
+    @cached_property
+    def _solver(self) -> Factor | SparseCholesky:
+        chosen = implementation(self.factorisation)
+        return chosen.factorise(self.matrix, self._name) if chosen.module and chosen.is_direct else self._factor
 
     def _refuse_others(self, u: Array) -> None:
         """Refuse what has not one row for each dimension of the space."""
@@ -98,7 +110,7 @@ class InnerProduct:
     def riesz(self, functional: Array) -> Array:
         """Riesz representer X⁻¹ ℓ of functionals given as (n,) or (n, k)."""
         self._refuse_others(functional)
-        return self._factor.solve(functional)
+        return self._solver.solve(functional)
 
     def whiten(self, u: Array) -> Array:
         """F u: coordinates in which the inner product is Euclidean; u (n,) or (n, k)."""

@@ -56,13 +56,6 @@ class EliminationPattern:
         order = implementation(factorisation).order(sp.csr_array(A)[inside][:, inside], last)
         return cls(retained, inside[order], interface)
 
-    def ordered_by_default(self, A: SparseMatrix) -> EliminationPattern:
-        """The pattern in the default's order of elimination, which is found for the first matrix A (n×n)."""
-        if "_default" not in self.__dict__:
-            self.__dict__["_default"] = EliminationPattern.of(A, self.retained)
-        pattern: EliminationPattern = self.__dict__["_default"]
-        return pattern
-
     @classmethod
     def of_none(cls, A: SparseMatrix, factorisation: str = DEFAULT) -> EliminationPattern:
         """The pattern that eliminates no unknown of matrices with the sparsity of A (n×n), and orders all."""

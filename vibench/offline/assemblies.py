@@ -8,7 +8,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from cachetools import LRUCache
 
-from vibench.arrays import Array
+from vibench.arrays import Array, digest
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
@@ -37,7 +37,7 @@ class Assemblies:
         self._solver = HighFidelitySolver(problem, condensing=True)
         self._contact: ContactInfSup | None = None
         self._alphas: LRUCache[bytes, Constant] = LRUCache(MANY)
-        self._gamma: Constant | None = None
+        self._gammas: LRUCache[bytes, Constant] = LRUCache(MANY)
 
     def at(self, mu: Array) -> VariationalInequality:
         """A copy of `checked_assembly` at mu (d,), which later assemblies leave as it is."""
@@ -63,8 +63,8 @@ class Assemblies:
         return Energy(vi.A, self._solver.condensed(vi))
 
     def coercivity_at(self, mu: Array) -> Constant:
-        """Lower bound of α at mu (d,), with the factorisation of `energy_at`; that of a constant A is computed once."""
-        key = b"" if "A" in self._problem.constant else _key(mu)
+        """Lower bound of α at mu (d,), with the factorisation of `energy_at`; computed once for all mu with one A."""
+        key = self._stiffness_at(mu)
         if key not in self._alphas:
             stiffness = self.energy_at(mu).stiffness
             self._alphas[key] = coercivity(self.at(mu).A, self._problem.V, stiffness.solve, stiffness.order)
@@ -72,9 +72,14 @@ class Assemblies:
 
     def continuity_at(self, mu: Array) -> Constant:
         """Upper bound of γ_a, likewise."""
-        if self._gamma is None or "A" not in self._problem.constant:
-            self._gamma = continuity(self.at(mu).A, self._problem.V)
-        return self._gamma
+        key = self._stiffness_at(mu)
+        if key not in self._gammas:
+            self._gammas[key] = continuity(self.at(mu).A, self._problem.V)
+        return self._gammas[key]
+
+    def _stiffness_at(self, mu: Array) -> bytes:
+        """What all parameters with the A of mu (d,) have in common: A often depends on a few of them alone."""
+        return b"" if "A" in self._problem.constant else digest(self.at(mu).A)
 
     def energy_inf_sup_at(self, mu: Array) -> Constant:
         """Lower bound of β_A at mu (d,): by dense matrices of contact size where these are few, else by sparse ones."""
@@ -82,8 +87,10 @@ class Assemblies:
         on, stiffness = energy.on_contact(vi), energy.stiffness
         if not on.is_dense:
             return energy_inf_sup(vi.A, vi.B, W)
+        squares = vi.A.diagonal()
+        if not stiffness.has_known_round_off:
+            return ContactInfSup(vi.A, squares, 0.0, stiffness.extend).energy_inf_sup(vi.B, on.liftings, W)
         if self._contact is None or "A" not in self._problem.constant:
-            squares = vi.A.diagonal()
             schur, round_off = stiffness.schur_with_round_off(squares)
             lost = round_off / share if (share := self._share_at(mu)) > 0.0 else np.inf
             self._contact = ContactInfSup(schur, squares[stiffness.retained], lost)

@@ -85,9 +85,9 @@ def coercivity_and_continuity(
 def coercivity(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None, order: Indices | None = None) -> Constant:
     """Lower bound of α for A (n×n).
 
-    `solve` solves with a factorisation of A that exists; by default A is factorised. `order` (n,) is one for the
-    elimination of its unknowns; by default of minimum degree. Raises a `NumericalError` if A is not symmetric positive
-    definite.
+    `solve` solves with a factorisation of A that exists; by default A is factorised as X_V is. `order` (n,) is one for
+    the elimination of its unknowns; by default of minimum degree. Raises a `NumericalError` if A is not symmetric
+    positive definite.
     """
     lowest = lowest_quotient(A, V, solve)  # refuses a matrix that is not positive definite
     chosen = implementation(V.factorisation)
@@ -127,11 +127,10 @@ def operator_norm(M: SparseMatrix, X: InnerProduct) -> Constant:
     else:
         inverse, options = _operator(X.dim, X.riesz), _lanczos(X.dim, ROUGH)
         estimate = float(np.abs(eigsh(M, M=X.matrix, Minv=inverse, which="LM", **options)[0]))
-    root = np.sqrt(estimate * X.matrix.diagonal())
+    chosen = implementation(X.factorisation)
 
     def above(c: float) -> bool:
-        scaled = np.sqrt(c / estimate) * root
-        return all(proved_positive([c * X.matrix, sign * M], scaled) == X.dim for sign in (-1.0, 1.0))
+        return all(is_proved_definite([c * X.matrix, sign * M], chosen) for sign in (-1.0, 1.0))
 
     return moved(estimate, 1.0, above)
 
@@ -152,7 +151,7 @@ def lowest_quotient(
 
     Raises a `NumericalError` if A is not symmetric positive definite and no `solve` is given.
     """
-    solve = solve or SparseCholesky(A, "A").solve
+    solve = solve or InnerProduct(A, "A", V.factorisation).riesz
     if V.dim <= FEW:
         return float(scipy.linalg.eigvalsh(A.toarray(), V.matrix.toarray())[0])
     return _smallest(A, V.matrix, solve, tolerance)

@@ -1,4 +1,6 @@
-"""β_A at contact size: proved from the Schur complement that a factorisation of A has, for all constraints with one A.
+"""β_A for all constraints with one A: proved by liftings of the constraints and products with one matrix.
+
+Where the round-off of a factorisation of A is known this is at contact size, by the Schur complement that it has.
 
 With c the unknowns that B touches, and S² = diag(A), a factorisation of A has computed factors, and with them the Schur
 complement Ŝ on c, which are the exact ones of a P with −δS² ≼ A − P ≼ δS² (`PartialCholesky.round_off`). Where
@@ -14,9 +16,13 @@ may be rough, since δ is round-off. For any matrix D (c×m), such as a computed
 where DᵀR is round-off: its entries are at most |S d_i||S⁻¹r_j|. So K − b²/(1 − δ/σ) X_W ≽ 0 proves b ≤ β_A, with the
 symmetric part K of the computed BD, by a Cholesky factorisation of it that succeeds after a shift by all that was left
 out (Rump 2006). Products of matrices have bounded round-off (Higham 2002, §3.5), and there is none with an inverse.
+
+The same with A in place of Ŝ, all unknowns in place of c and δ = 0 takes nothing for granted of who computed D.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 import scipy.sparse as sp
@@ -26,6 +32,9 @@ from vibench.linalg.cholesky import UNIT
 from vibench.linalg.definite import BlockDiagonal
 from vibench.linalg.inner_product import InnerProduct
 from vibench.stability.coercivity import Constant, moved, smallest_quotient
+
+COLUMNS = 128
+"""Columns of D at once: of all unknowns it may not fit in memory."""
 
 MOST_LOST = 0.5
 """Largest δ/σ: beyond, the factorisation of A is too inaccurate to say anything."""
@@ -37,15 +46,23 @@ class ContactInfSup:
     Parameters
     ----------
     schur
-        Ŝ (c×c), computed.
+        Ŝ (c×c), computed; or A, for constraints on all unknowns, c = n.
     squares
-        The diagonal of A on the retained unknowns (c,).
+        The diagonal of A on these unknowns (c,).
     lost
-        δ/σ.
+        δ/σ; 0 for A.
+    extend
+        From liftings (·, k) on the unknowns that constraints involve to columns (c, k) of D; for A these are more.
     """
 
-    def __init__(self, schur: BlockDiagonal | SparseMatrix, squares: Array, lost: float) -> None:
-        self._schur, self._scale, self._lost = schur, np.sqrt(squares), lost
+    def __init__(
+        self,
+        schur: BlockDiagonal | SparseMatrix,
+        squares: Array,
+        lost: float,
+        extend: Callable[[Array], Array] = np.asarray,
+    ) -> None:
+        self._schur, self._scale, self._lost, self._extend = schur, np.sqrt(squares), lost, extend
         # the largest row sum of S⁻¹|Ŝ|S⁻¹, which bounds its norm, and the terms of an inner product with Ŝ
         parts = schur.blocks if isinstance(schur, BlockDiagonal) else ((np.arange(len(squares)), schur),)
         sums = [np.max((abs(part) @ (1.0 / self._scale[c])) / self._scale[c], initial=0.0) for c, part in parts]
@@ -53,19 +70,19 @@ class ContactInfSup:
         self._terms = max((int(np.max(np.sum(part != 0.0, axis=0), initial=0)) for _, part in parts), default=0)
 
     def energy_inf_sup(self, B: SparseMatrix, liftings: Array, W: InnerProduct) -> Constant:
-        """Lower bound of β_A for B (m×c) on the retained unknowns, from Dᵀ (m×c); 0 where no other is proved."""
+        """Lower bound of β_A for B (m×c), from liftings (m×·) that `extend` makes Dᵀ; 0 where no other is proved."""
         if not B.shape[0]:
             return Constant(float("inf"), True)
         if not self._lost <= MOST_LOST:
             return Constant(0.0, True)
-        compliance = np.asarray(B @ liftings.T)
+        compliance, lifted, residuals = self._products(sp.csr_array(B), liftings)
         compliance = 0.5 * (compliance + compliance.T)
         square = smallest_quotient(compliance, W)
         if square <= 0.0:
             return Constant(0.0, True)
         sizes = np.sqrt(np.diag(compliance))
         scaled, mass = compliance / sizes / sizes[:, None], _scaled(W.matrix, sizes)
-        lost, of_mass = self._left_out(B, liftings, sizes), float(np.max(abs(mass).sum(axis=0), initial=0.0))
+        lost, of_mass = self._left_out(B, lifted, residuals, sizes), float(np.max(abs(mass).sum(axis=0), initial=0.0))
 
         def stable(beta: float) -> bool:
             weight = beta**2 / (1.0 - 1.01 * self._lost)
@@ -74,12 +91,21 @@ class ContactInfSup:
         found = moved(float(np.sqrt(square)), -1.0, stable)
         return found if found.proved else Constant(0.0, True)
 
-    def _left_out(self, B: SparseMatrix, liftings: Array, sizes: Array) -> float:
+    def _products(self, B: SparseMatrix, liftings: Array) -> tuple[Array, Array, Array]:
+        """K (m×m), and the norms (m,) of the columns of S D and of S⁻¹R."""
+        m, scale = B.shape[0], self._scale[:, None]
+        compliance, lifted, residuals = np.empty((m, m)), np.empty(m), np.empty(m)
+        for columns in (slice(first, first + COLUMNS) for first in range(0, m, COLUMNS)):
+            D = self._extend(liftings[columns].T)
+            compliance[:, columns], lifted[columns] = B @ D, np.linalg.norm(scale * D, axis=0)
+            left = np.asarray(B[columns].T.toarray() - self._schur @ D)
+            residuals[columns] = np.linalg.norm(left / scale, axis=0)
+        return compliance, lifted, residuals
+
+    def _left_out(self, B: SparseMatrix, lifted: Array, residuals: Array, sizes: Array) -> float:
         """A bound of the norm of DᵀR and of the round-off in K, both in units of t (m,), the roots of diag(K)."""
-        left = np.asarray(sp.csr_array(B).T.toarray() - self._schur @ liftings.T)
-        lifted, entries = np.linalg.norm(self._scale * liftings, axis=1), int(np.max(np.diff(sp.csr_array(B).indptr)))
+        entries = int(np.max(np.diff(sp.csr_array(B).indptr)))
         forces = sp.linalg.norm(sp.csr_array(B / self._scale), axis=1)
-        residuals = np.linalg.norm(left / self._scale[:, None], axis=0)
         residuals = residuals + _gamma(self._terms + 4) * (forces + self._norm * lifted)
         # |x_i y_j| and its transpose, by whose mean each entry is bounded, have at most the norm |x||y|
         of_products = np.linalg.norm(lifted / sizes) * np.linalg.norm(

@@ -62,6 +62,27 @@ def test_solutions_and_schur_complements_are_the_dense_ones(
 
 
 @EVERY
+@pytest.mark.parametrize("sizes", [(15,), (9, 12)], ids=["one body", "two bodies"])
+def test_a_factor_with_some_unknowns_last_makes_inner_products_euclidean(
+    chosen: Implementation, sizes: tuple[int, ...]
+) -> None:
+    A, rng = membranes(sizes), np.random.default_rng(1)
+    n, dense = A.shape[0], A.toarray()
+    last = np.concatenate([np.arange(5), np.arange(n - 4, n)])
+    both = [chosen.eliminate_with_factor(A, last, "A") for _ in range(2)]  # two at once, in one process
+    u, right = rng.standard_normal((n, 3)), rng.standard_normal((n, 2))
+    for factored in both:
+        F, whitened = factored.apply_factor(u), factored.solve_factor_transposed(right)
+        np.testing.assert_allclose(F.T @ F, u.T @ dense @ u, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(whitened.T @ whitened, right.T @ np.linalg.solve(dense, right), rtol=1e-12)
+        np.testing.assert_allclose(F.T @ whitened, u.T @ right, rtol=1e-12, atol=1e-12)
+        on_last = factored.solve_factor_transposed(np.eye(n)[:, last])
+        assert not on_last[:-9].any()
+        expected = np.linalg.solve(factored.trailing_factor.T, np.eye(9))
+        np.testing.assert_allclose(on_last[-9:], expected, atol=1e-13)
+
+
+@EVERY
 @pytest.mark.parametrize("count", [0, 1, 4], ids=["empty contact", "one unknown left", "nothing eliminated"])
 def test_tiny_matrices_and_empty_contact(chosen: Implementation, count: int) -> None:
     A = sp.csc_array(np.diag([2.0, 3.0, 4.0, 5.0]) - 0.5 * np.eye(4, k=1) - 0.5 * np.eye(4, k=-1))

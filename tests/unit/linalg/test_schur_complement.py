@@ -105,13 +105,3 @@ def test_a_constraint_outside_the_declared_contact_is_refused() -> None:
     problem = Declaring(n=60)
     with pytest.raises(NumericalError, match="B touches 1 unknowns outside the declared contact_dofs, the first is 13"):
         HighFidelitySolver(problem).solve(problem.training_set()[0])
-
-
-def test_a_pattern_of_others_is_ordered_once_for_the_default() -> None:
-    """PARDISO orders by itself: eliminated in the order that it gets, by SuperLU, a block in space fills in."""
-    A, retained = sp.csr_array(sp.diags_array([-1.0, 4.0, -1.0], offsets=[-5, 0, 5], shape=(25, 25))), np.arange(20, 25)
-    natural = EliminationPattern.of(A, retained, "pardiso")
-    assert np.array_equal(natural.order[:20], np.arange(20))
-    ordered = natural.ordered_by_default(A)
-    assert np.array_equal(ordered.order, EliminationPattern.of(A, retained).order)
-    assert natural.ordered_by_default(A) is ordered

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from numerics import Varying
 
+from vibench.arrays import Array
+from vibench.interfaces.problem import VariationalInequality
+from vibench.linalg.factorisations import IMPLEMENTATIONS
 from vibench.offline.assemblies import Assemblies
+from vibench.stability import coercivity
 
 
 def test_assemblies_are_kept_up_to_a_limit_and_those_of_longest_ago_go_first() -> None:
@@ -22,3 +29,38 @@ def test_assemblies_are_kept_up_to_a_limit_and_those_of_longest_ago_go_first() -
     kept.at(three)  # for which the second has to go
     assert kept.at(one) is first
     assert kept.at(two) is not second
+
+
+def test_parameters_with_the_same_stiffness_share_its_constants_of_v(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A of this problem does not depend on the angle, which it does not declare; of the other one it does."""
+
+    class SameStiffness(Varying):
+        def assemble(self, mu: Array) -> VariationalInequality:
+            return replace(super().assemble(mu), A=self._laplacian)
+
+    counted: list[str] = []
+    for name in ("coercivity", "continuity"):
+        original = getattr(coercivity, name)
+        monkeypatch.setattr(
+            f"vibench.offline.assemblies.{name}",
+            lambda *given, name=name, original=original: (counted.append(name), original(*given))[1],
+        )
+    mus = np.array([[0.2], [0.5], [0.2]])
+    for problem, expected in ((SameStiffness(), 2), (Varying(), 4)):
+        kept = Assemblies(problem)
+        found = [(kept.coercivity_at(mu), kept.continuity_at(mu)) for mu in mus]
+        assert len(counted) == expected
+        for mu, pair in zip(mus, found, strict=True):
+            assert pair == coercivity.coercivity_and_continuity(problem.assemble(mu).A, problem.V)
+        counted.clear()
+
+
+@pytest.mark.parametrize("name", [name for name, one in IMPLEMENTATIONS.items() if one.is_installed])
+def test_constants_are_those_of_the_default_whoever_factorises(name: str) -> None:
+    plain, other, mu = Varying(), Varying(), np.array([0.4])
+    other.factorised_by(name)
+    for constant in ("coercivity_at", "continuity_at", "energy_inf_sup_at"):
+        expected, found = (getattr(Assemblies(problem), constant)(mu) for problem in (plain, other))
+        assert expected.proved
+        assert found.proved
+        assert found.value == pytest.approx(expected.value, rel=1e-6)

@@ -132,7 +132,8 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
     A, f, dofs = members["A"], members["f"], contact_unknowns(problem)
     constant = is_exact(problem, "A", A) and A.way is Evaluation.CONSTANT
     box = problem.parameters
-    X = InnerProduct(A.terms[0] if constant else checked_assembly(problem, 0.5 * (box.lower + box.upper)).A, "A")
+    at_centre = A.terms[0] if constant else checked_assembly(problem, 0.5 * (box.lower + box.upper)).A
+    X = InnerProduct(at_centre, "A", problem.factorisation)
     load, stiffness = _interpolation_errors(problem, X, A, f)
     terms, rotation, spectral = list(A.terms), None, None
     if not constant:
@@ -140,7 +141,8 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
         samples = np.column_stack([evaluate(mu).get("A", ONE) for mu in training])
         rotation, terms = T, _ = rotated(A.terms, samples)
         spectral = spectral_bounds(problem, X, terms, lambda mu: T @ evaluate(mu).get("A", ONE), stiffness)
-    condensed = StaticCondensation(X.matrix, EliminationPattern.of(X.matrix, dofs))
+    pattern = EliminationPattern.of(X.matrix, dofs, X.factorisation)
+    condensed = StaticCondensation(X.matrix, pattern, X.factorisation)
     C = dense_inverse(condensed.dense_schur, "A")  # Eᵀ X⁻¹ E is the inverse of a Schur complement
     constraint, bound, inf_sup = _constant_constraint(problem, members, X, C, training)
     exact = all(is_exact(problem, name, members[name]) for name in "Af")

@@ -14,7 +14,7 @@ from vibench.arrays import Array, Indices, Mask
 from vibench.errors import UnsupportedError
 from vibench.highfidelity.active_set import FALLBACK_SOLVER
 from vibench.interfaces.problem import Problem
-from vibench.linalg.cholesky import PartialCholesky, elimination_order
+from vibench.linalg.factorisations import implementation
 from vibench.model.affine import AffineMember
 from vibench.model.certificates.base import CertificateBase, contact_at, contact_unknowns, is_exact
 from vibench.model.certificates.bounds import OnlineCertificate, residual_coefficients
@@ -42,7 +42,7 @@ def prepare(
     """
     problem, Phi, chi, B = model.problem, model.basis, model.generators, members["B"]
     X, dofs, scaled = base.X.matrix, contact_unknowns(problem), base.bound_terms is not None
-    factor = PartialCholesky(X, elimination_order(X, dofs), len(dofs), "A")
+    factor = implementation(base.X.factorisation).eliminate_with_factor(X, dofs, "A")
     forces = None if is_exact(problem, "B", B) else np.asarray(base.constraint.T @ chi)
 
     def known(functionals: Array) -> Known:

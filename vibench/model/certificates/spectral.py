@@ -20,12 +20,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from hashlib import sha256
 
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, SparseMatrix
+from vibench.arrays import Array, SparseMatrix, digest
 from vibench.interfaces.problem import ParameterBox, Problem
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct
@@ -114,7 +113,7 @@ def spectral_bounds(
     constants = []
     for mu in points:
         A = checked_assembly(problem, mu).A
-        key = sha256(b"".join(array.tobytes() for array in (A.indptr, A.indices, A.data))).digest()
+        key = digest(A)
         if key not in found:
             found[key] = coercivity_and_continuity(A, X)
         constants.append(found[key])
