@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import vibench
+from vibench_problems.elliptic_contact import elliptic_contact
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PYTHON = "/usr/bin/python3"
@@ -63,7 +64,13 @@ def run(example: Path, monkeypatch: pytest.MonkeyPatch) -> vibench.Run:
     return vibench.run(vibench.read_study("study.toml"), progress=False, jobs=1)
 
 
-@pytest.mark.parametrize("script", ["freefem/obstacle.edp", "freefem/signorini.edp", "getfem/hertz.py"])
+@pytest.mark.parametrize(
+    "script",
+    [
+        "freefem/obstacle.edp", "freefem/signorini.edp", "freefem/block.edp", "getfem/hertz.py",
+        "getfem/paraboloid.py",
+    ],
+)  # fmt: skip
 def test_a_script_has_sixty_lines_at_most(script: str) -> None:
     assert len((EXAMPLES / script).read_text(encoding="utf-8").splitlines()) <= 60
 
@@ -118,6 +125,40 @@ def test_the_signorini_problem_of_freefem_has_a_certified_model(freefem: Path) -
             error = np.sqrt((exact.u - found.u) @ (A @ (exact.u - found.u)))
             assert 1e-6 * np.sqrt(exact.u @ (A @ exact.u)) < error <= found.bound.u_energy
     assert in_contact >= 6
+
+
+def test_a_block_in_space_of_freefem_has_the_pressure_of_uniform_compression(freefem: Path) -> None:
+    """On a flat foundation that is E times depth over height, whatever Poisson's ratio; a curved one leaves the block.
+
+    Its models are certified, as all members are declared.
+    """
+    subprocess.run(
+        ["FreeFem++", "-nw", "block.edp", "block", "3"], cwd=freefem, check=True, capture_output=True, timeout=300
+    )
+    pack = vibench.create("problem", "pack", {"path": str(freefem / "block")})
+    solver = vibench.HighFidelitySolver(pack)
+    for poisson in (0.2, 0.4):
+        np.testing.assert_allclose(solver.solve(np.array([poisson, 0.015, 0.0, 0.0])).lam, 0.015, rtol=1e-10)
+    curved = solver.solve(np.array([0.3, 0.015, 0.05, 0.02]))
+    assert 0 < np.count_nonzero(curved.lam) < len(curved.lam)
+    dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
+    given = vibench.Stop(1e-2), vibench.Stop(1e-2)
+    model = vibench.Reduction(pack, dual, primal, *given, tolerance=0.5, assembly="certified").model
+    for mu in pack.parameters.sample(4, 7):
+        exact, A, found = solver.solve(mu), pack.assemble(mu).A, model.solve(mu)
+        assert found.bound is not None
+        assert found.bound.guarantee == "certified"
+        assert np.sqrt((exact.u - found.u) @ (A @ (exact.u - found.u))) <= found.bound.u_energy
+
+
+def test_a_half_space_of_getfem_agrees_with_hertz(getfem: Path) -> None:
+    """The force of an elliptic contact, up to what four cells along the zone and far faces that do not move cost."""
+    subprocess.run([PYTHON, "paraboloid.py", "paraboloid", "4"], cwd=getfem, check=True, timeout=300)
+    pack = vibench.create("problem", "pack", {"path": str(getfem / "paraboloid")})
+    solver = vibench.HighFidelitySolver(pack)
+    for mu in np.array([[1.0, 1.0, 0.00125, 0.3], [1.3, 0.8, 0.0014, 0.25]]):
+        force = 4.0 * pack.multiplier_integrals() @ solver.solve(mu).lam
+        assert force == pytest.approx(elliptic_contact(*mu[:3], 1.0 / (1.0 - mu[3] ** 2)).force, rel=0.07)
 
 
 def test_the_model_of_getfem_agrees_with_hertz(getfem: Path) -> None:
