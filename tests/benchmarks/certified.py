@@ -41,7 +41,7 @@ from vibench.offline.assemblies import Assemblies
 from vibench.offline.correction import Answer, Corrector
 from vibench.offline.models import Model
 from vibench.qp.solve import solve_qp
-from vibench.stages.query import VIOLATION
+from vibench.stages.judging.pairs import VIOLATION
 from vibench.study.plugin import Plugin
 
 SEED = 2027

@@ -160,8 +160,8 @@ class CondensedStiffness:
         return load, self.compliance(load), rest
 
     def extend(self, retained: Array) -> Array:
-        """The vector (n,) with these retained unknowns (c,) and no forces on the others."""
-        return self._condensed.recover(retained, np.zeros(0))
+        """The vectors (n,) or (n, k) with these retained unknowns (c,) or (c, k) and no forces on the others."""
+        return self._condensed.recover(retained, np.zeros((0, *retained.shape[1:])))
 
     def _unconstrained(self, load: Array) -> Array:
         """Ŝ⁻¹ f̂ (c,) of a condensed load, which is remembered until another one comes."""
