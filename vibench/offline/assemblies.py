@@ -20,8 +20,8 @@ LIMIT = 2**28
 """Size limit of the assemblies in bytes; the least recently used one is dropped first."""
 
 FACTORS = 3 * 2**28
-"""The same of factors of A and of compliances. Cells use the same parameters in the same order: too small a cache is
-none."""
+"""The same of factors of A and of compliances; those of the last parameter are kept whatever their size. Cells use the
+same parameters in the same order: too small a cache is none."""
 
 MANY = 1000
 """Constants of so many parameters are kept."""
@@ -34,6 +34,7 @@ class Assemblies:
         self._problem = problem
         self._kept: LRUCache[bytes, VariationalInequality] = LRUCache(limit, getsizeof=_bytes)
         self._energies: LRUCache[bytes, Energy] = LRUCache(FACTORS, getsizeof=self._own_bytes)
+        self._last: tuple[bytes, Energy] | None = None
         self._solver = HighFidelitySolver(problem, condensing=True)
         self._contact: ContactInfSup | None = None
         self._alphas: LRUCache[bytes, Constant] = LRUCache(MANY)
@@ -50,12 +51,16 @@ class Assemblies:
 
     def energy_at(self, mu: Array) -> Energy:
         """Factorisations of A at mu (d,) and what errors and bounds at mu share; a constant A is factorised once."""
-        vi, found = self.at(mu), self._energies.get(_key(mu))
+        vi, key = self.at(mu), _key(mu)
+        if self._last is not None and self._last[0] == key:
+            return self._last[1]
+        found, self._last = self._energies.get(key), None  # two large ones might not fit in memory
         if found is None:
             found = replace(self.energy_of(vi), shared=True)
             found.on_contact(vi)  # is of its size
             if self._own_bytes(found) <= self._energies.maxsize:
-                self._energies[_key(mu)] = found
+                self._energies[key] = found
+        self._last = key, found
         return found
 
     def energy_of(self, vi: VariationalInequality) -> Energy:

@@ -11,6 +11,7 @@ from numerics import Varying
 from vibench.arrays import Array
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.factorisations import IMPLEMENTATIONS
+from vibench.offline import assemblies
 from vibench.offline.assemblies import Assemblies
 from vibench.stability import coercivity
 
@@ -65,3 +66,14 @@ def test_constants_are_those_of_the_default_whoever_factorises(name: str) -> Non
         assert expected.proved
         assert found.proved
         assert found.value == pytest.approx(expected.value, rel=1e-6)
+
+
+def test_factors_too_large_to_be_kept_are_those_of_the_last_parameter_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise α, β_A and the bounds at one parameter would each factorise A."""
+    monkeypatch.setattr(assemblies, "FACTORS", 1)
+    kept, one, two = Assemblies(Varying()), np.array([0.2]), np.array([0.5])
+    first = kept.energy_at(one)
+    assert kept.energy_at(one) is first
+    assert kept.energy_at(one).on_contact(kept.at(one)) is first.on_contact(kept.at(one))
+    assert (kept.energy_at(two).A != first.A).nnz
+    assert kept.energy_at(one) is not first
