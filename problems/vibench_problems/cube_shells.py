@@ -41,10 +41,8 @@ class GradedBlock:
         facets = self.mesh.boundary_facets()
         corners = self.mesh.p[:, self.mesh.facets[:, facets]]
         inside = (corners[2] == 0.0).all(axis=0) & (corners[:2] <= extent).all(axis=(0, 1))
-        nodes, places = np.unique(self.mesh.facets[:, facets[inside]], return_inverse=True)
-        quads, middles = places.reshape(4, -1), corners[:2, :, inside].mean(axis=1)
-        x, y = corners[:2, :, inside] - middles[:, None]
-        around = np.take_along_axis(quads, np.argsort(np.arctan2(y, x), axis=0), axis=0)
+        nodes, places = np.unique(quads(self.mesh, facets[inside]).T, return_inverse=True)
+        around = places.reshape(4, -1)
         return nodes.astype(np.intp), np.hstack([around[[0, 1, 2]], around[[0, 2, 3]]]).astype(np.intp)
 
 
@@ -88,3 +86,20 @@ def graded_block(cells: int, layers: int, width: float, length: float) -> Graded
 def _quads(side: Array) -> Array:
     """Nodes (4×k²) of the squares of a side with the nodes (k + 1)×(k + 1)."""
     return np.vstack([side[:-1, :-1].ravel(), side[:-1, 1:].ravel(), side[1:, :-1].ravel(), side[1:, 1:].ravel()])
+
+
+def hexahedra(mesh: MeshHex) -> Indices:
+    """Nodes (k×8) of the hexahedra in the order of VTK, their volumes positive."""
+    reference = mesh.elem.refdom.p.T.astype(int) @ np.array([4, 2, 1])  # the corner x, y, z is 4x + 2y + z
+    corners = mesh.t[np.argsort(reference)[[0, 4, 6, 2, 1, 5, 7, 3]]]
+    first = mesh.p[:, corners[0]]
+    edges = np.stack([mesh.p[:, corners[k]] - first for k in (1, 3, 4)])
+    inverted = np.linalg.det(edges.transpose(2, 0, 1)) < 0.0
+    return np.asarray(np.where(inverted[:, None], corners[[4, 5, 6, 7, 0, 1, 2, 3]].T, corners.T))
+
+
+def quads(mesh: MeshHex, facets: Indices) -> Indices:
+    """Nodes (k×4) of facets in their order around them, seen from above."""
+    corners = mesh.facets[:, facets]
+    x, y = mesh.p[:2, corners] - mesh.p[:2, corners].mean(axis=1)[:, None]
+    return np.asarray(np.take_along_axis(corners, np.argsort(np.arctan2(y, x), axis=0), axis=0).T)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import scipy.sparse as sp
-from skfem import Basis, BilinearForm
+from skfem import Basis, BilinearForm, ElementHex1, MeshHex
 from skfem.element import ElementH1
 from skfem.refdom import RefHex
 
-from vibench import SparseMatrix
+from vibench import Indices, SparseMatrix
 
 AXES = range(3)
+
+ORDER = 5
+"""Order of the quadrature next to the contact zone, where integrands with bubbles are polynomials of that degree."""
 
 Gradients = Sequence[Sequence[SparseMatrix]]
 """∫ ∂_a u ∂_b v of scalar functions, for a and then b."""
@@ -59,3 +62,30 @@ def gradients(products: Gradients, i: int, j: int) -> SparseMatrix:
     """∫ ∇u : ∇v."""
     both = products[0][0] + products[1][1] + products[2][2]
     return both if i == j else sp.csr_array(both.shape)
+
+
+def interior(mesh: MeshHex, below: Indices, restriction: SparseMatrix) -> list[SparseMatrix]:
+    """The forms of Lamé's constants, ∫ tr ε(u) tr ε(v) and 2 ∫ ε(u) : ε(v), and ∫ ∇u : ∇v of a body of hexahedra.
+
+    Parameters
+    ----------
+    mesh
+        Its hexahedra.
+    below
+        Those with a bubble of the vertical displacement (k,).
+    restriction
+        Values in components x, y, z of nodes and in bubbles, of the unknowns ((3·nodes + k)×n).
+    """
+    nodal = products_of_gradients(Basis(mesh, ElementHex1()))
+    bubbles = Basis(mesh, ElementSurfaceBubble(), elements=below, intorder=ORDER)
+    beside = Basis(mesh, ElementHex1(), elements=below, intorder=ORDER)
+    mixed = [[each[:, below] for each in row] for row in products_of_gradients(bubbles, beside)]
+    own = [[each[below][:, below] for each in row] for row in products_of_gradients(bubbles)]
+
+    def whole(form: Callable[[Gradients, int, int], SparseMatrix]) -> SparseMatrix:
+        upper = [[*(form(nodal, i, j) for i in AXES), form(mixed, 2, j)] for j in AXES]
+        last = [*(row[-1].T for row in upper), form(own, 2, 2)]
+        T = restriction
+        return sp.csr_array(T.T @ sp.csr_array(sp.block_array([*upper, last])) @ T)
+
+    return [whole(form) for form in (dilatation, shearing, gradients)]

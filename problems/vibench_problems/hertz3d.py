@@ -1,28 +1,22 @@
-"""An elastic half-space pressed by a rigid elliptic paraboloid: Hertz contact in three dimensions."""
+"""Hertz contact in three dimensions: an elastic half-space pressed by a rigid elliptic paraboloid, or two spheres."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import scipy.sparse as sp
 from annotated_types import Ge, Gt, Le
-from skfem import Basis, BilinearForm, ElementHex0, ElementHex1, FacetBasis
+from skfem import BilinearForm, ElementHex0, ElementHex1, FacetBasis
 
-from vibench import AffineProblem, Array, InnerProduct, MeshFields, Output, ParameterBox, Picture, SparseMatrix
-from vibench_problems.cube_shells import graded_block
-from vibench_problems.elastic_forms import (
-    AXES,
-    ElementSurfaceBubble,
-    Gradients,
-    dilatation,
-    gradients,
-    products_of_gradients,
-    shearing,
-)
+from vibench import AffineProblem, Array, InnerProduct, MeshFields, ParameterBox, Picture, RequestError, SparseMatrix
+from vibench_problems.contact_zone import ContactZone
+from vibench_problems.cube_shells import graded_block, hexahedra, quads
+from vibench_problems.elastic_forms import AXES, ORDER, ElementSurfaceBubble, interior
 from vibench_problems.elliptic_contact import EllipticContact, elliptic_contact
 from vibench_problems.far_field import FarField
+from vibench_problems.two_spheres import TwoSpheres
 
 CELLS = {"coarse": 6, "medium": 10, "paper": 14, "fine": 21}
 """Cells along the potential contact zone behind each named resolution: 5, 22, 58 and 194 thousand unknowns."""
@@ -36,14 +30,14 @@ WIDTH = 0.06
 LARGEST = 0.0464
 """Largest semi-axis [m] of the contact in the parameter box."""
 
-ORDER = 5
-"""Order of the quadrature next to the contact zone, where integrands with bubbles are polynomials of that degree."""
+OPTIONS_OF = {"paraboloid": ("far", "distance"), "sphere": ("extent",)}
+"""Options that have a meaning with one obstacle only."""
 
 PICTURED = 2.5
 """Edge of the square that a picture shows, relative to that of the potential contact zone."""
 
 
-class Hertz3D(AffineProblem):
+class Hertz3D(ContactZone, AffineProblem):
     """A half-space z ≤ 0 pressed by the paraboloid z = x²/(2 R_x) + y²/(2 R_y) − δ; mu = (R_x, R_y, δ, ν).
 
     Rigid and frictionless, small strains. A point of the surface that moves by u is outside the paraboloid if, to
@@ -70,6 +64,11 @@ class Hertz3D(AffineProblem):
         resolutions have layers in proportion to their cells.
     young
         E [Pa].
+    obstacle
+        "paraboloid", the rigid one; or "sphere", elastic: `TwoSpheres`, with its parameters (R, δ, ν), of which
+        `resolution`, `growth`, `young` and `extent` are options and the others above are not.
+    extent
+        Semi-axis [m] of the largest contact of two spheres of the radius 1 m.
     """
 
     parameters = ParameterBox(
@@ -79,6 +78,21 @@ class Hertz3D(AffineProblem):
         units=("m", "m", "m", "1"),
     )
 
+    def __new__(cls, *arguments: Any, **options: Any) -> Any:
+        """A problem of this class; or, with a sphere, one of `TwoSpheres`, whose parameters and members are others.
+
+        Raises
+        ------
+        RequestError
+            If an option is given that the obstacle does not have.
+        """
+        obstacle = options.pop("obstacle", "paraboloid")
+        for name in OPTIONS_OF["sphere" if obstacle == "paraboloid" else "paraboloid"]:
+            if name in options:
+                own = " and ".join(f"'{each}'" for each in OPTIONS_OF[obstacle])
+                raise RequestError(f"obstacle = '{obstacle}' has no option '{name}'; beside those of both it has {own}")
+        return super().__new__(cls) if obstacle == "paraboloid" else TwoSpheres(*arguments, **options)
+
     def __init__(
         self,
         resolution: Literal["coarse", "medium", "paper", "fine"] | Annotated[int, Ge(1000), Le(2_000_000)] = "medium",
@@ -86,6 +100,8 @@ class Hertz3D(AffineProblem):
         distance: Annotated[float, Ge(5.0), Le(1000.0)] = 20.0,
         growth: Annotated[float, Gt(1.0), Le(2.0)] = 1.15,
         young: Annotated[float, Gt(0.0)] = 1.0,
+        obstacle: Literal["paraboloid", "sphere"] = "paraboloid",  # noqa: ARG002  `__new__` reads it
+        extent: Annotated[float, Ge(0.001), Le(0.2)] = 0.2,  # noqa: ARG002
     ) -> None:
         number = CELLS[resolution] if isinstance(resolution, str) else (resolution / UNKNOWNS_PER_CELL) ** (1.0 / 3.0)
         cells = round(number)
@@ -96,10 +112,10 @@ class Hertz3D(AffineProblem):
         # Facets of the zone and the hexahedra below them have one order, that of rows of B and of bubbles.
         self._below = np.asarray(self.block.mesh.f2t[0, self.block.zone])
         self.areas = self._integrals(lambda x: np.ones_like(x[0]))
-        self._squares = np.stack([self._integrals(lambda x: x[0] ** 2), self._integrals(lambda x: x[1] ** 2)])
+        self.squares = np.stack([self._integrals(lambda x: x[0] ** 2), self._integrals(lambda x: x[1] ** 2)])
         self.middles = np.stack([self._integrals(lambda x: x[0]), self._integrals(lambda x: x[1])]) / self.areas
         outside = self._restrict(far)
-        lame, shear, gram = self._interior()
+        lame, shear, gram = interior(self.block.mesh, self._below, self._restriction)
         if outside is not None:
             n = self._restriction.shape[1]
             parts = (outside.divergences, outside.strains, outside.gradients)
@@ -108,7 +124,7 @@ class Hertz3D(AffineProblem):
                 for inner, outer in zip((lame, shear, gram), parts, strict=True)
             )
         self.V, self.W = InnerProduct(gram), InnerProduct(sp.diags_array(self.areas))
-        x, y = self._squares
+        x, y = self.squares
         self.declare(
             A=[
                 (f"{young!r} * poisson / ((1 + poisson) * (1 - 2 * poisson))", lame),
@@ -143,23 +159,6 @@ class Hertz3D(AffineProblem):
         self._restriction = sp.csc_array(sp.hstack([chosen, sp.csc_array(columns)]))
         return outside
 
-    def _interior(self) -> list[SparseMatrix]:
-        """The forms of Lamé's constants and the product of gradients, inside the block, in the unknowns."""
-        mesh, below = self.block.mesh, self._below
-        bubbles = Basis(mesh, ElementSurfaceBubble(), elements=below, intorder=ORDER)
-        beside = Basis(mesh, ElementHex1(), elements=below, intorder=ORDER)
-        nodal = products_of_gradients(Basis(mesh, ElementHex1()))
-        mixed = [[each[:, below] for each in row] for row in products_of_gradients(bubbles, beside)]
-        own = [[each[below][:, below] for each in row] for row in products_of_gradients(bubbles)]
-
-        def whole(form: Callable[[Gradients, int, int], SparseMatrix]) -> SparseMatrix:
-            upper = [[*(form(nodal, i, j) for i in AXES), form(mixed, 2, j)] for j in AXES]
-            last = [*(row[-1].T for row in upper), form(own, 2, 2)]
-            T = self._restriction
-            return sp.csr_array(T.T @ sp.csr_array(sp.block_array([*upper, last])) @ T)
-
-        return [whole(form) for form in (dilatation, shearing, gradients)]
-
     def _coupling(self, axis: int, weight: Callable[[Array], Array]) -> SparseMatrix:
         """∫ weight u_axis η over the facets of the zone (m×n)."""
         product = BilinearForm(lambda u, v, w: weight(w.x) * u * v)
@@ -180,28 +179,9 @@ class Hertz3D(AffineProblem):
         """The 3×3×4×3 grid."""
         return self.parameters.grid(3, 3, 4, 3)
 
-    def refuse(self, mu: Array, u: Array, lam: Array) -> str:  # noqa: ARG002
-        """Refuse contact that reaches the end of the zone: it may extend beyond it."""
-        outermost = self.middles.max(axis=0) > self.middles.max() - 1e-9 * WIDTH
-        if not lam[outermost].any():
-            return ""
-        return "the contact reaches the end of the potential contact zone: a smaller approach keeps it inside"
-
     def theory(self, mu: Array) -> EllipticContact:
         """Hertz's elliptic contact at mu."""
         return elliptic_contact(float(mu[0]), float(mu[1]), float(mu[2]), self.young / (1.0 - float(mu[3]) ** 2))
-
-    def force(self, lam: Array) -> float:
-        """Contact force [N] of λ (m,), on all four quarters."""
-        return float(4.0 * self.areas @ lam)
-
-    def measured(self, lam: Array) -> EllipticContact:
-        """Semi-axes and peak of a pressure λ (m,): √5 times its radii of inertia, as for an ellipse, and its maximum.
-
-        `EllipticContact.force` of it is not its force, which is `force`.
-        """
-        a, b = np.sqrt(5.0 * self._squares @ lam / (self.areas @ lam))
-        return EllipticContact(float(a), float(b), float(lam.max()))
 
     def displacement(self, u: Array) -> Array:
         """Displacements (3×nodes) of the nodes, of u (n,)."""
@@ -210,15 +190,6 @@ class Hertz3D(AffineProblem):
     def amplitudes(self, u: Array) -> Array:
         """Amplitudes (2,) [m] of the two fields outside the block, the last unknowns; none where it is clamped."""
         return u[self._restriction.shape[1] - self._outside :]
-
-    @property
-    def outputs(self) -> tuple[Output, ...]:
-        """Contact force and area of all four quarters, and the largest pressure."""
-        return (
-            Output("contact force", "N", lam=4.0 * self.areas),
-            Output("contact area", "m²", function=lambda _mu, _u, lam: float(4.0 * self.areas @ (lam > 0.0))),
-            Output("largest pressure", "Pa", function=lambda _mu, _u, lam: float(np.max(lam))),
-        )
 
     def picture(self, mu: Array, u: Array, lam: Array) -> Picture:  # noqa: ARG002
         """The pressed surface from above, coloured by its vertical displacement, and the contact pressure."""
@@ -232,13 +203,6 @@ class Hertz3D(AffineProblem):
     def mesh_fields(self, mu: Array, u: Array, lam: Array) -> MeshFields:  # noqa: ARG002
         """Displacements of the block's nodes, without bubbles, and the contact pressure on facets of the zone."""
         mesh = self.block.mesh
-        reference = mesh.elem.refdom.p.T.astype(int) @ np.array([4, 2, 1])  # the corner x, y, z is 4x + 2y + z
-        around = np.array([0, 4, 6, 2, 1, 5, 7, 3])  # the order of VTK
-        corners = mesh.t[np.argsort(reference)[around]].T
-        top = mesh.facets[:, self.block.zone]
-        x, y = mesh.p[:2, top] - mesh.p[:2, top].mean(axis=1)[:, None]
-        zone = np.take_along_axis(top, np.argsort(np.arctan2(y, x), axis=0), axis=0).T
-        return MeshFields(
-            mesh.p.T.copy(), {"hexahedron": corners, "quad": zone}, {"u [m]": self.displacement(u).T.copy()},
-            {"quad": {"contact pressure [Pa]": lam}},
-        )  # fmt: skip
+        cells = {"hexahedron": hexahedra(mesh), "quad": quads(mesh, self.block.zone)}
+        fields = {"u [m]": self.displacement(u).T.copy()}
+        return MeshFields(mesh.p.T.copy(), cells, fields, {"quad": {"contact pressure [Pa]": lam}})
