@@ -191,6 +191,12 @@ class ContactLoads:
         """Rows that may vary."""
         return slice(self.first, len(self.fixed) if self.reach is None else self.first + self.reach)
 
+    def at(self, mu: Array) -> tuple[Array, Array]:
+        """Bᵀη on the contact unknowns (|E|×k) and ηᵀg (k,) at mu (d,)."""
+        (varying, bounds), loads = self.varying(mu), self.fixed.copy()
+        loads[self.first : self.first + len(varying)] += varying
+        return loads, bounds
+
 
 MEMBERS = ("A", "f", "B", "g")
 """The members of a `VariationalInequality` that depend on the parameter."""

@@ -22,7 +22,6 @@ from vibench import (
     FormulationModel,
     Indices,
     Kind,
-    Outcome,
     ParameterBox,
     Problem,
     Snapshots,
@@ -30,7 +29,7 @@ from vibench import (
     UnsupportedError,
     pod,
 )
-from vibench_strategies.formulations.reduced_programs import largest_dimension, reconstructed
+from vibench_strategies.formulations.reduced_programs import largest_dimension, reconstructed, solved
 
 if TYPE_CHECKING:
     from vibench import Reduction
@@ -140,10 +139,7 @@ class LocalModel(FormulationModel):
     def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
         """The mixed program of the cluster, solved by the QP solver of the cell."""
         reduced = self._models[self.cluster(mu)].assemble(mu)
-        found = asked.solve_qp(reduced.program, factor=reduced.factor)
-        if found.x is None or found.alpha is None:
-            return FormulationAnswer.none(found.solver_status)
-        return FormulationAnswer(found.x, found.alpha, Outcome.OK, "", found.iterations)
+        return solved(asked, reduced.program, reduced.factor)
 
     def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:
         """The pair in the spaces of the cluster."""

@@ -1,4 +1,4 @@
-"""What formulations that solve the reduced program of the mixed one by an algorithm of their own have in common."""
+"""What formulations have in common: reduced programs, the spaces of answers, and cones without free generators."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ import numpy as np
 from vibench import (
     Array,
     Asked,
+    Cone,
     Formulation,
     FormulationAnswer,
     FormulationModel,
     Kind,
     Outcome,
     UnsupportedError,
+    VariationalInequality,
 )
 from vibench_strategies.formulations.whitened import Whitened
 
@@ -38,8 +40,7 @@ class ProgramFormulation(Formulation):
 
     def build(self, offline: Reduction) -> Mapping[str, Any]:
         """Nothing beside the reduced model, whose multipliers have to have signs."""
-        if offline.cone.free.any():
-            raise UnsupportedError("the formulation needs λ ≥ 0, and the cone has generators that are free in sign")
+        refuse_free(offline.cone)
         return {}
 
     def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:  # noqa: ARG002
@@ -69,6 +70,34 @@ class ProgramModel(FormulationModel):
     def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:
         """U = Z x and λ = χ α."""
         return reconstructed(self._assembled, mu, answer)
+
+
+class FixedSpacesModel(FormulationModel):
+    """A model whose answers are in the span of vectors V (n×N') and in the cone of generators χ (m×R), at every mu."""
+
+    def __init__(self, vectors: Array, generators: Array) -> None:
+        self._vectors, self._chi = vectors, generators
+        self.dimension, self.generators = int(vectors.shape[1]), int(generators.shape[1])
+
+    def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:  # noqa: ARG002
+        """U = V x and λ = χ α."""
+        assert answer.x is not None
+        assert answer.alpha is not None
+        return self._vectors @ answer.x, self._chi @ answer.alpha
+
+
+def refuse_free(cone: Cone) -> None:
+    """Raise an `UnsupportedError` if generators may be used with either sign."""
+    if cone.free.any():
+        raise UnsupportedError("the formulation needs λ ≥ 0, and the cone has generators that are free in sign")
+
+
+def solved(asked: Asked, program: VariationalInequality, factor: Array | None = None) -> FormulationAnswer:
+    """The answer of the QP solver of the cell; `factor` is the Cholesky factor of A where it is known."""
+    found = asked.solve_qp(program, factor=factor)
+    if found.x is None or found.alpha is None:
+        return FormulationAnswer.none(found.solver_status)
+    return FormulationAnswer(found.x, found.alpha, iterations=found.iterations)
 
 
 def largest_dimension(offline: Reduction) -> int:

@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 from numerics import Varying
 from other_problems import Torsion
+from scipy.optimize import nnls
 from transformed import Transformed
 
 import vibench
 from vibench import Array, Enrichment, Formulation, Kind, Reduction, Stop, UnsupportedError
-from vibench.model.galerkin import ReducedModel
 from vibench.offline.sweep import high_fidelity_sweep
-from vibench.qp.solve import solve_qp
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies.cpg import CPG
 from vibench_strategies.dictionary import Dictionary
-from vibench_strategies.formulations.hyper_reduced import HyperReduced, cubature
+from vibench_strategies.formulations.hyper_reduced import HyperReduced
 from vibench_strategies.formulations.local import Local, LocalModel
 from vibench_strategies.formulations.penalty import Penalty
 from vibench_strategies.formulations.proximal import Proximal
+from vibench_strategies.formulations.reduced_domain import cubature
 from vibench_strategies.formulations.regression import Regression
 from vibench_strategies.formulations.sparse_dictionary import SparseDictionary
 from vibench_strategies.online_supremizers import OnlineSupremizers
@@ -106,16 +106,36 @@ def test_regression_interpolates_the_snapshots_and_its_uncertainty_has_the_size_
     assert 0.1 < np.median(ratios) < 10.0
 
 
-def test_the_whole_domain_is_the_mixed_formulation_with_all_multipliers(membrane: Reduction) -> None:
-    problem, mu = membrane.problem, np.array([0.93, 0.01, -0.02])
-    whole = membrane.formulated(HyperReduced(tolerance=0.0))
-    found, vectors = whole.solve(mu), whole.built["vectors"]
-    every = np.eye(problem.W.dim)
-    model = ReducedModel(problem, vectors, Enrichment(Kind.NONE), every, every)
-    program = model.assemble(mu).program
-    mixed = solve_qp(program, "piqp", 1e-10)
-    assert np.allclose(found.u, vectors @ mixed.x, atol=1e-9)
-    assert np.allclose(found.lam, mixed.alpha, atol=1e-6 * mixed.alpha.max())
+@pytest.mark.parametrize("integrate", ["varying", "all"])
+def test_the_whole_domain_is_the_mixed_formulation(membrane: Reduction, integrate: str) -> None:
+    mu = np.array([0.93, 0.01, -0.02])
+    whole = membrane.formulated(HyperReduced(tolerance=0.0, integrate=integrate))
+    found, added = whole.solve(mu), whole.built["vectors"][:, membrane.pod.basis.shape[1] :]
+    mixed = membrane.given(enrichment=Enrichment(Kind.FIXED, vectors=added)).model.solve(mu)
+    assert added.size
+    assert np.allclose(found.u, mixed.u, atol=1e-9)
+    assert np.allclose(found.lam, mixed.lam, atol=1e-6 * mixed.lam.max())
+
+
+def test_a_reduced_domain_has_the_multipliers_of_the_mixed_formulation(membrane: Reduction) -> None:
+    # single rows in place of pressures on them are far off here: a membrane does not feel a point in the interior
+    W, mixed = membrane.problem.W, membrane.formulated(HyperReduced(tolerance=0.0))
+    reduced = membrane.formulated(HyperReduced(tolerance=1e-4, integrate="all"))
+    assert len(reduced.built["rows"]) < 0.5 * W.dim
+    for mu in membrane.problem.validation_set(4, 0):
+        expected, found = mixed.solve(mu).lam, reduced.solve(mu).lam
+        assert W.norm(found - expected) <= 0.05 * W.norm(expected)
+
+
+def test_pressures_do_the_same_work_on_few_rows(membrane: Reduction) -> None:
+    chi, tolerance = membrane.cone.generators, 1e-2
+    built = membrane.formulated(HyperReduced(tolerance)).built
+    rows, shares = built["rows"], built["shares"]
+    assert shares.min() > 0.0  # so that every admissible displacement satisfies the restricted constraints
+    BV = membrane.problem.constraint(np.array([1.0, 0.0, 0.0]))[0] @ built["vectors"]
+    whole, few = chi.T @ BV, chi[rows].T @ (shares[:, None] * BV[rows])
+    lost = np.linalg.norm(whole - few, axis=1) / np.linalg.norm(whole, axis=1)
+    assert np.sqrt(np.mean(lost**2)) <= 2.0 * tolerance
 
 
 @pytest.mark.parametrize("integrate", ["varying", "all"])
@@ -137,19 +157,16 @@ def test_a_reduced_domain_converges_to_the_whole_one(membrane: Reduction, integr
     assert errors[2] < 0.02
 
 
-def test_the_enrichment_keeps_the_condition_of_the_chosen_rows(membrane: Reduction) -> None:
-    V = membrane.problem.V
-    tight, loose = (membrane.formulated(HyperReduced(1e-3, condition=c)).built for c in (1.5, 100.0))
-    assert np.array_equal(tight["rows"], loose["rows"])
-    assert tight["vectors"].shape[1] >= loose["vectors"].shape[1] >= len(loose["rows"])
-    for built, limit in ((tight, 1.5), (loose, 100.0)):
-        assert np.allclose(V.gram(built["vectors"], built["vectors"]), np.eye(built["vectors"].shape[1]), atol=1e-10)
-        loads = V.whiten_functional(
-            membrane.problem.constraint(np.array([1.0, 0.0, 0.0]))[0][built["rows"]].T.toarray()
-        )
-        units = loads / np.linalg.norm(loads, axis=0)
-        within = np.linalg.cond(units.T @ V.whiten(built["vectors"]))
-        assert within <= limit * np.linalg.cond(units) * (1.0 + 1e-9)
+def test_the_enrichment_keeps_the_condition_of_the_contact_rigidity(membrane: Reduction) -> None:
+    V, sizes = membrane.problem.V, []
+    B = membrane.problem.constraint(np.array([1.0, 0.0, 0.0]))[0]
+    rigidity = V.whiten_functional(np.asarray(B.T @ membrane.multipliers.span))
+    for limit in (1.2, 100.0):
+        vectors = membrane.formulated(HyperReduced(1e-1, condition=limit)).built["vectors"]
+        sizes.append(vectors.shape[1])
+        assert np.allclose(V.gram(vectors, vectors), np.eye(sizes[-1]), atol=1e-10)
+        assert np.linalg.cond(rigidity.T @ V.whiten(vectors)) <= limit * np.linalg.cond(rigidity) * (1.0 + 1e-9)
+    assert sizes[0] > sizes[1] >= membrane.multipliers.rank
 
 
 def test_problems_without_elements_say_so_unless_nothing_has_to_be_integrated() -> None:
@@ -171,6 +188,16 @@ def test_a_cubature_has_few_positive_weights_and_keeps_its_tolerance() -> None:
         residual = conditions.sum(axis=1) - conditions[:, columns] @ weights
         assert np.linalg.norm(residual) <= tolerance * np.linalg.norm(conditions.sum(axis=1))
     assert np.array_equal(cubature(np.zeros((3, 4)), 0.1)[0], np.zeros(0))
+    assert np.array_equal(cubature(conditions, 0.0)[1], np.ones(300))
+
+
+def test_a_cubature_that_cannot_reach_its_tolerance_is_the_nonnegative_least_squares_solution() -> None:
+    conditions = np.random.default_rng(1).standard_normal((40, 25))
+    conditions[:, -1] = -3.0 * conditions[:, :5].sum(axis=1)  # weights of one are far from the least residual
+    columns, weights = cubature(conditions, 1e-9)
+    expected, _ = nnls(conditions, conditions.sum(axis=1))
+    assert np.array_equal(columns, np.flatnonzero(expected > 1e-12))
+    assert np.allclose(weights, expected[columns])
 
 
 LENGTH = 1e4
