@@ -12,16 +12,16 @@ from vibench_problems.elliptic_contact import EllipticContact, elliptic_contact
 from vibench_problems.hemisphere import EDGE, hemisphere
 from vibench_problems.two_bodies import Body, TwoBodies
 
-CELLS = {"coarse": 5, "medium": 8, "paper": 12, "fine": 18}
+CELLS = {"coarse": 5, "medium": 9, "paper": 12, "fine": 18}
 """Cells along the potential contact zone behind each named resolution."""
 
-UNKNOWNS_PER_CELL = 36.0
+UNKNOWNS_PER_CELL = 33.0
 """Unknowns of both bodies divided by the cube of the number of cells, at large ones and the default extent."""
 
 ZONE = 1.37
-"""Edge of the potential contact zone, relative to the extent; the contact reaches 1.06 of it by Hertz's theory."""
+"""Edge of the potential contact zone, relative to the extent; by Hertz's theory the contact reaches 1.06 of it."""
 
-SMALLEST, LARGEST = 0.7, 1.3
+SMALLEST, LARGEST = 0.8, 1.25
 """Radii [m] of the upper sphere."""
 
 
@@ -40,8 +40,8 @@ class TwoSpheres(TwoBodies):
     young
         E [Pa].
     extent
-        Semi-axis [m] of the largest contact of equal spheres by Hertz's theory. The box of δ is that of its square and
-        twice this. The force exceeds Hertz's by a share that is proportional to it.
+        Semi-axis [m] of the largest contact of equal spheres by Hertz's theory. Approaches δ are between 4/3 of
+        its square and twice this. The force exceeds Hertz's by a share that is proportional to it.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class TwoSpheres(TwoBodies):
     ) -> None:
         box = ParameterBox(
             names=("radius", "approach", "poisson"),
-            lower=np.array([SMALLEST, extent**2, 0.2]),
+            lower=np.array([SMALLEST, 4.0 / 3.0 * extent**2, 0.2]),
             upper=np.array([LARGEST, 2.0 * extent**2, 0.4]),
             units=("m", "m", "1"),
         )

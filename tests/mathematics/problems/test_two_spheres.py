@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as sla
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import nnls
 from skfem import Basis, BilinearForm, ElementHex1, ElementQuad2, ElementVector, FacetBasis, MeshHex, MeshQuad
 
 from vibench import HighFidelitySolver, NumericalError, ParameterBox, RequestError, create
@@ -24,16 +26,8 @@ PUBLISHED = np.array([1.0, 0.08, 0.3])
 
 @cache
 def spheres(cells: int, extent: float) -> tuple[TwoSpheres, HighFidelitySolver]:
-    one = TwoSpheres(36 * cells**3, extent=extent)
+    one = TwoSpheres(33 * cells**3, extent=extent)
     return one, HighFidelitySolver(one)
-
-
-def excess(cells: int, extent: float, radius: float = 1.0, poisson: float = 0.3) -> float:
-    """Contact force over Hertz's, minus one, where Hertz's contact has the radius `extent`."""
-    one, solver = spheres(cells, extent)
-    mu = np.array([radius, extent**2 * (1.0 + radius) / radius, poisson])
-    mu[1] = min(mu[1], one.parameters.upper[1])
-    return one.force(solver.solve(mu).lam) / one.theory(mu).force - 1.0
 
 
 # --- grids that do not match ---
@@ -55,7 +49,7 @@ def test_integrals_of_hat_functions_are_those_of_a_quadrature_between_all_cuts(
     middles, widths = 0.5 * (every[1:] + every[:-1]), np.diff(every)  # exact: hats are linear in between
     for j, hat in enumerate(np.eye(len(nodes))):
         values = np.interp(middles, nodes, hat) * widths
-        expected = [values[(middles > a) & (middles < b)].sum() for a, b in zip(cuts, cuts[1:], strict=False)]
+        expected = [values[(middles > a) & (middles < b)].sum() for a, b in pairwise(cuts)]
         assert found[:, j] == pytest.approx(expected, abs=1e-14)
 
 
@@ -100,7 +94,7 @@ def test_a_constant_pressure_is_transferred_exactly(cells: tuple[int, int], radi
 def test_the_body_above_is_pressed_with_the_same_force() -> None:
     """Hat functions sum to one: the body above gets the load of the facets, at every radius."""
     one, _ = spheres(4, 0.2)
-    for radius in (0.7, 0.93, 1.3):
+    for radius in (0.8, 0.93, 1.25):
         B = one.contact(np.array([radius, 0.05, 0.3])).B.toarray()
         nodes = len(one.master.contact)
         assert B[:, -nodes:].sum(axis=1) == pytest.approx(one.areas, rel=1e-13)
@@ -169,12 +163,102 @@ def test_the_exported_mesh_has_both_bodies_the_right_way_round() -> None:
 # --- the solution ---
 
 
-@pytest.mark.parametrize(("radius", "poisson"), [(1.0, 0.3), (0.7, 0.4), (1.3, 0.2)])
+@pytest.mark.parametrize(("radius", "poisson"), [(1.0, 0.3), (0.8, 0.4), (1.25, 0.2)])
 def test_small_contacts_are_hertz_contacts_of_two_elastic_bodies(radius: float, poisson: float) -> None:
-    one, solver = spheres(5, 0.02)
-    mu = np.array([radius, 0.0007, poisson])
+    """Up to the mesh, and to half of a/R, by which the force is larger."""
+    one, solver = spheres(5, 0.05)
+    mu = np.array([radius, 0.005, poisson])
     lam = solver.solve(mu).lam
     found, theory = one.measured(lam), one.theory(mu)
-    assert one.force(lam) == pytest.approx(theory.force, rel=0.03)
+    assert one.force(lam) == pytest.approx(theory.force, rel=0.05)
     assert (found.a, found.b) == pytest.approx((theory.a, theory.b), rel=0.03)
-    assert found.peak == pytest.approx(theory.peak, rel=0.04)
+    assert found.peak == pytest.approx(theory.peak, rel=0.07)
+
+
+@cache
+def section(cells: int, approach: float, poisson: float, width: float) -> tuple[float, float]:
+    """Contact force and mean pressure of the innermost ring of equal spheres with E = 1, by other elements.
+
+    Equal spheres touch in a plane that each of them meets like a rigid one. This is a hemisphere against a plane, with
+    its rotational symmetry: biquadratic elements on the section y = 0 of the mesh, a constant pressure on each edge.
+    """
+    solid = hemisphere(cells, 3, width).mesh
+    sides = solid.facets[:, solid.boundary_facets()]
+    nodes, places = np.unique(sides[:, (solid.p[1, sides] == 0.0).all(axis=0)], return_inverse=True)
+    p, quads = solid.p[[0, 2]][:, nodes], places.reshape(4, -1)
+    x, z = p[:, quads] - p[:, quads].mean(axis=1)[:, None]
+    mesh = MeshQuad(np.ascontiguousarray(p), np.take_along_axis(quads, np.argsort(np.arctan2(z, x), axis=0), axis=0))
+    basis = Basis(mesh, ElementVector(ElementQuad2()), intorder=6)
+    lame, shear = poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson)), 0.5 / (1.0 + poisson)
+
+    def strains(u, r):  # type: ignore[no-untyped-def]
+        return u.grad[0, 0], u.grad[1, 1], u[0] / r, np.sqrt(0.5) * (u.grad[0, 1] + u.grad[1, 0])
+
+    @BilinearForm
+    def energy(u, v, w):  # type: ignore[no-untyped-def]
+        r = w.x[0]
+        e, f = strains(u, r), strains(v, r)
+        return r * (lame * sum(e[:3]) * sum(f[:3]) + 2.0 * shear * sum(i * j for i, j in zip(e, f, strict=True)))
+
+    top = mesh.facets_satisfying(
+        lambda x: (np.hypot(x[0], x[1] + 1.0) > 0.99) & (x[0] < width) & (x[1] > -0.5), boundaries_only=True
+    )
+    top = top[np.argsort(mesh.p[0, mesh.facets[:, top]].mean(axis=0))]
+    facets = FacetBasis(mesh, ElementVector(ElementQuad2()), facets=top, intorder=6)
+    r = np.asarray(facets.global_coordinates())[0]
+    rings = facets.dx * np.abs(facets.normals[1]) * r
+    B = np.zeros((len(top), basis.N))
+    for i in range(facets.Nbfun):
+        B[np.arange(len(top)), facets.element_dofs[i]] += (np.asarray(facets.basis[i][0])[1] * rings).sum(axis=1)
+    g = ((drop(r, 0.0 * r) - 0.5 * approach) * rings).sum(axis=1)
+    axis = basis.get_dofs(lambda x: np.isclose(x[0], 0.0)).all(["u^1"])
+    flat = basis.get_dofs(lambda x: np.isclose(x[1], -1.0)).all(["u^2"])
+    free = np.setdiff1d(np.arange(basis.N), np.concatenate([axis, flat]))
+    A = sp.csc_matrix(energy.assemble(basis))[free][:, free]
+    S = B[:, free] @ sla.splu(A).solve(B[:, free].T)
+    # B u ≤ g with u = −A⁻¹ Bᵀ p: the least squares of the Cholesky factor are nonnegative and the same problem.
+    factor = np.linalg.cholesky(S)
+    pressure = nnls(factor.T, -np.linalg.solve(factor, g))[0]
+    return float(2.0 * np.pi * rings.sum(axis=1) @ pressure), float(pressure[0])
+
+
+def test_the_published_case_is_that_of_axisymmetric_elements() -> None:
+    """Hertz's theory has 2798 MPa and a = 10 mm; a hemisphere of this size is stiffer, whatever the mesh."""
+    one, solver = spheres(6, 0.2)
+    found, theory = solver.solve(PUBLISHED), one.theory(PUBLISHED)
+    assert 50.0 * theory.a == pytest.approx(10.0)
+    assert 20_000.0 * theory.peak == pytest.approx(2798.0, abs=1.0)
+    force, pressure = section(9, PUBLISHED[1], PUBLISHED[2], 0.274)
+    assert force / theory.force == pytest.approx(1.125, abs=0.005)
+    assert 20_000.0 * pressure == pytest.approx(2910.0, abs=10.0)
+    assert one.force(found.lam) == pytest.approx(force, rel=0.015)
+    assert one.measured(found.lam).peak == pytest.approx(pressure, rel=0.015)
+    assert 50.0 * one.measured(found.lam).a == pytest.approx(10.3, abs=0.2)
+
+
+def test_contact_beyond_the_zone_is_refused() -> None:
+    with pytest.raises(NumericalError, match="reaches the end of the potential contact zone"):
+        spheres(4, 0.2)[1].solve(np.array([1.25, 0.15, 0.3]))
+
+
+# --- the option of the plugin ---
+
+
+def test_the_plugin_has_both_obstacles_and_refuses_options_of_the_other() -> None:
+    assert type(create("problem", "hertz3d", {"resolution": 1000, "obstacle": "sphere", "extent": 0.1})) is TwoSpheres
+    assert type(Hertz3D(1000, obstacle="paraboloid", distance=8.0)) is Hertz3D
+    with pytest.raises(RequestError, match="obstacle = 'sphere' has no option 'far'"):
+        create("problem", "hertz3d", {"obstacle": "sphere", "far": "clamped"})
+    with pytest.raises(RequestError, match="obstacle = 'paraboloid' has no option 'extent'"):
+        create("problem", "hertz3d", {"extent": 0.1})
+
+
+def test_outputs_and_the_picture_are_those_of_the_pressure() -> None:
+    one, solver = spheres(4, 0.2)
+    mu = np.array([1.0, 0.08, 0.3])
+    found = solver.solve(mu)
+    force = next(output for output in one.outputs if output.name == "contact force")
+    assert force.values(mu[None], found.u[:, None], found.lam[:, None]) == pytest.approx(one.force(found.lam))
+    picture = one.picture(mu, found.u, found.lam)
+    assert picture.values.min() == pytest.approx(-0.5 * mu[1], rel=0.05)  # equal spheres share the approach
+    assert picture.positions[:, np.argmax(picture.multiplier)] == pytest.approx(one.middles[:, 0])
