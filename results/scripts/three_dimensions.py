@@ -1,9 +1,9 @@
-"""Contact in three dimensions: the problem against its closed form on four meshes, and the study `three-dimensions`.
+"""Contact in three dimensions: the problem against its closed form on three meshes, and the study `three-dimensions`.
 
 vibench run three-dimensions --no-figures
 python results/scripts/three_dimensions.py runs/three-dimensions results/three-dimensions
 
-PARDISO factorises where the extra `fast` is installed; the finest mesh has 194,000 unknowns and takes about 4 GiB.
+PARDISO factorises where the extra `fast` is installed.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ from vibench import HighFidelitySolver, create
 from vibench.linalg.factorisations import DEFAULT, IMPLEMENTATIONS
 from vibench.report.figures.style import STYLE, CaptionedFigure
 from vibench.study.cells import CERTIFIED
+from vibench.study.matrix import read_study
 from vibench.timing import timed
 
-RESOLUTIONS = ("coarse", "medium", "paper", "fine")
+RESOLUTIONS = ("coarse", "medium", "paper")
 
 MUS = np.array([[1.0, 1.0, 0.00125, 0.3], [1.3, 0.8, 0.0014, 0.25], [0.7, 0.8, 0.001, 0.35]])
 """Where the closed form is compared: a round contact, a large elliptic one, a small one."""
@@ -38,6 +39,9 @@ SHOWN = {
     "N": "N", "R": "R", "enrichment": "added", "beta_span_min": "min β span", "beta_cone_lower_min": "min β cone",
     "error_u_mean": "error u", "error_lambda_mean": "error λ", "queries_ok": "queries ok",
 }  # fmt: skip
+
+BUSY = 1.25
+"""Wall seconds over CPU seconds beyond which a machine had other work."""
 
 OFFLINE = ["snapshots", "pod", "cone", "enrichment", "assembly", "certificate"]
 
@@ -79,6 +83,13 @@ def rates(compared: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(orders, columns=names).assign(mu=list(force.index))[["mu", *names]]
 
 
+def exponents(compared: pd.DataFrame) -> pd.DataFrame:
+    """Seconds of a solution on every mesh, the median of the parameters, and their exponent from the mesh before."""
+    found = compared.groupby("unknowns")["seconds"].median().reset_index()
+    growth = np.diff(np.log(found["seconds"])) / np.diff(np.log(found["unknowns"]))
+    return found.assign(exponent=[None, *growth])
+
+
 def models(cells: pd.DataFrame) -> pd.DataFrame:
     """Dimensions, constants and errors of every model; those of certified queries are the same."""
     plain = cells[cells["assembly"] != CERTIFIED]
@@ -103,12 +114,39 @@ def seconds(cells: pd.DataFrame) -> pd.DataFrame:
     return table.assign(**{"query [ms]": 1e3 * cells["online_s"], "high fidelity [ms]": 1e3 * cells["hf_s"]})
 
 
+def break_even(thresholds: pd.DataFrame) -> pd.DataFrame:
+    """Gains of offline over online enrichment and of every model over the high-fidelity one; from where they pay.
+
+    The gain is the ratio of seconds of a query, with its 95 % interval.
+    """
+    of_enrichments = thresholds["primal_b"].eq("offline-pga") & thresholds["primal_a"].eq("online-supremizers")
+    fair = of_enrichments & thresholds["assembly_a"].eq(thresholds["assembly_b"])
+    chosen = thresholds[fair | thresholds["cell_a"].isna()]
+    gain = [f"{row.gain:.3g} ({row.gain_low:.3g} to {row.gain_high:.3g})" for row in chosen.itertuples()]
+    begins = chosen["benefit_threshold"].map(lambda count: "" if pd.isna(count) else f" {count:.0f}")
+    columns = {"dual": "dual", "pod_tol": "pod_tol", "primal_a": "in place of", "primal_b": "primal"}
+    table = chosen[["problem", *columns, "assembly_b"]].rename(columns=columns | {"assembly_b": "assembly"})
+    return table.assign(gain=gain, **{"pays, in queries": chosen["meaning"] + begins})
+
+
 def growth(cells: pd.DataFrame) -> pd.DataFrame:
     """Queries on the finest mesh over those on the coarsest, where N, R and what was added agree."""
     of_model = cells.set_index([*MODEL[1:], "N", "R", "enrichment"])
     first, last = (of_model[of_model["dim_V"] == edge] for edge in (cells["dim_V"].min(), cells["dim_V"].max()))
     both = first[["online_s"]].join(last[["online_s"]], how="inner", lsuffix=" first", rsuffix=" last")
     return (both["online_s last"] / both["online_s first"]).rename("ratio").reset_index()
+
+
+def conditions(cells: pd.DataFrame) -> str:
+    """On which meshes of the study it was run, and what wall seconds say of other work that the machine had."""
+    labels = dict(zip(cells["problem"], cells["dim_V"], strict=True))
+    meshes = " and ".join(f"{label} ({int(n):,} unknowns)" for label, n in labels.items())
+    left = [f"{one.label}" for one in read_study("three-dimensions").problem if one.label not in labels]
+    not_run = f" Not run: {' and '.join(left)}." if left else ""
+    share = cells["offline_wall_s"].sum() / cells["offline_s"].sum()
+    load = f"the wall seconds of its offline phases were {share:.2g} times their CPU seconds"
+    busy = f" The machine had other work, too: {load}." if share > BUSY else ""
+    return f"The study was run on: {meshes}.{not_run}{busy}"
 
 
 def pressed(resolution: str = "medium") -> Figure:
@@ -146,7 +184,8 @@ def main(run: str, target: str) -> None:
     page = Page(
         target, "Three dimensions", made_by("three_dimensions", "three-dimensions", "three-dimensions",
                                             options=" --no-figures"),
-        f"A half-space pressed by a rigid elliptic paraboloid (`hertz3d`). {SECONDS}", machine=origin(cells),
+        f"A half-space pressed by a rigid elliptic paraboloid (`hertz3d`). {SECONDS} {conditions(cells)}",
+        machine=origin(cells),
     )  # fmt: skip
     compared = against_theory()
     page.section(
@@ -157,12 +196,21 @@ def main(run: str, target: str) -> None:
         compared,
         "Orders of convergence of the force without slopes, two by theory:",
         rates(compared),
+        "CPU seconds of a solution with its factorisation, the median of the three, and exponents in the unknowns:",
+        exponents(compared),
     )
     page.draw("pressed", pressed())
     page.section("Models", models(cells))
     page.section("Bounds", effectivities(cells))
     page.section("Seconds", seconds(cells))
-    page.section("Queries and meshes", "Seconds of a query, the finer mesh over the coarser one.", growth(cells))
+    page.section(
+        "Break-even",
+        "Gains are ratios of seconds of queries, with 95 % intervals; the last column says from how many queries on "
+        "the model pays.",
+        break_even(read(run, "thresholds")),
+    )
+    if cells["dim_V"].nunique() > 1:
+        page.section("Queries and meshes", "Seconds of a query, the finer mesh over the coarser one.", growth(cells))
     page.add(f"Full table of the cells: {page.link('cells', cells)}.")
     page.write()
 
