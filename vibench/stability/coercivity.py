@@ -3,9 +3,9 @@
     α = min vᵀAv / ‖v‖_V²,    γ_a = max vᵀAv / ‖v‖_V²,    β_A = min sup ηᵀBv / (‖v‖_A ‖η‖_W)   (min over η, sup over v)
 
 β_A² is the smallest eigenvalue of BA⁻¹Bᵀ against X_W. Lanczos approximates extreme eigenvalues from inside, so that a
-margin moves them outwards; that alone proves nothing, since an iteration may miss an eigenvalue. A number a ≤ α is
-proved by the n positive eigenvalues of A − aX_V, c ≥ γ_a by those of cX_V − A, and, where A is positive definite,
-b ≤ β_A by the m negative eigenvalues of
+margin moves them outwards; that alone proves nothing, since an iteration may miss an eigenvalue. Where the margin is
+too small, a more accurate estimate comes before a larger margin. A number a ≤ α is proved by the n positive eigenvalues
+of A − aX_V, c ≥ γ_a by those of cX_V − A, and, where A is positive definite, b ≤ β_A by the m negative eigenvalues of
 
     [ A    Bᵀ     ]
     [ B    b²X_W  ],    whose Schur complement of A is b²X_W − BA⁻¹Bᵀ (Haynsworth),
@@ -18,32 +18,26 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
-from scipy.sparse.linalg import LinearOperator, eigsh
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.linalg.cholesky import SparseCholesky, symmetric_lu
 from vibench.linalg.factorisations import implementation, is_proved_definite
 from vibench.linalg.inertia import proved_positive
 from vibench.linalg.inner_product import InnerProduct
+from vibench.linalg.lanczos import largest_eigenvalue
 from vibench.linalg.schur_complement import FEW_PER_UNKNOWN
 from vibench.stability.infsup import InfSup
 
 MARGINS = (1e-3, 1e-2, 1e-1, 0.5)
-"""Constants are moved outwards by the first of these shares for which they are proved; by the first one if by none.
+"""Constants are moved outwards by the first of these shares for which they are proved; by the first one if by none."""
 
-Lanczos iterations are accurate to 1e-4."""
-
-TOLERANCE, ROUGH = 1e-4, 1e-2
-"""Relative residuals of Lanczos iterations; the second one for operator norms, which enter bounds with a small factor,
-and for what is moved by the last of `MARGINS`."""
-
-NCV = 10
-"""Lanczos vectors with the inverse of a matrix. More cost solutions that the largest eigenvalue of it does not need."""
+ACCURACY, FINE, ROUGH = 1e-4, 1e-8, 1e-2
+"""Relative errors of Lanczos iterations: of a first estimate, of the second where the first is not proved with the
+smallest of `MARGINS`, and for what is moved by the largest of them."""
 
 FEW = 30
 """Spaces of at most this dimension have their eigenvalues from a dense matrix; Lanczos needs more than two."""
@@ -75,6 +69,10 @@ Solve = Callable[[Array], Array]
 """From a right-hand side (n,) to the solution with A."""
 
 
+Estimate = Callable[[float], float]
+"""An estimate of a constant, from its relative error."""
+
+
 def coercivity_and_continuity(
     A: SparseMatrix, V: InnerProduct, solve: Solve | None = None
 ) -> tuple[Constant, Constant]:
@@ -89,13 +87,12 @@ def coercivity(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None, ord
     the elimination of its unknowns; by default of minimum degree. Raises a `NumericalError` if A is not symmetric
     positive definite.
     """
-    lowest = lowest_quotient(A, V, solve)  # refuses a matrix that is not positive definite
     chosen = implementation(V.factorisation)
 
     def coercive(a: float) -> bool:
         return is_proved_definite([A, -a * V.matrix], chosen, order)
 
-    return moved(lowest, -1.0, coercive)
+    return moved(lambda accuracy: lowest_quotient(A, V, solve, accuracy), -1.0, coercive)
 
 
 def share_of_diagonal(X: InnerProduct) -> float:
@@ -115,19 +112,19 @@ def continuity(A: SparseMatrix, V: InnerProduct) -> Constant:
     def continuous(c: float) -> bool:
         return is_proved_definite([c * V.matrix, -A], chosen)
 
-    return moved(highest_quotient(A, V), 1.0, continuous)
+    return moved(lambda accuracy: highest_quotient(A, V, accuracy), 1.0, continuous)
 
 
 def operator_norm(M: SparseMatrix, X: InnerProduct) -> Constant:
     """Upper bound of max |vᵀMv| / ‖v‖² over v for a symmetric M (n×n), with ‖v‖ the norm of X."""
     if not abs(M).sum():
         return Constant(0.0, True)
-    if X.dim <= FEW:
-        estimate = float(np.abs(scipy.linalg.eigvalsh(M.toarray(), X.matrix.toarray())).max())
-    else:
-        inverse, options = _operator(X.dim, X.riesz), _lanczos(X.dim, ROUGH)
-        estimate = float(np.abs(eigsh(M, M=X.matrix, Minv=inverse, which="LM", **options)[0]))
     chosen = implementation(X.factorisation)
+
+    def estimate(accuracy: float) -> float:
+        if X.dim <= FEW:
+            return float(np.abs(scipy.linalg.eigvalsh(M.toarray(), X.matrix.toarray())).max())
+        return largest_eigenvalue(lambda v: X.riesz(M @ v), X.matrix, accuracy)
 
     def above(c: float) -> bool:
         return all(is_proved_definite([c * X.matrix, sign * M], chosen) for sign in (-1.0, 1.0))
@@ -135,18 +132,23 @@ def operator_norm(M: SparseMatrix, X: InnerProduct) -> Constant:
     return moved(estimate, 1.0, above)
 
 
-def moved(estimate: float, sign: float, proves: Callable[[float], bool]) -> Constant:
-    """The estimate moved outwards, downwards for a negative sign, until it is proved."""
-    candidates = [estimate * (1.0 + margin) ** sign for margin in MARGINS]
+def moved(estimate: Estimate, sign: float, proves: Callable[[float], bool]) -> Constant:
+    """An estimate moved outwards, downwards for a negative sign, until it is proved."""
+    first = estimate(ACCURACY)
+    if not 0.0 < first < np.inf:
+        return Constant(0.0 if sign < 0.0 else float("inf"), False)
+    closest = first * (1.0 + MARGINS[0]) ** sign
+    if proves(closest):
+        return Constant(closest, True)
+    accurate = estimate(FINE)
+    candidates = [accurate * (1.0 + margin) ** sign for margin in MARGINS]
     for candidate in candidates:
-        if proves(candidate):
+        if candidate != closest and proves(candidate):
             return Constant(candidate, True)
     return Constant(candidates[0], False)
 
 
-def lowest_quotient(
-    A: SparseMatrix, V: InnerProduct, solve: Solve | None = None, tolerance: float = TOLERANCE
-) -> float:
+def lowest_quotient(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None, accuracy: float = ACCURACY) -> float:
     """Estimate of α for A (n×n), the smallest eigenvalue of A against X_V, by Lanczos iterations.
 
     Raises a `NumericalError` if A is not symmetric positive definite and no `solve` is given.
@@ -154,14 +156,14 @@ def lowest_quotient(
     solve = solve or InnerProduct(A, "A", V.factorisation).riesz
     if V.dim <= FEW:
         return float(scipy.linalg.eigvalsh(A.toarray(), V.matrix.toarray())[0])
-    return _smallest(A, V.matrix, solve, tolerance)
+    return 1.0 / largest_eigenvalue(lambda v: solve(V.matrix @ v), A, accuracy)
 
 
-def highest_quotient(A: SparseMatrix, V: InnerProduct) -> float:
+def highest_quotient(A: SparseMatrix, V: InnerProduct, accuracy: float = ACCURACY) -> float:
     """Estimate of γ_a for A (n×n), the largest eigenvalue of A against X_V, by Lanczos iterations."""
     if V.dim <= FEW:
         return float(scipy.linalg.eigvalsh(A.toarray(), V.matrix.toarray())[-1])
-    return float(eigsh(A, M=V.matrix, Minv=_operator(V.dim, V.riesz), which="LA", **_lanczos(V.dim))[0])
+    return largest_eigenvalue(lambda v: V.riesz(A @ v), V.matrix, accuracy)
 
 
 def extreme_quotients(A: SparseMatrix, V: InnerProduct) -> tuple[float, float]:
@@ -190,8 +192,7 @@ def energy_inf_sup(A: SparseMatrix, B: SparseMatrix, W: InnerProduct) -> Constan
         return bool(proved_positive([saddle], np.concatenate([roots[0], beta * roots[1]]), order) >= m)
 
     for order in orders:
-        square = _smallest_compliance(A, sp.csc_array(B), W, factor, order)
-        constant = moved(float(np.sqrt(square)), -1.0, partial(stable, order)) if square > 0.0 else Constant(0.0, False)
+        constant = moved(_smallest_compliance(A, sp.csc_array(B), W, factor, order), -1.0, partial(stable, order))
         if constant.proved:
             return constant
     return Constant(0.0, True)
@@ -207,64 +208,45 @@ def _after_their_unknowns(order: Indices, B: SparseMatrix) -> Indices:
 
 def _smallest_compliance(
     A: SparseMatrix, B: SparseMatrix, W: InnerProduct, factor: SparseCholesky, order: Indices
-) -> float:
-    """Estimate of the smallest eigenvalue of BA⁻¹Bᵀ against X_W; 0 where it is singular."""
+) -> Estimate:
+    """The root of the smallest eigenvalue of BA⁻¹Bᵀ against X_W; 0 where it is singular."""
     m, n = B.shape
     if m <= FEW:
-        compliance = np.asarray(B @ factor.solve(B.toarray().T))
-        return float(scipy.linalg.eigvalsh(compliance, W.matrix.toarray())[0])
+        return _of_dense(np.asarray(B @ factor.solve(B.toarray().T)), W)
     saddle = _saddle_point(A, B, sp.csc_array((m, m)))[order][:, order]
     try:
         solve = symmetric_lu(sp.csc_array(saddle), "NATURAL").solve
     except RuntimeError:
-        return 0.0
+        return lambda _: 0.0
 
-    def inverse(y: Array) -> Array:
+    def inverse(v: Array) -> Array:
         """−(BA⁻¹Bᵀ)⁻¹ is the last block of the inverse."""
         found = np.empty(n + m)
-        found[order] = solve(np.concatenate([np.zeros(n), y])[order])
+        found[order] = solve(np.concatenate([np.zeros(n), W.matrix @ v])[order])
         return -found[n:]
 
-    compliance = _operator(m, lambda y: B @ factor.solve(B.T @ y))
-    return _smallest(compliance, W.matrix, inverse)
+    return lambda accuracy: largest_eigenvalue(inverse, W.matrix, accuracy) ** -0.5
 
 
 def _saddle_point(A: SparseMatrix, B: SparseMatrix, corner: SparseMatrix) -> SparseMatrix:
     return sp.csc_array(sp.block_array([[A, B.T], [B, corner]]))
 
 
-def smallest_quotient(matrix: Array, X: InnerProduct) -> float:
-    """Estimate of the smallest eigenvalue of a symmetric matrix (m×m) against that of X; 0 if it is not positive."""
+def smallest_root(matrix: Array, X: InnerProduct) -> Estimate:
+    """The root of the smallest eigenvalue of a symmetric matrix (m×m) against that of X; 0 if it is not positive."""
     if len(matrix) <= FEW:
-        return max(0.0, float(scipy.linalg.eigvalsh(matrix, X.matrix.toarray())[0]))
+        return _of_dense(matrix, X)
     try:
         factor = scipy.linalg.cho_factor(matrix)
     except np.linalg.LinAlgError:
-        return 0.0
+        return lambda _: 0.0
 
-    def inverse(y: Array) -> Array:
-        return np.asarray(scipy.linalg.cho_solve(factor, y, check_finite=False))
+    def inverse(v: Array) -> Array:
+        return np.asarray(scipy.linalg.cho_solve(factor, X.matrix @ v, check_finite=False))
 
-    return _smallest(_operator(len(matrix), lambda y: matrix @ y), X.matrix, inverse)
-
-
-def _smallest(
-    matrix: SparseMatrix | LinearOperator,
-    product: SparseMatrix,
-    inverse: Callable[[Array], Array],
-    tolerance: float = TOLERANCE,
-) -> float:
-    """Estimate of the smallest eigenvalue of a positive definite matrix (k×k) with this inverse."""
-    size = matrix.shape[0]
-    operator = _operator(size, inverse)
-    values = eigsh(matrix, M=product, sigma=0.0, OPinv=operator, which="LM", ncv=NCV, **_lanczos(size, tolerance))
-    return float(values[0])
+    return lambda accuracy: largest_eigenvalue(inverse, X.matrix, accuracy) ** -0.5
 
 
-def _operator(size: int, apply: Callable[[Array], Array]) -> LinearOperator:
-    return LinearOperator((size, size), matvec=apply)
-
-
-def _lanczos(size: int, tolerance: float = TOLERANCE) -> dict[str, Any]:
-    start = np.random.default_rng(0).standard_normal(size)
-    return {"k": 1, "v0": start, "tol": tolerance, "return_eigenvectors": False}
+def _of_dense(matrix: Array, X: InnerProduct) -> Estimate:
+    smallest = float(scipy.linalg.eigvalsh(matrix, X.matrix.toarray())[0])
+    return lambda _: float(np.sqrt(max(0.0, smallest)))

@@ -31,7 +31,7 @@ from vibench.arrays import Array, SparseMatrix
 from vibench.linalg.cholesky import UNIT
 from vibench.linalg.definite import BlockDiagonal
 from vibench.linalg.inner_product import InnerProduct
-from vibench.stability.coercivity import Constant, moved, smallest_quotient
+from vibench.stability.coercivity import Constant, moved, smallest_root
 
 COLUMNS = 128
 """Columns of D at once: of all unknowns it may not fit in memory."""
@@ -77,8 +77,7 @@ class ContactInfSup:
             return Constant(0.0, True)
         compliance, lifted, residuals = self._products(sp.csr_array(B), liftings)
         compliance = 0.5 * (compliance + compliance.T)
-        square = smallest_quotient(compliance, W)
-        if square <= 0.0:
+        if not np.all(np.diag(compliance) > 0.0):
             return Constant(0.0, True)
         sizes = np.sqrt(np.diag(compliance))
         scaled, mass = compliance / sizes / sizes[:, None], _scaled(W.matrix, sizes)
@@ -88,7 +87,7 @@ class ContactInfSup:
             weight = beta**2 / (1.0 - 1.01 * self._lost)
             return _proved_positive(scaled - weight * mass.toarray(), lost + 8.0 * UNIT * weight * of_mass)
 
-        found = moved(float(np.sqrt(square)), -1.0, stable)
+        found = moved(smallest_root(compliance, W), -1.0, stable)
         return found if found.proved else Constant(0.0, True)
 
     def _products(self, B: SparseMatrix, liftings: Array) -> tuple[Array, Array, Array]:

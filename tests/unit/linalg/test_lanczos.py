@@ -1,0 +1,81 @@
+"""Extreme eigenvalues against dense ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.sparse as sp
+from numerics import spd
+
+from vibench.linalg import lanczos
+from vibench.linalg.lanczos import largest_eigenvalue
+
+ACCURACIES = 1e-3, 1e-6, 1e-10
+
+
+def pencil(n: int, spectrum: np.ndarray) -> tuple[np.ndarray, sp.csc_array]:
+    """K and M (n×n) with these eigenvalues of K against M."""
+    rng = np.random.default_rng(n)
+    root = scipy.linalg.cholesky(spd(n, rng))
+    turned = np.linalg.qr(rng.standard_normal((n, n)))[0] @ root
+    return turned.T @ (spectrum[:, None] * turned), sp.csc_array(root.T @ root)
+
+
+def estimate(K: np.ndarray, M: sp.csc_array, accuracy: float) -> float:
+    factor = scipy.linalg.cho_factor(M.toarray())
+    return largest_eigenvalue(lambda v: scipy.linalg.cho_solve(factor, K @ v), M, accuracy)
+
+
+@pytest.mark.parametrize("accuracy", ACCURACIES)
+@pytest.mark.parametrize("scale", [1.0, 1e100, 1e-100])
+def test_the_eigenvalue_of_largest_magnitude_is_as_accurate_as_asked(accuracy: float, scale: float) -> None:
+    n = 60
+    for spectrum in (
+        np.linspace(-1.0, 3.0, n),
+        np.linspace(-3.0, 1.0, n),
+        np.linspace(0.5, 1.0, n),  # the edge of a continuous spectrum
+        np.concatenate([np.full(3, 5.0), np.linspace(0.1, 4.9, n - 3)]),  # a multiple one
+        np.concatenate([[1.0], np.full(n - 1, 1e-9)]),
+    ):
+        found = estimate(*pencil(n, scale * spectrum), accuracy)
+        exact = scale * np.abs(spectrum).max()
+        assert (1.0 - 10.0 * accuracy) * exact <= found <= (1.0 + 1e-12) * exact
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 7])
+def test_small_matrices_are_exact(n: int) -> None:
+    assert estimate(*pencil(n, np.arange(1.0, n + 1.0)), 1e-15) == pytest.approx(n, rel=1e-11)
+
+
+def test_few_vectors_start_again_from_the_last_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    K, M = pencil(80, np.linspace(0.0, 1.0, 80))
+    monkeypatch.setattr(lanczos, "VECTORS", 12)
+    assert estimate(K, M, 1e-4) == pytest.approx(1.0, rel=1e-3)
+    monkeypatch.setattr(lanczos, "RESTARTS", 1)
+    assert estimate(K, M, 1e-4) < 1.0 - 1e-3
+
+
+def test_what_is_not_definite_or_not_finite_has_an_infinite_one() -> None:
+    n = 40
+    indefinite = sp.diags_array(np.concatenate([np.full(n - 1, 1e-3), [-1.0]]), format="csc")
+    assert largest_eigenvalue(lambda v: v, indefinite, 1e-4) == np.inf
+    M = sp.eye_array(n, format="csc")
+    assert largest_eigenvalue(lambda v: np.nan * v, M, 1e-4) == np.inf
+    assert largest_eigenvalue(np.zeros_like, M, 1e-4) == 0.0
+
+
+def test_iterations_end_with_the_accuracy_of_the_eigenvalue() -> None:
+    """The residual is still about 0.01 where the eigenvalue has an error of 1e-4."""
+    spectrum = np.concatenate([[1.0], np.linspace(0.0, 0.8, 399)])
+    counts = list[int]()
+    M = sp.eye_array(400, format="csc")
+
+    def apply(v: np.ndarray) -> np.ndarray:
+        counts[-1] += 1
+        return spectrum * v
+
+    for accuracy in (1e-4, 1e-8):
+        counts.append(0)
+        assert 1.0 - 10.0 * accuracy <= largest_eigenvalue(apply, M, accuracy) <= 1.0 + 1e-12
+    assert counts[0] < 0.7 * counts[1]
