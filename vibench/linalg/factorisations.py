@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError, unknown_name
+from vibench.linalg.banded import is_proved_by_band
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky, elimination_order
 from vibench.linalg.definite import BlockDiagonal
 from vibench.linalg.inertia import ATTEMPTS, first_shift, proved_positive
@@ -270,14 +271,17 @@ def _slices(count: int) -> Iterator[slice]:
 def is_proved_definite(parts: Sequence[SparseMatrix], chosen: Implementation, order: Indices | None = None) -> bool:
     """Whether the sum of symmetric matrices (n×n) is proved to be positive definite, whatever the round-off.
 
-    Factors of SuperLU, which stands in for what factorises nothing, are looked at (`vibench.linalg.inertia`); `order`
-    (n,) is one for it. Of the others nothing is known but that they compute a Cholesky factorisation. If it ends for
-    the computed D⁻¹XD⁻¹ − cI, D² being the diagonal of X, then X is definite, with c the sum of the round-off of
-    summing and scaling and of the factorisation, Σ_j γ / (1 − γ) with γ_k of k = t_j + 1 and t_j entries in column j of
-    the factor (Rump, "Verification of positive definiteness", BIT Numerical Mathematics 46, 2006, §2): about u times
-    the number of all entries. An LU factorisation has no such bound, since its two factors differ by round-off.
+    By default a narrow band is factorised (`vibench.linalg.banded`), or factors of SuperLU, which stands in for what
+    factorises nothing, are looked at (`vibench.linalg.inertia`); `order` (n,) is one for it. Of the others nothing is
+    known but that they compute a Cholesky factorisation. If it ends for the computed D⁻¹XD⁻¹ − cI, D² being the
+    diagonal of X, then X is definite, with c the sum of the round-off of summing and scaling and of the factorisation,
+    Σ_j γ / (1 − γ) with γ_k of k = t_j + 1 and t_j entries in column j of the factor (Rump, "Verification of positive
+    definiteness", BIT Numerical Mathematics 46, 2006, §2): about u times the number of all entries. An LU factorisation
+    has no such bound, since its two factors differ by round-off.
     """
     if not chosen.module or not chosen.is_direct:
+        if order is None and (found := is_proved_by_band(parts)) is not None:
+            return found
         diagonal = np.asarray(sum(part.diagonal() for part in parts))
         return bool(np.all(diagonal > 0.0)) and proved_positive(parts, np.sqrt(diagonal), order) == len(diagonal)
     try:
