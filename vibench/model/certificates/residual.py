@@ -21,6 +21,8 @@ from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
+import scipy.linalg
+from scipy.linalg.blas import dgemm
 
 from vibench.arrays import Array, Indices
 from vibench.linalg.inner_product import project_out
@@ -143,7 +145,7 @@ def residual_basis(
         R = _with_fewer_rows(R, last)
     inverse = 1.0 / scale[kept]
     reach = float(np.linalg.norm(inverse[:, None] * samples[kept], axis=0).mean())
-    U, remainder = _directions(R * scale[kept], DIRECTIONS * typical / max(reach, np.finfo(float).tiny))
+    U, remainder = _directions(R, scale[kept], DIRECTIONS * typical / max(reach, np.finfo(float).tiny))
     norms[kept], factor = 0.0, U.T @ R
     round_off = 1.01 * UNIT * (len(kept) + 8.0) * float(np.linalg.norm(factor * scale[kept]))
     basis = ResidualBasis(kept, factor, inverse, remainder + round_off, norms)
@@ -170,48 +172,52 @@ def _worth_keeping(largest: Array, mean: Array, allowed: float) -> Indices:
     return np.flatnonzero(keep & (largest > NEGLIGIBLE * largest.max(initial=0.0)))
 
 
-def _directions(scaled: Array, allowed: float) -> tuple[Array, float]:
-    """Orthonormal basis (n×K) of the columns (n×p) up to a remainder of norm `allowed`, and a bound of this norm.
+def _directions(R: Array, scale: Array, allowed: float) -> tuple[Array, float]:
+    """Orthonormal basis (n×K) of S = R D (n×p), D = diag(`scale`), up to a remainder, and a bound of its norm.
 
-    All of the columns where `MOST` principal directions are not enough, or few of the columns are saved: then nothing
-    remains.
+    It is at most `allowed`. All of the columns where `MOST` principal directions are not enough, or few of the columns
+    are saved: then nothing remains.
     """
-    count = scaled.shape[1]
+    count = R.shape[1]
     if count > FEW:
-        found = _random_range(scaled, allowed)
+        found = _random_range(R, scale, allowed)
         if found is None:
-            return np.linalg.qr(scaled)[0], 0.0
+            return np.linalg.qr(R * scale)[0], 0.0
         Q, small, rest = found
     else:
-        Q, small = np.linalg.qr(scaled)
+        Q, small = np.linalg.qr(R * scale)
         rest, allowed = 0.0, allowed * SHARE_OF_FEW  # but for round-off
-    left, sigma, _ = np.linalg.svd(small, full_matrices=False)
+    # The transpose of a triangular factor has the same left singular vectors.
+    triangle = scipy.linalg.qr(small.T, mode="r", check_finite=False)[0][: len(small)]
+    left, sigma, _ = np.linalg.svd(triangle.T, full_matrices=False)
     remainders = np.hypot(np.append(sigma, 0.0), rest)
     enough = int(np.argmax(remainders <= allowed))
     if remainders[enough] <= allowed and enough <= min(MOST, 0.7 * count):
         return Q @ left[:, :enough], float(remainders[enough])
-    return (Q if count <= FEW else np.linalg.qr(scaled)[0]), 0.0
+    return (Q if count <= FEW else np.linalg.qr(R * scale)[0]), 0.0
 
 
-def _random_range(scaled: Array, allowed: float) -> tuple[Array, Array, float] | None:
-    """Orthonormal Q (n×k), Qᵀ S (k×p) and ‖S − QQᵀS‖ in the Frobenius norm for S (n×p), at most half of `allowed`.
+def _random_range(R: Array, scale: Array, allowed: float) -> tuple[Array, Array, float] | None:
+    """Orthonormal Q (n×k), QᵀS (k×p) and ‖S − QQᵀS‖ in the Frobenius norm, at most half of `allowed`, for S = R D.
 
     A randomised range finder by blocks (Martinsson and Voronin, 2016): each of them is found in what the ones before
     leave, so that no more are computed than are needed. `None` where the decay says that `MOST` will not do.
     """
-    rng, left, limit = np.random.default_rng(0), scaled.copy(), min(MOST + OVERSAMPLING, *scaled.shape)
-    bases, parts, rests = list[Array](), list[Array](), [float(np.linalg.norm(scaled))]
+    rng, limit = np.random.default_rng(0), min(MOST + OVERSAMPLING, *R.shape)
+    left = np.empty(R.shape, order="F")  # updated in place: to allocate so much takes as long as to compute it
+    np.multiply(R, scale, out=left)
+    bases, parts, rests = list[Array](), list[Array](), [float(np.linalg.norm(left))]
     while rests[-1] > 0.5 * allowed:
         remaining = limit - sum(basis.shape[1] for basis in bases)
         decay = rests[-1] / rests[-2] if len(bases) > 1 else 0.0  # of a block; the first one is the fastest
         if not remaining or rests[-1] * decay ** (remaining / BLOCK) > allowed:
             return None
-        Q = np.linalg.qr(left @ rng.standard_normal((scaled.shape[1], min(BLOCK, remaining))))[0]
+        Q = np.linalg.qr(left @ rng.standard_normal((R.shape[1], min(BLOCK, remaining))))[0]
         Q = np.linalg.qr(left @ (left.T @ Q))[0]
         if bases:
             Q = np.linalg.qr(project_out(np.hstack(bases), Q))[0]
         parts.append(Q.T @ left)
-        left -= Q @ parts[-1]
+        left = dgemm(-1.0, Q, parts[-1], 1.0, left, overwrite_c=1)
         bases.append(Q)
         rests.append(float(np.linalg.norm(left)))
     return np.hstack(bases), np.vstack(parts), rests[-1]

@@ -66,7 +66,7 @@ def test_few_directions_are_enough_for_many_terms(monkeypatch: pytest.MonkeyPatc
 def test_a_random_range_leaves_what_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(residual, "BLOCK", 6)
     S = np.linalg.qr(rng.standard_normal((50, 50)))[0] * 0.5 ** np.arange(50) @ rng.standard_normal((50, 80))
-    found = residual._random_range(S, 1e-3)
+    found = residual._random_range(S, np.ones(S.shape[1]), 1e-3)
     assert found is not None
     Q, small, rest = found
     np.testing.assert_allclose(Q.T @ Q, np.eye(Q.shape[1]), atol=1e-12)
@@ -75,7 +75,7 @@ def test_a_random_range_leaves_what_it_says(monkeypatch: pytest.MonkeyPatch) -> 
     assert Q.shape[1] < 40
     monkeypatch.setattr(residual, "MOST", 12)
     monkeypatch.setattr(residual, "OVERSAMPLING", 0)
-    assert residual._random_range(S, 1e-3) is None
+    assert residual._random_range(S, np.ones(S.shape[1]), 1e-3) is None
 
 
 def test_rows_that_few_terms_enter_are_made_fewer() -> None:
