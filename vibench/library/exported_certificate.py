@@ -72,7 +72,10 @@ def arrays(
         np.linalg.norm(residual.factor, axis=0), residual.remainder * residual.inverse_scale
     )
     of_f, of_lam = sizes[: polynomials["theta_f"].terms.shape[1]], sizes[-certificate.generators.shape[1] :]
-    stiffness = 0.0 if base.spectral is None else error["theta_A"] * float(np.linalg.norm(base.spectral.norms))
+    stiffness = 0.0
+    if base.spectral is not None:  # terms whose norms are not needed otherwise are taken to have the largest one
+        norms = base.spectral.norms
+        stiffness = error["theta_A"] * float(np.linalg.norm(np.where(norms > 0.0, norms, norms.max())))
     found |= {
         "load_error": np.array(base.load_error + error["theta_f"] * np.linalg.norm(of_f)),
         "stiffness_error": np.array(base.stiffness_error + stiffness),

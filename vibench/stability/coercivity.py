@@ -115,21 +115,41 @@ def continuity(A: SparseMatrix, V: InnerProduct) -> Constant:
     return moved(lambda accuracy: highest_quotient(A, V, accuracy), 1.0, continuous)
 
 
+def constants_near(A: SparseMatrix, X: InnerProduct) -> tuple[Constant, Constant]:
+    """Bounds as those of `coercivity_and_continuity`, for a matrix A (n×n) that is near to X.
+
+    Both ends of a spectrum that is not wide come from solutions with X, which has a factorisation.
+    """
+    if X.dim <= FEW:
+        return coercivity_and_continuity(A, X)
+    chosen, shift = implementation(X.factorisation), highest_quotient(A, X, ROUGH)
+
+    def lowest(accuracy: float) -> float:
+        return shift - largest_eigenvalue(lambda v: shift * v - X.riesz(A @ v), X.matrix, accuracy)
+
+    low = moved(lowest, -1.0, lambda a: is_proved_definite([A, -a * X.matrix], chosen))
+    return (low, continuity(A, X)) if low.proved else coercivity_and_continuity(A, X)
+
+
 def operator_norm(M: SparseMatrix, X: InnerProduct) -> Constant:
     """Upper bound of max |vᵀMv| / ‖v‖² over v for a symmetric M (n×n), with ‖v‖ the norm of X."""
     if not abs(M).sum():
         return Constant(0.0, True)
     chosen = implementation(X.factorisation)
 
-    def estimate(accuracy: float) -> float:
-        if X.dim <= FEW:
-            return float(np.abs(scipy.linalg.eigvalsh(M.toarray(), X.matrix.toarray())).max())
-        return largest_eigenvalue(lambda v: X.riesz(M @ v), X.matrix, accuracy)
-
     def above(c: float) -> bool:
         return all(is_proved_definite([c * X.matrix, sign * M], chosen) for sign in (-1.0, 1.0))
 
-    return moved(estimate, 1.0, above)
+    return moved(partial(largest_quotient, M, X), 1.0, above)
+
+
+def largest_quotient(M: SparseMatrix, X: InnerProduct, accuracy: float = ROUGH) -> float:
+    """Estimate of max |vᵀMv| / ‖v‖² over v for a symmetric M (n×n); nothing is proved."""
+    if not abs(M).sum():
+        return 0.0
+    if X.dim <= FEW:
+        return float(np.abs(scipy.linalg.eigvalsh(M.toarray(), X.matrix.toarray())).max())
+    return largest_eigenvalue(lambda v: X.riesz(M @ v), X.matrix, accuracy)
 
 
 def moved(estimate: Estimate, sign: float, proves: Callable[[float], bool]) -> Constant:

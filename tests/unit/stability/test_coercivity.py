@@ -8,7 +8,13 @@ from numerics import Varying, space, spd
 
 from vibench.errors import NumericalError
 from vibench.stability import coercivity
-from vibench.stability.coercivity import MARGINS, Constant, coercivity_and_continuity, energy_inf_sup
+from vibench.stability.coercivity import (
+    MARGINS,
+    Constant,
+    coercivity_and_continuity,
+    constants_near,
+    energy_inf_sup,
+)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 40])
@@ -20,6 +26,24 @@ def test_proved_constants_enclose_the_spectrum_closely(n: int) -> None:
     assert (1.0 - 2.0 * MARGINS[0]) * values[0] <= low.value <= values[0]
     assert high.proved
     assert values[-1] <= high.value <= (1.0 + 2.0 * MARGINS[0]) * values[-1]
+
+
+@pytest.mark.parametrize("accuracy", [coercivity.ACCURACY, 0.5])
+def test_constants_of_a_matrix_near_to_the_inner_product_are_as_sharp(
+    monkeypatch: pytest.MonkeyPatch, accuracy: float
+) -> None:
+    """With a first Lanczos iteration that is accurate enough, and with one that is not."""
+    monkeypatch.setattr(coercivity, "ACCURACY", accuracy)
+    rng, V = np.random.default_rng(5), space(80, 5)
+    A = V.matrix.toarray() + 0.3 * spd(80, rng, 10.0) / 10.0
+    values = scipy.linalg.eigh(A, V.matrix.toarray(), eigvals_only=True)
+    low, high = constants_near(sp.csc_array(A), V)
+    assert low.proved
+    assert (1.0 - 2.0 * MARGINS[0]) * values[0] <= low.value <= values[0]
+    assert high.proved
+    assert values[-1] <= high.value <= (1.0 + 2.0 * MARGINS[0]) * values[-1]
+    with pytest.raises(NumericalError, match="not positive definite"):
+        constants_near(sp.csc_array(A - 2.0 * values[-1] * V.matrix.toarray()), V)
 
 
 def test_an_indefinite_matrix_has_no_coercivity() -> None:

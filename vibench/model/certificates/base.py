@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -19,8 +19,8 @@ from vibench.linalg.schur_complement import EliminationPattern, StaticCondensati
 from vibench.model.affine import AffineMember, Evaluation, coefficients, evaluated_members
 from vibench.model.certificates.inf_sup import OnlineInfSup, online_inf_sup
 from vibench.model.certificates.prepared_correction import constant_unknowns
-from vibench.model.certificates.spectral import SpectralBounds, rotated, spectral_bounds
-from vibench.stability.coercivity import operator_norm
+from vibench.model.certificates.spectral import SpectralBounds, leading_terms, rotated, spectral_bounds
+from vibench.stability.coercivity import MARGINS, largest_quotient
 
 VERIFICATION = 16
 """Random parameters at which interpolation errors are measured."""
@@ -134,13 +134,15 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
     box = problem.parameters
     at_centre = A.terms[0] if constant else checked_assembly(problem, 0.5 * (box.lower + box.upper)).A
     X = InnerProduct(at_centre, "A", problem.factorisation)
-    load, stiffness = _interpolation_errors(problem, X, A, f)
-    terms, rotation, spectral = list(A.terms), None, None
+    terms, rotation, spectral, leading = list(A.terms), None, None, len(A.terms)
+    evaluate = coefficients(problem, *evaluated_members({"A": A, "f": f}))
     if not constant:
-        evaluate = coefficients(problem, *evaluated_members({"A": A}))
         samples = np.column_stack([evaluate(mu).get("A", ONE) for mu in training])
         rotation, terms = T, _ = rotated(A.terms, samples)
-        spectral = spectral_bounds(problem, X, terms, lambda mu: T @ evaluate(mu).get("A", ONE), stiffness)
+        leading = len(terms) if is_exact(problem, "A", A) else leading_terms(T @ samples)
+    load, stiffness, of_leading = _interpolation_errors(problem, X, A, f, rotation, terms, leading)
+    if not constant:
+        spectral = spectral_bounds(problem, X, terms[:leading], lambda mu: T @ evaluate(mu).get("A", ONE), of_leading)
     pattern = EliminationPattern.of(X.matrix, dofs, X.factorisation)
     condensed = StaticCondensation(X.matrix, pattern, X.factorisation)
     C = dense_inverse(condensed.dense_schur, "A")  # Eᵀ X⁻¹ E is the inverse of a Schur complement
@@ -179,19 +181,33 @@ def contact_at(problem: Problem, mu: Array) -> Contact:
     return contact
 
 
-def _interpolation_errors(problem: Problem, X: InnerProduct, A: AffineMember, f: AffineMember) -> tuple[float, float]:
-    """Bounds of the errors of f̃ and Ã, from random parameters."""
+def _interpolation_errors(
+    problem: Problem,
+    X: InnerProduct,
+    A: AffineMember,
+    f: AffineMember,
+    rotation: Array | None,
+    terms: Sequence[SparseMatrix],
+    leading: int,
+) -> tuple[float, float, float]:
+    """Bounds of the errors of f̃, of Ã, and of the sum of its leading rotated terms, from random parameters."""
     exact = {name: is_exact(problem, name, member) for name, member in (("A", A), ("f", f))}
     if all(exact.values()):
-        return 0.0, 0.0
+        return 0.0, 0.0, 0.0
     evaluate = coefficients(problem, *evaluated_members({"A": A, "f": f}))
-    load = stiffness = 0.0
+    load = stiffness = of_leading = 0.0
     for mu in problem.parameters.sample(VERIFICATION, SEED):
         vi, theta = checked_assembly(problem, mu), evaluate(mu)
         if not exact["f"]:
             interpolated = sum(t * term for t, term in zip(theta.get("f", ONE), f.terms, strict=True))
             load = max(load, float(np.linalg.norm(X.whiten_functional(vi.f - interpolated))))
         if not exact["A"]:
-            difference = vi.A - sum(t * term for t, term in zip(theta.get("A", ONE), A.terms, strict=True))
-            stiffness = max(stiffness, operator_norm(difference, X).value)
-    return SAFETY * load, SAFETY * stiffness
+            of_A = theta.get("A", ONE)
+            difference = vi.A - sum(t * term for t, term in zip(of_A, A.terms, strict=True))
+            missed = left_out = largest_quotient(difference, X)
+            if rotation is not None and leading < len(terms):
+                last = zip((rotation @ of_A)[leading:], terms[leading:], strict=True)
+                left_out = largest_quotient(difference + sum(t * term for t, term in last), X)
+            stiffness, of_leading = max(stiffness, missed), max(of_leading, left_out)
+    moved = SAFETY * (1.0 + MARGINS[0])
+    return SAFETY * load, moved * stiffness, moved * of_leading

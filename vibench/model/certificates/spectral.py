@@ -12,7 +12,8 @@ so that, with ‖A_q‖ ≤ s_q,
 are bounds whatever c is: each c is a feasible point of the dual of the linear program that the successive constraint
 method solves (Huynh, Rozza, Sen and Patera, C. R. Math. 345, 2007). Anchors form a grid of the parameter box, and c are
 the weights of multilinear interpolation on it, which leave a small δ and take no optimisation. The A_q are rotated to
-the principal directions of A over the parameters first, so that the sum is close to the norm of Σ_q δ_q A_q.
+the principal directions of A over the parameters first, so that the sum is close to the norm of Σ_q δ_q A_q. Where A is
+interpolated, and η has been measured, the last directions hardly matter: they are left out of the sum, and D has them.
 """
 
 from __future__ import annotations
@@ -28,12 +29,15 @@ from vibench.arrays import Array, SparseMatrix, digest
 from vibench.interfaces.problem import ParameterBox, Problem
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct
-from vibench.stability.coercivity import Constant, coercivity_and_continuity, operator_norm
+from vibench.stability.coercivity import Constant, constants_near, operator_norm
 
 ANCHORS = 81
 """Largest number of anchors; a grid has from 2 to 9 points per direction, or one point alone where 2^d are too many."""
 
 MOST_PER_DIRECTION = 9
+
+LEFT_OUT = 1e-4
+"""Share of the variation of A over the parameters, in coefficients, that directions may have to be left out."""
 
 TINY = float(np.finfo(float).tiny)
 
@@ -53,7 +57,7 @@ class SpectralBounds:
     theta
         θ(µ_i) (Q×P) in the rotated coordinates.
     norms
-        s_q (Q,) of the rotated A_q.
+        s_q (Q,) of the rotated A_q; zero for those that D has.
     error
         η.
     proved
@@ -107,7 +111,7 @@ def anchors(box: ParameterBox) -> tuple[Array, int]:
 def spectral_bounds(
     problem: Problem, X: InnerProduct, terms: list[SparseMatrix], theta: Callable[[Array], Array], error: float
 ) -> SpectralBounds:
-    """Bounds from the terms A_q (n×n) of A, their coefficients θ (Q,) as a function of mu, and η."""
+    """Bounds from the first terms A_q (n×n) of A, coefficients θ (Q,) of all as a function of mu, and η of these."""
     points, count = anchors(problem.parameters)
     found: dict[bytes, tuple[Constant, Constant]] = {}  # A often depends on a few of the parameters alone
     constants = []
@@ -115,17 +119,17 @@ def spectral_bounds(
         A = checked_assembly(problem, mu).A
         key = digest(A)
         if key not in found:
-            found[key] = coercivity_and_continuity(A, X)
+            found[key] = constants_near(A, X)
         constants.append(found[key])
-    norms = [operator_norm(term, X) for term in terms]
+    norms, coefficients = [operator_norm(term, X) for term in terms], np.column_stack([theta(mu) for mu in points])
     return SpectralBounds(
         lower=problem.parameters.lower,
         upper=problem.parameters.upper,
         count=count,
         alpha=np.array([alpha.value for alpha, _ in constants]),
         gamma=np.array([gamma.value for _, gamma in constants]),
-        theta=np.column_stack([theta(mu) for mu in points]),
-        norms=np.array([norm.value for norm in norms]),
+        theta=coefficients,
+        norms=np.append([norm.value for norm in norms], np.zeros(len(coefficients) - len(norms))),
         error=error,
         proved=all(constant.proved for pair in constants for constant in pair) and all(norm.proved for norm in norms),
     )
@@ -143,3 +147,10 @@ def rotated(terms: tuple[SparseMatrix, ...], theta: Array) -> tuple[Array, list[
     left, _, _ = np.linalg.svd(r @ theta)
     modes = [sp.csr_array((mode, (rows, columns)), shape=pattern.shape) for mode in (q @ left).T]
     return np.asarray(left.T @ r), modes
+
+
+def leading_terms(theta: Array) -> int:
+    """How many of the rotated terms are more than `LEFT_OUT` of the variation of A over samples θ (Q×P)."""
+    varying = np.linalg.norm(theta - theta.mean(axis=1, keepdims=True), axis=0).max()
+    rest = np.sqrt(np.cumsum((theta**2)[::-1], axis=0)[::-1].max(axis=1))  # of this term and those after it
+    return int(np.count_nonzero(rest > LEFT_OUT * varying))

@@ -11,7 +11,7 @@ from numerics import space, spd
 from vibench import InnerProduct, create
 from vibench.interfaces.problem import ParameterBox, Problem, VariationalInequality
 from vibench.model.certificates import spectral
-from vibench.model.certificates.spectral import ANCHORS, anchors, rotated, spectral_bounds
+from vibench.model.certificates.spectral import ANCHORS, LEFT_OUT, anchors, leading_terms, rotated, spectral_bounds
 from vibench.stability.coercivity import Constant, operator_norm
 
 N, Q = 6, 3
@@ -109,8 +109,30 @@ def test_anchors_at_which_a_is_the_same_share_their_constants(monkeypatch: pytes
         calls.append(A)
         return Constant(0.5, True), Constant(2.0, True)
 
-    monkeypatch.setattr(spectral, "coercivity_and_continuity", counted)
+    monkeypatch.setattr(spectral, "constants_near", counted)
     A = problem.affine["A"]
     bounds = spectral.spectral_bounds(problem, problem.V, list(A.terms), A.coefficients, 0.0)
     assert len(bounds.alpha) == bounds.count**4
     assert len(calls) == bounds.count
+
+
+def test_terms_that_are_left_out_are_bounded_by_what_they_are() -> None:
+    """The last of three terms, with its largest norm in the place of an error that was measured."""
+    points = Curved.parameters.sample(50, 2)
+    last = [abs((T @ theta(mu))[2]) * operator_norm(ROTATED[2], X).value for mu in points]
+    found = spectral_bounds(Curved(), X, ROTATED[:2], lambda mu: T @ theta(mu), 1.5 * max(last))
+    assert found.norms[2] == 0.0
+    assert np.array_equal(found.norms[:2], BOUNDS.norms[:2])
+    for mu in points:
+        low, high = found.at(mu, T @ theta(mu))
+        smallest, largest = extremes(mu)
+        assert low <= smallest
+        assert high >= largest
+
+
+def test_leading_terms_have_all_but_a_share_of_the_variation() -> None:
+    samples = np.array([[9.0, 10.0, 11.0], [0.5, -0.5, 0.0], [0.9, 0.5, -0.9], [0.2, 0.3, 0.1], [0.0, 0.4, 0.0]])
+    small = 0.2 * LEFT_OUT
+    assert leading_terms(samples) == 5
+    assert leading_terms(np.vstack([samples, small * samples])) == 5 + 1  # one more varies by more
+    assert leading_terms(np.vstack([samples, 0.1 * small * samples[1:]])) == 5
