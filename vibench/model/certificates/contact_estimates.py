@@ -18,19 +18,22 @@ from math import inf, sqrt
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Mask
+from vibench.arrays import Array, Mask, SparseMatrix
+from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import Contact, Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.definite import dense_inverse
 from vibench.linalg.schur_complement import EliminationPattern, StaticCondensation
 from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction
-from vibench.model.galerkin import project
 from vibench.qp.exact import exact_solution
 from vibench.qp.scaling import ratio
 
 MOST_CONTACT = 4000
 """Largest number of contact unknowns whose compliance is a dense matrix here."""
+
+KEPT = 1000
+"""Parameters whose projected stiffness is kept."""
 
 
 class ContactEstimates:
@@ -40,22 +43,26 @@ class ContactEstimates:
     ----------
     problem
         One that `supports` estimates.
-    vi
-        The variational inequality of the first solution.
+    vi, stiffness
+        The variational inequality of the first solution, and its A as a high-fidelity solver condensed it.
     """
 
-    def __init__(self, problem: Problem, vi: VariationalInequality) -> None:
+    def __init__(self, problem: Problem, vi: VariationalInequality, stiffness: CondensedStiffness) -> None:
         assert problem.contact_dofs is not None  # as `supports` says
         self._problem, self._dofs, self._A, self._f = problem, problem.contact_dofs, vi.A.copy(), vi.f.copy()
         self._constant = {"A", "f"} <= set(problem.constant)
-        self._factor = SparseCholesky(vi.A, "A")
-        condensed = StaticCondensation(vi.A, EliminationPattern.of(vi.A, self._dofs))
-        self._compliance = ContactCompliance(dense_inverse(condensed.dense_schur, "A"), np.zeros(0, np.intp))
+        if self._constant and stiffness.dense and np.array_equal(stiffness.retained, self._dofs):
+            self._solve, compliance = stiffness.solve, stiffness.liftings(sp.eye_array(len(self._dofs), format="csr"))
+        else:
+            condensed = StaticCondensation(vi.A, EliminationPattern.of(vi.A, self._dofs))
+            self._solve, compliance = SparseCholesky(vi.A, "A").solve, dense_inverse(condensed.dense_schur, "A")
+        self._compliance = ContactCompliance(compliance, np.zeros(0, np.intp))
         self._near = np.zeros(len(self._dofs), bool)
-        self._of_load = self._factor.solve(self._f)[self._dofs]
-        self._square_of_load = float(self._f @ self._factor.solve(self._f))
+        of_load = self._solve(self._f[:, None])[:, 0]
+        self._of_load, self._square_of_load = of_load[self._dofs], float(self._f @ of_load)
         self._basis, self._at_contact = np.zeros((len(vi.f), 0)), np.zeros((len(self._dofs), 0))
         self._stiffness, self._loads, self._generators = np.zeros((0, 0)), np.zeros(0), np.zeros((len(vi.g), 0))
+        self._projected = dict[bytes, Array]()
 
     @staticmethod
     def supports(problem: Problem) -> bool:
@@ -67,15 +74,32 @@ class ContactEstimates:
         """Take the model with new basis vectors (n×k) and all of its generators (m×R), after a solution of `vi`."""
         self._basis, self._generators = np.hstack([self._basis, new]), generators
         self._at_contact = np.ascontiguousarray(self._basis[self._dofs])
-        products, size = self._basis.T @ (self._A @ new), len(self._stiffness)
-        grown = np.zeros((self._basis.shape[1],) * 2)
-        grown[:size, :size], grown[:, size:], grown[size:] = self._stiffness, products, products.T
-        self._stiffness, self._loads = 0.5 * (grown + grown.T), np.append(self._loads, new.T @ self._f)
+        self._stiffness, self._loads = self._grown(self._stiffness, self._A, self._f)
         touches = abs(sp.csr_array(vi.B)[:, self._dofs]) > 0.0
         near = self._near | self._next_to(touches)
         if np.any(near & ~self._near):
             self._near = near
             self._compliance = ContactCompliance(self._compliance.matrix, np.flatnonzero(near))
+
+    def _grown(self, projected: Array, A: SparseMatrix, f: Array) -> tuple[Array, Array]:
+        """ΦᵀAΦ (d×d), from that on the first vectors of Φ, and Φᵀf (d,)."""
+        size, (n, count) = len(projected), self._basis.shape
+        right = np.empty((n, count - size + 1))  # one product with Φ, which is large, for all
+        right[:, :-1], right[:, -1] = A @ self._basis[:, size:], f
+        products = self._basis.T @ right
+        new, grown = products[:, :-1], np.zeros((count, count))
+        grown[:size, :size], grown[:, size:], grown[size:] = projected, new, new.T
+        grown[size:, size:] = 0.5 * (new[size:] + new[size:].T)
+        return grown, products[:, -1]
+
+    def _program(self, mu: Array, vi: VariationalInequality, contact: Contact) -> VariationalInequality:
+        """The reduced program at mu (d,), where A varies; candidates are evaluated again with a larger basis."""
+        key, chi = mu.tobytes(), self._generators
+        A, f = self._grown(self._projected.pop(key, np.zeros((0, 0))), vi.A, vi.f)
+        self._projected[key] = A
+        if len(self._projected) > KEPT:
+            del self._projected[next(iter(self._projected))]
+        return VariationalInequality(A, f, chi.T @ np.asarray(contact.B @ self._at_contact), chi.T @ contact.g)
 
     def _next_to(self, touches: Mask) -> Mask:
         """Contact unknowns (k,) in rows of the support of a generator, or in rows that touch one of these."""
@@ -92,7 +116,7 @@ class ContactEstimates:
             B = chi.T @ np.asarray(rows @ self._at_contact)
             program = VariationalInequality(self._stiffness, self._loads, B, chi.T @ contact.g)
         else:
-            program = project(vi, self._basis, chi)
+            program = self._program(mu, vi, contact)
         answer = exact_solution(program)
         if answer is None:
             return inf
@@ -112,7 +136,7 @@ class ContactEstimates:
         u = self._basis @ z
         residual = vi.f - vi.A @ u
         residual[self._dofs] -= force
-        riesz = self._factor.solve(residual)
+        riesz = self._solve(residual[:, None])[:, 0]
         gamma = ratio(energy, float(z @ (self._stiffness @ z))) or 1.0
         return gamma, riesz[self._dofs], float(residual @ riesz)
 

@@ -70,7 +70,7 @@ class GrowingModel:
             self._whitened = np.hstack([self._whitened, more])
             self._basis = np.hstack([self._basis, V.unwhiten(more)])
         if self._estimates is None and ContactEstimates.supports(self._problem):
-            self._estimates = ContactEstimates(self._problem, vi)
+            self._estimates = ContactEstimates(self._problem, vi, self._solver.condensed(vi))
         if self._estimates is not None:
             self._estimates.grow(vi, self._basis[:, size:], self.generators)
         return note

@@ -9,10 +9,11 @@ import pytest
 from numerics import Tied, Varying
 
 from vibench import create, project_on_cone
-from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.problem import Problem
+from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
+from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import ReferenceAssembly
 from vibench.linalg.cholesky import SparseCholesky
+from vibench.model.certificates import contact_estimates
 from vibench.model.certificates.growing import GrowingModel, GrowingTrainer
 from vibench.reduction import part_in_cone
 
@@ -78,6 +79,26 @@ def test_estimates_are_about_what_bounds_are(name: str, resolution: int, share: 
         model.add(vi, solver.solve_assembled(mu, vi))
     for mu in problem.parameters.sample(10, 2):
         assert model.estimate(mu) == pytest.approx(model.bound(mu), rel=share)
+
+
+@pytest.mark.parametrize("kept", [1000, 2])
+def test_what_is_kept_of_a_candidate_changes_no_estimate(monkeypatch: pytest.MonkeyPatch, kept: int) -> None:
+    """Estimates of a model that grows under its candidates are those of one that sees them for the first time."""
+    monkeypatch.setattr(contact_estimates, "KEPT", kept)
+    problem = create("problem", "obstacle", {"resolution": 160})
+    solver, candidates = HighFidelitySolver(problem), problem.parameters.sample(6, 4)
+    growing, solved = GrowingModel(problem, solver), list[tuple[VariationalInequality, HighFidelitySolution]]()
+    for mu in problem.parameters.sample(5, 1):
+        vi = problem.assemble(mu).copy()
+        solved.append((vi, solver.solve(mu)))
+        growing.add(*solved[-1])
+        fresh = GrowingModel(problem, solver)
+        for one in solved:
+            fresh.add(*one)
+        again = [growing.estimate(mu) for mu in candidates]
+        np.testing.assert_allclose(again, [fresh.estimate(mu) for mu in candidates], rtol=1e-8)
+    assert growing._estimates is not None
+    assert len(growing._estimates._projected) == min(kept, len(candidates))
 
 
 def test_without_contact_unknowns_there_are_no_estimates() -> None:
