@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import scipy.linalg
 from annotated_types import Gt, Le
+from scipy.interpolate import RBFInterpolator
 from scipy.optimize import nnls
 
 from vibench import Array, Asked, Formulation, FormulationAnswer, FormulationModel, UnsupportedError
+from vibench_strategies.formulations.reduced_programs import FixedSpacesModel, refuse_free
 
 if TYPE_CHECKING:
     from vibench import Reduction
@@ -23,46 +25,52 @@ VARIANCES = 1e-3, 1e6
 """Between which that of the process is, relative to that of the snapshots' values."""
 
 NOISE = 1e-8
-"""Variance of the noise that every process has, relative to that of its values: the interpolation is regular."""
+"""Variance of the noise that every process has, relative to that of its values: the interpolation is regular. Radial
+basis functions are smoothed by the same number."""
 
 
 class Regression(Formulation):
-    """POD coefficients of u and coefficients of λ by Gaussian processes (Guo and Hesthaven 2018), λ put into the cone.
+    """POD coefficients of u and coefficients of λ as functions of the parameter, fitted to snapshots, λ in the cone.
 
     Each coefficient of u in V_N, and of λ in an orthonormal basis of the span of the cone, is a Gaussian process in
     the parameter with a Matérn 5/2 covariance and a length scale for each parameter, which maximise the likelihood of
-    the snapshots (scikit-learn). The predicted λ is projected on the cone in the norm of W, so that it is in W⁺. No
-    assembled matrix has a part in a query; nothing makes u satisfy the constraints. The uncertainty stated beside u is
-    the root of the sum of the predicted variances of its coefficients and of the mean square that V_N leaves out.
+    the snapshots (Guo and Hesthaven 2018, scikit-learn); or a sum of cubic radial basis functions and a linear function
+    (Audouze et al. 2009, SciPy), the interpolation of the least bending, in the unit cube. The predicted λ
+    is projected on the cone in the norm of W, so that it is in W⁺. No assembled matrix has a part in a query; nothing
+    makes u satisfy the constraints. The uncertainty stated beside u is the root of the sum of the predicted variances
+    of its coefficients and of the mean square that V_N leaves out; radial basis functions state none.
 
     Parameters
     ----------
+    kind
+        "gaussian" processes, or "radial" basis functions.
     length
-        Length scale, relative to the widths of the box, from which the likelihood is maximised.
+        Length scale, relative to the widths of the box, from which the likelihood of processes is maximised.
     """
 
     requires: ClassVar[tuple[str, ...]] = ("scikit-learn",)
     uses: ClassVar[tuple[str, ...]] = ("pod", "dual")
 
-    def __init__(self, length: Annotated[float, Gt(ROUGHEST), Le(SMOOTHEST)] = 1.0) -> None:
-        self.length = length
+    def __init__(
+        self,
+        kind: Literal["gaussian", "radial"] = "gaussian",
+        length: Annotated[float, Gt(ROUGHEST), Le(SMOOTHEST)] = 1.0,
+    ) -> None:
+        self.kind, self.length = kind, length
 
     def build(self, offline: Reduction) -> Mapping[str, Any]:
-        """The processes of u and of λ, and the Gram matrices with which λ is projected."""
+        """What is fitted to u and to λ, and the Gram matrix with which λ is projected."""
         problem, snapshots, cone = offline.problem, offline.snapshots, offline.cone
-        if cone.free.any():
-            raise UnsupportedError("the formulation needs λ ≥ 0, and the cone has generators that are free in sign")
+        refuse_free(cone)
         box, span = problem.parameters, offline.multipliers.span
         places = (snapshots.mu - box.lower) / box.widths
-        coefficients = problem.V.gram(offline.pod.basis, snapshots.u)
-        rest = problem.V.norm(snapshots.u - offline.pod.basis @ coefficients)
-        return {
-            "places": places,
-            "left_out": float(np.mean(rest**2)),
-            "u": self._processes(places, coefficients),
-            "lam": self._processes(places, problem.W.gram(span, snapshots.lam)),
-            "rays": problem.W.gram(span, cone.generators),
-        }
+        if self.kind == "radial" and np.linalg.matrix_rank(places - places.mean(axis=0)) < box.dim:
+            raise UnsupportedError(f"the training parameters are in a hyperplane, no linear function of {box.dim} fits")
+        values = {"u": problem.V.gram(offline.pod.basis, snapshots.u), "lam": problem.W.gram(span, snapshots.lam)}
+        rest = problem.V.norm(snapshots.u - offline.pod.basis @ values["u"])
+        fitted = {n: {"values": v} if self.kind == "radial" else self._processes(places, v) for n, v in values.items()}
+        rays = problem.W.gram(span, cone.generators)
+        return {"places": places, "left_out": float(np.mean(rest**2)), "rays": rays, **fitted}
 
     def _processes(self, places: Array, values: Array) -> dict[str, Array]:
         """Processes of values (k×P): covariances by length scales (k×d) and variances (k,), means and spreads (k,).
@@ -96,41 +104,63 @@ class Regression(Formulation):
         return found
 
     def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
-        """The processes, and the bases of their coefficients."""
-        return RegressionModel(offline, built)
+        """The fitted functions, and the bases of their coefficients."""
+        made = RadialFunctions if self.kind == "radial" else Processes
+        return RegressionModel(offline, built, made(built["places"], built["u"]), made(built["places"], built["lam"]))
 
 
-class RegressionModel(FormulationModel):
-    """Evaluates the processes at a parameter."""
+class RadialFunctions:
+    """Sums of cubic radial basis functions and a linear function, of values (k×P) at places (P×d) in the unit cube."""
 
-    def __init__(self, offline: Reduction, built: Mapping[str, Any]) -> None:
-        self._box, self._basis, self._chi = offline.problem.parameters, offline.pod.basis, offline.cone.generators
-        self.dimension, self.generators = int(self._basis.shape[1]), int(self._chi.shape[1])
-        self._places, self._left_out, self._rays = built["places"], built["left_out"], built["rays"]
-        self._u, self._lam = built["u"], built["lam"]
+    def __init__(self, places: Array, of: Mapping[str, Array]) -> None:
+        values = of["values"].T
+        self._fitted = (
+            RBFInterpolator(places, values, kernel="cubic", degree=1, smoothing=NOISE) if values.size else None
+        )
 
-    def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:  # noqa: ARG002
-        """Means of the coefficients, those of λ projected on the cone, and the uncertainty of u."""
-        place = (mu - self._box.lower) / self._box.widths
-        covariances = self._covariances(self._u, place)
-        x, lam = _mean(self._u, covariances), _mean(self._lam, self._covariances(self._lam, place))
-        explained = np.einsum("kpq,kq->kp", self._u["inverses"], covariances)
-        variances = np.maximum(self._u["variances"] - np.sum(explained**2, axis=1), 0.0) * self._u["spreads"] ** 2
-        alpha = nnls(self._rays, lam)[0] if self._rays.size else np.zeros(self._rays.shape[1])
-        return FormulationAnswer(x, alpha, uncertainty=float(np.sqrt(variances.sum() + self._left_out)))
+    def at(self, place: Array) -> Array:
+        """Their values (k,) at a place (d,)."""
+        return np.zeros(0) if self._fitted is None else np.asarray(self._fitted(place[None])[0])
 
-    def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:  # noqa: ARG002
-        """The pair in V_N and in the cone."""
-        assert answer.x is not None
-        assert answer.alpha is not None
-        return self._basis @ answer.x, self._chi @ answer.alpha
 
-    def _covariances(self, of: Mapping[str, Array], place: Array) -> Array:
+class Processes:
+    """Gaussian processes, from what `Regression` stores of them."""
+
+    def __init__(self, places: Array, of: Mapping[str, Array]) -> None:
+        self._places, self._of = places, of
+
+    def at(self, place: Array) -> Array:
+        """Their means (k,) at a place (d,)."""
+        of = self._of
+        return np.asarray(of["means"] + of["spreads"] * np.sum(of["weights"] * self._covariances(place), axis=1))
+
+    def variance(self, place: Array) -> float:
+        """The sum of their variances there."""
+        explained = np.einsum("kpq,kq->kp", self._of["inverses"], self._covariances(place))
+        left = np.maximum(self._of["variances"] - np.sum(explained**2, axis=1), 0.0)
+        return float(left @ self._of["spreads"] ** 2)
+
+    def _covariances(self, place: Array) -> Array:
         """Covariances (k×P) of the values at a place (d,) with those at the training parameters."""
+        of = self._of
         r = np.sqrt(5.0 * (of["lengths"] ** -2.0) @ ((self._places - place) ** 2).T)
         return np.asarray(of["variances"][:, None] * (1.0 + r + r**2 / 3.0) * np.exp(-r))
 
 
-def _mean(of: Mapping[str, Array], covariances: Array) -> Array:
-    """Predicted means (k,) of processes."""
-    return np.asarray(of["means"] + of["spreads"] * np.sum(of["weights"] * covariances, axis=1))
+Fitted = Processes | RadialFunctions
+
+
+class RegressionModel(FixedSpacesModel):
+    """Evaluates fitted coefficients at a parameter."""
+
+    def __init__(self, offline: Reduction, built: Mapping[str, Any], u: Fitted, lam: Fitted) -> None:
+        super().__init__(offline.pod.basis, offline.cone.generators)
+        self._box, self._u, self._lam = offline.problem.parameters, u, lam
+        self._left_out, self._rays = built["left_out"], built["rays"]
+
+    def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:  # noqa: ARG002
+        """The coefficients, those of λ projected on the cone, and the uncertainty of u."""
+        place = (mu - self._box.lower) / self._box.widths
+        alpha = nnls(self._rays, self._lam.at(place))[0] if self._rays.size else np.zeros(self._rays.shape[1])
+        stated = np.sqrt(self._u.variance(place) + self._left_out) if isinstance(self._u, Processes) else None
+        return FormulationAnswer(self._u.at(place), alpha, uncertainty=stated)

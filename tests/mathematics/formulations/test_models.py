@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 from transformed import Transformed
 
 import vibench
-from vibench import Array, Enrichment, Formulation, Kind, Reduction, Stop, UnsupportedError
+from vibench import Array, Enrichment, Formulation, Kind, Reduction, Snapshots, Stop, UnsupportedError
 from vibench.offline.sweep import high_fidelity_sweep
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies.cpg import CPG
@@ -104,6 +104,27 @@ def test_regression_interpolates_the_snapshots_and_its_uncertainty_has_the_size_
         ratios.append(V.norm(found.u - exact.u) / found.answer.uncertainty)
         assert V.norm(found.u - exact.u) <= found.error_bounds.u  # the proved bound knows nothing of the regression
     assert 0.1 < np.median(ratios) < 10.0
+
+
+def test_radial_basis_functions_interpolate_the_snapshots_and_reproduce_what_is_linear() -> None:
+    pytest.importorskip("sklearn")  # which the formulation requires
+    problem, V = STRING.problem, STRING.problem.V
+    fitted = STRING.formulated(Regression("radial"))
+    known = STRING.snapshots
+    for k in (0, 7):
+        found = fitted.solve(known.mu[k])
+        assert V.norm(found.u - known.u[:, k]) <= 1e-3 * V.norm(known.u[:, k])
+        assert problem.W.norm(found.lam - known.lam[:, k]) <= 1e-2 * problem.W.norm(known.lam[:, k])
+        assert found.lam.min() >= 0.0
+        assert found.answer.uncertainty is None
+    # snapshots that are linear in the parameter, which few basis functions fit exactly
+    first, slope = known.u[:, 0], known.u[:, -1] - known.u[:, 0]
+    linear = Snapshots(known.mu, first[:, None] + slope[:, None] * known.mu.T, known.lam)
+    between = STRING.given(snapshots=linear).formulated(Regression("radial")).solve(MU).u
+    assert V.norm(between - first - slope * MU[0]) <= 1e-6 * V.norm(between)
+    alone = STRING.given(snapshots=Snapshots(known.mu[:1], known.u[:, :1], known.lam[:, :1]))
+    with pytest.raises(UnsupportedError, match="in a hyperplane, no linear function of 1 fits"):
+        alone.formulated(Regression("radial"))
 
 
 @pytest.mark.parametrize("integrate", ["varying", "all"])
@@ -216,8 +237,8 @@ def discs() -> list[Reduction]:
 
 @pytest.mark.parametrize(
     "formulation",
-    [Penalty(), Proximal(), SparseDictionary(), Local(2), Regression(), HyperReduced(1e-2)],
-    ids=lambda formulation: type(formulation).__name__,
+    [Penalty(), Proximal(), SparseDictionary(), Local(2), Regression(), Regression("radial"), HyperReduced(1e-2)],
+    ids=lambda formulation: " ".join([type(formulation).__name__, getattr(formulation, "kind", "")]).strip(),
 )
 def test_units_have_no_part_in_any_formulation(discs: list[Reduction], formulation: Formulation) -> None:
     first, second = (offline.formulated(formulation).solve([1.04]) for offline in discs)
