@@ -312,7 +312,10 @@ def round_off_of_factors(lu: SuperLU, split: int, corner: SparseMatrix, weights:
         product = _rows_of(lower, few, split)
         product.data = product.data * pivots[product.indices]
         mirrored = _rows_of(upper, few, split).tocsc().tocsr()  # sorted, which is a copy
-        missing = mirrored - product
+        if have_one_pattern(mirrored, product):
+            missing = sp.csr_array((mirrored.data - product.data, *_pattern(mirrored)), shape=mirrored.shape)
+        else:  # an entry of one of the factors is zero
+            missing = mirrored - product
         for part in (mirrored, missing):
             np.abs(part.data, out=part.data)
         inner += gamma * (mirrored.T @ w_i[few]) + (1.0 + gamma) * (missing.T @ w_i[few])
@@ -323,6 +326,15 @@ def round_off_of_factors(lu: SuperLU, split: int, corner: SparseMatrix, weights:
     if len(w_c):
         sums[split:] += gamma * (abs(corner) @ w_c + lower[split:, :split] @ (np.abs(pivots) * back))
     return np.asarray(1.01 * sums)
+
+
+def have_one_pattern(first: SparseMatrix, second: SparseMatrix) -> bool:
+    """Whether two matrices of one format have their entries, in sorted order, at the same places."""
+    return all(map(np.array_equal, _pattern(first), _pattern(second)))
+
+
+def _pattern(matrix: SparseMatrix) -> tuple[Indices, Indices]:
+    return matrix.indices, matrix.indptr
 
 
 def _groups(pointers: Indices) -> Iterator[slice]:

@@ -15,14 +15,16 @@ round-off that is computed instead of estimated beforehand. It assumes that noth
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
+from functools import reduce
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import SuperLU
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.linalg.cholesky import UNIT, round_off_of_factors, symmetric_lu
+from vibench.linalg.cholesky import UNIT, have_one_pattern, round_off_of_factors, symmetric_lu
 
 FIRST_SHIFT, PLANE = 1e-11, 16.0
 """τ of the first attempt, and the entries of a row from which on it is larger by their share: factors of matrices of
@@ -43,17 +45,18 @@ def proved_positive(parts: Sequence[SparseMatrix], scale: Array, order: Indices 
     order
         Elimination order (n,); by default minimum degree.
     """
-    total, squares = sum(sp.csc_array(part) for part in parts), scale**2
-    total, absolute = 0.5 * (total + sp.csc_array(total.T)), [abs(sp.csc_array(part)) for part in parts]
-    inverse = 1.0 / scale
-    sizes = 0.5 * sum(part @ inverse + part.T @ inverse for part in absolute)
+    columns = [sp.csc_array(part) for part in parts]
+    if not all(np.all(np.isfinite(part.data)) for part in columns):
+        return 0
+    sizes, squares = np.sum([_absolute_sums(part, 1.0 / scale) for part in columns], axis=0), scale**2
+    total = columns[0] if len(columns) == 1 else reduce(operator.add, columns)
     if order is not None:
-        total, sizes, squares = sp.csc_array(total[order][:, order]), sizes[order], squares[order]
-    permutation, inverse = "MMD_AT_PLUS_A" if order is None else "NATURAL", 1.0 / np.sqrt(squares)
-    shift = first_shift(total)
+        total, sizes, squares = total[order][:, order], sizes[order], squares[order]
+    matrix, permutation = _symmetric_part(total), "MMD_AT_PLUS_A" if order is None else "NATURAL"
+    shift, inverse = first_shift(matrix), 1.0 / np.sqrt(squares)
     for _ in range(ATTEMPTS):
         try:
-            lu = symmetric_lu(total - sp.diags_array(shift * squares, format="csc"), permutation)
+            lu = symmetric_lu(_less_diagonal(matrix, shift * squares), permutation)
         except RuntimeError:  # exactly singular
             return 0
         pivots = lu.U.diagonal()
@@ -67,6 +70,34 @@ def proved_positive(parts: Sequence[SparseMatrix], scale: Array, order: Indices 
             return 0
         shift = 2.0 * error
     return 0
+
+
+def _absolute_sums(part: SparseMatrix, weights: Array) -> Array:
+    """½(|Q| + |Q|ᵀ)w (n,) for Q (n×n, CSC) and w (n,), without a matrix that costs more to make than to multiply."""
+    n, sizes = part.shape[0], np.abs(part.data)
+    columns = np.repeat(np.arange(n), np.diff(part.indptr))
+    of_rows = np.bincount(part.indices, sizes * weights[columns], n)
+    return np.asarray(0.5 * (of_rows + np.bincount(columns, sizes * weights[part.indices], n)))
+
+
+def _symmetric_part(matrix: SparseMatrix) -> SparseMatrix:
+    """½(M + Mᵀ) of M (n×n)."""
+    mirrored = sp.csc_array(sp.csr_array(matrix))  # sorted
+    transposed = sp.csc_array(mirrored.T)
+    if not have_one_pattern(mirrored, transposed):
+        return sp.csc_array(0.5 * (mirrored + transposed))
+    mirrored.data = 0.5 * (mirrored.data + transposed.data)
+    return mirrored
+
+
+def _less_diagonal(matrix: SparseMatrix, squares: Array) -> SparseMatrix:
+    """M − diag(s²) (n×n, CSC) for a sorted M."""
+    places = np.flatnonzero(matrix.indices == np.repeat(np.arange(len(squares)), np.diff(matrix.indptr)))
+    if len(places) < len(squares):
+        return sp.csc_array(matrix - sp.diags_array(squares, format="csc"))
+    result = matrix.copy()
+    result.data[places] -= squares
+    return result
 
 
 def first_shift(matrix: SparseMatrix) -> float:

@@ -35,7 +35,7 @@ from vibench.stability.infsup import InfSup
 MARGINS = (1e-3, 1e-2, 1e-1, 0.5)
 """Constants are moved outwards by the first of these shares for which they are proved; by the first one if by none."""
 
-ACCURACY, FINE, ROUGH = 1e-4, 1e-8, 1e-2
+ACCURACY, FINE, ROUGH = 1e-5, 1e-8, 1e-2
 """Relative errors of Lanczos iterations: of a first estimate, of the second where the first is not proved with the
 smallest of `MARGINS`, and for what is moved by the largest of them."""
 

@@ -66,3 +66,29 @@ def test_the_error_of_a_factorisation_is_bounded(seed: int, n: int) -> None:
             difference = abs(product - Fraction(matrix[back[i], back[j]]))
             total += difference / (Fraction(scale[back[i]]) * Fraction(scale[back[j]]))
         assert float(total) <= bound[back[i]]
+
+
+def test_patterns_may_be_neither_symmetric_nor_hold_the_diagonal() -> None:
+    """Sums are symmetrised and shifted by other means then, with the same counts."""
+    rng = np.random.default_rng(4)
+    for n in (6, 40):
+        full = spd(n, rng) - 2.0 * np.eye(n)
+        full[np.diag_indices(n)] = 0.0
+        expected = int(np.sum(np.linalg.eigvalsh(full) > 0.0))
+        lopsided = np.tril(full, -1) * 2.0  # its symmetric part is that of `full`
+        shift = 0.5 * sp.eye_array(n, format="csr")
+        for parts in ([sp.csr_array(full)], [sp.csr_array(lopsided)], [sp.csc_array(lopsided), shift, -shift]):
+            assert parts[0].diagonal().max() == 0.0
+            assert proved_positive(parts, np.ones(n)) <= expected
+        definite = [sp.csr_array(2.0 * np.tril(full, -1)), sp.csr_array(np.diag(np.abs(full).sum(axis=0) + 1.0))]
+        assert proved_positive(definite, np.ones(n)) == n
+        assert proved_positive([*definite, sp.csc_array(np.diag([np.nan] + [1.0] * (n - 1)))], np.ones(n)) == 0
+
+
+@pytest.mark.parametrize("factor", [1e100, 1e-100])
+def test_counts_do_not_depend_on_units(factor: float) -> None:
+    matrix = factor * spd(20, np.random.default_rng(5))
+    assert proved_positive([sp.csc_array(matrix)], np.sqrt(np.diag(matrix))) == 20
+    smallest = np.linalg.eigvalsh(matrix)[0] * (1.0 + 1e-6)
+    shifted = [sp.csc_array(matrix), -smallest * sp.eye_array(20, format="csc")]
+    assert proved_positive(shifted, np.sqrt(np.diag(matrix))) == 19
