@@ -439,8 +439,15 @@ FAULTS = (
     Fault(
         "constant-of-the-wrong-side",
         "vibench/stability/coercivity.py",
-        "candidates = [estimate * (1.0 + margin) ** sign for margin in MARGINS]",
-        "candidates = [estimate * (1.0 + margin) ** -sign for margin in MARGINS]",
+        "candidates = [accurate * (1.0 + margin) ** sign for margin in MARGINS]",
+        "candidates = [accurate * (1.0 + margin) ** -sign for margin in MARGINS]",
+        ("tests/unit/stability/test_coercivity.py",),
+    ),
+    Fault(
+        "constant-without-a-proof",
+        "vibench/stability/coercivity.py",
+        "if proves(closest):",
+        "if closest > 0.0:",
         ("tests/unit/stability/test_coercivity.py",),
     ),
     Fault(
