@@ -65,6 +65,13 @@ def test_a_stage_that_goes_well_is_stored(run: Run, tmp_path: Path) -> None:
     assert found.value == "fine"
 
 
+def test_a_stage_says_which_share_of_it_is_done(run: Run, shared: Supervisor) -> None:
+    for how, share in (("third", 1.0 / 3.0), ("fine", 0.0)):
+        stage = Whole(how)
+        assert isinstance(run(stage), Done)
+        assert shared.share == (stage.key, share)
+
+
 def test_processes_of_tests_are_forked_whatever_seed_dask_leaves_in_the_environment(
     watcher: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

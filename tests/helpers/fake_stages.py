@@ -15,7 +15,7 @@ from typing import Any
 import fake_plugins
 import numpy as np
 
-from vibench.stages.base import Failed, Items, ItemwiseStage, Result, Stage
+from vibench.stages.base import SHARE, Failed, Items, ItemwiseStage, Result, Stage
 from vibench.storage.artefacts import Store
 from vibench.study.plugin import Plugin
 from vibench.timing import Seconds
@@ -37,6 +37,8 @@ def misbehave(how: str) -> None:
         os.fork()
     elif how == "hunger":
         np.ones(2**36)
+    elif how == "third":
+        SHARE.get()(1.0 / 3.0)
     elif how == "moment":
         time.sleep(0.05)
     else:

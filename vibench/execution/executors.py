@@ -8,6 +8,7 @@ import resource
 import secrets
 import threading
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
@@ -45,6 +46,10 @@ class Executor(ABC):
     @abstractmethod
     def submit(self, job: Job) -> Future[StageOutcome]:
         """Begin a job."""
+
+    def shares(self) -> Mapping[str, float]:
+        """Which share of running stages is done, by their keys, where that is known."""
+        return {}
 
     def check(self) -> None:  # noqa: B027  nothing to check where jobs run in our own threads
         """Check that submitted jobs can still finish.
@@ -90,6 +95,10 @@ class Local(Executor):
             return supervisor.run(job)
         finally:
             self._free.put(supervisor)
+
+    def shares(self) -> Mapping[str, float]:
+        """Those that the worker processes have told."""
+        return dict(supervisor.share for supervisor in self._supervisors)
 
     def close(self) -> None:
         """End the worker processes."""

@@ -76,6 +76,13 @@ class Begun:
 
 
 @dataclass(frozen=True)
+class Share:
+    """A worker has done this share of its stage."""
+
+    share: float
+
+
+@dataclass(frozen=True)
 class InItem:
     """A worker is in an item; `watched` while it is in an operation with a time limit of its own."""
 

@@ -74,6 +74,9 @@ class Observer:
     def begin(self, stage: Stage) -> None:
         """A stage begins."""
 
+    def shares(self, done: Sequence[tuple[Stage, float]]) -> None:
+        """These stages are running, and these shares of them are done as far as that is known; told often."""
+
     def stage(self, stage: Stage, wall: float) -> None:
         """A stage is done, after so many wall seconds."""
 
@@ -292,6 +295,8 @@ class _Run:
                 )
             done, _ = wait(running, timeout=CHECK_INTERVAL, return_when=FIRST_COMPLETED)
             workers.check()
+            shares = workers.shares()
+            self.observer.shares([(stage, shares.get(stage.key, 0.0)) for stage in running.values()])
             for future in done:
                 self._finish(running.pop(future), _outcome(future))
 

@@ -22,7 +22,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from vibench.execution.jobs import Batch, BatchDone, Begun, InItem, ItemDone, Job, OutOfMemory, Progress, batches
+from vibench.execution.jobs import Batch, BatchDone, Begun, InItem, ItemDone, Job, OutOfMemory, Progress, Share, batches
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, ItemwiseStage, Unstored
 from vibench.timing import KEPT_MEMORY, ONE_THREAD
@@ -67,7 +67,7 @@ class _JobState:
 
     def __init__(self, job: Job, observe: Callable[[Any], None]) -> None:
         self.job, self.progress, self._observe = job, Progress(), observe
-        self.seconds = 0.0
+        self.seconds = self.share = 0.0
         self.start(Batch(frozenset(), (), ends=False))
 
     def start(self, batch: Batch) -> Progress:
@@ -102,6 +102,8 @@ class _JobState:
         match message:
             case Begun():
                 self._begun, self._last = True, time.monotonic()
+            case Share():
+                self.share = message.share
             case InItem():
                 self.item = message.number
                 self._item_limit = self.seconds + self.job.query_seconds + GRACE if message.watched else float("inf")
@@ -138,6 +140,7 @@ class Supervisor:
         self._log, self._environment = log, dict(environment or {})
         self._workers: OrderedDict[frozenset[str], _Worker] = OrderedDict()  # the one used last comes last
         self._session = 0
+        self._state: _JobState | None = None
         self._stop = threading.Event()
 
     def run(self, job: Job, observe: Callable[[Any], None] = lambda _: None) -> Done | Failed | Unstored:
@@ -157,6 +160,12 @@ class Supervisor:
             self._kill()
             raise
 
+    @property
+    def share(self) -> tuple[str, float]:
+        """The key of the stage that is run, and which share of it is done as far as that is known."""
+        state = self._state
+        return ("", 0.0) if state is None else (state.job.stage.key, state.share)
+
     def stop(self) -> None:
         """Make `run`, which may be active in another thread, return soon."""
         self._stop.set()
@@ -168,6 +177,7 @@ class Supervisor:
 
     def _run(self, job: Job, observe: Callable[[Any], None]) -> Done | Failed | Unstored:
         state, limit, retried = _JobState(job, observe), job.cell_seconds, False
+        self._state = state
         done, lost = state.progress.done, state.progress.lost
         while len(self._workers) > KEPT:
             self._kill(next(iter(self._workers)))

@@ -21,10 +21,21 @@ from threadpoolctl import threadpool_limits
 
 from vibench import interrupts
 from vibench.errors import NumericalError, StorageError, UnsupportedError, VibenchError, in_a_line, message_of
-from vibench.execution.jobs import Batch, BatchDone, Begun, InItem, ItemDone, Job, OutOfMemory, Progress, code_here
+from vibench.execution.jobs import (
+    Batch,
+    BatchDone,
+    Begun,
+    InItem,
+    ItemDone,
+    Job,
+    OutOfMemory,
+    Progress,
+    Share,
+    code_here,
+)
 from vibench.execution.supervisor import MARK, kill_marked
 from vibench.qp.status import Status
-from vibench.stages.base import Done, Failed, Items, ItemwiseStage, Unstored
+from vibench.stages.base import SHARE, Done, Failed, Items, ItemwiseStage, Unstored
 from vibench.storage.artefacts import Store
 
 T = TypeVar("T")
@@ -99,6 +110,7 @@ def perform(
             _last.clear()
             value = items.finish([done[number] for number in range(job.stage.items)])
             return Done((), value, time.perf_counter() - start)
+        SHARE.set(lambda share: send(Share(share)))
         result = job.stage.run(store)
         store.put(job.stage.key, result.value, result.seconds, result.histories)
         return Done(result.histories, None, time.perf_counter() - start, result.seconds)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property, lru_cache
 from typing import Any, ClassVar
@@ -22,6 +23,10 @@ from vibench.timing import NO_TIME, Seconds
 
 Row = dict[str, Any]
 """A row of a results table: column → value."""
+
+
+SHARE: ContextVar[Callable[[float], None]] = ContextVar("SHARE", default=lambda _: None)
+"""Whom a long stage tells which share of it is done, for the estimate of the time left."""
 
 
 @lru_cache(maxsize=4)

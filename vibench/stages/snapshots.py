@@ -22,7 +22,7 @@ from vibench.model.error_bounds import reference_bound
 from vibench.offline.assemblies import assemblies
 from vibench.offline.sweep import Snapshots
 from vibench.qp.repeats import nearby
-from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
+from vibench.stages.base import SHARE, Result, Stage, build_problem, faults_of, value_of
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes
@@ -141,6 +141,7 @@ class SnapshotStage(Stage):
             solver.remember(mu, solution)
             u[:, k], lam[:, k] = solution.u, solution.lam
             fallbacks.append(solution.fallback)
+            SHARE.get()((k + 1) / len(mus))
         reference.refuse_rewritten_constants()
         refuse_shifted()
         setups = () if kept.seconds is None else (kept.seconds,)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
+from time import monotonic
 from typing import Any
 
 from rich.console import Console
@@ -27,10 +28,19 @@ ALIKE = 3
 """Lines about cells that are not ok for reasons that differ in their numbers alone."""
 
 
+FIRST_SECONDS = 20.0
+"""A line says how long the run will take when the first stage has taken so long and is not done."""
+
+
 class TimeLeft:
-    """Estimate of the seconds left from the mean wall seconds of the stages of each sort done so far."""
+    """Estimate of the seconds left from the mean wall seconds of the stages of each sort done so far.
+
+    A stage that tells which share of it is done counts before its end, too.
+    """
 
     def __init__(self, pending: Sequence[Stage], jobs: int) -> None:
+        self._began: dict[str, float] = {}
+        self._running: dict[str, tuple[str, float, float]] = {}
         self._left = Counter(stage.sort for stage in pending)
         self._done: Counter[str] = Counter()
         self._walls: defaultdict[str, float] = defaultdict(float)
@@ -40,20 +50,35 @@ class TimeLeft:
         """Count a stage that was planned later."""
         self._left[stage.sort] += 1
 
+    def begin(self, stage: Stage) -> None:
+        """Note when a stage begins."""
+        self._began[stage.key] = monotonic()
+
+    def shares(self, done: Sequence[tuple[Stage, float]]) -> float:
+        """Note which shares of the running stages are done; returns how long the longest one of these has taken."""
+        now = monotonic()
+        self._running = {one.key: (one.sort, share, now - self._began[one.key]) for one, share in done if share}
+        return max((seconds for _, _, seconds in self._running.values()), default=0.0)
+
     def done(self, stage: Stage, wall: float) -> None:
         """Count a finished stage."""
+        self._running.pop(stage.key, None)
         self._left[stage.sort] -= 1
         self._done[stage.sort] += 1
         self._walls[stage.sort] += wall
 
     def seconds(self) -> float | None:
         """Seconds left, `None` before there is anything to judge by."""
-        if not self._done:
-            return None
-        mean = sum(self._walls.values()) / self._done.total()
         means = {sort: self._walls[sort] / count for sort, count in self._done.items()}
-        left = (max(count, 0) * means.get(sort, mean) for sort, count in self._left.items())
-        return sum(left) / self._jobs
+        counts = Counter(self._done)
+        for sort, share, seconds in self._running.values():
+            means.setdefault(sort, seconds / share)
+            counts.setdefault(sort, 1)
+        if not counts:
+            return None
+        mean = sum(means[sort] * count for sort, count in counts.items()) / counts.total()
+        left = sum(max(count, 0) * means.get(sort, mean) for sort, count in self._left.items())
+        return max(0.0, left - sum(share * means[sort] for sort, share, _ in self._running.values())) / self._jobs
 
 
 def duration(seconds: float) -> str:
@@ -107,7 +132,7 @@ class ProgressDisplay(Observer):
         self._done: Counter[str] = Counter()
         self._failures: Counter[tuple[str, str]] = Counter()
         self._begun: set[str] = set()
-        self._none_can_run = False
+        self._none_can_run = self._has_estimated = False
         self._bar: Progress | None = None
 
     def __enter__(self) -> ProgressDisplay:
@@ -137,14 +162,26 @@ class ProgressDisplay(Observer):
 
     def begin(self, stage: Stage) -> None:
         """A stage begins: the bar names it, lines name each sort once."""
+        self._left.begin(stage)
         if self._bar is not None:
             self._bar.update(self._task, description=stage.label)
         elif stage.label not in self._begun:
             self._begun.add(stage.label)
             print_line(self._console, f"{stage.label} …")
 
+    def shares(self, done: Sequence[tuple[Stage, float]]) -> None:
+        """Shares of running stages: the bar has the time left from the first one on, and so does one line."""
+        longest = self._left.shares(done)
+        if self._bar is not None:
+            self._bar.update(self._task, left=self._left_text())
+        elif longest > FIRST_SECONDS and not self._has_estimated:
+            stage, share = max(done, key=lambda one: one[1])
+            self._has_estimated = True
+            print_line(self._console, f"{stage.label}: {share:.0%} of one part{self._left_text(', ')}")
+
     def stage(self, stage: Stage, wall: float) -> None:
         """A stage is done."""
+        self._has_estimated = True
         self._left.done(stage, wall)
         if self._bar is not None:
             self._bar.update(self._task, advance=1, left=self._left_text())

@@ -54,6 +54,21 @@ def test_stages_of_one_sort_are_taken_to_last_as_long() -> None:
     assert left.seconds() == pytest.approx(2 * 3.0)
 
 
+def test_a_stage_that_tells_its_share_counts_before_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After 10 s a quarter of the first of four parts is done; what is done of it is not left."""
+    now = [100.0]
+    monkeypatch.setattr("vibench.terminal.progress.monotonic", lambda: now[0])
+    left = TimeLeft(CHUNK[:4], 2)
+    left.begin(CHUNK[0])
+    assert left.shares([(CHUNK[0], 0.0)]) == 0.0
+    assert left.seconds() is None
+    now[0] += 10.0
+    assert left.shares([(CHUNK[0], 0.25)]) == 10.0
+    assert left.seconds() == pytest.approx((4 * 40.0 - 10.0) / 2)
+    left.done(CHUNK[0], 30.0)
+    assert left.seconds() == pytest.approx(3 * 30.0 / 2)
+
+
 def test_a_sort_never_seen_is_taken_to_last_as_the_mean_of_all() -> None:
     left = TimeLeft([*PODS[:2], *CHUNK[:4]], 1)
     left.done(PODS[0], 3.0)
@@ -151,6 +166,19 @@ def test_where_nothing_is_to_be_done_nobody_works(report: Make) -> None:
     made, printed = report()
     made.start(agenda(1, [], 0))
     assert printed.getvalue() == "1 cells, 0 to run, 0 stages\n"
+
+
+def test_a_long_first_part_says_how_long_the_run_will_take(report: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr("vibench.terminal.progress.monotonic", lambda: now[0])
+    made, printed = report()
+    made.start(agenda(1, CHUNK, 1))
+    made.begin(CHUNK[0])
+    for seconds, share in ((10.0, 0.1), (15.0, 0.25), (15.0, 0.4)):
+        now[0] += seconds
+        made.shares([(CHUNK[0], share)])
+    assert printed.getvalue().count("left") == 1
+    assert "high-fidelity solutions: 25% of one part, about 6 min left" in printed.getvalue()
 
 
 def test_high_fidelity_parts_are_reported_four_by_four(report: Make) -> None:
