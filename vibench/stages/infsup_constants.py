@@ -44,12 +44,11 @@ class ReferenceConstants(Stage):
         problem = build_problem(self.constraints.problem)
         inf_sup = constants_full(problem.V, value_of(store, self.constraints), nodal_multipliers(problem.W))
         mus, kept = self.constraints.parameters.of(problem), assemblies(problem)
-        quotients = [(kept.coercivity_at(mu), kept.continuity_at(mu)) for mu in mus]
         different = mus[:1] if {"A", "B"} <= problem.constant else mus
-        energies = [kept.energy_inf_sup_at(mu) for mu in different]
-        energies *= len(mus) // len(different)
-        constants = zip(inf_sup, quotients, energies, strict=True)
-        return Result([Stability(hf, *extremes, energy) for hf, extremes, energy in constants])
+        # of one parameter together, as long as its factorisation is there
+        others = [(kept.coercivity_at(mu), kept.continuity_at(mu), kept.energy_inf_sup_at(mu)) for mu in different]
+        others *= len(mus) // len(different)
+        return Result([Stability(hf, *constants) for hf, constants in zip(inf_sup, others, strict=True)])
 
 
 @dataclass(frozen=True)
