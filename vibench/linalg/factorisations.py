@@ -17,12 +17,13 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.errors import NumericalError, unknown_name
+from vibench.errors import NumericalError, RequestError, unknown_name
 from vibench.linalg.banded import is_proved_by_band
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky, elimination_order
 from vibench.linalg.definite import BlockDiagonal
 from vibench.linalg.inertia import ATTEMPTS, first_shift, proved_positive
 from vibench.provenance import distribution_version
+from vibench.text import brief
 
 COLUMNS = 128
 """Columns of a Schur complement that are solved for at once, where an implementation has no better way to it."""
@@ -196,6 +197,8 @@ PREFERRED = ("pardiso", "cholmod", "superlu")
 
 def implementation(name: str) -> Implementation:
     """The implementation of a name; raises a `RequestError` if there is none."""
+    if not isinstance(name, str):
+        raise RequestError(f"the factorisation is {brief(repr(name), 80)}, expected the name of one")
     if name == AVAILABLE:
         return next(IMPLEMENTATIONS[one] for one in PREFERRED if IMPLEMENTATIONS[one].is_installed)
     if name not in IMPLEMENTATIONS:

@@ -47,7 +47,7 @@ class InnerProduct:
     NumericalError
         If X is not square, not finite, not symmetric or not positive definite.
     RequestError
-        If X is no matrix of real numbers, or what a method is given is not of the space.
+        If X is no matrix of real numbers, no factorisation has the name, or what a method is given is not of the space.
     """
 
     def __init__(self, matrix: SparseMatrix, name: str = "the Gram matrix", factorisation: str = DEFAULT) -> None:

@@ -103,7 +103,10 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[Ca
             vibench.solve_qp,
             {"program": vi, "solver": "piqp", "accuracy": 1e-8, "extra": None, "factor": None, "start": None},
         ),
-        "InnerProduct": (vibench.InnerProduct, {"matrix": sp.eye_array(5), "name": "X"}),
+        "InnerProduct": (
+            vibench.InnerProduct,
+            {"matrix": sp.eye_array(5), "name": "X", "factorisation": "superlu"},
+        ),
         **{f"InnerProduct.{name}": (getattr(space, name), {"u": np.ones(5)}) for name in ("apply", "norm", "whiten")},
         **{
             f"InnerProduct.{name}": (getattr(space, name), {"functional": np.ones(5)})
