@@ -11,6 +11,7 @@ import importlib
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -83,9 +84,58 @@ def of_guarantees() -> Sequence[str]:
     )
 
 
+def span(values: pd.Series) -> str:
+    """The range of some numbers, to two digits."""
+    return f"{values.min():.2g} to {values.max():.2g}"
+
+
+def of_formulations() -> Sequence[str]:
+    """What the page on formulations says of times and errors beside those of `mixed`, and of less training."""
+    table = pd.read_csv(ROOT / "results" / "formulations" / "cells.csv")
+    assert (table["queries_ok"] == table["queries"]).all()
+    key = ["problem", "dual", "pod_tol", "training"]
+    mixed = table[table["formulation"] == "mixed"].set_index(key)
+    ratios = {}
+    for column in ("online_s", "error_lambda_mean"):
+        pairs = table.merge(mixed[column].rename(f"{column} of mixed"), left_on=key, right_index=True)
+        ratios[column] = pairs[column] / pairs[f"{column} of mixed"]
+    own, of = table["training"] == "own", table["formulation"]
+    mcpg, kind = table["dual"] == "mcpg", of.str.split().str[0]
+
+    def times(name: str, chosen: pd.Series | bool = True) -> str:
+        return span(ratios["online_s"][own & (kind == name) & chosen])
+
+    def errors(names: Sequence[str], chosen: pd.Series) -> str:
+        return span(ratios["error_lambda_mean"][own & kind.isin(names) & chosen])
+
+    same = ("penalty", "proximal", "sparse-dictionary")
+    fastest = table[own].loc[table[own].groupby("problem")["online_s"].idxmin()]
+    assert set(fastest["formulation"]) == {"regression (radial)"}
+    errors_of = table.pivot_table(index=["formulation", "problem", "dual", "pod_tol"], columns="training",
+                                  values="error_lambda_mean")  # fmt: skip
+    grown = np.log(errors_of[["half", "inner"]].div(errors_of["own"], axis=0))
+    growth = np.exp(grown.groupby(level=["formulation", "problem"]).mean()).reset_index("problem", drop=True)
+    regression = growth[growth.index.str.startswith("regression")]
+    return (
+        f"{of.str.split().str[0].nunique()} formulations, {len(table)} cells".replace("7 ", "seven "),
+        f"has the fastest queries on all four problems, with errors of λ of {span(fastest['error_lambda_mean'])}",
+        f"have {errors(same, mcpg)} times the errors of λ of `mixed` with `mcpg`, and {errors(same, ~mcpg)} times with",
+        f"take {times(same[0])}, {times(same[1])} and, with `mcpg`, {times(same[2], mcpg)} times as long",
+        f"`sparse-dictionary` takes {times(same[2], ~mcpg)} times as long",
+        f"`local` takes {times('local')} times as long as `mixed` in the same cell, with "
+        f"{errors(['local'], mcpg | ~mcpg)} times its errors",
+        f"`hyper-reduced` has {errors(['hyper-reduced'], mcpg)} times its errors of λ with `mcpg`, "
+        f"{errors(['hyper-reduced'], ~mcpg)} times with a dictionary, and takes {times('hyper-reduced')} times as long",
+        f"grow by factors of {span(growth.loc['mixed', 'inner'])}, those of `regression` of "
+        f"{span(regression['inner'])}; with half",
+        f"with half of the solutions, of {span(growth.loc['mixed', 'half'])} and {span(regression['half'])}",
+        f"in {table['queries'].sum():,} queries",
+    )
+
+
 @pytest.mark.parametrize(
     ("page", "sentences"),
-    [("docs/field.md", of_cones), ("docs/field.md", of_guarantees)],
+    [("docs/field.md", of_cones), ("docs/field.md", of_guarantees), ("docs/formulations.md", of_formulations)],
 )
 def test_a_page_says_what_the_tables_say(page: str, sentences: object) -> None:
     assert callable(sentences)
