@@ -98,7 +98,7 @@ def test_an_answer_to_a_similar_program_is_not_timed(which: int, store: Store, m
     monkeypatch.setattr(registry, "qp_solver", lambda name: {name: solver})
     with pytest.raises(NumericalError, match=r"residual .* above 3e-07.*does the solver remember answers"):
         TimingRounds(CELLS[which : which + 1], (EVERY,), 12).run(store)
-    assert solver.remembered == 1
+    assert 1 <= solver.remembered <= len(EVERY)  # refused within the first round
 
 
 def test_reduced_programs_are_assembled_nowhere_twice(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
