@@ -96,9 +96,11 @@ def test_a_solver_that_remembers_programs_never_meets_one_again(store: Store, mo
 def test_an_answer_to_a_similar_program_is_not_timed(which: int, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     solver = Remembers(digits=1)
     monkeypatch.setattr(registry, "qp_solver", lambda name: {name: solver})
+    # which queries a round begins with depends on measured seconds; units of some let the first answer pass
+    monkeypatch.setattr(timing_rounds, "parts_alike", lambda _, parts: (EVERY,) * parts)
     with pytest.raises(NumericalError, match=r"residual .* above 3e-07.*does the solver remember answers"):
         TimingRounds(CELLS[which : which + 1], (EVERY,), 12).run(store)
-    assert 1 <= solver.remembered <= len(EVERY)  # refused within the first round
+    assert solver.remembered == 1
 
 
 def test_reduced_programs_are_assembled_nowhere_twice(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
