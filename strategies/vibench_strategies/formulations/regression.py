@@ -122,6 +122,10 @@ class RadialFunctions:
         """Their values (k,) at a place (d,)."""
         return np.zeros(0) if self._fitted is None else np.asarray(self._fitted(place[None])[0])
 
+    def with_variance(self, place: Array) -> tuple[Array, None]:
+        """Their values; they state no variance."""
+        return self.at(place), None
+
 
 class Processes:
     """Gaussian processes, from what `Regression` stores of them."""
@@ -131,14 +135,18 @@ class Processes:
 
     def at(self, place: Array) -> Array:
         """Their means (k,) at a place (d,)."""
-        of = self._of
-        return np.asarray(of["means"] + of["spreads"] * np.sum(of["weights"] * self._covariances(place), axis=1))
+        return self._means(self._covariances(place))
 
-    def variance(self, place: Array) -> float:
-        """The sum of their variances there."""
-        explained = np.einsum("kpq,kq->kp", self._of["inverses"], self._covariances(place))
-        left = np.maximum(self._of["variances"] - np.sum(explained**2, axis=1), 0.0)
-        return float(left @ self._of["spreads"] ** 2)
+    def with_variance(self, place: Array) -> tuple[Array, float]:
+        """Their means, and the sum of their variances."""
+        of, covariances = self._of, self._covariances(place)
+        explained = np.einsum("kpq,kq->kp", of["inverses"], covariances)
+        left = np.maximum(of["variances"] - np.sum(explained**2, axis=1), 0.0)
+        return self._means(covariances), float(left @ of["spreads"] ** 2)
+
+    def _means(self, covariances: Array) -> Array:
+        of = self._of
+        return np.asarray(of["means"] + of["spreads"] * np.sum(of["weights"] * covariances, axis=1))
 
     def _covariances(self, place: Array) -> Array:
         """Covariances (k×P) of the values at a place (d,) with those at the training parameters."""
@@ -161,6 +169,7 @@ class RegressionModel(FixedSpacesModel):
     def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:  # noqa: ARG002
         """The coefficients, those of λ projected on the cone, and the uncertainty of u."""
         place = (mu - self._box.lower) / self._box.widths
-        alpha = nnls(self._rays, self._lam.at(place))[0] if self._rays.size else np.zeros(self._rays.shape[1])
-        stated = np.sqrt(self._u.variance(place) + self._left_out) if isinstance(self._u, Processes) else None
-        return FormulationAnswer(self._u.at(place), alpha, uncertainty=stated)
+        (x, variance), lam = self._u.with_variance(place), self._lam.at(place)
+        alpha = nnls(self._rays, lam)[0] if self._rays.size else np.zeros(self._rays.shape[1])
+        stated = None if variance is None else np.sqrt(variance + self._left_out)
+        return FormulationAnswer(x, alpha, uncertainty=stated)

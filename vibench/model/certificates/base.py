@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -140,7 +140,7 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
         samples = np.column_stack([evaluate(mu).get("A", ONE) for mu in training])
         rotation, terms = T, _ = rotated(A.terms, samples)
         leading = len(terms) if is_exact(problem, "A", A) else leading_terms(T @ samples)
-    load, stiffness, of_leading = _interpolation_errors(problem, X, A, f, rotation, terms, leading)
+    load, stiffness, of_leading = _interpolation_errors(problem, X, A, f, evaluate, rotation, terms, leading)
     if not constant:
         spectral = spectral_bounds(problem, X, terms[:leading], lambda mu: T @ evaluate(mu).get("A", ONE), of_leading)
     pattern = EliminationPattern.of(X.matrix, dofs, X.factorisation)
@@ -186,6 +186,7 @@ def _interpolation_errors(
     X: InnerProduct,
     A: AffineMember,
     f: AffineMember,
+    evaluate: Callable[[Array], Mapping[str, Array]],
     rotation: Array | None,
     terms: Sequence[SparseMatrix],
     leading: int,
@@ -194,7 +195,6 @@ def _interpolation_errors(
     exact = {name: is_exact(problem, name, member) for name, member in (("A", A), ("f", f))}
     if all(exact.values()):
         return 0.0, 0.0, 0.0
-    evaluate = coefficients(problem, *evaluated_members({"A": A, "f": f}))
     load = stiffness = of_leading = 0.0
     for mu in problem.parameters.sample(VERIFICATION, SEED):
         vi, theta = checked_assembly(problem, mu), evaluate(mu)
