@@ -115,7 +115,12 @@ def test_a_formulation_is_timed_in_the_rounds_with_all_of_it(found: Run) -> None
     assert cells.loc[("mixed", "full"), "offline_formulation_s"] == 0.0
     assert cells.loc[("Nearest", "full"), "offline_formulation_s"] > 0.0
     compared = found.table("thresholds")
-    assert set(compared.loc[compared["primal_a"] == "high-fidelity", "formulation"]) >= {"mixed", "Program", "Nearest"}
+    of_model = compared["cell_a"].isna()
+    assert set(compared.loc[of_model, "formulation_b"]) >= {"mixed", "Program", "Nearest"}
+    others = compared[~of_model & (compared["formulation_a"] == "mixed")].groupby("formulation_b")["cell_a"]
+    known = cells.reset_index().groupby("formulation")["cell"].agg(set)
+    assert {"Program", "Nearest"} <= set(others.groups)
+    assert all(set(mine) <= known["mixed"] for _, mine in others)
 
 
 def test_a_recorded_formulation_answers_and_is_refused_where_it_makes_no_sense(found: Run) -> None:

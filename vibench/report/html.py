@@ -205,12 +205,14 @@ def _grids(read: Mapping[str, Extended]) -> Iterator[TableGrid]:
         grid_of_cells(read["cells"], ERRORS),
     ]
     model = thresholds.frame["cell_a"].isna()
+    formulations = ~model & (thresholds.frame["formulation_a"] != thresholds.frame["formulation_b"])
     caption = (
         "When b is cheaper than a, offline and online together, by the number of queries, with its 95 % interval; "
         "undecided where the measured rounds do not tell the sign of a difference."
     )
     for name, title, rows in (
-        ("enrichments", "Break-even between enrichments", thresholds.frame[~model]),
+        ("enrichments", "Break-even between enrichments", thresholds.frame[~model & ~formulations]),
+        ("formulations", "Break-even between formulations", thresholds.frame[formulations]),
         ("model", "Break-even against the high-fidelity model", thresholds.frame[model]),
     ):
         if len(rows):

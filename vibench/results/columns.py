@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-VERSION = 18
+VERSION = 19
 """Schema version of a results file; a file of another version is refused."""
 
 TEXT, REAL, INTEGER, BLOB = "TEXT", "REAL", "INTEGER", "BLOB"
@@ -483,9 +483,15 @@ HISTORIES: Mapping[str, Column] = {
 }
 
 THRESHOLDS: Mapping[str, Column] = {
-    **_without("primal", "primal_options", "primal_tol", "assembly"),
+    **_without("formulation", "formulation_options", "primal", "primal_options", "primal_tol", "assembly"),
     "cell_a": text("Cell of model a; empty for the high-fidelity model."),
     "cell_b": text("Cell of model b."),
+    "formulation_a": text(
+        "Formulation of a; mixed for the high-fidelity model, too, which is the program of V and W.",
+        "formulation of a",
+        10,
+    ),
+    "formulation_b": text("Formulation of b.", "formulation of b", 10),
     "primal_a": text("Model a: its primal strategy, or high-fidelity.", "a", 11),
     "primal_tol_a": real("1", "Tolerance of the primal strategy of a."),
     "assembly_a": text("Assembly of the queries of a.", "assembly a", 12),

@@ -40,8 +40,8 @@ from vibench.study.cells import UNCORRECTED
 from vibench.text import brief, json_object
 
 ORDER = (
-    *KEYS, "primal_a", "primal_b", "primal_tol_a", "primal_tol_b", "assembly_a", "assembly_b", "stage", "quantity",
-    "query", "step",
+    *KEYS, "formulation_a", "formulation_b", "primal_a", "primal_b", "primal_tol_a", "primal_tol_b", "assembly_a",
+    "assembly_b", "stage", "quantity", "query", "step",
 )  # fmt: skip
 """Columns by which rows are sorted, where a table has them."""
 
@@ -218,7 +218,10 @@ def _for_reading(frame: pd.DataFrame, table: Mapping[str, Column]) -> pd.DataFra
     return under_headings(frame, [name for name in shown_columns(table) if says_something(frame, name)], table)
 
 
-USUAL = {"correction": UNCORRECTED, "formulation": MIXED, "certificate": "none"}
+USUAL = {
+    "correction": UNCORRECTED, "certificate": "none",
+    **dict.fromkeys(("formulation", "formulation_a", "formulation_b"), MIXED),
+}  # fmt: skip
 """Values of columns that say nothing where all cells have them."""
 
 

@@ -35,8 +35,8 @@ OF_CELLS = (
 )  # fmt: skip
 
 OF_BENEFITS = (
-    "problem", "formulation", "dual", "primal_a", "primal_b", "benefit_threshold", "primal_tol_b", "solver",
-    "assembly_a", "assembly_b", "correction", "threshold_high", "gain", "rounds_missing", "pod_tol",
+    "problem", "formulation_a", "formulation_b", "dual", "primal_a", "primal_b", "benefit_threshold", "primal_tol_b",
+    "solver", "assembly_a", "assembly_b", "correction", "threshold_high", "gain", "rounds_missing", "pod_tol",
     "dual_tol", "accuracy", "online_b_s", "online_a_s",
     "offline_b_s", "offline_a_s",
 )  # fmt: skip

@@ -195,9 +195,10 @@ def _break_evens(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator
             verdict = ChangeKind.CHANGED
         elif ChangeKind.WORSE in own and verdict is ChangeKind.CHANGED and after.meaning == Meaning.NEVER:
             verdict = ChangeKind.WORSE
-        cell = row | {name: row[f"{name}_b"] for name in ("cell", "primal", "assembly", "primal_tol")}
+        cell = row | {name: row[f"{name}_b"] for name in ("cell", "formulation", "primal", "assembly", "primal_tol")}
+        other = row["primal_a"] if row["formulation_a"] == row["formulation_b"] else row["formulation_a"]
         if verdict is not None:
-            yield Difference(cell, f"break-even against {row['primal_a']}", str(before), str(after), verdict)
+            yield Difference(cell, f"break-even against {other}", str(before), str(after), verdict)
 
 
 class Agreement(NamedTuple):

@@ -215,8 +215,9 @@ def total_cost(data: Data) -> Pages:
             f"CPU seconds offline and online of the models of {data.problem} together against the number of queries; "
             f"solver {cells['solver'].iloc[0]}. A panel for every dual strategy and pair (N, R); every primal strategy "
             "and assembly is shown at the tolerance δ with the most vectors. Triangles mark where two models cost the "
-            "same and point to the side on which the reduced model is cheaper than the high-fidelity one, or the fixed "
-            "enrichment than the one per parameter; bars are 95 % intervals of that number of queries.",
+            "same and point to the side on which the reduced model is cheaper than the high-fidelity one, the fixed "
+            "enrichment than the one per parameter, or another formulation than the mixed program; bars are 95 % "
+            "intervals of that number of queries.",
             part,
         )
 

@@ -12,10 +12,11 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import requested
+from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Kind
 from vibench.results.columns import KEYS, THRESHOLDS
 from vibench.results.costs.paired_seconds import PairedSeconds
-from vibench.study.cells import CERTIFIED
+from vibench.study.cells import CERTIFIED, NO_SUCH_AXIS
 
 DRAWS = 2000
 """Draws of what other runs might measure, from which an interval is taken."""
@@ -119,11 +120,10 @@ STRATEGY = ("primal", "primal_options", "primal_tol")
 HIGH_FIDELITY = "high-fidelity"
 """Value of `primal_a` where a is the high-fidelity model."""
 
-SHARED_PHASES = ("offline_snapshots_s", "offline_pod_s", "offline_cone_s")
-"""Offline phases that compared cells have in common; measured once for both, they do not differ between them."""
-
-MODEL_PHASES = (*SHARED_PHASES, "offline_enrichment_s", "offline_assembly_s")
-"""Offline phases that cells of the same model have in common, with certificates and without."""
+SHARED_PHASES = (
+    "offline_snapshots_s", "offline_pod_s", "offline_cone_s", "offline_enrichment_s", "offline_assembly_s",
+)  # fmt: skip
+"""Offline phases that cells may have in common: equal seconds were measured once for both, and do not differ."""
 
 NORMAL_95 = 1.96
 """Half the width of the 95 % interval of a normal distribution, in standard deviations."""
@@ -135,6 +135,18 @@ VALIDATION = ("validation", "validation_options")
 """Columns that name the validation set: seconds of a query are means over its queries."""
 
 _SHARED = tuple(name for name in THRESHOLDS if name in KEYS)
+
+FORMULATION = ("formulation", "formulation_options")
+
+AXES = (
+    ("dual", "dual_options", "dual_tol", "dual_size"), STRATEGY, ("pod_tol", "pod_size"), ("solver",), ("accuracy",),
+)  # fmt: skip
+"""Columns of the axes that a formulation may lack."""
+
+BLANK = (None, NO_SUCH_AXIS, "{}")
+"""Values in the columns of an axis that a cell does not have."""
+
+_OF_SIDES = ("cell", "formulation", "primal", "primal_tol", "assembly")
 
 
 class Comparison(NamedTuple):
@@ -159,30 +171,56 @@ def break_even_rows(
 def compared(cells: Iterable[Mapping[str, Any]], paired: PairedSeconds, tail: float = TAIL) -> Iterator[Comparison]:
     """Break-even of the models that are compared, undecided where more than `tail` of the draws deny it.
 
-    Every per-parameter enrichment (a) is compared with every fixed one (b) of the same problem, cone, tolerances and
-    solver, if one machine measured both and both or none have certificates; every reduced cell (a) with that of the
-    same model with certificates (b); the high-fidelity model (a, whose offline phase is its set-up) with every strategy
-    (b). Cells without an ok query are left out.
+    Every per-parameter enrichment (a) is compared with every fixed one (b) of the same problem, formulation, cone,
+    tolerances and solver; every reduced cell (a) with that of the same model with certificates (b); every mixed program
+    (a) with every other formulation (b) that agrees with it on the axes that b has; the high-fidelity model (a, whose
+    offline phase is its set-up) with every cell (b). One machine measured both, and but for the second of these pairs
+    both or none have certificates. Cells without an ok query are left out.
     """
     timed = [cell for cell in cells if cell["online_s"] is not None]
-    alike: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
-    for cell in timed:
-        alike.setdefault(_alike(cell), []).append(cell)
+    alike = _Groups(timed)
+    mixed = _Groups([cell for cell in timed if cell["formulation"] == MIXED])
+    everything = (*_SHARED, *FORMULATION, *VALIDATION, "machine")
     for b in timed:
         yield _comparison(paired, None, b, tail)
-        yield from (_comparison(paired, a, b, tail) for a in alike[_alike(b)] if _compared(a, b))
+        yield from (_comparison(paired, a, b, tail) for a in alike.of(b, everything) if _compared(a, b))
+        if b["formulation"] != MIXED:
+            yield from (_comparison(paired, a, b, tail) for a in mixed.of(b, _axes(b)) if _as_certified(a, b))
 
 
-def _alike(cell: Mapping[str, Any]) -> tuple[Any, ...]:
-    """What cells that are compared have in common."""
-    return tuple(cell[name] for name in (*_SHARED, *VALIDATION, "machine"))
+class _Groups:
+    """Cells by what they have in some columns: a cell finds those like it without looking at all others."""
+
+    def __init__(self, cells: Iterable[Mapping[str, Any]]) -> None:
+        self._cells = list(cells)
+        self._groups: dict[tuple[str, ...], dict[tuple[Any, ...], list[Mapping[str, Any]]]] = {}
+
+    def of(self, cell: Mapping[str, Any], columns: tuple[str, ...]) -> Iterable[Mapping[str, Any]]:
+        """The cells with the same values in these columns."""
+        groups = self._groups.get(columns)
+        if groups is None:
+            groups = self._groups[columns] = {}
+            for one in self._cells:
+                groups.setdefault(tuple(one[name] for name in columns), []).append(one)
+        return groups.get(tuple(cell[name] for name in columns), [])
+
+
+def _axes(cell: Mapping[str, Any]) -> tuple[str, ...]:
+    """The columns by which a cell and the mixed program that it is an alternative to agree."""
+    lacking = {name for axis in AXES if all(cell[column] in BLANK for column in axis) for name in axis}
+    return tuple(name for name in (*_SHARED, *STRATEGY, *VALIDATION, "machine") if name not in lacking)
 
 
 def _compared(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     """Whether b is an alternative to a: fixed to per-parameter enrichment, or the same with certificates to without."""
-    if (a["assembly"] == CERTIFIED) == (b["assembly"] == CERTIFIED):
+    if _as_certified(a, b):
         return bool(a["enrichment_kind"] == Kind.PER_PARAMETER and b["enrichment_kind"] == Kind.FIXED)
     return a["assembly"] == "reduced" and all(a[name] == b[name] for name in STRATEGY)
+
+
+def _as_certified(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+    """Whether both have certificates or none has."""
+    return bool((a["assembly"] == CERTIFIED) == (b["assembly"] == CERTIFIED))
 
 
 def _comparison(paired: PairedSeconds, a: Mapping[str, Any] | None, b: Mapping[str, Any], tail: float) -> Comparison:
@@ -211,8 +249,7 @@ def _comparison(paired: PairedSeconds, a: Mapping[str, Any] | None, b: Mapping[s
 
 def shared_offline(a: Mapping[str, Any], b: Mapping[str, Any]) -> float:
     """Offline seconds of the phases that two cells have in common."""
-    phases = MODEL_PHASES if b["assembly"] == CERTIFIED != a["assembly"] else SHARED_PHASES
-    return float(sum(a[name] for name in phases if a[name] == b[name]))
+    return float(sum(a[name] for name in SHARED_PHASES if a[name] == b[name]))
 
 
 def offline_draws(cell: Mapping[str, Any], shared: float, rng: np.random.Generator) -> Array:
@@ -223,13 +260,18 @@ def offline_draws(cell: Mapping[str, Any], shared: float, rng: np.random.Generat
 
 
 def _row(one: Comparison) -> dict[str, Any]:
-    model = {"cell": None, "primal": HIGH_FIDELITY, "primal_tol": None, "assembly": ""}
-    a, b, result = one.a or model | {"offline_s": one.b["hf_setup_s"]}, one.b, one.result
-    row = {name: b[name] for name in _SHARED}
+    a, b, result = one.a or _high_fidelity(one.b), one.b, one.result
+    row = {name: a[name] if b[name] in BLANK else b[name] for name in _SHARED}
     for side, cell, online in zip("ab", (a, b), one.online, strict=True):
-        row |= {f"{name}_{side}": cell[name] for name in ("cell", "primal", "primal_tol", "assembly")}
+        row |= {f"{name}_{side}": cell[name] for name in _OF_SIDES}
         row |= {f"offline_{side}_s": cell["offline_s"], f"online_{side}_s": online}
     numbers = {"benefit_threshold": result.number, "threshold_low": result.low, "threshold_high": result.high}
     low, high = one.gain or (None, None)
     gains = {"gain": one.online[0] / one.online[1], "gain_low": low, "gain_high": high}
     return row | gains | numbers | {"meaning": result.meaning.value, "rounds_missing": result.rounds}
+
+
+def _high_fidelity(b: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The high-fidelity model beside a cell, as a cell."""
+    model = {"cell": None, "formulation": MIXED, "primal": HIGH_FIDELITY, "primal_tol": None, "assembly": ""}
+    return {**b, **model, "offline_s": b["hf_setup_s"]}

@@ -200,9 +200,12 @@ class PairedSeconds:
         self._levels.add(cell, [b.online for b in blocks.values()])
 
     def rounds(self, a: str | None, b: str) -> int:
-        """Number of rounds in the blocks that b shares with a, or with the high-fidelity model without a."""
-        shared = self._blocks.get(b, {}) if a is None else self._blocks.get(b, {}).keys() & self._blocks.get(a, {})
-        return sum(self._rounds[b][name] for name in shared)
+        """Number of rounds of b in the blocks that it shares with a, or with the high-fidelity model without a.
+
+        Where they share none, they are compared by that model.
+        """
+        mine = self._blocks.get(b, {})
+        return sum(self._rounds[b][name] for name in mine.keys() & self._blocks.get(a or b, {}) or mine)
 
     def ratio(self, a: str | None, b: str) -> Estimate | None:
         """The logarithm of the seconds of a query of b over those of a, or of the high-fidelity model without a.
@@ -223,12 +226,16 @@ class PairedSeconds:
         return None if apart[0] is None or apart[1] is None else apart[0].minus(apart[1])
 
     def level(self, a: str | None, b: str) -> Estimate | None:
-        """The logarithm of the seconds of a query of a, or of the high-fidelity model, in the blocks shared with b."""
+        """The logarithm of the seconds of a query of a, or of the high-fidelity model, in the blocks shared with b.
+
+        Where a shares none with b, in all of its own.
+        """
         mine = self._blocks.get(b, {})
         if a is None:
             values = [x.high_fidelity for x in mine.values() if math.isfinite(x.high_fidelity)]
         else:
-            values = [x.online for name, x in self._blocks.get(a, {}).items() if name in mine]
+            others = self._blocks.get(a, {})
+            values = [x.online for name, x in others.items() if name in mine] or [x.online for x in others.values()]
         return self._estimate(self._levels, values)
 
     def _estimate(self, common: CommonVariance, values: Sequence[float]) -> Estimate | None:

@@ -90,6 +90,7 @@ def test_the_two_ways_exchanged_turn_from_into_until(off_a: float, on_a: float, 
 def cell(primal: str, kind: str, **columns: Any) -> dict[str, Any]:
     times = {"offline_s": 10.0, "online_s": 0.1, "hf_setup_s": 4.0, "hf_s": 2.0}
     times |= {"offline_snapshots_s": 6.0, "offline_pod_s": 1.0, "offline_cone_s": 1.0}
+    times |= {"offline_enrichment_s": 0.0, "offline_assembly_s": 0.0}
     times |= {"offline_low_s": 10.0, "offline_high_s": 10.0}
     if "offline_s" in columns:
         columns = {"offline_low_s": columns["offline_s"], "offline_high_s": columns["offline_s"]} | columns
@@ -171,6 +172,72 @@ SHARED: Mapping[str, Any] = {
 def test_only_like_is_compared_with_like(column: str) -> None:
     cells = [cell("varying", "per-parameter"), cell("fixed", "fixed", **{column: SHARED[column]})]
     assert ("varying", "fixed") not in pairs(compared(cells))
+
+
+def of(formulation: str, **columns: Any) -> dict[str, Any]:
+    """A cell of a formulation other than the mixed program, without an axis whose columns are given as blank."""
+    return cell("fixed", "fixed", formulation=formulation, formulation_options=f'{{"of": "{formulation}"}}', **columns)
+
+
+def of_formulations(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [row for row in rows if row["cell_a"] is not None and row["formulation_a"] != row["formulation_b"]]
+
+
+def test_every_formulation_is_compared_with_the_mixed_program() -> None:
+    cells = [cell("fixed", "fixed"), of("penalty", offline_s=12.0, online_s=0.05), of("local", online_s=0.2)]
+    rows = of_formulations(compared(cells))
+    assert [(row["formulation_a"], row["formulation_b"]) for row in rows] == [("mixed", "penalty"), ("mixed", "local")]
+    assert [(row["cell_a"], row["cell_b"]) for row in rows] == [(cells[0]["cell"], one["cell"]) for one in cells[1:]]
+    assert rows[0]["benefit_threshold"] == pytest.approx((12.0 - 10.0) / (0.1 - 0.05))
+    assert [row["meaning"] for row in rows] == ["from", "never"]
+    assert {row["formulation_a"] for row in compared(cells) if row["cell_a"] is None} == {"mixed"}
+
+
+NO_CONE: Mapping[str, Any] = {"dual": "–", "dual_options": "{}", "dual_tol": None, "dual_size": None}
+NO_ENRICHMENT: Mapping[str, Any] = {"primal": "–", "primal_options": "{}", "primal_tol": None}
+LACKING: Mapping[str, Mapping[str, Any]] = {
+    "dual": NO_CONE, "primal": NO_ENRICHMENT, "pod": {"pod_tol": None, "pod_size": None}, "solver": {"solver": "–"},
+    "accuracy": {"accuracy": None},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("axis", LACKING)
+def test_a_formulation_is_compared_over_the_axes_that_it_lacks(axis: str) -> None:
+    others: dict[str, Any] = {"dual": "other", "primal": "other", "pod_tol": 0.5, "solver": "other", "accuracy": 0.25}
+    name = "pod_tol" if axis == "pod" else axis
+    mixed = [cell("fixed", "fixed", pod_tol=0.1), cell("fixed", "fixed", pod_tol=0.1) | {name: others[name]}]
+    lacking = cell("fixed", "none", pod_tol=0.1, formulation="f") | LACKING[axis]
+    rows = of_formulations(compared([*mixed, lacking, cell("fixed", "none", pod_tol=0.1, formulation="g")]))
+    assert [row["formulation_b"] for row in rows] == ["f", "f", "g"]
+    if axis != "primal":  # which has a column for each side
+        assert [row[name] for row in rows] == [one[name] for one in (*mixed, mixed[0])]
+    assert [row["primal_a"] for row in rows] == [one["primal"] for one in (*mixed, mixed[0])]
+
+
+@pytest.mark.parametrize("column", ["problem", "training", "validation", "machine", "correction", "dual", "solver"])
+def test_a_formulation_is_compared_with_nothing_unlike(column: str) -> None:
+    cells = [cell("fixed", "fixed"), of("penalty", **{column: "other"})]
+    assert not of_formulations(compared(cells))
+
+
+def test_certified_queries_of_a_formulation_are_compared_with_certified_ones() -> None:
+    cells = [cell("fixed", "fixed", assembly=name) for name in ("reduced", "compiled", "certified")]
+    rows = of_formulations(compared([*cells, of("penalty", assembly="reduced"), of("local", assembly="certified")]))
+    assert [(row["assembly_a"], row["formulation_b"]) for row in rows] == [
+        ("reduced", "penalty"), ("compiled", "penalty"), ("certified", "local")
+    ]  # fmt: skip
+
+
+def test_formulations_are_compared_with_the_mixed_program_of_another_group_by_the_high_fidelity_model() -> None:
+    cells = [cell("fixed", "fixed"), cell("fixed", "none", formulation="f", online_s=0.05, offline_s=12.0) | NO_CONE]
+    timings = rounds(cells)
+    for row in timings:
+        if row["cell"] == cells[1]["cell"]:  # timed later, on a machine of half the speed
+            row |= {"block": f"later {row['block']}", "total_s": 2 * row["total_s"], "hf_s": 2 * row["hf_s"]}
+    (row,) = of_formulations(list(break_even_rows(cells, timings)))
+    assert row["gain"] == pytest.approx(2.0)
+    assert (row["online_a_s"], row["online_b_s"]) == (pytest.approx(0.1), pytest.approx(0.05))
+    assert row["benefit_threshold"] == pytest.approx((12.0 - 10.0) / (0.1 - 0.05))
 
 
 def test_another_assembly_may_be_compared() -> None:
