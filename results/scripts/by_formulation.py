@@ -16,6 +16,7 @@ from page import SECONDS, Page, made_by, origin, read, start
 
 from vibench.report.figures.looks import Looks, Series
 from vibench.report.figures.style import Sheet, scatter, styled
+from vibench.results import formats
 
 ROUND_OFF = 1e-10
 """An error above its bound by more than this share of the solution violates it; less is round-off."""
@@ -127,6 +128,25 @@ def uncertainty(queries: pd.DataFrame) -> pd.DataFrame:
     return medians.assign(**{"share of errors above what is stated": grouped["below"].mean()}).reset_index()
 
 
+def pairs(thresholds: pd.DataFrame) -> pd.DataFrame:
+    """The break-evens of formulations with `mixed`, of the problems' own training sets."""
+    of_formulations = thresholds["cell_a"].notna() & (thresholds["formulation_a"] != thresholds["formulation_b"])
+    return thresholds[of_formulations & (thresholds["training"] == "own")]
+
+
+def break_evens(compared: pd.DataFrame) -> pd.DataFrame:
+    """When each formulation is cheaper in total than `mixed`, a column for every cone and tolerance."""
+    rows = list[dict[str, object]]()
+    for (problem, formulation), mine in compared.groupby(["problem", "formulation_b"], sort=True):
+        row: dict[str, object] = {"problem": problem, "formulation": formulation}
+        for one in mine.sort_values(["dual", "pod_tol"], ascending=[False, False]).itertuples():
+            within = formats.interval(one.threshold_low, one.threshold_high) if one.meaning in ("from", "until") else ""
+            number = formats.break_even(one.meaning, one.benefit_threshold)
+            row[f"{one.dual}, {one.pod_tol:g}"] = f"{number} ({within})" if within else number
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
 def figure(cells: pd.DataFrame) -> Figure:
     """Errors of λ over the time of a query, a look for each formulation."""
     problems, title = list(dict.fromkeys(cells["problem"])), "Error of λ against online time"
@@ -178,6 +198,13 @@ def main(run: str, run_compiled: str, target: str) -> None:
     with styled():
         page.draw("formulations-time", figure(own))
     page.section("All cells", table(own))
+    compared = pairs(read(run, "thresholds"))
+    page.section(
+        "Break-even with `mixed`",
+        "The number of queries from which, or until which, a formulation is cheaper in total than `mixed` with the "
+        "same cone and tolerances, whatever their errors, with its 95 % interval: columns are the cone and δ_POD.",
+        break_evens(compared),
+    )
     page.section(
         "Compiled",
         "The cells of `mixed` with `mcpg` as programs in C, from a run of their own. No other formulation is exported.",
@@ -191,7 +218,10 @@ def main(run: str, run_compiled: str, target: str) -> None:
     )
     page.section("Bounds", "Errors above their bounds, of those compared.", violated(queries))
     page.section("Uncertainty that formulations state", uncertainty(queries))
-    page.add(f"All columns of the cells: {page.link('cells', cells.drop(columns=['definition', 'versions']))}.")
+    page.add(
+        f"All columns of the cells: {page.link('cells', cells.drop(columns=['definition', 'versions']))}; of the "
+        f"break-evens with `mixed`: {page.link('thresholds', compared)}."
+    )
     page.write()
 
 

@@ -133,10 +133,45 @@ def of_formulations() -> Sequence[str]:
     )
 
 
+def of_break_evens() -> Sequence[str]:
+    """What the page on formulations says of when they are cheaper than `mixed`."""
+    table = pd.read_csv(ROOT / "results" / "formulations" / "thresholds.csv")
+    assert (table["formulation_a"] == "mixed").all()
+    assert set(table.groupby("formulation_b").size()) == {16}
+    of, meaning, kind = table["formulation_b"], table["meaning"], table["formulation_b"].str.split().str[0]
+
+    def some(chosen: pd.Series, name: str) -> int:
+        return int((chosen & (meaning == name)).sum())
+
+    def number(chosen: pd.Series, name: str) -> str:
+        numbers = table["benefit_threshold"][chosen & (meaning == name)]
+        return f"{numbers.min():.0f} to {numbers.max():.0f} queries"
+
+    processes, contact = of == "regression", of == "local (contact sets)"
+    sparse, hyper, undecided = of == "sparse-dictionary", kind == "hyper-reduced", meaning == "undecided"
+    assert {some(of == name, "never") for name in ("penalty", "proximal")} == {16}
+    local = (kind == "local") & (table["dual"] == "mcpg")
+    assert some(local, "never") > local.sum() / 2
+    assert set(table["dual"][sparse & (meaning == "never")]) == {"mcpg"}
+    return (
+        f"radial basis functions is cheaper at once in {some(of == 'regression (radial)', 'at once')} of 16;",
+        f"at once in {some(processes, 'at once')} and from {number(processes, 'from')} on in {some(processes, 'from')}",
+        f"is cheaper from {number(of == 'local', 'from')} on in {some(of == 'local', 'from')}, with contact sets from "
+        f"{number(contact, 'from').removesuffix(' queries')} in {some(contact, 'from')}",
+        f"from at most {table['benefit_threshold'][sparse].max():.0f} queries on in {some(sparse, 'from')}, never in "
+        f"{some(sparse, 'never')}",
+        f"in {some(hyper, 'until')} of {hyper.sum()}, and is cheaper there until {number(hyper, 'until')} only",
+        f"{undecided.sum()} of the {len(table)} pairs are undecided, {(undecided & hyper).sum()} of them of `hyper",
+    )
+
+
 @pytest.mark.parametrize(
     ("page", "sentences"),
-    [("docs/field.md", of_cones), ("docs/field.md", of_guarantees), ("docs/formulations.md", of_formulations)],
-)
+    [
+        ("docs/field.md", of_cones), ("docs/field.md", of_guarantees), ("docs/formulations.md", of_formulations),
+        ("docs/formulations.md", of_break_evens),
+    ],
+)  # fmt: skip
 def test_a_page_says_what_the_tables_say(page: str, sentences: object) -> None:
     assert callable(sentences)
     text = " ".join((ROOT / page).read_text(encoding="utf-8").split())
