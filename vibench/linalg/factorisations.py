@@ -275,7 +275,7 @@ def is_proved_definite(parts: Sequence[SparseMatrix], chosen: Implementation, or
     """Whether the sum of symmetric matrices (n×n) is proved to be positive definite, whatever the round-off.
 
     By default a narrow band is factorised (`vibench.linalg.banded`), or factors of SuperLU, which stands in for what
-    factorises nothing, are looked at (`vibench.linalg.inertia`); `order` (n,) is one for it. Of the others nothing is
+    factorises nothing, are looked at (`vibench.linalg.inertia`), in an `order` (n,) if given. Of the others nothing is
     known but that they compute a Cholesky factorisation. If it ends for the computed D⁻¹XD⁻¹ − cI, D² being the
     diagonal of X, then X is definite, with c the sum of the round-off of summing and scaling and of the factorisation,
     Σ_j γ / (1 − γ) with γ_k of k = t_j + 1 and t_j entries in column j of the factor (Rump, "Verification of positive
@@ -283,7 +283,7 @@ def is_proved_definite(parts: Sequence[SparseMatrix], chosen: Implementation, or
     has no such bound, since its two factors differ by round-off.
     """
     if not chosen.module or not chosen.is_direct:
-        if order is None and (found := is_proved_by_band(parts)) is not None:
+        if (found := is_proved_by_band(parts)) is not None:
             return found
         diagonal = np.asarray(sum(part.diagonal() for part in parts))
         return bool(np.all(diagonal > 0.0)) and proved_positive(parts, np.sqrt(diagonal), order) == len(diagonal)
