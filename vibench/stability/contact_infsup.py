@@ -26,6 +26,7 @@ from collections.abc import Callable
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.linalg.lapack import dpotrf
 
 from vibench.arrays import Array, SparseMatrix
 from vibench.linalg.cholesky import UNIT
@@ -76,18 +77,21 @@ class ContactInfSup:
         if not self._lost <= MOST_LOST:
             return Constant(0.0, True)
         compliance, lifted, residuals = self._products(sp.csr_array(B), liftings)
-        compliance = 0.5 * (compliance + compliance.T)
         if not np.all(np.diag(compliance) > 0.0):
             return Constant(0.0, True)
         sizes = np.sqrt(np.diag(compliance))
-        scaled, mass = compliance / sizes / sizes[:, None], _scaled(W.matrix, sizes)
+        scaled, mass = compliance + compliance.T, _scaled(W.matrix, sizes)
+        scaled *= 0.5 / sizes
+        scaled /= sizes[:, None]
         lost, of_mass = self._left_out(B, lifted, residuals, sizes), float(np.max(abs(mass).sum(axis=0), initial=0.0))
 
         def stable(beta: float) -> bool:
             weight = beta**2 / (1.0 - 1.01 * self._lost)
-            return _proved_positive(scaled - weight * mass.toarray(), lost + 8.0 * UNIT * weight * of_mass)
+            shifted = (-weight * mass).toarray()
+            shifted += scaled
+            return _proved_positive(shifted, lost + 8.0 * UNIT * weight * of_mass)
 
-        found = moved(smallest_root(compliance, W), -1.0, stable)
+        found = moved(smallest_root(scaled, mass), -1.0, stable)
         return found if found.proved else Constant(0.0, True)
 
     def _products(self, B: SparseMatrix, liftings: Array) -> tuple[Array, Array, Array]:
@@ -119,16 +123,16 @@ def _scaled(matrix: SparseMatrix, sizes: Array) -> SparseMatrix:
 
 
 def _proved_positive(scaled: Array, lost: float) -> bool:
-    """Whether a symmetric matrix (m×m) is positive definite of which a matrix of norm `lost` may be round-off."""
+    """Whether a symmetric matrix (m×m) is positive definite of which a matrix of norm `lost` may be round-off.
+
+    It is overwritten.
+    """
     m = len(scaled)
     if not np.all(np.diag(scaled) <= 2.0):  # entries are then at most 2, and what a Cholesky factorisation loses is
         return False
-    shifted = scaled - (lost + 4.0 * m * _gamma(m + 8)) * np.eye(m)
-    try:
-        np.linalg.cholesky(shifted)
-    except np.linalg.LinAlgError:
-        return False
-    return True
+    scaled[np.diag_indices(m)] -= lost + 4.0 * m * _gamma(m + 8)
+    factor, failed = dpotrf(scaled.T, lower=True, overwrite_a=True)
+    return not failed and bool(np.all(np.diag(factor) > 0.0))  # OpenBLAS goes on with pivots that are not numbers
 
 
 def _gamma(terms: int) -> float:

@@ -10,7 +10,7 @@ from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.inner_product import InnerProduct
 from vibench.linalg.schur_complement import EliminationPattern
-from vibench.stability import coercivity
+from vibench.stability import coercivity, contact_infsup
 from vibench.stability.coercivity import MARGINS, Constant, energy_inf_sup, share_of_diagonal
 from vibench.stability.contact_infsup import ContactInfSup
 
@@ -133,3 +133,13 @@ def test_the_share_of_the_diagonal_is_below_and_near_the_largest(n: int) -> None
     unit = 1.0 / np.sqrt(X.matrix.diagonal())
     largest = float(np.linalg.eigvalsh(X.matrix.toarray() * np.outer(unit, unit))[0])
     assert largest / 1.6 < share_of_diagonal(X) <= largest
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, 0.0, -1.0])
+@pytest.mark.parametrize("place", [(0, 0), (3, 3), (2, 1)])
+def test_a_matrix_with_a_wrong_entry_is_not_proved_positive(wrong: float, place: tuple[int, int]) -> None:
+    matrix = np.eye(4) + 0.25
+    assert contact_infsup._proved_positive(matrix.copy(), 1e-3)
+    assert not contact_infsup._proved_positive(matrix.copy(), 1.0)  # more is left out than the smallest eigenvalue
+    matrix[place] = matrix[place[::-1]] = wrong if place[0] == place[1] or not np.isfinite(wrong) else 2.0
+    assert not contact_infsup._proved_positive(matrix, 1e-3)
