@@ -187,9 +187,10 @@ class Formulation(ABC):
 
         Returns
         -------
-        What `model` needs and `offline` does not have, by name: numbers, texts, `None`, arrays, sparse matrices, and
-        tuples, lists and dictionaries of these. It is stored as arrays and JSON, so nothing else is taken, and must be
-        the same whenever it is built. {} if there is nothing.
+        What `model` needs and `offline` does not have, by name: numbers, texts, `None`, arrays, sparse matrices, the
+        `pod`, `cone` and `enrichment` of another offline phase (without a supply), and tuples, lists and dictionaries
+        of these. It is stored as arrays and JSON, so nothing else is taken, and must be the same whenever it is built.
+        {} if there is nothing.
 
         Raises
         ------

@@ -88,6 +88,10 @@ class ParameterBox:
             linear[:, i] = np.clip(np.exp(low + unit[:, i] * (high - low)), self.lower[i], self.upper[i])
         return linear
 
+    def to_unit(self, mus: Array) -> Array:
+        """The places (…×d) of points (…×d) in the unit cube; the inverse of `from_unit` without `log`."""
+        return np.asarray((mus - self.lower) / self.widths)
+
     def logarithmic(self, log: Sequence[str]) -> list[int]:
         """Numbers of the parameters that `log` names; with the errors of `from_unit`."""
         chosen = list(dict.fromkeys(map(self.index, log)))

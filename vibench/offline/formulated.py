@@ -18,6 +18,7 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.formulations import Asked, Formulation, FormulationAnswer, FormulationModel, Multiplier
 from vibench.interfaces.problem import VariationalInequality
+from vibench.interfaces.strategies import Cone, Enrichment, Kind
 from vibench.model.error_bounds import ErrorBounds, bound_errors_at
 from vibench.model.high_fidelity_residuals import high_fidelity_residuals, residual_multiplier
 from vibench.offline.assemblies import assemblies
@@ -26,12 +27,17 @@ from vibench.qp.repeats import RECOGNISED
 from vibench.qp.solve import solve_qp, takes_start
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, verify
+from vibench.reduction.pod import POD
+from vibench.storage.serialisation import storable
 from vibench.study import registry
 from vibench.text import brief
 from vibench.timing import timed
 
 if TYPE_CHECKING:
     from vibench.offline.reduction import Reduction
+
+for _step in (POD, Cone, Kind, Enrichment):
+    storable(_step)  # steps of other offline phases, which a formulation may build
 
 ACCURACY = 1e-7
 """What formulations without an axis of accuracies are asked for."""

@@ -15,13 +15,10 @@ from vibench import (
     POD,
     Array,
     Asked,
-    Cone,
-    Enrichment,
     Formulation,
     FormulationAnswer,
     FormulationModel,
     Indices,
-    Kind,
     ParameterBox,
     Problem,
     Snapshots,
@@ -29,7 +26,7 @@ from vibench import (
     UnsupportedError,
     pod,
 )
-from vibench_strategies.formulations.reduced_programs import largest_dimension, reconstructed, solved
+from vibench_strategies.formulations.reduced_programs import PhasesModel, largest_dimension, solved
 
 if TYPE_CHECKING:
     from vibench import Reduction
@@ -41,9 +38,9 @@ INDEPENDENT = 1e-10
 class Local(Formulation):
     """Mixed models with local bases, as Amsallem, Zahr and Farhat (2012) and Le Berre et al. (2022) have them.
 
-    k-means makes clusters of the training parameters, or of the contact sets of their solutions. A polynomial of the
-    parameter for each cluster, linear or quadratic, the largest of which names the cluster, chooses at the query:
-    nearest centroids, or a least squares fit of the clusters of contact sets. The snapshots of a cluster are those that
+    k-means makes clusters of the training parameters, or of the contact sets of their solutions. A quadratic polynomial
+    of the parameter for each cluster, the largest of which names the cluster, chooses at the query: that of the nearest
+    centroid, or a least squares fit of the clusters of contact sets. The snapshots of a cluster are those that
     the polynomials give it, so that queries are answered by the spaces trained around them. POD, cone and enrichment
     are those of the study for the snapshots of one cluster.
 
@@ -69,7 +66,7 @@ class Local(Formulation):
     def build(self, offline: Reduction) -> Mapping[str, Any]:
         """The polynomials, and POD, cone and enrichment of every cluster."""
         weights, owners = self._chosen(offline.problem, offline.snapshots)
-        spaces = []
+        steps = []
         for number in range(weights.shape[1]):
             part = _restricted(offline, owners == number)
             if part.modes is not None and part.modes.size is not None:
@@ -79,94 +76,62 @@ class Local(Formulation):
             if part.enrichment.supply is not None:
                 raise UnsupportedError("local bases cannot be stored for an enrichment that supplies its own vectors")
             part.assembled  # noqa: B018  reduced operators are prepared offline
-            spaces.append(
-                {
-                    "basis": part.pod.basis,
-                    "generators": part.cone.generators,
-                    "free": part.cone.free.astype(float),
-                    "fallbacks": [*part.cone.fallbacks, *part.enrichment.fallbacks],
-                    "kind": part.enrichment.kind.value,
-                    "added": part.enrichment.vectors if part.enrichment.eta is None else part.enrichment.eta,
-                }
-            )
-        return {"weights": weights, "owners": owners.astype(float), "spaces": spaces}
+            steps.append({name: getattr(part, name) for name in ("pod", "cone", "enrichment")})
+        return {"weights": weights, "owners": owners, "steps": steps}
 
     def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
         """The models of the clusters."""
-        parts = [
-            _restored(_restricted(offline, built["owners"] == number), space)
-            for number, space in enumerate(built["spaces"])
-        ]
+        known = enumerate(built["steps"])
+        parts = [_restricted(offline, built["owners"] == number).given(**steps) for number, steps in known]
         return LocalModel(offline.problem.parameters, built["weights"], parts)
 
     def _chosen(self, problem: Problem, snapshots: Snapshots) -> tuple[Array, Indices]:
         """Coefficients (features×K) of the polynomials, and the largest of them at training parameters (P,)."""
-        places = _scaled(problem.parameters, snapshots.mu)
-        count = min(self.clusters, len(places))
+        places = problem.parameters.to_unit(snapshots.mu)
+        features = np.array([_features(place) for place in places])
         if self.by == "parameters":
-            centroids = _clusters(places, count, self.seed)[0]
+            centroids = _clusters(places, self.clusters, self.seed)[0]
             # |µ − c|² is smallest where µ·c − |c|²/2 is largest
-            weights = np.vstack([-0.5 * np.sum(centroids**2, axis=1), centroids.T])
+            weights = np.zeros((features.shape[1], len(centroids)))
+            weights[0], weights[1 : 1 + centroids.shape[1]] = -0.5 * np.sum(centroids**2, axis=1), centroids.T
         else:
             measures = np.sqrt(np.maximum(problem.multiplier_integrals(), 0.0))
-            labels = _clusters(np.where(snapshots.lam.T > 0.0, measures, 0.0), count, self.seed)[1]
+            labels = _clusters(np.where(snapshots.lam.T > 0.0, measures, 0.0), self.clusters, self.seed)[1]
             one_hot = (labels[:, None] == np.unique(labels)).astype(float)
-            features = _features(places, _quadratic(places.shape[1]))
             weights = np.linalg.lstsq(features, one_hot, rcond=None)[0]
-        owners = np.array([_largest(place, weights) for place in places])
-        present, owners = np.unique(owners, return_inverse=True)
+        present, owners = np.unique([_largest(place, weights) for place in places], return_inverse=True)
         return np.ascontiguousarray(weights[:, present]), owners
 
 
-class LocalModel(FormulationModel):
+class LocalModel(PhasesModel):
     """Models of clusters, one of which answers a query."""
 
     def __init__(self, box: ParameterBox, weights: Array, parts: Sequence[Reduction]) -> None:
+        super().__init__(parts)
         self._box, self._weights = box, weights
-        self._models = [part.assembled for part in parts]
+        self.enrichment = self.dimension - max(parts, key=largest_dimension).pod.basis.shape[1]
+        lines = [(*part.cone.fallbacks, *part.enrichment.fallbacks) for part in parts]
+        self.fallbacks = tuple(f"cluster {number}: {line}" for number, of in enumerate(lines) for line in of)
 
-        largest = max(parts, key=largest_dimension)
-        self.dimension, self.generators = largest_dimension(largest), max(part.cone.size for part in parts)
-        self.enrichment = self.dimension - largest.pod.basis.shape[1]
-        self.fallbacks = tuple(
-            f"cluster {number}: {line}" for number, part in enumerate(parts) for line in part.cone.fallbacks
-        )
-
-    def cluster(self, mu: Array) -> int:
+    def phase(self, mu: Array) -> int:
         """The cluster that answers at mu (d,), at the cost of one polynomial for each."""
-        return _largest(_scaled(self._box, mu), self._weights)
+        return _largest(self._box.to_unit(mu), self._weights)
 
     def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
         """The mixed program of the cluster, solved by the QP solver of the cell."""
-        reduced = self._models[self.cluster(mu)].assemble(mu)
+        reduced = self.assembled(mu)
         return solved(asked, reduced.program, reduced.factor)
-
-    def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:
-        """The pair in the spaces of the cluster."""
-        return reconstructed(self._models[self.cluster(mu)], mu, answer)
-
-
-def _scaled(box: ParameterBox, mus: Array) -> Array:
-    """Places (P×d) or (d,) of parameters in the unit cube."""
-    return np.asarray((mus - box.lower) / box.widths)
-
-
-def _quadratic(d: int) -> int:
-    return 1 + d + d * (d + 1) // 2
 
 
 def _largest(place: Array, weights: Array) -> int:
     """Which polynomial is the largest at a place (d,)."""
-    return int(np.argmax(_features(place[None], len(weights))[0] @ weights))
+    return int(np.argmax(_features(place) @ weights))
 
 
-def _features(places: Array, count: int) -> Array:
-    """1, the places (P×d), and their products if `count` says so (P×count)."""
-    features = np.hstack([np.ones((len(places), 1)), places])
-    if count > features.shape[1]:
-        i, j = np.triu_indices(places.shape[1])
-        features = np.hstack([features, places[:, i] * places[:, j]])
-    return features
+def _features(place: Array) -> Array:
+    """1, a place (d,) and the products of its coordinates, of which polynomials are sums."""
+    i, j = np.triu_indices(len(place))
+    return np.concatenate([[1.0], place, place[i] * place[j]])
 
 
 def _clusters(points: Array, count: int, seed: int) -> tuple[Array, Indices]:
@@ -186,12 +151,3 @@ def _restricted(offline: Reduction, mask: Any) -> Reduction:
     if offline.assembly != "full":
         known |= {"members": offline.members}
     return replace(offline).given(**known)
-
-
-def _restored(part: Reduction, space: Mapping[str, Any]) -> Reduction:
-    """A reduction whose spaces were stored."""
-    kind, added = Kind(space["kind"]), space["added"]
-    enrichment = Enrichment(kind, **({} if added is None else {"vectors" if kind is Kind.FIXED else "eta": added}))
-    free = np.asarray(space["free"]) > 0.0
-    cone = Cone(space["generators"], np.zeros(len(free) + 1), free, tuple(space["fallbacks"]))
-    return part.given(pod=POD(space["basis"], np.zeros(1)), cone=cone, enrichment=enrichment)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -48,16 +48,40 @@ class ProgramFormulation(Formulation):
         return ProgramModel(offline, self)
 
 
-class ProgramModel(FormulationModel):
+class PhasesModel(FormulationModel):
+    """A model that answers in the spaces of offline phases, of one of them at each parameter."""
+
+    def __init__(self, phases: Sequence[Reduction]) -> None:
+        self._models = [phase.assembled for phase in phases]
+        self.dimension = max(largest_dimension(phase) for phase in phases)
+        self.generators = max(phase.cone.size for phase in phases)
+
+    def phase(self, mu: Array) -> int:  # noqa: ARG002
+        """The number of the phase that answers at mu (d,)."""
+        return 0
+
+    def assembled(self, mu: Array) -> Any:
+        """The reduced problem at mu (d,), of the phase that answers there."""
+        return self._models[self.phase(mu)].assemble(mu)
+
+    def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:
+        """U = Z x and λ = χ α in the spaces of this phase."""
+        assert answer.x is not None
+        assert answer.alpha is not None
+        chi = self._models[self.phase(mu)].generators
+        return self.assembled(mu).reconstruct(answer.x[:, None])[:, 0], chi @ answer.alpha
+
+
+class ProgramModel(PhasesModel):
     """Assembles the reduced program at a parameter, and solves it by the algorithm of a formulation."""
 
     def __init__(self, offline: Reduction, formulation: ProgramFormulation) -> None:
-        self._assembled, self._formulation = offline.assembled, formulation
-        self.dimension, self.generators = largest_dimension(offline), int(self._assembled.generators.shape[1])
+        super().__init__([offline])
+        self._formulation = formulation
 
     def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
         """Assemble, whiten, solve, and return to the coordinates of the model."""
-        reduced = self._assembled.assemble(mu)
+        reduced = self.assembled(mu)
         program = Whitened.of(reduced.program, reduced.factor)
         if program.is_free:
             x, alpha = program.back(program.y, np.zeros(len(program.g)))
@@ -66,10 +90,6 @@ class ProgramModel(FormulationModel):
         x, alpha = program.back(z, nu)
         outcome = Outcome.INACCURATE if reason else Outcome.OK
         return FormulationAnswer(x, alpha, outcome, reason, steps)
-
-    def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:
-        """U = Z x and λ = χ α."""
-        return reconstructed(self._assembled, mu, answer)
 
 
 class FixedSpacesModel(FormulationModel):
@@ -108,10 +128,3 @@ def largest_dimension(offline: Reduction) -> int:
     elif enrichment.eta is not None:
         added = enrichment.eta
     return int(offline.pod.basis.shape[1] + added.shape[1])
-
-
-def reconstructed(assembled: Any, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:
-    """The pair u (n,), λ (m,) of coefficients in the spaces of a reduced model at mu (d,)."""
-    assert answer.x is not None
-    assert answer.alpha is not None
-    return assembled.assemble(mu).reconstruct(answer.x[:, None])[:, 0], assembled.generators @ answer.alpha

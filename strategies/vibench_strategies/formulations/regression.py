@@ -63,7 +63,7 @@ class Regression(Formulation):
         problem, snapshots, cone = offline.problem, offline.snapshots, offline.cone
         refuse_free(cone)
         box, span = problem.parameters, offline.multipliers.span
-        places = (snapshots.mu - box.lower) / box.widths
+        places = box.to_unit(snapshots.mu)
         if self.kind == "radial" and np.linalg.matrix_rank(places - places.mean(axis=0)) < box.dim:
             raise UnsupportedError(f"the training parameters are in a hyperplane, no linear function of {box.dim} fits")
         values = {"u": problem.V.gram(offline.pod.basis, snapshots.u), "lam": problem.W.gram(span, snapshots.lam)}
@@ -81,27 +81,21 @@ class Regression(Formulation):
         from sklearn.gaussian_process import GaussianProcessRegressor  # noqa: PLC0415
         from sklearn.gaussian_process.kernels import ConstantKernel, Matern  # noqa: PLC0415
 
-        count, d = places.shape
-        found: dict[str, Array] = {
-            "lengths": np.ones((len(values), d)),
-            "variances": np.zeros(len(values)),
-            "means": values.mean(axis=1),
-            "spreads": values.std(axis=1),
-            "weights": np.zeros((len(values), count)),
-            "inverses": np.zeros((len(values), count, count)),
+        means, spreads, (count, d) = values.mean(axis=1), values.std(axis=1), places.shape
+        scaled = (values - means[:, None]) / np.where(spreads > 0.0, spreads, 1.0)[:, None]
+        kernel = ConstantKernel(1.0, VARIANCES) * Matern(np.full(d, self.length), (ROUGHEST, SMOOTHEST), nu=2.5)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)  # what fits best may be at a bound
+            processes = [GaussianProcessRegressor(kernel, alpha=NOISE).fit(places, row) for row in scaled]
+        inverses = [scipy.linalg.solve_triangular(process.L_, np.eye(count), lower=True) for process in processes]
+        return {
+            "lengths": np.reshape([process.kernel_.k2.length_scale for process in processes], (len(values), d)),
+            "variances": np.array([process.kernel_.k1.constant_value for process in processes], float),
+            "means": means,
+            "spreads": spreads,
+            "weights": np.reshape([process.alpha_ for process in processes], values.shape),
+            "inverses": np.reshape(inverses, (len(values), count, count)),
         }
-        for k in np.flatnonzero(found["spreads"] > 0.0):
-            scaled = (values[k] - found["means"][k]) / found["spreads"][k]
-            matern = Matern(np.full(d, self.length), (ROUGHEST, SMOOTHEST), nu=2.5)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", ConvergenceWarning)  # what fits best may be at a bound
-                process = GaussianProcessRegressor(ConstantKernel(1.0, VARIANCES) * matern, alpha=NOISE)
-                process.fit(places, scaled)
-            found["lengths"][k] = process.kernel_.k2.length_scale
-            found["variances"][k] = process.kernel_.k1.constant_value
-            found["weights"][k] = process.alpha_
-            found["inverses"][k] = scipy.linalg.solve_triangular(process.L_, np.eye(count), lower=True)
-        return found
 
     def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
         """The fitted functions, and the bases of their coefficients."""
@@ -168,7 +162,7 @@ class RegressionModel(FixedSpacesModel):
 
     def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:  # noqa: ARG002
         """The coefficients, those of λ projected on the cone, and the uncertainty of u."""
-        place = (mu - self._box.lower) / self._box.widths
+        place = self._box.to_unit(mu)
         (x, variance), lam = self._u.with_variance(place), self._lam.at(place)
         alpha = nnls(self._rays, lam)[0] if self._rays.size else np.zeros(self._rays.shape[1])
         stated = None if variance is None else np.sqrt(variance + self._left_out)

@@ -14,6 +14,7 @@ from transformed import Transformed
 import vibench
 from vibench import Array, Enrichment, Formulation, Kind, Reduction, Snapshots, Stop, UnsupportedError
 from vibench.offline.sweep import high_fidelity_sweep
+from vibench.storage.serialisation import dumps, loads
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies.cpg import CPG
 from vibench_strategies.dictionary import Dictionary
@@ -74,17 +75,20 @@ def test_one_cluster_is_the_mixed_model_and_several_have_smaller_spaces(by: str)
     several = STRING.formulated(Local(clusters=3, by=by))
     assert isinstance(several.model, LocalModel)
     assert several.model.dimension < STRING.pod.basis.shape[1] + STRING.cone.size
-    owners, spaces = several.built["owners"], several.built["spaces"]
-    assert set(owners) == set(range(len(spaces)))
-    assert 1 < len(spaces) <= 3
-    for number, space in enumerate(spaces):
+    owners, steps = several.built["owners"], several.built["steps"]
+    assert set(owners) == set(range(len(steps)))
+    assert 1 < len(steps) <= 3
+    for number, of_cluster in enumerate(steps):
         members = np.flatnonzero(owners == number)
         # the query chooses what the training chose, and each space keeps the tolerance for its own snapshots
-        assert all(several.model.cluster(STRING.snapshots.mu[k]) == number for k in members)
+        assert all(several.model.phase(STRING.snapshots.mu[k]) == number for k in members)
         u, V = STRING.snapshots.u[:, members], STRING.problem.V
-        rest = V.norm(u - space["basis"] @ V.gram(space["basis"], u))
+        basis = of_cluster["pod"].basis
+        rest = V.norm(u - basis @ V.gram(basis, u))
         assert np.linalg.norm(rest) <= 1e-6 * np.linalg.norm(V.norm(u)) + 1e-12
     assert several.solve(MU).status == "ok"
+    stored = Local(by=by).model(STRING, loads(dumps(several.built)))
+    assert np.array_equal(stored.solve(MU, several.asked()[0]).x, several.solve(MU).answer.x)
 
 
 def test_regression_interpolates_the_snapshots_and_its_uncertainty_has_the_size_of_the_error() -> None:

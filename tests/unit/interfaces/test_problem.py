@@ -19,6 +19,13 @@ def test_grid_runs_over_the_last_parameter_first_and_reaches_the_bounds() -> Non
     assert grid.tolist() == [[0, -1], [0, 1], [0, 3], [1, -1], [1, 1], [1, 3]]
 
 
+def test_places_in_the_unit_cube_are_those_that_points_are_made_of() -> None:
+    box = ParameterBox(("a", "b", "c"), np.array([-2.0, 1.0, 3.0]), np.array([4.0, 5.0, 3.0]), ("1",) * 3)
+    places = np.array([[0.0, 0.25, 0.0], [1.0, 0.75, 0.0]])
+    assert np.allclose(box.to_unit(box.from_unit(places)), places, atol=1e-15)  # the width of a point is not zero
+    assert np.allclose(box.to_unit(np.array([1.0, 2.0, 3.0])), [0.5, 0.25, 0.0])
+
+
 def test_samples_lie_in_the_box_and_depend_on_nothing_but_the_seed() -> None:
     sample = BOX.sample(50, seed=7)
     assert np.all((sample >= BOX.lower) & (sample <= BOX.upper))
