@@ -65,6 +65,7 @@ from .library.runs import open_run as open_run
 from .library.runs import run as run
 from .library.vtu import export_vtu as export_vtu
 from .linalg.inner_product import InnerProduct as InnerProduct
+from .model.galerkin import projected_members as projected_members
 from .offline.checked_tools import greedy_cone as greedy_cone
 from .offline.checked_tools import pod as pod
 from .offline.checked_tools import project_on_cone as project_on_cone

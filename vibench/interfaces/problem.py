@@ -201,6 +201,11 @@ class ContactLoads:
         loads[self.first : self.first + len(varying)] += varying
         return loads, bounds
 
+    def on(self, basis: Array) -> Callable[[Array], Array]:
+        """ηᵀB Z (k×N') for rows of Z at the contact unknowns (|E|×N'), a function of what varies in Bᵀη (j×k)."""
+        constant, reached = np.asarray(self.fixed.T @ basis), basis[self.reached]
+        return lambda varying: np.asarray(constant + varying.T @ reached[: len(varying)])
+
 
 MEMBERS = ("A", "f", "B", "g")
 """The members of a `VariationalInequality` that depend on the parameter."""

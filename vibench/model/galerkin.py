@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
-from vibench.interfaces.problem import Contact, Problem, VariationalInequality
+from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.interfaces.strategies import Enrichment
-from vibench.interfaces.validation import checked_assembly
+from vibench.interfaces.validation import checked_assembly, training_parameters
 from vibench.linalg.inner_product import orthonormal_range
 from vibench.reduction.supremizers import ContactCoordinates, projected_supremizers
 
@@ -162,20 +163,61 @@ class ReducedModel:
         return ReducedProblem(project(vi, Z, self.generators), partial(np.matmul, Z))
 
 
+def projections(Z: Array, chi: Array) -> dict[str, Callable[[Any], Array]]:
+    """Galerkin projections on span Z (n×N') and the cone of χ (m×R) by member, linear maps: dense A, f, B, g."""
+
+    def stiffness(A: Any) -> Array:
+        projected = Z.T @ np.asarray(A @ Z)
+        return np.asarray(0.5 * (projected + projected.T))
+
+    return {
+        "A": stiffness,
+        "f": lambda f: Z.T @ f,
+        "B": lambda B: np.asarray(chi.T @ np.asarray(B @ Z)),
+        "g": lambda g: chi.T @ g,
+    }
+
+
 def project(
     vi: VariationalInequality, Z: Array, chi: Array, known: Mapping[str, Array] = MappingProxyType({})
 ) -> VariationalInequality:
-    """Galerkin projection on span Z (n×N') and the cone of χ (m×R): dense A, f, B, g.
+    """Galerkin projection on span Z (n×N') and the cone of χ (m×R).
 
     `known` has projections of members, by name, that were made at another parameter.
     """
-    A = known["A"] if "A" in known else Z.T @ np.asarray(vi.A @ Z)
-    return VariationalInequality(
-        A=A if "A" in known else 0.5 * (A + A.T),
-        f=known["f"] if "f" in known else Z.T @ vi.f,
-        B=known["B"] if "B" in known else chi.T @ np.asarray(vi.B @ Z),
-        g=known["g"] if "g" in known else chi.T @ vi.g,
-    )
+    made = projections(Z, chi).items()
+    return VariationalInequality(**{n: known[n] if n in known else of(getattr(vi, n)) for n, of in made})
+
+
+def projected_members(
+    problem: Problem, Z: Array, chi: Array, left_out: Collection[str] = ()
+) -> Callable[[Array], dict[str, Array]]:
+    """A function of mu (d,) for the projections of members by name, on span Z (n×N') and the cone of χ (m×R).
+
+    What is constant or declared affine is projected once, other B and g on the contact unknowns where the problem has
+    them. A and f have to be constant or affine, or among those left out.
+    """
+    names = [name for name in MEMBERS if name not in left_out]
+    of, vi = projections(Z, chi), checked_assembly(problem, training_parameters(problem)[0])
+    constant = {name: of[name](getattr(vi, name)) for name in names if name in problem.constant}
+    affine = {n: problem.affine[n].mapped(of[n]) for n in names if n in problem.affine and n not in constant}
+    left = [name for name in names if name not in constant and name not in affine]
+    loads = problem.contact_loads(chi) if problem.has_contact and left else None
+    on = None if loads is None else loads.on(Z[problem.contact_dofs])
+
+    def at(mu: Array) -> dict[str, Array]:
+        found = constant | {name: sums.at(mu) for name, sums in affine.items()}
+        if not left:
+            return found
+        if loads is None or on is None:
+            B, g = problem.constraint(mu)
+            evaluated = {"B": of["B"](B), "g": of["g"](g)}
+        else:
+            varying, bounds = loads.varying(mu)
+            evaluated = {"B": on(varying), "g": bounds}
+        return found | {name: evaluated[name] for name in left}
+
+    return at
 
 
 def leading_part(program: VariationalInequality, size: int) -> VariationalInequality:

@@ -344,16 +344,15 @@ class HyperReducedModel:
         if isinstance(self.space, LoadCoordinates):
             coordinates, combination = self.space.supremizers(loads).T, self._tested[1]
             return coordinates if combination is None else np.vstack([coordinates, combination.T @ coordinates])
-        constant, reached = self._contact_rows
-        return np.asarray(constant + loads.T @ reached[: len(loads)])
+        return self._constraint_of(loads)
 
     @cached_property
-    def _contact_rows(self) -> tuple[Array, Array]:
-        """B (R×d) as far as it does not depend on mu, and the rows (j×d) of Φ that varying contact loads meet."""
+    def _constraint_of(self) -> Callable[[Array], Array]:
+        """B (R×d) of varying contact loads."""
         loads, basis = self._loads, self._operators.contact_basis
         assert loads is not None
         assert basis is not None  # set by `hyper_reduce`
-        return np.asarray(loads.fixed.T @ basis), basis[loads.reached]
+        return loads.on(basis)
 
 
 def _enriched(members: VariationalInequality, plain: Array) -> tuple[Array, Array, Array, Array]:

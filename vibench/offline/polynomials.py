@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from vibench.interfaces.strategies import Kind
 from vibench.interfaces.validation import training_parameters
 from vibench.model.affine import affine_decomposition, check_affine
 from vibench.model.chebyshev import AffinePolynomial, interpolate_on_box
+from vibench.model.galerkin import projections
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.offline.models import AnyReducedModel
 
@@ -111,16 +111,10 @@ def declared_terms(queried: AnyReducedModel) -> dict[str, Array]:
     """Flat terms (Q×size) of the members declared affine, of A packed upper triangles, on a fixed space."""
     if isinstance(queried, HyperReducedModel):
         return queried.declared_terms()
-    Z, chi, problem = queried.fixed_basis, queried.generators, queried.problem
-    upper = np.triu_indices(Z.shape[1])
-    projected: Mapping[str, Callable[[Any], Array]] = {
-        "A": lambda term: (0.5 * (Z.T @ (term @ Z) + (Z.T @ (term @ Z)).T))[upper],
-        "f": lambda term: Z.T @ term,
-        "B": lambda term: chi.T @ (term @ Z),
-        "g": lambda term: chi.T @ term,
-    }
-    declared = {name: sums for name, sums in problem.affine.items() if name not in problem.constant}
-    return {name: np.stack([np.ravel(projected[name](t)) for t in sums.terms]) for name, sums in declared.items()}
+    problem, of = queried.problem, projections(queried.fixed_basis, queried.generators)
+    upper = np.triu_indices(queried.fixed_basis.shape[1])
+    declared = {name: sums.mapped(of[name]) for name, sums in problem.affine.items() if name not in problem.constant}
+    return {n: np.stack([t[upper] if n == "A" else np.ravel(t) for t in sums.terms]) for n, sums in declared.items()}
 
 
 def _stiffness_terms(queried: AnyReducedModel, mu: Array) -> Array:

@@ -120,6 +120,11 @@ class Reduction:
         other.__dict__.update(kept, _given=kept)
         return other
 
+    def enriched(self, primal: PrimalStrategy, tolerance: float | None) -> Reduction:
+        """The reduction with the same V_N and cone, and the enrichment of another primal strategy."""
+        known = {name: getattr(self, name) for name in ("snapshots", "pod", "cone", "multipliers")}
+        return replace(self, primal=primal, tolerance=tolerance).given(**known)
+
     @cached_property
     def snapshots(self) -> Snapshots:
         """High-fidelity solutions at the training parameters; an adaptive sampling strategy chooses these itself."""

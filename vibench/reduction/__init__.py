@@ -1,4 +1,4 @@
-"""Reduced bases: POD, projection on cones, supremizers, nested enrichments, lazy greedy selection."""
+"""Reduced bases: POD, projection on cones, supremizers, nested enrichments, lazy greedy selection, cubatures."""
 
 import lazy_loader
 

@@ -2,31 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
+import scipy.linalg
 from annotated_types import Ge, Gt, Lt
 
 from vibench import (
-    AffineSum,
     Array,
     Asked,
     Formulation,
     FormulationAnswer,
     FormulationModel,
+    Indices,
     Problem,
     UnsupportedError,
     VariationalInequality,
+    projected_members,
 )
-from vibench.reduction import constraint_classes
-from vibench_strategies.formulations.reduced_domain import ReducedDomain, reduced_elements, reduced_rows
+from vibench.reduction import Cubature, constraint_classes
 from vibench_strategies.formulations.reduced_programs import FixedSpacesModel, refuse_free, solved
 from vibench_strategies.infsup_greedy import InfSupGreedy
 
 if TYPE_CHECKING:
     from vibench import Reduction
+
+STABILITY = 0.1
+"""Weight of A times a random vector beside A times a snapshot: A has to stay definite where no snapshot is."""
 
 PARAMETERS = 32
 """Training parameters, spread over all of them, at which the cubatures are trained."""
@@ -76,18 +79,16 @@ class HyperReduced(Formulation):
         if missing := " and ".join(sorted(members - problem.elementwise)):
             raise UnsupportedError(f"hyper-reduction integrates {missing} by elements, the problem does not")
         refuse_free(offline.cone)
-        known = {name: getattr(offline, name) for name in ("snapshots", "pod", "cone", "multipliers")}
-        greedy = replace(offline, primal=InfSupGreedy(), tolerance=1.0 / self.condition).given(**known)
-        vectors = greedy.projection.fixed_basis
+        vectors = offline.enriched(InfSupGreedy(), 1.0 / self.condition).projection.fixed_basis
         chosen = np.unique(np.linspace(0, len(snapshots.mu) - 1, PARAMETERS).round().astype(int))
         mus, u = snapshots.mu[chosen], snapshots.u[:, chosen]
         constraints = constraint_classes(problem.constraint(mu)[0] for mu in mus).representatives
         works = [np.asarray(B @ vectors) for B in constraints]
-        rows, shares = reduced_rows(offline.cone.generators, works, self.tolerance)
-        built = {"vectors": vectors, "rows": rows, "shares": shares}
+        built = {"vectors": vectors, "rows": reduced_rows(offline.cone.generators, works, self.tolerance)}
         if members:
-            found = reduced_elements(problem, members, vectors, mus, u, self.tolerance)
-            built |= {"elements": found[0], "weights": found[1]}
+            everywhere = np.arange(problem.element_dofs.shape[1])
+            whole = ReducedDomain(problem, members, vectors, everywhere, np.ones(len(everywhere)))
+            built["elements"] = whole.cubature(mus, u, self.tolerance)
         return built
 
     def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
@@ -96,8 +97,8 @@ class HyperReduced(Formulation):
 
     def _integrated(self, problem: Problem) -> frozenset[str]:
         """Members that are integrated at every query."""
-        both = frozenset({"A", "f"})
-        return both if self.integrate == "all" else both - problem.constant - problem.affine.keys()
+        once = frozenset() if self.integrate == "all" else problem.constant | problem.affine.keys()
+        return frozenset({"A", "f"}) - once
 
 
 class HyperReducedContact(FixedSpacesModel):
@@ -106,32 +107,64 @@ class HyperReducedContact(FixedSpacesModel):
     def __init__(self, offline: Reduction, built: Mapping[str, Any], integrated: frozenset[str]) -> None:
         super().__init__(V := built["vectors"], chi := offline.cone.generators)
         self.enrichment = V.shape[1] - offline.pod.basis.shape[1]
-        self._problem, self._tests = problem, tests = offline.problem, np.zeros_like(chi)
-        tests[built["rows"]] = built["shares"][:, None] * chi[built["rows"]]
-        projections: dict[str, Callable[[Any], Array]] = {
-            "A": lambda A: V.T @ np.asarray(A @ V),
-            "f": lambda f: V.T @ f,
-            "B": lambda B: tests.T @ np.asarray(B @ V),
-            "g": lambda g: tests.T @ np.minimum(g, np.finfo(float).max),  # pressures are zero where g is infinite
-        }
-        vi = problem.assemble(offline.snapshots.mu[0])
-        sums = dict(problem.affine) | {name: AffineSum.of([(1.0, getattr(vi, name))], ()) for name in problem.constant}
-        self._once = {name: of.mapped(projections[name]).at for name, of in sums.items() if name not in integrated}
-        if integrated:
-            self._domain = ReducedDomain(problem, integrated, V, built["elements"], built["weights"])
-        self._loads = problem.contact_loads(tests) if problem.has_contact else None
-        self._touched = V[problem.contact_dofs] if problem.has_contact else V
+        problem, tests, (rows, shares) = offline.problem, np.zeros_like(chi), built["rows"]
+        tests[rows] = shares[:, None] * chi[rows]
+        self._projected = projected_members(problem, V, tests, left_out=integrated)
+        self._domain = ReducedDomain(problem, integrated, V, *built["elements"]) if integrated else None
 
     def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
         """The program of the reduced domain."""
-        members = {name: of(mu) for name, of in self._once.items()}
-        if not {"A", "f"} <= members.keys():
-            members |= self._domain.at(mu)
-        if not {"B", "g"} <= members.keys():
-            if self._loads is None:
-                B, g = self._problem.constraint(mu)
-                members |= {"B": self._tests.T @ np.asarray(B @ self._touched), "g": self._tests.T @ g}
-            else:
-                loads, members["g"] = self._loads.at(mu)
-                members["B"] = loads.T @ self._touched
+        members = self._projected(mu) | (self._domain.at(mu) if self._domain else {})
         return solved(asked, VariationalInequality(**members))
+
+
+class ReducedDomain:
+    """A and f, or one of them, integrated over elements (e,) and weights, between vectors V (n×N')."""
+
+    def __init__(self, problem: Problem, members: frozenset[str], V: Array, elements: Indices, weights: Array) -> None:
+        dofs, self._sampler = problem.element_dofs[:, elements], problem.element_sampler(elements)
+        padded = np.vstack([V, np.zeros(V.shape[1])])  # the last row is that of -1
+        self._local = np.ascontiguousarray(np.moveaxis(padded[dofs], 0, 1))
+        self._problem, self._members, self._vectors, self._weights = problem, members, V, weights
+
+    def at(self, mu: Array) -> dict[str, Array]:
+        """The members at mu (d,) by name, A (N'×N') and f (N',)."""
+        sampled, found = self._sampler(mu), dict[str, Array]()
+        if "A" in self._members:
+            A = np.tensordot(self._local, (self._weights[:, None, None] * sampled["A"]) @ self._local, ((0, 1), (0, 1)))
+            found["A"] = 0.5 * (A + A.T)
+        if "f" in self._members:
+            found["f"] = self._works(sampled["f"]) @ self._weights
+        return found
+
+    def _works(self, forces: Array) -> Array:
+        """Works (N'×e) of forces on elements (e×k)."""
+        return np.asarray(np.einsum("ekn,ek->ne", self._local, forces))
+
+    def cubature(self, mus: Array, u: Array, tolerance: float) -> tuple[Indices, Array]:
+        """Few of the elements and their weights, trained on snapshots u (n×P) at mus (P×d).
+
+        Its conditions are works of f, of A x, and of A times noise, as far as these are integrated.
+        """
+        problem, V, rng = self._problem, self._vectors, np.random.default_rng(0)
+        sums = Cubature(V.shape[1], len(self._weights))
+        for mu, x in zip(mus, problem.V.gram(V, u).T, strict=True):
+            sampled = self._sampler(mu)
+            lower = scipy.linalg.cholesky(V.T @ np.asarray(problem.assemble(mu).A @ V), lower=True)
+            trials = [(1.0, x), (STABILITY, rng.standard_normal(len(x)))] if "A" in self._members else []
+            forces = [(weight, np.einsum("eij,ej->ei", sampled["A"], self._local @ trial)) for weight, trial in trials]
+            for weight, each in [*forces, (1.0, sampled["f"])] if "f" in self._members else forces:
+                sums.add(scipy.linalg.solve_triangular(lower, self._works(each), lower=True), weight)
+        return sums.columns(tolerance)
+
+
+def reduced_rows(pressures: Array, works: Sequence[Array], tolerance: float) -> tuple[Indices, Array]:
+    """Rows and weights with which each of the pressures χ (m×R) does about the work χᵀ B V that it does on all rows.
+
+    `works` are B V (m×N') at some parameters.
+    """
+    sums = Cubature(works[0].shape[1], len(pressures))
+    for each in works:
+        for pressure in pressures.T:
+            sums.add(each.T * pressure)
+    return sums.columns(tolerance)

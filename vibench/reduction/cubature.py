@@ -1,0 +1,74 @@
+"""Cubatures with nonnegative weights: few columns that have about the sum of all."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg
+
+from vibench.arrays import Array, Indices
+
+SUMS, SUMS_PER_VECTOR = 800, 8
+"""How many sums stand for all conditions of a cubature: far more than it takes columns."""
+
+
+class Cubature:
+    """The conditions of a cubature, each with a random sign in one of few sums, which keep its residual.
+
+    Parameters
+    ----------
+    size, count
+        Number N' of conditions that are added at a time, and number e of columns that the cubature chooses from.
+    """
+
+    def __init__(self, size: int, count: int) -> None:
+        self._sums, self._rng = np.zeros((max(SUMS, SUMS_PER_VECTOR * size), count)), np.random.default_rng(0)
+
+    def add(self, conditions: Array, weight: float = 1.0) -> None:
+        """Add conditions (N'×e), relative to what all columns together are."""
+        if size := float(np.linalg.norm(conditions.sum(axis=1))):
+            signs = self._rng.choice([-1.0, 1.0], len(conditions))
+            where = self._rng.choice(len(self._sums), len(conditions), replace=False)
+            self._sums[where] += (weight / size * signs)[:, None] * conditions
+
+    def columns(self, tolerance: float) -> tuple[Indices, Array]:
+        """Few columns (j,) and weights (j,) > 0 with which all conditions are met to a tolerance; see `cubature`."""
+        return cubature(self._sums, tolerance)
+
+
+def cubature(conditions: Array, tolerance: float) -> tuple[Indices, Array]:
+    """Few columns (j,) of conditions (k×e) and weights (j,) > 0 with which they have about the sum of all.
+
+    Nonnegative least squares after Lawson and Hanson (1974), ended at a relative residual as by Farhat et al. (2015);
+    all columns with the weight 1 for the tolerance 0. Where the tolerance cannot be reached it is the least residual.
+    """
+    if not tolerance:
+        return np.arange(conditions.shape[1]), np.ones(conditions.shape[1])
+    total, chosen, weights = conditions.sum(axis=1), list[int](), np.zeros(conditions.shape[1])
+    Q, R, residual = np.zeros((len(total), 0)), np.zeros((0, 0)), total
+    while np.linalg.norm(residual) > tolerance * np.linalg.norm(total):
+        slopes = conditions.T @ residual
+        slopes[chosen] = -np.inf
+        best = int(np.argmax(slopes))
+        if not slopes[best] > 0.0:
+            break  # the least residual there is
+        Q, R = _with_column(Q, R, conditions[:, best])
+        chosen.append(best)
+        while (solved := scipy.linalg.solve_triangular(R, Q.T @ total)).min() <= 0.0:
+            present, falling = weights[chosen], np.flatnonzero(solved <= 0.0)
+            ratios = present[falling] / (present[falling] - solved[falling])
+            first = int(falling[np.argmin(ratios)])
+            weights[chosen] = present + ratios.min() * (solved - present)
+            weights[chosen.pop(first)] = 0.0
+            Q, R = scipy.linalg.qr_delete(Q, R, first, which="col")
+        weights[chosen] = solved
+        residual = total - conditions[:, chosen] @ solved
+    columns = np.sort(np.array(chosen, int))
+    return columns, weights[columns]
+
+
+def _with_column(Q: Array, R: Array, column: Array) -> tuple[Array, Array]:
+    """The economic QR decomposition of a matrix with one more column."""
+    if not R.size:
+        return column[:, None] / np.linalg.norm(column), np.array([[np.linalg.norm(column)]])
+    extended: tuple[Array, Array] = scipy.linalg.qr_insert(Q, R, column, R.shape[1], which="col")
+    return extended
