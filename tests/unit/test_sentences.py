@@ -96,7 +96,7 @@ def of_formulations() -> Sequence[str]:
     key = ["problem", "dual", "pod_tol", "training"]
     mixed = table[table["formulation"] == "mixed"].set_index(key)
     ratios = {}
-    for column in ("online_s", "error_lambda_mean"):
+    for column in ("online_s", "error_lambda_mean", "offline_s", "violation_max"):
         pairs = table.merge(mixed[column].rename(f"{column} of mixed"), left_on=key, right_index=True)
         ratios[column] = pairs[column] / pairs[f"{column} of mixed"]
     own, of = table["training"] == "own", table["formulation"]
@@ -108,7 +108,11 @@ def of_formulations() -> Sequence[str]:
     def errors(names: Sequence[str], chosen: pd.Series) -> str:
         return span(ratios["error_lambda_mean"][own & kind.isin(names) & chosen])
 
+    def beside(column: str, *names: str) -> str:
+        return span(ratios[column][own & (kind.isin(names) | of.isin(names))])
+
     same = ("penalty", "proximal", "sparse-dictionary")
+    added = ratios["offline_s"][own & kind.isin(same)].max() - 1.0
     fastest = table[own].loc[table[own].groupby("problem")["online_s"].idxmin()]
     assert set(fastest["formulation"]) == {"regression (radial)"}
     errors_of = table.pivot_table(index=["formulation", "problem", "dual", "pod_tol"], columns="training",
@@ -130,6 +134,12 @@ def of_formulations() -> Sequence[str]:
         f"{span(regression['inner'])}; with half",
         f"with half of the solutions, of {span(growth.loc['mixed', 'half'])} and {span(regression['half'])}",
         f"in {table['queries'].sum():,} queries",
+        f"radial basis functions {beside('offline_s', 'regression (radial)')} times, with Gaussian processes "
+        f"{span(ratios['offline_s'][own & (of == 'regression')])}; `local` {beside('offline_s', 'local')}, "
+        f"`hyper-reduced` {beside('offline_s', 'hyper-reduced')}; the others add at most {100 * added:.1g} %",
+        f"`hyper-reduced` {beside('violation_max', 'hyper-reduced')} times that of `mixed`, `local` "
+        f"{beside('violation_max', 'local')}, `regression` {beside('violation_max', 'regression')}, the others "
+        f"{beside('violation_max', *same)}",
     )
 
 
