@@ -164,6 +164,16 @@ def test_a_run_in_which_nothing_works_comes_to_its_end(vibench: Vibench, tmp_pat
     assert {row["queries_ok"] for row in found.values()} == {0}
     assert "2 cells, 0 ok, 2 not ok" in done.stdout
 
+    # with a larger limit the cell that it had ended is run again, once; what raises is not
+    longer = write_study(tmp_path, study | {"limits": {"query_seconds": 20.0}})
+    done = vibench(tmp_path, "run", longer, "--jobs", "1")
+    assert "2 cells, 1 to run" in done.stdout + done.stderr
+    assert {row["problem"]: row["status"] for row in rows(tmp_path / "runs" / "wire")} == {
+        "wire-raises": "error", "wire": "ok"
+    }  # fmt: skip
+    done = vibench(tmp_path, "run", longer, "--jobs", "1")
+    assert "2 cells, 0 to run" in done.stdout + done.stderr
+
 
 def test_a_problem_that_fails_first_leaves_the_one_beside_it_alone(vibench: Vibench, tmp_path: Path) -> None:
     """What the good problem waits for is not dropped when the stages of the bad one fail before it could begin."""

@@ -11,6 +11,9 @@ from vibench.dependencies import CELL, code_used
 from vibench.provenance import libraries
 from vibench.stages.base import Failed, ItemwiseStage, Stage
 
+OUT_OF_MEMORY = "out of memory: the limit is memory_gib"
+"""Beginning of the reason of what a worker has no memory for; the limit follows."""
+
 
 def code_here() -> str:
     """The code of vibench that determines numbers, and the libraries, in this process."""

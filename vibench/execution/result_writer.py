@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from vibench import provenance
@@ -28,6 +29,11 @@ class ResultWriter:
     database: ResultsDatabase
     labels: Mapping[Plugin, str]
 
+    @cached_property
+    def study_hash(self) -> str:
+        """What the rows name the study by."""
+        return digest(self.study.model_dump(mode="json"))
+
     def cell(self, cell: Cell, rows: CellRows) -> Row:
         """Write the rows of a cell; returns its own as it is stored."""
         keys = cell_columns(cell)
@@ -35,7 +41,7 @@ class ResultWriter:
         row |= {
             "seed": cell.validation.seed,
             **_set_columns(cell.validation),
-            "study_hash": digest(self.study.model_dump(mode="json")),
+            "study_hash": self.study_hash,
             "code": cell.code,
             "threads": 1,
             "versions": json.dumps(provenance.versions(cell.solver), sort_keys=True),

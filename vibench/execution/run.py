@@ -15,6 +15,7 @@ from vibench.execution.executors import Dask, Executor, Local
 from vibench.execution.graph import Graph
 from vibench.execution.jobs import Job
 from vibench.execution.offline_plan import OfflinePlan
+from vibench.execution.raised_limits import ended_by_smaller_limits, keep_limits
 from vibench.execution.result_writer import ResultWriter, labels_of
 from vibench.execution.run_folder import LOG, claimed, clear
 from vibench.execution.timing_plan import TimingPlan
@@ -182,9 +183,11 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
             clear(folder, study.name, observer.note)
         database = ResultsDatabase(folder, identity(study), anew=options.fresh)
         try:
-            finished = database.finished()
-            todo = [cell for cell in cells if _to_do(cell, finished, options.retry)]
-            run = _Run(study, folder, store, ResultWriter(study, database, labels_of(cells)), observer, options)
+            finished, raised = database.finished(), ended_by_smaller_limits(database, study.limits)
+            todo = [cell for cell in cells if cell.key in raised or _to_do(cell, finished, options.retry)]
+            writer = ResultWriter(study, database, labels_of(cells))
+            keep_limits(database, writer.study_hash, study.limits)
+            run = _Run(study, folder, store, writer, observer, options)
             interrupted = run.execute(cells, todo)
             everything = list(database.rows("cells"))
             database.replace("thresholds", break_even_rows(everything, database.rows("timings")))

@@ -22,6 +22,7 @@ from threadpoolctl import threadpool_limits
 from vibench import interrupts
 from vibench.errors import NumericalError, StorageError, UnsupportedError, VibenchError, in_a_line, message_of
 from vibench.execution.jobs import (
+    OUT_OF_MEMORY,
     Batch,
     BatchDone,
     Begun,
@@ -122,7 +123,7 @@ def perform(
             return Failed(Status.ERROR, f"{error}; a plugin limits or closes the files of its process")
         return Unstored(str(error))
     except _NoMemoryError:
-        return OutOfMemory(Failed(Status.ERROR, f"out of memory: the limit is memory_gib = {job.memory_gib:g}"))
+        return OutOfMemory(Failed(Status.ERROR, f"{OUT_OF_MEMORY} = {job.memory_gib:g}"))
 
 
 def _check_code(job: Job, batch: Batch) -> None:

@@ -146,6 +146,13 @@ class ResultsDatabase:
         """Status and code of the cells that have a row, by their key."""
         return {key: (status, code) for key, status, code in self._db.execute("SELECT cell, status, code FROM cells")}
 
+    def ends(self) -> Iterator[tuple[str, str, str, str]]:
+        """Cell, hash of its study, status and reason of all cells and queries that are not ok."""
+        columns = "cells.cell, cells.study_hash, {0}.status, coalesce({0}.reason, '') FROM cells"
+        own = f"SELECT {columns.format('cells')} WHERE cells.status <> 'ok'"
+        queries = f"SELECT {columns.format('queries')} JOIN queries USING (cell) WHERE queries.status <> 'ok'"
+        return self._db.execute(f"{own} UNION ALL {queries}")
+
     def write_cell(
         self,
         cell: Mapping[str, Any],
@@ -170,13 +177,22 @@ class ResultsDatabase:
 
     def _name_parameters(self, problem: str, parameters: Sequence[tuple[str, str]]) -> None:
         """Keep what mu_1, mu_2, … of a problem are, where it is not known yet."""
-        entry = PARAMETERS + problem, json.dumps(parameters)
-        if not parameters or self._db.execute("SELECT 1 FROM meta WHERE key = ? AND value = ?", entry).fetchone():
+        if parameters:
+            self.keep(PARAMETERS + problem, json.dumps(parameters))
+
+    def keep(self, key: str, value: str) -> None:
+        """Keep a text in the table `meta`, in place of an earlier one with the same key."""
+        if self._db.execute("SELECT 1 FROM meta WHERE key = ? AND value = ?", (key, value)).fetchone():
             return
         with self._writing():
-            self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", entry)
+            self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, value))
             self._digests.forget(name="meta")
             self._digests.count("meta")
+
+    def kept(self, beginning: str) -> dict[str, str]:
+        """The texts in `meta` whose keys have this beginning, by the rest of their keys."""
+        entries = self._db.execute("SELECT key, value FROM meta").fetchall()
+        return {key.removeprefix(beginning): value for key, value in entries if key.startswith(beginning)}
 
     def _write_cell(self, cell: Mapping[str, Any], **others: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         with self._writing():
