@@ -15,7 +15,7 @@ from vibench.results.columns import HISTORY_KEYS, KEYS
 from vibench.stages.base import Stage
 from vibench.stages.cell_queries import cell_queries
 from vibench.stages.enrichment import NestedEnrichment
-from vibench.stages.infsup_constants import ReferenceConstants
+from vibench.stages.infsup_constants import EnergyConstants
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.snapshots import SnapshotStage
 from vibench.study.cells import Cell
@@ -82,7 +82,7 @@ CONE = TRAINED | {"dual", "dual_options", "dual_tol", "dual_size"}
         (PODStage, POD),
         (ConeStage, CONE),
         (NestedEnrichment, POD | CONE | {"primal", "primal_options", "primal_tol"}),
-        (ReferenceConstants, set()),
+        (EnergyConstants, set()),
     ],
 )
 def test_a_history_is_named_by_what_its_stage_depends_on(

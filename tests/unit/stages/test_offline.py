@@ -19,12 +19,14 @@ from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Kind, Stop
+from vibench.qp.status import Status
 from vibench.reduction.nested import Milestone
+from vibench.stability.coercivity import Stability
 from vibench.stages import snapshots
 from vibench.stages.assembly import AssemblyStage
-from vibench.stages.base import value_of
+from vibench.stages.base import LOST, Failed, value_of
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.chunks import CHUNKS
+from vibench.stages.chunks import CHUNKS, part
 from vibench.stages.enrichment import NestedEnrichment, SingleEnrichment
 from vibench.stages.infsup_constants import ReferenceConstants
 from vibench.stages.judging.cell_summary import summarise
@@ -253,13 +255,16 @@ def test_a_slow_query_is_a_timeout(store: SampleStore) -> None:
 
 
 def test_the_reference_constants_are_those_of_every_parameter(store: SampleStore) -> None:
-    constants = value_of(store, ReferenceConstants(ConstraintMatrices(PROBLEM, VALIDATION)))
+    constants = ReferenceConstants(ConstraintMatrices(PROBLEM, VALIDATION)).gather(store)
     mus = PROBLEM.create().validation_set(9, 3)
-    scaled = [c.inf_sup.span / mu[0] ** 2 for c, mu in zip(constants, mus, strict=True)]  # B = mu_1² times one matrix
+    scaled = [
+        c.inf_sup.span / mu[0] ** 2 for c, mu in zip(constants, mus, strict=True) if isinstance(c, Stability)
+    ]  # B = mu_1² times one matrix
     assert np.allclose(scaled, scaled[0], rtol=1e-9)
     assert scaled[0] > 0.0
     problem = PROBLEM.create()
     for c, mu in zip(constants, mus, strict=True):
+        assert isinstance(c, Stability)
         vi = problem.assemble(mu)
         values = scipy.linalg.eigh(vi.A.toarray(), problem.V.matrix.toarray(), eigvals_only=True)
         assert c.coercivity.proved
@@ -347,3 +352,19 @@ def test_without_an_ok_query_there_are_no_means() -> None:
     assert found["error_u_mean"] is None
     assert found["residual_max"] is None
     assert found["beta_span_min"] == 0.2
+
+
+def test_a_chunk_of_constants_that_failed_costs_the_queries_at_its_own_parameters(store: SampleStore) -> None:
+    stage = cell("offline-pga", 0.5)
+    first, *_ = stage.reference.chunks
+    token = LOST.set({first.key: Failed(Status.TIMEOUT, "too long")})
+    try:
+        rows = stage.run(store).value.queries
+    finally:
+        LOST.reset(token)
+    lost = part(np.arange(9.0)[:, None], 0)[1].size
+    assert [row["status"] for row in rows] == ["timeout"] * lost + ["ok"] * (9 - lost)
+    assert {row["reason"] for row in rows[:lost]} == {"in high-fidelity constants: too long"}
+    before = value_of(store, stage).queries
+    assert all(row["bound_u"] == other["bound_u"] for row, other in zip(rows[lost:], before[lost:], strict=True))
+    assert not any("coercivity" in row for row in rows[:lost])
