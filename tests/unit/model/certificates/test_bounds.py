@@ -307,6 +307,20 @@ def test_the_residual_of_a_corrected_pair_is_that_of_the_inner_product_in_place_
         assert float(np.sqrt(r @ np.linalg.solve(A, r))) <= found.bound.rho
 
 
+@pytest.mark.parametrize(("stiffness", "differs"), [("constant", False), ("affine", True), ("interpolated", True)])
+def test_errors_are_told_apart_where_the_stiffness_varies_alone(
+    stiffness: str, differs: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Elsewhere bounds are those of the sum of both, to the last bit."""
+    mu = np.array([1.2, 0.3])
+    problem, model, certificate = prepared(stiffness, True)
+    reduced = model.assemble(mu)
+    x, alpha = disturbed(reduced.program, 1e-3, np.random.default_rng(4))
+    before = certificate.evaluate(problem, mu, reduced, x, alpha)
+    monkeypatch.setattr(bounds_module, "defect_corrected_bounds", lambda *_: (0.0, 0.0))  # below all others
+    assert (certificate.evaluate(problem, mu, reduced, x, alpha) != before) is differs
+
+
 def test_where_a_constant_body_moves_at_a_parameter_there_is_no_inf_sup_constant() -> None:
     """What was the same at all training parameters may be another one elsewhere: this is looked at."""
     _, model, certificate = prepared("constant", constraint="half")

@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numerics import exact, spd
+
+from vibench.interfaces.problem import Contact, VariationalInequality
+from vibench.model.certificates.contact_correction import ContactCompliance
+from vibench.model.certificates.defect_correction import defect_corrected_bounds
+
+N, M = 9, 4
+CONTACT = np.arange(2, 8)
+
+
+class Pair:
+    """A random inequality in the inner product X, and u_N, λ_N ≥ 0 away from its solution."""
+
+    def __init__(self, seed: int, size: float, pressure: float, spread: float) -> None:
+        """A = L M Lᵀ with X = L Lᵀ and the eigenvalues of M between 1 and `spread`."""
+        rng = np.random.default_rng(seed)
+        self.X = spd(N, rng, 30.0)
+        half, self.spectrum = np.linalg.cholesky(self.X), (1.0, spread)
+        A = half @ spd(N, rng, spread) @ half.T
+        B = np.zeros((M, N))
+        B[:, CONTACT] = rng.standard_normal((M, len(CONTACT)))
+        self.vi = VariationalInequality(0.5 * (A + A.T), rng.standard_normal(N), B, rng.uniform(-0.3, 0.1, M))
+        u, lam = exact(self.vi)
+        self.u_N = u + size * rng.standard_normal(N)
+        self.lam_N = np.maximum(lam + pressure * rng.standard_normal(M), 0.0)
+        e, force = u - self.u_N, B.T @ (lam - self.lam_N)
+        self.errors = float(np.sqrt(e @ A @ e)), float(np.sqrt(force @ np.linalg.solve(A, force)))
+        self.scale = 1.0 + float(np.linalg.norm(self.u_N) + np.linalg.norm(self.lam_N))
+        self.rng = rng
+
+    def bounds(self, kept: int = N) -> tuple[float, float]:
+        """Where `kept` random coordinates of the residual are known, and of what it lacks the norm."""
+        X, (A, f, B, g) = self.X, (self.vi.A, self.vi.f, self.vi.B, self.vi.g)
+        half = np.linalg.cholesky(X)
+        rotated = np.linalg.qr(self.rng.standard_normal((N, N)))[0]
+        coordinates = rotated.T @ np.linalg.solve(half, f - A @ self.u_N - B.T @ self.lam_N)
+        directions = np.linalg.solve(half, np.eye(N)[:, CONTACT]).T @ rotated
+        compliance = ContactCompliance(np.linalg.inv(X)[np.ix_(CONTACT, CONTACT)], np.arange(len(CONTACT)))
+        solution = self.u_N[CONTACT], np.zeros(len(CONTACT)), self.lam_N
+        shown = coordinates[:kept], float(np.linalg.norm(coordinates[kept:]))
+        contact = Contact(sp.csr_array(B[:, CONTACT]), g)
+        return defect_corrected_bounds(compliance, directions[:, :kept], contact, solution, shown, self.spectrum)
+
+
+SIZES = st.sampled_from([0.0, 1e-3, 1.0])
+
+
+@given(st.integers(0, 10_000), SIZES, SIZES, st.sampled_from([1.0, 1.5, 20.0]), st.sampled_from([N, 5, 0]))
+@settings(max_examples=60)
+def test_no_error_is_above_its_bound(seed: int, size: float, pressure: float, spread: float, kept: int) -> None:
+    """Also where most of the residual is known by its norm alone."""
+    pair = Pair(seed, size, pressure, spread)
+    for error, bound in zip(pair.errors, pair.bounds(kept), strict=True):
+        assert error <= bound + 1e-7 * pair.scale
+
+
+@given(st.integers(0, 10_000), SIZES, SIZES)
+@settings(max_examples=40)
+def test_bounds_are_the_errors_where_the_stiffness_is_the_inner_product(
+    seed: int, size: float, pressure: float
+) -> None:
+    pair = Pair(seed, size, pressure, 1.0)
+    assert pair.bounds() == pytest.approx(pair.errors, rel=1e-5, abs=1e-6 * pair.scale)
+
+
+def test_a_small_error_of_one_of_both_has_a_small_bound() -> None:
+    """The bound of the sum is as large as the other one."""
+    nearly = 1.0 + 1e-3
+    for size, pressure in ((1.0, 1e-4), (1e-4, 1.0)):
+        of_u, of_lam = Pair(3, size, pressure, nearly).bounds()
+        small, large = sorted((of_u, of_lam))
+        assert small < 0.05 * large
+        assert (of_u > of_lam) == (size > pressure)
