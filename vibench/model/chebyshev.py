@@ -85,7 +85,8 @@ def interpolate_on_box(
     Degrees differ by direction: along random lines, the arrays are interpolated with more and more points until the
     coefficients have decayed to a tenth of the tolerance, relative to the largest array (`_degree`). One grid has these
     degrees, or larger ones if its measured error is above the tolerance. Every array loses the coefficients it does not
-    need; the others are factorised into θ and terms by a singular value decomposition, unless its terms are given.
+    need. If all have the tolerance, those without given terms are factorised into θ and terms by a singular value
+    decomposition.
 
     Parameters
     ----------
@@ -121,13 +122,21 @@ def interpolate_on_box(
     # A function that needs more points than that along a line has a grid beyond the budget, or nearly.
     limit = max(9, round(4 * budget ** (1.0 / len(lower)))) if len(lower) > 1 else budget
     counts = [max(along.degree(k, at, 0.1 * tolerance, limit) for at in anchors) + 1 for k in range(len(lower))]
+
+    def measured(name: str, polynomial: AffinePolynomial) -> AffinePolynomial:
+        error = float(np.linalg.norm(polynomial.at(unit) - values[name], axis=-1).max()) / scale[name]
+        return replace(polynomial, error=error, scale=scale[name])
+
     for _ in range(TRIALS):
         counts = _within(counts, budget)
-        grid = along.coefficients(counts)
-        polynomials = {name: _truncated(c, units[name], 0.1 * tolerance, terms.get(name)) for name, c in grid.items()}
-        for name, p in polynomials.items():
-            error = float(np.linalg.norm(p.at(unit) - values[name], axis=-1).max()) / scale[name]
-            polynomials[name] = replace(p, error=error, scale=scale[name])
+        kept = {name: _needed(c, 0.1 * tolerance) for name, c in along.coefficients(counts).items()}
+        polynomials = {name: _with_terms(*kept[name], units[name], terms[name], 0.1 * tolerance) for name in terms}
+        polynomials |= {name: _plain(*kept[name], units[name]) for name in kept if name not in terms}
+        polynomials = {name: measured(name, polynomials[name]) for name in kept}
+        if max(p.error for p in polynomials.values()) <= tolerance:
+            # not before: the decomposition of a large array takes minutes
+            for name in kept.keys() - terms.keys():
+                polynomials[name] = measured(name, _factorised(*kept[name], units[name], 0.1 * tolerance))
         if max(p.error for p in polynomials.values()) <= tolerance or prod(counts) >= 0.7 * budget:
             break
         counts = [count + max(1, count // 4) if count > 1 else count for count in counts]
@@ -191,22 +200,34 @@ def _within(counts: Sequence[int], budget: int) -> list[int]:
     return kept
 
 
-def _truncated(coefficients: Array, unit: Any, tolerance: float, terms: Array | None) -> AffinePolynomial:
-    """A polynomial from its coefficients (n₁×…×n_d×size), without those that sum up to less than a tolerance.
-
-    The coefficients are in a unit, a number or an array (size,). With given terms they are those of θ.
-    """
+def _needed(coefficients: Array, tolerance: float) -> tuple[Indices, Array]:
+    """Degrees (K×d) and coefficients (K×size), of n₁×…×n_d×size, without those that sum up to less than a tolerance."""
     shape = coefficients.shape
     flat = coefficients.reshape(-1, shape[-1])
     norms = np.linalg.norm(flat, axis=1)
     rising = np.argsort(norms, kind="stable")
     kept = np.sort(rising[np.cumsum(norms[rising]) > tolerance]) if norms.sum() > tolerance else np.zeros(1, np.intp)
-    indices = np.stack(np.unravel_index(kept, shape[:-1]), axis=1)
-    if terms is not None:
-        return AffinePolynomial(indices, _without_smallest(flat[kept], tolerance) * unit, terms, np.inf)
-    left, sigma, right = svd(flat[kept])
+    return np.stack(np.unravel_index(kept, shape[:-1]), axis=1), flat[kept]
+
+
+def _with_terms(indices: Indices, theta: Array, unit: Any, terms: Array, tolerance: float) -> AffinePolynomial:
+    """The polynomial with given terms (Q×size) from coefficients of θ (K×Q) in a unit, a number or an array (Q,)."""
+    return AffinePolynomial(indices, _without_smallest(theta, tolerance) * unit, terms, np.inf)
+
+
+def _plain(indices: Indices, coefficients: Array, unit: Any) -> AffinePolynomial:
+    """The polynomial with its coefficients (K×size) themselves as terms, or its entries, whichever are fewer."""
+    count, size = coefficients.shape
+    if size < count:
+        return AffinePolynomial(indices, coefficients, unit * np.eye(size), np.inf)
+    return AffinePolynomial(indices, np.eye(count), unit * coefficients, np.inf)
+
+
+def _factorised(indices: Indices, coefficients: Array, unit: Any, tolerance: float) -> AffinePolynomial:
+    """The polynomial with fewest terms, orthogonal ones, by the singular value decomposition of its coefficients."""
+    left, sigma, right = svd(coefficients)
     # a value is a sum over all rows, with factors of at most 1
-    lost = np.sqrt(len(kept) * np.append(np.cumsum(sigma[::-1] ** 2)[::-1], 0.0))
+    lost = np.sqrt(len(indices) * np.append(np.cumsum(sigma[::-1] ** 2)[::-1], 0.0))
     count = max(1, int(np.argmax(lost <= tolerance)))
     theta = _without_smallest(left[:, :count] * sigma[:count], tolerance)
     return AffinePolynomial(indices, theta, right[:count] * unit, np.inf)

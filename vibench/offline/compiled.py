@@ -21,7 +21,7 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import RequestError, UnsupportedError
-from vibench.interfaces.problem import MEMBERS
+from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.model.chebyshev import AffinePolynomial
 from vibench.offline import c_source
 from vibench.offline.models import AnyReducedModel
@@ -67,15 +67,10 @@ class CompiledModel:
             too large.
         """
         try:
-            _, polynomials = member_polynomials(reduced, TOLERANCE, EVALUATIONS, fixed=True)
+            _, polynomials = member_polynomials(reduced, TOLERANCE, EVALUATIONS, fixed=True, check=_refuse_large)
         except RequestError as error:
             raise UnsupportedError(f"the model cannot be exported to C: {error}") from None
         box, members = reduced.problem.parameters, {name: polynomials[name] for name in MEMBERS}
-        N, R = members["f"].terms.shape[1], members["g"].terms.shape[1]
-        size = 8 * (5 * N * N + 2 * N * R)  # A packed and twice in full, J and U; B and the normals
-        if size > STACK:
-            what = f"the program of {N} unknowns and {R} constraints has {size / 2**20:.1f} MiB of arrays on the stack"
-            raise UnsupportedError(f"{what}, at most {STACK // 2**20} MiB are safe")
         return cls(members, box.lower, box.upper, box.names, box.units, accuracy)
 
     @property
@@ -101,6 +96,15 @@ class CompiledModel:
         with TemporaryDirectory(prefix="vibench-") as folder:  # what is loaded needs its file no longer
             loaded = ctypes.CDLL(str(_compiled(self.source, Path(folder))))
         return Program(loaded, self.members["f"].terms.shape[1], self.members["g"].terms.shape[1])
+
+
+def _refuse_large(program: VariationalInequality) -> None:
+    """Raise an `UnsupportedError` if programs of this size have too many arrays on the stack."""
+    N, R = len(program.f), len(program.g)
+    size = 8 * (5 * N * N + 2 * N * R)  # A packed and twice in full, J and U; B and the normals
+    if size > STACK:
+        what = f"the program of {N} unknowns and {R} constraints has {size / 2**20:.1f} MiB of arrays on the stack"
+        raise UnsupportedError(f"{what}, at most {STACK // 2**20} MiB are safe")
 
 
 class Program:

@@ -45,12 +45,14 @@ def member_polynomials(
     fixed: bool,
     beside: Beside | None = None,
     rotated: Mapping[str, Array] = MappingProxyType({}),
+    check: Callable[[VariationalInequality], None] | None = None,
 ) -> tuple[AnyReducedModel, dict[str, AffinePolynomial]]:
     """The model whose members are evaluated, see `declared_model`, and polynomials of the members.
 
     A is a packed upper triangle (row by row). With `fixed` a basis that depends on the parameter is refused; what is
     interpolated `beside` the members has polynomials, too. Of these, the `rotated` ones are the θ of A times a
-    matrix, by name: one polynomial serves them and A.
+    matrix, by name: one polynomial serves them and A. `check` may refuse a model by its program at one parameter,
+    before it is interpolated.
 
     Raises
     ------
@@ -65,6 +67,8 @@ def member_polynomials(
         first = members_of(queried, box.lower, coefficients_of(queried, box.lower))
         if not len(first.f) or not len(first.g):
             raise RequestError("the model has no unknowns or no constraints")
+        if check is not None:
+            check(first)
         terms = declared_terms(queried)
         if rotated:
             terms |= {"A": _stiffness_terms(queried, box.lower)} | {name: of.T for name, of in rotated.items()}

@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from vibench.model import chebyshev
 from vibench.model.chebyshev import interpolate_on_box
 
 LOWER, UPPER = np.array([0.5, -2.0]), np.array([1.5, 3.0])
 UNIT = np.random.default_rng(1).random((50, 2))
 POINTS = LOWER + UNIT * (UPPER - LOWER)
+MANY = np.linspace(0.5, 1.0, 150)
+"""More entries than polynomials of the tests have coefficients."""
 
 
 def test_polynomials_are_found_with_their_degrees_and_terms() -> None:
@@ -41,13 +44,19 @@ def test_degrees_follow_the_decay_in_every_direction() -> None:
 
 
 @pytest.mark.parametrize("dimension", [1, 2])
-def test_what_is_not_smooth_misses_the_tolerance_and_says_by_how_much(dimension: int) -> None:
+def test_what_is_not_smooth_misses_the_tolerance_and_says_by_how_much(
+    dimension: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def decomposed(_: np.ndarray) -> None:
+        raise AssertionError("arrays that are not accurate enough were factorised")
+
+    monkeypatch.setattr(chebyshev, "svd", decomposed)
     lower, upper, budget = LOWER[:dimension], UPPER[:dimension], 100
     evaluated: list[np.ndarray] = []
 
     def kink(mu: np.ndarray) -> dict[str, np.ndarray]:
         evaluated.append(mu)
-        return {"a": np.array([abs(mu[0] - 1.03)]), "b": np.array([1.0 + mu[-1]])}
+        return {"a": np.array([abs(mu[0] - 1.03)]), "b": np.array([1.0 + mu[-1]]), "c": abs(mu[0] - 1.03) * MANY}
 
     found = interpolate_on_box(kink, lower, upper, 1e-9, budget)
     assert found["b"].error <= 1e-12
@@ -56,6 +65,7 @@ def test_what_is_not_smooth_misses_the_tolerance_and_says_by_how_much(dimension:
     true = np.abs(found["a"].at(unit)[:, 0] - expected).max() / expected.max()
     assert 0.2 * true <= found["a"].error <= 5.0 * true
     assert found["a"].error > 1e-4
+    assert np.allclose(found["c"].at(unit), np.outer(found["a"].at(unit)[:, 0], MANY), atol=1e-9)
     assert np.prod(np.array(found["a"].degrees) + 1) <= budget
     assert len(evaluated) <= 12 * budget
 

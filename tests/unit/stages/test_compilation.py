@@ -14,7 +14,7 @@ import vibench
 from vibench.errors import UnsupportedError
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.model.chebyshev import AffinePolynomial
-from vibench.offline import compiled
+from vibench.offline import compiled, polynomials
 from vibench.offline.compiled import CompiledModel, compiler
 from vibench.offline.polynomials import InaccurateError
 from vibench.qp.status import Status
@@ -149,9 +149,15 @@ def test_there_is_no_program_of_a_model_that_is_too_large_or_not_smooth_enough(
     run: vibench.Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reduced = run.model(str(run.cells["cell"].iloc[0])).reduced
-    monkeypatch.setattr(compiled, "STACK", 100)
-    with pytest.raises(UnsupportedError, match="MiB of arrays on the stack"):
-        CompiledModel.of(reduced, 1e-9)
+
+    def interpolated(*_: object, **__: object) -> None:
+        raise AssertionError("a model that is too large was interpolated before it was refused")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(compiled, "STACK", 100)
+        patched.setattr(polynomials, "interpolate_on_box", interpolated)
+        with pytest.raises(UnsupportedError, match="MiB of arrays on the stack"):
+            CompiledModel.of(reduced, 1e-9)
 
     def inaccurate(*_: object, **__: object) -> None:
         raise InaccurateError("B is not smooth", 0.1)
