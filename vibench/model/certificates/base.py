@@ -140,7 +140,8 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
         samples = np.column_stack([evaluate(mu).get("A", ONE) for mu in training])
         rotation, terms = T, _ = rotated(A.terms, samples)
         leading = len(terms) if is_exact(problem, "A", A) else leading_terms(T @ samples)
-    load, stiffness, of_leading = _interpolation_errors(problem, X, A, f, evaluate, rotation, terms, leading)
+    last = None if rotation is None or leading == len(terms) else (rotation[leading:], terms[leading:])
+    load, stiffness, of_leading = _interpolation_errors(problem, X, members, evaluate, last)
     if not constant:
         spectral = spectral_bounds(problem, X, terms[:leading], lambda mu: T @ evaluate(mu).get("A", ONE), of_leading)
     pattern = EliminationPattern.of(X.matrix, dofs, X.factorisation)
@@ -184,14 +185,15 @@ def contact_at(problem: Problem, mu: Array) -> Contact:
 def _interpolation_errors(
     problem: Problem,
     X: InnerProduct,
-    A: AffineMember,
-    f: AffineMember,
+    members: Mapping[str, AffineMember],
     evaluate: Callable[[Array], Mapping[str, Array]],
-    rotation: Array | None,
-    terms: Sequence[SparseMatrix],
-    leading: int,
+    last: tuple[Array, Sequence[SparseMatrix]] | None,
 ) -> tuple[float, float, float]:
-    """Bounds of the errors of f̃, of Ã, and of the sum of its leading rotated terms, from random parameters."""
+    """Bounds of the errors of f̃, of Ã, and of Ã without its last rotated terms, from random parameters.
+
+    These terms are given with their rows of the rotation (k×Q).
+    """
+    A, f = members["A"], members["f"]
     exact = {name: is_exact(problem, name, member) for name, member in (("A", A), ("f", f))}
     if all(exact.values()):
         return 0.0, 0.0, 0.0
@@ -205,9 +207,9 @@ def _interpolation_errors(
             of_A = theta.get("A", ONE)
             difference = vi.A - sum(t * term for t, term in zip(of_A, A.terms, strict=True))
             missed = left_out = largest_quotient(difference, X)
-            if rotation is not None and leading < len(terms):
-                last = zip((rotation @ of_A)[leading:], terms[leading:], strict=True)
-                left_out = largest_quotient(difference + sum(t * term for t, term in last), X)
+            if last is not None:
+                left = zip(last[0] @ of_A, last[1], strict=True)
+                left_out = largest_quotient(difference + sum(t * term for t, term in left), X)
             stiffness, of_leading = max(stiffness, missed), max(of_leading, left_out)
     moved = SAFETY * (1.0 + MARGINS[0])
     return SAFETY * load, moved * stiffness, moved * of_leading
