@@ -29,7 +29,7 @@ from vibench.results.tables import results_file
 from vibench.stages.assembly import assembly_stage
 from vibench.stages.base import Done, Stage, value_of
 from vibench.stages.cell_queries import CellQueries, cell_queries
-from vibench.stages.formulations import formulation_queries
+from vibench.stages.formulations.queries import formulation_queries
 from vibench.storage.artefacts import Store, usable_store
 from vibench.study.cells import NOT_MOVED, Cell
 from vibench.study.matrix import study_of_cell

@@ -23,7 +23,7 @@ from vibench.rounds.timed_seconds import TimedCell, TimedRound, round_columns
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, Watch, build_problem, value_of
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.formulations import FormulationModels, FormulationQueries
+from vibench.stages.formulations.queries import FormulationModels, FormulationQueries
 from vibench.stages.judging.cell_goal import CellGoal
 from vibench.stages.query import Queries
 from vibench.stages.snapshots import TimedSnapshots, gather

@@ -20,7 +20,7 @@ from vibench.stages.assembly import AssemblyStage, ExactSolutions, assembly_stag
 from vibench.stages.base import Row, Stage, Watch, value_of
 from vibench.stages.certification import CertificateStage
 from vibench.stages.compilation import CompilationStage, compiled_query, loaded_program
-from vibench.stages.formulations import formulation_queries
+from vibench.stages.formulations.queries import formulation_queries
 from vibench.stages.infsup_constants import InfSupConstants
 from vibench.stages.judging.cell_goal import CellGoal, CellItems, QueryRows, inf_sup_columns
 from vibench.stages.offline import ReducedCone
