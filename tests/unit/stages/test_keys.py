@@ -178,7 +178,8 @@ def test_no_code_counts_that_only_requests_records_or_shows() -> None:
     assert {module.split(".")[1] for module in used} >= {name.split(".")[0] for name in NUMERICAL}
 
 
-SOLUTIONS, MATRICES, CONSTANTS = "high-fidelity solutions", "constraint matrices", "high-fidelity constants"
+SOLUTIONS, MATRICES = "high-fidelity solutions", "constraint matrices"
+CONSTANTS, REFERENCE = "high-fidelity constants", "high-fidelity inf-sup constants"
 SHOWN = (
     "report.html", "results.columns", "results.costs.break_even", "study.spec", "study.registry", "errors", "text",
     "storage.artefacts", "storage.serialisation", "stages.base", "provenance", "execution.run", "cli.main",
@@ -188,8 +189,9 @@ EDITS: Mapping[str, tuple[set[str], set[str]]] = {
     "highfidelity.active_set": ({SOLUTIONS, "POD", "cone", "assembly"}, {MATRICES, "affine decomposition"}),
     "reduction.pod": ({"POD", "enrichment", "assembly"}, {SOLUTIONS, "cone", "training constants", "pictures"}),
     "reduction.cones": ({"cone", "enrichment", "assembly"}, {SOLUTIONS, "POD"}),
-    "stability.infsup": ({"cone", "enrichment", CONSTANTS}, {SOLUTIONS, "POD", MATRICES}),
-    "stability.conic_infsup": ({CONSTANTS}, {SOLUTIONS, "POD", "cone", "enrichment", "assembly"}),
+    "stability.infsup": ({"cone", "enrichment", REFERENCE}, {SOLUTIONS, "POD", MATRICES, CONSTANTS}),
+    "stability.conic_infsup": ({REFERENCE}, {SOLUTIONS, "POD", "cone", "enrichment", "assembly", CONSTANTS}),
+    "stability.coercivity": ({CONSTANTS}, {SOLUTIONS, "POD", "cone", MATRICES, REFERENCE}),
     "model.hyperreduced": ({"hyper-reduction", "assembly"}, {SOLUTIONS, "POD", "cone", "enrichment"}),
     "qp.exact": ({"exact reduced solutions", SOLUTIONS, "POD", "cone", "enrichment"}, set()),
     "study.parameter_sets": ({SOLUTIONS, "affine decomposition", "assembly"}, set()),
