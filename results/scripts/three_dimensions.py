@@ -137,16 +137,27 @@ def growth(cells: pd.DataFrame) -> pd.DataFrame:
     return (both["online_s last"] / both["online_s first"]).rename("ratio").reset_index()
 
 
+def not_run(cells: pd.DataFrame) -> list[str]:
+    """Problems of the study without a cell."""
+    return [str(one.label) for one in read_study("three-dimensions").problem if one.label not in set(cells["problem"])]
+
+
+def restricted(cells: pd.DataFrame) -> str:
+    """What restricts the study to the problems that were run."""
+    return "".join(f' --problem "{label}"' for label in cells["problem"].unique()) if not_run(cells) else ""
+
+
 def conditions(cells: pd.DataFrame) -> str:
     """On which meshes of the study it was run, and what wall seconds say of other work that the machine had."""
     labels = dict(zip(cells["problem"], cells["dim_V"], strict=True))
     meshes = " and ".join(f"{label} ({int(n):,} unknowns)" for label, n in labels.items())
-    left = [f"{one.label}" for one in read_study("three-dimensions").problem if one.label not in labels]
-    not_run = f" Not run: {' and '.join(left)}." if left else ""
-    share = cells["offline_wall_s"].sum() / cells["offline_s"].sum()
-    load = f"the wall seconds of its offline phases were {share:.2g} times their CPU seconds"
-    busy = f" The machine had other work, too: {load}." if share > BUSY else ""
-    return f"The study was run on: {meshes}.{not_run}{busy}"
+    left = not_run(cells)
+    missing = f" Not run: {' and '.join(left)}." if left else ""
+    shares = {name: cells[f"{kind}_wall_s"].sum() / cells[f"{kind}_s"].sum()
+              for kind, name in (("offline", "offline phases"), ("online", "queries"))}  # fmt: skip
+    load = " and ".join(f"{share:.2g} times those of {name}" for name, share in shares.items() if share > BUSY)
+    busy = f" The machine had other work, too: wall seconds were {load} in CPU seconds." if load else ""
+    return f"The study was run on: {meshes}.{missing}{busy}"
 
 
 def pressed(resolution: str = "medium") -> Figure:
@@ -165,6 +176,7 @@ def pressed(resolution: str = "medium") -> Figure:
         mesh = Triangulation(*picture.points, picture.triangles.T)
         surface.plot_trisurf(mesh, 1e3 * picture.values, cmap="viridis", linewidth=0.1)
         surface.set(xlabel="x [m]", ylabel="y [m]", zlabel="displacement [mm]")
+        surface.locator_params(nbins=4)
         axes = figure.add_subplot(1, 2, 2)
         theory, along = problem.theory(mu), np.linspace(0.0, 0.06, 200)
         for axis, name in enumerate("xy"):
@@ -183,7 +195,7 @@ def main(run: str, target: str) -> None:
     cells = read(run, "cells")
     page = Page(
         target, "Three dimensions", made_by("three_dimensions", "three-dimensions", "three-dimensions",
-                                            options=" --no-figures"),
+                                            options=f"{restricted(cells)} --no-figures"),
         f"A half-space pressed by a rigid elliptic paraboloid (`hertz3d`). {SECONDS} {conditions(cells)}",
         machine=origin(cells),
     )  # fmt: skip

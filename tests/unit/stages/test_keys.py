@@ -191,7 +191,7 @@ EDITS: Mapping[str, tuple[set[str], set[str]]] = {
     "reduction.cones": ({"cone", "enrichment", "assembly"}, {SOLUTIONS, "POD"}),
     "stability.infsup": ({"cone", "enrichment", REFERENCE}, {SOLUTIONS, "POD", MATRICES, CONSTANTS}),
     "stability.conic_infsup": ({REFERENCE}, {SOLUTIONS, "POD", "cone", "enrichment", "assembly", CONSTANTS}),
-    "stability.coercivity": ({CONSTANTS}, {SOLUTIONS, "POD", "cone", MATRICES, REFERENCE}),
+    "stability.coercivity": ({CONSTANTS}, {MATRICES, REFERENCE}),
     "model.hyperreduced": ({"hyper-reduction", "assembly"}, {SOLUTIONS, "POD", "cone", "enrichment"}),
     "qp.exact": ({"exact reduced solutions", SOLUTIONS, "POD", "cone", "enrichment"}, set()),
     "study.parameter_sets": ({SOLUTIONS, "affine decomposition", "assembly"}, set()),
