@@ -11,7 +11,8 @@ from other_problems import Torsion
 from transformed import Transformed
 
 import vibench
-from vibench import Enrichment, Formulation, Kind, Reduction, Snapshots, Stop, UnsupportedError
+from vibench import Enrichment, Formulation, Kind, Offline, PrimalStrategy, Reduction, Snapshots, Stop, UnsupportedError
+from vibench.offline.formulated import Formulated
 from vibench.offline.sweep import high_fidelity_sweep
 from vibench.storage.serialisation import dumps, loads
 from vibench_problems.obstacle import Obstacle
@@ -30,6 +31,22 @@ MU = np.array([0.43])
 STRING = Reduction(
     Varying(count=15), CPG(), OnlineSupremizers(), Stop(tolerance=1e-6), Stop(tolerance=1e-3), accuracy=1e-11
 )
+
+
+class Supplied(PrimalStrategy):
+    """Supremizers as a strategy makes them that computes its vectors itself."""
+
+    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
+        assert offline.span.size
+        assert tolerance is None
+        return Enrichment(Kind.PER_PARAMETER, supply=lambda V, vi, span: V.solve(np.asarray(vi.B.T @ span)))
+
+
+@pytest.fixture(scope="module")
+def processes() -> Formulated:
+    """Gaussian processes of the string."""
+    pytest.importorskip("sklearn")
+    return STRING.formulated(Regression())
 
 
 @pytest.fixture(scope="module")
@@ -89,10 +106,60 @@ def test_one_cluster_is_the_mixed_model_and_several_have_smaller_spaces(by: str)
     assert np.array_equal(stored.solve(MU, several.asked()[0]).x, several.solve(MU).answer.x)
 
 
-def test_regression_interpolates_the_snapshots_and_its_uncertainty_has_the_size_of_the_error() -> None:
-    pytest.importorskip("sklearn")
+def test_clusters_of_parameters_are_chosen_by_the_nearest_centroid() -> None:
+    model = STRING.formulated(Local(clusters=3)).model
+    assert isinstance(model, LocalModel)
+    owners = np.array([model.phase(mu) for mu in STRING.snapshots.mu])
+    places = STRING.problem.parameters.to_unit(STRING.snapshots.mu)
+    # k-means has ended: each centroid is the mean of those that it is nearest to
+    centroids = np.array([places[owners == number].mean(axis=0) for number in range(owners.max() + 1)])
+    for mu in STRING.problem.validation_set(20, 1):
+        distances = np.linalg.norm(centroids - STRING.problem.parameters.to_unit(mu), axis=1)
+        assert distances[model.phase(mu)] <= distances.min() + 1e-12
+
+
+def test_clusters_name_their_fallbacks_and_take_no_vectors_that_are_supplied() -> None:
+    offline = STRING.given(cone=replace(STRING.cone, fallbacks=("a step",)))
+    model = Local(clusters=1).model(offline, {
+        "weights": np.zeros((3, 1)), "owners": np.zeros(len(offline.snapshots.mu)),
+        "steps": [{name: getattr(offline, name) for name in ("pod", "cone", "enrichment")}],
+    })  # fmt: skip
+    assert model.fallbacks == ("cluster 0: a step",)
+    with pytest.raises(UnsupportedError, match="an enrichment that supplies its own vectors"):
+        replace(STRING, primal=Supplied()).formulated(Local(clusters=1))
+
+
+def test_processes_are_those_of_scikit_learn_and_multipliers_are_projected_on_the_cone_in_w(
+    processes: Formulated,
+) -> None:
+    from sklearn.gaussian_process import GaussianProcessRegressor  # noqa: PLC0415
+    from sklearn.gaussian_process.kernels import ConstantKernel, Matern  # noqa: PLC0415
+
+    problem, basis, W = STRING.problem, STRING.pod.basis, STRING.problem.W
+    fitted = processes
+    of, places = fitted.built["u"], fitted.built["places"]
+    found, place = fitted.solve(MU), problem.parameters.to_unit(MU)
+    variance = fitted.built["left_out"]
+    for k, values in enumerate(problem.V.gram(basis, STRING.snapshots.u)):
+        kernel = ConstantKernel(of["variances"][k]) * Matern(of["lengths"][k], nu=2.5)
+        process = GaussianProcessRegressor(kernel, alpha=1e-8, optimizer=None, normalize_y=True).fit(places, values)
+        mean, deviation = process.predict(place[None], return_std=True)
+        assert found.answer.x[k] == pytest.approx(mean[0], rel=1e-6, abs=1e-9 * np.abs(values).max())
+        variance += deviation[0] ** 2
+    assert found.answer.uncertainty == pytest.approx(np.sqrt(variance), rel=1e-3)
+    # λ is the nearest of the cone in W to what the processes predict: the conditions of the projection
+    span, chi, alpha = STRING.multipliers.span, STRING.cone.generators, found.answer.alpha
+    predicted = span @ fitted.model._lam.at(place)
+    slope = W.gram(chi, (found.lam - predicted)[:, None])[:, 0]
+    assert slope.min() >= -1e-8 * W.norm(predicted)
+    assert np.abs(slope[alpha > 0.0]).max() <= 1e-8 * W.norm(predicted)
+
+
+def test_regression_interpolates_the_snapshots_and_its_uncertainty_has_the_size_of_the_error(
+    processes: Formulated,
+) -> None:
     problem, V, W = STRING.problem, STRING.problem.V, STRING.problem.W
-    fitted = STRING.formulated(Regression())
+    fitted = processes
     for k in (0, 7):
         known = STRING.snapshots.u[:, k], STRING.snapshots.lam[:, k]
         found = fitted.solve(STRING.snapshots.mu[k])

@@ -5,13 +5,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import Varying
+from other_problems import Torsion
 
 from vibench.highfidelity import active_set
+from vibench.interfaces.problem import MEMBERS, Problem
 from vibench.interfaces.strategies import Enrichment, Kind
-from vibench.model.galerkin import ReducedModel, project
+from vibench.interfaces.validation import checked_assembly
+from vibench.model.galerkin import ReducedModel, project, projected_members
 from vibench.qp.solve import solve_qp
 from vibench.reduction.supremizers import supremizers
 from vibench.stability.infsup import multipliers
+from vibench_problems.hertz import Hertz
+from vibench_problems.obstacle import Obstacle
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +46,29 @@ def test_projection_is_galerkin(solved) -> None:
     assert np.isclose(alpha @ found.B @ x, (chi @ alpha) @ (vi.B @ (Z @ x)))
     assert np.isclose(found.g @ alpha, vi.g @ (chi @ alpha))
     assert np.array_equal(found.A, found.A.T)
+
+
+@pytest.mark.parametrize(
+    ("problem", "left_out"),
+    [
+        (Varying(), {"A", "f"}),
+        (Torsion(), set()),
+        (Obstacle(resolution=150), {"A", "f"}),
+        (Hertz(resolution=300), {"g"}),
+    ],
+    ids=lambda given: type(given).__name__,
+)
+def test_projected_members_are_those_of_the_assembled_problem(problem: Problem, left_out: set[str]) -> None:
+    # sums, members on the contact unknowns, and constraints that are assembled
+    rng = np.random.default_rng(1)
+    Z, chi = rng.standard_normal((problem.V.dim, 3)), rng.random((problem.W.dim, 2))
+    made = projected_members(problem, Z, chi, left_out)
+    for mu in problem.parameters.sample(2, seed=3):
+        expected, found = project(checked_assembly(problem, mu), Z, chi), made(mu)
+        assert found.keys() == set(MEMBERS) - left_out
+        for name, value in found.items():
+            known = getattr(expected, name)
+            assert np.allclose(value, known, rtol=0.0, atol=1e-10 * np.abs(known).max()), name
 
 
 @pytest.mark.parametrize("kind", [Kind.NONE, Kind.FIXED, Kind.PER_PARAMETER])
