@@ -7,8 +7,8 @@ from .cones import GrowingCone as GrowingCone
 from .cones import LazyDistances as LazyDistances
 from .cones import LazyMaximum as LazyMaximum
 from .cones import refuse_negative as refuse_negative
-from .cubature import Cubature as Cubature
-from .cubature import cubature as cubature
+from .cubatures import Cubature as Cubature
+from .cubatures import cubature as cubature
 from .supremizers import constraint_classes as constraint_classes
 from .supremizers import projected_supremizers as projected_supremizers
 from .supremizers import supremizer_coordinates as supremizer_coordinates
