@@ -155,8 +155,9 @@ def conditions(cells: pd.DataFrame) -> str:
     missing = f" Not run: {' and '.join(left)}." if left else ""
     shares = {name: cells[f"{kind}_wall_s"].sum() / cells[f"{kind}_s"].sum()
               for kind, name in (("offline", "offline phases"), ("online", "queries"))}  # fmt: skip
-    load = " and ".join(f"{share:.2g} times those of {name}" for name, share in shares.items() if share > BUSY)
-    busy = f" The machine had other work, too: wall seconds were {load} in CPU seconds." if load else ""
+    load = " and ".join(f"{name} took {share:.2g} times their CPU seconds" for name, share in shares.items()
+                        if share > BUSY)  # fmt: skip
+    busy = f" The machine had other work, too: in wall seconds {load}." if load else ""
     return f"The study was run on: {meshes}.{missing}{busy}"
 
 
