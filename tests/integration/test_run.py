@@ -19,7 +19,7 @@ from samples import wire_study, write_study
 import vibench.execution.run  # noqa: F401  lists the classes of all stages
 from vibench.results.columns import TABLES
 from vibench.results.sqlite.reading import FILE
-from vibench.stages.snapshots import CHUNKS
+from vibench.stages.chunks import CHUNKS
 from vibench.storage.artefacts import CACHE_VARIABLE, SUFFIX, Store, encoded
 
 SOLVERS = ["piqp", "careful", "gives-up"]

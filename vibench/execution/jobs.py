@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any
@@ -26,6 +26,8 @@ class Job:
     query_seconds: float
     cell_seconds: float
     memory_gib: float
+    lost: Mapping[str, Failed] = field(default_factory=dict)
+    """Dispensable stages that failed, by key."""
     code: str = field(default_factory=code_here)
 
 

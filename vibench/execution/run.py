@@ -214,6 +214,8 @@ class _Run:
     graph: Graph = field(default_factory=Graph)
     cells: dict[str, list[Cell]] = field(default_factory=dict)
     """The cells that get their rows from a goal, by its key; several cells may share a goal."""
+    lost: dict[str, Failed] = field(default_factory=dict)
+    """The dispensable stages that failed, by key."""
     timing: TimingPlan = field(init=False)
     offline: OfflinePlan = field(init=False)
     machines: Set[str] = frozenset()
@@ -286,7 +288,8 @@ class _Run:
         while self.graph.waiting or running:
             for stage in self.graph.begin(workers.slots - len(running)):
                 cell_seconds = stage.weight * limits.cell_seconds
-                job = Job(str(self.store.folder), stage, limits.query_seconds, cell_seconds, limits.memory_gib)
+                folder, lost = str(self.store.folder), dict(self.lost)
+                job = Job(folder, stage, limits.query_seconds, cell_seconds, limits.memory_gib, lost)
                 self.observer.begin(stage)
                 running[workers.submit(job)] = stage
             if not running:
@@ -301,7 +304,11 @@ class _Run:
                 self._finish(running.pop(future), _outcome(future))
 
     def _finish(self, stage: Stage, outcome: Done | Failed) -> None:
-        """Record the end of a stage; if it failed, every cell that needs it gets a row with the reason."""
+        """Record the end of a stage; if it failed, every cell that cannot do without gets a row with the reason."""
+        if isinstance(outcome, Failed) and stage.dispensable:
+            self.lost[stage.key] = outcome
+            self.graph.done(stage)
+            return
         if isinstance(outcome, Failed):
             reason = outcome.reason if stage.key in self.cells else f"in {stage.label}: {outcome.reason}"
             self.writer.failure(stage, outcome.reason)

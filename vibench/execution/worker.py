@@ -35,7 +35,7 @@ from vibench.execution.jobs import (
 )
 from vibench.execution.supervisor import MARK, kill_marked
 from vibench.qp.status import Status
-from vibench.stages.base import SHARE, Done, Failed, Items, ItemwiseStage, Unstored
+from vibench.stages.base import LOST, SHARE, Done, Failed, Items, ItemwiseStage, Unstored
 from vibench.storage.artefacts import Store
 
 T = TypeVar("T")
@@ -100,6 +100,7 @@ def perform(
     def work() -> Done | BatchDone:
         _check_code(job, batch)
         store = _store(job.store)
+        LOST.set(job.lost)
         if isinstance(job.stage, ItemwiseStage):
             items = _begun(job.stage, store)
             earlier = {number: items.lost(number, failed) for number, failed in progress.lost.items()} | progress.done

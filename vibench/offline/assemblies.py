@@ -39,6 +39,7 @@ class Assemblies:
         self._contact: ContactInfSup | None = None
         self._alphas: LRUCache[bytes, Constant] = LRUCache(MANY)
         self._gammas: LRUCache[bytes, Constant] = LRUCache(MANY)
+        self._betas: LRUCache[tuple[bytes, bytes], Constant] = LRUCache(MANY)
 
     def at(self, mu: Array) -> VariationalInequality:
         """A copy of `checked_assembly` at mu (d,), which later assemblies leave as it is."""
@@ -87,7 +88,14 @@ class Assemblies:
         return b"" if "A" in self._problem.constant else digest(self.at(mu).A)
 
     def energy_inf_sup_at(self, mu: Array) -> Constant:
-        """Lower bound of β_A at mu (d,): by dense matrices of contact size where these are few, else by sparse ones."""
+        """Lower bound of β_A at mu (d,), computed once for all mu with one A and one B."""
+        key = self._stiffness_at(mu), b"" if "B" in self._problem.constant else digest(self.at(mu).B)
+        if key not in self._betas:
+            self._betas[key] = self._energy_inf_sup(mu)
+        return self._betas[key]
+
+    def _energy_inf_sup(self, mu: Array) -> Constant:
+        """By dense matrices of contact size where these are few, else by sparse ones."""
         vi, energy, W = self.at(mu), self.energy_at(mu), self._problem.W
         on, stiffness = energy.on_contact(vi), energy.stiffness
         if not on.is_dense:

@@ -21,11 +21,11 @@ from vibench.results.costs.paired_seconds import paces
 from vibench.rounds.marginal_solutions import MarginalSolutions, parts_alike
 from vibench.rounds.timed_seconds import TimedCell, TimedRound, round_columns
 from vibench.stages.assembly import AssemblyStage
-from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, build_problem, value_of
+from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, Watch, build_problem, value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.formulations import FormulationModels, FormulationQueries
 from vibench.stages.judging.cell_goal import CellGoal
-from vibench.stages.query import Queries, Watch
+from vibench.stages.query import Queries
 from vibench.stages.snapshots import TimedSnapshots, gather
 from vibench.storage.artefacts import Store
 from vibench.timing import NO_TIME, Seconds, calibration, timed

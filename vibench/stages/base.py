@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property, lru_cache
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 from vibench.dependencies import code_used
@@ -73,6 +74,10 @@ class Failed:
     reason: str
 
 
+LOST: ContextVar[Mapping[str, Failed]] = ContextVar("LOST", default=MappingProxyType({}))
+"""Dispensable stages that failed, by their keys, for a stage that needs them."""
+
+
 @dataclass(frozen=True)
 class Unstored:
     """A stage whose artefact could not be written, and the reason; no other could be written either."""
@@ -92,7 +97,9 @@ class Stage(ABC):
     stored: ClassVar[bool] = True
     """Whether the value is kept as an artefact, under `key`."""
     partial: ClassVar[bool] = False
-    """Whether several stages hold parts of the same histories; progress is then shown part by part."""
+    """Whether several stages hold parts of one result; progress is then shown part by part."""
+    dispensable: ClassVar[bool] = False
+    """Whether stages that need it run even if it failed, and find the reason in `LOST`; these must not be `stored`."""
 
     @cached_property
     def key(self) -> str:
@@ -188,6 +195,10 @@ def _described(value: Any) -> Any:
     return value
 
 
+Watch = Callable[[bool], None]
+"""Called with True before an operation that has a time limit of its own, and with False after it."""
+
+
 class Items(ABC):
     """The items of a stage in progress, which can be done in any order and by several processes."""
 
@@ -195,7 +206,7 @@ class Items(ABC):
         """Take note of the values of items that another process did, or lost; by default nothing."""
 
     @abstractmethod
-    def item(self, number: int, watch: Callable[[bool], None]) -> Any:
+    def item(self, number: int, watch: Watch) -> Any:
         """Do one item; `watch(True)` is called before an operation with its own time limit, `watch(False)` after."""
 
     @abstractmethod

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from vibench.interfaces.formulations import Multiplier
@@ -17,7 +17,7 @@ from vibench.qp.exact import ExactSolution
 from vibench.results.solver_agreement import vectors
 from vibench.stability.infsup import share
 from vibench.stages.assembly import AssemblyStage, ExactSolutions, assembly_stage
-from vibench.stages.base import Row, Stage, value_of
+from vibench.stages.base import Row, Stage, Watch, value_of
 from vibench.stages.certification import CertificateStage
 from vibench.stages.compilation import CompilationStage, compiled_query, loaded_program
 from vibench.stages.formulations import formulation_queries
@@ -113,7 +113,7 @@ class CellQueries(CellGoal):
         """All stages whose artefacts enter the rows of the cell."""
         timed = (stage for stages in self.offline.values() for stage in stages)
         read = (self.assembly, self.exact, *self.assembly.model_inputs, *timed)
-        stages = (*read, *self.constants, self.reference, *self.validation)
+        stages = (*read, *self.constants, *self.reference.stages, *self.validation)
         return tuple(dict.fromkeys(stages))
 
     def begin(self, store: Store) -> _Queries:
@@ -149,7 +149,7 @@ class _Queries(CellItems):
         )
         self._corrector = Corrector(self._model, self._certificate, stage.correction)
 
-    def item(self, number: int, watch: Callable[[bool], None]) -> QueryRows:
+    def answer(self, number: int, watch: Watch) -> QueryRows:
         """The rows of one query."""
         row, solution = run_query(self._stage.query(self._queries, number), self._stage.query_seconds, watch)
         return self.known(number) | row, solution and {"query": number} | solution
@@ -162,7 +162,7 @@ class _Queries(CellItems):
             self._reference.mu[numbers],
             [vectors(solution) for solution in solutions.values()],
             self._compared.at(numbers),
-            [self._stability[k] for k in numbers],
+            self.constants(numbers),
             [self._exact[k] for k in numbers],
             [self._reduced.projected[k] for k in numbers] if self._reduced.projected else (),
         )

@@ -13,8 +13,8 @@ from vibench.model.chebyshev import AffinePolynomial
 from vibench.offline.compiled import CompiledModel, Program
 from vibench.qp.verification import QPSolution
 from vibench.stages.assembly import AssemblyStage
-from vibench.stages.base import Result, Stage, value_of
-from vibench.stages.query import Queries, Query, Watch
+from vibench.stages.base import Result, Stage, Watch, value_of
+from vibench.stages.query import Queries, Query
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
 from vibench.timing import Seconds, timed

@@ -24,12 +24,12 @@ from vibench.qp.repeats import nearby
 from vibench.qp.status import Status
 from vibench.results.solver_agreement import answer_row
 from vibench.stages.assembly import AffineDecomposition, HyperReduction
-from vibench.stages.base import Result, Row, Stage, build_problem, faults_of, value_of
+from vibench.stages.base import Result, Row, Stage, Watch, build_problem, faults_of, value_of
 from vibench.stages.enrichment import EnrichmentStage, spaces_of
 from vibench.stages.judging.cell_goal import CellGoal, CellItems, QueryRows
 from vibench.stages.judging.pairs import pair_columns
 from vibench.stages.offline import ConeStage, PODStage, ReducedCone
-from vibench.stages.query import Watch, query_before
+from vibench.stages.query import query_before
 from vibench.stages.snapshots import gather, solution_stages
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
@@ -299,7 +299,7 @@ class FormulationQueries(CellGoal):
     def inputs(self) -> tuple[Stage, ...]:
         """All stages whose artefacts enter the rows of the cell."""
         timed = (stage for stages in self.offline.values() for stage in stages)
-        return tuple(dict.fromkeys((*self.timed_inputs, *timed, self.reference, *self.validation)))
+        return tuple(dict.fromkeys((*self.timed_inputs, *timed, *self.reference.stages, *self.validation)))
 
     def begin(self, store: Store) -> _FormulationItems:
         """Load the model and the reference solutions."""
@@ -313,7 +313,7 @@ class _FormulationItems(CellItems):
         super().__init__(stage, store)
         self._stage, self._models = stage, FormulationModels(store, stage)
 
-    def item(self, number: int, watch: Watch) -> QueryRows:
+    def answer(self, number: int, watch: Watch) -> QueryRows:
         """The rows of one query; u and λ are reconstructed here, too, where a broken answer costs one query."""
         row, solution = self._run(self._models.query(number), watch)
         return self.known(number) | row, solution and {"query": number} | solution
@@ -356,8 +356,8 @@ class _FormulationItems(CellItems):
             return []
         u, lam = (np.column_stack(of_all) for of_all in zip(*pairs, strict=True))
         vis = [assemblies(self._problem).at(mus[k]) for k in numbers]
-        constants = [self._stability[k] for k in numbers]
-        return pair_columns(self._problem, mus[numbers], vis, u, lam, self._compared.at(numbers), constants)
+        compared, constants = self._compared.at(numbers), self.constants(numbers)
+        return pair_columns(self._problem, mus[numbers], vis, u, lam, compared, constants)
 
     def sizes(self, rows: Sequence[Row]) -> tuple[Row, list[str]]:  # noqa: ARG002
         """Dimensions, and the fallbacks of the offline phase and of the model."""

@@ -1,8 +1,9 @@
-"""The stages that compute inf-sup constants at the validation parameters; many cells share each of them."""
+"""The stages of constants at the validation parameters, inf-sup and others; many cells share each of them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -21,34 +22,88 @@ from vibench.stability.infsup import (
     inf_sup,
     nodal_multipliers,
 )
-from vibench.stages.base import Result, Stage, build_problem, value_of
+from vibench.stages.base import LOST, SHARE, Failed, Result, Stage, build_problem, value_of
+from vibench.stages.chunks import CHUNKS, edges, part
 from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
+from vibench.study.parameter_sets import ParameterSet
+from vibench.study.plugin import Plugin
 
 for _kind in (ConstraintClasses, Stability, Constant, InfSup):
     storable(_kind)
 
 
 @dataclass(frozen=True)
-class ReferenceConstants(Stage):
-    """Constants of the high-fidelity problem: β_HF, α, γ_a and β_A; a `Stability` per parameter."""
+class ReferenceInfSup(Stage):
+    """β_HF of the high-fidelity pair: an `InfSup` per parameter."""
 
-    label = "high-fidelity constants"
+    label = "high-fidelity inf-sup constants"
 
     constraints: ConstraintMatrices
 
     def run(self, store: Store) -> Result:
         """Compute the constants."""
         problem = build_problem(self.constraints.problem)
-        inf_sup = constants_full(problem.V, value_of(store, self.constraints), nodal_multipliers(problem.W))
-        mus, kept = self.constraints.parameters.of(problem), assemblies(problem)
-        different = mus[:1] if {"A", "B"} <= problem.constant else mus
-        # of one parameter together, as long as its factorisation is there
-        others = [(kept.coercivity_at(mu), kept.continuity_at(mu), kept.energy_inf_sup_at(mu)) for mu in different]
-        others *= len(mus) // len(different)
-        return Result([Stability(hf, *constants) for hf, constants in zip(inf_sup, others, strict=True)])
+        return Result(constants_full(problem.V, value_of(store, self.constraints), nodal_multipliers(problem.W)))
+
+
+@dataclass(frozen=True)
+class EnergyConstants(Stage):
+    """α, γ_a and β_A of the high-fidelity problem at one chunk of a parameter set: three `Constant` per parameter."""
+
+    label = "high-fidelity constants"
+    partial = True
+    dispensable = True
+
+    problem: Plugin
+    parameters: ParameterSet
+    chunk: int
+
+    def run(self, store: Store) -> Result:  # noqa: ARG002
+        """Compute the constants, those of one parameter together, as long as its factorisation is there."""
+        problem, found = build_problem(self.problem), []
+        kept, (_, mus) = assemblies(problem), part(self.parameters.of(problem), self.chunk)
+        for mu in mus:
+            found.append((kept.coercivity_at(mu), kept.continuity_at(mu), kept.energy_inf_sup_at(mu)))
+            SHARE.get()(len(found) / len(mus))
+        return Result(found)
+
+
+@dataclass(frozen=True)
+class ReferenceConstants:
+    """The stages of all constants of the high-fidelity problem at the parameters of a set."""
+
+    constraints: ConstraintMatrices
+
+    @property
+    def inf_sup(self) -> ReferenceInfSup:
+        """The stage of β_HF."""
+        return ReferenceInfSup(self.constraints)
+
+    @property
+    def chunks(self) -> tuple[EnergyConstants, ...]:
+        """The stages of α, γ_a and β_A."""
+        problem, parameters = self.constraints.problem, self.constraints.parameters
+        return tuple(EnergyConstants(problem, parameters, chunk) for chunk in range(CHUNKS))
+
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        """All of them."""
+        return (self.inf_sup, *self.chunks)
+
+    def gather(self, store: Store) -> list[Stability | Failed]:
+        """The constants at every parameter; of those of a chunk that failed, why it did."""
+        inf_sup: list[InfSup] = value_of(store, self.inf_sup)
+        found: list[Stability | Failed] = []
+        for chunk, (first, end) in zip(self.chunks, pairwise(edges(len(inf_sup))), strict=True):
+            if (failed := LOST.get().get(chunk.key)) is not None:
+                found += [replace(failed, reason=f"in {chunk.label}: {failed.reason}")] * (end - first)
+            else:
+                pairs = zip(inf_sup[first:end], value_of(store, chunk), strict=True)
+                found += [Stability(hf, *of_A) for hf, of_A in pairs]
+        return found
 
 
 @dataclass(frozen=True)

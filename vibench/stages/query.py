@@ -26,15 +26,12 @@ from vibench.qp.verification import QPSolution, slack, verify
 from vibench.results.solver_agreement import solution_row
 from vibench.stability.coercivity import Stability
 from vibench.stages.assembly import AssemblyStage, ReducedPrograms
-from vibench.stages.base import Row, value_of
+from vibench.stages.base import Row, Watch, value_of
 from vibench.stages.judging.pairs import online_columns, pair_columns
 from vibench.storage.artefacts import Store
 from vibench.study import registry
 from vibench.study.parameter_sets import ParameterSet
 from vibench.timing import SLOW, Seconds, timed
-
-Watch = Callable[[bool], None]
-"""Called with True before an operation that has a time limit of its own, and with False after it."""
 
 
 @dataclass(frozen=True)

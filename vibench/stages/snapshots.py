@@ -23,6 +23,7 @@ from vibench.offline.assemblies import assemblies
 from vibench.offline.sweep import Snapshots
 from vibench.qp.repeats import nearby
 from vibench.stages.base import SHARE, Result, Stage, build_problem, faults_of, value_of
+from vibench.stages.chunks import CHUNKS, part
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes
@@ -32,10 +33,6 @@ from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, Seconds, median_seconds, timed
 
 T = TypeVar("T")
-
-CHUNKS = 4
-"""Number of chunks of a parameter set, each with its own set-up; fixed, so that keys do not depend on the workers."""
-
 
 storable(Fingerprint)
 
@@ -75,7 +72,7 @@ def _set_up(problem: Problem) -> _SetUp:  # noqa: ARG001
 
 @dataclass(frozen=True)
 class SnapshotStage(Stage):
-    """High-fidelity solutions at one chunk of a parameter set."""
+    """High-fidelity solutions at one chunk of a parameter set; each has its own set-up."""
 
     label = "high-fidelity solutions"
     partial = True
@@ -95,7 +92,7 @@ class SnapshotStage(Stage):
             return self._sweep(build_problem(self.problem))
 
     def _sweep(self, problem: Problem) -> Result:
-        first, mus = self.part(self.parameters.of(problem))
+        first, mus = part(self.parameters.of(problem), self.chunk)
         given, reference = mus.copy(), reference_assembly(problem)
         u, lam = np.zeros((problem.V.dim, len(mus))), np.zeros((problem.W.dim, len(mus)))
         seconds, fallbacks, kept = [], [], _set_up(problem)
@@ -164,11 +161,6 @@ class SnapshotStage(Stage):
         The result is the one at the first parameter.
         """
         return timed(partial(work, next(mus))) if self.parameters.role == "training" else median_seconds(work, mus)
-
-    def part(self, everything: Array) -> tuple[int, Array]:
-        """Number of the first parameter of the chunk, and its parameters."""
-        edges = np.linspace(0, len(everything), CHUNKS + 1).round().astype(int)
-        return int(edges[self.chunk]), everything[edges[self.chunk] : edges[self.chunk + 1]]
 
     def _diagnostics(self, problem: Problem, mus: Array, first: int) -> tuple[History, ...]:
         by_quantity: dict[str, list[float]] = {}

@@ -24,11 +24,12 @@ from vibench.stages import snapshots
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
+from vibench.stages.chunks import CHUNKS
 from vibench.stages.enrichment import NestedEnrichment, SingleEnrichment
 from vibench.stages.infsup_constants import ReferenceConstants
 from vibench.stages.judging.cell_summary import summarise
 from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage
-from vibench.stages.snapshots import CHUNKS, SnapshotStage, gather, solution_stages
+from vibench.stages.snapshots import SnapshotStage, gather, solution_stages
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, Seconds

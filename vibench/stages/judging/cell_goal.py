@@ -6,7 +6,7 @@ import json
 import math
 import resource
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -20,7 +20,7 @@ from vibench.provenance import machine
 from vibench.qp.status import Status
 from vibench.stability.coercivity import Stability
 from vibench.stability.infsup import InfSup
-from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, build_problem, value_of
+from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, Watch, build_problem
 from vibench.stages.infsup_constants import ReferenceConstants
 from vibench.stages.judging.cell_summary import summarise
 from vibench.stages.offline import ConstraintMatrices
@@ -106,7 +106,7 @@ class CellGoal(ItemwiseStage):
 
     @property
     def reference(self) -> ReferenceConstants:
-        """The stage of the constants of the high-fidelity problem."""
+        """The stages of the constants of the high-fidelity problem."""
         return ReferenceConstants(ConstraintMatrices(self.problem, self.validation_set))
 
     @property
@@ -129,7 +129,20 @@ class CellItems(Items):
         solved = _solutions(_Solutions(stage.problem, stage.training, stage.validation, store.folder, store))
         self._training, self._reference, self._compared = solved
         self._zeros = zeros(self._problem, self._compared)
-        self._stability: list[Stability] = value_of(store, stage.reference)
+        self._stability = stage.reference.gather(store)
+
+    def item(self, number: int, watch: Watch) -> QueryRows:
+        """The rows of one query; of one without constants the reason."""
+        constants = self._stability[number]
+        return self.lost(number, constants) if isinstance(constants, Failed) else self.answer(number, watch)
+
+    @abstractmethod
+    def answer(self, number: int, watch: Watch) -> QueryRows:
+        """The rows of one query at a parameter that has all constants."""
+
+    def constants(self, numbers: Iterable[int]) -> list[Stability]:
+        """The constants of the high-fidelity problem for some queries that have an answer."""
+        return [one for k in numbers if isinstance(one := self._stability[k], Stability)]
 
     @abstractmethod
     def assess(self, solutions: Mapping[int, Row]) -> list[Row]:
@@ -172,12 +185,12 @@ class CellItems(Items):
     def known(self, number: int) -> Row:
         """The columns of a query that do not depend on its solution: parameter, zeros of the reference, constants."""
         reference, (zero_u, zero_lam) = self._reference, self._zeros
+        constants = self._stability[number]
         return (
             {f"mu_{i + 1}": float(value) for i, value in enumerate(reference.mu[number])}
             | {"hf_s": reference.seconds[number].cpu, "reference_bound": _finite(reference.bounds[number])}
             | {"zero_u": int(zero_u[number]), "zero_lambda": int(zero_lam[number])}
-            | inf_sup_columns("beta_hf_", self._stability[number].inf_sup)
-            | _energy_constants(self._stability[number])
+            | (_constants(constants) if isinstance(constants, Stability) else {})
         )
 
     def _outputs(self, rows: Sequence[Row]) -> tuple[Row, ...]:
@@ -267,8 +280,8 @@ def inf_sup_columns(prefix: str, constants: InfSup) -> Row:
     }
 
 
-def _energy_constants(constants: Stability) -> Row:
-    return {
+def _constants(constants: Stability) -> Row:
+    return inf_sup_columns("beta_hf_", constants.inf_sup) | {
         "coercivity": constants.coercivity.value,
         "coercivity_proved": int(constants.coercivity.proved),
         "continuity": constants.continuity.value,
