@@ -31,6 +31,9 @@ v = u_N − w and ν has the residual f − A v − Bᵀν = r − (c X − A) w
 the first norm at most ρ/√α + ½ (γ − α)/√α ‖w‖_X for c = ½ (α + γ), where |c X − A| ≼ ½ (γ − α) X. Where A is constant
 the residual alone is left. This *corrected pair* is better where ω > ρ.
 
+Δ bounds both errors together. Where A varies and corrections are not prepared, which is where programs of contact size
+are solved in any case, `vibench.model.certificates.defect_correction` has bounds of each; the smaller ones are taken.
+
 Round-off is bounded where it decides whether w is feasible, and in the coordinates of the residual: it may be all that
 is left of Δ² + 2 rᵀw, in which these are multiplied with those of X w.
 """
@@ -48,6 +51,7 @@ from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.interfaces.problem import Contact, Problem
 from vibench.model.certificates.base import ONE, CertificateBase, Guarantee, contact_at
 from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction
+from vibench.model.certificates.defect_correction import defect_corrected_bounds
 from vibench.model.certificates.prepared_correction import PreparedCorrections
 from vibench.model.certificates.residual import ResidualBasis
 from vibench.model.error_bounds import NO_CORRECTION, NOT_IN_CONE, CorrectionMode
@@ -194,6 +198,18 @@ class OnlineCertificate:
         bound = sqrt(square)
         work = float(along @ coordinates) + (beside + missing + lacking) * norm + rho * eta  # at least rᵀw
         natural = min(sqrt(max(0.0, square + 2.0 * work)), omega + bound)
+        if self.prepared is None and base.spectral is not None:
+            solution = *self._on_contact(y), lam
+            shown = coordinates, beside + missing + lacking
+            of_u, of_lam = defect_corrected_bounds(
+                self.compliance,
+                self.contact_directions,
+                evaluated.contact or contact_at(problem, mu),
+                solution,
+                shown,
+                (lower, upper),
+            )
+            bound, natural = min(bound, of_u), min(natural, of_lam)
         least = sqrt(max(0.0, square_of_u - base.stiffness_error * u_norm**2)) - bound  # of ‖u‖
         relative = bound / least if least > 0.0 else inf
         beta, which = self._inf_sup(problem, mu, evaluated, float(theta["B"][0]), upper)
@@ -231,8 +247,7 @@ class OnlineCertificate:
             B, g, g_size = self._constraint(problem, mu, evaluated)
             found = self.prepared.multiplier(float(B), g, g_size, y, lam, middle)
         if found is None:  # the best of all w
-            on_contact, uncertain = self.contact_basis @ y, float(np.linalg.norm(y)) * self._round_off
-            best = find_contact_correction(self.compliance, contact, on_contact, uncertain, lam, middle)
+            best = find_contact_correction(self.compliance, contact, *self._on_contact(y), lam, middle)
             if best is None or best.nu is None:
                 return None
             found, eta = (best.nu, best.norm, best.gap), best.eta
@@ -254,6 +269,10 @@ class OnlineCertificate:
         load[unknowns] = correction.load
         return np.asarray(u - self.base.X.riesz(load))
 
+    def _on_contact(self, y: Array) -> tuple[Array, Array]:
+        """u_N (k,) of coefficients y (d,) on the contact unknowns, and a bound of its round-off."""
+        return self.contact_basis @ y, float(np.linalg.norm(y)) * self._round_off
+
     def _inf_sup(
         self, problem: Problem, mu: Array, evaluated: Evaluated, theta: float, gamma: float
     ) -> tuple[float, str]:
@@ -273,10 +292,8 @@ class OnlineCertificate:
             quick = prepared.correction(B, g, g_size, y, lam, gamma)
             if quick is not None:
                 return (*quick, 0.0), ""
-        on_contact, uncertain = self.contact_basis @ y, float(np.linalg.norm(y)) * self._round_off
-        correction = find_contact_correction(
-            self.compliance, evaluated.contact or contact_at(problem, mu), on_contact, uncertain, lam, gamma
-        )
+        contact = evaluated.contact or contact_at(problem, mu)
+        correction = find_contact_correction(self.compliance, contact, *self._on_contact(y), lam, gamma)
         if correction is None:
             return None, NO_CORRECTION
         along = correction.load @ self.contact_directions[correction.unknowns]
