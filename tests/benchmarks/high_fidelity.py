@@ -27,9 +27,8 @@ from vibench.interfaces.problem import Problem
 from vibench.interfaces.validation import checked_assembly
 from vibench.results import formats
 from vibench.stages.base import build_problem
-from vibench.stages.chunks import CHUNKS
 from vibench.stages.snapshots import SnapshotStage
-from vibench.study.parameter_sets import ParameterSet
+from vibench.study.parameter_sets import CHUNKS, ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.timing import median_interval, timed
 

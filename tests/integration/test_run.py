@@ -19,8 +19,8 @@ from samples import wire_study, write_study
 import vibench.execution.run  # noqa: F401  lists the classes of all stages
 from vibench.results.columns import TABLES
 from vibench.results.sqlite.reading import FILE
-from vibench.stages.chunks import CHUNKS
 from vibench.storage.artefacts import CACHE_VARIABLE, SUFFIX, Store, encoded
+from vibench.study.parameter_sets import CHUNKS
 
 SOLVERS = ["piqp", "careful", "gives-up"]
 

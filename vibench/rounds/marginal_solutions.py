@@ -14,8 +14,8 @@ from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolve
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.validation import checked_assembly
 from vibench.qp.repeats import nearby
-from vibench.stages.chunks import edges
 from vibench.stages.snapshots import TimedSnapshots
+from vibench.study.parameter_sets import chunk_edges
 from vibench.timing import Seconds, timed
 
 SAME = 1e-6
@@ -60,7 +60,7 @@ def _starts(problem: Problem, reference: TimedSnapshots) -> Iterator[Mask | None
     """The contact set (m,) that each solution of the sweep starts from; `None` for the first ones of its parts."""
     box = problem.parameters
     width = np.maximum(box.upper - box.lower, np.finfo(float).tiny)
-    for first, end in pairwise(edges(len(reference.mu))):
+    for first, end in pairwise(chunk_edges(len(reference.mu))):
         for k in range(first, end):
             distances = np.linalg.norm((reference.mu[first:k] - reference.mu[k]) / width, axis=1)
             yield reference.lam[:, first + int(np.argmin(distances))] > 0.0 if k > first else None

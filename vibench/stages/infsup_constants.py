@@ -23,12 +23,11 @@ from vibench.stability.infsup import (
     nodal_multipliers,
 )
 from vibench.stages.base import LOST, SHARE, Failed, Result, Stage, build_problem, value_of
-from vibench.stages.chunks import CHUNKS, edges, part
 from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
-from vibench.study.parameter_sets import ParameterSet
+from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_edges, chunk_of
 from vibench.study.plugin import Plugin
 
 for _kind in (ConstraintClasses, Stability, Constant, InfSup):
@@ -64,7 +63,7 @@ class EnergyConstants(Stage):
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """Compute the constants, those of one parameter together, as long as its factorisation is there."""
         problem, found = build_problem(self.problem), []
-        kept, (_, mus) = assemblies(problem), part(self.parameters.of(problem), self.chunk)
+        kept, (_, mus) = assemblies(problem), chunk_of(self.parameters.of(problem), self.chunk)
         for mu in mus:
             found.append((kept.coercivity_at(mu), kept.continuity_at(mu), kept.energy_inf_sup_at(mu)))
             SHARE.get()(len(found) / len(mus))
@@ -97,7 +96,7 @@ class ReferenceConstants:
         """The constants at every parameter; of those of a chunk that failed, why it did."""
         inf_sup: list[InfSup] = value_of(store, self.inf_sup)
         found: list[Stability | Failed] = []
-        for chunk, (first, end) in zip(self.chunks, pairwise(edges(len(inf_sup))), strict=True):
+        for chunk, (first, end) in zip(self.chunks, pairwise(chunk_edges(len(inf_sup))), strict=True):
             if (failed := LOST.get().get(chunk.key)) is not None:
                 found += [replace(failed, reason=f"in {chunk.label}: {failed.reason}")] * (end - first)
             else:

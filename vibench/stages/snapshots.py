@@ -23,12 +23,11 @@ from vibench.offline.assemblies import assemblies
 from vibench.offline.sweep import Snapshots
 from vibench.qp.repeats import nearby
 from vibench.stages.base import SHARE, Result, Stage, build_problem, faults_of, value_of
-from vibench.stages.chunks import CHUNKS, part
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes
 from vibench.study.kinds import PROBLEM
-from vibench.study.parameter_sets import ParameterSet
+from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_of
 from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, Seconds, median_seconds, timed
 
@@ -92,7 +91,7 @@ class SnapshotStage(Stage):
             return self._sweep(build_problem(self.problem))
 
     def _sweep(self, problem: Problem) -> Result:
-        first, mus = part(self.parameters.of(problem), self.chunk)
+        first, mus = chunk_of(self.parameters.of(problem), self.chunk)
         given, reference = mus.copy(), reference_assembly(problem)
         u, lam = np.zeros((problem.V.dim, len(mus))), np.zeros((problem.W.dim, len(mus)))
         seconds, fallbacks, kept = [], [], _set_up(problem)

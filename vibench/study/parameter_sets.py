@@ -134,3 +134,19 @@ def check_sets(problem: Plugin, training: ParameterSet, validation: ParameterSet
 def _rows(mus: Array) -> Array:
     """Every row as one value that compares to the last bit."""
     return np.ascontiguousarray(mus, float).view(f"V{8 * mus.shape[1]}").ravel()
+
+
+CHUNKS = 4
+"""Number of chunks of a parameter set, which are stages of their own where every parameter takes long; fixed, so that
+keys do not depend on the workers."""
+
+
+def chunk_edges(count: int) -> list[int]:
+    """Numbers of the first parameter of every chunk of `count` parameters, and `count` (CHUNKS + 1,)."""
+    return [int(edge) for edge in np.linspace(0, count, CHUNKS + 1).round()]
+
+
+def chunk_of(everything: Array, chunk: int) -> tuple[int, Array]:
+    """Number of the first parameter of a chunk, and its parameters, of all (P×d)."""
+    first, end = chunk_edges(len(everything))[chunk : chunk + 2]
+    return first, everything[first:end]

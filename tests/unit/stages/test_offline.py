@@ -26,13 +26,12 @@ from vibench.stages import snapshots
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import LOST, Failed, value_of
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.chunks import CHUNKS, part
 from vibench.stages.enrichment import NestedEnrichment, SingleEnrichment
 from vibench.stages.infsup_constants import ReferenceConstants
 from vibench.stages.judging.cell_summary import summarise
 from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage
 from vibench.stages.snapshots import SnapshotStage, gather, solution_stages
-from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
+from vibench.study.parameter_sets import CHUNKS, OWN_TRAINING, ParameterSet, chunk_of
 from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, Seconds
 
@@ -362,7 +361,7 @@ def test_a_chunk_of_constants_that_failed_costs_the_queries_at_its_own_parameter
         rows = stage.run(store).value.queries
     finally:
         LOST.reset(token)
-    lost = part(np.arange(9.0)[:, None], 0)[1].size
+    lost = chunk_of(np.arange(9.0)[:, None], 0)[1].size
     assert [row["status"] for row in rows] == ["timeout"] * lost + ["ok"] * (9 - lost)
     assert {row["reason"] for row in rows[:lost]} == {"in high-fidelity constants: too long"}
     before = value_of(store, stage).queries

@@ -18,12 +18,11 @@ from vibench.execution.run import Agenda
 from vibench.interfaces.strategies import Stop
 from vibench.stages.base import Stage
 from vibench.stages.cell_queries import CellQueries, cell_queries
-from vibench.stages.chunks import CHUNKS
 from vibench.stages.offline import PODStage
 from vibench.stages.snapshots import SnapshotStage
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, read_study
-from vibench.study.parameter_sets import OWN_TRAINING
+from vibench.study.parameter_sets import CHUNKS, OWN_TRAINING
 from vibench.study.plugin import Plugin
 from vibench.terminal.progress import ALIKE, DrawingDisplay, ProgressDisplay, TimeLeft, duration
 
