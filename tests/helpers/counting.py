@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Callable
 from types import FrameType
@@ -9,8 +10,11 @@ from typing import Any
 
 
 def instructions(work: Callable[[], object]) -> int:
-    """Number of instructions of Python that a call executes, whatever functions it passes."""
-    count, before = 0, sys.gettrace()
+    """Number of instructions of Python that a call executes, whatever functions it passes.
+
+    None of them are those of callbacks of the garbage collector, such as Hypothesis has.
+    """
+    count, before, collects = 0, sys.gettrace(), gc.isenabled()
 
     def trace(frame: FrameType, event: str, _: Any) -> Callable[..., Any]:
         nonlocal count
@@ -18,11 +22,14 @@ def instructions(work: Callable[[], object]) -> int:
         count += event == "opcode"
         return trace
 
+    gc.disable()
     sys.settrace(trace)
     try:
         work()
     finally:
         sys.settrace(before)
+        if collects:
+            gc.enable()
     return count
 
 

@@ -15,9 +15,8 @@ from vibench.execution.executors import Dask, Executor, Local
 from vibench.execution.graph import Graph
 from vibench.execution.jobs import Job
 from vibench.execution.offline_plan import OfflinePlan
-from vibench.execution.raised_limits import ended_by_smaller_limits, keep_limits
 from vibench.execution.result_writer import ResultWriter, labels_of
-from vibench.execution.run_folder import LOG, claimed, clear
+from vibench.execution.run_folder import LOG, claimed, clear, ended_by_smaller_limits, keep_limits
 from vibench.execution.timing_plan import TimingPlan
 from vibench.linalg.factorisations import DEFAULT, implementation
 from vibench.provenance import solver_distribution

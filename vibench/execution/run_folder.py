@@ -1,13 +1,17 @@
-"""The folder of a run: what lies in it, that one run at a time writes into it, and what a fresh run removes."""
+"""The folder of a run: that one run at a time writes into it, what a fresh run removes, what larger limits run again."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from vibench.errors import RequestError
+from vibench.execution.jobs import OUT_OF_MEMORY
 from vibench.files import locked
+from vibench.qp.status import Status
+from vibench.results.database import ResultsDatabase
 from vibench.results.sqlite.reading import (
     DAMAGED,
     FILE,
@@ -18,6 +22,7 @@ from vibench.results.sqlite.reading import (
     study_of,
 )
 from vibench.results.tables import EXPORTED
+from vibench.study.spec import Limits
 
 LOCK = ".lock"
 """Lock file, held during a run."""
@@ -27,6 +32,13 @@ LOG = "workers.log"
 
 REPORT = "report.html"
 """File that `vibench report` writes unless told otherwise."""
+
+
+SECONDS = {"query_seconds", "cell_seconds"}
+"""Limits that end with the status `timeout`."""
+
+LIMITS = "limits of "
+"""Beginning of the keys of `meta` under which the limits of a study are, by its hash."""
 
 
 @contextlib.contextmanager
@@ -74,3 +86,22 @@ def clear(folder: Path, study: str, note: Callable[[str], None]) -> None:
         raise RequestError(f"'{folder}' holds results of the study '{there}'; --fresh removes only '{study}'")
     for name in (LOG, REPORT, *(f"tables/{file}" for file in EXPORTED)):
         (folder / name).unlink(missing_ok=True)
+
+
+def ended_by_smaller_limits(database: ResultsDatabase, limits: Limits) -> set[str]:
+    """Keys of the cells that a limit ended, or a query of which, where that limit was smaller than it is now.
+
+    Rows name the study that they are of by its hash; of a hash without known limits none is said to be raised.
+    """
+    known = {study: json.loads(text) for study, text in database.kept(LIMITS).items()}
+    found = set()
+    for cell, study, status, reason in database.ends():
+        raised = {name for name, value in limits.model_dump().items() if value > known.get(study, {}).get(name, value)}
+        if (status == Status.TIMEOUT and raised & SECONDS) or (OUT_OF_MEMORY in reason and "memory_gib" in raised):
+            found.add(cell)
+    return found
+
+
+def keep_limits(database: ResultsDatabase, study: str, limits: Limits) -> None:
+    """Keep the limits of the study with this hash in its results file."""
+    database.keep(LIMITS + study, limits.model_dump_json())
