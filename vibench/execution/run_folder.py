@@ -1,4 +1,4 @@
-"""The folder of a run: that one run at a time writes into it, what a fresh run removes, what larger limits run again."""
+"""The folder of a run: one run at a time writes into it, a fresh run removes, larger limits run cells again."""
 
 from __future__ import annotations
 
