@@ -21,6 +21,7 @@ from page import SECONDS, Page, made_by, origin, read, start
 from vibench import HighFidelitySolver, create
 from vibench.linalg.factorisations import DEFAULT, IMPLEMENTATIONS
 from vibench.report.figures.style import STYLE, CaptionedFigure
+from vibench.results import formats
 from vibench.study.cells import CERTIFIED
 from vibench.study.matrix import read_study
 from vibench.timing import timed
@@ -123,10 +124,10 @@ def break_even(thresholds: pd.DataFrame) -> pd.DataFrame:
     fair = of_enrichments & thresholds["assembly_a"].eq(thresholds["assembly_b"])
     chosen = thresholds[fair | thresholds["cell_a"].isna()]
     gain = [f"{row.gain:.3g} ({row.gain_low:.3g} to {row.gain_high:.3g})" for row in chosen.itertuples()]
-    begins = chosen["benefit_threshold"].map(lambda count: "" if pd.isna(count) else f" {count:.0f}")
+    pays = list(map(formats.break_even, chosen["meaning"], chosen["benefit_threshold"]))
     columns = {"dual": "dual", "pod_tol": "pod_tol", "primal_a": "in place of", "primal_b": "primal"}
     table = chosen[["problem", *columns, "assembly_b"]].rename(columns=columns | {"assembly_b": "assembly"})
-    return table.assign(gain=gain, **{"pays, in queries": chosen["meaning"] + begins})
+    return table.assign(gain=gain, **{"pays, in queries": pays})
 
 
 def growth(cells: pd.DataFrame) -> pd.DataFrame:

@@ -205,7 +205,7 @@ def _grids(read: Mapping[str, Extended]) -> Iterator[TableGrid]:
         grid_of_cells(read["cells"], ERRORS),
     ]
     model = thresholds.frame["cell_a"].isna()
-    formulations = ~model & (thresholds.frame["formulation_a"] != thresholds.frame["formulation_b"])
+    formulations = tables.between_formulations(thresholds.frame)
     caption = (
         "When b is cheaper than a, offline and online together, by the number of queries, with its 95 % interval; "
         "undecided where the measured rounds do not tell the sign of a difference."

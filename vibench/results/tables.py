@@ -213,6 +213,11 @@ def benefits(thresholds: pd.DataFrame, plugins: Mapping[str, Column] = MappingPr
     return _for_reading(in_order(thresholds), {**THRESHOLDS, **plugins})
 
 
+def between_formulations(thresholds: pd.DataFrame) -> pd.Series:
+    """Which break-evens are those of a formulation with another one, the high-fidelity model apart."""
+    return thresholds["cell_a"].notna() & (thresholds["formulation_a"] != thresholds["formulation_b"])
+
+
 def _for_reading(frame: pd.DataFrame, table: Mapping[str, Column]) -> pd.DataFrame:
     """The columns that have a heading, under it; some only where they say something."""
     return under_headings(frame, [name for name in shown_columns(table) if says_something(frame, name)], table)

@@ -18,6 +18,10 @@ from vibench.study.plugin import Plugin
 OWN = "own"
 """Name of the training and the validation set that a problem itself has."""
 
+CHUNKS = 4
+"""Number of chunks of a parameter set, which are stages of their own where every parameter takes long; fixed, so that
+keys do not depend on the workers."""
+
 
 @dataclass(frozen=True)
 class ParameterSet:
@@ -134,11 +138,6 @@ def check_sets(problem: Plugin, training: ParameterSet, validation: ParameterSet
 def _rows(mus: Array) -> Array:
     """Every row as one value that compares to the last bit."""
     return np.ascontiguousarray(mus, float).view(f"V{8 * mus.shape[1]}").ravel()
-
-
-CHUNKS = 4
-"""Number of chunks of a parameter set, which are stages of their own where every parameter takes long; fixed, so that
-keys do not depend on the workers."""
 
 
 def chunk_edges(count: int) -> list[int]:

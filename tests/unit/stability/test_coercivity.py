@@ -17,15 +17,20 @@ from vibench.stability.coercivity import (
 )
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 40])
-def test_proved_constants_enclose_the_spectrum_closely(n: int) -> None:
-    A, V = spd(n, np.random.default_rng(n)), space(n, 5)
-    values = scipy.linalg.eigh(A, V.matrix.toarray(), eigvals_only=True)
-    low, high = coercivity_and_continuity(sp.csc_array(A), V)
+def assert_close(constants: tuple[Constant, Constant], values: np.ndarray) -> None:
+    """Both constants are proved, outside of the spectrum, and near to its ends."""
+    low, high = constants
     assert low.proved
     assert (1.0 - 2.0 * MARGINS[0]) * values[0] <= low.value <= values[0]
     assert high.proved
     assert values[-1] <= high.value <= (1.0 + 2.0 * MARGINS[0]) * values[-1]
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 40])
+def test_proved_constants_enclose_the_spectrum_closely(n: int) -> None:
+    A, V = spd(n, np.random.default_rng(n)), space(n, 5)
+    values = scipy.linalg.eigh(A, V.matrix.toarray(), eigvals_only=True)
+    assert_close(coercivity_and_continuity(sp.csc_array(A), V), values)
 
 
 @pytest.mark.parametrize("accuracy", [coercivity.ACCURACY, 0.5])
@@ -37,11 +42,7 @@ def test_constants_of_a_matrix_near_to_the_inner_product_are_as_sharp(
     rng, V = np.random.default_rng(5), space(80, 5)
     A = V.matrix.toarray() + 0.3 * spd(80, rng, 10.0) / 10.0
     values = scipy.linalg.eigh(A, V.matrix.toarray(), eigvals_only=True)
-    low, high = constants_near(sp.csc_array(A), V)
-    assert low.proved
-    assert (1.0 - 2.0 * MARGINS[0]) * values[0] <= low.value <= values[0]
-    assert high.proved
-    assert values[-1] <= high.value <= (1.0 + 2.0 * MARGINS[0]) * values[-1]
+    assert_close(constants_near(sp.csc_array(A), V), values)
     with pytest.raises(NumericalError, match="not positive definite"):
         constants_near(sp.csc_array(A - 2.0 * values[-1] * V.matrix.toarray()), V)
 
