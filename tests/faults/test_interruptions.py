@@ -59,17 +59,17 @@ def test_a_run_that_was_stopped_goes_on_later(
 def test_workers_do_not_see_ctrl_c(command: str, plugins_folder: Path, waiting: Path) -> None:
     """A terminal tells the group of the command; from the moment on which they come to life, workers are in others."""
     (waiting / "go on").touch()
-    groups: set[int] = set()
+    groups: dict[int, int] = {}  # of each worker: how many there are in turn depends on how busy the machine is
     with started([command, *RUN], waiting, plugins_folder) as process:
         while process.poll() is None:
             for worker in workers(process.pid):
                 with contextlib.suppress(ProcessLookupError):
-                    groups.add(os.getpgid(worker))
+                    groups[worker] = os.getpgid(worker)
             time.sleep(0.005)
         _, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (0, "")
-    assert len(groups) == 2
-    assert process.pid not in groups
+    assert groups
+    assert all(group == worker for worker, group in groups.items())
 
 
 def test_a_second_interrupt_changes_nothing(plugins_folder: Path, waiting: Path) -> None:
