@@ -14,6 +14,7 @@ from vibench import (
     Contact,
     ContactLoads,
     InnerProduct,
+    MeshFields,
     Output,
     ParameterBox,
     Picture,
@@ -379,6 +380,12 @@ class PaintsNothing(Declared):
     def picture(self, mu: Array, u: Array, lam: Array) -> Picture:
         found = super().picture(mu, u, lam)
         return replace(found, triangles=np.array([[0], [1], [len(u)]]), values=u[:-1])
+
+
+class InsideOut(Declared):
+    def mesh_fields(self, mu: Array, u: Array, lam: Array) -> MeshFields:
+        corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
+        return MeshFields(corners, {"tetra": np.arange(4)[None]}, {}, {})
 
 
 class NoMeasure(Declared):

@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from vibench.arrays import Array, Indices
+
+NODES = {
+    "vertex": 1, "line": 2, "line3": 3, "triangle": 3, "triangle6": 6, "quad": 4, "quad8": 8, "quad9": 9,
+    "tetra": 4, "tetra10": 10, "pyramid": 5, "pyramid13": 13, "wedge": 6, "wedge15": 15, "hexahedron": 8,
+    "hexahedron20": 20, "hexahedron27": 27,
+}  # fmt: skip
+"""Numbers of nodes of the types of cells, by meshio's names; the corners come first, as in VTK."""
+
+RIGHT_HANDED = {
+    "tetra": ((0, 1, 2, 3),),
+    "hexahedron": (
+        (0, 1, 3, 4), (1, 2, 0, 5), (2, 3, 1, 6), (3, 0, 2, 7), (4, 7, 5, 0), (5, 4, 6, 1), (6, 5, 7, 2), (7, 6, 4, 3),
+    ),
+}  # fmt: skip
+"""Corners of cells in space, each followed by those beside it: three edges with a positive determinant."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +75,46 @@ class MeshFields:
     at_points: Mapping[str, Array]
     in_cells: Mapping[str, Mapping[str, Array]]
 
+    def faults(self) -> Iterator[str]:
+        """What makes the fields no solution on a mesh: shapes, types, nodes that there are not, cells inside out."""
+        count = len(self.points)
+        if fault := _real_fault("points", self.points, ((count, 3),)):
+            yield fault
+            return
+        for name, corners in self.cells.items():
+            yield from self._cell_faults(name, np.asarray(corners))
+        for name, values in self.at_points.items():
+            yield from filter(None, [_real_fault(f"at_points[{name!r}]", values, ((count,), (count, 3)))])
+        for owner, named in self.in_cells.items():
+            if owner not in self.cells:
+                yield f"in_cells has {owner!r}, of which there are no cells; expected one of {sorted(self.cells)}"
+                continue
+            for name, values in named.items():
+                shape = (len(self.cells[owner]),)
+                yield from filter(None, [_real_fault(f"in_cells[{owner!r}][{name!r}]", values, (shape,))])
+
+    def _cell_faults(self, name: str, corners: Indices) -> Iterator[str]:
+        where = f"cells[{name!r}]"
+        if name not in NODES:
+            yield f"{where}: no type of cells; expected one of {', '.join(NODES)}"
+        elif not np.issubdtype(corners.dtype, np.integer) or corners.ndim != 2 or corners.shape[1] != NODES[name]:
+            yield f"{where} has dtype {corners.dtype} and shape {corners.shape}; expected indices (k, {NODES[name]})"
+        elif corners.size and (corners.min() < 0 or corners.max() >= len(self.points)):
+            yield f"{where} refers to nodes {corners.min()} to {corners.max()}; there are {len(self.points)}"
+        elif count := np.count_nonzero(self._inverted(name, corners)):
+            yield (
+                f"{where}: {count} of {len(corners)} cells are inside out or flat; expected nodes in the order of VTK, "
+                "at every corner with edges that are right-handed"
+            )
+
+    def _inverted(self, name: str, corners: Indices) -> Any:
+        """Which cells (k,) of a type have a corner whose edges are not right-handed."""
+        inverted = np.zeros(len(corners), dtype=bool)
+        for corner, *beside in RIGHT_HANDED.get(name.rstrip("0123456789"), ()):
+            edges = self.points[corners[:, beside]] - self.points[corners[:, [corner]]]
+            inverted |= np.linalg.det(edges) <= 0.0
+        return inverted
+
     @classmethod
     def of_picture(cls, picture: Picture) -> MeshFields:
         """The triangles of a picture, or its line, with the colour map; the multiplier at vertices at its positions."""
@@ -74,3 +130,12 @@ class MeshFields:
         return cls(
             points, cells | {"vertex": vertices}, at_points, {"vertex": {picture.multiplier_name: picture.multiplier}}
         )
+
+
+def _real_fault(name: str, values: Any, shapes: tuple[tuple[int, ...], ...]) -> str:
+    """Why values are not floats in one of the shapes, finite or NaN; "" if they are."""
+    if np.shape(values) not in shapes or np.asarray(values).dtype != np.float64:
+        kind = f"dtype {np.asarray(values).dtype} and shape {np.shape(values)}"
+        return f"{name} has {kind}; expected float64 of shape {' or '.join(map(str, shapes))}"
+    missing = np.isnan(values).any() and name == "points"
+    return f"{name} is not finite" if missing or np.isinf(values).any() else ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import tempfile
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -37,8 +38,8 @@ def export_vtu(model: Model, mu: Parameters, file: Path | str) -> Path:
     Raises
     ------
     RequestError
-        If meshio is not installed, the problem has neither `mesh_fields` nor a picture, the parameter is outside the
-        box, a solution fails, or the file exists or cannot be written.
+        If meshio is not installed, the problem has neither `mesh_fields` nor a picture, or has wrong ones, the
+        parameter is outside the box, a solution fails, or the file exists or cannot be written.
     """
     file = Path(file)
     if file.suffix != ".vtu":
@@ -53,12 +54,23 @@ def export_vtu(model: Model, mu: Parameters, file: Path | str) -> Path:
         model.problem.mesh_fields(answer.mu, *each) for each in ((reference.u, reference.lam), (answer.u, answer.lam))
     ]
     exact, reduced = found
+    name = type(model.problem).__name__
     if exact is None or reduced is None:
-        raise RequestError(f"the problem '{type(model.problem).__name__}' has neither mesh_fields nor a picture")
+        raise RequestError(f"the problem '{name}' has neither mesh_fields nor a picture")
+    for fault in chain(exact.faults(), reduced.faults()):
+        raise RequestError(f"the problem '{name}': mesh_fields.{fault}")
+    if _shapes(exact) != _shapes(reduced):
+        raise RequestError(f"the problem '{name}': mesh_fields gives two solutions different meshes or fields")
     with writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(file, _written(exact, reduced))
     return file
+
+
+def _shapes(fields: MeshFields) -> tuple[dict[str, tuple[int, ...]], dict[str, list[str]]]:
+    """What fields have in common if one can be subtracted from the other."""
+    arrays = {"points": fields.points, **fields.cells, **fields.at_points}
+    return {name: array.shape for name, array in arrays.items()}, {k: sorted(v) for k, v in fields.in_cells.items()}
 
 
 def _written(exact: MeshFields, reduced: MeshFields) -> bytes:
@@ -70,14 +82,18 @@ def _written(exact: MeshFields, reduced: MeshFields) -> bytes:
         for name, first in exact.at_points.items()
         for kind, values in _compared(first, reduced.at_points[name])
     }
-    in_cells: dict[str, list[Array]] = {}
-    for owner, named in exact.in_cells.items():
-        for name, first in named.items():
-            for kind, values in _compared(first, reduced.in_cells[owner][name]):
-                in_cells[f"{name}, {kind}"] = [
-                    values if each == owner else np.full(len(corners), np.nan) for each, corners in exact.cells.items()
-                ]
-    mesh = meshio.Mesh(exact.points, list(exact.cells.items()), point_data=at_points, cell_data=in_cells)
+    in_cells = {
+        f"{name}, {kind}": [
+            _compared(named[name], reduced.in_cells[owner][name])[k][1]
+            if name in (named := exact.in_cells.get(owner, {}))
+            else np.full(len(corners), np.nan)
+            for owner, corners in exact.cells.items()
+        ]
+        for name in dict.fromkeys(chain.from_iterable(exact.in_cells.values()))
+        for k, kind in enumerate(KINDS)
+    }
+    cells = [(owner, corners.astype(np.int64)) for owner, corners in exact.cells.items()]  # VTK has no other integers
+    mesh = meshio.Mesh(exact.points, cells, point_data=at_points, cell_data=in_cells)
     with tempfile.TemporaryDirectory() as scratch:  # meshio writes to names of files alone
         mesh.write(Path(scratch) / "fields.vtu")
         return (Path(scratch) / "fields.vtu").read_bytes()

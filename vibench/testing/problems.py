@@ -11,7 +11,7 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.highfidelity import active_set
 from vibench.interfaces.outputs import Output
-from vibench.interfaces.pictures import Picture
+from vibench.interfaces.pictures import MeshFields, Picture
 from vibench.interfaces.problem import MEMBERS, ParameterBox
 from vibench.interfaces.validation import training_parameters, validation_parameters
 from vibench.linalg.inner_product import InnerProduct, singular_values
@@ -199,7 +199,7 @@ def interpolation(case: ProblemCase) -> Iterator[str]:
 
 
 def pictures(case: ProblemCase) -> Iterator[str]:
-    """`diagnostics` are finite numbers; `picture` has the right shapes and does not change the solution."""
+    """`diagnostics` are finite numbers; `picture` and `mesh_fields` are well formed and leave the solution as it is."""
     mu = training_parameters(case.plugin)[0]
     for name, value in case.plugin.diagnostics(mu.copy()).items():
         if not isinstance(name, str) or not np.isscalar(value) or not np.isfinite(float(value)):  # type: ignore[arg-type]
@@ -211,8 +211,15 @@ def pictures(case: ProblemCase) -> Iterator[str]:
         yield Note("no picture")
     elif not isinstance(picture, Picture):
         yield f"picture returns a {type(picture).__name__}; expected a vibench.Picture or None"
-    else:
-        yield from _picture_faults(picture, len(lam))
+    elif faults := list(_picture_faults(picture, len(lam))):
+        yield from faults
+        return
+    mesh = unmutated("mesh_fields", {"u": u, "lam": lam}, lambda: case.plugin.mesh_fields(mu.copy(), u, lam))
+    if isinstance(mesh, MeshFields):
+        yield from (f"mesh_fields.{fault}" for fault in mesh.faults())
+        yield Note(", ".join(f"{len(corners)} {name}" for name, corners in mesh.cells.items()))
+    elif mesh is not None:
+        yield f"mesh_fields returns a {type(mesh).__name__}; expected a vibench.MeshFields or None"
 
 
 def _picture_faults(picture: Picture, m: int) -> Iterator[str]:

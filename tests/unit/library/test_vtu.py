@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -73,9 +74,30 @@ def test_requests_that_cannot_be_met_are_one_line(tmp_path: Path, monkeypatch: p
     (tmp_path / "there.vtu").touch()
     with pytest.raises(RequestError, match="exists"):
         export_vtu(model, mu, tmp_path / "there.vtu")
+    right = model.problem.mesh_fields(mu, np.zeros(model.problem.V.dim), np.zeros(model.problem.W.dim))
+    wrong = replace(right, cells={"polygon7": np.arange(7)[None]}, in_cells={})
+    several = iter([right, replace(right, at_points={})])
+    for given, line in (
+        (lambda *_: wrong, r"mesh_fields.cells\['polygon7'\]: no type"),
+        (lambda *_: next(several), "two"),
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(type(model.problem), "mesh_fields", given)
+            with pytest.raises(RequestError, match=line):
+                export_vtu(model, mu, tmp_path / "fields.vtu")
     monkeypatch.setattr(type(model.problem), "picture", lambda *_: None)
     with pytest.raises(RequestError, match="neither mesh_fields nor a picture"):
         export_vtu(model, mu, tmp_path / "fields.vtu")
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     with pytest.raises(RequestError, match="needs meshio"):
         export_vtu(model, mu, tmp_path / "fields.vtu")
+
+
+def test_a_field_in_cells_of_two_types_keeps_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = model_of("obstacle")
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    cells = {"triangle": np.array([[0, 1, 2]], dtype=np.uint64), "tetra": np.arange(4)[None]}
+    stress = {"triangle": {"stress [Pa]": np.array([2.0])}, "tetra": {"stress [Pa]": np.array([3.0])}}
+    monkeypatch.setattr(type(model.problem), "mesh_fields", lambda *_: vibench.MeshFields(points, cells, {}, stress))
+    written = meshio.read(export_vtu(model, model.parameters.lower, tmp_path / "fields.vtu"))
+    assert [values.tolist() for values in written.cell_data["stress [Pa], reduced"]] == [[2.0], [3.0]]

@@ -99,6 +99,7 @@ MORE_PROBLEMS: Mapping[str, Case] = {
     "WrongSign": ("high-fidelity solution", ["no constraint is active at any of 9", "B u ≤ g"]),
     "OutOfReach": ("high-fidelity solution", ["no solution at mu = [8.0]", "more than the wire bears"]),
     "PaintsNothing": ("picture and diagnostics", ["picture.values has shape (11,); expected (12,)", "points 0 to 12"]),
+    "InsideOut": ("picture and diagnostics", ["mesh_fields.cells['tetra']: 1 of 1 cells are inside out or flat"]),
     "OutputsOfOneName": ("outputs", ["two outputs have the same name: force, force"]),
     "OutputOfNothing": ("outputs", ["the output 'peak' fails at mu = [4.0]: ValueError: zero-size array"]),
     "OutputOfAnotherSize": ("outputs", ["the output 'force' has coefficients of λ of shape (13,); expected (12,)"]),
