@@ -125,6 +125,11 @@ class Stage(ABC):
         return self.label
 
     @property
+    def effort(self) -> float:
+        """So many high-fidelity solutions take about as long; this is expected before one of its sort is done."""
+        return 1.0
+
+    @property
     def weight(self) -> int:
         """Number of cells that the stage works for at once; the limit `cell_seconds` is for each."""
         return 1

@@ -25,6 +25,10 @@ for _kind in (
     storable(_kind)
 
 
+BASE_SOLUTIONS, SOLUTIONS = 25.0, 4.0
+"""A base, and a certificate, take about as long as so many high-fidelity solutions."""
+
+
 @dataclass(frozen=True)
 class CertificateBaseStage(Stage):
     """What certificates of all reduced models of a problem have in common; the value is a `CertificateBase`."""
@@ -32,6 +36,11 @@ class CertificateBaseStage(Stage):
     label = "certificate base"
 
     decomposition: AffineDecomposition
+
+    @property
+    def effort(self) -> float:
+        """Those of a bound of the spectrum."""
+        return BASE_SOLUTIONS
 
     def run(self, store: Store) -> Result:
         """Factorise, bound the spectrum, measure interpolation errors."""
@@ -51,6 +60,11 @@ class CertificateStage(Stage):
     label = "certificate"
 
     assembly: AssemblyStage
+
+    @property
+    def effort(self) -> float:
+        """Those of the functionals of its residuals."""
+        return SOLUTIONS
 
     @property
     def base(self) -> CertificateBaseStage:

@@ -34,6 +34,10 @@ for _kind in (ConstraintClasses, Stability, Constant, InfSup):
     storable(_kind)
 
 
+SOLUTIONS = 6.0
+"""The constants of one parameter take about as long as so many high-fidelity solutions."""
+
+
 @dataclass(frozen=True)
 class ReferenceInfSup(Stage):
     """β_HF of the high-fidelity pair: an `InfSup` per parameter."""
@@ -59,6 +63,12 @@ class EnergyConstants(Stage):
     problem: Plugin
     parameters: ParameterSet
     chunk: int
+
+    @property
+    def effort(self) -> float:
+        """By the number of its parameters."""
+        first, end = chunk_edges(self.parameters.count)[self.chunk : self.chunk + 2]
+        return SOLUTIONS * (end - first)
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """Compute the constants, those of one parameter together, as long as its factorisation is there."""

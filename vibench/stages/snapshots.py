@@ -27,11 +27,14 @@ from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes
 from vibench.study.kinds import PROBLEM
-from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_of
+from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_of, parameters_of
 from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, Seconds, median_seconds, timed
 
 T = TypeVar("T")
+
+VALIDATED = 3.0
+"""As many training solutions take about as long as a validation solution, its repetitions and its error bound."""
 
 storable(Fingerprint)
 
@@ -79,6 +82,17 @@ class SnapshotStage(Stage):
     problem: Plugin
     parameters: ParameterSet
     chunk: int
+
+    @property
+    def sort(self) -> str:
+        """Those of the two sets take differently long."""
+        return f"{self.label} of the {self.parameters.role} set"
+
+    @property
+    def effort(self) -> float:
+        """Those of the chunk."""
+        each = VALIDATED if self.parameters.role == "validation" else 1.0
+        return each * len(chunk_of(parameters_of(self.problem, self.parameters), self.chunk)[1])
 
     @property
     def axes(self) -> Axes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
@@ -14,6 +15,8 @@ from vibench.execution.run import Agenda, Observer
 from vibench.qp.status import Status
 from vibench.stages.base import Stage
 from vibench.study.cells import Cell
+from vibench.study.kinds import PROBLEM
+from vibench.study.plugin import Plugin
 from vibench.terminal.console import print_line
 from vibench.terminal.run_summary import REASONS, kind_of_failure
 from vibench.text import printable
@@ -29,56 +32,119 @@ ALIKE = 3
 
 
 FIRST_SECONDS = 20.0
-"""A line says how long the run will take when the first stage has taken so long and is not done."""
+"""A line says how long the run will take when a stage has taken so long, its pace is known, and none is done."""
+
+
+_Sort = tuple[Plugin | None, str]
+"""Stages of one problem that take about as long: the problem, and `Stage.sort`."""
+
+
+@dataclass
+class _Count:
+    """What is known of the stages of one sort: how many were planned, are left and are done, and wall seconds."""
+
+    effort: float = 0.0
+    planned: int = 0
+    left: int = 0
+    done: int = 0
+    wall: float = 0.0
+
+
+@dataclass
+class _Running:
+    """A running stage: when it began, and the shares of it (share, seconds) that were seen to be done."""
+
+    sort: _Sort
+    began: float
+    first: tuple[float, float] = (0.0, 0.0)
+    last: tuple[float, float] = (0.0, 0.0)
+
+    def note(self, share: float, now: float) -> None:
+        """It tells this share."""
+        if share > self.last[0]:
+            self.last = share, now - self.began
+            self.first = self.first if self.first[0] else self.last
+
+    @property
+    def tells_more(self) -> bool:
+        """Whether two shares are known: the first one has the set-up."""
+        return self.last != self.first
+
+    @property
+    def seconds(self) -> float:
+        """How long it takes but for the set-up, if that is told apart; there is a share."""
+        (share, seconds), (before, setup) = self.last, self.first if self.tells_more else (0.0, 0.0)
+        return (seconds - setup) / (share - before)
 
 
 class TimeLeft:
     """Estimate of the seconds left from the mean wall seconds of the stages of each sort done so far.
 
-    A stage that tells which share of it is done counts before its end, too.
+    A stage that tells which share of it is done counts before its end, too. How long stages of a sort take that has not
+    been seen follows from their `effort`, and from what those of the others of the same problem take.
     """
 
     def __init__(self, pending: Sequence[Stage], jobs: int) -> None:
-        self._began: dict[str, float] = {}
-        self._running: dict[str, tuple[str, float, float]] = {}
-        self._left = Counter(stage.sort for stage in pending)
-        self._done: Counter[str] = Counter()
-        self._walls: defaultdict[str, float] = defaultdict(float)
+        self._sorts: defaultdict[_Sort, _Count] = defaultdict(_Count)
+        self._running: dict[str, _Running] = {}
         self._jobs = jobs
+        for stage in pending:
+            self.add(stage)
 
     def add(self, stage: Stage) -> None:
-        """Count a stage that was planned later."""
-        self._left[stage.sort] += 1
+        """Count a stage that is planned."""
+        count = self._sorts[_sort(stage)]
+        count.planned += 1
+        count.left += 1
+        count.effort += stage.effort
 
     def begin(self, stage: Stage) -> None:
         """Note when a stage begins."""
-        self._began[stage.key] = monotonic()
+        self._running[stage.key] = _Running(_sort(stage), monotonic())
 
     def shares(self, done: Sequence[tuple[Stage, float]]) -> float:
-        """Note which shares of the running stages are done; returns how long the longest one of these has taken."""
-        now = monotonic()
-        self._running = {one.key: (one.sort, share, now - self._began[one.key]) for one, share in done if share}
-        return max((seconds for _, _, seconds in self._running.values()), default=0.0)
+        """Note which shares of the running stages are done.
+
+        Returns how long the longest one of those has taken whose pace is known.
+        """
+        now, began = monotonic(), self._running
+        self._running = {stage.key: began[stage.key] for stage, _ in done}  # without those that have failed
+        for stage, share in done:
+            self._running[stage.key].note(share, now)
+        return max((now - one.began for one in self._running.values() if one.tells_more), default=0.0)
 
     def done(self, stage: Stage, wall: float) -> None:
         """Count a finished stage."""
         self._running.pop(stage.key, None)
-        self._left[stage.sort] -= 1
-        self._done[stage.sort] += 1
-        self._walls[stage.sort] += wall
+        count = self._sorts[_sort(stage)]
+        count.left -= 1
+        count.done += 1
+        count.wall += wall
 
     def seconds(self) -> float | None:
         """Seconds left, `None` before there is anything to judge by."""
-        means = {sort: self._walls[sort] / count for sort, count in self._done.items()}
-        counts = Counter(self._done)
-        for sort, share, seconds in self._running.values():
-            means.setdefault(sort, seconds / share)
-            counts.setdefault(sort, 1)
-        if not counts:
+        means = {sort: count.wall / count.done for sort, count in self._sorts.items() if count.done}
+        telling = [one for one in self._running.values() if one.last[0]]
+        for one in telling:
+            means.setdefault(one.sort, one.seconds)
+        if not means:
             return None
-        mean = sum(means[sort] * count for sort, count in counts.items()) / counts.total()
-        left = sum(max(count, 0) * means.get(sort, mean) for sort, count in self._left.items())
-        return max(0.0, left - sum(share * means[sort] for sort, share, _ in self._running.values())) / self._jobs
+        paces = {problem: self._pace(means, problem) for problem, _ in self._sorts}
+        left = 0.0
+        for sort, count in self._sorts.items():
+            expected = paces[sort[0]] * count.effort / max(count.planned, 1)
+            left += max(count.left, 0) * means.get(sort, expected)
+        return max(0.0, left - sum(one.last[0] * means[one.sort] for one in telling)) / self._jobs
+
+    def _pace(self, means: Mapping[_Sort, float], problem: Plugin | None) -> float:
+        """Seconds of what takes as long as a high-fidelity solution, by the seen stages of a problem, or of all."""
+        seen = [sort for sort in means if sort[0] == problem] or list(means)
+        wall = sum(means[sort] * self._sorts[sort].planned for sort in seen)
+        return wall / max(sum(self._sorts[sort].effort for sort in seen), 1.0)
+
+
+def _sort(stage: Stage) -> _Sort:
+    return next((plugin for plugin in stage.plugins() if plugin.kind is PROBLEM), None), stage.sort
 
 
 def duration(seconds: float) -> str:

@@ -26,7 +26,7 @@ from vibench.study.parameter_sets import CHUNKS, OWN_TRAINING
 from vibench.study.plugin import Plugin
 from vibench.terminal.progress import ALIKE, DrawingDisplay, ProgressDisplay, TimeLeft, duration
 
-PROBLEM = Plugin("problem", "p", "{}", "")
+PROBLEM = Plugin("problem", "radial-obstacle", '{"resolution": 200}', "")
 PODS: list[Stage] = [PODStage(PROBLEM, Stop(size=k)) for k in range(1, 5)]
 CHUNK: list[Stage] = [SnapshotStage(PROBLEM, OWN_TRAINING, chunk) for chunk in range(CHUNKS)]
 
@@ -63,18 +63,41 @@ def test_a_stage_that_tells_its_share_counts_before_its_end(monkeypatch: pytest.
     assert left.shares([(CHUNK[0], 0.0)]) == 0.0
     assert left.seconds() is None
     now[0] += 10.0
-    assert left.shares([(CHUNK[0], 0.25)]) == 10.0
+    assert left.shares([(CHUNK[0], 0.25)]) == 0.0  # its pace may be that of a set-up
     assert left.seconds() == pytest.approx((4 * 40.0 - 10.0) / 2)
     left.done(CHUNK[0], 30.0)
     assert left.seconds() == pytest.approx(3 * 30.0 / 2)
 
 
-def test_a_sort_never_seen_is_taken_to_last_as_the_mean_of_all() -> None:
+def test_a_sort_never_seen_takes_as_long_as_its_number_of_high_fidelity_solutions_says() -> None:
+    assert CHUNK[0].effort > PODS[0].effort == 1.0
     left = TimeLeft([*PODS[:2], *CHUNK[:4]], 1)
     left.done(PODS[0], 3.0)
-    assert left.seconds() == pytest.approx(3.0 + 4 * 3.0)
+    assert left.seconds() == pytest.approx(3.0 + sum(3.0 * chunk.effort for chunk in CHUNK[:4]))
     left.done(CHUNK[0], 1.0)
     assert left.seconds() == pytest.approx(3.0 + 3 * 1.0)
+
+
+def test_a_problem_never_seen_is_taken_to_be_as_quick_as_the_others() -> None:
+    finer = Plugin("problem", "radial-obstacle", '{"resolution": 400}', "")
+    others: list[Stage] = [SnapshotStage(finer, OWN_TRAINING, chunk) for chunk in range(CHUNKS)]
+    left = TimeLeft([*CHUNK, *others], 1)
+    for chunk in CHUNK:
+        left.done(chunk, 2.0 * chunk.effort)
+    assert left.seconds() == pytest.approx(sum(2.0 * chunk.effort for chunk in others))
+    left.done(others[0], 5.0)
+    assert left.seconds() == pytest.approx(3 * 5.0)
+
+
+def test_the_set_up_of_a_long_stage_is_not_expected_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr("vibench.terminal.progress.monotonic", lambda: now[0])
+    left = TimeLeft(CHUNK[:2], 1)
+    left.begin(CHUNK[0])
+    for seconds, share in ((30.0, 0.1), (35.0, 0.2), (37.0, 0.2), (40.0, 0.3)):
+        now[0] = seconds
+        left.shares([(CHUNK[0], share)])
+    assert left.seconds() == pytest.approx(0.7 * 50.0 + 50.0)
 
 
 def test_workers_share_what_is_left() -> None:

@@ -33,6 +33,9 @@ from vibench.study.plugin import Plugin
 from vibench.study.registry import find
 from vibench.timing import median_of
 
+JUDGED = 1.5
+"""A query and what is measured of its answer take about as long as so many high-fidelity solutions."""
+
 QueryRows = tuple[Row, Row | None]
 """The row of a query, and that of its solution if there is one."""
 
@@ -93,6 +96,11 @@ class CellGoal(ItemwiseStage):
     def sort(self) -> str:
         """Queries of one solver take about as long."""
         return f"{self.label} with {self.solver}"
+
+    @property
+    def effort(self) -> float:
+        """By the number of queries."""
+        return JUDGED * self.items
 
     @cached_property
     def packages(self) -> frozenset[str]:
