@@ -21,6 +21,7 @@ from hypothesis import settings
 from running import Changed, Main, Register, Shared, Vibench, execute
 from samples import QUICK_ROUNDS, SMALL, install_fakes
 from threadpoolctl import threadpool_limits
+from unsynced import leave_syncing_to_the_system
 
 from vibench.cli import start
 from vibench.execution import supervisor
@@ -51,6 +52,8 @@ TESTS = Path(__file__).resolve().parent
 
 # Parallel workers import the same tests: their bytecode is kept, whatever the environment says.
 sys.dont_write_bytecode = False
+
+leave_syncing_to_the_system()
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -246,6 +246,8 @@ def _load() -> None:
     for package in PACKAGES:
         for module in walk_packages(import_module(f"vibench.{package}").__path__, f"vibench.{package}."):
             import_module(module.name)
+    sys.path.append(str(Path(__file__).parent))  # only here: what is forked has a path of its own
+    import_module("unsynced").leave_syncing_to_the_system()
     import_module("vibench.execution.jobs").code_here()
     _hash_stages(import_module("vibench.stages.base").Stage)
     typer = import_module("typer.main")
