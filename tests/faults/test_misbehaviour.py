@@ -20,7 +20,7 @@ BAD_PROBLEMS: Mapping[str, tuple[set[str], str]] = {
     "wire-indefinite": ({"error"}, "not positive definite"),
     "wire-broken": ({"error"}, "in high-fidelity solutions: OSError: no wire in stock"),
     "wire-hungry": ({"error"}, "out of memory: the limit is memory_gib = 8"),
-    "wire-sleeps": ({"timeout"}, "in high-fidelity solutions: stopped after cell_seconds = 6 s"),
+    "wire-sleeps": ({"timeout"}, "in high-fidelity solutions: stopped after cell_seconds = 20 s"),
     "wire-exits": ({"crashed"}, "in high-fidelity solutions: the worker process died with exit code 3"),
     "wire-segfaults": ({"crashed"}, "in high-fidelity solutions: the worker process died with signal SIGSEGV"),
     "wire-infeasible": (
@@ -31,7 +31,7 @@ BAD_PROBLEMS: Mapping[str, tuple[set[str], str]] = {
 }
 BAD_DUALS: Mapping[str, tuple[set[str], str]] = {
     "cone-raises": ({"error"}, "in cone: LookupError: no generator found"),
-    "cone-waits": ({"timeout"}, "in cone: stopped after cell_seconds = 6 s"),
+    "cone-waits": ({"timeout"}, "in cone: stopped after cell_seconds = 20 s"),
     "cone-nan": ({"error"}, "in cone: the generators have entries that are not finite"),
     "cone-shape": ({"error"}, "in cone: the generators have shape (11, 2), expected (12, count)"),
     "cone-negative": ({"error"}, "in cone: a generator has the negative coefficient -"),
@@ -55,7 +55,7 @@ BAD_SOLVERS: Mapping[str, tuple[set[str], str]] = {
     "wrong-length": ({"error"}, "3 of 3 queries"),
     "dies": ({"crashed"}, "exit code 7"),
     "segfaults": ({"crashed"}, "died with signal SIGSEGV"),
-    "hangs": ({"timeout"}, "stopped after query_seconds = 0.5 s"),
+    "hangs": ({"timeout"}, "stopped after query_seconds = 3 s"),
     "hungry": ({"error"}, "out of memory: the limit is memory_gib = 8"),
     "leaves": ({"error"}, "SystemExit: 3"),
     "ecos": ({"unavailable"}, "the QP solver 'ecos' is not installed"),
@@ -91,7 +91,7 @@ def run(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Run:
     waits = {"name": "cone-waits", "options": {"file": str(folder / "never")}}
     duals = [bad(name, "cone-bad") for name in list(BAD_DUALS)[2:]]
     primals = [bad(name, "enrichment-bad") for name in list(BAD_PRIMALS)[1:]]
-    limits = {"cell_seconds": 6.0, "query_seconds": 0.5}
+    limits = {"cell_seconds": 20.0, "query_seconds": 3.0}  # a busy machine may take seconds for what is fine
     studies = [
         wire_study(
             problem=[*FINE["problem"], *BAD_PROBLEMS],
