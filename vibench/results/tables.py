@@ -267,7 +267,8 @@ INTERVALS: Mapping[str, tuple[str, Callable[..., str]]] = {
 def _shown(frame: pd.DataFrame, name: str, column: Column) -> pd.Series | list[str]:
     """One column under its heading; some combine several columns of the results file."""
     if name in ("pod_tol", "dual_tol"):
-        return [asked(row, name.removesuffix("_tol")) for row in frame.to_dict("records")]
+        axis = name.removesuffix("_tol")
+        return [asked(row, axis) for row in frame[[name, f"{axis}_size"]].to_dict("records")]
     if name == "queries_ok":
         return [f"{fine:.0f}/{count:.0f}" for fine, count in zip(frame[name], frame["queries"], strict=True)]
     if name == "benefit_threshold":
