@@ -136,13 +136,14 @@ def error_bounds(
     u: Array,
     lam: Array,
     pressed: Mask | None = None,
+    residuals: Sequence[Array] | None = None,
 ) -> list[ErrorBounds]:
     """Bounds (ii) of reduced u (n×P) and λ (m×P), column by column at the parameters of `vis`.
 
     `pressed` (m×P) are rows that multipliers press where these are known: ν is nearly λ, so that corrections of all
-    pairs at one parameter start there, and from one factor.
+    pairs at one parameter start there, and from one factor. `residuals` (n,) are those of the pairs, where known.
     """
-    residuals = [residual(vi, u[:, k], lam[:, k]) for k, vi in enumerate(vis)]
+    residuals = residuals or [residual(vi, u[:, k], lam[:, k]) for k, vi in enumerate(vis)]
     starts = [None] * len(vis) if pressed is None else pressed.T
     given = zip(vis, energies, constants, u.T, lam.T, rieszes(energies, residuals), starts, strict=True)
     return [_bounds(vi, energy, c.coercivity, c.energy_inf_sup, *one) for vi, energy, c, *one in given]
@@ -286,7 +287,7 @@ class Constraints:
         """As a correction of u_N with retained unknowns u (c,) and λ_N (m,) reads them."""
         on = energy.on_contact(vi)
         room = NO_ROOM * (on.sizes @ np.abs(u) + np.abs(vi.g))
-        rows, equalities = rows_that_matter(on.B, vi.g, room, lam), None
+        rows, equalities = rows_that_matter(on.B, vi.g, room, lam, on.directions), None
         if rows.equal.any():
             K = energy.factor.solve_factor_transposed(sp.csr_array(vi.B)[rows.equalities].toarray().T)
             equalities = Equalities.of(K, lambda y: on.values(energy.factor.solve_factor(y)), on.B)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.model.on_contact import OnContact, Representer, representers
 from vibench.qp.scaling import ratio
+
+T = TypeVar("T")
 
 UNMEASURABLE = 1e-8
 """Nothing is measured below this: not by an error relative to its solution, nor by a solution relative to the largest
@@ -92,10 +94,33 @@ class ReferenceSolutions:
     scale_u: float
     scale_lam: float
     scale_outputs: tuple[float, ...] = ()
+    _known: dict[Any, Any] = field(init=False, default_factory=dict, repr=False, compare=False)
+    """What was computed of them: many models are compared with the same solutions."""
 
     def at(self, numbers: Sequence[int]) -> ReferenceSolutions:
-        """The solutions at some of the parameters."""
+        """The solutions at some of the parameters; of all of them the same object, with what is known of it."""
+        if list(numbers) == list(range(self.u.shape[1])):
+            return self
         return replace(self, u=self.u[:, numbers], lam=self.lam[:, numbers])
+
+    def norms(self, problem: Problem) -> tuple[Array, Array]:
+        """‖u‖_V and ‖λ‖_W (P,)."""
+        return self._once("norms", lambda: (problem.V.norm(self.u), problem.W.norm(self.lam)))
+
+    def energies(self, number: int, vi: VariationalInequality, energy: Energy) -> tuple[float, float]:
+        """‖u‖ in the norm of A and ‖Bᵀλ‖ in that of A⁻¹ of one solution, whose inequality is `vi`."""
+        u, lam = self.u[:, number], self.lam[:, number]
+        return self._once(number, lambda: (energy.norm(u), energy.on_contact(vi).of_force(lam).norm))
+
+    def values(self, outputs: Sequence[Output], mus: Array) -> list[Array]:
+        """Values (P,) of the outputs of the problem at their parameters (P×d)."""
+        return self._once("outputs", lambda: [output.values(mus, self.u, self.lam) for output in outputs])
+
+    def _once(self, name: str | int, compute: Callable[[], T]) -> T:
+        if name not in self._known:
+            self._known[name] = compute()
+        found: T = self._known[name]
+        return found
 
 
 @dataclass(frozen=True)
@@ -137,7 +162,7 @@ def zeros(problem: Problem, reference: ReferenceSolutions) -> tuple[Mask, Mask]:
 
     Without contact λ is zero, and u too where there is no load; a relative error would divide round-off by round-off.
     """
-    norm_u, norm_lam = problem.V.norm(reference.u), problem.W.norm(reference.lam)
+    norm_u, norm_lam = reference.norms(problem)
     return norm_u <= UNMEASURABLE * reference.scale_u, norm_lam <= UNMEASURABLE * reference.scale_lam
 
 
@@ -152,13 +177,13 @@ def errors(
     """Errors of reduced u (n×P) and λ (m×P), column by column at the parameters of `vis`."""
     V, W = problem.V, problem.W
     du, dlam = u - reference.u, lam - reference.lam
-    norm_u, norm_lam, (zero_u, zero_lam) = V.norm(reference.u), W.norm(reference.lam), zeros(problem, reference)
+    (norm_u, norm_lam), (zero_u, zero_lam) = reference.norms(problem), zeros(problem, reference)
     error_u, error_lam, integrals = V.norm(du), W.norm(dlam), problem.multiplier_integrals()
     excesses = [vi.B @ u[:, k] - vi.g for k, vi in enumerate(vis)]
     rows = []
     for k, (vi, energy) in enumerate(zip(vis, energies, strict=True)):
-        in_energy, energy_u = energy.norm(du[:, k]), energy.norm(reference.u[:, k])
-        natural, natural_lam = (energy.on_contact(vi).of_force(eta).norm for eta in (dlam[:, k], reference.lam[:, k]))
+        in_energy, natural = energy.norm(du[:, k]), energy.on_contact(vi).of_force(dlam[:, k]).norm
+        energy_u, natural_lam = reference.energies(k, vi, energy)
         rows.append(
             Errors(
                 error_u=None if zero_u[k] else ratio(float(error_u[k]), float(norm_u[k])),
@@ -191,17 +216,17 @@ def output_errors(
     outputs: Sequence[Output],
     mus: Array,
     reduced: tuple[Array, Array],
-    reference: tuple[Array, Array],
-    scale: Sequence[float],
+    reference: ReferenceSolutions,
 ) -> list[list[OutputErrors]]:
-    """Every output at parameters (P×d), from solutions (u, λ) as columns, reduced ones and high-fidelity ones.
+    """Every output at parameters (P×d), from reduced solutions (u, λ) as columns and from high-fidelity ones.
 
     An output that is at most `UNMEASURABLE` of its scale is zero: there is no contact, for instance. A relative error
     would divide round-off by round-off, and is `None`; the error over the scale is not.
     """
     rows: list[list[OutputErrors]] = [[] for _ in mus]
-    for output, largest in zip(outputs, scale, strict=True):
-        pairs = zip(output.values(mus, *reduced), output.values(mus, *reference), strict=True)
+    known = zip(outputs, reference.scale_outputs, reference.values(outputs, mus), strict=True)
+    for output, largest, exact_values in known:
+        pairs = zip(output.values(mus, *reduced), exact_values, strict=True)
         for row, (value, exact) in zip(rows, pairs, strict=True):
             error = abs(float(value - exact))
             relative = None if abs(exact) <= UNMEASURABLE * largest else error / abs(float(exact))

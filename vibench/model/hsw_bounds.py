@@ -46,15 +46,21 @@ class HSWBounds:
 
 
 def hsw_bounds(
-    problem: Problem, vis: Sequence[VariationalInequality], constants: Sequence[Stability], u: Array, lam: Array
+    problem: Problem,
+    vis: Sequence[VariationalInequality],
+    constants: Sequence[Stability],
+    u: Array,
+    lam: Array,
+    residuals: Sequence[Array] | None = None,
 ) -> list[HSWBounds | None]:
     """Δ_u and Δ_λ of reduced u (n×P), λ (m×P), column by column at the parameters of `vis`; see above.
 
     Infinite where β_HF over the span is zero; `None` where λ is not in W⁺ and nothing is certified, and where rows are
-    absent: the distance of B u_N − g from the cone is one in W of all rows.
+    absent: the distance of B u_N − g from the cone is one in W of all rows. `residuals` are those of the pairs (n,),
+    where known.
     """
-    residuals = np.column_stack([vi.f - vi.A @ u[:, k] - vi.B.T @ lam[:, k] for k, vi in enumerate(vis)])
-    dual_norms = np.linalg.norm(problem.V.whiten_functional(residuals), axis=0)
+    residuals = residuals or [vi.f - vi.A @ u[:, k] - vi.B.T @ lam[:, k] for k, vi in enumerate(vis)]
+    dual_norms = np.linalg.norm(problem.V.whiten_functional(np.column_stack(residuals)), axis=0)
     excesses = (vi.B @ u[:, k] - vi.g for k, vi in enumerate(vis))
     return [
         None if is_absent(vis[k].g).any() else _bound(problem.W, s, lam[:, k], float(dual_norms[k]), constants[k])

@@ -22,7 +22,8 @@ from cachetools import LRUCache
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness
-from vibench.interfaces.problem import VariationalInequality
+from vibench.interfaces.problem import VariationalInequality, is_absent
+from vibench.qp.rows import Directions
 from vibench.qp.scaling import near_rows
 
 SMALL = 2**18
@@ -95,6 +96,11 @@ class OnContact:
     def extended(self, values: Array) -> Array:
         """The vector (n,) with these retained unknowns (c,) that has the smallest energy."""
         return self._stiffness.extend(values)
+
+    @cached_property
+    def directions(self) -> Directions:
+        """Lengths of the rows, and which of those that are not absent are parallel."""
+        return Directions.of(self.B, ~is_absent(self.vi.g))
 
     @cached_property
     def near(self) -> Mask:

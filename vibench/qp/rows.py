@@ -64,7 +64,33 @@ class Rows:
         return lam
 
 
-def rows_that_matter(B: SparseMatrix, g: Array, room: Array, preferred: Array | None = None) -> Rows:
+@dataclass(frozen=True)
+class Directions:
+    """Rows of one matrix that are parallel.
+
+    Attributes
+    ----------
+    lengths
+        Euclidean norms (m,) of all rows.
+    members, group, side
+        The rows (p,) that are parallel to others, the number of the direction of each, and its sign in it.
+    """
+
+    lengths: Array
+    members: Indices
+    group: Indices
+    side: Array
+
+    @classmethod
+    def of(cls, B: SparseMatrix, present: Mask) -> Directions:
+        """Of the rows of B (m×n) that are `present` (m,)."""
+        lengths = row_norms(B)
+        return cls(lengths, *_parallel(B, lengths, present))
+
+
+def rows_that_matter(
+    B: SparseMatrix, g: Array, room: Array, preferred: Array | None = None, directions: Directions | None = None
+) -> Rows:
     """The rows of B (m×n) and g (m,) that matter.
 
     Parameters
@@ -73,12 +99,14 @@ def rows_that_matter(B: SparseMatrix, g: Array, room: Array, preferred: Array | 
         Opposite rows are an equality where there is at most this room (m,) between them, in the unit of g.
     preferred
         Of an equality the row with the larger of these (m,) is kept, in units of its length.
+    directions
+        Those of the rows that are not absent, where they are known.
     """
-    B, m = sp.csr_array(B), len(g)
-    lengths, opposite, ratio = row_norms(B), np.arange(m), np.ones(m)
-    dropped, equal = is_absent(g), np.zeros(m, bool)
+    m = len(g)
+    dropped, equal, opposite, ratio = is_absent(g), np.zeros(m, bool), np.arange(m), np.ones(m)
     implied = dropped.copy()
-    members, group, side = _parallel(B, lengths, ~dropped)
+    directions = directions or Directions.of(sp.csr_array(B), ~dropped)
+    lengths, members, group, side = directions.lengths, directions.members, directions.group, directions.side
     bounds = g[members] / lengths[members]
     order = np.lexsort((members, bounds, side, group))
     members, group, side, bounds = members[order], group[order], side[order], bounds[order]

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from vibench.errors import NumericalError
 from vibench.interfaces.outputs import Output
-from vibench.model.errors import output_errors, output_scales, summarise_outputs
+from vibench.model.errors import ReferenceSolutions, output_errors, output_scales, summarise_outputs
 
 MUS = np.array([[1.0], [2.0], [3.0]])
 U, LAM = np.array([[1.0, 2.0, 0.0], [1.0, 1.0, 0.0]]), np.array([[0.0, 4.0, 0.0]])
@@ -35,7 +35,8 @@ def test_a_linear_output_is_linear(u: np.ndarray, v: np.ndarray, t: float) -> No
 
 def test_errors_are_relative_but_for_zeros_which_are_counted_apart() -> None:
     reduced = U + np.array([[0.2, 0.0, 0.1], [0.0, -0.5, 0.0]]), LAM
-    found = output_errors((TOTAL,), MUS, reduced, (U, LAM), output_scales((TOTAL,), MUS, U, LAM))
+    exact = ReferenceSolutions(U, LAM, 1.0, 1.0, output_scales((TOTAL,), MUS, U, LAM))
+    found = output_errors((TOTAL,), MUS, reduced, exact)
     rows = [row for (row,) in found]
     assert [row["error"] for row in rows] == [pytest.approx(0.1), pytest.approx(0.1), None]
     assert [row["scaled"] for row in rows] == [pytest.approx(x) for x in (0.04, 0.1, 0.02)]
@@ -50,7 +51,8 @@ def test_errors_are_relative_but_for_zeros_which_are_counted_apart() -> None:
 
 
 def test_an_output_that_vanishes_on_the_whole_training_set_has_absolute_errors() -> None:
-    (row,), *_ = output_errors((TOTAL,), MUS[:1], (U[:, :1], LAM[:, :1]), (0.0 * U[:, :1], LAM[:, :1]), (0.0,))
+    zero = ReferenceSolutions(0.0 * U[:, :1], LAM[:, :1], 1.0, 1.0, (0.0,))
+    (row,), *_ = output_errors((TOTAL,), MUS[:1], (U[:, :1], LAM[:, :1]), zero)
     assert (row["error"], row["scaled"]) == (None, 2.0)
 
 

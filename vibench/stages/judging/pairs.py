@@ -11,7 +11,7 @@ from vibench.arrays import Array
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineBound
-from vibench.model.error_bounds import ErrorBounds, error_bounds
+from vibench.model.error_bounds import ErrorBounds, error_bounds, residual
 from vibench.model.errors import UNMEASURABLE, Errors, ReferenceSolutions, errors, output_errors
 from vibench.model.high_fidelity_residuals import high_fidelity_residuals
 from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
@@ -35,19 +35,19 @@ def pair_columns(
 ) -> list[Row]:
     """Columns of answers u (n×P), λ (m×P) at parameters (P×d): errors, their bounds, residuals and outputs."""
     energies = [assemblies(problem).energy_at(mu) for mu in mus]
-    bounds = error_bounds(vis, energies, constants, u, lam, reference.lam > 0.0)
+    residuals = [residual(vi, *pair) for vi, *pair in zip(vis, u.T, lam.T, strict=True)]
+    bounds = error_bounds(vis, energies, constants, u, lam, reference.lam > 0.0, residuals)
     measured = zip(
         errors(problem, vis, energies, reference, u, lam),
         bounds,
-        hsw_bounds(problem, vis, constants, u, lam),
+        hsw_bounds(problem, vis, constants, u, lam, residuals),
         strict=True,
     )
     rows = [_columns(*one) for one in measured]
     for row, vi, energy, pair, bound in zip(rows, vis, energies, zip(u.T, lam.T, strict=True), bounds, strict=True):
         found = high_fidelity_residuals(vi, energy, *pair, bound.rho)
         row |= {"hf_primal_residual": found.primal, "hf_dual_residual": found.dual, "hf_gap": found.gap}
-    compared = (u, lam), (reference.u, reference.lam), reference.scale_outputs
-    for row, of_query in zip(rows, output_errors(problem.outputs, mus, *compared), strict=True):
+    for row, of_query in zip(rows, output_errors(problem.outputs, mus, (u, lam), reference), strict=True):
         row["outputs"] = of_query
     return rows
 
