@@ -58,17 +58,20 @@ class ResultWriter:
         rows: Sequence[Row],
         rounds: Sequence[TimedRound],
         machines: Set[str],
-        asked: int | None,
         lost: str,
     ) -> None:
-        """Write the seconds of a cell that has its rows; `asked` are the rounds that were allowed once all are done."""
+        """Write the seconds of a cell that has its rows, of which there may be more; see `timed`."""
         row = self.database.cell(cell.key)
         assert row is not None  # cells are timed when they have their rows
-        own = seconds_of_cell(rows) | {"timing_rounds": asked, "timed_rounds": len(rows), "timing_reason": lost}
+        own = seconds_of_cell(rows) | {"timing_rounds": None, "timed_rounds": len(rows), "timing_reason": lost}
         if rows:
             own["machine"] = "; ".join(sorted({*row["machine"].split("; "), *machines}))
         keys = {"cell": cell.key, **cell_columns(cell)}
         self.database.write_seconds(cell.key, own, seconds_of_queries(rounds), [keys | row for row in rows])
+
+    def timed(self, cell: Cell, asked: int) -> None:
+        """Note that a cell has all of its seconds, of at most so many rounds."""
+        self.database.write_columns(cell.key, {"timing_rounds": asked})
 
     def offline(self, cell: Cell, columns: Row) -> None:
         """Write the offline columns of a cell that has its rows."""

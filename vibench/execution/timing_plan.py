@@ -127,15 +127,17 @@ class TimingPlan:
             self._note(group, goal.key, rows, timed)
         group.blocks += 1
         group.first += stage.rounds
+        timed_here = {goal.key for goal in stage.cells}
         for cell, goal in group.members.items():
-            self._write(group, cell, goal, None)
-            self.paired.add(cell.key, group.rows[goal.key])
+            if goal.key in timed_here:  # nothing is new of others
+                self._write(group, cell, goal)
+                self.paired.add(cell.key, group.rows[goal.key])
         timed_now = {goal.key for goal, timed in zip(stage.cells, outcome, strict=False) if timed.rounds}
         following = [goal for goal in self._undecided(group) if goal.key in timed_now]
         if following and group.blocks < len(block_sizes(self.rounds)):
             return self._block(group, stage.session + 1, following)
-        for cell, goal in group.members.items():
-            self._write(group, cell, goal, self.rounds)
+        for cell in group.members:
+            self.writer.timed(cell, self.rounds)
         return None
 
     def _note(self, group: _Group, goal: str, rows: list[Row], timed: TimedCell) -> None:
@@ -145,12 +147,12 @@ class TimingPlan:
         count, reason = group.lost.get(goal, (0, ""))
         group.lost[goal] = count + timed.lost, reason or timed.reason
 
-    def _write(self, group: _Group, cell: Cell, goal: CellGoal, asked: int | None) -> None:
+    def _write(self, group: _Group, cell: Cell, goal: CellGoal) -> None:
         count, reason = group.lost[goal.key]
         rows, rounds = group.rows[goal.key], group.rounds[goal.key]
         everything = len(rows) + count
         lost = f"{'all' if count == everything else f'{count} of {everything}'} rounds: {reason}" if count else ""
-        self.writer.seconds(cell, rows, rounds, group.machines[goal.key], asked, lost)
+        self.writer.seconds(cell, rows, rounds, group.machines[goal.key], lost)
 
     def _undecided(self, group: _Group) -> list[CellGoal]:
         """The goals that further rounds may decide a comparison of."""

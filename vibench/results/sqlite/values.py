@@ -61,6 +61,8 @@ def error_row(cell: Mapping[str, Any], reason: str) -> dict[str, Any]:
 
 def stored(column: Column, value: Any) -> Any:
     """A value in the type of its column; a `TypeError` or an `OverflowError` where there is none."""
+    if type(value) is float and column.kind == REAL and value == value:  # noqa: PLR0124  most values; NaN is no number
+        return value
     kind = column.kind.split()[0]
     if isinstance(value, np.generic):
         value = value.item()
