@@ -199,9 +199,9 @@ def when_not(results: Results) -> str:
         for how, group in mine[mine["meaning"].notna()].groupby("assembly", sort=False):
             begins = group[group["meaning"] == "from"]["benefit_threshold"]
             never = int(group["meaning"].isin(["never", "until"]).sum())
-            unknown = int((group["meaning"] == "undecided").sum())
+            neither = int(group["meaning"].isin(["as fast", "undecided"]).sum())
             said = f"from {span(begins)} queries" if len(begins) else "at no number"
-            parts.append(f"| {problem} | {how} | {len(group)} | {said} | {never} | {unknown} |")
+            parts.append(f"| {problem} | {how} | {len(group)} | {said} | {never} | {neither} |")
     least = every[every["meaning"] == "from"].groupby("problem")["threshold_low"].min()
     return question(
         "When not to reduce at all?",
@@ -212,7 +212,7 @@ def when_not(results: Results) -> str:
         "[paper-hertz](../results/paper-hertz/README.md)).",
         "seconds are those of small plane problems on one core; high-fidelity solutions start from the nearest contact "
         "set that is known. `vibench show RUN --table best --queries N` says it for yours.",
-        "| problem | assembly | models | cheaper than high-fidelity solutions | never | undecided |\n"
+        "| problem | assembly | models | cheaper than high-fidelity solutions | never | as fast or undecided |\n"
         "| --- | --- | --- | --- | --- | --- |\n" + "\n".join(parts),
     )
 

@@ -27,6 +27,7 @@ from vibench.report.page.grids import TableGrid, grid_of, grid_of_cells, grid_of
 from vibench.report.page.images import image_of
 from vibench.results import pictures, tables
 from vibench.results.costs import best
+from vibench.results.costs.break_even import MARGIN
 from vibench.results.costs.paired_seconds import PairedSeconds
 from vibench.results.costs.ranking import LARGEST_BAND, Criterion, Winner, leaderboard
 from vibench.results.plugin_columns import Extended, faults_of
@@ -208,7 +209,8 @@ def _grids(read: Mapping[str, Extended]) -> Iterator[TableGrid]:
     formulations = tables.between_formulations(thresholds.frame)
     caption = (
         "When b is cheaper than a, offline and online together, by the number of queries, with its 95 % interval; "
-        "undecided where the measured rounds do not tell the sign of a difference."
+        f"as fast where the seconds of queries differ by less than a factor of {MARGIN:g}; undecided where the rounds "
+        "do not tell."
     )
     for name, title, rows in (
         ("enrichments", "Break-even between enrichments", thresholds.frame[~model & ~formulations]),

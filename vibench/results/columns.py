@@ -506,11 +506,14 @@ THRESHOLDS: Mapping[str, Column] = {
     "gain_low": real("1", "Lower end of the 95 % interval of the gain."),
     "gain_high": real("1", "Upper end of this interval."),
     "benefit_threshold": real(
-        "1", "Number n* of queries at break-even; empty if there is none or it is undecided.", "break-even", 20
+        "1", "Number n* of queries at break-even; empty if there is none, or none is claimed.", "break-even", 20
     ),
     "threshold_low": real("1", "Lower end of the 95 % interval of n*; if undecided, the smallest n*."),
     "threshold_high": real("1", "Upper end of the 95 % interval of n*.", "interval", 21),
-    "meaning": text("When b is cheaper than a in total: from n* on, until n*, never or at once; or undecided."),
+    "meaning": text(
+        "When b is cheaper than a in total: from n* on, until n*, never or at once; as fast where the seconds of their "
+        "queries differ by less than a factor of 1.25; or undecided."
+    ),
     "rounds_missing": integer(
         "If undecided, how many more rounds would decide it; empty where the offline seconds are too close.",
         "more rounds",

@@ -25,7 +25,7 @@ class TimedRound:
     """One round of one cell: seconds of its queries by their number, and how slow the machine was beside them."""
 
     assemble: Mapping[int, Seconds]
-    """Seconds of the assembly; in full, of one query, which counts for all."""
+    """Seconds of the assembly; in full, of some of the queries, which count for all."""
     solve: Mapping[int, Seconds]
     """Seconds of the solver; of the high-fidelity model, of its solutions with their assembly."""
     slowdown: float

@@ -36,9 +36,12 @@ SHARE = 3
 ROUND_SECONDS = 5.0
 """Wall seconds of the solver after which a cell's part of a round ends."""
 
+HIGH_FIDELITY_SECONDS = 0.1
+"""CPU seconds of high-fidelity solutions after which their part of a round ends: all of a round where they are short,
+since every ratio rests on them, and what the sweep says of the others is as uncertain as one measurement of it."""
 
-HIGH_FIDELITY_SECONDS = 0.02
-"""CPU seconds of high-fidelity solutions after which their part of a round ends."""
+ASSEMBLY_SECONDS = 0.02
+"""CPU seconds of assemblies in full after which no further one is timed in a round."""
 
 
 @dataclass(frozen=True)
@@ -231,7 +234,7 @@ class _Rounds(Items):
     def _assemblies(
         self, queries: Queries, order: Sequence[int], at: int, cell: int, stage: CellQueries, *, warm_up: bool
     ) -> dict[int, Seconds]:
-        """Seconds of the assembly of every query; in full, which costs the same at each parameter, of the first one.
+        """Seconds of the assembly of every query; in full, which costs the same at each parameter, of the first ones.
 
         High-fidelity matrices are the same for all models: they are assembled once in a round.
         """
@@ -240,14 +243,19 @@ class _Rounds(Items):
             return dict.fromkeys(order, NO_TIME)  # it is part of the solution
         if isinstance(model, HyperReducedModel):
             return {k: timed(partial(model.assemble, queries.near(k, at, cell, int(warm_up))))[1] for k in order}
-        k = order[0]
-        if (at, k) not in self._forms:
-            if not self._forms:
-                checked_assembly(model.problem, queries.near(k, at, cell, 1))  # the warm-up
-            vi, seconds = timed(partial(checked_assembly, model.problem, queries.near(k, at, cell, 0)))
-            self._forms = {(at, k): (vi.copy(), seconds)}  # the next assembly may be written into the same arrays
-        vi, forms = self._forms[at, k]
-        return {k: forms + timed(partial(model.reduce, vi))[1]}
+        if not self._forms:
+            checked_assembly(model.problem, queries.near(order[0], at, cell, 1))  # the warm-up
+        self._forms = {key: forms for key, forms in self._forms.items() if key[0] == at}
+        seconds: dict[int, Seconds] = {}
+        for k in order:
+            if (at, k) not in self._forms:
+                vi, forms = timed(partial(checked_assembly, model.problem, queries.near(k, at, cell, 0)))
+                self._forms[at, k] = vi.copy(), forms  # the next assembly may be written into the same arrays
+            vi, forms = self._forms[at, k]
+            seconds[k] = forms + timed(partial(model.reduce, vi))[1]
+            if sum(one.cpu for one in seconds.values()) > ASSEMBLY_SECONDS:
+                break
+        return seconds
 
     def lost(self, number: int, failed: Failed) -> Failed:  # noqa: ARG002
         """A round without a result."""

@@ -170,12 +170,17 @@ def exceptions(smaller: Mapping[int, float], larger: Mapping[int, float]) -> lis
     return [k for k in smaller if k in larger and smaller[k] > larger[k] * (1.0 + ROUND_OFF)]
 
 
+OPEN = frozenset({"undecided", "as fast"})
+"""Meanings of a break-even that claim no number and contradict none."""
+
+
 def break_even_verdict(paper: float, meaning: str, low: float | None, high: float | None) -> Agreement:
     """Whether a published break-even lies in a measured interval; "from" is the only meaning that the paper knows.
 
-    Open where the break-even is undecided, or where the interval contains the number and is too wide to confirm it.
+    Open where the break-even is undecided or the queries are as fast, so that no number is claimed, or where the
+    interval contains the number and is too wide to confirm it.
     """
-    if meaning == "undecided":
+    if meaning in OPEN:
         return Agreement.OPEN
     if meaning != "from" or low is None or high is None or not low <= paper <= high:
         return Agreement.DIFFERS
@@ -183,9 +188,9 @@ def break_even_verdict(paper: float, meaning: str, low: float | None, high: floa
 
 
 def cheaper_from(meanings: Iterable[str]) -> Agreement:
-    """Whether several break-evens all read "from"; open where none contradicts it but some are undecided."""
+    """Whether several break-evens all read "from"; open where none contradicts it but some are open."""
     different = set(meanings) - {"from"}
-    return judged(False if different - {"undecided"} else None if different else True)
+    return judged(False if different - OPEN else None if different else True)
 
 
 def break_even_text(value: float | None, meaning: str, low: float | None, high: float | None) -> str:

@@ -189,6 +189,7 @@ def threshold(column: PaperColumn, place: str, cause: str) -> Claim:
     )
     causes = {
         "undecided": "The sign of the saving is not significant at 95 %.",
+        "as fast": "Queries on and off are as fast within the margin.",
         "never": "Queries off are slower, see the row above.",
     }
     wide = row["meaning"] == "from" and verdict is Agreement.OPEN

@@ -151,7 +151,7 @@ def test_times_of_another_machine_are_left_out(changed: Changed, quick_run: Path
 
 
 def test_times_of_another_version_of_the_benchmark_are_left_out(changed: Changed, quick_run: Path) -> None:
-    other = 'versions = replace(versions, \'"protocol": "1"\', \'"protocol": "0"\')'
+    other = 'versions = replace(versions, \'"protocol": "2"\', \'"protocol": "0"\')'
     later = changed(f"UPDATE cells SET {other}, online_s = 9 * online_s")
     found = compare([quick_run / FILE, later], 1.25)
     assert found.changes.empty

@@ -120,9 +120,13 @@ def test_every_ok_query_is_timed_and_no_other(store: SampleStore) -> None:
         assert all(row["total_s"] == row["assemble_s"] + row["solve_s"] for row in rows.values())
 
 
-def test_reduced_assembly_is_timed_at_every_query_and_full_assembly_once_a_round(store: SampleStore) -> None:
+@pytest.mark.parametrize(("enough", "in_full"), [(0.0, 1), (np.inf, 2)])
+def test_reduced_assembly_is_timed_at_every_query_and_full_assembly_at_as_many_as_are_enough(
+    store: SampleStore, monkeypatch: pytest.MonkeyPatch, enough: float, in_full: int
+) -> None:
+    monkeypatch.setattr(timing_rounds, "ASSEMBLY_SECONDS", enough)
     timed = TimingRounds(CELLS, (EVERY,) * len(CELLS), 2).run(store).value
-    assert [[len(each.assemble) for each in one.rounds.values()] for one in timed[:3]] == [[1, 1]] * 3
+    assert [[len(each.assemble) for each in one.rounds.values()] for one in timed[:3]] == [[in_full] * 2] * 3
     assert all(each.assemble.keys() == each.solve.keys() for each in timed[3].rounds.values())
 
 
@@ -182,6 +186,7 @@ def test_matrices_in_full_are_assembled_once_in_a_round_for_all_cells(
 ) -> None:
     calls: list[float] = []
     plain = timing_rounds.checked_assembly
+    monkeypatch.setattr(timing_rounds, "ASSEMBLY_SECONDS", 0.0)
     monkeypatch.setattr(
         timing_rounds, "checked_assembly", lambda problem, mu: (calls.append(float(mu[0])), plain(problem, mu))[1]
     )

@@ -220,7 +220,7 @@ def _agreements(runs: Sequence[ComparedRun]) -> list[str]:
     total = Agreement(*map(sum, zip(*found, strict=True)))
     return [
         f"intervals of break-evens overlap in {total.overlapping} of {total.both} pairs",
-        f"{total.opposite} of {total.decided} break-evens that two runs decide differ in meaning",
+        f"{total.opposite} of {total.decided} break-evens that two runs decide contradict each other",
     ]
 
 

@@ -209,21 +209,27 @@ class Agreement(NamedTuple):
     overlapping: int
     """Those whose intervals have a number in common."""
     opposite: int
-    """Comparisons that are decided in both runs and do not mean the same."""
+    """Comparisons that are decided in both runs, of which at most one is right."""
     decided: int
     """Comparisons that are decided in both."""
 
 
 def agreement(one: pd.DataFrame, two: pd.DataFrame) -> Agreement:
     """How break-evens of two runs, rows of their thresholds, agree; whatever the machines were."""
-    pairs = [
-        (_break_even(row, "one"), _break_even(row, "two"))
-        for row in one.merge(two, on=["cell_a", "cell_b"], suffixes=("_one", "_two")).to_dict("records")
-    ]
-    decided = [pair for pair in pairs if Meaning.UNDECIDED not in (pair[0].meaning, pair[1].meaning)]
-    numbers = [(a, b) for a, b in decided if a.meaning == b.meaning and a.number is not None]
+    rows = one.merge(two, on=["cell_a", "cell_b"], suffixes=("_one", "_two")).to_dict("records")
+    pairs = [(row, _break_even(row, "one"), _break_even(row, "two")) for row in rows]
+    decided = [pair for pair in pairs if Meaning.UNDECIDED not in (pair[1].meaning, pair[2].meaning)]
+    numbers = [(a, b) for _, a, b in decided if a.meaning == b.meaning and a.number is not None]
     overlapping = sum(a.overlaps(b) for a, b in numbers)
-    return Agreement(len(numbers), overlapping, sum(a.meaning != b.meaning for a, b in decided), len(decided))
+    return Agreement(len(numbers), overlapping, sum(_opposite(*pair) for pair in decided), len(decided))
+
+
+def _opposite(row: Mapping[Any, Any], a: BreakEven, b: BreakEven) -> bool:
+    """Whether one contradicts the other; "as fast" and a small difference do not unless the gains are apart."""
+    if Meaning.AS_FAST not in (a.meaning, b.meaning):
+        return a.meaning != b.meaning
+    apart = row["gain_high_one"] < row["gain_low_two"] or row["gain_high_two"] < row["gain_low_one"]
+    return a.meaning != b.meaning and apart
 
 
 def _break_even(row: Mapping[Any, Any], run: str) -> BreakEven:

@@ -15,7 +15,7 @@ from vibench.errors import requested
 from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Kind
 from vibench.results.columns import KEYS, THRESHOLDS
-from vibench.results.costs.paired_seconds import PairedSeconds
+from vibench.results.costs.paired_seconds import CONDITIONS, PairedSeconds
 from vibench.study.cells import CERTIFIED, NO_SUCH_AXIS
 
 DRAWS = 2000
@@ -42,6 +42,7 @@ class Meaning(StrEnum):
     UNTIL = "until"
     NEVER = "never"
     AT_ONCE = "at once"
+    AS_FAST = "as fast"
     UNDECIDED = "undecided"
 
 
@@ -49,9 +50,10 @@ class Meaning(StrEnum):
 class BreakEven:
     """Number n* of queries, `None` where the total costs are never equal, and on which side of it b is cheaper.
 
-    `low` and `high` are the ends of the 95 % interval of n*, where seconds were measured in rounds. Where it is
-    undecided, `rounds` is how many more of them would decide it at the present scatter, `None` where none would since
-    it is the offline seconds that do not differ by more than theirs.
+    `low` and `high` are the ends of the 95 % interval of n*, where seconds were measured in rounds. Where the queries
+    are as fast, within `MARGIN`, no number is claimed. Where it is undecided, `rounds` is how many more of them would
+    decide it at the present scatter, `None` where none would since it is the offline seconds that do not differ by more
+    than theirs.
     """
 
     number: float | None
@@ -131,6 +133,10 @@ NORMAL_95 = 1.96
 STUDENT_95 = 2.1
 """The same of Student's distribution, with the degrees of freedom that further rounds would lead to."""
 
+MARGIN = 1.25
+"""Queries whose seconds differ by less than this factor are as fast: what else uses a machine changes their ratio by
+about as much, and no threshold that rests on it would be found again."""
+
 VALIDATION = ("validation", "validation_options")
 """Columns that name the validation set: seconds of a query are means over its queries."""
 
@@ -170,6 +176,9 @@ def break_even_rows(
 
 def compared(cells: Iterable[Mapping[str, Any]], paired: PairedSeconds, tail: float = TAIL) -> Iterator[Comparison]:
     """Break-even of the models that are compared, undecided where more than `tail` of the draws deny it.
+
+    It is "as fast" where it would be undecided, but the seconds of both queries differ by less than `MARGIN`, with the
+    probability `tail` of either to be wrong.
 
     Every per-parameter enrichment (a) is compared with every fixed one (b) of the same problem, formulation, cone,
     tolerances and solver; every reduced cell (a) with that of the same model with certificates (b); every mixed program
@@ -238,13 +247,25 @@ def _comparison(paired: PairedSeconds, a: Mapping[str, Any] | None, b: Mapping[s
     quotients = np.exp(ratio.draws(rng, DRAWS))
     costs_b = Costs(b["offline_s"], online_a * quotient, offline_draws(b, shared, rng), seconds * quotients)
     result = drawn_break_even(costs_a, costs_b, tail)
-    faster = float(np.mean(quotients < 1.0))
-    if result.meaning is Meaning.UNDECIDED and tail < faster < 1.0 - tail:
-        done = paired.rounds(key, b["cell"])
-        needed = done * (STUDENT_95 * ratio.error / ratio.mean) ** 2 if ratio.mean else math.inf
-        result = replace(result, rounds=max(1, math.ceil(min(needed, MOST_ROUNDS) - done)))
+    if result.meaning is Meaning.UNDECIDED:
+        faster, margin = float(np.mean(quotients < 1.0)), math.log(MARGIN)
+        if all(abs(end) <= margin for end in ratio.interval(tail)):
+            result = BreakEven(None, Meaning.AS_FAST)
+        elif tail < faster < 1.0 - tail:
+            result = replace(result, rounds=_rounds_missing(paired, key, b["cell"]))
     low, high = ratio.interval(TAIL)
     return Comparison(a, b, result, (online_a, online_a * quotient), (math.exp(-high), math.exp(-low)))
+
+
+def _rounds_missing(paired: PairedSeconds, a: str | None, b: str) -> int | None:
+    """How many more rounds would decide between two queries at their present scatter: which is faster, or neither."""
+    within, done = paired.ratio_within(a, b), paired.rounds(a, b)
+    if within is None:
+        return None
+    distance = max(abs(within.mean), math.log(MARGIN) - abs(within.mean))
+    allowed = (distance / STUDENT_95) ** 2 - CONDITIONS**2
+    needed = done * within.error**2 / allowed if allowed > 0.0 else math.inf
+    return max(1, math.ceil(min(needed, MOST_ROUNDS) - done))
 
 
 def shared_offline(a: Mapping[str, Any], b: Mapping[str, Any]) -> float:

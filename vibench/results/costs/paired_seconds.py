@@ -6,6 +6,8 @@ slows down a whole round leaves ratios as they are, and what hits one model in o
 independent, and what differs between processes differs between them. The interval of a ratio is that of a mean over
 blocks: Student's, its variance moderated by those of all models of the run (Smyth 2004, "Linear models and empirical
 Bayes methods for assessing differential expression", section 6), since a model has few blocks of its own.
+What else uses the core and its caches during a run changes ratios, too, in all of its blocks alike: the variance of
+`CONDITIONS` is added to what the blocks show.
 """
 
 from __future__ import annotations
@@ -33,6 +35,10 @@ CERTAIN = 1e3
 FAR = 50.0
 """Deviations of logarithms beyond which exponentials overflow."""
 
+CONDITIONS = 0.05
+"""Standard deviation of the logarithm of a ratio from one cold run to another beyond what their blocks show, measured
+in runs under different loads (docs/measurement.md)."""
+
 ROUND_OFF = 1e-18
 """Variances below this are those of equal numbers."""
 
@@ -59,6 +65,10 @@ class Estimate(NamedTuple):
         spread = mine**2 / self.freedom + others**2 / other.freedom
         freedom = (mine + others) ** 2 / spread if spread else CERTAIN
         return Estimate(self.mean - other.mean, math.sqrt(mine + others), min(freedom, CERTAIN))
+
+    def of_other_runs(self) -> Estimate:
+        """The same with what differs between cold runs but not between blocks."""
+        return self.minus(Estimate(0.0, CONDITIONS, CERTAIN))
 
 
 class _Scatter(NamedTuple):
@@ -213,6 +223,11 @@ class PairedSeconds:
         Cells of different groups are compared by their ratios to the high-fidelity model. `None` with fewer than two
         blocks.
         """
+        within = self.ratio_within(a, b)
+        return None if within is None else within.of_other_runs()
+
+    def ratio_within(self, a: str | None, b: str) -> Estimate | None:
+        """The same as further blocks of this run would have it."""
         mine = self._blocks.get(b, {})
         if a is None:
             return self._estimate(
@@ -222,13 +237,14 @@ class PairedSeconds:
         common = [name for name in mine if name in others]
         if common:
             return self._estimate(self._ratios, [mine[name].online - others[name].online for name in common])
-        apart = self.ratio(None, b), self.ratio(None, a)
+        apart = self.ratio_within(None, b), self.ratio_within(None, a)
         return None if apart[0] is None or apart[1] is None else apart[0].minus(apart[1])
 
     def level(self, a: str | None, b: str) -> Estimate | None:
         """The logarithm of the seconds of a query of a, or of the high-fidelity model, in the blocks shared with b.
 
-        Where a shares none with b, in all of its own.
+        Where a shares none with b, in all of its own. What differs between cold runs is a part of it, too: offline
+        seconds come from other moments.
         """
         mine = self._blocks.get(b, {})
         if a is None:
@@ -236,7 +252,8 @@ class PairedSeconds:
         else:
             others = self._blocks.get(a, {})
             values = [x.online for name, x in others.items() if name in mine] or [x.online for x in others.values()]
-        return self._estimate(self._levels, values)
+        level = self._estimate(self._levels, values)
+        return None if level is None else level.of_other_runs()
 
     def _estimate(self, common: CommonVariance, values: Sequence[float]) -> Estimate | None:
         count = len(values)
