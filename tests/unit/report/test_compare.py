@@ -13,7 +13,7 @@ from running import DECIDED, Changed, Main, refused
 from vibench.cli.result_commands import diff_runs
 from vibench.errors import RequestError
 from vibench.report.comparison.compare import compare
-from vibench.report.comparison.differences import ChangeKind
+from vibench.report.comparison.differences import ChangeKind, agreement
 from vibench.report.comparison.runs import run_names
 from vibench.results.sqlite.reading import FILE
 
@@ -366,3 +366,31 @@ def test_runs_of_folders_with_the_same_name_are_told_apart(tmp_path: Path) -> No
     assert run_names(paths) == ["a/quick", "b/quick", "c/other"]
     assert run_names([paths[0], paths[2]]) == ["quick", "other"]
     assert run_names([paths[0], paths[0]]) == ["quick", "quick (2)"]
+
+
+@pytest.mark.parametrize(
+    ("one", "two", "opposite"),
+    [
+        (("from", 1.5, 1.4, 1.6), ("from", 1.3, 1.2, 1.39), False),
+        (("from", 1.1, 1.01, 1.2), ("never", 0.9, 0.8, 0.99), True),
+        (("from", 1.1, 1.01, 1.2), ("at once", 1.1, 1.01, 1.2), True),
+        (("from", 1.1, 1.01, 1.2), ("as fast", 1.0, 0.9, 1.1), False),
+        (("from", 1.5, 1.4, 1.6), ("as fast", 1.0, 0.9, 1.1), True),
+        (("never", 0.7, 0.6, 0.8), ("as fast", 1.0, 0.9, 1.1), True),
+        (("as fast", 1.0, 0.9, 1.1), ("as fast", 0.98, 0.9, 1.05), False),
+    ],
+)
+def test_break_evens_contradict_each_other_where_at_most_one_is_right(
+    one: tuple[str, float, float, float], two: tuple[str, float, float, float], opposite: bool
+) -> None:
+    """Queries that are as fast in one run may be a little faster in another; a run that is undecided says nothing."""
+    runs = [
+        pd.DataFrame([{"cell_a": "a", "cell_b": "b", "meaning": meaning, "benefit_threshold": number}])
+        .assign(threshold_low=number, threshold_high=number, gain=gain, gain_low=low, gain_high=high)
+        for meaning, gain, low, high in (one, two)
+        for number in [9.0 if meaning == "from" else None]
+    ]  # fmt: skip
+    both = int(one[0] == two[0] == "from")
+    assert agreement(*runs) == agreement(*runs[::-1]) == (both, both, opposite, 1)
+    undecided = runs[1].assign(meaning="undecided", benefit_threshold=None)
+    assert agreement(runs[0], undecided) == (0, 0, 0, 0)
