@@ -46,10 +46,14 @@ def energy(vi: VariationalInequality) -> Energy:
 
 
 def stability(vi: VariationalInequality) -> Stability:
-    """Without β_HF, which the bounds do not use."""
-    return Stability(
-        InfSup(0.0, 0.0, 0.0, ""), *coercivity_and_continuity(vi.A, V), energy_inf_sup(vi.A, sp.csr_array(vi.B), W)
-    )
+    """Without β_HF, which the bounds do not use; of the inequality asked for last it is known."""
+    if all(vi is not known for known, _ in _latest):
+        constants = *coercivity_and_continuity(vi.A, V), energy_inf_sup(vi.A, sp.csr_array(vi.B), W)
+        _latest[:] = [(vi, Stability(InfSup(0.0, 0.0, 0.0, ""), *constants))]
+    return _latest[0][1]
+
+
+_latest: list[tuple[VariationalInequality, Stability]] = []
 
 
 def bounds_or_note(
