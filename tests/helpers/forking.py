@@ -52,6 +52,9 @@ TESTS = Path(__file__).parents[1]
 FILE_KIB = "VIBENCH_TESTS_FILE_KIB"
 """Variable of the environment: the largest file that a forked process and its workers may write, in KiB."""
 
+SUPERVISOR = "VIBENCH_TESTS_SUPERVISOR"
+"""Variable of the environment of a forked worker process: the process that watches it, which is not its parent."""
+
 _starting = threading.Lock()
 
 start_new_worker = supervisor.start_worker
@@ -201,7 +204,8 @@ def fork_workers(address: Callable[[], str] = template) -> Iterator[None]:
             return start_new_worker(descriptor, log, environment)
         request = {
             "main": "worker", "arguments": ["worker", str(descriptor), log], "folder": str(Path.cwd()),
-            "environment": dict(environment), "path": environment["PYTHONPATH"].split(os.pathsep),
+            "environment": {**environment, SUPERVISOR: str(os.getpid())},
+            "path": environment["PYTHONPATH"].split(os.pathsep),
         }  # fmt: skip
         return Forked(address(), request, descriptor)
 

@@ -7,11 +7,12 @@ import os
 import socket
 import ssl
 import struct
-import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future
+from multiprocessing import forkserver
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,8 +22,9 @@ import dask
 import pytest
 from distributed import LocalCluster
 from distributed.security import Security
-from fake_stages import KillsItsParent, Whole
-from forking import forked
+from distributed.utils import get_mp_context
+from fake_stages import KillsItsSupervisor, Whole
+from forking import forked, template
 from running import Vibench, assert_same_numbers, read_until
 from samples import wire_study, write_study
 
@@ -47,12 +49,20 @@ def job(stage: Stage, store: Path) -> Job:
 
 @pytest.fixture(scope="module", autouse=True)
 def forked_dask_workers() -> Iterator[None]:
-    """Dask forks its workers from a process that has imported dask, here and in the processes that tests start."""
+    """Dask forks its workers from a process that has imported dask, here and in the processes that tests start.
+
+    Here it has imported vibench as well, and worker processes of dask's workers are forked from that of the tests.
+    """
     with (
         pytest.MonkeyPatch.context() as patch,
         dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}),
     ):
         patch.setenv("DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD", "forkserver")
+        get_mp_context().set_forkserver_preload(["distributed", "dask_preload"])
+        with pytest.MonkeyPatch.context() as beginning:
+            beginning.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
+            beginning.setenv("VIBENCH_TESTS_TEMPLATE", template())
+            forkserver.ensure_running()
         yield
 
 
@@ -106,7 +116,7 @@ def test_a_cluster_somebody_has_is_used_and_left_alone(cluster: LocalCluster, tm
 def test_a_dask_worker_that_dies_is_survived(cluster: LocalCluster, tmp_path: Path) -> None:
     workers = Dask(cluster.scheduler_address, 1, tmp_path)
     try:
-        stages = [KillsItsParent(str(tmp_path / f"diary {k}")) for k in range(2)]
+        stages = [KillsItsSupervisor(str(tmp_path / f"diary {k}")) for k in range(2)]
         futures = [workers.submit(job(stage, tmp_path)) for stage in stages]
         for k, future in enumerate(futures):
             assert isinstance(future.result(timeout=90), Done)
@@ -287,13 +297,11 @@ def test_a_scheduler_without_dask_is_refused(vibench: Vibench, tmp_path: Path) -
     )  # fmt: skip
 
 
-def test_without_dask_the_extra_is_named(command: str, tmp_path: Path) -> None:
+def test_without_dask_the_extra_is_named(vibench: Vibench, tmp_path: Path) -> None:
     (tmp_path / "hidden").mkdir()
     (tmp_path / "hidden" / "distributed.py").write_text("raise ImportError('not here')\n")
     path = write_study(tmp_path, wire_study(problem=["obstacle"]))
-    environment = os.environ | {"PYTHONPATH": str(tmp_path / "hidden")}
-    arguments = [command, "run", path, "--executor", "dask"]
-    done = subprocess.run(arguments, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = vibench(tmp_path, "run", path, "--executor", "dask", plugins=tmp_path / "hidden")
     assert done.returncode == 2
     assert "install vibench with its extra 'cluster'" in done.stderr
 
