@@ -30,55 +30,94 @@ thousand unknowns."""
 def largest_eigenvalue(apply: Callable[[Array], Array], M: SparseMatrix, accuracy: float) -> float:
     """Estimate of the largest |θ| with T v = θ v; infinite where M is seen not to be positive definite.
 
+    `apply` and `M` are those of `Lanczos`, `accuracy` is the estimated relative error of θ at which iterations end.
+    """
+    return Lanczos(apply, M).largest(accuracy)
+
+
+class Lanczos:
+    """Iterations that go on where they ended: a more accurate eigenvalue costs what is missing, another end often none.
+
     Parameters
     ----------
     apply
         From v (n,) to T v, self-adjoint in the inner product of M.
     M
         Sparse symmetric positive definite (n×n).
-    accuracy
-        Estimated relative error of θ at which iterations end.
     """
-    start, theta = np.random.default_rng(0).standard_normal(M.shape[0]), 0.0
-    for _ in range(RESTARTS):
-        theta, error, start = _iterate(apply, M, accuracy, start)
-        if not error > accuracy * theta:
-            break
-    return theta
 
+    def __init__(self, apply: Callable[[Array], Array], M: SparseMatrix) -> None:
+        self._apply, self._M, n = apply, M, M.shape[0]
+        self._count = min(VECTORS, n)
+        self._basis, self._images = np.empty((self._count, n)), np.empty((self._count, n))
+        self._restarted = False
+        self._begin(np.random.default_rng(0).standard_normal(n))
 
-def _iterate(apply: Callable[[Array], Array], M: SparseMatrix, accuracy: float, w: Array) -> tuple[float, float, Array]:
-    """|θ|, its estimated error and the Ritz vector (n,) of iterations from w (n,); the vector only if it is needed."""
-    count, norm = min(VECTORS, len(w)), _norm(M, w)
-    basis, diagonal, beside = np.empty((count, len(w))), np.empty(count), np.empty(count)
-    theta, error, vector = float("inf"), 0.0, w
-    for k in range(count):
-        if not (np.isfinite(norm) and norm > 0.0):
-            return float("inf"), 0.0, w
-        basis[k] = w / norm
-        done, w = basis[: k + 1], apply(basis[k])
-        along = done @ (M @ w)
-        diagonal[k], w = along[k], w - along @ done
-        w -= (done @ (M @ w)) @ done  # again, against round-off
-        norm = beside[k] = _norm(M, w)
-        if not (np.isfinite(norm) and np.isfinite(diagonal[k])):
-            return float("inf"), 0.0, w
-        if (k + 1) % LOOKED_AT and norm > BREAKDOWN * abs(diagonal[k]) and k + 1 < count:
-            continue
-        values, vectors, failed = dstev(diagonal[: k + 1], beside[: max(k, 1)])
+    def largest(self, accuracy: float) -> float:
+        """Estimate of the largest |θ|, whose relative error is about `accuracy`; infinite where M is not definite."""
+        theta = 0.0
+        for _ in range(RESTARTS):
+            theta, error, vector = self._iterate(accuracy, smallest=False)
+            if not error > accuracy * theta:
+                break
+            self._restarted = True
+            self._begin(vector @ self._basis)
+        return theta
+
+    def smallest(self, accuracy: float) -> float | None:
+        """The same of the smallest θ of a positive definite T; `None` where so many vectors do not lead to it."""
+        if self._restarted:  # towards the other end
+            return None
+        theta, error, _ = self._iterate(accuracy, smallest=True)
+        return theta if error <= accuracy * theta and 0.0 < theta < np.inf else None
+
+    def _begin(self, start: Array) -> None:
+        """Iterations from a vector (n,)."""
+        self._size, self._diagonal, self._beside = 0, np.empty(self._count), np.empty(self._count)
+        self._follow(start)
+
+    def _follow(self, w: Array) -> None:
+        """The next vector w (n,) of the basis, and M w; its norm is NaN where wᵀMw < 0."""
+        self._next, self._image = w, self._M @ w
+        square = float(w @ self._image)
+        self._norm = float(np.sqrt(square)) if square >= 0.0 else float("nan")
+
+    def _iterate(self, accuracy: float, smallest: bool) -> tuple[float, float, Array]:
+        """|θ|, its estimated error, and the coefficients of its Ritz vector, once it is accurate or the basis full."""
+        ritz = self._ritz(smallest)
+        while ritz[1] > accuracy * ritz[0] and self._size < self._count:
+            if not (np.isfinite(self._norm) and self._norm > 0.0):
+                return float("inf"), 0.0, ritz[2]
+            self._extend()
+            if not (np.isfinite(self._norm) and np.isfinite(self._diagonal[self._size - 1])):
+                return float("inf"), 0.0, ritz[2]
+            ended = self._norm <= BREAKDOWN * abs(self._diagonal[self._size - 1]) or self._size == self._count
+            if ended or self._size % LOOKED_AT == 0:
+                ritz = self._ritz(smallest)
+        return ritz
+
+    def _extend(self) -> None:
+        """One more vector of the basis."""
+        k = self._size
+        self._basis[k], self._images[k] = self._next / self._norm, self._image / self._norm
+        done, images, w = self._basis[: k + 1], self._images[: k + 1], self._apply(self._basis[k])
+        along = images @ w
+        self._diagonal[k], w = along[k], w - along @ done
+        w -= (images @ w) @ done  # again, against round-off
+        self._follow(w)
+        self._beside[k], self._size = self._norm, k + 1
+
+    def _ritz(self, smallest: bool) -> tuple[float, float, Array]:
+        """|θ| of the smallest or of the largest Ritz value, its estimated error, and its vector in the basis."""
+        k = self._size
+        if not k:
+            return 0.0, float("inf"), np.zeros(0)
+        values, vectors, failed = dstev(self._diagonal[:k], self._beside[: max(k - 1, 1)])
         if failed:
-            return float("inf"), 0.0, w
-        first, second = (0, 1) if -values[0] > values[-1] else (-1, -2)
-        theta, residual = abs(float(values[first])), float(norm * abs(vectors[-1, first]))
-        gap = abs(float(values[first] - values[second])) if k else 0.0
+            return float("inf"), 0.0, np.zeros(0)
+        first, second = (0, 1) if smallest or -values[0] > values[-1] else (-1, -2)
+        theta, residual = float(values[first]), float(self._norm * abs(vectors[-1, first]))
+        theta = theta if smallest else abs(theta)
+        gap = abs(float(values[first] - values[second])) if k > 1 else 0.0
         error = residual * min(1.0, residual / gap) if gap > 0.0 else residual
-        if error <= accuracy * theta or k + 1 == len(w):
-            return theta, 0.0, w
-        vector = vectors[:, first]
-    return theta, error, vector @ basis
-
-
-def _norm(M: SparseMatrix, w: Array) -> float:
-    """‖w‖ in M; NaN where wᵀMw < 0."""
-    square = float(w @ (M @ w))
-    return float(np.sqrt(square)) if square >= 0.0 else float("nan")
+        return theta, 0.0 if k == self._M.shape[0] else error, vectors[:, first]

@@ -13,7 +13,7 @@ from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.errors import Energy
-from vibench.stability.coercivity import Constant, coercivity, continuity, energy_inf_sup, share_of_diagonal
+from vibench.stability.coercivity import Constant, Quotients, coercivity, continuity, energy_inf_sup, share_of_diagonal
 from vibench.stability.contact_infsup import ContactInfSup
 
 LIMIT = 2**28
@@ -37,6 +37,7 @@ class Assemblies:
         self._last: tuple[bytes, Energy] | None = None
         self._solver = HighFidelitySolver(problem, condensing=True)
         self._contact: ContactInfSup | None = None
+        self._quotients: LRUCache[bytes, Quotients] = LRUCache(1)  # it holds vectors
         self._alphas: LRUCache[bytes, Constant] = LRUCache(MANY)
         self._gammas: LRUCache[bytes, Constant] = LRUCache(MANY)
         self._betas: LRUCache[tuple[bytes, bytes], Constant] = LRUCache(MANY)
@@ -77,16 +78,24 @@ class Assemblies:
         """Lower bound of α at mu (d,), with the factorisation of `energy_at`; computed once for all mu with one A."""
         key = self._stiffness_at(mu)
         if key not in self._alphas:
-            stiffness = self.energy_at(mu).stiffness
-            self._alphas[key] = coercivity(self.at(mu).A, self._problem.V, stiffness.solve, stiffness.order)
+            order = self.energy_at(mu).stiffness.order
+            self._alphas[key] = coercivity(self._quotients_at(mu), order)
         return self._alphas[key]
 
     def continuity_at(self, mu: Array) -> Constant:
         """Upper bound of γ_a, likewise."""
         key = self._stiffness_at(mu)
         if key not in self._gammas:
-            self._gammas[key] = continuity(self.at(mu).A, self._problem.V)
+            self._gammas[key] = continuity(self._quotients_at(mu))
+            self._quotients.clear()
         return self._gammas[key]
+
+    def _quotients_at(self, mu: Array) -> Quotients:
+        """Estimates of both, those of the last A."""
+        key = self._stiffness_at(mu)
+        if key not in self._quotients:
+            self._quotients[key] = Quotients(self.at(mu).A, self._problem.V, self.energy_at(mu).stiffness.solve)
+        return self._quotients[key]
 
     def _stiffness_at(self, mu: Array) -> bytes:
         """What all parameters with the A of mu (d,) have in common: A often depends on a few of them alone."""

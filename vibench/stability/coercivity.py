@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import scipy.linalg
@@ -28,7 +28,7 @@ from vibench.linalg.cholesky import SparseCholesky, symmetric_lu
 from vibench.linalg.factorisations import implementation, is_proved_definite
 from vibench.linalg.inertia import proved_positive
 from vibench.linalg.inner_product import InnerProduct
-from vibench.linalg.lanczos import largest_eigenvalue
+from vibench.linalg.lanczos import Lanczos, largest_eigenvalue
 from vibench.linalg.schur_complement import FEW_PER_UNKNOWN
 from vibench.stability.infsup import InfSup
 
@@ -78,22 +78,55 @@ def coercivity_and_continuity(
     A: SparseMatrix, V: InnerProduct, solve: Solve | None = None
 ) -> tuple[Constant, Constant]:
     """Lower bound of α and upper bound of γ_a for A (n×n); see `coercivity` and `continuity`."""
-    return coercivity(A, V, solve), continuity(A, V)
+    quotients = Quotients(A, V, solve)
+    return coercivity(quotients), continuity(quotients)
 
 
-def coercivity(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None, order: Indices | None = None) -> Constant:
+class Quotients:
+    """Estimates of both ends of the spectrum of A (n×n) against X_V.
+
+    Both come from one iteration with X_V⁻¹A, whose factor of X_V all parameters share, while the lower end is among its
+    first vectors; else α comes from an iteration with A⁻¹X_V. `solve` solves with a factorisation of A that exists; by
+    default A is factorised as X_V is where that is needed.
+    """
+
+    def __init__(self, A: SparseMatrix, V: InnerProduct, solve: Solve | None = None) -> None:
+        self.A, self.V, self._solve = A, V, solve
+
+    @cached_property
+    def _both(self) -> Lanczos:
+        return Lanczos(lambda v: self.V.riesz(self.A @ v), self.V.matrix)
+
+    @cached_property
+    def _inverse(self) -> Estimate:
+        return lowest(self.A, self.V, self._solve)
+
+    def lowest(self, accuracy: float) -> float:
+        """Estimate of α with this relative error.
+
+        Raises a `NumericalError` if A is seen not to be symmetric positive definite.
+        """
+        found = self._both.smallest(accuracy) if self.V.dim > FEW and accuracy >= ACCURACY else None
+        return found if found is not None else self._inverse(accuracy)
+
+    def highest(self, accuracy: float) -> float:
+        """The same of γ_a."""
+        return self._both.largest(accuracy) if self.V.dim > FEW else highest_quotient(self.A, self.V)
+
+
+def coercivity(quotients: Quotients, order: Indices | None = None) -> Constant:
     """Lower bound of α for A (n×n).
 
-    `solve` solves with a factorisation of A that exists; by default A is factorised as X_V is. `order` (n,) is one for
-    the elimination of its unknowns; by default of minimum degree. Raises a `NumericalError` if A is not symmetric
-    positive definite.
+    `order` (n,) is one for the elimination of its unknowns; by default of minimum degree. Raises a `NumericalError` if
+    A is seen not to be symmetric positive definite.
     """
+    A, V = quotients.A, quotients.V
     chosen = implementation(V.factorisation)
 
     def coercive(a: float) -> bool:
         return is_proved_definite([A, -a * V.matrix], chosen, order)
 
-    return moved(lambda accuracy: lowest_quotient(A, V, solve, accuracy), -1.0, coercive)
+    return moved(quotients.lowest, -1.0, coercive)
 
 
 def share_of_diagonal(X: InnerProduct) -> float:
@@ -106,14 +139,15 @@ def share_of_diagonal(X: InnerProduct) -> float:
     return share if proved_positive([X.matrix, scaled], np.sqrt(diagonal)) == X.dim else 0.0
 
 
-def continuity(A: SparseMatrix, V: InnerProduct) -> Constant:
+def continuity(quotients: Quotients) -> Constant:
     """Upper bound of γ_a for A (n×n), symmetric positive definite."""
+    A, V = quotients.A, quotients.V
     chosen = implementation(V.factorisation)
 
     def continuous(c: float) -> bool:
         return is_proved_definite([c * V.matrix, -A], chosen)
 
-    return moved(lambda accuracy: highest_quotient(A, V, accuracy), 1.0, continuous)
+    return moved(quotients.highest, 1.0, continuous)
 
 
 def constants_near(A: SparseMatrix, X: InnerProduct) -> tuple[Constant, Constant]:
@@ -123,13 +157,15 @@ def constants_near(A: SparseMatrix, X: InnerProduct) -> tuple[Constant, Constant
     """
     if X.dim <= FEW:
         return coercivity_and_continuity(A, X)
-    chosen, shift = implementation(X.factorisation), highest_quotient(A, X, ROUGH)
-
-    def lowest(accuracy: float) -> float:
-        return shift - largest_eigenvalue(lambda v: shift * v - X.riesz(A @ v), X.matrix, accuracy)
-
-    low = moved(lowest, -1.0, lambda a: is_proved_definite([A, -a * X.matrix], chosen))
-    return (low, continuity(A, X)) if low.proved else coercivity_and_continuity(A, X)
+    chosen, quotients = implementation(X.factorisation), Quotients(A, X)
+    shift = quotients.highest(ROUGH)
+    reversed_ends = Lanczos(lambda v: shift * v - X.riesz(A @ v), X.matrix)
+    low = moved(
+        lambda accuracy: shift - reversed_ends.largest(accuracy),
+        -1.0,
+        lambda a: is_proved_definite([A, -a * X.matrix], chosen),
+    )
+    return (low, continuity(quotients)) if low.proved else coercivity_and_continuity(A, X)
 
 
 def operator_norm(M: SparseMatrix, X: InnerProduct) -> Constant:
@@ -174,10 +210,17 @@ def lowest_quotient(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None
 
     Raises a `NumericalError` if A is not symmetric positive definite and no `solve` is given.
     """
-    solve = solve or InnerProduct(A, "A", V.factorisation).riesz
+    return lowest(A, V, solve)(accuracy)
+
+
+def lowest(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None) -> Estimate:
+    """The estimates of `lowest_quotient`."""
+    inverse = solve or InnerProduct(A, "A", V.factorisation).riesz
     if V.dim <= FEW:
-        return float(scipy.linalg.eigvalsh(A.toarray(), V.matrix.toarray())[0])
-    return 1.0 / largest_eigenvalue(lambda v: solve(V.matrix @ v), A, accuracy)
+        smallest = float(scipy.linalg.eigvalsh(A.toarray(), V.matrix.toarray())[0])
+        return lambda _: smallest
+    iterations = Lanczos(lambda v: inverse(V.matrix @ v), A)
+    return lambda accuracy: 1.0 / iterations.largest(accuracy)
 
 
 def highest_quotient(A: SparseMatrix, V: InnerProduct, accuracy: float = ACCURACY) -> float:
@@ -246,7 +289,8 @@ def _smallest_compliance(
         found[order] = solve(np.concatenate([np.zeros(n), W.matrix @ v])[order])
         return -found[n:]
 
-    return lambda accuracy: largest_eigenvalue(inverse, W.matrix, accuracy) ** -0.5
+    iterations = Lanczos(inverse, W.matrix)
+    return lambda accuracy: iterations.largest(accuracy) ** -0.5
 
 
 def _saddle_point(A: SparseMatrix, B: SparseMatrix, corner: SparseMatrix) -> SparseMatrix:
@@ -265,7 +309,8 @@ def smallest_root(matrix: Array, mass: SparseMatrix) -> Estimate:
     def inverse(v: Array) -> Array:
         return np.asarray(scipy.linalg.cho_solve(factor, mass @ v, overwrite_b=True, check_finite=False))
 
-    return lambda accuracy: largest_eigenvalue(inverse, mass, accuracy) ** -0.5
+    iterations = Lanczos(inverse, mass)
+    return lambda accuracy: iterations.largest(accuracy) ** -0.5
 
 
 def _of_dense(matrix: Array, mass: SparseMatrix) -> Estimate:

@@ -9,7 +9,7 @@ import scipy.sparse as sp
 from numerics import spd
 
 from vibench.linalg import lanczos
-from vibench.linalg.lanczos import largest_eigenvalue
+from vibench.linalg.lanczos import Lanczos, largest_eigenvalue
 
 ACCURACIES = 1e-3, 1e-6, 1e-10
 
@@ -79,3 +79,35 @@ def test_iterations_end_with_the_accuracy_of_the_eigenvalue() -> None:
         counts.append(0)
         assert 1.0 - 10.0 * accuracy <= largest_eigenvalue(apply, M, accuracy) <= 1.0 + 1e-12
     assert counts[0] < 0.7 * counts[1]
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e100, 1e-100])
+def test_iterations_go_on_to_more_accuracy_and_to_the_other_end(scale: float) -> None:
+    """What follows another estimate takes less than it would alone."""
+    spectrum = scale * np.concatenate([[0.5], np.linspace(0.6, 1.7, 198), [2.0]])
+    M, counts = sp.eye_array(200, format="csc"), list[int]()
+
+    def run() -> Lanczos:
+        counts.append(0)
+        return Lanczos(apply, M)
+
+    def apply(v: np.ndarray) -> np.ndarray:
+        counts[-1] += 1
+        return spectrum * v
+
+    both, alone = run(), []
+    for end, accuracy, exact in (("smallest", 1e-3, 0.5), ("largest", 1e-3, 2.0), ("largest", 1e-8, 2.0)):
+        assert getattr(both, end)(accuracy) == pytest.approx(exact * scale, rel=10.0 * accuracy)
+    for end, accuracy in (("smallest", 1e-3), ("largest", 1e-8)):
+        getattr(run(), end)(accuracy)
+        alone.append(counts[-1])
+    assert counts[0] == max(alone)
+
+
+def test_an_end_that_so_many_vectors_do_not_reach_or_that_is_not_positive_has_no_estimate() -> None:
+    M = sp.eye_array(400, format="csc")
+    for spectrum in (np.geomspace(1e-6, 1.0, 400), np.linspace(-0.5, 1.0, 400), np.full(400, np.nan), np.zeros(400)):
+        assert Lanczos(lambda v, spectrum=spectrum: spectrum * v, M).smallest(1e-3) is None
+    restarted = Lanczos(lambda v: np.linspace(0.0, 1.0, 400) ** 0.1 * v, M)
+    assert restarted.largest(1e-12) == pytest.approx(1.0)
+    assert restarted.smallest(1e-3) is None

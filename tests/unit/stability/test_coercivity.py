@@ -59,8 +59,8 @@ def test_an_eigenvalue_that_lanczos_missed_costs_sharpness_or_the_proof(
     A, V = spd(40, np.random.default_rng(1)), space(40, 5)
     values = scipy.linalg.eigh(A, V.matrix.toarray(), eigvals_only=True)
     wrong = missed * values[0], values[-1] / missed
-    monkeypatch.setattr(coercivity, "lowest_quotient", lambda *_: wrong[0])
-    monkeypatch.setattr(coercivity, "highest_quotient", lambda *_: wrong[1])
+    monkeypatch.setattr(coercivity.Quotients, "lowest", lambda *_: wrong[0])
+    monkeypatch.setattr(coercivity.Quotients, "highest", lambda *_: wrong[1])
     low, high = coercivity_and_continuity(sp.csc_array(A), V)
     if margin is None:
         assert not low.proved
