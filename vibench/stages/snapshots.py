@@ -29,7 +29,7 @@ from vibench.study.cells import Axes
 from vibench.study.kinds import PROBLEM
 from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_of, parameters_of
 from vibench.study.plugin import Plugin
-from vibench.timing import NO_TIME, Seconds, median_seconds, timed
+from vibench.timing import NO_TIME, SLOW, Seconds, median_of, timed
 
 T = TypeVar("T")
 
@@ -37,6 +37,10 @@ VALIDATED = 3.0
 """As many training solutions take about as long as a validation solution, its repetitions and its error bound."""
 
 storable(Fingerprint)
+
+RUNS = 3
+"""How often a validation solution is solved, so that a disturbed one does not count. That is no more than its share of
+those that rounds time later, beside the queries which they are compared with."""
 
 
 @storable
@@ -169,11 +173,15 @@ class SnapshotStage(Stage):
                 raise NumericalError(f"at mu = {mu.tolist()}: {error}") from error
 
     def _measure(self, work: Callable[[Array], T], mus: Iterator[Array]) -> tuple[T, Seconds]:
-        """A training solution is an offline cost, timed once; a validation solution is timed as a query is.
+        """A training solution is an offline cost, timed once; of a validation solution the median of a few counts.
 
         The result is the one at the first parameter.
         """
-        return timed(partial(work, next(mus))) if self.parameters.role == "training" else median_seconds(work, mus)
+        result, first = timed(partial(work, next(mus)))
+        runs = [first]
+        if self.parameters.role != "training" and first.wall <= SLOW:
+            runs += [timed(partial(work, next(mus)))[1] for _ in range(RUNS - 1)]
+        return result, median_of(runs)
 
     def _diagnostics(self, problem: Problem, mus: Array, first: int) -> tuple[History, ...]:
         by_quantity: dict[str, list[float]] = {}
