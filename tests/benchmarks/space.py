@@ -36,8 +36,7 @@ SOLVER, ACCURACY = "piqp", 1e-10
 
 def reductions(resolution: str) -> dict[str, vibench.Reduction]:
     """Certified reductions on one mesh, by primal strategy, on the same snapshots."""
-    problem = vibench.create("problem", "hertz3d", {"resolution": resolution})
-    problem.factorised_by("pardiso")
+    problem = vibench.create("problem", "hertz3d", {"resolution": resolution, "factorisation": "pardiso"})
     start, dual = time.process_time(), vibench.create("dual strategy", "mcpg")
     solved = high_fidelity_sweep(problem, problem.parameters.grid(*TRAINING))
     print(
@@ -69,8 +68,7 @@ def timed_query(reduction: vibench.Reduction, mu: np.ndarray) -> tuple[float, fl
 
 def unseen(resolution: str, count: str = "1000") -> int:
     """Compare bounds with errors; returns the number of violations."""
-    problem = vibench.create("problem", "hertz3d", {"resolution": resolution})
-    problem.factorised_by("pardiso")
+    problem = vibench.create("problem", "hertz3d", {"resolution": resolution, "factorisation": "pardiso"})
     dual, solved = vibench.create("dual strategy", "mcpg"), high_fidelity_sweep(problem, problem.training_set())
     models: dict[str, vibench.Model] = {}
     shared = {"snapshots": solved}

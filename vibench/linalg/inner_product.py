@@ -5,6 +5,9 @@ Bases and ranks are those of small dense matrices, often nearly rank-deficient, 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cached_property
 
 import numpy as np
@@ -25,6 +28,26 @@ RANK_RTOL = 1e-12
 
 ORTHOGONALITY_ATOL = 1e-13
 """Inner products of unit vectors below this are round-off."""
+
+_POSTPONED: ContextVar[list[InnerProduct] | None] = ContextVar(
+    "inner products that are not factorised yet", default=None
+)
+
+
+@contextmanager
+def factorised_later() -> Iterator[None]:
+    """Inner products made inside are factorised, and indefinite ones refused, at the end.
+
+    Who factorises them may be chosen until then: the default takes minutes for a space of 200,000 dimensions.
+    """
+    made: list[InnerProduct] = []
+    token = _POSTPONED.set(made)
+    try:
+        yield
+    finally:
+        _POSTPONED.reset(token)
+    for product in made:
+        product._solver  # noqa: B018
 
 
 class InnerProduct:
@@ -57,7 +80,10 @@ class InnerProduct:
         self.matrix = sp.csc_array(matrix)
         self._name, self.factorisation = name, factorisation
         check_symmetric(self.matrix, name)
-        self._solver  # noqa: B018  refuses an indefinite matrix here and not at its first use
+        if (postponed := _POSTPONED.get()) is not None:
+            postponed.append(self)
+        else:
+            self._solver  # noqa: B018  refuses an indefinite matrix here and not at its first use
 
     def __getstate__(self) -> dict[str, object]:
         """Drop the factorisation: SuperLU objects cannot be pickled."""

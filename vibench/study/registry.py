@@ -220,8 +220,12 @@ class RegisteredPlugin:
         Raises a `RequestError` if there is no such plugin, or it does not take these options.
         """
         own, chosen = self._without_factorisation(self.check_options(options))
-        made = self.load()(**own)
-        if chosen:
+        if not chosen:
+            return self.load()(**own)
+        from vibench.linalg.inner_product import factorised_later
+
+        with factorised_later():
+            made = self.load()(**own)
             made.factorised_by(chosen[FACTORISATION])
         return made
 

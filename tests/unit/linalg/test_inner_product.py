@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numerics import space, spd
 
 from vibench.errors import NumericalError
-from vibench.linalg.inner_product import InnerProduct
+from vibench.linalg.inner_product import InnerProduct, factorised_later
 
 seeds = st.integers(0, 10_000)
 
@@ -71,6 +71,17 @@ def test_empty_bases_are_fine() -> None:
 def test_what_is_no_inner_product_is_refused(matrix: np.ndarray, message: str) -> None:
     with pytest.raises(NumericalError, match=message):
         InnerProduct(sp.csc_array(matrix))
+
+
+def test_what_is_factorised_later_is_refused_later() -> None:
+    indefinite, made = sp.csc_array([[1.0, 2.0], [2.0, 1.0]]), []
+    with pytest.raises(NumericalError, match="X is not positive definite"), factorised_later():
+        made.append(InnerProduct(indefinite, "X"))
+    assert len(made) == 1
+    with pytest.raises(NumericalError, match="must be square"), factorised_later():
+        InnerProduct(sp.csc_array(np.ones((2, 3))))
+    with pytest.raises(NumericalError, match="not positive definite"):
+        InnerProduct(indefinite)
 
 
 def test_an_inner_product_travels_between_processes() -> None:

@@ -12,7 +12,7 @@ from vibench.errors import RequestError
 from vibench.execution.run import unavailable
 from vibench.highfidelity import kkt_systems
 from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.linalg import factorisations
+from vibench.linalg import factorisations, inner_product
 from vibench.linalg.factorisations import IMPLEMENTATIONS
 from vibench.reduction import supremizers
 from vibench.study.kinds import PROBLEM
@@ -50,6 +50,18 @@ def test_the_numbers_are_those_of_the_default(name: str, factorisation: str) -> 
         solved(name, options | {"factorisation": factorisation}), solved(name, options), strict=True
     ):
         np.testing.assert_allclose(own, default, atol=1e-9 * np.abs(default).max())
+
+
+@pytest.mark.parametrize("factorisation", [one for one, made in IMPLEMENTATIONS.items() if made.is_direct])
+def test_only_who_is_chosen_factorises_a_problem_that_is_made(factorisation: str) -> None:
+    """In space the default would take longer for X_V than all that follows."""
+    if not IMPLEMENTATIONS[factorisation].is_installed:
+        pytest.skip("not installed")
+    with mock.patch.object(inner_product, "SparseCholesky", wraps=inner_product.SparseCholesky) as default:
+        problem = create("problem", "obstacle", {"resolution": 300, "factorisation": factorisation})
+        problem.V.riesz(np.ones(problem.V.dim))
+    by_default = [call.args[0].shape[0] for call in default.call_args_list].count(problem.V.dim)
+    assert by_default == (1 if factorisation == "superlu" else 0)
 
 
 def test_a_study_chooses_for_its_problems_and_a_problem_for_itself() -> None:
