@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 from samples import STUDY, changed, write_study
 
+from vibench.execution.graph import Graph
 from vibench.execution.run import Agenda
 from vibench.interfaces.strategies import Stop
 from vibench.stages.base import Stage
@@ -98,6 +99,51 @@ def test_the_set_up_of_a_long_stage_is_not_expected_of_the_others(monkeypatch: p
         now[0] = seconds
         left.shares([(CHUNK[0], share)])
     assert left.seconds() == pytest.approx(0.7 * 50.0 + 50.0)
+
+
+RECORDED = {
+    "high-fidelity solutions of the training set": 22.0, "high-fidelity solutions of the validation set": 19.0,
+    "high-fidelity constants": 38.5, "certificate base": 20.0, "certificate": 3.0, "queries with piqp": 33.0,
+}  # fmt: skip
+"""Mean wall seconds of the stages of `three-dimensions` at medium, in a run of 11 minutes; others took less than 1."""
+
+SOLUTIONS = 27
+"""Training solutions of a part; the first one has the set-up."""
+
+
+def test_a_run_in_space_says_in_its_first_minute_how_long_it_will_take(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two workers, looked at every five seconds, with stages that take what they took in a run."""
+    cells = [cell for cell in expand(read_study("three-dimensions")) if "medium" in str(cell)]
+    graph, now, running, estimates = (
+        Graph(),
+        [0.0],
+        dict[str, tuple[Stage, float, float]](),
+        list[tuple[float, float]](),
+    )
+    for cell in cells:
+        graph.add_goal(cell_queries(cell, 20.0), lambda _: False)
+    monkeypatch.setattr("vibench.terminal.progress.monotonic", lambda: now[0])
+    left = TimeLeft(list(graph.stages.values()), 2)
+    while graph.waiting or running:
+        for stage in graph.begin(2 - len(running)):
+            left.begin(stage)
+            running[stage.key] = stage, now[0], now[0] + RECORDED.get(stage.sort, 0.5)
+        told = []
+        for stage, began, end in running.values():
+            solved = int(max(0.0, (now[0] - began) / (end - began) * (SOLUTIONS + 4) - 4)) / SOLUTIONS
+            told.append((stage, solved if isinstance(stage, SnapshotStage) else 0.0))
+        left.shares(told)
+        if (seconds := left.seconds()) is not None:
+            estimates.append((now[0], seconds))
+        first = min(end for _, _, end in running.values())
+        now[0] = min(now[0] + 5.0, first)
+        for stage, began, end in [one for one in running.values() if one[2] <= now[0]]:
+            left.done(running.pop(stage.key)[0], end - began)
+            graph.done(stage)
+    assert estimates[0][0] < 60.0
+    assert 500.0 < now[0] < 700.0
+    compared = [(at, seconds / (now[0] - at)) for at, seconds in estimates if at < 0.9 * now[0]]
+    assert all(1.0 / 1.5 < ratio < 1.5 for at, ratio in compared if at > 20.0), compared
 
 
 def test_workers_share_what_is_left() -> None:
