@@ -130,6 +130,15 @@ def break_even(thresholds: pd.DataFrame) -> pd.DataFrame:
     return table.assign(gain=gain, **{"pays, in queries": pays})
 
 
+def stages(cells: pd.DataFrame) -> pd.DataFrame:
+    """Median seconds of a solution, of all snapshots, of a certificate with its base, and exponents in the unknowns."""
+    certified = cells[cells["assembly"] == CERTIFIED]
+    named = {"hf_s": "solution", "offline_snapshots_s": "snapshots", "offline_certificate_s": "certificate"}
+    found = certified.groupby("dim_V")[list(named)].median().rename(columns=named)
+    orders = np.log(found).diff().div(np.log(found.index.to_series()).diff(), axis=0).add_suffix(", exponent")
+    return found.join(orders).rename_axis("unknowns").reset_index()
+
+
 def growth(cells: pd.DataFrame) -> pd.DataFrame:
     """Queries on the finest mesh over those on the coarsest, where N, R and what was added agree."""
     of_model = cells.set_index([*MODEL[1:], "N", "R", "enrichment"])
@@ -224,7 +233,13 @@ def main(run: str, target: str) -> None:
         break_even(read(run, "thresholds")),
     )
     if cells["dim_V"].nunique() > 1:
-        page.section("Queries and meshes", "Seconds of a query, the finer mesh over the coarser one.", growth(cells))
+        page.section(
+            "Meshes",
+            "Offline CPU seconds, and their exponents in the unknowns:",
+            stages(cells),
+            "Seconds of a query of models of equal dimensions, the finer mesh over the coarser one:",
+            growth(cells),
+        )
     page.add(f"Full table of the cells: {page.link('cells', cells)}.")
     page.write()
 

@@ -176,72 +176,94 @@ def of_break_evens() -> Sequence[str]:
     )
 
 
+BARE, ONLINE, OFFLINE = "decorrelated", "online-supremizers", "offline-pga"
+
+
+def ladder(rows: pd.DataFrame, column: str, dual: str, primal: str, digits: int = 2) -> str:
+    """A column at both tolerances of a model, the looser one first."""
+    equal = rows[(rows["pod_tol"] == rows["dual_tol"]) & (rows["dual"] == dual) & (rows["primal"] == primal)]
+    by = equal.groupby("pod_tol")[column].first()
+    return f"{by[1e-2]:.{digits}g}, {by[1e-3]:.{digits}g}"
+
+
+def of_models(rows: pd.DataFrame) -> dict[str, str]:
+    """What the table on three dimensions says of the models on one mesh, or of those of the plane."""
+    enriched = rows.loc[(rows["primal"] != BARE) & (rows["pod_tol"] == rows["dual_tol"]), "beta_span_min"]
+    cones = {
+        f"β over the cone, `{dual}`, {name}": ladder(rows, "beta_cone_lower_min", dual, primal)
+        for dual in ("cpg", "mcpg") for name, primal in (("not enriched", BARE), ("offline PGA", OFFLINE))
+    }  # fmt: skip
+    errors = {
+        f"error of λ, `{dual}`, {name}": ladder(rows, "error_lambda_mean", dual, primal)
+        for dual in ("cpg", "mcpg") for name, primal in (("not enriched", BARE), ("offline PGA", OFFLINE))
+    }  # fmt: skip
+    return {
+        "N": ladder(rows, "N", "cpg", BARE, 3),
+        "generators of `cpg`": ladder(rows, "R", "cpg", BARE, 3),
+        "generators of `mcpg`": ladder(rows, "R", "mcpg", BARE, 3),
+        "vectors of offline PGA, `mcpg`": ladder(rows, "enrichment", "mcpg", OFFLINE, 3),
+        "β over the span, enriched": span(enriched),
+        **cones,
+        "error of u, `mcpg`, offline PGA": ladder(rows, "error_u_mean", "mcpg", OFFLINE),
+        **errors,
+    }
+
+
+def of_costs(rows: pd.DataFrame, page: str) -> dict[str, str]:
+    """What it says of seconds and bounds of the models on one mesh; break-even is that of the page."""
+    kinds = {kind: rows[rows["assembly"] == kind] for kind in ("reduced", "certified")}
+    certified, label = kinds["certified"], str(rows["problem"].iloc[0])
+    share = 100.0 * rows["offline_snapshots_s"] / rows["offline_s"]
+    pattern = rf"\| {label} +\|[^|]+\|[^|]+\| high-fidelity +\|[^|]+\| (reduced|certified) +\|[^|]+\| from (\d+)"
+    starts = {kind: [int(start) for found, start in re.findall(pattern, page) if found == kind] for kind in kinds}
+    gains = {
+        kind: span(some[some["primal"] == ONLINE].set_index(["dual", "pod_tol"])["online_s"]
+                   / some[some["primal"] == OFFLINE].set_index(["dual", "pod_tol"])["online_s"])
+        for kind, some in kinds.items()
+    }  # fmt: skip
+    each = {
+        kind: {
+            f"{kind} query [ms]": span(1e3 * some["online_s"]),
+            f"{kind}: online over offline enrichment": gains[kind],
+            f"{kind}: pays from, queries": f"{min(starts[kind])} to {max(starts[kind])}",
+            f"{kind}: snapshots, share of offline seconds": f"{share[some.index].min():.0f} to "
+            f"{share[some.index].max():.0f} %",
+        }
+        for kind, some in kinds.items()
+    }
+    return {
+        "high-fidelity solution [s]": span(rows["hf_s"]),
+        **each["reduced"],
+        **each["certified"],
+        "certificate and base [s]": span(certified["offline_certificate_s"]),
+        "effectivity of u, online": span(certified["effectivity_online_u_energy_median"]),
+        "effectivity of λ, online": span(certified["effectivity_online_lambda_natural_median"]),
+        "effectivity of u, high-fidelity": span(certified["effectivity_u_energy_median"]),
+    }
+
+
 def of_space() -> Sequence[str]:
-    """What the page on three dimensions says of dimensions, constants, errors and seconds, there and in the plane."""
+    """The table of the page on three dimensions, by mesh and in the plane."""
     table = pd.read_csv(ROOT / "results" / "three-dimensions" / "cells.csv")
     assert (table["queries_ok"] == table["queries"]).all()
     assert (table["bound_online_violations"].fillna(0.0) == 0.0).all()
-    key = ["dual", "primal", "pod_tol", "dual_tol"]
-    plane = cells("paper-hertz")
-    plane = plane[plane["primal_tol"].isna() | (plane["primal_tol"] == 0.5)]
-    space_, plane_ = (
-        rows[rows["pod_tol"] == rows["dual_tol"]].drop_duplicates(key).set_index(key).sort_index()
-        for rows in (table[table["assembly"] == "reduced"], plane[plane["assembly"] == "full"])
-    )
-
-    def at(rows: pd.DataFrame, column: str, dual: str, primal: str, tolerance: float) -> float:
-        return float(rows.loc[(dual, primal, tolerance, tolerance), column])
-
-    def ladder(rows: pd.DataFrame, column: str, dual: str, primal: str, digits: int = 2) -> str:
-        return " and ".join(f"{at(rows, column, dual, primal, each):.{digits}g}" for each in (1e-2, 1e-3))
-
-    bare, online, offline = "decorrelated", "online-supremizers", "offline-pga"
-    assert (table["beta_span_min"][table["primal"] == bare] == 0.0).all()
-    sizes = {
-        (where, name): [ladder(rows, name, dual, bare, 3) for dual in ("cpg", "mcpg")]
-        for where, rows in (("space", space_), ("plane", plane_)) for name in ("N", "R")
-    }  # fmt: skip
-    enriched = table[table["primal"] != bare]
-    reduced, certified = table[table["assembly"] == "reduced"], table[table["assembly"] == "certified"]
-    share = 100.0 * table["offline_snapshots_s"] / table["offline_s"]
-    shares = [f"{share[rows.index].min():.0f} to {share[rows.index].max():.0f} %" for rows in (reduced, certified)]
-    gains = {
-        kind: span(rows[rows["primal"] == online].set_index(["dual", "pod_tol"])["online_s"]
-                   / rows[rows["primal"] == offline].set_index(["dual", "pod_tol"])["online_s"])
-        for kind, rows in (("reduced", reduced), ("certified", certified))
-    }  # fmt: skip
+    assert (table.loc[table["primal"] == BARE, "beta_span_min"] == 0.0).all()
     page = (ROOT / "results" / "three-dimensions" / "README.md").read_text(encoding="utf-8")
-    starts: dict[str, list[int]] = {"reduced": [], "certified": []}
-    for kind, start in re.findall(r"\| high-fidelity +\|[^|]+\| (reduced|certified) +\|[^|]+\| from (\d+)", page):
-        starts[kind].append(int(start))
-    pays = {kind: f"{min(values)} to {max(values)}" for kind, values in starts.items()}
-    return (
-        f"N is {sizes['space', 'N'][0]} at 1e-2 and 1e-3",
-        f"`cpg` has {sizes['space', 'R'][0]} generators and `mcpg` {sizes['space', 'R'][1]}",
-        f"N is {sizes['plane', 'N'][0]}, R {sizes['plane', 'R'][0]} and {sizes['plane', 'R'][1]}",
-        f"by {ladder(space_, 'enrichment', 'mcpg', offline)} vectors with `mcpg`",
-        f"in the plane by {ladder(plane_, 'enrichment', 'mcpg', offline, 3)}, more",
-        f"β over the span is then {span(enriched['beta_span_min'])}",
-        f"β over the cone is {ladder(space_, 'beta_cone_lower_min', 'cpg', bare)} with `cpg` and "
-        f"{ladder(space_, 'beta_cone_lower_min', 'mcpg', bare)} with `mcpg` without enrichment, "
-        f"{ladder(space_, 'beta_cone_lower_min', 'cpg', offline)} and "
-        f"{ladder(space_, 'beta_cone_lower_min', 'mcpg', offline)} with",
-        f"of λ fall from {ladder(space_, 'error_lambda_mean', 'mcpg', bare)} to "
-        f"{ladder(space_, 'error_lambda_mean', 'mcpg', offline)} with `mcpg`",
-        f"in the plane from {ladder(plane_, 'error_lambda_mean', 'mcpg', bare)} to "
-        f"{ladder(plane_, 'error_lambda_mean', 'mcpg', offline)}",
-        f"With `cpg` they stay at {ladder(space_, 'error_lambda_mean', 'cpg', offline)}",
-        f"{gains['reduced']} times as long as those with offline PGA, certified ones {gains['certified']} times",
-        f"takes {span(1e3 * reduced['online_s'])} ms, a certified one {span(1e3 * certified['online_s'])} ms",
-        f"a high-fidelity solution {1e3 * table['hf_s'].min():.0f} to {1e3 * table['hf_s'].max():.0f} ms",
-        f"Snapshots are {shares[0]} of the offline seconds, {shares[1]} with certificates",
-        f"certificates take {certified['offline_certificate_s'].min():.0f} to "
-        f"{certified['offline_certificate_s'].max():.0f} s",
+    plane = cells("paper-hertz")
+    plane = plane[(plane["primal_tol"].isna() | (plane["primal_tol"] == 0.5)) & (plane["assembly"] == "full")]
+    meshes = [rows for _, rows in sorted(table.groupby("dim_V"), key=lambda one: one[0])]
+    columns = [of_models(rows[rows["assembly"] == "reduced"]) | of_costs(rows, page) for rows in meshes]
+    columns.append(of_models(plane))
+    for rows, smaller in ((table, True), (plane, False)):  # than the number of generators
+        added = rows[(rows["primal"] == OFFLINE) & (rows["dual"] == "mcpg") & (rows["pod_tol"] == rows["dual_tol"])]
+        assert ((added["enrichment"] < added["R"]) == smaller).all()
+    certified = table[table["assembly"] == "certified"]
+    return [
+        *(f"| {name} | {' | '.join(one.get(name, '–') for one in columns)} |" for name in columns[0]),
         f"{span(certified['effectivity_online_u_energy_median'])} for u and "
         f"{span(certified['effectivity_online_lambda_natural_median'])} for λ",
         f"up to {certified['effectivity_u_energy_median'].max():.2g} times the error of u",
-        f"from {pays['reduced']} queries on, with certificates from {pays['certified']} on",
-    )
+    ]
 
 
 @pytest.mark.parametrize(
