@@ -149,15 +149,15 @@ def shared(tmp_path_factory: pytest.TempPathFactory, artefacts: Path) -> Shared:
 
 
 @pytest.fixture(scope="session")
-def quick_run(command: str, shared: Shared) -> Path:
-    """Folder of one run of the study `quick`, timed in half the rounds, through the installed command; not drawn."""
+def quick_run(shared: Shared) -> Path:
+    """Folder of one run of the study `quick`, timed in half the rounds, through the command line; not drawn."""
 
     def run(folder: Path) -> None:
         study = Path(registry.registered(STUDY)["quick"].load()).read_text(encoding="utf-8")
         path = folder.with_suffix(".toml")
         path.write_text(f"timing_rounds = {QUICK_ROUNDS}\n{study}", encoding="utf-8")
-        arguments = [command, "run", str(path), "--out", str(folder), "--jobs", "2", "--no-figures"]
-        done = subprocess.run(arguments, cwd=folder.parent, capture_output=True, text=True, check=False)
+        arguments = ["run", str(path), "--out", str(folder), "--jobs", "2", "--no-figures"]
+        done = run_command(arguments, folder.parent, folder.with_suffix(".plugins"), 600.0)
         assert done.returncode == 0, done.stderr
         (folder / "printed.txt").write_text(done.stdout, encoding="utf-8")
 
