@@ -38,14 +38,17 @@ settings.load_profile("same")
 
 
 LONGEST = (
-    "test_executors", "test_figures", "test_docs", "test_run", "test_interruptions", "test_other_problems",
-    "test_c_source", "test_export", "test_scaffold", "test_site", "test_conformance", "test_bounds", "test_keys",
-    "test_correction", "test_machines", "test_compare", "test_text_from_others", "test_outputs_in_danger",
-    "test_findings", "test_supervisor", "test_example_rope", "test_invariance", "test_error_bounds",
-    "test_html_in_browser", "test_misbehaviour", "test_damaged_files", "test_packs", "test_as_published",
-    "test_other_codes", "test_own_classes", "test_faults",
+    "test_misbehaviour", "report/test_figures", "test_executors", "test_docs", "test_other_problems",
+    "test_example_rope", "test_hertz3d", "test_conformance", "test_machines", "test_html_in_browser",
+    "test_results_folder", "testing/test_figures", "test_run", "test_supervisor", "test_c_source", "test_scaffold",
+    "test_interruptions", "test_text_from_others", "test_error_bounds", "test_html", "test_site", "test_keys",
+    "test_paper_figures", "test_export", "test_invariance", "test_obstacle", "test_benchmarks", "test_any_text",
+    "test_compare", "test_findings", "test_damaged_files", "test_own_classes", "test_packs", "test_as_published",
+    "test_outputs_in_danger", "test_compilation", "test_correction", "test_faults", "test_formulations", "test_bounds",
+    "test_other_codes", "test_database", "test_end_to_end",
 )  # fmt: skip
-"""Files that take longest, though some have few tests: parallel workers begin with them, so that all end together."""
+"""Files that take longest, those first that wait more than they compute: parallel workers begin with them, so that all
+end together, and only one of the first needs the run of `quick`, for which others would wait."""
 
 
 TESTS = Path(__file__).resolve().parent
@@ -72,7 +75,11 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first; parallel workers come to the same order."""
     places = {name: place for place, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: (places.get(item.path.stem, len(places)), item.path))
+
+    def place(path: Path) -> int:
+        return min(places.get(name, len(places)) for name in (path.stem, f"{path.parent.name}/{path.stem}"))
+
+    items.sort(key=lambda item: (place(item.path), item.path))
 
 
 def pytest_collection_finish() -> None:
