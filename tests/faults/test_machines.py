@@ -51,18 +51,12 @@ def test_dask_without_open_files_ends_with_a_line(command: str, tmp_path: Path) 
     )
 
 
-@pytest.mark.parametrize(
-    "variables",
-    [
-        {"PYTHONOPTIMIZE": "1"},  # as `python -O`: classes were registered inside an assert
-        {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0", "LC_ALL": "C"},  # a log of a batch system: no δ, no …
-    ],
-)
 def test_a_run_does_not_depend_on_asserts_nor_on_an_encoding_that_has_all_letters(
-    command: str, plugins_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variables: dict[str, str]
+    command: str, plugins_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """As `python -O` (classes were registered inside an assert), for a log of a batch system, without δ and …."""
     write_study(tmp_path, wire_study())
-    for name, value in variables.items():
+    for name, value in {"PYTHONOPTIMIZE": "1", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0", "LC_ALL": "C"}.items():
         monkeypatch.setenv(name, value)
     with started([command, "run", "study.toml", "--jobs", "1", "--no-figures"], tmp_path, plugins_folder) as process:
         printed, errors = process.communicate(timeout=120)
