@@ -58,6 +58,20 @@ FAULTS = (
         ("tests/unit/results/costs/test_break_even.py",),
     ),
     Fault(
+        "other-runs-left-out",
+        "vibench/results/costs/paired_seconds.py",
+        "return None if within is None else within.of_other_runs()",
+        "return within",
+        ("tests/unit/results/costs/test_paired_seconds.py",),
+    ),
+    Fault(
+        "as-fast-whatever-the-rounds-say",
+        "vibench/results/costs/break_even.py",
+        "if all(abs(end) <= margin for end in ratio.interval(tail)):",
+        "if abs(ratio.mean) <= margin:",
+        ("tests/unit/results/costs/test_break_even.py",),
+    ),
+    Fault(
         "cell-after-cell",
         "vibench/rounds/timing_rounds.py",
         "number, within = divmod(item, self.competitors)\n",
