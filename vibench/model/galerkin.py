@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from types import MappingProxyType
@@ -17,6 +17,9 @@ from vibench.interfaces.strategies import Enrichment
 from vibench.interfaces.validation import checked_assembly, training_parameters
 from vibench.linalg.inner_product import orthonormal_range
 from vibench.reduction.supremizers import ContactCoordinates, projected_supremizers
+
+ROUND_OFF = 1e-12
+"""Orthonormal coordinates of supremizers of proportional B differ by less than this."""
 
 
 @dataclass(frozen=True)
@@ -124,6 +127,21 @@ class ReducedModel:
             return self.fixed_basis
         return np.hstack([self.fixed_basis, V.unwhiten(orthonormal_range(whitened, self._whitened_basis))])
 
+    def primal_bases(self, vis: Iterable[VariationalInequality]) -> Iterator[Array]:
+        """`primal_basis` at many parameters: one array where what is added agrees but for round-off.
+
+        That is so where B(mu) is one matrix times a positive number.
+        """
+        before: tuple[Array, Array] | None = None
+        for vi in vis:
+            if (contact := self._contact) is None:
+                yield self.primal_basis(vi)
+                continue
+            added = self._added(contact, vi)
+            if before is None or not _agree(added, before[0]):
+                before = added, np.hstack([self.fixed_basis, contact.vectors(added)])
+            yield before[1]
+
     def reconstruct(self, mu: Array, vi: VariationalInequality, x: Array) -> Array:  # noqa: ARG002
         """Vectors u = Z x (n×k) with coordinates x (N'×k) at mu, with `vi` assembled there."""
         if (contact := self._contact) is None:
@@ -161,6 +179,11 @@ class ReducedModel:
         """Galerkin projection of an assembled variational inequality."""
         Z = self.primal_basis(vi)
         return ReducedProblem(project(vi, Z, self.generators), partial(np.matmul, Z))
+
+
+def _agree(one: Array, other: Array) -> bool:
+    """Whether orthonormal columns are the same but for round-off."""
+    return one.shape == other.shape and float(np.max(np.abs(one - other), initial=0.0)) <= ROUND_OFF
 
 
 def projections(Z: Array, chi: Array) -> dict[str, Callable[[Any], Array]]:

@@ -220,7 +220,8 @@ def _projections(model: ReducedModel, mus: Array) -> list[VariationalInequality]
     """The Galerkin projections at every parameter; constant members are projected once on a fixed basis."""
     matrices, problem = assemblies(model.problem), model.problem
     if model.kind is Kind.PER_PARAMETER:
-        return [model.reduce(matrices.at(mu)).program for mu in mus]
+        bases = model.primal_bases(map(matrices.at, mus))
+        return [project(matrices.at(mu), Z, model.generators) for mu, Z in zip(mus, bases, strict=True)]
     Z, chi, programs = model.fixed_basis, model.generators, list[VariationalInequality]()
     for mu in mus:
         known = {name: getattr(programs[0], name) for name in problem.constant if programs}

@@ -127,3 +127,23 @@ def test_an_enrichment_is_what_its_kind_says() -> None:
         Enrichment(Kind.NONE, vectors=np.zeros((3, 1)))
     with pytest.raises(ValueError, match="per-parameter enrichment"):
         Enrichment(Kind.PER_PARAMETER)
+
+
+@pytest.mark.parametrize("resolution", [150, 400])
+def test_bases_at_many_parameters_are_those_of_each(resolution: int) -> None:
+    """Without a bulge B is one matrix times a number, and all share one array; with one each has its own."""
+    for bulge in (False, True):
+        problem = Obstacle(resolution=resolution, bulge=bulge)
+        mus = problem.parameters.lower + np.random.default_rng(1).random((9, len(problem.parameters.lower))) * (
+            problem.parameters.upper - problem.parameters.lower
+        )
+        vis = [problem.assemble(mu).copy() for mu in mus]
+        rng, V, W = np.random.default_rng(0), problem.V, problem.W
+        chi = rng.random((W.dim, 12))
+        cone = multipliers(chi / W.norm(chi), W)
+        online = Enrichment(Kind.PER_PARAMETER, eta=cone.span)
+        reduced = ReducedModel(problem, V.orthonormalise(rng.standard_normal((V.dim, 3))), online, cone.chi, cone.span)
+        found = list(reduced.primal_bases(iter(vis)))
+        for vi, Z in zip(vis, found, strict=True):
+            np.testing.assert_allclose(Z, reduced.primal_basis(vi), atol=1e-11 * np.abs(Z).max())
+        assert len({id(Z) for Z in found}) == (len(vis) if bulge else 1)
