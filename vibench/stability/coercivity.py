@@ -77,7 +77,10 @@ Estimate = Callable[[float], float]
 def coercivity_and_continuity(
     A: SparseMatrix, V: InnerProduct, solve: Solve | None = None
 ) -> tuple[Constant, Constant]:
-    """Lower bound of α and upper bound of γ_a for A (n×n); see `coercivity` and `continuity`."""
+    """Lower bound of α and upper bound of γ_a for A (n×n); see `coercivity` and `continuity`.
+
+    Raises a `NumericalError` if A is seen not to be symmetric positive definite.
+    """
     quotients = Quotients(A, V, solve)
     return coercivity(quotients), continuity(quotients)
 
@@ -106,7 +109,7 @@ class Quotients:
 
         Raises a `NumericalError` if A is seen not to be symmetric positive definite.
         """
-        found = self._both.smallest(accuracy) if self.V.dim > FEW and accuracy >= ACCURACY else None
+        found = self._both.smallest(accuracy) if self.V.dim > FEW else None
         return found if found is not None else self._inverse(accuracy)
 
     def highest(self, accuracy: float) -> float:
@@ -148,24 +151,6 @@ def continuity(quotients: Quotients) -> Constant:
         return is_proved_definite([c * V.matrix, -A], chosen)
 
     return moved(quotients.highest, 1.0, continuous)
-
-
-def constants_near(A: SparseMatrix, X: InnerProduct) -> tuple[Constant, Constant]:
-    """Bounds as those of `coercivity_and_continuity`, for a matrix A (n×n) that is near to X.
-
-    Both ends of a spectrum that is not wide come from solutions with X, which has a factorisation.
-    """
-    if X.dim <= FEW:
-        return coercivity_and_continuity(A, X)
-    chosen, quotients = implementation(X.factorisation), Quotients(A, X)
-    shift = quotients.highest(ROUGH)
-    reversed_ends = Lanczos(lambda v: shift * v - X.riesz(A @ v), X.matrix)
-    low = moved(
-        lambda accuracy: shift - reversed_ends.largest(accuracy),
-        -1.0,
-        lambda a: is_proved_definite([A, -a * X.matrix], chosen),
-    )
-    return (low, continuity(quotients)) if low.proved else coercivity_and_continuity(A, X)
 
 
 def operator_norm(M: SparseMatrix, X: InnerProduct) -> Constant:

@@ -29,7 +29,7 @@ from vibench.arrays import Array, SparseMatrix, digest
 from vibench.interfaces.problem import ParameterBox, Problem
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct
-from vibench.stability.coercivity import Constant, constants_near, operator_norm
+from vibench.stability.coercivity import Constant, coercivity_and_continuity, operator_norm
 
 ANCHORS = 81
 """Largest number of anchors; a grid has from 2 to 9 points per direction, or one point alone where 2^d are too many."""
@@ -119,7 +119,7 @@ def spectral_bounds(
         A = checked_assembly(problem, mu).A
         key = digest(A)
         if key not in found:
-            found[key] = constants_near(A, X)
+            found[key] = coercivity_and_continuity(A, X)
         constants.append(found[key])
     norms, coefficients = [operator_norm(term, X) for term in terms], np.column_stack([theta(mu) for mu in points])
     return SpectralBounds(

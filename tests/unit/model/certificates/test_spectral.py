@@ -109,7 +109,7 @@ def test_anchors_at_which_a_is_the_same_share_their_constants(monkeypatch: pytes
         calls.append(A)
         return Constant(0.5, True), Constant(2.0, True)
 
-    monkeypatch.setattr(spectral, "constants_near", counted)
+    monkeypatch.setattr(spectral, "coercivity_and_continuity", counted)
     A = problem.affine["A"]
     bounds = spectral.spectral_bounds(problem, problem.V, list(A.terms), A.coefficients, 0.0)
     assert len(bounds.alpha) == bounds.count**4
