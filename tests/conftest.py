@@ -18,7 +18,7 @@ import pytest
 import typer.main
 from forking import fork_workers, run_command, start_new_worker
 from hypothesis import settings
-from running import Changed, Main, Register, Shared, Vibench, execute
+from running import PATIENCE, Changed, Main, Register, Shared, Vibench, execute
 from samples import QUICK_ROUNDS, SMALL, install_fakes
 from threadpoolctl import threadpool_limits
 from unsynced import leave_syncing_to_the_system
@@ -164,7 +164,7 @@ def quick_run(shared: Shared) -> Path:
         path = folder.with_suffix(".toml")
         path.write_text(f"timing_rounds = {QUICK_ROUNDS}\n{study}", encoding="utf-8")
         arguments = ["run", str(path), "--out", str(folder), "--jobs", "2", "--no-figures"]
-        done = run_command(arguments, folder.parent, folder.with_suffix(".plugins"), 600.0)
+        done = run_command(arguments, folder.parent, folder.with_suffix(".plugins"), PATIENCE)
         assert done.returncode == 0, done.stderr
         (folder / "printed.txt").write_text(done.stdout, encoding="utf-8")
 
@@ -222,7 +222,7 @@ def vibench(plugins_folder: Path) -> Vibench:
     """Function that runs the command in a folder; it draws where a test is about figures."""
 
     def run(
-        folder: Path, *arguments: str, plugins: Path = plugins_folder, figures: bool = False, timeout: float = 120.0,
+        folder: Path, *arguments: str, plugins: Path = plugins_folder, figures: bool = False, timeout: float = PATIENCE,
         file_kib: int | None = None,
     ) -> subprocess.CompletedProcess[str]:  # fmt: skip
         plain = ["--no-figures"] if arguments[:1] == ("run",) and not figures else []

@@ -12,7 +12,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from forking import forked
-from running import Main, Vibench, read_until, rows, run_again, started, without_seconds, workers
+from running import PATIENCE, Main, Vibench, read_until, rows, run_again, started, without_seconds, workers
 from samples import ROUNDS, wire_study, write_study
 
 from vibench.results import tables
@@ -35,7 +35,7 @@ def test_a_run_that_was_stopped_goes_on_later(
     with started([command, *RUN], waiting, plugins_folder) as process:
         read_until(process, "[1/2] ok")
         os.killpg(process.pid, kill)  # the workers too, as a terminal does
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == code
     assert err == ""
     folder = waiting / "runs" / "wire"
@@ -64,7 +64,7 @@ def test_workers_do_not_see_ctrl_c(command: str, plugins_folder: Path, waiting: 
                 with contextlib.suppress(ProcessLookupError):
                     groups[worker] = os.getpgid(worker)
             time.sleep(0.005)
-        _, err = process.communicate(timeout=60)
+        _, err = process.communicate(timeout=PATIENCE)
     assert (process.returncode, err) == (0, "")
     assert groups
     assert all(group == worker for worker, group in groups.items())
@@ -78,7 +78,7 @@ def test_a_second_interrupt_changes_nothing(plugins_folder: Path, waiting: Path)
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGINT)
             time.sleep(0.01)
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=PATIENCE)
     assert (process.returncode, err) == (130, "")
     assert "interrupted: 1 cells have no row yet; the same command without --fresh resumes the run" in out
     assert len(rows(waiting / "runs" / "wire")) == 1
@@ -91,7 +91,7 @@ def test_a_run_that_is_terminated_leaves_no_worker_behind(command: str, plugins_
         left = set(workers(process.pid))
         assert left
         process.terminate()
-        process.wait(timeout=60)
+        process.wait(timeout=PATIENCE)
         for _ in range(600):  # a busy machine takes its time
             left = {worker for worker in left if Path(f"/proc/{worker}").exists()}
             if not left:
@@ -111,7 +111,7 @@ def test_two_runs_do_not_write_into_one_folder(plugins_folder: Path, vibench: Vi
         assert refused.returncode == 2
         assert "a run uses the artefacts in" in refused.stderr
         (waiting / "go on").touch()
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=PATIENCE)
     assert (process.returncode, err) == (0, "")
     assert "2 cells, 2 ok" in out
 
@@ -128,7 +128,7 @@ def test_a_run_folder_that_is_gone_ends_the_run_with_a_line(
         if swapped:
             shutil.copytree(waiting / "elsewhere", folder)
         (waiting / "go on").touch()
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1
     assert err.endswith(
         "removed or replaced during the run; the same command runs its cells again, with the artefacts that are "
@@ -173,7 +173,7 @@ def test_an_interrupt_among_the_imports_ends_the_command_with_a_line(
     (waiting / "go on").touch()  # a run that misses the signal comes to its end
     path = Path(os.pathsep.join(map(str, (waiting / "first", plugins_folder))))
     with started([command, "run", "study.toml", "--no-figures"], waiting, path) as process:
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=PATIENCE)
     assert (process.returncode, out, err) == (130, "", "vibench: interrupted\n")
     assert not (waiting / "runs").exists()
 

@@ -10,7 +10,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from running import Main, Register, Vibench, by_solver, refused, started
+from running import PATIENCE, Main, Register, Vibench, by_solver, refused, started
 from samples import wire_study, write_study
 
 from vibench import Enrichment, Kind, Offline, PrimalStrategy
@@ -59,7 +59,7 @@ def test_a_run_does_not_depend_on_asserts_nor_on_an_encoding_that_has_all_letter
     for name, value in {"PYTHONOPTIMIZE": "1", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0", "LC_ALL": "C"}.items():
         monkeypatch.setenv(name, value)
     with started([command, "run", "study.toml", "--jobs", "1", "--no-figures"], tmp_path, plugins_folder) as process:
-        printed, errors = process.communicate(timeout=120)
+        printed, errors = process.communicate(timeout=PATIENCE)
     assert (process.returncode, errors) == (0, "")
     assert "[1/1] ok: wire" in printed
     assert [row["status"] for row in by_solver(tmp_path / "runs" / "wire").values()] == ["ok"]
@@ -77,7 +77,7 @@ def test_folders_called_like_a_library_are_not_taken_for_it(
     with started(
         [command, "run", "study.toml", "--jobs", "1", "--no-figures"], tmp_path, Path(f"{plugins_folder}:")
     ) as process:
-        _, errors = process.communicate(timeout=120)
+        _, errors = process.communicate(timeout=PATIENCE)
     assert (process.returncode, errors) == (0, "")
     found = {solver: row["status"] for solver, row in by_solver(tmp_path / "runs" / "wire").items()}
     assert found == {"piqp": "ok", "careful": "ok", "daqp": "unavailable"}

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from running import seal
+from running import PATIENCE, seal
 
 from vibench.cli.output_commands import export_qps, write_report
 from vibench.cli.result_commands import replay_query, show
@@ -212,7 +212,7 @@ said("study.toml", lambda: read_study(str(folder / "study.toml")))
 
 def test_pipes_of_others_are_refused_wherever_a_file_is_opened(run: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", PIPES, str(run)], capture_output=True, text=True, check=False, timeout=120
+        [sys.executable, "-c", PIPES, str(run)], capture_output=True, text=True, check=False, timeout=PATIENCE
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [

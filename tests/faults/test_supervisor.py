@@ -18,6 +18,7 @@ from pathlib import Path
 import forking
 import pytest
 from fake_stages import InItems, OfAPlugin, Whole
+from running import PATIENCE
 
 from vibench.execution import supervisor
 from vibench.execution.jobs import Begun, Job
@@ -300,7 +301,7 @@ def test_a_keeper_that_is_closed_stops_at_once_and_leaves_nobody(watcher: Superv
         time.sleep(0.05)
     worker = int(diary.read_text().split()[0])
     watcher.close()
-    thread.join(timeout=60.0)
+    thread.join(timeout=PATIENCE)
     assert stopped == [True]
     with pytest.raises(ProcessLookupError):
         os.kill(worker, 0)

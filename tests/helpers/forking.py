@@ -186,7 +186,7 @@ def run_command(
     return subprocess.CompletedProcess(list(arguments), process.wait(), out, err)
 
 
-def run_script(script: Path, *arguments: str, timeout: float = 120.0) -> subprocess.CompletedProcess[str]:
+def run_script(script: Path, *arguments: str, timeout: float = 600.0) -> subprocess.CompletedProcess[str]:
     """Run a script of Python in its folder, as `subprocess.run` does."""
     program = {"main": "script", "arguments": [str(script), *arguments], "path": [str(script.parent), *paths()]}
     with _ended(ForkedCommand(program, script.parent)) as process:

@@ -23,6 +23,9 @@ from vibench.testing.checks import CheckResult, Verdict
 Vibench = Callable[..., "subprocess.CompletedProcess[str]"]
 """Runs the installed command in a folder."""
 
+PATIENCE = 600.0
+"""Seconds after which a process that does not end is taken to hang: a busy machine may take minutes for a short run."""
+
 Main = Callable[..., tuple[int, str, str]]
 """Calls the command in this process: exit code, what was printed, and errors."""
 

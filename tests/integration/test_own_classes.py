@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from forking import run_script
-from running import Main, refused
+from running import PATIENCE, Main, refused
 
 import vibench
 
@@ -80,7 +80,7 @@ if __name__ == "__main__":
 def interpreted(script: Path, out: str) -> subprocess.CompletedProcess[str]:
     """A script run by a new interpreter."""
     line = [sys.executable, script.name, out]
-    return subprocess.run(line, cwd=script.parent, capture_output=True, text=True, check=False, timeout=120)
+    return subprocess.run(line, cwd=script.parent, capture_output=True, text=True, check=False, timeout=PATIENCE)
 
 
 def run_source(

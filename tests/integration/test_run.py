@@ -178,7 +178,7 @@ def test_a_run_in_which_nothing_works_comes_to_its_end(vibench: Vibench, tmp_pat
 def test_a_problem_that_fails_first_leaves_the_one_beside_it_alone(vibench: Vibench, tmp_path: Path) -> None:
     """What the good problem waits for is not dropped when the stages of the bad one fail before it could begin."""
     study = wire_study(problem=["wire-raises", "wire"], primal=["decorrelated", "online-supremizers"])
-    done = vibench(tmp_path, "run", write_study(tmp_path, study), "--jobs", "1", timeout=60)
+    done = vibench(tmp_path, "run", write_study(tmp_path, study), "--jobs", "1")
     assert (done.returncode, done.stderr) == (0, "")
     found = {(row["problem"], row["primal"]): row["status"] for row in rows(tmp_path / "runs" / "wire")}
     statuses = {"wire-raises": "error", "wire": "ok"}

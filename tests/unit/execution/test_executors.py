@@ -25,7 +25,7 @@ from distributed.security import Security
 from distributed.utils import get_mp_context
 from fake_stages import KillsItsSupervisor, Whole
 from forking import forked, template
-from running import Vibench, assert_same_numbers, read_until
+from running import PATIENCE, Vibench, assert_same_numbers, read_until
 from samples import wire_study, write_study
 
 from vibench.errors import ExecutorError, RequestError
@@ -98,7 +98,7 @@ def test_a_cluster_somebody_has_is_used_and_left_alone(cluster: LocalCluster, tm
         try:
             assert workers.slots == 2
             stage = Whole(f"fine {k}")
-            assert isinstance(workers.submit(job(stage, tmp_path)).result(timeout=60), Done)
+            assert isinstance(workers.submit(job(stage, tmp_path)).result(timeout=PATIENCE), Done)
             assert Store(tmp_path).get(stage.key) is not None
             endless = workers.submit(job(Whole("sleep", str(tmp_path / f"diary {k}")), tmp_path))
             while not (tmp_path / f"diary {k}").exists():
@@ -109,7 +109,7 @@ def test_a_cluster_somebody_has_is_used_and_left_alone(cluster: LocalCluster, tm
         with pytest.raises(ProcessLookupError):  # nothing of ours goes on there
             os.kill(worker, 0)
         with pytest.raises(ExecutorError):
-            endless.result(timeout=60)
+            endless.result(timeout=PATIENCE)
     assert list(tmp_path.glob("*.part")) == []
 
 
@@ -119,7 +119,7 @@ def test_a_dask_worker_that_dies_is_survived(cluster: LocalCluster, tmp_path: Pa
         stages = [KillsItsSupervisor(str(tmp_path / f"diary {k}")) for k in range(2)]
         futures = [workers.submit(job(stage, tmp_path)) for stage in stages]
         for k, future in enumerate(futures):
-            assert isinstance(future.result(timeout=90), Done)
+            assert isinstance(future.result(timeout=PATIENCE), Done)
             assert len((tmp_path / f"diary {k}").read_text().splitlines()) >= 2  # it was begun again
     finally:
         workers.close()
@@ -193,7 +193,7 @@ def test_a_cluster_that_is_shut_down_stops_the_run_with_a_line_and_it_goes_on_wi
     with forked(options, tmp_path, plugins_folder) as process:
         read_until(process, "[1/2] ok")
         cluster.close()
-        _, err = process.communicate(timeout=90)
+        _, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1
     assert err.splitlines()[-1].startswith("vibench: the dask ")
     assert err.splitlines()[-1].endswith("run the same command again to continue")
@@ -258,17 +258,17 @@ def test_a_cluster_of_this_machine_answers_nobody_else(tmp_path: Path) -> None:
     try:
         address = urlsplit(workers._cluster.scheduler_address)
         assert (address.scheme, address.hostname) == ("tls", "127.0.0.1")
-        with socket.create_connection((address.hostname, address.port), timeout=60) as plain:
+        with socket.create_connection((address.hostname, address.port), timeout=PATIENCE) as plain:
             plain.sendall(bytes(64))
             assert answer(plain) == b""
         other = Security.temporary().get_connection_args("client")["ssl_context"]
         nobody = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         for context in (nobody, other):
             context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-            with socket.create_connection((address.hostname, address.port), timeout=60) as plain:
+            with socket.create_connection((address.hostname, address.port), timeout=PATIENCE) as plain:
                 assert refusal(context, plain)
         stage = Whole("fine")
-        assert isinstance(workers.submit(job(stage, tmp_path)).result(timeout=60), Done)
+        assert isinstance(workers.submit(job(stage, tmp_path)).result(timeout=PATIENCE), Done)
     finally:
         workers.close()
 

@@ -24,7 +24,8 @@ from vibench import testing
 from vibench.interfaces.strategies import DualStrategy
 from vibench.study.kinds import CHECKED
 from vibench.study.registry import create, find
-from vibench.testing.checks import Check, Conformance, Note, Verdict
+from vibench.testing import solvers
+from vibench.testing.checks import Check, Conformance, Doubt, Note, Verdict
 from vibench.testing.comparisons import JUMP, WIDTH, difference, find_jump
 
 Case = tuple[str, list[str]]
@@ -291,6 +292,27 @@ def test_a_call_that_takes_longer_than_the_limit_fails(check, monkeypatch: pytes
         testing.examine_primal: broken_strategies.Supremizing,
     }[check]
     assert "above the limit of 0 s" in failures(check(plugin, seconds=0.0))["time"]
+
+
+@pytest.mark.parametrize(
+    ("walls", "remarks"),
+    [
+        ((0.5,), [(Note, "takes 0.5 s")]),
+        ((5.0, 0.25), [(Note, "takes 0.25 s")]),  # the first time the machine was busy
+        ((5.0, 4.0), [(Doubt, "6 unknowns takes 4 s"), (Note, "takes 4 s")]),
+        ((500.0,), [(str, "takes 500 s, above the limit of 120 s"), (Note, "takes 5e+02 s")]),
+    ],
+)
+def test_a_solver_is_slow_that_takes_long_twice(
+    walls: tuple[float, ...], remarks: list[tuple[type, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter([reading for wall in walls for reading in (0.0, wall)])
+    monkeypatch.setattr(solvers.time, "perf_counter", lambda: next(clock))
+    found = list(solvers.SolverCase(lambda *_: None).duration())
+    assert [(type(remark), text in remark) for remark, (_, text) in zip(found, remarks, strict=True)] == [
+        (kind, True) for kind, _ in remarks
+    ]
+    assert next(clock, None) is None
 
 
 @dataclass

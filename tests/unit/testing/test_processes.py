@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from broken_variants import Bar
 from fake_plugins import Wire
-from running import Main
+from running import PATIENCE, Main
 
 from vibench import testing
 from vibench.testing.case import LEAST_POINTS, MOST_POINTS, ProblemCase
@@ -100,17 +100,17 @@ def fails() -> None:
 
 
 def test_another_process_has_other_hashes() -> None:
-    there = call_in_other_process(process, seconds=60.0)
+    there = call_in_other_process(process, seconds=PATIENCE)
     assert there[0] != os.getpid()
     assert there[1] != hash("a text")
-    assert call_in_other_process(process, seconds=60.0) == there
+    assert call_in_other_process(process, seconds=PATIENCE) == there
 
 
 def test_what_fails_there_is_told_from_what_cannot_be_sent() -> None:
     with pytest.raises(ConformanceError, match="in another process it fails: ArithmeticError: the wire snapped"):
-        call_in_other_process(fails, seconds=60.0)
+        call_in_other_process(fails, seconds=PATIENCE)
     with pytest.raises(NotImportableError):
-        call_in_other_process(lambda: None, seconds=60.0)
+        call_in_other_process(lambda: None, seconds=PATIENCE)
 
     class Local(Wire):
         pass
@@ -124,4 +124,4 @@ def test_a_plugin_in_a_module_that_only_this_process_has_is_not_compared() -> No
     code: dict[str, Any] = {"__name__": "made_up", "Wire": Wire}
     exec("class Mine(Wire):\n    pass", code)
     with pytest.raises(NotImportableError):
-        call_in_other_process(code["Mine"], seconds=60.0)
+        call_in_other_process(code["Mine"], seconds=PATIENCE)
