@@ -5,7 +5,8 @@ Usage: python tests/benchmarks/exponents.py [RESOLUTION...]
 For every resolution, "coarse", "medium", "paper" and "fine" by default, CPU seconds of one thread of
 
     problem       the mesh, the terms of A, B and g, and a factor of X_V
-    set-up        A factorised with its Schur complement on the contact unknowns
+    set-up        A factorised with its Schur complement on the contact unknowns; with as many of these as at "fine" the
+                  complement is that of the zone in contact, and waits for a solution
     solution      assembly, set-up and active sets at another parameter
     A             factors of A there, for constants and bounds
     α, γ, β_A     the constants there, proved
