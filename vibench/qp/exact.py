@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
+from scipy.linalg.lapack import dtrtrs
 from scipy.optimize import nnls
 
 from vibench.arrays import Array, Indices, Mask
@@ -79,6 +80,8 @@ def _exact_solution(program: VariationalInequality) -> ExactSolution | None:
     active, seen = whitened.least_distance_set(), set[bytes]()
     for _ in range(MAX_ITERATIONS):
         x, alpha = whitened.solve_active(active)
+        if not (np.all(np.isfinite(x)) and np.all(np.isfinite(alpha))):  # something has overflowed
+            return None
         # An excess is compared with the terms that it is the difference of, not with g alone, which may be small.
         excess, terms = program.B @ x - program.g, np.abs(program.B) @ np.abs(x) + np.abs(program.g)
         violated, pulling = excess > ROUND_OFF * terms + whitened.noise, alpha < -ROUND_OFF * size(alpha)
@@ -161,11 +164,12 @@ class _Whitened:
     def __init__(self, program: VariationalInequality, L: Array) -> None:
         self._program, self._L, self._rows = program, L, row_norms(program.B)
         self._C, self._load = self._whiten((program.B / self._rows[:, None]).T), self._whiten(program.f)
+        self._factors: tuple[bytes, tuple[Indices, Array, Array]] | None = None
         # What is left of the load where forces balance it: all there is of x where constraints hold it at zero.
         self.noise = CANCELLED * self._rows * np.linalg.norm(self._C, axis=0) * np.linalg.norm(self._load)
 
     def _whiten(self, right: Array) -> Array:
-        return np.asarray(scipy.linalg.solve_triangular(self._L, right, lower=True, check_finite=False))
+        return _solve_triangular(self._L, right, lower=True)
 
     def least_distance_set(self) -> Mask:
         """Constraints that are active in min ‖z‖ subject to Cᵀz ≥ d; none where nonnegative least squares fails."""
@@ -180,7 +184,16 @@ class _Whitened:
         return np.asarray(weights > 0.0)
 
     def factorised(self, chosen: Mask) -> tuple[Indices, Array, Array]:
-        """A largest independent set of constraints, and the QR factors of their columns of C."""
+        """A largest independent set of constraints, and the QR factors of their columns of C.
+
+        The last ones are kept: where no other constraint is tight, those that are active are asked for twice.
+        """
+        key = chosen.tobytes()
+        if self._factors is None or self._factors[0] != key:
+            self._factors = key, self._factorised(chosen)
+        return self._factors[1]
+
+    def _factorised(self, chosen: Mask) -> tuple[Indices, Array, Array]:
         columns = np.flatnonzero(chosen)
         if not len(columns):  # LAPACK does not factorise matrices without columns
             return columns, np.zeros((len(self._C), 0)), np.zeros((0, 0))
@@ -197,7 +210,20 @@ class _Whitened:
         for _ in range(2):  # the second time for the residual of the first
             load = self._whiten(program.f - program.A @ x - program.B.T @ alpha)
             right = r.T @ (q.T @ load) - (program.g[kept] / self._rows[kept] - B @ x)
-            y = scipy.linalg.solve_triangular(r, right, trans="T")
-            x = x + scipy.linalg.solve_triangular(self._L, load - q @ y, lower=True, trans="T")
-            alpha[kept] += scipy.linalg.solve_triangular(r, y) / self._rows[kept]
+            y = _solve_triangular(r, right, transposed=True)
+            x = x + _solve_triangular(self._L, load - q @ y, lower=True, transposed=True)
+            alpha[kept] += _solve_triangular(r, y) / self._rows[kept]
         return x, alpha
+
+
+def _solve_triangular(factor: Array, right: Array, *, lower: bool = False, transposed: bool = False) -> Array:
+    """LAPACK's solution with a triangular matrix (k×k), without the checks that take longer in SciPy's function.
+
+    Raises a `LinAlgError` if the matrix is exactly singular.
+    """
+    if not right.size:
+        return np.zeros_like(right)
+    solved, singular = dtrtrs(factor.T, right, lower=not lower, trans=not transposed)
+    if singular:
+        raise np.linalg.LinAlgError("a triangular matrix is singular")
+    return np.asarray(solved)
