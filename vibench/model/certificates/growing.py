@@ -8,13 +8,19 @@ from typing import TypeVar
 
 import numpy as np
 
-from vibench.arrays import Array
-from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolution, HighFidelitySolver
+from vibench.arrays import Array, Mask
+from vibench.highfidelity.active_set import (
+    ActiveSetSolution,
+    HighFidelitySolution,
+    HighFidelitySolver,
+    solve_unverified,
+)  # fmt: skip
+from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Trainer
 from vibench.interfaces.validation import ReferenceAssembly, checked_assembly
 from vibench.linalg.inner_product import orthonormal_range
-from vibench.model.certificates.contact_estimates import ContactEstimates
+from vibench.model.certificates.contact_estimates import ContactEstimates, Estimate
 from vibench.model.error_bounds import find_correction, residual, terms
 from vibench.model.errors import Energy, rieszes
 from vibench.model.galerkin import project
@@ -27,6 +33,20 @@ from vibench.reduction.supremizers import supremizers
 from vibench.timing import NO_TIME, Seconds, timed
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Bounded:
+    """What a bound at mu (d,) leaves to a solution there: where to start, and what was assembled and condensed.
+
+    The multiplier of the correction, which presses rows (m,), is that of the solution but for the residual.
+    """
+
+    mu: Array
+    vi: VariationalInequality
+    stiffness: CondensedStiffness
+    pressed: Mask
+
 
 IN_CONE = 1e-6
 """A multiplier is in the cone where less than this share of it is outside: it may be what a solver left."""
@@ -55,6 +75,8 @@ class GrowingModel:
         self._basis = np.zeros((problem.V.dim, 0))
         self.generators = np.zeros((problem.W.dim, 0))
         self._estimates: ContactEstimates | None = None
+        self._last: tuple[bytes, Estimate] | None = None
+        self._bounded: Bounded | None = None
 
     def add(self, vi: VariationalInequality, solution: HighFidelitySolution) -> str:
         """Add the solution of `vi`; returns what was less accurate than usual, "" if nothing."""
@@ -71,6 +93,7 @@ class GrowingModel:
             self._basis = np.hstack([self._basis, V.unwhiten(more)])
         if self._estimates is None and ContactEstimates.supports(self._problem):
             self._estimates = ContactEstimates(self._problem, vi, self._solver.condensed(vi))
+        self._last = self._bounded = None
         if self._estimates is not None:
             self._estimates.grow(vi, self._basis[:, size:], self.generators)
         return note
@@ -87,7 +110,19 @@ class GrowingModel:
 
     def estimate(self, mu: Array) -> float | None:
         """What `bound` is about, at the cost of the contact; `None` where the problem does not allow it."""
-        return None if self._estimates is None else self._estimates.at(mu)
+        return None if self._estimates is None else self._estimated(self._estimates, mu).value
+
+    def _estimated(self, estimates: ContactEstimates, mu: Array) -> Estimate:
+        """The estimate at mu (d,); the last one is kept, which is what a bound is asked for next."""
+        key = mu.tobytes()
+        if self._last is None or self._last[0] != key:
+            self._bounded = None  # a problem may assemble into the arrays of that
+            self._last = key, estimates.at(mu)
+        return self._last[1]
+
+    def bounded(self, mu: Array) -> Bounded | None:
+        """What the last bound leaves to a solution at mu (d,), unless it was at another parameter."""
+        return self._bounded if self._bounded is not None and np.array_equal(self._bounded.mu, mu) else None
 
     def bound(self, mu: Array) -> float:
         """The largest of two bounds and an estimate at mu (d,), relative to the reduced solution; infinite without one.
@@ -95,10 +130,13 @@ class GrowingModel:
         The bound of u is in the energy norm over that of u_N, that of λ in the norm of A⁻¹ over that of Bᵀλ_N. Neither
         follows the error of λ in W, in which contact pressures are compared: the same λ − λ_N is smaller in the norm of
         A⁻¹ the faster it oscillates. Its estimate is ‖ν − λ_N‖_W / ‖λ_N‖_W, ν the multiplier of the correction that the
-        bounds need anyway.
+        bounds need anyway. Where A and f are constant the estimate is all that, with a factorisation of A, too.
         """
-        vi = checked_assembly(self._problem, mu)
-        solved = self.solution(vi)
+        if self._estimates is not None and self._estimates.may_be_bounds:
+            estimated = self._estimated(self._estimates, mu)
+            if estimated.is_bound:
+                return estimated.value
+        vi, solved = self._assembled(mu)
         if solved is None:
             return float("inf")
         u, lam = solved
@@ -106,6 +144,7 @@ class GrowingModel:
         corrected = find_correction(vi, energy, u, lam)
         if corrected is None:
             return float("inf")
+        self._bounded = Bounded(mu, vi, energy.stiffness, corrected.nu > 0.0)
         (riesz,) = rieszes([energy], [residual(vi, u, lam)])
         of_pair = terms(corrected, u, lam, riesz)
         of_u = ratio(of_pair.primal, energy.norm(u))
@@ -114,6 +153,14 @@ class GrowingModel:
             return of_u
         in_W = ratio(float(W.norm(corrected.nu - lam)), float(W.norm(lam)))
         return max(of_u, ratio(of_pair.dual, pressed), in_W)
+
+    def _assembled(self, mu: Array) -> tuple[VariationalInequality, tuple[Array, Array] | None]:
+        """The inequality at mu (d,) and its reduced solution: what an estimate just there has left, or made anew."""
+        last, self._last, self._bounded = self._last, None, None
+        if last is not None and last[0] == mu.tobytes() and (reduced := last[1].reduced) is not None:
+            return reduced.vi, (self._basis @ reduced.z, reduced.lam)
+        vi = checked_assembly(self._problem, mu)
+        return vi, self.solution(vi)
 
 
 @dataclass(frozen=True)
@@ -135,6 +182,9 @@ class Solved:
 class GrowingTrainer(Trainer):
     """High-fidelity solutions, and bounds of the model that they make, with the seconds of both.
 
+    A solution where a bound was computed last starts from what that has left: its assembly and its factors of A are
+    among the seconds of bounds.
+
     Attributes
     ----------
     solved
@@ -154,8 +204,11 @@ class GrowingTrainer(Trainer):
     def solve(self, mu: Array, bound: float = float("nan")) -> None:
         """Assemble, solve, and let the model grow."""
         mu = np.array(mu, float)
+        bounded = self._model.bounded(mu)
 
         def work() -> tuple[VariationalInequality, ActiveSetSolution]:
+            if bounded is not None:
+                return bounded.vi, solve_unverified(bounded.vi, bounded.stiffness, bounded.pressed)
             vi = checked_assembly(self._problem, mu)
             return vi, self._solver.solve_assembled(mu, vi)
 

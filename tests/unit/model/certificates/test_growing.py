@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numerics import Tied, Varying
 
-from vibench import create, project_on_cone
+from vibench import Array, create, project_on_cone
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
-from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.problem import Contact, Problem, VariationalInequality
 from vibench.interfaces.validation import ReferenceAssembly
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.model.certificates import contact_estimates
@@ -79,6 +79,72 @@ def test_estimates_are_about_what_bounds_are(name: str, resolution: int, share: 
         model.add(vi, solver.solve_assembled(mu, vi))
     for mu in problem.parameters.sample(10, 2):
         assert model.estimate(mu) == pytest.approx(model.bound(mu), rel=share)
+
+
+def test_estimates_are_bounds_where_no_stiffness_and_no_load_vary_unless_round_off_decides() -> None:
+    """The cost of the mesh is paid for residuals of which the sum of squares says nothing."""
+    problem = create("problem", "hertz", {"resolution": 300})
+    solver = HighFidelitySolver(problem)
+    model, solved = GrowingModel(problem, solver), problem.parameters.sample(4, 1)
+    for mu in solved:
+        vi = problem.assemble(mu).copy()
+        model.add(vi, solver.solve_assembled(mu, vi))
+    assert model._estimates is not None
+    unseen = problem.parameters.sample(20, 2)
+    cheap, is_bound = [model.bound(mu) for mu in unseen], [model._estimates.at(mu).is_bound for mu in unseen]
+    assert np.mean(is_bound) > 0.8
+    assert not any(model._estimates.at(mu).is_bound for mu in solved)
+    assert all(model.bound(mu) < 1e-5 for mu in solved)
+    model._estimates.may_be_bounds, model._last = False, None
+    np.testing.assert_allclose(cheap, [model.bound(mu) for mu in unseen], rtol=1e-6)
+
+
+class Rewriting(Problem):
+    """A problem that writes every assembly into the arrays of the first one, as a plugin may."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._inner, self._arrays = problem, problem.assemble(problem.training_set()[0]).copy()
+        self.parameters, self.V, self.W = problem.parameters, problem.V, problem.W
+
+    contact_dofs = property(lambda self: self._inner.contact_dofs)
+
+    def contact(self, mu: Array) -> Contact | None:
+        return self._inner.contact(mu)
+
+    def training_set(self) -> Array:
+        return self._inner.training_set()
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        new, old = self._inner.assemble(mu), self._arrays
+        old.A.data[:], old.B.data[:], old.f[:], old.g[:] = new.A.data, new.B.data, new.f, new.g
+        return old
+
+
+@pytest.mark.parametrize("rewritten", [False, True])
+def test_a_solution_starts_from_what_a_bound_has_left_only_at_its_parameter(rewritten: bool) -> None:
+    obstacle = create("problem", "obstacle", {"resolution": 160})
+    problem = Rewriting(obstacle) if rewritten else obstacle
+    trainer = GrowingTrainer(problem, ReferenceAssembly(problem, problem.assemble(problem.training_set()[0])))
+    first, *others, last = problem.parameters.sample(8, 5)
+    trainer.solve(first)
+    for mu in others:
+        estimate, bound = trainer.estimate(mu), trainer.bound(mu)
+        assert estimate == pytest.approx(bound, rel=0.3)
+        trainer.solve(mu)
+    fresh = GrowingModel(problem, HighFidelitySolver(problem))
+    for one in trainer.solved:
+        fresh.add(obstacle.assemble(one.mu), one.solution)
+    bound = trainer.bound(last)
+    assert bound == pytest.approx(fresh.bound(last), rel=1e-6)  # the one with what an estimate left, one without
+    trainer.estimate(last)
+    assert trainer.bound(last) == pytest.approx(bound, rel=1e-6)
+    trainer.estimate(others[0])  # another assembly
+    trainer.solve(last)
+    solver = HighFidelitySolver(obstacle)
+    for one in trainer.solved:
+        exact = solver.solve(one.mu)
+        np.testing.assert_allclose(one.solution.u, exact.u, atol=1e-9 * np.abs(exact.u).max())
+        np.testing.assert_allclose(one.solution.lam, exact.lam, atol=1e-8 * np.abs(exact.lam).max())
 
 
 @pytest.mark.parametrize("kept", [1000, 2])
