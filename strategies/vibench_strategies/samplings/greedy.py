@@ -7,7 +7,7 @@ from typing import Annotated
 from annotated_types import Ge, Gt, Le, Lt
 
 from vibench import AdaptiveSampling, Array, ParameterBox, Trainer
-from vibench_strategies.samplings.candidates import nested_candidates
+from vibench_strategies.samplings.candidates import AMONG, Candidates
 
 WEAK = 0.8
 """The worst bound is at least this share of all known ones, most of which are those of earlier models."""
@@ -18,9 +18,10 @@ class Greedy(AdaptiveSampling):
 
     Candidates are ranked by estimates; what is solved, and what ends it, has been bounded.
     The first candidates are grids: multipliers of nested contacts on one axis of the box leave thin differences, of
-    which cones are made. `drawn` new candidates are evaluated for every solution; it ends when all known bounds, and
-    those of `checked` random candidates in a row, meet the tolerance: with 95 % confidence fewer than 3 in `checked` do
-    not, or with `most`.
+    which cones are made. `drawn` new candidates are evaluated for every solution, those that are farthest from all
+    solutions and from each other among `AMONG` times as many: bounds grow away from solutions. It ends when all known
+    bounds, and those of `checked` random candidates in a row, meet the tolerance: with 95 % confidence fewer than 3 in
+    `checked` do not, or with `most`.
     """
 
     def __init__(
@@ -28,7 +29,7 @@ class Greedy(AdaptiveSampling):
         candidates: Annotated[int, Ge(2), Le(1_000_000)],
         tolerance: Annotated[float, Gt(0.0), Lt(1.0)],
         seed: Annotated[int, Ge(0), Lt(2**63)] = 0,
-        drawn: Annotated[int, Ge(1)] = 8,
+        drawn: Annotated[int, Ge(1)] = 4,
         checked: Annotated[int, Ge(1)] = 100,
         most: Annotated[int, Ge(1)] = 1000,
     ) -> None:
@@ -37,13 +38,12 @@ class Greedy(AdaptiveSampling):
 
     def parameters(self, box: ParameterBox) -> Array:
         """The candidates: the middle of the box, grids, each in at most half of them, then the sequence."""
-        return nested_candidates(box, self.candidates, self.seed)[0]
+        return Candidates(box, self.candidates, self.seed).mus
 
     def train(self, box: ParameterBox, trainer: Trainer) -> None:
         """Solve in the middle of the box, then where the bound is largest."""
-        mus, (coarse, fixed), unseen = nested_candidates(box, self.candidates, self.seed)
-
-        bounds = dict[int, float]()
+        candidates = Candidates(box, self.candidates, self.seed)
+        mus, solved, bounds = candidates.mus, [0], dict[int, float]()
 
         def judge(k: int) -> bool:
             """Take the estimate if it is above the tolerance; whether it is a bound, which alone can meet that."""
@@ -52,20 +52,26 @@ class Greedy(AdaptiveSampling):
             bounds[k] = trainer.bound(mus[k]) if estimate is None or is_bound else estimate
             return is_bound
 
+        def far(count: int) -> list[int]:
+            return candidates.draw_far(count, AMONG * self.drawn, solved)
+
         trainer.solve(mus[0])
-        solved, passed, draws = 1, 0, coarse + self.drawn
-        while solved < self.most and (bounds or unseen):
-            for k in [unseen.pop() for _ in range(min(draws, len(unseen)))]:
+        passed, is_random, new = 0, False, far(candidates.coarse + self.drawn)
+        while len(solved) < self.most:
+            for k in new:
                 judge(k)
-                passed = 0 if bounds[k] > self.tolerance else passed + int(k >= fixed)
-            k, draws = max(bounds, key=bounds.__getitem__), 0
+                passed = 0 if bounds[k] > self.tolerance else passed + int(is_random)
+            if not bounds:
+                return
+            k, new = max(bounds, key=bounds.__getitem__), []
             is_bound = judge(k)  # of the present model
             if bounds[k] > self.tolerance and bounds[k] >= WEAK * max(bounds.values()):
                 bounds[k] = bounds[k] if is_bound else trainer.bound(mus[k])
                 if bounds[k] > self.tolerance:
                     trainer.solve(mus[k], bounds.pop(k))
-                    solved, passed, draws = solved + 1, 0, self.drawn
+                    solved.append(k)
+                    passed, is_random, new = 0, False, far(self.drawn)
             elif max(bounds.values()) <= self.tolerance:
-                if passed >= self.checked or not unseen:
+                if passed >= self.checked or not candidates:
                     return
-                draws = self.drawn
+                new, is_random = candidates.draw(self.drawn)

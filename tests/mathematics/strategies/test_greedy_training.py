@@ -15,6 +15,7 @@ from vibench.stages.offline import ConstraintMatrices, PODStage
 from vibench.stages.snapshots import gather, parameters_in, solution_stages
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
+from vibench_strategies.samplings.candidates import Candidates
 
 BOX = ParameterBox(("x", "y"), np.zeros(2), np.array([2.0, 1.0]), ("1", "1"))
 
@@ -118,6 +119,42 @@ def test_the_coarse_grid_comes_first_and_the_finer_one_before_random_candidates(
 def test_it_ends_where_every_candidate_is_solved(candidates: int) -> None:
     _, trainer = trained(candidates=candidates, tolerance=1e-9)
     assert len(np.unique(trainer.solved, axis=0)) == len(trainer.solved) == candidates
+
+
+def test_candidates_are_drawn_once_and_are_the_farthest_of_their_turn() -> None:
+    candidates = Candidates(BOX, 90, 3)
+    places, known, seen = BOX.to_unit(candidates.mus), [0], list[int]()
+    assert candidates.coarse == 8
+    while candidates:
+        before = [list(part) for part in candidates._unseen]
+        if len(seen) % 3 == 2:
+            drawn, random = candidates.draw(2)
+            assert random == (not any(before[:-1]))
+        else:
+            drawn = candidates.draw_far(3, 16, known)
+            for n, k in enumerate(drawn):
+                part = next(filter(None, before))
+                away = [min(np.linalg.norm(places[j] - places[i]) for i in [*known, *drawn[:n]]) for j in part[-16:]]
+                assert k == part[-16:][int(np.argmax(away))]
+                part.remove(k)
+        seen += drawn
+        known.append(drawn[-1])
+    assert sorted(seen) == list(range(1, 90))
+    assert candidates.draw_far(3, 16, known) == []
+
+
+def test_what_ends_the_training_is_random() -> None:
+    """Candidates far from solutions are not counted: those that are drawn at random say how many others miss it."""
+    _, trainer = trained(candidates=2000, tolerance=0.35, checked=60)
+    places = [tuple(mu) for mu, _ in trainer.asked]
+    random = [place for place in dict.fromkeys(places) if places.count(place) == 1][-60:]
+    assert len(random) == 60
+    strategy = create("sampling strategy", "greedy", {"candidates": 2000, "tolerance": 0.35})
+    assert isinstance(strategy, AdaptiveSampling)
+    all_of_them = strategy.parameters(BOX)
+    mean = np.linalg.norm(all_of_them[:, None] - np.array(trainer.solved), axis=2).min(axis=1)
+    asked = np.linalg.norm(np.array(random)[:, None] - np.array(trainer.solved), axis=2).min(axis=1)
+    assert abs(asked.mean() - mean.mean()) < 4.0 * mean.std() / np.sqrt(60)
 
 
 PROBLEM = Plugin("problem", "obstacle", '{"resolution": 160}', "test")
