@@ -196,7 +196,9 @@ class GrowingTrainer(Trainer):
     """
 
     def __init__(self, problem: Problem, reference: ReferenceAssembly) -> None:
-        self._problem, self._reference, self._solver = problem, reference, HighFidelitySolver(problem)
+        self._problem, self._reference = problem, reference
+        # one condensation serves a bound and the solution there
+        self._solver = HighFidelitySolver(problem, condensing=True)
         self._model, self._evaluated = GrowingModel(problem, self._solver), 0
         self.solved: list[Solved] = []
         self.setup = self.selecting = NO_TIME
