@@ -97,9 +97,12 @@ class ContactEstimates:
         dofs = problem.contact_dofs
         return problem.has_contact and dofs is not None and len(dofs) <= MOST_CONTACT
 
-    def grow(self, vi: VariationalInequality, new: Array, generators: Array) -> None:
-        """Take the model with new basis vectors (n×k) and all of its generators (m×R), after a solution of `vi`."""
-        self._basis, self._generators = np.hstack([self._basis, new]), generators
+    def grow(self, vi: VariationalInequality, basis: Array, generators: Array) -> None:
+        """Take the basis Φ (n×d) and the generators (m×R) of the model, after it has taken a solution of `vi`.
+
+        Φ begins with what it was before.
+        """
+        self._basis, self._generators = basis, generators
         self._at_contact = np.ascontiguousarray(self._basis[self._dofs])
         self._sizes = np.linalg.norm(self._at_contact, axis=1)
         self._stiffness, self._loads = self._grown(self._stiffness, self._A, self._f)

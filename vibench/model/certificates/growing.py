@@ -80,7 +80,7 @@ class GrowingModel:
 
     def add(self, vi: VariationalInequality, solution: HighFidelitySolution) -> str:
         """Add the solution of `vi`; returns what was less accurate than usual, "" if nothing."""
-        V, W, size = self._problem.V, self._problem.W, self._basis.shape[1]
+        V, W, size = self._problem.V, self._problem.W, self._whitened.shape[1]
         part, note = part_in_cone(solution.lam, self.generators, W)
         new, rest = [solution.u[:, None]], solution.lam - part
         norm = float(W.norm(rest))
@@ -90,12 +90,12 @@ class GrowingModel:
         for column in new:  # one after the other: u must not lose to its supremizer
             more = orthonormal_range(V.whiten(column), self._whitened)
             self._whitened = np.hstack([self._whitened, more])
-            self._basis = np.hstack([self._basis, V.unwhiten(more)])
+        self._basis = np.hstack([self._basis, V.unwhiten(self._whitened[:, size:])])
         if self._estimates is None and ContactEstimates.supports(self._problem):
             self._estimates = ContactEstimates(self._problem, vi, self._solver.condensed(vi))
         self._last = self._bounded = None
         if self._estimates is not None:
-            self._estimates.grow(vi, self._basis[:, size:], self.generators)
+            self._estimates.grow(vi, self._basis, self.generators)
         return note
 
     def solution(self, vi: VariationalInequality) -> tuple[Array, Array] | None:
