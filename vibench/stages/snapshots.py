@@ -27,11 +27,14 @@ from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes
 from vibench.study.kinds import PROBLEM
-from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_of, parameters_of
+from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_edges, chunk_of
 from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, SLOW, Seconds, median_of, timed
 
 T = TypeVar("T")
+
+TRAINED = 100
+"""Number of training parameters that is expected of a problem, which is not built to ask for its own."""
 
 VALIDATED = 3.0
 """As many training solutions take about as long as a validation solution, its repetitions and its error bound."""
@@ -95,8 +98,8 @@ class SnapshotStage(Stage):
     @property
     def effort(self) -> float:
         """Those of the chunk."""
-        each = VALIDATED if self.parameters.role == "validation" else 1.0
-        return each * len(chunk_of(parameters_of(self.problem, self.parameters), self.chunk)[1])
+        first, end = chunk_edges(self.parameters.count or TRAINED)[self.chunk : self.chunk + 2]
+        return (end - first) * (VALIDATED if self.parameters.role == "validation" else 1.0)
 
     @property
     def axes(self) -> Axes:

@@ -27,7 +27,7 @@ from vibench.study.parameter_sets import CHUNKS, OWN_TRAINING
 from vibench.study.plugin import Plugin
 from vibench.terminal.progress import ALIKE, DrawingDisplay, ProgressDisplay, TimeLeft, duration
 
-PROBLEM = Plugin("problem", "radial-obstacle", '{"resolution": 200}', "")
+PROBLEM = Plugin("problem", "p", "{}", "")  # there is none: nothing is built to estimate seconds
 PODS: list[Stage] = [PODStage(PROBLEM, Stop(size=k)) for k in range(1, 5)]
 CHUNK: list[Stage] = [SnapshotStage(PROBLEM, OWN_TRAINING, chunk) for chunk in range(CHUNKS)]
 
@@ -80,7 +80,7 @@ def test_a_sort_never_seen_takes_as_long_as_its_number_of_high_fidelity_solution
 
 
 def test_a_problem_never_seen_is_taken_to_be_as_quick_as_the_others() -> None:
-    finer = Plugin("problem", "radial-obstacle", '{"resolution": 400}', "")
+    finer = Plugin("problem", "q", "{}", "")
     others: list[Stage] = [SnapshotStage(finer, OWN_TRAINING, chunk) for chunk in range(CHUNKS)]
     left = TimeLeft([*CHUNK, *others], 1)
     for chunk in CHUNK:
