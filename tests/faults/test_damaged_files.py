@@ -256,7 +256,7 @@ WRONG = {
     ("cells", "online_s", "x'00ff'"): "a number",
     ("cells", "reason", "x'00ff'"): "a text",
     ("cells", "versions", "'[1, 2]'"): "a JSON object",
-    ("thresholds", "meaning", "'sometimes'"): "one of from, until, never, at once, undecided",
+    ("thresholds", "meaning", "'sometimes'"): "one of from, until, never, at once, as fast, undecided",
 }
 
 

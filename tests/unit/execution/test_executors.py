@@ -100,12 +100,13 @@ def test_a_cluster_somebody_has_is_used_and_left_alone(cluster: LocalCluster, tm
             stage = Whole(f"fine {k}")
             assert isinstance(workers.submit(job(stage, tmp_path)).result(timeout=PATIENCE), Done)
             assert Store(tmp_path).get(stage.key) is not None
-            endless = workers.submit(job(Whole("sleep", str(tmp_path / f"diary {k}")), tmp_path))
-            while not (tmp_path / f"diary {k}").exists():
+            diary = tmp_path / f"diary {k}"
+            endless = workers.submit(job(Whole("sleep", str(diary)), tmp_path))
+            while not diary.exists() or not diary.read_text():  # it is there before it is written
                 time.sleep(0.05)
         finally:
             workers.close()
-        worker = int((tmp_path / f"diary {k}").read_text().split()[0])
+        worker = int(diary.read_text().split()[0])
         with pytest.raises(ProcessLookupError):  # nothing of ours goes on there
             os.kill(worker, 0)
         with pytest.raises(ExecutorError):
