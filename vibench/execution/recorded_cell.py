@@ -27,7 +27,7 @@ from vibench.results.selection import key_of
 from vibench.results.sqlite.reading import read_meta, read_rows, study_of
 from vibench.results.tables import results_file
 from vibench.stages.assembly import assembly_stage
-from vibench.stages.base import Done, Stage, value_of
+from vibench.stages.base import Done, Stage
 from vibench.stages.cell_queries import CellQueries, cell_queries
 from vibench.stages.formulations.queries import formulation_queries
 from vibench.storage.artefacts import Store, usable_store
@@ -120,9 +120,8 @@ class RecordedCell:
         if stage is None:
             return None
         store = usable_store()
-        _provide((stage,), store)
-        certificate: OnlineCertificate = value_of(store, stage)
-        return certificate
+        _provide((stage.base, stage), store)
+        return stage.certificate(store)
 
     @cached_property
     def parameters(self) -> Array:

@@ -42,6 +42,10 @@ from vibench.storage.artefacts import Store
 T = TypeVar("T")
 Send = Callable[[Any], None]
 
+KEPT, SHARE_KEPT = 2**30, 0.125
+"""Bytes of artefacts that this process keeps after it has read them, and the share of its memory limit that they take
+at most."""
+
 OF_THIS_PROCESS = (errno.EBADF, errno.EFBIG, errno.EMFILE)
 """Errors of writing that other processes need not have."""
 
@@ -100,7 +104,7 @@ def perform(
 
     def work() -> Done | BatchDone:
         _check_code(job, batch)
-        store = _store(job.store)
+        store = _store(job.store, min(KEPT, int(SHARE_KEPT * job.memory_gib * 2**30)))
         LOST.set(job.lost)
         if isinstance(job.stage, ItemwiseStage):
             items = _begun(job.stage, store)
@@ -204,8 +208,8 @@ def _address_space() -> int:
 
 
 @cache
-def _store(folder: str) -> Store:
-    return Store(Path(folder))
+def _store(folder: str, kept: int) -> Store:
+    return Store(Path(folder), kept)
 
 
 if __name__ == "__main__":

@@ -64,6 +64,11 @@ class Assemblies:
         self._last = key, found
         return found
 
+    def together(self, mu: Array) -> int:
+        """At how many parameters like mu (d,) what `at` and `energy_at` return may be held at once: one at least."""
+        sizes = (self._kept.maxsize, _bytes(self.at(mu))), (self._energies.maxsize, self._own_bytes(self.energy_at(mu)))
+        return max(1, min(int(limit // max(size, 1)) for limit, size in sizes))
+
     def energy_of(self, vi: VariationalInequality) -> Energy:
         """Factorisations of an assembled A, which are not kept unless it is constant: this may be timed."""
         return Energy(vi.A, self._solver.condensed(vi))

@@ -21,7 +21,7 @@ from vibench.results.costs.paired_seconds import paces
 from vibench.rounds.marginal_solutions import MarginalSolutions, parts_alike
 from vibench.rounds.timed_seconds import TimedCell, TimedRound, round_columns
 from vibench.stages.assembly import AssemblyStage
-from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, Watch, build_problem, value_of
+from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, Watch, build_problem
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.formulations.queries import FormulationModels, FormulationQueries
 from vibench.stages.judging.cell_goal import CellGoal
@@ -218,7 +218,7 @@ class _Rounds(Items):
             return assembly + seconds if isinstance(model, HyperReducedModel) else seconds
         key = stage.certificate.key
         if key not in self._certificates:
-            self._certificates[key] = value_of(self._store, stage.certificate)
+            self._certificates[key] = stage.certificate.certificate(self._store)
         assert isinstance(model, HyperReducedModel)  # it has a certificate
         given = model.problem, near, model.assemble(near), *solution
         return timed(partial(self._certificates[key].certify, *given, stage.correction))[1]

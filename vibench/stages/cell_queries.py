@@ -69,9 +69,10 @@ class CellQueries(CellGoal):
 
     @property
     def timed_inputs(self) -> tuple[Stage, ...]:
-        """The model and the reduced programs, the certificate and the compiled program."""
-        made = (stage for stage in (self.certificate, self.compilation) if stage is not None)
-        return (*self.assembly.model_inputs, self.assembly, *made)
+        """The model and the reduced programs, the certificate with its base, and the compiled program."""
+        certifying = () if self.certificate is None else (self.certificate.base, self.certificate)
+        compiled = () if self.compilation is None else (self.compilation,)
+        return (*self.assembly.model_inputs, self.assembly, *certifying, *compiled)
 
     def query(self, queries: Queries, number: int) -> Query:
         """One query of the cell's reduced model, for its solver or its compiled program."""
@@ -145,7 +146,7 @@ class _Queries(CellItems):
         self._own, self._full, self._plain = (value_of(store, one) for one in stage.constants)
         self._exact: tuple[ExactSolution | None, ...] = value_of(store, stage.exact)
         self._certificate: OnlineCertificate | None = (
-            None if stage.certificate is None else value_of(store, stage.certificate)
+            None if stage.certificate is None else stage.certificate.certificate(store)
         )
         self._corrector = Corrector(self._model, self._certificate, stage.correction)
 

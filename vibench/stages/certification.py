@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from vibench.model.affine import AffineMember
 from vibench.model.certificates.base import CertificateBase, certificate_base
@@ -20,8 +20,7 @@ from vibench.storage.serialisation import storable
 from vibench.timing import timed
 
 for _kind in (
-    CertificateBase, ContactCompliance, OnlineCertificate, OnlineInfSup, PreparedCorrections, ResidualBasis,
-    SpectralBounds,
+    CertificateBase, ContactCompliance, OnlineInfSup, PreparedCorrections, ResidualBasis, SpectralBounds,
 ):  # fmt: skip
     storable(_kind)
 
@@ -44,7 +43,10 @@ class CertificateBaseStage(Stage):
 
 @dataclass(frozen=True)
 class CertificateStage(Stage):
-    """What certifies the queries of one reduced model; the value is an `OnlineCertificate`."""
+    """What certifies the queries of one reduced model; the value are the members of its `OnlineCertificate` but one.
+
+    The base, which is of mesh size, is stored once for all models.
+    """
 
     label = "certificate"
 
@@ -60,6 +62,10 @@ class CertificateStage(Stage):
         """The model, its members, and the base."""
         return (*self.assembly.model_inputs, self.base.decomposition, self.base)
 
+    def certificate(self, store: Store) -> OnlineCertificate:
+        """The certificate, once the stage has been run."""
+        return OnlineCertificate(value_of(store, self.base), **value_of(store, self))
+
     def run(self, store: Store) -> Result:
         """Prepare the certificate.
 
@@ -72,4 +78,6 @@ class CertificateStage(Stage):
             decomposed=self.base.decomposition.parameters(problem),
         )
         reduction.assembled  # noqa: B018  the clock begins after it
-        return Result(*timed(lambda: reduction.certificate))
+        prepared, seconds = timed(lambda: reduction.certificate)
+        own = (one.name for one in fields(prepared) if one.name != "base")
+        return Result({name: getattr(prepared, name) for name in own}, seconds)

@@ -35,6 +35,9 @@ DIGEST = hashlib.sha256().digest_size
 LOCK = "lock"
 """Lock file: shared by runs, exclusive for `clear`."""
 
+KEPT = 2**28
+"""Bytes of artefacts that a store keeps in memory, by the size of their files, unless it is told otherwise."""
+
 
 @storable
 @dataclass(frozen=True)
@@ -94,19 +97,27 @@ def default_folder() -> Path:
 
 
 class Store:
-    """The artefacts in a folder."""
+    """The artefacts in a folder, of which those used last are kept in memory.
 
-    def __init__(self, folder: Path) -> None:
+    Parameters
+    ----------
+    folder
+        Where their files are.
+    kept
+        Bytes of files whose artefacts are kept in memory at most; a larger artefact is read whenever it is asked for.
+    """
+
+    def __init__(self, folder: Path, kept: int = KEPT) -> None:
         self.folder = folder
-        self._recent: LRUCache[str, Artefact] = LRUCache(maxsize=64)
+        self._recent: LRUCache[str, tuple[Artefact, int]] = LRUCache(kept, getsizeof=lambda one: one[1])
 
     def get(self, key: str) -> Artefact | None:
         """The artefact stored under a key; `None` if it is missing or damaged.
 
         Raises a `StorageError` if the folder cannot be read.
         """
-        if key in self._recent:
-            return self._recent[key]
+        if (recent := self._recent.get(key)) is not None:
+            return recent[0]
         try:
             with self._path(key).open("rb") as file:
                 digest, content = file.read(DIGEST), file.read()
@@ -117,7 +128,8 @@ class Store:
             return None
         except OSError as error:
             raise StorageError(f"artefacts cannot be read from '{self.folder}': {error.strerror}") from None
-        self._recent[key] = artefact
+        if len(content) <= self._recent.maxsize:
+            self._recent[key] = artefact, len(content)
         return artefact
 
     def put(self, key: str, value: Any, seconds: Seconds, histories: tuple[History, ...]) -> None:

@@ -138,7 +138,11 @@ class Limits(_Model):
     query_seconds: Annotated[Seconds, Field(description="Wall seconds of one solution of a query.")] = 20.0
     cell_seconds: Annotated[Seconds, Field(description="Wall seconds of a stage.")] = 600.0
     memory_gib: Annotated[
-        float, Gt(0.0), Lt(1e6), AllowInfNan(False), Field(description="Address space of a worker process in GiB.")
+        float,
+        Gt(0.0),
+        Lt(1e6),
+        AllowInfNan(False),
+        Field(description="Address space of a worker process in GiB; kept artefacts take an eighth, at most 1 GiB."),
     ] = 8.0
 
 

@@ -77,3 +77,14 @@ def test_factors_too_large_to_be_kept_are_those_of_the_last_parameter_alone(monk
     assert kept.energy_at(one).on_contact(kept.at(one)) is first.on_contact(kept.at(one))
     assert (kept.energy_at(two).A != first.A).nnz
     assert kept.energy_at(one) is not first
+
+
+def test_as_many_parameters_are_together_as_their_factors_and_their_matrices_fit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    mu = np.array([0.2])
+    factors, matrices = Assemblies(Varying()).energy_at(mu).nbytes, assemblies._bytes(Assemblies(Varying()).at(mu))
+    assert Assemblies(Varying(), limit=5 * matrices).together(mu) == 5
+    assert Assemblies(Varying(), limit=matrices // 2).together(mu) == 1
+    monkeypatch.setattr(assemblies, "FACTORS", 3 * factors + 1)
+    assert Assemblies(Varying(), limit=5 * matrices).together(mu) == 3

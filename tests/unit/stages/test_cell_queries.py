@@ -14,12 +14,14 @@ from samples import SampleStore, carry_out
 
 from vibench.interfaces.problem import ParameterBox, VariationalInequality
 from vibench.interfaces.strategies import Stop
+from vibench.offline.assemblies import Assemblies
 from vibench.qp import verification
 from vibench.qp.solve import solve_qp, takes_start
 from vibench.stages import cell_queries
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
+from vibench.stages.certification import CertificateStage
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.query import error_columns, path_before, query_before
@@ -93,6 +95,35 @@ def test_a_query_whose_assessment_fails_costs_itself(tmp_path: Path, monkeypatch
     assert found.cell["queries_ok"] == 3
     for k in (0, 1, 3):
         assert found.queries[k]["error_u"] == pytest.approx(whole.queries[k]["error_u"], rel=1e-9)
+
+
+@pytest.mark.parametrize("certified", [False, True])
+def test_a_cell_whose_factors_do_not_fit_is_assessed_in_parts(
+    certified: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Factors of as many parameters as fit are held at a time; rows are those of all at once."""
+    problem = Plugin("problem", "hertz", '{"resolution": "coarse"}', "test")
+    cone = ConeStage(problem, Plugin("dual strategy", "mcpg", "{}", "test"), Stop(size=3))
+    primal = Plugin("primal strategy", "decorrelated", "{}", "test")
+    enrichment = SingleEnrichment(PODStage(problem, Stop(size=4)), cone, primal, None)
+    assembly = AssemblyStage(enrichment, 1e-6 if certified else None, ParameterSet("validation", 4, 1))
+    certificate, store = CertificateStage(assembly) if certified else None, SampleStore(tmp_path)
+    stage = CellQueries(assembly, "piqp", 1e-8, 20.0, certificate=certificate)
+    carry_out(stage, store)
+    whole, sizes = value_of(store, stage), []
+    monkeypatch.setattr(Assemblies, "together", lambda *_: 3)
+    monkeypatch.setattr(
+        cell_queries, "error_columns", lambda *given: (sizes.append(len(given[1])), error_columns(*given))[1]
+    )
+    found = stage.run(store).value
+    assert sizes == [3, 1]
+    online = ("bound_online_u_energy",) if certified else ()
+    for row, expected in zip(found.queries, whole.queries, strict=True):
+        for name in ("error_u", "bound_u_energy", "hf_dual_residual", *online):
+            assert row[name] == pytest.approx(expected[name], rel=1e-9)
+    if certificate is not None:  # what is of mesh size is there once for all models
+        assert certificate.certificate(store).base is value_of(store, certificate.base)
+        assert "base" not in value_of(store, certificate)
 
 
 def test_rows_say_which_query_they_started_from(tmp_path: Path) -> None:

@@ -136,7 +136,7 @@ def test_a_damaged_artefact_counts_as_missing(damage: Callable[[Path], object], 
 
 def test_many_artefacts_are_all_found(tmp_path: Path) -> None:
     """More than are kept in memory at a time."""
-    store = Store(tmp_path)
+    store = Store(tmp_path, kept=10_000)
     for k in range(200):
         store.put(f"key-{k}", k, TIME, ())
     for _ in range(2):
@@ -144,6 +144,23 @@ def test_many_artefacts_are_all_found(tmp_path: Path) -> None:
             found = store.get(f"key-{k}")
             assert isinstance(found, Artefact)
             assert found.value == k
+
+
+def test_artefacts_are_kept_up_to_so_many_bytes_and_those_used_long_ago_go_first(tmp_path: Path) -> None:
+    for name, size in (("one", 1000), ("two", 1000), ("three", 1000), ("large", 4000)):
+        Store(tmp_path).put(name, np.zeros(size), TIME, ())
+    store = Store(tmp_path, kept=20_000)  # two of them, and their descriptions
+    first, second = store.get("one"), store.get("two")
+    assert store.get("one") is first
+    assert store.get("two") is second
+    store.get("one")
+    store.get("three")  # for which the second has to go
+    assert store.get("one") is first
+    assert store.get("two") is not second
+    large = store.get("large")
+    assert large is not None
+    assert len(large.value) == 4000
+    assert store.get("large") is not large
 
 
 def test_a_full_disk_is_said_in_a_line_and_leaves_what_was_there(

@@ -16,6 +16,7 @@ import numpy as np
 from vibench.errors import in_a_line
 from vibench.interfaces.problem import Problem
 from vibench.model.errors import ReferenceSolutions, output_scales, summarise_outputs, zeros
+from vibench.offline.assemblies import assemblies
 from vibench.provenance import machine
 from vibench.qp.status import Status
 from vibench.stability.coercivity import Stability
@@ -171,16 +172,25 @@ class CellItems(Items):
         return CellRows(own, tuple(written), tuple(solutions.values()), outputs, named)
 
     def _assess(self, solutions: Mapping[int, Row]) -> list[Row]:
-        """Error columns of some queries, all at once; where that fails, one by one, and a row says why it failed."""
+        """Error columns of some queries, of as many at once as there is memory for the factors of their A.
+
+        Where that fails, one by one, and a row says why it failed.
+        """
         numbers = list(solutions)
+        if not numbers:
+            return []
         try:
-            return self.assess(solutions)
+            count = assemblies(self._problem).together(self._reference.mu[numbers[0]])
+            if len(numbers) <= count:
+                return self.assess(solutions)
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001  whatever it is, it may concern one query alone
-            if len(numbers) > 1:
-                return [row for k in numbers for row in self._assess({k: solutions[k]})]
-            return [{"status": Status.ERROR.value, "reason": f"in the assessment: {in_a_line(error)}"}]
+            if len(numbers) == 1:
+                return [{"status": Status.ERROR.value, "reason": f"in the assessment: {in_a_line(error)}"}]
+            count = 1
+        parts = (numbers[first : first + count] for first in range(0, len(numbers), count))
+        return [row for part in parts for row in self._assess({k: solutions[k] for k in part})]
 
     def known(self, number: int) -> Row:
         """The columns of a query that do not depend on its solution: parameter, zeros of the reference, constants."""
