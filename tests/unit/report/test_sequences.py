@@ -78,6 +78,7 @@ def exported(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def loaded(exported: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """The test set as qpbenchmark loads it: the class whose name is that of the file."""
     monkeypatch.syspath_prepend(str(exported))
+    monkeypatch.delitem(sys.modules, replay.SEQUENCES, raising=False)  # a script of the results has the same name
     yield importlib.import_module(replay.SEQUENCES).Sequences()
     sys.modules.pop(replay.SEQUENCES, None)
 
