@@ -78,20 +78,19 @@ class MeshFields:
     def faults(self) -> Iterator[str]:
         """What makes the fields no solution on a mesh: shapes, types, nodes that there are not, cells inside out."""
         count = len(self.points)
-        if fault := _real_fault("points", self.points, ((count, 3),)):
-            yield fault
+        if faults := list(_real_faults("points", self.points, (count, 3), missing=False)):
+            yield from faults
             return
         for name, corners in self.cells.items():
             yield from self._cell_faults(name, np.asarray(corners))
         for name, values in self.at_points.items():
-            yield from filter(None, [_real_fault(f"at_points[{name!r}]", values, ((count,), (count, 3)))])
+            yield from _real_faults(f"at_points[{name!r}]", values, (count,), (count, 3))
         for owner, named in self.in_cells.items():
             if owner not in self.cells:
                 yield f"in_cells has {owner!r}, of which there are no cells; expected one of {sorted(self.cells)}"
                 continue
             for name, values in named.items():
-                shape = (len(self.cells[owner]),)
-                yield from filter(None, [_real_fault(f"in_cells[{owner!r}][{name!r}]", values, (shape,))])
+                yield from _real_faults(f"in_cells[{owner!r}][{name!r}]", values, (len(self.cells[owner]),))
 
     def _cell_faults(self, name: str, corners: Indices) -> Iterator[str]:
         where = f"cells[{name!r}]"
@@ -132,10 +131,11 @@ class MeshFields:
         )
 
 
-def _real_fault(name: str, values: Any, shapes: tuple[tuple[int, ...], ...]) -> str:
-    """Why values are not floats in one of the shapes, finite or NaN; "" if they are."""
-    if np.shape(values) not in shapes or np.asarray(values).dtype != np.float64:
-        kind = f"dtype {np.asarray(values).dtype} and shape {np.shape(values)}"
-        return f"{name} has {kind}; expected float64 of shape {' or '.join(map(str, shapes))}"
-    missing = np.isnan(values).any() and name == "points"
-    return f"{name} is not finite" if missing or np.isinf(values).any() else ""
+def _real_faults(name: str, values: Any, *shapes: tuple[int, ...], missing: bool = True) -> Iterator[str]:
+    """Why values are not floats in one of the shapes, finite or, where some may be missing, NaN."""
+    given = np.asarray(values)
+    if given.shape not in shapes or given.dtype != np.float64:
+        expected = " or ".join(map(str, shapes))
+        yield f"{name} has dtype {given.dtype} and shape {given.shape}; expected float64 of shape {expected}"
+    elif np.isinf(given).any() or (not missing and np.isnan(given).any()):
+        yield f"{name} is not finite"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import tempfile
+from collections import defaultdict
 from itertools import chain
 from pathlib import Path
 
@@ -82,16 +83,11 @@ def _written(exact: MeshFields, reduced: MeshFields) -> bytes:
         for name, first in exact.at_points.items()
         for kind, values in _compared(first, reduced.at_points[name])
     }
-    in_cells = {
-        f"{name}, {kind}": [
-            _compared(named[name], reduced.in_cells[owner][name])[k][1]
-            if name in (named := exact.in_cells.get(owner, {}))
-            else np.full(len(corners), np.nan)
-            for owner, corners in exact.cells.items()
-        ]
-        for name in dict.fromkeys(chain.from_iterable(exact.in_cells.values()))
-        for k, kind in enumerate(KINDS)
-    }
+    in_cells = defaultdict[str, list[Array]](lambda: [np.full(len(each), np.nan) for each in exact.cells.values()])
+    for place, owner in enumerate(exact.cells):
+        for name, first in exact.in_cells.get(owner, {}).items():
+            for kind, values in _compared(first, reduced.in_cells[owner][name]):
+                in_cells[f"{name}, {kind}"][place] = values
     cells = [(owner, corners.astype(np.int64)) for owner, corners in exact.cells.items()]  # VTK has no other integers
     mesh = meshio.Mesh(exact.points, cells, point_data=at_points, cell_data=in_cells)
     with tempfile.TemporaryDirectory() as scratch:  # meshio writes to names of files alone

@@ -27,7 +27,7 @@ from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
-from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_edges, chunk_of
+from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_edges, chunk_of, chunk_size
 from vibench.study.plugin import Plugin
 
 for _kind in (ConstraintClasses, Stability, Constant, InfSup):
@@ -67,8 +67,7 @@ class EnergyConstants(Stage):
     @property
     def effort(self) -> float:
         """By the number of its parameters."""
-        first, end = chunk_edges(self.parameters.count)[self.chunk : self.chunk + 2]
-        return SOLUTIONS * (end - first)
+        return SOLUTIONS * chunk_size(self.parameters.count, self.chunk)
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """Compute the constants, those of one parameter together, as long as its factorisation is there."""

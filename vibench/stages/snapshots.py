@@ -27,7 +27,7 @@ from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes
 from vibench.study.kinds import PROBLEM
-from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_edges, chunk_of
+from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_of, chunk_size
 from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, SLOW, Seconds, median_of, timed
 
@@ -98,8 +98,8 @@ class SnapshotStage(Stage):
     @property
     def effort(self) -> float:
         """Those of the chunk."""
-        first, end = chunk_edges(self.parameters.count or TRAINED)[self.chunk : self.chunk + 2]
-        return (end - first) * (VALIDATED if self.parameters.role == "validation" else 1.0)
+        each = VALIDATED if self.parameters.role == "validation" else 1.0
+        return each * chunk_size(self.parameters.count or TRAINED, self.chunk)
 
     @property
     def axes(self) -> Axes:

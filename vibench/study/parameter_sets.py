@@ -145,6 +145,12 @@ def chunk_edges(count: int) -> list[int]:
     return [int(edge) for edge in np.linspace(0, count, CHUNKS + 1).round()]
 
 
+def chunk_size(count: int, chunk: int) -> int:
+    """Number of parameters in a chunk of `count`."""
+    first, end = chunk_edges(count)[chunk : chunk + 2]
+    return end - first
+
+
 def chunk_of(everything: Array, chunk: int) -> tuple[int, Array]:
     """Number of the first parameter of a chunk, and its parameters, of all (P×d)."""
     first, end = chunk_edges(len(everything))[chunk : chunk + 2]
