@@ -1,0 +1,57 @@
+"""How far break-evens of several cold runs of one study on one machine agree.
+
+    python tests/benchmarks/repeatability.py RUN… [--loaded RUN]
+
+Prints how many rows of each run are undecided, how often intervals of one break-even overlap and contradict each other
+over all pairs of runs, and by how much gains against the high-fidelity model differ between the runs that had a core
+of their own: those that are not named by `--loaded`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from vibench.library.runs import open_run
+from vibench.report.comparison.differences import Agreement, agreement
+from vibench.results.costs.break_even import HIGH_FIDELITY, Meaning
+
+
+def main() -> None:
+    """Print the agreement of the runs that are named."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", type=Path)
+    parser.add_argument("--loaded", action="append", default=[], type=Path)
+    asked = parser.parse_args()
+    quiet = {path: open_run(path).thresholds for path in asked.runs}
+    every = quiet | {path: open_run(path).thresholds for path in asked.loaded}
+    for path, rows in every.items():
+        meanings = rows["meaning"].value_counts().to_dict()
+        undecided = meanings.get(Meaning.UNDECIDED, 0) / len(rows)
+        print(f"{path.name}: {len(rows)} rows, {undecided:.1%} undecided: {meanings}")
+    total = Agreement(*map(sum, zip(*(agreement(*two) for two in combinations(every.values(), 2)), strict=True)))
+    print(
+        f"{total.overlapping} of {total.both} pairs of intervals overlap, {total.opposite} of {total.decided} pairs of "
+        "decided rows are opposite"
+    )
+    for phase, other in (("high-fidelity model", False), ("other models", True)):
+        print(f"gains against the {phase}: {spread(list(quiet.values()), others=other)}")
+
+
+def spread(runs: list[pd.DataFrame], *, others: bool) -> str:
+    """How much larger the largest gain of a row is than the smallest one over all runs: quantiles over the rows."""
+    columns = [
+        rows[(rows["primal_a"] == HIGH_FIDELITY) != others].set_index(["cell_a", "cell_b"])["gain"] for rows in runs
+    ]
+    gains = pd.concat(columns, axis=1, join="inner").to_numpy(dtype=float)
+    factors = np.max(gains, axis=1) / np.min(gains, axis=1) - 1.0
+    half, most, largest = np.quantile(factors, (0.5, 0.95, 1.0))
+    within = np.mean(factors <= 0.15)
+    return f"{half:.1%}, {most:.1%}, {largest:.1%} (median, 95 %, largest of {len(gains)} rows); {within:.0%} within 15 %"
+
+
+if __name__ == "__main__":
+    main()
