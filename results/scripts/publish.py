@@ -1,4 +1,4 @@
-"""Publish the results of this folder as a static site.
+"""Publish the results of this folder, and those of other machines, as a static site.
 
 python results/scripts/publish.py SITE
 
@@ -25,6 +25,8 @@ from vibench.study.cells import UNCORRECTED
 from vibench.study.matrix import expand, read_study
 
 RESULTS = Path(__file__).parents[1]
+OTHERS = "machines/*/*/cells.csv"
+"""Studies that were run on other machines, too."""
 
 CITATION = Citation(
     "vibench: results of the reduced-order models of the paper and of the field",
@@ -34,25 +36,24 @@ CITATION = Citation(
 
 def main(site: str) -> None:
     with tempfile.TemporaryDirectory() as scratch:
-        files = {
-            restore(table.parent, Path(scratch)): table.parent.name for table in sorted(RESULTS.glob("*/cells.csv"))
-        }
+        tables = [table.parent for table in sorted(RESULTS.glob("*/cells.csv")) + sorted(RESULTS.glob(OTHERS))]
+        files = {restore(folder, Path(scratch) / folder.relative_to(RESULTS)): folder for folder in tables}
         notes = {
-            file: f"made of the tables in results/{name}, with six digits and without queries; `vibench run {name}` "
-            "makes all of it"
-            for file, name in files.items()
+            file: f"made of the tables in results/{folder.relative_to(RESULTS)}, with six digits and without queries; "
+            f"`vibench run {folder.name}` makes all of it"
+            for file, folder in files.items()
         }
         print(publish(list(files), Path(site), CITATION, notes))
 
 
 def restore(tables: Path, folder: Path) -> Path:
-    """Write a results file of committed tables; columns that were added after them are empty."""
+    """Write a results file of committed tables into a folder; columns that were added after them are empty."""
     cells = rows(tables / "cells.csv")
     if "definition" not in cells[0]:  # left out of a large table: the study says the same
         definitions = {cell.key: cell.definition for cell in expand(read_study(tables.name))}
         cells = [row | {"definition": definitions[row["cell"]]} for row in cells]
     identity = {"name": tables.name, "seed": int(cells[0]["seed"]), "validation": int(cells[0]["queries"])}
-    database = ResultsDatabase(folder / tables.name, identity)
+    database = ResultsDatabase(folder, identity)
     try:
         for row in cells:
             database.write_cell(stored("cells", row), ())
@@ -61,7 +62,7 @@ def restore(tables: Path, folder: Path) -> Path:
                 database.replace(name, [stored(name, row) for row in rows(tables / f"{name}.csv")])
     finally:
         database.close()
-    return folder / tables.name / FILE
+    return folder / FILE
 
 
 def rows(table: Path) -> list[dict[str, Any]]:

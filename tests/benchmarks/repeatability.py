@@ -3,8 +3,8 @@
     python tests/benchmarks/repeatability.py RUN… [--loaded RUN]
 
 Prints how many rows of each run are undecided, how often intervals of one break-even overlap and contradict each other
-over all pairs of runs, and by how much gains against the high-fidelity model differ between the runs that had a core
-of their own: those that are not named by `--loaded`.
+over all pairs of runs, by how much gains differ between the runs that had a core of their own, those that are not named
+by `--loaded`, and the scatter of the gains over all runs beyond what their blocks show.
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+
 from vibench.library.runs import open_run
 from vibench.report.comparison.differences import Agreement, agreement
 from vibench.results.costs.break_even import HIGH_FIDELITY, Meaning
+from vibench.results.costs.paired_seconds import PairedSeconds
 
 
 def main() -> None:
@@ -26,8 +28,9 @@ def main() -> None:
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--loaded", action="append", default=[], type=Path)
     asked = parser.parse_args()
-    quiet = {path: open_run(path).thresholds for path in asked.runs}
-    every = quiet | {path: open_run(path).thresholds for path in asked.loaded}
+    runs = {path: open_run(path) for path in (*asked.runs, *asked.loaded)}
+    every = {path: run.thresholds for path, run in runs.items()}
+    quiet = [every[path] for path in asked.runs]
     for path, rows in every.items():
         meanings = rows["meaning"].value_counts().to_dict()
         undecided = meanings.get(Meaning.UNDECIDED, 0) / len(rows)
@@ -37,8 +40,10 @@ def main() -> None:
         f"{total.overlapping} of {total.both} pairs of intervals overlap, {total.opposite} of {total.decided} pairs of "
         "decided rows are opposite"
     )
-    for phase, other in (("high-fidelity model", False), ("other models", True)):
-        print(f"gains against the {phase}: {spread(list(quiet.values()), others=other)}")
+    timings = [PairedSeconds(run.table("timings").to_dict("records")) for run in runs.values()]
+    for models, others in (("the high-fidelity model", False), ("other models", True)):
+        print(f"gains against {models}: {spread(quiet, others=others)}")
+        print(f"  standard deviation beyond their blocks: {beyond_blocks(timings, quiet[0], others=others):.1%}")
 
 
 def spread(runs: list[pd.DataFrame], *, others: bool) -> str:
@@ -50,7 +55,20 @@ def spread(runs: list[pd.DataFrame], *, others: bool) -> str:
     factors = np.max(gains, axis=1) / np.min(gains, axis=1) - 1.0
     half, most, largest = np.quantile(factors, (0.5, 0.95, 1.0))
     within = np.mean(factors <= 0.15)
-    return f"{half:.1%}, {most:.1%}, {largest:.1%} (median, 95 %, largest of {len(gains)} rows); {within:.0%} within 15 %"
+    return (
+        f"{half:.1%}, {most:.1%}, {largest:.1%} (median, 95 %, largest of {len(gains)} rows); {within:.0%} within 15 %"
+    )
+
+
+def beyond_blocks(runs: list[PairedSeconds], rows: pd.DataFrame, *, others: bool) -> float:
+    """Standard deviation of the logarithm of a gain over the runs, without the variance that blocks account for."""
+    excess = list[float]()
+    for a, b in rows[(rows["primal_a"] == HIGH_FIDELITY) != others][["cell_a", "cell_b"]].itertuples(index=False):
+        estimates = [run.ratio_within(a if others else None, b) for run in runs]
+        if None not in estimates:
+            means, errors = np.array([(one.mean, one.error) for one in estimates if one is not None]).T
+            excess.append(float(np.var(means, ddof=1) - np.mean(errors**2)))
+    return float(np.sqrt(max(0.0, np.mean(excess))))
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -123,6 +124,37 @@ def test_the_results_are_published_by_one_command(tmp_path: Path, monkeypatch: p
         assert f"vibench run results.sqlite --cell {key} --out again" in page
         assert f"`vibench run {name}` makes all of it" in page
         assert [cell.key for cell in expand(recorded_study(str(own / FILE), key))] == [key]
+    others = list((RESULTS / "machines").glob("*/*/cells.csv"))  # the same studies on other machines, beside ours
+    assert others
+    published_runs = list((tmp_path / "site" / "runs").glob(f"*/{FILE}"))
+    assert len(published_runs) == len(list(RESULTS.glob("*/cells.csv"))) + len(others)
+    machines = {machine for file in published_runs for machine in tables.read(file, "cells")["machine"].dropna()}
+    assert machines >= {machine for file in others for machine in pd.read_csv(file)["machine"].dropna()}
+
+
+def test_other_machines_are_compared_row_by_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    here, there = tmp_path / "benefit", tmp_path / "machines" / "other" / "benefit"
+    for folder in (here, there):
+        folder.mkdir(parents=True)
+        for name in ("cells", "thresholds"):
+            shutil.copy(RESULTS / "benefit" / f"{name}.csv", folder)
+    cells, rows = (pd.read_csv(there / f"{name}.csv") for name in ("cells", "thresholds"))
+    cells["error_u_mean"] *= 1.0 + 1e-3
+    (first, *_) = rows.index[(rows["meaning"] == "from") & (rows["primal_a"] == "high-fidelity")]
+    rows.loc[first, "meaning"] = "never"
+    rows["gain"] /= 2.0
+    cells.to_csv(there / "cells.csv", index=False)
+    rows.to_csv(there / "thresholds.csv", index=False)
+    importlib.import_module("machines").main(str(tmp_path), str(tmp_path / "machines"))
+    lines = (tmp_path / "machines" / "README.md").read_text(encoding="utf-8").splitlines()
+    verdicts, apart = (
+        [part.strip() for part in line.split("|")[1:-1]] for line in lines if line.startswith("| benefit")
+    )
+    assert verdicts[:3] == ["benefit", "other", str(len(rows))]
+    assert verdicts[4] == "1"  # the one that is contradicted
+    assert verdicts[6:] == ["2.00 (2.00–2.00)"] * 2
+    assert apart[3:] == ["0.0e+00"] * 4 + ["1.0e-03", "0.0e+00"]
 
 
 def test_the_readme_says_what_a_query_is_compared_with() -> None:
