@@ -74,7 +74,7 @@ FAULTS = (
     Fault(
         "cell-after-cell",
         "vibench/rounds/timing_rounds.py",
-        "number, within = divmod(item, self.competitors)\n",
+        "number, within = divmod(item, len(self.cells))\n",
         "within, number = divmod(item, self.rounds)\n",
         ("tests/unit/rounds/test_timing_rounds.py",),
     ),

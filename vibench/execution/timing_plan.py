@@ -122,8 +122,8 @@ class TimingPlan:
         group = self._planned.pop(stage.key)
         if isinstance(outcome, Failed):
             lost = TimedCell({}, "", stage.rounds, outcome.reason)
-            outcome = (lost,) * stage.competitors
-        for goal, rows, timed in zip(stage.cells, block_rows(stage, outcome), outcome, strict=False):
+            outcome = (lost,) * len(stage.cells)
+        for goal, rows, timed in zip(stage.cells, block_rows(stage, outcome), outcome, strict=True):
             self._note(group, goal.key, rows, timed)
         group.blocks += 1
         group.first += stage.rounds
@@ -132,7 +132,7 @@ class TimingPlan:
             if goal.key in timed_here:  # nothing is new of others
                 self._write(group, cell, goal)
                 self.paired.add(cell.key, group.rows[goal.key])
-        timed_now = {goal.key for goal, timed in zip(stage.cells, outcome, strict=False) if timed.rounds}
+        timed_now = {goal.key for goal, timed in zip(stage.cells, outcome, strict=True) if timed.rounds}
         following = [goal for goal in self._undecided(group) if goal.key in timed_now]
         if following and group.blocks < len(block_sizes(self.rounds)):
             return self._block(group, stage.session + 1, following)

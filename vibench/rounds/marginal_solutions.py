@@ -1,22 +1,37 @@
-"""High-fidelity solutions timed as the sweep over the validation set makes them: what one more of them costs."""
+"""High-fidelity solutions timed as the sweep over the validation set makes them: what one more of them costs.
+
+What else uses a machine changes its speed within tenths of a second. Solutions therefore alternate with the queries
+that they are compared with.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
-from vibench.arrays import Array, Mask
+from vibench.arrays import Mask
 from vibench.errors import NumericalError
-from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolver, solve_unverified
-from vibench.interfaces.problem import Problem
+from vibench.highfidelity.active_set import HighFidelitySolver, solve_unverified
+from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.qp.repeats import nearby
 from vibench.stages.snapshots import TimedSnapshots
 from vibench.study.parameter_sets import chunk_edges
 from vibench.timing import Seconds, timed
+
+ENOUGH = 0.05
+"""CPU seconds of high-fidelity solutions beside the queries of a cell in one round after which there is no further."""
+
+LONG = 0.1
+"""CPU seconds from which on a solution averages over what changes the speed of the machine: one is enough for a
+round, and counts for all cells in it."""
+
+FIRST_SEED = 2
+"""Seeds of solutions in a round: those of the queries beside them are smaller, and no parameter is the same."""
 
 SAME = 1e-6
 """Largest distance of a solution next to a parameter from that at it, relative to the largest solution."""
@@ -40,20 +55,76 @@ class MarginalSolutions:
         self._solver, self._starts = _solver_of(problem), list(_starts(problem, reference))
         self._allowed = SAME * float(np.max(problem.V.norm(reference.u), initial=0.0))
 
-    def seconds(self, number: int, *seed: int) -> Seconds:
-        """Seconds of one solution, its assembly included; another parameter next to its own for every seed.
+    def solve(self, number: int, *seed: int) -> MarginalSolution:
+        """One solution, its assembly included; another parameter next to its own for every seed.
 
-        Raises a `NumericalError` if it is not that of this parameter.
+        There are no seconds if it is not that of this parameter, or if there is none.
         """
-        mu = nearby(self._problem.parameters, self._mus[number], self._seed, number, *seed)
-        solution, seconds = timed(partial(self._solved, mu, self._starts[number]))
-        if not float(self._problem.V.norm(solution.u - self._u[:, number])) <= self._allowed:
-            raise NumericalError(f"the timed high-fidelity solution {number} differs from the one that was verified")
-        return seconds
+        assembled = self.assemble(number, *seed)
+        vi = assembled.vi
+        try:
+            solution, rest = timed(lambda: solve_unverified(vi, self._solver.condensed(vi), self._starts[number]))
+        except NumericalError:
+            return assembled
+        distance = float(self._problem.V.norm(solution.u - self._u[:, number]))
+        return assembled._replace(seconds=assembled.assembly + rest) if distance <= self._allowed else assembled
 
-    def _solved(self, mu: Array, start: Mask | None) -> ActiveSetSolution:
-        vi = checked_assembly(self._problem, mu)
-        return solve_unverified(vi, self._solver.condensed(vi), start)
+    def assemble(self, number: int, *seed: int) -> MarginalSolution:
+        """What is assembled for a solution, without it."""
+        mu = nearby(self._problem.parameters, self._mus[number], self._seed, number, *seed)
+        return MarginalSolution(number, *timed(partial(checked_assembly, self._problem, mu)), None)
+
+
+class MarginalSolution(NamedTuple):
+    """A high-fidelity solution that was timed."""
+
+    number: int
+    """That of its validation parameter."""
+    vi: VariationalInequality
+    """What was assembled next to that parameter; the next assembly may be written into the same arrays."""
+    assembly: Seconds
+    seconds: Seconds | None
+    """Those of the whole solution; `None` of one that is not the right one."""
+
+
+class SolutionsBeside:
+    """High-fidelity solutions beside the queries of cells in rounds.
+
+    `sweep` (P,) are CPU seconds of all solutions, as the sweep over the validation set measured them.
+    """
+
+    def __init__(self, marginal: MarginalSolutions, sweep: Sequence[float]) -> None:
+        self._marginal, self._sweep = marginal, np.asarray(sweep)
+        self._long: dict[int, MarginalSolution] = {}
+
+    def alternated(
+        self, order: Sequence[int], done: list[MarginalSolution], at: int, cell: int
+    ) -> Iterator[tuple[int, MarginalSolution | None]]:
+        """The queries `order` of a cell in a round, each with the solution that was made before it, if there is one.
+
+        There is one before the first query, one before that in the middle, and one after the last query, unless fewer
+        are enough. They are added to `done`.
+        """
+        for place, k in enumerate(order):
+            yield k, self._next(done, k, at, cell) if place in (0, len(order) // 2) else None
+        self._next(done, order[0], at, cell)
+
+    def _next(self, done: list[MarginalSolution], k: int, at: int, cell: int) -> MarginalSolution | None:
+        if sum(one.seconds.cpu for one in done if one.seconds) > ENOUGH:
+            return None
+        one = self._long.get(at) or self._marginal.solve(k, at, cell, FIRST_SEED + len(done))
+        if one.seconds and one.seconds.cpu > LONG and at not in self._long:
+            self._long = {at: one._replace(vi=one.vi.copy())}
+        done.append(one)
+        return one
+
+    def seconds(self, done: Sequence[MarginalSolution], part: Sequence[int]) -> Seconds | None:
+        """Mean seconds of solutions at the parameters of a part, from those of some and the sweep; `None` of none."""
+        right = [(one.number, one.seconds) for one in done if one.seconds is not None]
+        if not right:
+            return None
+        share = float(self._sweep[list(part)].mean() / self._sweep[[k for k, _ in right]].mean()) / len(right)
+        return Seconds(share * sum(s.cpu for _, s in right), share * sum(s.wall for _, s in right))
 
 
 def _starts(problem: Problem, reference: TimedSnapshots) -> Iterator[Mask | None]:

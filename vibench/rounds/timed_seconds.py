@@ -27,16 +27,23 @@ class TimedRound:
     assemble: Mapping[int, Seconds]
     """Seconds of the assembly; in full, of some of the queries, which count for all."""
     solve: Mapping[int, Seconds]
-    """Seconds of the solver; of the high-fidelity model, of its solutions with their assembly."""
+    """Seconds of the solver."""
     slowdown: float
     """Slowdown of the calibration before or after it, whichever is larger."""
     certify: Mapping[int, Seconds] = field(default_factory=dict)
     """Seconds of the certificate; nothing without one."""
+    high_fidelity: Seconds | None = None
+    """Mean seconds of the high-fidelity solutions beside the queries, their assembly included."""
 
     @property
     def cpu(self) -> float:
         """CPU seconds of a query, mean over those of the round."""
         return float(round_columns(self)["total_s"])
+
+    @property
+    def high_fidelity_cpu(self) -> float:
+        """CPU seconds of a high-fidelity solution; NaN without one."""
+        return np.nan if self.high_fidelity is None else self.high_fidelity.cpu
 
 
 @dataclass(frozen=True)

@@ -1,24 +1,24 @@
-"""Seconds of queries of several cells and of high-fidelity solutions, measured interleaved, round by round."""
+"""Seconds of queries of several cells, each alternated with high-fidelity solutions, round by round."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
 from vibench.arrays import Array, Indices
-from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.error_bounds import CorrectionMode
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline.assemblies import Assemblies
 from vibench.offline.correction import corrected_in_full
+from vibench.offline.models import AnyReducedModel
 from vibench.provenance import machine
 from vibench.results.costs.paired_seconds import paces
-from vibench.rounds.marginal_solutions import MarginalSolutions, parts_alike
+from vibench.rounds.marginal_solutions import MarginalSolution, MarginalSolutions, SolutionsBeside, parts_alike
 from vibench.rounds.timed_seconds import TimedCell, TimedRound, round_columns
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, Watch, build_problem
@@ -36,20 +36,16 @@ SHARE = 3
 ROUND_SECONDS = 5.0
 """Wall seconds of the solver after which a cell's part of a round ends."""
 
-HIGH_FIDELITY_SECONDS = 0.1
-"""CPU seconds of high-fidelity solutions after which their part of a round ends: all of a round where they are short,
-since every ratio rests on them, and what the sweep says of the others is as uncertain as one measurement of it."""
-
 ASSEMBLY_SECONDS = 0.02
-"""CPU seconds of assemblies in full after which no further one is timed in a round."""
+"""CPU seconds of assemblies in full after which no further one is timed in a cell's part of a round."""
 
 
 @dataclass(frozen=True)
 class TimingRounds(ItemwiseStage):
-    """One block of rounds of cells that are compared and of the high-fidelity model; a item is a round of one of them.
+    """One block of rounds of cells that are compared; an item is a round of one of them.
 
-    A disturbance of the machine that lasts longer than a round meets all alike. Their order is another one in each
-    round. The value is a `TimedCell` per cell, then that of the high-fidelity model.
+    A cell's queries alternate with high-fidelity solutions, so that a disturbance of the machine meets both alike. The
+    order of the cells is another one in each round. The value is a `TimedCell` per cell.
     """
 
     label = "timing"
@@ -65,18 +61,13 @@ class TimingRounds(ItemwiseStage):
 
     @property
     def items(self) -> int:
-        """One for each round of each cell, and of the high-fidelity model."""
-        return self.rounds * self.competitors
-
-    @property
-    def competitors(self) -> int:
-        """The cells and the high-fidelity model, which is the last one."""
-        return len(self.cells) + 1
+        """One for each round of each cell."""
+        return self.rounds * len(self.cells)
 
     @property
     def weight(self) -> int:
         """It works for all of its cells."""
-        return self.competitors
+        return len(self.cells)
 
     @property
     def solutions(self) -> tuple[Stage, ...]:
@@ -89,13 +80,13 @@ class TimingRounds(ItemwiseStage):
         return tuple(dict.fromkeys((*read, *self.solutions)))
 
     def place(self, item: int) -> tuple[int, int]:
-        """The round of the block, and the competitor, of a item."""
-        number, within = divmod(item, self.competitors)
-        return number, int(_order(self.first + number, self.competitors)[within])
+        """The round of the block, and the cell, of an item."""
+        number, within = divmod(item, len(self.cells))
+        return number, int(_order(self.first + number, len(self.cells))[within])
 
     def stage_of(self, number: int) -> Stage:
-        """The cell of a item: processes take turns where its plugins are of other packages than the next one's."""
-        return (*self.cells, self.solutions[0])[self.place(number)[1]]
+        """The cell of an item: processes take turns where its plugins are of other packages than the next one's."""
+        return self.cells[self.place(number)[1]]
 
     def begin(self, store: Store) -> _Rounds:
         """Models are loaded when they are first needed; cells that differ in their solver alone share one."""
@@ -118,7 +109,6 @@ class _Rounds(Items):
         self._certificates: dict[str, OnlineCertificate] = {}
         self._factors: dict[str, Assemblies] = {}
         self._warm: set[int] = set()
-        self._forms: dict[tuple[int, int], tuple[VariationalInequality, Seconds]] = {}
         self._slowdown: float | None = None
 
     @cached_property
@@ -135,69 +125,70 @@ class _Rounds(Items):
         one = self._stage.cells[0]
         return MarginalSolutions(build_problem(one.problem), self._reference, one.validation_set.seed)
 
+    @cached_property
+    def _beside(self) -> SolutionsBeside:
+        return SolutionsBeside(self._marginal, [seconds.cpu for seconds in self._reference.seconds])
+
     def item(self, number: int, watch: Watch) -> TimedRound:
         """One round of one cell, after a warm-up if it is the cell's first one in this process."""
         within, cell = self._stage.place(number)
         at, before = self._stage.first + within, self._slowdown
-        timed_round = self._solutions if cell == len(self._stage.cells) else partial(self._round, cell, watch)
         if cell not in self._warm:
-            timed_round(at, warm_up=True)
+            self._queries_of(watch, self._warming_up(cell, at), at, cell, 1)
             self._warm.add(cell)
             before = None
         before = calibration().slowdown() if before is None else before
-        assemble, solve, certify = timed_round(at)
+        part = self._parts[at % SHARE] or self._parts[0]
+        solutions: list[MarginalSolution] = []
+        alternated = self._beside.alternated(self._order(cell, at, part), solutions, at, cell)
+        assemble, solve, certify = self._queries_of(watch, alternated, at, cell, 0)
         self._slowdown = calibration().slowdown()
-        return TimedRound(assemble, solve, max(before, self._slowdown), certify)
+        high_fidelity = self._beside.seconds(solutions, part)
+        return TimedRound(assemble, solve, max(before, self._slowdown), certify, high_fidelity)
 
-    def _solutions(
-        self, at: int, *, warm_up: bool = False
+    def _order(self, cell: int, at: int, part: Sequence[int]) -> Sequence[int]:
+        """The queries of a cell in a round; the first one is another one in every block."""
+        fine = self._stage.queries[cell]
+        mine = [k for k in fine if k in part] or [fine[at % len(fine)]]
+        shift = at // SHARE % len(mine)
+        return [*mine[shift:], *mine[:shift]]
+
+    def _warming_up(self, cell: int, at: int) -> Iterator[tuple[int, MarginalSolution]]:
+        """One query with an assembly before it, and a solution in a process that has made none: it does the set-up."""
+        k = self._stage.queries[cell][0]
+        yield k, self._marginal.assemble(k, at, cell) if self._warm else self._marginal.solve(k, at, cell, 1)
+
+    def _queries_of(
+        self, watch: Watch, alternated: Iterator[tuple[int, MarginalSolution | None]], at: int, cell: int, warm_up: int
     ) -> tuple[dict[int, Seconds], dict[int, Seconds], dict[int, Seconds]]:
-        """Seconds of high-fidelity solutions of a round, or of one to warm up.
-
-        Where they are too long for all parameters of the round, what the sweep took says how many the others stand for.
-        """
-        part, sweep = self._parts[at % SHARE] or self._parts[0], [s.cpu for s in self._reference.seconds]
-        shift = at // SHARE % len(part)  # another one in every block
-        solve: dict[int, Seconds] = {}
-        for k in [*part[shift:], *part[:shift]][: 1 if warm_up else None]:
-            solve[k] = self._marginal.seconds(k, at, int(warm_up))
-            if sum(seconds.cpu for seconds in solve.values()) > HIGH_FIDELITY_SECONDS:
-                break
-        share = float(np.mean([sweep[k] for k in part]) / np.mean([sweep[k] for k in solve]))
-        return {}, {k: Seconds(share * seconds.cpu, share * seconds.wall) for k, seconds in solve.items()}, {}
-
-    def _round(
-        self, cell: int, watch: Watch, at: int, *, warm_up: bool = False
-    ) -> tuple[dict[int, Seconds], dict[int, Seconds], dict[int, Seconds]]:
-        """Seconds of assembly, solution, certificate and correction of the cell's queries, or of one to warm up.
+        """Seconds of assembly, solution, certificate and correction of queries, each with the solution before it.
 
         What is timed is equivalent to the queries and nowhere the same: nothing is gained by remembering it.
         """
-        stage, fine = self._stage.cells[cell], self._stage.queries[cell]
-        mine = [k for k in fine if k in self._parts[at % SHARE]] or [fine[at % len(fine)]]
-        order = mine[: 1 if warm_up else None]
+        stage, seed = self._stage.cells[cell], (at, cell, warm_up)
+        if isinstance(stage, FormulationQueries):
+            return self._formulated(stage, (k for k, _ in alternated), watch, *seed)
+        assert isinstance(stage, CellQueries)
+        assemble: dict[int, Seconds] = {}
         solve: dict[int, Seconds] = {}
         certify: dict[int, Seconds] = {}
-        if isinstance(stage, FormulationQueries):
-            return self._formulated(stage, order, watch, at, cell, int(warm_up))
-        assert isinstance(stage, CellQueries)
         queries = self._queries(stage.assembly)
-        assemble = self._assemblies(queries, order, at, cell, stage, warm_up=warm_up)
-        for k in order:
-            seed = (stage.assembly.validation.seed, k, at, cell, int(warm_up))
-            query = stage.query(queries, k).repeated(*seed)
+        asked = stage.certificate is not None or stage.correction is not CorrectionMode.NONE
+        for k, solution in alternated:
+            near = queries.near(k, *seed)
+            if (seconds := _assembly(stage, queries.model, near, solution, assemble)) is not None:
+                assemble[k] = seconds
+            query = stage.query(queries, k).repeated(stage.assembly.validation.seed, k, *seed)
             answer, solve[k] = query.prepare(watch)()
             query.check(answer)
-            asked = stage.certificate is not None or stage.correction is not CorrectionMode.NONE
             if asked and answer.x is not None and answer.alpha is not None:
-                near = queries.near(k, at, cell, int(warm_up))
                 certify[k] = self._certified(stage, queries, near, (query.in_model(answer.x), answer.alpha))
             if sum(seconds.wall for seconds in solve.values()) > ROUND_SECONDS:
                 break
         return assemble, solve, certify
 
     def _formulated(
-        self, stage: FormulationQueries, order: Sequence[int], watch: Watch, *seed: int
+        self, stage: FormulationQueries, order: Iterable[int], watch: Watch, *seed: int
     ) -> tuple[dict[int, Seconds], dict[int, Seconds], dict[int, Seconds]]:
         """Seconds of queries of a formulation, whose assembly is a part of the solution."""
         if stage.key not in self._formulations:
@@ -231,64 +222,60 @@ class _Rounds(Items):
             self._models[assembly.key] = Queries(self._store, assembly)
         return self._models[assembly.key]
 
-    def _assemblies(
-        self, queries: Queries, order: Sequence[int], at: int, cell: int, stage: CellQueries, *, warm_up: bool
-    ) -> dict[int, Seconds]:
-        """Seconds of the assembly of every query; in full, which costs the same at each parameter, of the first ones.
-
-        High-fidelity matrices are the same for all models: they are assembled once in a round.
-        """
-        model = queries.model
-        if stage.compilation is not None:
-            return dict.fromkeys(order, NO_TIME)  # it is part of the solution
-        if isinstance(model, HyperReducedModel):
-            return {k: timed(partial(model.assemble, queries.near(k, at, cell, int(warm_up))))[1] for k in order}
-        if not self._forms:
-            checked_assembly(model.problem, queries.near(order[0], at, cell, 1))  # the warm-up
-        self._forms = {key: forms for key, forms in self._forms.items() if key[0] == at}
-        seconds: dict[int, Seconds] = {}
-        for k in order:
-            if (at, k) not in self._forms:
-                vi, forms = timed(partial(checked_assembly, model.problem, queries.near(k, at, cell, 0)))
-                self._forms[at, k] = vi.copy(), forms  # the next assembly may be written into the same arrays
-            vi, forms = self._forms[at, k]
-            seconds[k] = forms + timed(partial(model.reduce, vi))[1]
-            if sum(one.cpu for one in seconds.values()) > ASSEMBLY_SECONDS:
-                break
-        return seconds
-
     def lost(self, number: int, failed: Failed) -> Failed:  # noqa: ARG002
         """A round without a result."""
         return failed
 
     def finish(self, items: Sequence[TimedRound | Failed]) -> tuple[TimedCell, ...]:
-        """The rounds of every cell and of the high-fidelity model, in their order."""
-        rounds: list[dict[int, TimedRound]] = [{} for _ in range(self._stage.competitors)]
+        """The rounds of every cell, in their order."""
+        rounds: list[dict[int, TimedRound]] = [{} for _ in self._stage.cells]
         lost: list[list[Failed]] = [[] for _ in rounds]
         for number, outcome in enumerate(items):
-            within, competitor = self._stage.place(number)
+            within, cell = self._stage.place(number)
             if isinstance(outcome, Failed):
-                lost[competitor].append(outcome)
+                lost[cell].append(outcome)
             else:
-                rounds[competitor][self._stage.first + within] = outcome
+                rounds[cell][self._stage.first + within] = outcome
         return tuple(
             TimedCell(mine, machine(), len(gone), gone[0].reason if gone else "")
             for mine, gone in zip(rounds, lost, strict=True)
         )
 
 
+def _assembly(
+    stage: CellQueries,
+    model: AnyReducedModel,
+    near: Array,
+    solution: MarginalSolution | None,
+    done: Mapping[int, Seconds],
+) -> Seconds | None:
+    """Seconds of the assembly of a query, `None` where it is not timed.
+
+    In full it costs the same at each parameter: some assemblies stand for all, those of the high-fidelity solutions.
+    """
+    if stage.compilation is not None:
+        return NO_TIME  # it is part of the solution
+    if isinstance(model, HyperReducedModel):
+        return timed(partial(model.assemble, near))[1]
+    if solution is None or sum(seconds.cpu for seconds in done.values()) > ASSEMBLY_SECONDS:
+        return None
+    return solution.assembly + timed(partial(model.reduce, solution.vi))[1]
+
+
 def block_rows(stage: TimingRounds, timed: Sequence[TimedCell]) -> list[list[Row]]:
-    """Rows of the timings table of every cell of a block, from its rounds and those of the high-fidelity model."""
+    """Rows of the timings table of every cell of a block, from its rounds."""
     numbers = range(stage.first, stage.first + stage.rounds)
-    seconds = np.array([[one.rounds[k].cpu if k in one.rounds else np.nan for k in numbers] for one in timed])
-    pace, high_fidelity = dict(zip(numbers, paces(seconds), strict=True)), timed[-1].rounds
+    of_cells = [[one.rounds[k].cpu if k in one.rounds else np.nan for k in numbers] for one in timed]
+    beside = [[one.rounds[k].high_fidelity_cpu if k in one.rounds else np.nan for k in numbers] for one in timed]
+    seconds = np.array([*of_cells, *beside])
+    pace = dict(zip(numbers, paces(seconds), strict=True))
     block = stage.key.rpartition("-")[2]
     return [
         [
             {"block": block, "round": k, "queries": len(one.solve), "slowdown": one.slowdown, "pace": pace[k]}
-            | {"hf_s": high_fidelity[k].cpu if k in high_fidelity else None}
+            | {"hf_s": one.high_fidelity and one.high_fidelity.cpu}
             | round_columns(one)
             for k, one in cell.rounds.items()
         ]
-        for cell in timed[:-1]
+        for cell in timed
     ]

@@ -61,11 +61,10 @@ def timed(stage: TimingRounds, unsteady: float = 0.0) -> tuple[TimedCell, ...]:
 
     def once(cell: CellQueries) -> TimedRound:
         factor = np.exp(unsteady * (1.2 if even else -1.0)) if cell.assembly.enrichment.primal.name == FIXED else 1.0
-        return TimedRound({0: Seconds(factor, factor)}, {0: Seconds(2.0 * factor, 2.0 * factor)}, 1.0)
+        own = Seconds(factor, factor), Seconds(2.0 * factor, 2.0 * factor)
+        return TimedRound({0: own[0]}, {0: own[1]}, 1.0, high_fidelity=Seconds(30.0, 30.0))
 
-    model = TimedRound({}, {0: Seconds(30.0, 30.0)}, 1.0)
-    cells = tuple(TimedCell(dict.fromkeys(numbers, once(cell)), "this one") for cell in stage.cells)
-    return (*cells, TimedCell(dict.fromkeys(numbers, model), "this one"))
+    return tuple(TimedCell(dict.fromkeys(numbers, once(cell)), "this one") for cell in stage.cells)
 
 
 def record(plan: TimingPlan, stage: TimingRounds | None, unsteady: float = 0.0) -> list[TimingRounds]:

@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import SampleStore, carry_out
 
-from vibench.errors import NumericalError
 from vibench.interfaces.strategies import Stop
+from vibench.model.galerkin import ReducedModel
 from vibench.qp.status import Status
 from vibench.rounds import marginal_solutions, timing_rounds
-from vibench.rounds.marginal_solutions import MarginalSolutions, parts_alike
+from vibench.rounds.marginal_solutions import MarginalSolution, MarginalSolutions, SolutionsBeside, parts_alike
 from vibench.rounds.timed_seconds import TimedCell, TimedRound, round_columns, seconds_of_cell, seconds_of_queries
 from vibench.rounds.timing_rounds import TimingRounds, block_rows
 from vibench.stages.assembly import AssemblyStage
@@ -27,7 +27,7 @@ from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.snapshots import gather
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
-from vibench.timing import Seconds
+from vibench.timing import NO_TIME, Seconds
 
 PROBLEM = Plugin("problem", "obstacle", '{"resolution": 200}', "test")
 VALIDATION = 6
@@ -71,26 +71,26 @@ def steady(seconds: float, queries: tuple[int, ...] = (0, 1), slowdown: float = 
 
 @given(st.integers(1, 9), st.integers(1, 9))
 def test_every_round_has_every_cell_once_before_the_next_one_begins(rounds: int, count: int) -> None:
-    """And the high-fidelity model, which comes after the cells in number alone."""
     stage = TimingRounds((CELLS[0],) * count, (EVERY,) * count, rounds)
     places = [stage.place(item) for item in range(stage.items)]
     assert [number for number, _ in places] == sorted(number for number, _ in places)
-    assert sorted(places) == [(number, k) for number in range(rounds) for k in range(count + 1)]
+    assert sorted(places) == [(number, k) for number in range(rounds) for k in range(count)]
 
 
 def test_the_order_of_the_cells_changes_from_round_to_round() -> None:
     """Whoever comes after a large model finds its own arrays out of the cache: not always the same one."""
     stage = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 12)
-    first = [stage.place(number * 7)[1] for number in range(12)]
+    first = [stage.place(number * 6)[1] for number in range(12)]
     assert len(set(first)) > 3
     later = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 4, first=8)
-    assert [later.place(number * 7)[1] for number in range(4)] == first[8:]
+    assert [later.place(number * 6)[1] for number in range(4)] == first[8:]
 
 
 def test_a_machine_that_slows_down_halfway_meets_all_alike() -> None:
     """Cell after cell, the second of two equal ones would seem thrice as slow."""
     stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 12)
-    items = [steady(1.0 if item < stage.items / 2 else 3.0) for item in range(stage.items)]
+    spent = [1.0 if item < stage.items / 2 else 3.0 for item in range(stage.items)]
+    items = [replace(steady(one), high_fidelity=Seconds(2.0 * one, 2.0 * one)) for one in spent]
     timed = timing_rounds._Rounds.finish(_in(stage), items)
     one, other = map(seconds_of_cell, block_rows(stage, timed))
     assert one == other
@@ -106,15 +106,15 @@ def _in(stage: TimingRounds) -> timing_rounds._Rounds:
 
 
 def test_every_ok_query_is_timed_and_no_other(store: SampleStore) -> None:
-    fine = (EVERY, (0, 2, 5), EVERY, (3,), EVERY)
-    timed = TimingRounds(CELLS, fine[:-1], 8).run(store).value
+    fine = (EVERY, (0, 2, 5), EVERY, (3,))
+    timed = TimingRounds(CELLS, fine, 8).run(store).value
     for one, numbers in zip(timed, fine, strict=True):
         rounds = list(one.rounds.values())
         assert list(one.rounds) == list(range(8))
         assert {k for each in rounds for k in each.solve} == set(numbers)
         assert all(s.cpu > 0.0 for each in rounds for part in (each.assemble, each.solve) for s in part.values())
+        assert all(each.high_fidelity_cpu > 0.0 for each in rounds)
         assert (one.lost, one.reason) == (0, "")
-    for one, numbers in zip(timed[:-1], fine, strict=False):
         rows = seconds_of_queries(list(one.rounds.values()))
         assert set(rows) == set(numbers)
         assert all(row["total_s"] == row["assemble_s"] + row["solve_s"] for row in rows.values())
@@ -142,7 +142,7 @@ def test_high_fidelity_solutions_start_where_those_of_the_sweep_do(
         marginal_solutions, "solve_unverified", lambda *given: (starts.append(given[2]), solve(*given))[1]
     )
     marginal = MarginalSolutions(PROBLEM.create(), reference, 1)
-    assert all(marginal.seconds(k, 0).cpu > 0.0 for k in EVERY)
+    assert all(one.seconds and one.seconds.cpu > one.assembly.cpu for one in (marginal.solve(k, 0) for k in EVERY))
     edges = [0, 2, 3, 4, 6]
     for k, start in enumerate(starts):
         before = range(max(edge for edge in edges if edge <= k), k)
@@ -150,27 +150,63 @@ def test_high_fidelity_solutions_start_where_those_of_the_sweep_do(
         if start is not None:
             assert any(np.array_equal(start, reference.lam[:, number] > 0.0) for number in before)
     wrong = replace(reference, u=reference.u[:, ::-1].copy())
-    with pytest.raises(NumericalError, match="differs from the one that was verified"):
-        MarginalSolutions(PROBLEM.create(), wrong, 1).seconds(0, 0)
+    assert MarginalSolutions(PROBLEM.create(), wrong, 1).solve(0, 0).seconds is None
 
 
-def test_long_high_fidelity_solutions_stand_for_others(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One is timed in a round; the sweep says how long the others of the round take beside it."""
-    monkeypatch.setattr(timing_rounds, "HIGH_FIDELITY_SECONDS", 0.0)
+class Given(MarginalSolutions):
+    """Solutions that take the given seconds, `None` of those that fail; what was asked for is kept."""
+
+    def __init__(self, *taken: float | None) -> None:
+        self._taken = list(taken)
+        self.asked: list[tuple[int, ...]] = []
+
+    def solve(self, number: int, *seed: int) -> MarginalSolution:
+        self.asked.append((number, *seed))
+        taken = self._taken[(len(self.asked) - 1) % len(self._taken)]
+        vi = PROBLEM.create().assemble(PROBLEM.create().parameters.lower)
+        return MarginalSolution(number, vi, NO_TIME, None if taken is None else Seconds(taken, taken))
+
+
+@pytest.mark.parametrize(("taken", "numbers"), [(0.01, [7, 5, 7]), (0.03, [7, 5]), (0.06, [7])])
+def test_solutions_come_before_amid_and_after_the_queries_until_they_are_enough(
+    taken: float, numbers: list[int]
+) -> None:
+    marginal, done = Given(taken), list[MarginalSolution]()
+    beside = SolutionsBeside(marginal, [1.0] * 9)
+    steps = list(beside.alternated([7, 3, 5, 8], done, 4, 1))
+    assert [k for k, _ in steps] == [7, 3, 5, 8]
+    assert [k for k, solution in steps if solution is not None] == numbers[:2]
+    assert [number for number, *_ in marginal.asked] == numbers == [one.number for one in done]
+    assert len(set(marginal.asked)) == len(marginal.asked)  # each is next to another parameter
+
+
+def test_a_long_solution_serves_all_cells_of_a_round_and_no_other_round() -> None:
+    marginal = Given(2.0)
+    beside, done = SolutionsBeside(marginal, [1.0] * 9), [list[MarginalSolution]() for _ in range(3)]
+    for solutions, (at, cell) in zip(done, [(0, 0), (0, 1), (1, 1)], strict=True):
+        ((_, first), *_) = beside.alternated([2 * cell, 5], solutions, at, cell)
+        assert first is not None
+    assert [number for number, *_ in marginal.asked] == [0, 2]
+    assert [[one.number for one in solutions] for solutions in done] == [[0], [0], [2]]
+    assert done[0][0].vi.A is not done[1][0].vi.A  # kept in arrays of its own
+
+
+def test_some_solutions_stand_for_all_of_a_part_by_the_sweep() -> None:
+    marginal = Given(0.01, None, 0.03)
+    beside, done = SolutionsBeside(marginal, [1.0, 2.0, 3.0, 6.0]), list[MarginalSolution]()
+    list(beside.alternated([1, 2, 3], done, 0, 0))
+    assert [one.seconds is None for one in done] == [False, True, False]
+    mean = beside.seconds(done, (1, 2, 3))
+    assert mean is not None
+    assert mean.cpu == pytest.approx(0.02 * (11.0 / 3.0) / 2.0)  # both right ones are at parameter 1
+    assert beside.seconds([done[1]], (1, 2, 3)) is None
+
+
+def test_rounds_begin_at_other_queries_in_later_blocks(store: SampleStore) -> None:
     work = TimingRounds(CELLS[:1], (EVERY,), 1).begin(store)
     assert isinstance(work, timing_rounds._Rounds)
-    sweep = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
-    work._reference = replace(work._reference, seconds=tuple(Seconds(one, one) for one in sweep))
-    seen = {}
-    for at in range(8):
-        _, solve, _ = work._solutions(at)
-        (k,) = solve
-        seen[k] = at % timing_rounds.SHARE
-    part = work._parts[0]
-    monkeypatch.setattr(MarginalSolutions, "seconds", lambda _, k, *__: Seconds(sweep[k], sweep[k]))
-    _, solve, _ = work._solutions(0)
-    assert [one.cpu for one in solve.values()] == pytest.approx([np.mean([sweep[k] for k in part])])
-    assert len(seen) > timing_rounds.SHARE  # in later blocks it is another one
+    firsts = {work._order(0, at, work._parts[at % timing_rounds.SHARE])[0] for at in range(2 * timing_rounds.SHARE)}
+    assert firsts == set(EVERY)
 
 
 @given(st.lists(st.floats(0.1, 10.0), min_size=1, max_size=40))
@@ -181,19 +217,20 @@ def test_parts_of_a_pass_have_all_queries_once_and_take_about_as_long(seconds: l
     assert max(sums) - min(sums) <= 2.0 * max(seconds)
 
 
-def test_matrices_in_full_are_assembled_once_in_a_round_for_all_cells(
+def test_matrices_in_full_are_those_of_the_solutions_and_none_is_assembled_twice(
     store: SampleStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[float] = []
-    plain = timing_rounds.checked_assembly
-    monkeypatch.setattr(timing_rounds, "ASSEMBLY_SECONDS", 0.0)
+    reduced: list[Any] = []
+    plain, reduce = marginal_solutions.checked_assembly, ReducedModel.reduce
     monkeypatch.setattr(
-        timing_rounds, "checked_assembly", lambda problem, mu: (calls.append(float(mu[0])), plain(problem, mu))[1]
+        marginal_solutions, "checked_assembly", lambda problem, mu: (calls.append(float(mu[0])), plain(problem, mu))[1]
     )
-    TimingRounds(CELLS[:3], (EVERY,) * 3, 4).run(store)  # high-fidelity solutions assemble for themselves
-    assert len(calls) == 1 + 4  # a warm-up, then once per round, at another parameter each time
-    assert len({round(mu, 6) for mu in calls}) == timing_rounds.SHARE
-    assert len(set(calls)) == 5
+    monkeypatch.setattr(ReducedModel, "reduce", lambda model, vi: (reduced.append(vi), reduce(model, vi))[1])
+    TimingRounds(CELLS[:3], (EVERY,) * 3, 4).run(store)
+    assert len(calls) == 3 * (1 + 4 * 3)  # a warm-up, then three solutions in each round, for every cell
+    assert len(set(calls)) == len(calls)
+    assert len(reduced) == 3 * (1 + 4 * 2)  # none after the last query
 
 
 def test_a_round_that_takes_long_ends_early(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -208,21 +245,19 @@ def test_a_lost_round_is_told_and_the_others_keep_their_numbers() -> None:
     gone = next(item for item in range(stage.items) if stage.place(item) == (1, 0))
     items[gone] = Failed(Status.CRASHED, "the worker died")
     timed = _in(stage).finish(items)
-    assert [list(one.rounds) for one in timed] == [[6, 8], [6, 7, 8], [6, 7, 8]]
-    assert [(one.lost, one.reason) for one in timed] == [(1, "the worker died"), (0, ""), (0, "")]
+    assert [list(one.rounds) for one in timed] == [[6, 8], [6, 7, 8]]
+    assert [(one.lost, one.reason) for one in timed] == [(1, "the worker died"), (0, "")]
     assert [[row["round"] for row in rows] for rows in block_rows(stage, timed)] == [[6, 8], [6, 7, 8]]
 
 
-def test_rows_have_what_the_high_fidelity_model_took_in_their_round() -> None:
+def test_rows_have_what_a_high_fidelity_solution_took_beside_their_queries() -> None:
     stage = TimingRounds((CELLS[0],), (EVERY,), 2)
-    model = TimedCell({0: TimedRound({}, {3: Seconds(7.0, 7.0), 4: Seconds(9.0, 9.0)}, 1.0)}, "here", 1, "lost")
-    (rows,) = block_rows(stage, [TimedCell({0: steady(1.0), 1: steady(3.0)}, "here"), model])
+    rounds = {0: replace(steady(1.0), high_fidelity=Seconds(8.0, 9.0)), 1: steady(3.0)}
+    (rows,) = block_rows(stage, [TimedCell(rounds, "here")])
     assert [row["hf_s"] for row in rows] == [8.0, None]
     assert len({row["block"] for row in rows}) == 1
     other = TimingRounds((CELLS[0],), (EVERY,), 2, first=2)
-    assert (
-        block_rows(other, [TimedCell({2: steady(1.0)}, "here"), TimedCell({}, "")])[0][0]["block"] != rows[0]["block"]
-    )
+    assert block_rows(other, [TimedCell({2: steady(1.0)}, "here")])[0][0]["block"] != rows[0]["block"]
 
 
 def test_a_certificate_is_a_part_of_its_query() -> None:
@@ -267,5 +302,5 @@ def test_a_slow_machine_marks_the_row_and_waiting_for_a_core_does_not(wall: floa
 
 
 def test_the_limit_of_the_stage_is_that_of_all_its_cells(tmp_path: Path) -> None:
-    assert TimingRounds(CELLS, (EVERY,) * 4, 12).weight == 5
+    assert TimingRounds(CELLS, (EVERY,) * 4, 12).weight == 4
     assert CELLS[0].weight == 1

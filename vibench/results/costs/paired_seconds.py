@@ -1,8 +1,9 @@
 """Seconds of models that were timed in the same rounds: their ratios, and where those of another run would lie.
 
-A *block* is a pass of rounds over all queries, in a process of its own. Within a block the seconds of a model are the
-median over its rounds, each divided by the pace of the round, which is how much slower all models were in it: whatever
-slows down a whole round leaves ratios as they are, and what hits one model in one round is an outlier. Blocks are
+A *block* is a pass of rounds over all queries, in a process of its own. In every round the queries of a model alternate
+with high-fidelity solutions, so that both meet the machine as it is within tenths of a second: the ratio of a block is
+the median over the ratios of its rounds, and two models are compared by their ratios. Seconds of a block are the median
+over its rounds, each divided by the pace of the round, which is how much slower everything was in it. Blocks are
 independent, and what differs between processes differs between them. The interval of a ratio is that of a mean over
 blocks: Student's, its variance moderated by those of all models of the run (Smyth 2004, "Linear models and empirical
 Bayes methods for assessing differential expression", section 6), since a model has few blocks of its own.
@@ -143,19 +144,24 @@ def _median(values: Array) -> float:
 
 
 class Block(NamedTuple):
-    """Logarithms of the seconds of a query and of a high-fidelity solution in one block."""
+    """Logarithms of the seconds of a query in one block, and of its ratio to a high-fidelity solution beside it."""
 
     online: float
-    high_fidelity: float
+    ratio: float
+
+    @property
+    def high_fidelity(self) -> float:
+        """Logarithm of the seconds of a high-fidelity solution that belong to the ratio."""
+        return self.online - self.ratio
 
 
 Measured = tuple[str, float, float]
-"""The block of a round, and the seconds of a query and of a high-fidelity solution in it, at its pace."""
+"""The block of a round, the seconds of a query in it, at its pace, and their ratio to a high-fidelity solution's."""
 
 
 def _measured(row: Mapping[str, Any]) -> Measured:
     high_fidelity = math.nan if row["hf_s"] is None else row["hf_s"]
-    return row["block"], row["total_s"] / row["pace"], high_fidelity / row["pace"]
+    return row["block"], row["total_s"] / row["pace"], row["total_s"] / high_fidelity
 
 
 def blocks_of(rounds: Iterable[Mapping[str, Any]]) -> dict[str, Block]:
@@ -165,10 +171,16 @@ def blocks_of(rounds: Iterable[Mapping[str, Any]]) -> dict[str, Block]:
 
 def _blocks(rounds: Iterable[Measured]) -> dict[str, Block]:
     by_block: dict[str, list[tuple[float, float]]] = {}
-    for block, *seconds in rounds:
-        by_block.setdefault(block, []).append((seconds[0], seconds[1]))
+    for block, *measured in rounds:
+        by_block.setdefault(block, []).append((measured[0], measured[1]))
     with np.errstate(all="ignore"):
         return {name: Block(*map(_median, np.log(np.array(rows)).T)) for name, rows in by_block.items()}
+
+
+def _log_ratio(b: Block, a: Block) -> float:
+    """Of the seconds of a query of b to those of a, in one block: by the high-fidelity model, where it was timed."""
+    ratio = b.ratio - a.ratio
+    return ratio if math.isfinite(ratio) else b.online - a.online
 
 
 def mean_seconds(blocks: Iterable[Block]) -> tuple[float, float | None]:
@@ -178,8 +190,8 @@ def mean_seconds(blocks: Iterable[Block]) -> tuple[float, float | None]:
     """
     every = np.array(list(blocks))
     paired = every[np.isfinite(every[:, 1])]
-    online, high_fidelity = np.exp((paired if len(paired) else every).mean(axis=0))
-    return float(online), float(high_fidelity) if len(paired) else None
+    online, ratio = np.exp((paired if len(paired) else every).mean(axis=0))
+    return float(online), float(online / ratio) if len(paired) else None
 
 
 class PairedSeconds:
@@ -206,7 +218,7 @@ class PairedSeconds:
         self._rounds[cell] = Counter(block for block, *_ in rounds)
         self._names.update(blocks)
         self._first.update(list(blocks)[:1])
-        self._ratios.add(cell, [b.online - b.high_fidelity for b in blocks.values() if math.isfinite(b.high_fidelity)])
+        self._ratios.add(cell, [b.ratio for b in blocks.values() if math.isfinite(b.ratio)])
         self._levels.add(cell, [b.online for b in blocks.values()])
 
     def rounds(self, a: str | None, b: str) -> int:
@@ -230,30 +242,27 @@ class PairedSeconds:
         """The same as further blocks of this run would have it."""
         mine = self._blocks.get(b, {})
         if a is None:
-            return self._estimate(
-                self._ratios, [x.online - x.high_fidelity for x in mine.values() if math.isfinite(x.high_fidelity)]
-            )
+            return self._estimate(self._ratios, [x.ratio for x in mine.values() if math.isfinite(x.ratio)])
         others = self._blocks.get(a, {})
-        common = [name for name in mine if name in others]
+        common = [(x, others[name]) for name, x in mine.items() if name in others]
         if common:
-            return self._estimate(self._ratios, [mine[name].online - others[name].online for name in common])
+            return self._estimate(self._ratios, [_log_ratio(x, y) for x, y in common])
         apart = self.ratio_within(None, b), self.ratio_within(None, a)
         return None if apart[0] is None or apart[1] is None else apart[0].minus(apart[1])
 
     def level(self, a: str | None, b: str) -> Estimate | None:
         """The logarithm of the seconds of a query of a, or of the high-fidelity model, in the blocks shared with b.
 
-        Where a shares none with b, in all of its own. What differs between cold runs is a part of it, too: offline
-        seconds come from other moments.
+        Where a shares none with b, in all of its own. It is what further blocks of this run would have; offline seconds
+        come from other moments, so that what differs between cold runs has to be added beside them.
         """
         mine = self._blocks.get(b, {})
         if a is None:
-            values = [x.high_fidelity for x in mine.values() if math.isfinite(x.high_fidelity)]
+            values = [x.high_fidelity for x in mine.values() if math.isfinite(x.ratio)]
         else:
             others = self._blocks.get(a, {})
             values = [x.online for name, x in others.items() if name in mine] or [x.online for x in others.values()]
-        level = self._estimate(self._levels, values)
-        return None if level is None else level.of_other_runs()
+        return self._estimate(self._levels, values)
 
     def _estimate(self, common: CommonVariance, values: Sequence[float]) -> Estimate | None:
         count = len(values)

@@ -43,22 +43,24 @@ def measured(
     truth = rng.uniform(-1.5, 1.0, (groups, CELLS))
     conditions = deviations * rng.standard_normal((groups, CELLS + 1))
     conditions[:, -1] = conditions[0, -1]  # one high-fidelity model is timed in all groups
-    speed = speeds(kind, 8 * blocks * groups * ROUNDS * (CELLS + 1), rng)
+    speed = speeds(kind, 4 * blocks * groups * ROUNDS * CELLS + 1, rng)
     rows, now = list[dict[str, Any]](), 0
     for block in range(blocks):
         for group in range(groups):
             process = 0.02 * rng.standard_normal(CELLS + 1)
-            seconds = np.zeros((CELLS + 1, ROUNDS))
+            seconds = np.zeros((2, CELLS, ROUNDS))
             for k in range(ROUNDS):
-                for one in rng.permutation(CELLS + 1):
-                    slow = speed[now : now + 4].mean()
+                for one in rng.permutation(CELLS):
+                    # high-fidelity solutions before, amid and after the queries
+                    slow = speed[now : now + 4].mean(), speed[now : now + 5 : 2].mean()
                     now += 4
-                    level = (truth[group, one] if one < CELLS else 0.0) + conditions[group, one]
-                    seconds[one, k] = np.exp(level + process[one] + 0.02 * rng.standard_t(2.5)) * slow
-            pace = paces(seconds)
+                    for model, (which, level) in enumerate(((one, truth[group, one]), (CELLS, 0.0))):
+                        noise = conditions[group, which] + process[which] + 0.02 * rng.standard_t(2.5)
+                        seconds[model, one, k] = np.exp(level + noise) * slow[model]
+            pace = paces(seconds.reshape(-1, ROUNDS))
             rows += [
-                {"cell": f"{group}-{one}", "block": f"{group}/{block}", "total_s": seconds[one, k], "pace": pace[k]}
-                | {"hf_s": seconds[-1, k]}
+                {"cell": f"{group}-{one}", "block": f"{group}/{block}", "pace": pace[k]}
+                | {"total_s": seconds[0, one, k], "hf_s": seconds[1, one, k]}
                 for one in range(CELLS)
                 for k in range(ROUNDS)
             ]
@@ -152,13 +154,27 @@ def test_a_pace_is_how_much_slower_a_round_is_and_nobody_alone_makes_it() -> Non
     assert paces(seconds) == pytest.approx([1.0, 2.0, 1.0, 1.0])
 
 
-def test_a_block_is_the_median_of_its_rounds_at_their_pace() -> None:
+def test_a_block_has_the_median_of_its_rounds_at_their_pace_and_that_of_their_ratios() -> None:
     rows = [
         {"block": "b", "total_s": total * pace, "hf_s": hf * pace if hf else None, "pace": pace}
-        for total, hf, pace in ((1.0, 4.0, 1.0), (1.0, 4.0, 3.0), (1.0, None, 1.0), (90.0, 4.0, 1.0))
+        for total, hf, pace in ((1.0, 4.0, 1.0), (1.0, 4.0, 3.0), (1.0, None, 1.0), (90.0, 9.0, 1.0))
     ]
     (block,) = blocks_of(rows).values()
-    assert np.exp(block) == pytest.approx([1.0, 4.0])
+    assert np.exp(block) == pytest.approx([1.0, 0.25])
+    assert np.exp(block.high_fidelity) == pytest.approx(4.0)
+
+
+def test_models_of_one_block_are_compared_by_the_solutions_beside_them() -> None:
+    """The machine was twice as slow while one of them was timed; without solutions nobody knows."""
+    for hf, expected in (((4.0, 8.0), 1.5), ((4.0, None), 3.0)):
+        rows = [
+            {"cell": cell, "block": str(k), "total_s": seconds, "hf_s": beside, "pace": 1.0}
+            for cell, seconds, beside in (("a", 1.0, hf[0]), ("b", 3.0, hf[1]))
+            for k in range(2)
+        ]
+        found = PairedSeconds(rows).ratio("a", "b")
+        assert found is not None
+        assert np.exp(found.mean) == pytest.approx(expected)
 
 
 def test_without_other_models_an_interval_is_students() -> None:

@@ -46,14 +46,12 @@ class Raw:
         return max(fmean(values) for values in columns if values)
 
     def gain(self, cell: str) -> float:
-        """Seconds of a high-fidelity solution over those of a query: by block, at the pace of each round."""
-        blocks: dict[str, list[tuple[float, float]]] = defaultdict(list)
+        """Seconds of a high-fidelity solution over those of a query beside it: medians of blocks, and their mean."""
+        blocks: dict[str, list[float]] = defaultdict(list)
         for row in self.timings:
             if row["cell"] == cell:
-                paced = [math.log(row[name] / row["pace"]) for name in ("hf_s", "total_s")]
-                blocks[row["block"]].append((paced[0], paced[1]))
-        parts = [[median(column) for column in zip(*rows, strict=True)] for rows in blocks.values()]
-        return math.exp(fmean(model - online for model, online in parts))
+                blocks[row["block"]].append(math.log(row["hf_s"] / row["total_s"]))
+        return math.exp(fmean(map(median, blocks.values())))
 
     def takes_part(self, cell: dict[str, Any]) -> bool:
         shares = [cell[f"{source}_share_mean"] or 0.0 for source in ("solver", "assembly")]
