@@ -235,17 +235,15 @@ def _as_certified(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
 def _comparison(paired: PairedSeconds, a: Mapping[str, Any] | None, b: Mapping[str, Any], tail: float) -> Comparison:
     """Break-even of b against a; what both have in common, offline phases or the set-up, does not differ."""
     key, offline_a = (None, b["hf_setup_s"]) if a is None else (a["cell"], a["offline_s"])
-    ratio, within, level = (of(key, b["cell"]) for of in (paired.ratio, paired.ratio_within, paired.level))
-    if ratio is None or within is None or level is None:
+    ratio, level = paired.ratio(key, b["cell"]), paired.level(key, b["cell"])
+    if ratio is None or level is None:
         online = (b["hf_s"] if a is None else a["online_s"]), b["online_s"]
         return Comparison(a, b, UNDECIDED, online, None)
     rng = np.random.default_rng(0)
     shared = b["hf_setup_s"] if a is None else shared_offline(a, b)
-    conditions = CONDITIONS * rng.standard_normal(DRAWS)  # of a, whose seconds are in both
-    seconds = np.exp(level.draws(rng, DRAWS) + conditions)
+    seconds, quotients = paired.draws(key, b["cell"], rng, DRAWS)
     online_a, quotient = float(np.exp(level.mean)), float(np.exp(ratio.mean))
     costs_a = Costs(offline_a, online_a, offline_draws(a, shared, rng) if a else np.full(DRAWS, offline_a), seconds)
-    quotients = np.exp(within.draws(rng, DRAWS) - conditions)
     costs_b = Costs(b["offline_s"], online_a * quotient, offline_draws(b, shared, rng), seconds * quotients)
     result = drawn_break_even(costs_a, costs_b, tail)
     if result.meaning is Meaning.UNDECIDED:

@@ -264,6 +264,17 @@ class PairedSeconds:
             values = [x.online for name, x in others.items() if name in mine] or [x.online for x in others.values()]
         return self._estimate(self._levels, values)
 
+    def draws(self, a: str | None, b: str, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
+        """Seconds of a query of a, and those of b over them, as other runs might have them (`count`,).
+
+        They are NaN where they were not measured in two blocks. What slows down a in another run makes its ratio to b smaller.
+        """
+        level, ratio = self.level(a, b), self.ratio_within(a, b)
+        if level is None or ratio is None:
+            return np.full(count, np.nan), np.full(count, np.nan)
+        conditions = CONDITIONS * rng.standard_normal(count)
+        return np.exp(level.draws(rng, count) + conditions), np.exp(ratio.draws(rng, count) - conditions)
+
     def _estimate(self, common: CommonVariance, values: Sequence[float]) -> Estimate | None:
         count = len(values)
         if count < FEWEST_BLOCKS:
