@@ -176,6 +176,64 @@ def of_break_evens() -> Sequence[str]:
     )
 
 
+def page_tables(study: str) -> list[pd.DataFrame]:
+    """The Markdown tables of a page of results, in their order."""
+    text = (ROOT / "results" / study / "README.md").read_text(encoding="utf-8")
+    found = []
+    for part in re.findall(r"^\|.*(?:\n\|.*)*", text, re.MULTILINE):
+        head, _, *rows = [[word.strip() for word in line.strip("|").split("|")] for line in part.splitlines()]
+        table = pd.DataFrame(rows, columns=head)
+        found.append(table.assign(**{n: pd.to_numeric(table[n]) for n in head if table[n].str.match(r"-?\d").all()}))
+    return found
+
+
+def of_certified() -> Sequence[str]:
+    """What the page on certified models says of effectivities, corrections, certificates and greedy training."""
+    medians, largest, costs, corrected, *_ = page_tables("certified")
+    u, in_V, natural, in_W = "u in the energy norm", "u in V", "λ in the natural norm", "λ in W"
+
+    def between(name: str, low: str = ".2f", high: str = ".2f") -> str:
+        return f"{medians[name].min():{low}} to {medians[name].max():{high}}"
+
+    def row(*names: str) -> str:
+        return " | ".join(f"{largest[n].max():.3g} ({medians[n].max():.3g})" if n else "" for n in names)
+
+    share = (costs["certificates offline [s]"] / costs["offline without [s]"]).groupby(
+        [costs["training"], costs["problem"]]
+    )
+    takes = {key: span(some) for key, some in share}
+    of_obstacle = corrected[corrected["problem"] == "obstacle"]
+    shown = of_obstacle[(of_obstacle["training"] == "own") & (of_obstacle["primal"] == "offline-pga")]
+    gained = shown[["λ without / with online", "λ without / with in full"]].to_numpy()
+    training = pd.read_csv(ROOT / "results" / "certified" / "training.csv")
+    equal = training[training["largest ratio of errors"] <= 1.0]
+    assert set(training["paper"][training["largest ratio of errors"] > 1.0]) == {"no"}
+    assert (training["largest ratio of errors"] > 1.0).sum() == 2
+    (orthant,) = [rows for key, rows in equal.groupby(["problem", "pod_tol", "dual_tol"]) if key[1:] == (1e-4, 1e-3)]
+    slower = orthant.set_index("primal")["greedy query [ms]"] / orthant.set_index("primal")["fixed query [ms]"]
+    return (
+        f"{between(f'{u}, (ii)')} times the error of u in the energy norm and {between(f'{in_V}, (ii)')} times that in",
+        f"{between(f'{natural}, (ii)')} times the error of λ in the natural norm and "
+        f"{between(f'{in_W}, (ii)', '.1f', '.1f')} times that in W",
+        f"{between(f'{in_V}, HSW', '.1f', '.0f')} times the error of u in V and "
+        f"{between(f'{in_W}, HSW', '.0f', '.0f')} times that of λ in W",
+        f"{between(f'{u}, (ii) online', high='.1f')} for u in the energy norm, "
+        f"{between(f'{natural}, (ii) online', '.1f', '.1f')} for λ in the natural norm, and "
+        f"{between(f'{in_W}, (ii) online', '.1f', '.0f')} for λ in W",
+        f"| {row(f'{u}, (ii)', f'{in_V}, (ii)', f'{natural}, (ii)', f'{in_W}, (ii)')} |",
+        f"| {row(f'{u}, (ii) online')} | | {row(f'{natural}, (ii) online', f'{in_W}, (ii) online')} |",
+        f"| | {row(f'{in_V}, HSW')} | | {row(f'{in_W}, HSW')} |",
+        f"takes {takes['own', 'obstacle']} times (obstacle) and {takes['own', 'hertz']} times (Hertz) for fixed",
+        f"{takes['greedy', 'obstacle']} and {takes['greedy', 'hertz']} times for greedy ones",
+        *(
+            f"| {share:.0f} % | {' | '.join(f'{factor:.3g}' for factor in factors)} |"
+            for share, factors in zip(100.0 * shown["ω &gt; ρ online"], gained, strict=True)
+        ),
+        f"take {slower['offline-pga']:.1f} and {slower['online-supremizers']:.1f} times as long, with offline PGA",
+        f"greedy models takes {span(equal['greedy offline_s'] / equal['fixed offline_s'])} times as long",
+    )
+
+
 BARE, ONLINE, OFFLINE = "decorrelated", "online-supremizers", "offline-pga"
 
 
@@ -309,6 +367,7 @@ def of_space() -> Sequence[str]:
         ("docs/field.md", of_guarantees),
         ("docs/formulations.md", of_formulations),
         ("docs/formulations.md", of_break_evens),
+        ("docs/certified.md", of_certified),
         ("docs/three-dimensions.md", of_elliptic_contact),
         ("docs/three-dimensions.md", of_space),
     ],
