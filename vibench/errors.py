@@ -21,7 +21,7 @@ class VibenchError(Exception):
 
 
 class RequestError(VibenchError):
-    """What the user asked for is wrong: a study file, a name, an option or an output folder (exit code 2)."""
+    """A request of the user is invalid: a study file, a name, an option or an output folder (exit code 2)."""
 
 
 class StorageError(VibenchError):
@@ -37,7 +37,7 @@ class NumericalError(VibenchError):
 
 
 class UnsupportedError(VibenchError):
-    """What was asked for does not exist for this problem or model; its cells are unavailable."""
+    """The problem or model does not support what was requested; its cells are unavailable."""
 
 
 def in_a_line(error: BaseException) -> str:

@@ -41,7 +41,7 @@ NEEDED_BY_PRIMAL = ("pod", "dual")
 
 
 class Outcome(StrEnum):
-    """What a formulation says of its own answer; the status of the row is never better than this."""
+    """Outcome of a query as the formulation itself reports it; the status of the row is never better."""
 
     OK = "ok"
     INACCURATE = "inaccurate"
@@ -63,7 +63,7 @@ class Multiplier(StrEnum):
 
 @dataclass(frozen=True)
 class FormulationAnswer:
-    """What a query found.
+    """The solution of a query by a formulation.
 
     Attributes
     ----------
@@ -112,7 +112,7 @@ class SolveQP(Protocol):
 
 @dataclass(frozen=True)
 class Asked:
-    """What a query is asked for beside its parameter.
+    """Settings of a query besides its parameter.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class Asked:
 
 
 class FormulationModel(ABC):
-    """A model that answers queries. It remembers nothing from one query to the next.
+    """A model of a formulation. It keeps no state from one query to the next.
 
     A query must not depend on those before it, and what is timed is repeated at parameters next to the queries' own.
     """
@@ -155,7 +155,7 @@ class FormulationModel(ABC):
         """The pair u (n,) and λ (m,) ≥ 0 of an answer at mu (d,), not timed; bases may depend on the parameter.
 
         Of the answer `x` and `alpha` alone are kept in results, and given here. λ is `None` for `Multiplier.RESIDUAL`,
-        and for no other. A negative coefficient of λ is a broken answer, be it round-off: every bound needs λ ≥ 0.
+        and for no other. A negative coefficient of λ is an error, even one of round-off: every bound needs λ ≥ 0.
         """
 
 

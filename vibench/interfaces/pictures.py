@@ -76,7 +76,7 @@ class MeshFields:
     in_cells: Mapping[str, Mapping[str, Array]]
 
     def faults(self) -> Iterator[str]:
-        """What makes the fields no solution on a mesh: shapes, types, nodes that there are not, cells inside out."""
+        """What is wrong with the fields: shapes, types, nodes that do not exist, cells inside out."""
         count = len(self.points)
         if faults := list(_real_faults("points", self.points, (count, 3), missing=False)):
             yield from faults

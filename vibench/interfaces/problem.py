@@ -171,7 +171,7 @@ class Contact:
 
 @dataclass(frozen=True)
 class ContactLoads:
-    """What B and g are for k given multipliers η (m×k): the loads Bᵀη on the contact unknowns, and the bounds ηᵀg.
+    """B and g applied to k given multipliers η (m×k): the loads Bᵀη on the contact unknowns, and the bounds ηᵀg.
 
     Attributes
     ----------

@@ -238,18 +238,18 @@ class Trainer(ABC):
 
     @abstractmethod
     def bound(self, mu: Array) -> float:
-        """Relative error of the model of all solutions so far at mu (d,): at least its bounds; infinite without them.
+        """Bound of the relative error of the model of all solutions so far at mu (d,); infinite without bounds.
 
         An estimate of the error of λ in W is taken where it is larger than the bounds of u and λ.
         """
 
     def estimate(self, mu: Array) -> float | None:  # noqa: ARG002
-        """About what `bound` is, for less, to rank candidates by; `None` where nothing is cheaper than the bound."""
+        """Approximation of `bound` at a lower cost, to rank candidates; `None` where nothing is cheaper."""
         return None
 
 
 class AdaptiveSampling(Sampling):
-    """Chooses training parameters one after the other, by what the solutions so far know; `parameters` are candidates.
+    """Chooses training parameters one after the other, by the model of all solutions so far, among `parameters`.
 
     It makes no validation set.
     """

@@ -63,7 +63,7 @@ class InnerProduct:
     name
         Its name in error messages.
     factorisation
-        Who factorises X where no explicit F is asked for, see `factorised_by`.
+        Implementation that factorises X where no explicit F is needed, see `factorised_by`.
 
     Raises
     ------

@@ -53,7 +53,7 @@ NO_TOLERANCE = "no tolerance"
 
 @dataclass(frozen=True)
 class Solution:
-    """The answer of a reduced model at one parameter; the fields are those of a row of the queries table.
+    """The solution of a reduced model at one parameter; the fields are those of a row of the queries table.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Solution:
 
     @property
     def verdict(self) -> str:
-        """Whether the bound keeps the tolerance: what it is worth, "certified" or "verified", or "not certified".
+        """Whether the bound is within the tolerance: "certified" or "verified", as its guarantee, or "not certified".
 
         "no tolerance" where none was asked for. A solution that is not ok is not certified, however small its bound is.
         """
@@ -168,7 +168,7 @@ class _Asked(NamedTuple):
 
 
 class Model:
-    """A reduced model of a run or of a `Reduction`, which answers queries at any parameter.
+    """A reduced model of a run or of a `Reduction`, which can be evaluated at any parameter.
 
     Attributes
     ----------
@@ -181,7 +181,7 @@ class Model:
     certificate
         What bounds errors at online cost; `None` where the model is not certified.
     row
-        Its row of the cells table; empty for a model that is of no run.
+        Its row of the cells table; empty for a model that belongs to no run.
     correction
         Which solutions are corrected where nothing else is asked for: as in its cell.
     """
@@ -231,11 +231,11 @@ class Model:
         solver, accuracy
             QP solver and the relative accuracy that it has to reach; those of the model by default.
         tolerance
-            Largest relative error of u in the energy norm; `verdict` of the solution says whether the bound keeps it.
+            Largest relative error of u in the energy norm; `verdict` of the solution says if the bound is within it.
         corrected
-            Whether `u` and `lam` of the solution are corrected: they satisfy the constraints, and are more accurate
-            where the violation dominates the bound (`omega` > `rho`). A certificate does that at online cost; without
-            one it takes factorisations at mu. Where there is no bound there is no correction either, as
+            Whether `u` and `lam` of the solution are corrected: they satisfy the constraints, and are usually more
+            accurate where the violation dominates the bound (`omega` > `rho`). A certificate does that at online cost;
+            without one it takes factorisations at mu. Where there is no bound there is no correction either, as
             `solution.answer` says. By default as in the cell of the model.
 
         Raises

@@ -112,7 +112,7 @@ class Reduction:
             raise RequestError(f"{type(self.primal).__qualname__} {needed} tolerance")
 
     def given(self, **steps: Any) -> Reduction:
-        """A reduction with the same inputs for which these steps are known, by the names of the attributes.
+        """A reduction with the same inputs and these steps prescribed, by the names of the attributes.
 
         Steps that were given before are kept, steps that were computed are computed again: they may depend on the new.
         """

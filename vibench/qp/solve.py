@@ -43,8 +43,8 @@ def solve_qp(
 
     The data are scaled first (`Units`), every constraint row to unit norm and x and the objective by what drives them
     (`drive`), so that the absolute tolerances of the solvers correspond to the relative residuals of the benchmark.
-    Constraints that are far beyond are left out at first, and brought back if the solution violates one of them. The
-    solution is scaled back.
+    Constraints at a distance of more than 1e4 units are left out at first, and restored if the solution violates one of
+    them. The solution is scaled back.
 
     Parameters
     ----------

@@ -271,7 +271,7 @@ def create(kind: str, name: str, options: Mapping[str, Any] | None = None) -> An
     Parameters
     ----------
     kind
-        "problem", "dual strategy", "primal strategy", "sampling strategy" or "figure plugin".
+        "problem", "dual strategy", "primal strategy", "formulation", "sampling strategy" or "figure plugin".
     name
         Name under which the plugin is registered.
     options
