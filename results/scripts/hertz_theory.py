@@ -21,8 +21,8 @@ CASES = [(multipliers, growth, approach) for approach in (0.01, 0.09) for multip
 ABOUT = """With E* = E/(2(1−ν²)), 1/R* = 1 + 1/µ and the computed load P of the whole bodies, Hertz theory for small a/R
 gives a = √(4PR*/(πE*)) and p₀ = 2P/(πa). The computed half-width a and peak pressure p₀ come from a linear fit of p²
 over x² on the active macro-edges without the last one. The studies use growth 1.265, the largest here, with 280
-multipliers: how much of their difference from the theory the coarse mesh away from the contact makes is the difference
-from the rows with a smaller growth."""
+multipliers: comparison with the rows of a smaller growth shows which part of the difference from the theory is due to
+the coarse mesh away from the contact."""
 
 
 def main(target: str) -> None:

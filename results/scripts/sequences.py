@@ -30,7 +30,7 @@ def main(cold: str, warm: str, target: str) -> None:
         "How to read it",
         "Seconds are those of the solver in the rounds, iterations medians over the programs of the path without the "
         "first one. The ratio cold/warm is one of seconds in those of the high-fidelity solutions of the same rounds, "
-        "since the two runs meet the machine at different speeds. `start` says whether the solver can start from a "
+        "since the machine may be faster in one of the two runs. `start` says whether the solver can start from a "
         "solution. Where it cannot, both runs solve the same programs cold, and the ratio is what two runs differ by.",
         page.link("sequences", table),
     )

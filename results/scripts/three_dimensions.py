@@ -252,7 +252,7 @@ def main(run: str, target: str) -> None:
     page.section(
         "Break-even",
         "Gains are ratios of seconds of queries, with 95 % intervals; the last column says from how many queries on "
-        "the model pays.",
+        "the model is cheaper in total.",
         break_even(read(run, "thresholds")),
     )
     if cells["dim_V"].nunique() > 1:

@@ -163,7 +163,7 @@ def which_assembly(results: Results) -> str:
         f"Reduced, compiled where there is a program. Gains against high-fidelity solutions over the models of "
         f"[benefit](../results/benefit/README.md), errors unchanged: {said}.",
         f"in full assembly {of(len(slow), int((gains['assembly'] == 'full').sum()))} models are surely slower than "
-        "what they replace; problems that declare neither affine members nor entries are assembled in full"
+        "what they replace; problems with a member that can only be assembled as a whole are assembled in full"
         + ("; there is no C program " + "; ".join(none) if none else "")
         + ".",
     )
