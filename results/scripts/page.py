@@ -34,7 +34,7 @@ LIMITATIONS = {
     "speed": f"{ONE_MACHINE} The transcription is ours and not the code of the authors.",
     "stability-per-vector": "One mesh and one pair of N and R for each problem; the counts are those of the training set.",  # noqa: E501
     "three-dimensions": f"{ONE_MACHINE} One problem, a convex contact without friction, on the meshes named above; one factorisation.",  # noqa: E501
-    "exact-answers": "The problem has radial symmetry and a circular contact; rates of the other problems are not shown.",
+    "exact-answers": "The problem has radial symmetry and a circular contact; rates of other problems are not shown.",
     "hertz-theory": "The theory assumes small deformations and half-planes, whereas the problem has discs of finite size: deviations of some per cent are due to the difference of the models, and not to the discretisation alone.",  # noqa: E501
 }
 """What a page does not show, by its folder; it is said at its end."""

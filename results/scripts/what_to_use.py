@@ -226,7 +226,7 @@ def what_to_use(results: Results) -> str:
         "# What to use\n\nSix questions, answered from the tables of [all results](../results/README.md) by\n\n"
         "```\npython results/scripts/what_to_use.py results docs/what-to-use.md\n```\n\n"
         "Ranges are over all models of the studies that are linked; intervals are those of 95 % of [measured "
-        "seconds](measurement.md#seconds). All of it is measured on two plane contact problems of 3,400 to 12,200 "
+        "seconds](measurement.md#seconds). All of it is measured on two plane contact problems of 1,100 to 12,200 "
         "unknowns, on one machine: run your own problem before you rely on an answer."
     )
     return "\n\n".join([head, *(ask(results) for ask in QUESTIONS)]) + "\n"
