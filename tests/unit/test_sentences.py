@@ -85,6 +85,24 @@ def of_guarantees() -> Sequence[str]:
     )
 
 
+def of_slowest() -> Sequence[str]:
+    """What it says of the enrichment with the slowest queries."""
+    table = cells("field")
+    table = table[~table["dual"].str.startswith("pod-dual")]
+    slowest = table.loc[table.groupby(["problem", "assembly", "pod_tol", "dual"])["online_s"].idxmax()]
+    others = slowest[slowest["primal"] != ONLINE]
+    assert set(others["problem"]) == {"hertz"}
+    assert set(others["primal"]) == {"pod-supremizers"}
+    assert set(others["dual"][others["assembly"] == "reduced"]) == {"dictionary"}
+    full = others[(others["assembly"] == "full") & (others["pod_tol"] == 1e-3)]
+    assert len(full) > table["dual"].nunique() / 2
+    assert set(full["primal_tol"]) == {0.01}
+    return (
+        "has the slowest queries on the obstacle",
+        "`pod-supremizers` with δ = 0.01 is slower on Hertz with most cones",
+    )
+
+
 def span(values: pd.Series) -> str:
     """The range of some numbers, to two digits."""
     return f"{values.min():.2g} to {values.max():.2g}"
@@ -365,6 +383,7 @@ def of_space() -> Sequence[str]:
     [
         ("docs/field.md", of_cones),
         ("docs/field.md", of_guarantees),
+        ("docs/field.md", of_slowest),
         ("docs/formulations.md", of_formulations),
         ("docs/formulations.md", of_break_evens),
         ("docs/certified.md", of_certified),
