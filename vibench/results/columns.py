@@ -212,8 +212,8 @@ CELLS: Mapping[str, Column] = {
     ),
     "hf_s": real(
         "s",
-        "One high-fidelity solution after the set-up, mean over the validation parameters, timed in the rounds of the "
-        "cell as online_s; where it could not be, in the sweep over these parameters.",
+        "One high-fidelity solution after the set-up, mean over the validation parameters: online_s times the gain of the "
+        "rounds; where none was timed in them, in the sweep over these parameters.",
     ),
     "beta_span_min": real(
         "b/VW", "Smallest β over the span of the generators, over the validation parameters.", "min β span", 14
@@ -454,7 +454,7 @@ TIMINGS: Mapping[str, Column] = {
     "total_s": real("s", "Sum of the three."),
     "total_wall_s": real("s", "The same in wall seconds."),
     "block": text("Block of rounds, which cells that were timed together share; each block is a process of its own."),
-    "hf_s": real("s", "High-fidelity solution in the round, mean over the parameters that it takes."),
+    "hf_s": real("s", "High-fidelity solution beside the queries, mean over the parameters of the round."),
     "pace": real(
         "1", "Factor by which the timings of this round exceed those of the other rounds of the block: the median."
     ),

@@ -267,7 +267,8 @@ class PairedSeconds:
     def draws(self, a: str | None, b: str, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
         """Seconds of a query of a, and those of b over them, as other runs might have them (`count`,).
 
-        They are NaN where they were not measured in two blocks. What slows down a in another run makes its ratio to b smaller.
+        They are NaN where they were not measured in two blocks. What slows down a in another run makes the seconds of b
+        smaller beside its own.
         """
         level, ratio = self.level(a, b), self.ratio_within(a, b)
         if level is None or ratio is None:
