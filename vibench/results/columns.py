@@ -212,8 +212,8 @@ CELLS: Mapping[str, Column] = {
     ),
     "hf_s": real(
         "s",
-        "One high-fidelity solution after the set-up, mean over the validation parameters: online_s times the gain of the "
-        "rounds; where none was timed in them, in the sweep over these parameters.",
+        "One high-fidelity solution after the set-up, mean over the validation parameters: online_s times the gain in "
+        "the rounds; where none was timed in them, in the sweep over these parameters.",
     ),
     "beta_span_min": real(
         "b/VW", "Smallest β over the span of the generators, over the validation parameters.", "min β span", 14
