@@ -107,7 +107,7 @@ class SolutionsBeside:
         """
         for place, k in enumerate(order):
             yield k, self._next(done, k, at, cell) if place in (0, len(order) // 2) else None
-        self._next(done, order[0], at, cell)
+        self._next(done, order[-1], at, cell)
 
     def _next(self, done: list[MarginalSolution], k: int, at: int, cell: int) -> MarginalSolution | None:
         if sum(one.seconds.cpu for one in done if one.seconds) > ENOUGH:

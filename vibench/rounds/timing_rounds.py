@@ -147,10 +147,13 @@ class _Rounds(Items):
         return TimedRound(assemble, solve, max(before, self._slowdown), certify, high_fidelity)
 
     def _order(self, cell: int, at: int, part: Sequence[int]) -> Sequence[int]:
-        """The queries of a cell in a round; the first one is another one in every block."""
+        """The queries of a cell in a round; the first one is another one in every block, and for the next cell.
+
+        Solutions at some parameters stand for all by the seconds of the sweep, whose errors should not be common to all.
+        """
         fine = self._stage.queries[cell]
         mine = [k for k in fine if k in part] or [fine[at % len(fine)]]
-        shift = at // SHARE % len(mine)
+        shift = (at // SHARE + cell) % len(mine)
         return [*mine[shift:], *mine[:shift]]
 
     def _warming_up(self, cell: int, at: int) -> Iterator[tuple[int, MarginalSolution]]:

@@ -167,7 +167,7 @@ class Given(MarginalSolutions):
         return MarginalSolution(number, vi, NO_TIME, None if taken is None else Seconds(taken, taken))
 
 
-@pytest.mark.parametrize(("taken", "numbers"), [(0.01, [7, 5, 7]), (0.03, [7, 5]), (0.06, [7])])
+@pytest.mark.parametrize(("taken", "numbers"), [(0.01, [7, 5, 8]), (0.03, [7, 5]), (0.06, [7])])
 def test_solutions_come_before_amid_and_after_the_queries_until_they_are_enough(
     taken: float, numbers: list[int]
 ) -> None:
@@ -198,15 +198,16 @@ def test_some_solutions_stand_for_all_of_a_part_by_the_sweep() -> None:
     assert [one.seconds is None for one in done] == [False, True, False]
     mean = beside.seconds(done, (1, 2, 3))
     assert mean is not None
-    assert mean.cpu == pytest.approx(0.02 * (11.0 / 3.0) / 2.0)  # both right ones are at parameter 1
+    assert mean.cpu == pytest.approx(0.02 * (11.0 / 3.0) / 4.0)  # the right ones are at parameters 1 and 3
     assert beside.seconds([done[1]], (1, 2, 3)) is None
 
 
-def test_rounds_begin_at_other_queries_in_later_blocks(store: SampleStore) -> None:
-    work = TimingRounds(CELLS[:1], (EVERY,), 1).begin(store)
+def test_rounds_begin_at_other_queries_in_later_blocks_and_for_other_cells(store: SampleStore) -> None:
+    work = TimingRounds(CELLS[:2], (EVERY,) * 2, 1).begin(store)
     assert isinstance(work, timing_rounds._Rounds)
-    firsts = {work._order(0, at, work._parts[at % timing_rounds.SHARE])[0] for at in range(2 * timing_rounds.SHARE)}
-    assert firsts == set(EVERY)
+    numbers, parts = range(2 * timing_rounds.SHARE), work._parts
+    assert {work._order(0, at, parts[at % timing_rounds.SHARE])[0] for at in numbers} == set(EVERY)
+    assert work._order(0, 0, (1, 4, 5)) != work._order(1, 0, (1, 4, 5))
 
 
 @given(st.lists(st.floats(0.1, 10.0), min_size=1, max_size=40))
