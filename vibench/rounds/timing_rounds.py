@@ -149,7 +149,7 @@ class _Rounds(Items):
     def _order(self, cell: int, at: int, part: Sequence[int]) -> Sequence[int]:
         """The queries of a cell in a round; the first one is another one in every block, and for the next cell.
 
-        Solutions at some parameters stand for all by the seconds of the sweep, whose errors should not be common to all.
+        Solutions at some parameters stand for all by the seconds of the sweep, whose errors are not to be common to all.
         """
         fine = self._stage.queries[cell]
         mine = [k for k in fine if k in part] or [fine[at % len(fine)]]
