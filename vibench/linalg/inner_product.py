@@ -94,6 +94,16 @@ class InnerProduct:
         """Dimension n of the space."""
         return int(self.matrix.shape[0])
 
+    @cached_property
+    def is_diagonal(self) -> bool:
+        """Whether X has no entry off its diagonal."""
+        return int(self.matrix.count_nonzero()) == int(np.count_nonzero(self.matrix.diagonal()))
+
+    @cached_property
+    def dense(self) -> Array:
+        """X as an array."""
+        return np.asarray(self.matrix.toarray())
+
     def factorised_by(self, name: str) -> None:
         """Let an implementation solve with X and eliminate unknowns of it (`vibench.linalg.factorisations`).
 

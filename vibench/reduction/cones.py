@@ -6,9 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 from scipy.optimize import nnls
 
-from vibench.arrays import Array, Mask
+from vibench.arrays import Array, Indices, Mask
 from vibench.errors import NumericalError
 from vibench.interfaces.strategies import Cone, Stop, no_free, rays
 from vibench.linalg.cholesky import SparseCholesky
@@ -20,6 +21,10 @@ REPRODUCED = 1e-12
 TIE = 1e-9
 """Values within this fraction of the largest first value count as equal, and the smallest index wins: duplicated or
 mirrored snapshots must not let round-off choose."""
+
+
+FEW, SMALL = 128, 1024
+"""Unknowns up to which a dense system takes less time than a sparse one; dimensions of a dense X_W that is kept."""
 
 
 class LazyMaximum:
@@ -89,6 +94,8 @@ def project_on_orthant(functional: Array, W: InnerProduct) -> Array:
     X_W π − s ≥ 0 and π ≥ 0 are complementary. An active set method starts from the support of the positive part of s;
     where its sets cycle, nonnegative least squares replaces it.
     """
+    if W.is_diagonal:
+        return np.asarray(np.maximum(functional, 0.0) / W.matrix.diagonal())
     free, seen, norms = functional > 0.0, set[bytes](), np.sqrt(W.matrix.diagonal())
     round_off = 1e-14 * norms * np.max(np.abs(functional) / norms, initial=0.0)
     while free.tobytes() not in seen:
@@ -96,14 +103,21 @@ def project_on_orthant(functional: Array, W: InnerProduct) -> Array:
         support = np.flatnonzero(free)
         projection = np.zeros(W.dim)
         if len(support):
-            block = W.matrix[support][:, support]
-            projection[support] = SparseCholesky(block, "a block of X_W").solve(functional[support])
+            projection[support] = _solve_block(W, support, functional[support])
         residual = functional - W.apply(projection)
         following = np.where(free, projection > 0.0, residual > round_off)
         if np.array_equal(following, free):
             return projection
         free = following
     return project_on_cone(np.eye(W.dim), W.riesz(functional), W).coefficients
+
+
+def _solve_block(W: InnerProduct, support: Indices, right: Array) -> Array:
+    """The solution (k,) with the block of X_W of some unknowns (k,)."""
+    if len(support) > FEW:
+        return SparseCholesky(W.matrix[support][:, support], "a block of X_W").solve(right)
+    block = W.dense[np.ix_(support, support)] if W.dim <= SMALL else W.matrix[support][:, support].toarray()
+    return np.asarray(scipy.linalg.cho_solve(scipy.linalg.cho_factor(block, check_finite=False), right))
 
 
 def _project_whitened(generators: Array, theta: Array) -> Projection:

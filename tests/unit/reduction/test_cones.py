@@ -4,6 +4,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import space
@@ -14,12 +15,31 @@ from vibench.interfaces.strategies import DualStrategy, Stop
 from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction import cones as cone_module
 from vibench.reduction import part_in_cone
-from vibench.reduction.cones import greedy_cone, orthogonality, project_on_cone
+from vibench.reduction.cones import greedy_cone, orthogonality, project_on_cone, project_on_orthant
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies.cpg import CPG
 from vibench_strategies.mcpg import ModifiedCPG
 
 seeds = st.integers(0, 10_000)
+
+
+@pytest.mark.parametrize("kind", ["diagonal", "dense blocks", "sparse blocks", "no array of all"])
+def test_projection_on_the_orthant_meets_its_optimality_conditions(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, m = np.random.default_rng(3), 200
+    off = 0.0 if kind == "diagonal" else 1.0
+    X = InnerProduct(
+        sp.diags_array([off * np.ones(m - 1), 4.0 + rng.random(m), off * np.ones(m - 1)], offsets=[-1, 0, 1])
+    )
+    assert X.is_diagonal is (kind == "diagonal")
+    monkeypatch.setattr(cone_module, "FEW", 0 if kind == "sparse blocks" else m)
+    monkeypatch.setattr(cone_module, "SMALL", 0 if kind == "no array of all" else m)
+    functional = rng.standard_normal(m)
+    found = project_on_orthant(functional, X)
+    slope = X.apply(found) - functional
+    assert 0 < np.count_nonzero(found) < m
+    assert np.all(found >= 0.0)
+    assert np.all(slope >= -1e-13)
+    assert np.all(np.abs(found * slope) <= 1e-13)
 
 
 def nothing(theta: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, str]:
