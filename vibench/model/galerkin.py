@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from types import MappingProxyType
@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from vibench.arrays import Array
+from vibench.arrays import Array, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.interfaces.strategies import Enrichment
 from vibench.interfaces.validation import checked_assembly, training_parameters
 from vibench.linalg.inner_product import orthonormal_range
-from vibench.reduction.supremizers import ContactCoordinates, projected_supremizers
+from vibench.reduction.supremizers import ContactCoordinates, projected_supremizers, proportionality
 
 ROUND_OFF = 1e-12
 """Orthonormal coordinates of supremizers of proportional B differ by less than this."""
@@ -132,13 +132,12 @@ class ReducedModel:
 
         That is so where B(mu) is one matrix times a positive number.
         """
+        if (contact := self._contact) is None:
+            yield from map(self.primal_basis, vis)
+            return
         before: tuple[Array, Array] | None = None
-        for vi in vis:
-            if (contact := self._contact) is None:
-                yield self.primal_basis(vi)
-                continue
-            added = self._added(contact, vi)
-            if before is None or not _agree(added, before[0]):
+        for added in self._added_at(contact, vis):
+            if before is None or not (added is before[0] or _agree(added, before[0])):
                 before = added, np.hstack([self.fixed_basis, contact.vectors(added)])
             yield before[1]
 
@@ -148,6 +147,14 @@ class ReducedModel:
             return np.asarray(self.primal_basis(vi) @ x)
         count = self.fixed_basis.shape[1]
         return np.asarray(self.fixed_basis @ x[:count] + contact.vectors(self._added(contact, vi) @ x[count:]))
+
+    def reconstruct_all(self, vis: Iterable[VariationalInequality], xs: Sequence[Array]) -> Array:
+        """The columns u = Z x (n×P) with coordinates x (N',), each at the parameter of its own inequality."""
+        count, contact = self.fixed_basis.shape[1], self._contact
+        if contact is None:
+            return np.column_stack([self.primal_basis(vi) @ x for vi, x in zip(vis, xs, strict=True)])
+        on = [added @ x[count:] for added, x in zip(self._added_at(contact, vis), xs, strict=True)]
+        return np.asarray(self.fixed_basis @ np.column_stack([x[:count] for x in xs]) + contact.vectors(np.array(on).T))
 
     def project_supremizers(self, vi: VariationalInequality, eta: Array) -> Array:
         """ZᵀBᵀη (N'×k) for multipliers η (m×k) at the parameter of `vi`."""
@@ -160,6 +167,25 @@ class ReducedModel:
         """Orthonormal coordinates (d×S) of what the supremizers at the parameter of `vi` add to V_N."""
         loads = np.asarray(vi.B.T @ self.enrichment.eta)[self.problem.contact_dofs]
         return orthonormal_range(contact.supremizers(loads), contact.plain)
+
+    def _added_at(self, contact: ContactCoordinates, vis: Iterable[VariationalInequality]) -> Iterator[Array]:
+        """`_added` at many parameters: one array where B is a positive multiple of that of an earlier parameter.
+
+        The first of these multiples shows whether round-off decides about the coordinates: then every one has its own.
+        """
+        first: tuple[SparseMatrix, Array] | None = None
+        shared: bool | None = None
+        for vi in vis:
+            alike = first is not None and (proportionality(vi.B, first[0]) or 0.0) > 0.0
+            if first is not None and alike and shared:
+                yield first[1]
+                continue
+            own = self._added(contact, vi)
+            if first is None or not alike:
+                first, shared = (vi.B.copy(), own), None
+            elif shared is None:
+                shared = _agree(own, first[1])
+            yield first[1] if shared else own
 
     @cached_property
     def _contact(self) -> ContactCoordinates | None:

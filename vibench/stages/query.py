@@ -14,6 +14,7 @@ from vibench.interfaces.problem import ParameterBox, Problem, VariationalInequal
 from vibench.interfaces.strategies import Kind
 from vibench.model.error_bounds import CorrectionMode
 from vibench.model.errors import UNMEASURABLE, ReferenceSolutions
+from vibench.model.galerkin import ReducedModel
 from vibench.offline.assemblies import assemblies
 from vibench.offline.correction import Answer, Corrector
 from vibench.offline.models import AnyReducedModel
@@ -240,6 +241,8 @@ def _reconstructed(
     """The columns u_N (n×P) and λ_N (m×P) of solutions (x, α)."""
     lam = model.generators @ np.column_stack([alpha for _, alpha in solutions])
     if model.kind is Kind.PER_PARAMETER:
+        if isinstance(model, ReducedModel):
+            return model.reconstruct_all(vis, [x for x, _ in solutions]), lam
         queries = zip(mus, vis, solutions, strict=True)
         return np.hstack([model.reconstruct(mu, vi, x[:, None]) for mu, vi, (x, _) in queries]), lam
     # a fixed basis: all solutions are reconstructed at once

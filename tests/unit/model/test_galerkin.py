@@ -130,7 +130,7 @@ def test_an_enrichment_is_what_its_kind_says() -> None:
 
 
 @pytest.mark.parametrize("resolution", [150, 400])
-def test_bases_at_many_parameters_are_those_of_each(resolution: int) -> None:
+def test_bases_at_many_parameters_are_those_of_each(resolution: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a bulge B is one matrix times a number, and all share one array; with one each has its own."""
     for bulge in (False, True):
         problem = Obstacle(resolution=resolution, bulge=bulge)
@@ -143,7 +143,16 @@ def test_bases_at_many_parameters_are_those_of_each(resolution: int) -> None:
         cone = multipliers(chi / W.norm(chi), W)
         online = Enrichment(Kind.PER_PARAMETER, eta=cone.span)
         reduced = ReducedModel(problem, V.orthonormalise(rng.standard_normal((V.dim, 3))), online, cone.chi, cone.span)
-        found = list(reduced.primal_bases(iter(vis)))
-        for vi, Z in zip(vis, found, strict=True):
+        computed: list[VariationalInequality] = []
+        with monkeypatch.context() as patch:
+            added = ReducedModel._added
+            patch.setattr(ReducedModel, "_added", lambda *given: computed.append(given[2]) or added(*given))
+            found = list(reduced.primal_bases(iter(vis)))
+            assert len(computed) == (len(vis) if bulge else 2)
+            xs = list(rng.standard_normal((len(vis), found[0].shape[1])))
+            together = reduced.reconstruct_all(vis, xs)
+            assert len(computed) == 2 * (len(vis) if bulge else 2)
+        for vi, Z, x, u in zip(vis, found, xs, together.T, strict=True):
             np.testing.assert_allclose(Z, reduced.primal_basis(vi), atol=1e-11 * np.abs(Z).max())
+            np.testing.assert_allclose(u, Z @ x, atol=1e-11 * np.abs(u).max())
         assert len({id(Z) for Z in found}) == (len(vis) if bulge else 1)
