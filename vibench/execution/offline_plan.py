@@ -44,6 +44,8 @@ class OfflinePlan:
     """What stages took, by key."""
     _costs: dict[str, float] = field(default_factory=dict)
     """What it takes to run the stage again, by key."""
+    _sources: set[str] = field(default_factory=set)
+    """The offline stages among them, which share the budget: what judges answers takes many times their seconds."""
     _planned: set[str] = field(default_factory=set)
     _spent: float = 0.0
     _cells: dict[Cell, CellGoal] = field(default_factory=dict)
@@ -58,6 +60,7 @@ class OfflinePlan:
         mine = dict(cells)
         self._cells |= mine
         stages = {stage.key: stage for goal in mine.values() for stage in sources(goal)}
+        self._sources |= stages.keys() & self._costs.keys()
         known = sorted((key for key in stages if key in self._costs), key=self._costs.__getitem__)
         planned = []
         for number in range(1, (self.asked or REPEATS) + 1):
@@ -69,10 +72,14 @@ class OfflinePlan:
         return planned
 
     def _afford(self, cost: float) -> bool:
-        if not self.asked and (cost > SHORT or self._spent + cost > BUDGET * sum(self._costs.values())):
+        if not self.asked and (cost > SHORT or self._spent + cost > BUDGET * self._offline_costs):
             return False
         self._spent += cost
         return True
+
+    @property
+    def _offline_costs(self) -> float:
+        return sum(self._costs[key] for key in self._sources)
 
     def finish(self) -> None:
         """Write the offline columns of the cells whose repeats were planned."""

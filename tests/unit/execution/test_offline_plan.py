@@ -14,6 +14,7 @@ from vibench.execution import offline_plan
 from vibench.execution.offline_plan import OfflinePlan
 from vibench.results.costs.break_even import SCATTER
 from vibench.rounds.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
+from vibench.stages.assembly import ExactSolutions
 from vibench.stages.base import Stage
 from vibench.stages.cell_queries import CellQueries, cell_queries
 from vibench.study.cells import Cell
@@ -46,6 +47,17 @@ def test_short_stages_are_repeated_the_cheapest_first_within_the_budget() -> Non
     firsts = [costs[one.stage.key] for one in repeats if one.number == 1]
     assert firsts == sorted(cost for cost in costs.values() if cost <= offline_plan.SHORT)
     assert plan.repeats([(CELL, GOAL)]) == []  # once is enough
+
+
+def test_what_is_not_offline_pays_for_no_repeats() -> None:
+    costs = {stage.key: 1.0 for stage in STAGES}
+    _, repeats = plan_of(costs)
+    plan = OfflinePlan(None, SimpleNamespace())  # type: ignore[arg-type]
+    plan.note(ExactSolutions(GOAL.assembly), spent(100.0), 100.0)
+    for stage in STAGES:
+        plan.note(stage, spent(1.0), 1.0)
+    assert plan.repeats([(CELL, GOAL)]) == repeats
+    assert 0 < len(repeats) < 2 * len(STAGES)
 
 
 def test_repeats_that_are_asked_for_are_all_run() -> None:
