@@ -206,7 +206,7 @@ def reference_bound(vi: VariationalInequality, energy: Energy, u: Array, lam: Ar
     (riesz,) = rieszes([energy], [residual(vi, u, lam)])
     bound = terms(correction, u, lam, riesz).primal
     on = correction.on
-    size = float(np.hypot(energy.norm(u), on.of_force(lam).norm))
+    size = float(np.hypot(energy.norm(u), on.force_norm(lam)))
     round_off = np.nan_to_num(_round_off(on, on.values(u), correction.values), posinf=0.0)
     open_by_round_off = np.sqrt(4.0 * MARGIN * float(lam @ round_off))
     if not bound <= max(REFERENCE * size, open_by_round_off):
@@ -364,6 +364,10 @@ def _with_constrained_residual(correction: Correction, u: Array, lam: Array, rie
     """
     on, constraints = correction.on, correction.constraints
     rows = constraints.rows.kept[on.near[constraints.rows.kept]]  # any d will do for which w is feasible
+    if len(rows) == on.B.shape[0] == on.B.shape[1]:
+        # as many rows as unknowns: B d = 0 leaves nothing of d there, and w is feasible for u + d as for u
+        yield _terms(correction, on.values(u), lam, replace(riesz, rest=0.0), riesz.norm)
+        return
     try:
         held = on.holding(rows, riesz.values)
     except (RuntimeError, np.linalg.LinAlgError):  # an exactly singular system

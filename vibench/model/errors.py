@@ -71,13 +71,32 @@ class Energy:
         return float(np.sqrt(max(float(functional @ self.factor.solve(functional)), 0.0)))
 
 
+def of_stiffness(energies: Sequence[Energy], vectors: Array) -> Array:
+    """A v (n×P) of vectors (n×P), each at its own parameter; those of one A are multiplied in one block."""
+    product = np.empty_like(vectors)
+    for numbers in _with_one_stiffness(energies):
+        product[:, numbers] = energies[numbers[0]].A @ vectors[:, numbers]
+    return product
+
+
+def energy_norms(vectors: Array, products: Array) -> Array:
+    """‖v‖_A (P,) of vectors (n×P), from A v (n×P)."""
+    return np.asarray(np.sqrt(np.maximum(np.einsum("ik,ik->k", vectors, products), 0.0)))
+
+
+def _with_one_stiffness(energies: Sequence[Energy]) -> list[list[int]]:
+    """Numbers of the energies that share a stiffness."""
+    numbers: dict[int, list[int]] = {}
+    for k, energy in enumerate(energies):
+        numbers.setdefault(id(energy.stiffness), []).append(k)
+    return list(numbers.values())
+
+
 def rieszes(energies: Sequence[Energy], functionals: Sequence[Array]) -> list[Representer]:
     """A⁻¹ℓ of functionals (n,), each at its own parameter; those of one A are solved in one block."""
     found: dict[int, Representer] = {}
-    stiffnesses = {id(energy.stiffness): energy.stiffness for energy in energies}
-    for key, stiffness in stiffnesses.items():
-        numbers = [k for k, energy in enumerate(energies) if id(energy.stiffness) == key]
-        of_one = representers(stiffness, np.column_stack([functionals[k] for k in numbers]))
+    for numbers in _with_one_stiffness(energies):
+        of_one = representers(energies[numbers[0]].stiffness, np.column_stack([functionals[k] for k in numbers]))
         found |= dict(zip(numbers, of_one, strict=True))
     return [found[k] for k in range(len(energies))]
 
@@ -110,7 +129,7 @@ class ReferenceSolutions:
     def energies(self, number: int, vi: VariationalInequality, energy: Energy) -> tuple[float, float]:
         """‖u‖ in the norm of A and ‖Bᵀλ‖ in that of A⁻¹ of one solution, whose inequality is `vi`."""
         u, lam = self.u[:, number], self.lam[:, number]
-        return self._once(number, lambda: (energy.norm(u), energy.on_contact(vi).of_force(lam).norm))
+        return self._once(number, lambda: (energy.norm(u), energy.on_contact(vi).force_norm(lam)))
 
     def values(self, outputs: Sequence[Output], mus: Array) -> list[Array]:
         """Values (P,) of the outputs of the problem at their parameters (P×d)."""
@@ -180,9 +199,9 @@ def errors(
     (norm_u, norm_lam), (zero_u, zero_lam) = reference.norms(problem), zeros(problem, reference)
     error_u, error_lam, integrals = V.norm(du), W.norm(dlam), problem.multiplier_integrals()
     excesses = [vi.B @ u[:, k] - vi.g for k, vi in enumerate(vis)]
-    rows = []
+    in_energies, rows = energy_norms(du, of_stiffness(energies, du)), []
     for k, (vi, energy) in enumerate(zip(vis, energies, strict=True)):
-        in_energy, natural = energy.norm(du[:, k]), energy.on_contact(vi).of_force(dlam[:, k]).norm
+        in_energy, natural = float(in_energies[k]), energy.on_contact(vi).force_norm(dlam[:, k])
         energy_u, natural_lam = reference.energies(k, vi, energy)
         rows.append(
             Errors(

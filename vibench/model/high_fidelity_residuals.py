@@ -17,24 +17,32 @@ from vibench.interfaces.problem import VariationalInequality, is_absent
 from vibench.model.errors import Energy
 from vibench.model.on_contact import OnContact, representers
 from vibench.qp.scaling import ratio
-from vibench.qp.verification import Residuals, accurate_excess, accurate_residuals, round_off
+from vibench.qp.verification import Residuals, accurate_residuals, round_off_of_terms
 
 BLOCK = 8
 """Rows whose norms in A⁻¹ are computed at once where there is no compliance of all."""
 
 
 def high_fidelity_residuals(
-    vi: VariationalInequality, energy: Energy, u: Array, lam: Array, rho: float = np.inf
+    vi: VariationalInequality,
+    energy: Energy,
+    u: Array,
+    lam: Array,
+    rho: float = np.inf,
+    u_energy: float | None = None,
 ) -> Residuals:
-    """Residuals of u (n,) and λ (m,); `rho` is ‖f − A u − Bᵀλ‖_{A⁻¹} where that is known, and finite."""
+    """Residuals of u (n,) and λ (m,).
+
+    `rho` is ‖f − A u − Bᵀλ‖_{A⁻¹} where that is known, and finite, `u_energy` is ‖u‖_A where that is.
+    """
     on = energy.on_contact(vi)
-    if np.isfinite(rho):
-        excess = accurate_excess(vi, u)
-    else:
-        residual, excess = accurate_residuals(vi, u, lam)
+    values = on.values(u)
+    if not np.isfinite(rho):
+        residual, _ = accurate_residuals(vi, u, lam)
         rho = representers(energy.stiffness, residual[:, None])[0].norm
-    size = float(np.hypot(energy.norm(u), on.of_force(lam).norm))
-    violated = np.flatnonzero(excess > round_off(vi.B, u, vi.g))
+    excess = np.asarray(on.in_extended_precision @ values.astype(np.longdouble) - vi.g, dtype=float)
+    size = float(np.hypot(energy.norm(u) if u_energy is None else u_energy, on.force_norm(lam)))
+    violated = np.flatnonzero(excess > round_off_of_terms(on.entries, on.sizes @ np.abs(values) + np.abs(vi.g)))
     pressed = lam > 0.0  # elsewhere s may be infinite
     gap = abs(float(lam[pressed] @ excess[pressed]))
     return Residuals(
@@ -50,8 +58,7 @@ def _largest_step(on: OnContact, energy: Energy, rows: Indices, excess: Array) -
     ‖B_i‖⁻¹ is bounded from above without A⁻¹, so that the rows with the largest bounds are enough.
     """
     if on.is_dense:
-        squares = np.asarray(on.B[rows].multiply(on.liftings[rows]).sum(axis=1)).ravel()
-        return float(np.max(excess / np.sqrt(squares), initial=0.0))
+        return float(np.max(excess / np.sqrt(on.squares[rows]), initial=0.0))
     bounds = excess * np.sqrt(on.stiffnesses[rows])
     largest, order = 0.0, np.argsort(-bounds, kind="stable")
     for start in range(0, len(order), BLOCK):

@@ -32,6 +32,9 @@ SMALL = 2**18
 KEPT = 4
 """Factors of compliances that are kept: of all rows that matter, and of active sets, whose first one pairs share."""
 
+FEW_PRESSED = 3
+"""A multiplier has few entries where these are less than this part of all."""
+
 CANCELLED = 1e-4
 """A representer A⁻¹ℓ that is a sum of terms, whose norm is below this share of theirs, is computed anew from ℓ."""
 
@@ -85,9 +88,9 @@ class OnContact:
 
     @property
     def nbytes(self) -> int:
-        """Memory, about, once everything is computed: B and |B|, D, K, and factors of K."""
+        """Memory, about, once everything is computed: B in two precisions, |B|, D, K, factors of K."""
         m, c = self.B.shape
-        return 24 * int(self.B.nnz) + (8 * m * (c + 3 * m) if self.is_dense else 0)
+        return 48 * int(self.B.nnz) + (8 * m * (c + 3 * m) if self.is_dense else 0)
 
     def values(self, u: Array) -> Array:
         """The retained unknowns (c,) of u (n,)."""
@@ -125,6 +128,16 @@ class OnContact:
         return self._stiffness.liftings(self.B)
 
     @cached_property
+    def squares(self) -> Array:
+        """The compliances b A⁻¹ bᵀ (m,) of single rows."""
+        return np.asarray(self.B.multiply(self.liftings).sum(axis=1)).ravel()
+
+    @cached_property
+    def in_extended_precision(self) -> SparseMatrix:
+        """B in extended precision, where the machine has one."""
+        return self.B.astype(np.longdouble)
+
+    @cached_property
     def _compliance(self) -> Array:
         """K (m×m), not symmetrised: what forces displace is to the last digit what B says of it."""
         return np.asarray(self.B @ self.liftings.T)
@@ -134,9 +147,17 @@ class OnContact:
         load = np.asarray(self.B.T @ multiplier)
         return Representer(self._displaced(multiplier) if self.is_dense else self._stiffness.compliance(load), load)
 
+    def force_norm(self, multiplier: Array) -> float:
+        """‖Bᵀη‖ in A⁻¹ of a multiplier η (m,): from K alone, where it is computed."""
+        if not self.is_dense:
+            return self.of_force(multiplier).norm
+        return float(np.sqrt(max(float(multiplier @ (self._compliance @ multiplier)), 0.0)))
+
     def _displaced(self, multiplier: Array) -> Array:
-        """D η (c,) of a multiplier η (m,) with few entries."""
+        """D η (c,) of a multiplier η (m,)."""
         pressed = np.flatnonzero(multiplier)
+        if FEW_PRESSED * len(pressed) > len(multiplier):  # a copy of so many rows takes more than their products
+            return np.asarray(multiplier @ self.liftings)
         return np.asarray(multiplier[pressed] @ self.liftings[pressed])
 
     def load(self, values: Array, multiplier: Array) -> Array:

@@ -34,7 +34,7 @@ import scipy.linalg
 import scipy.sparse as sp
 from scipy.optimize import nnls
 
-from vibench.arrays import Array, SparseMatrix
+from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
@@ -144,12 +144,6 @@ def accurate_residuals(program: VariationalInequality, x: Array, alpha: Array) -
     return residual.astype(float), excess.astype(float)
 
 
-def accurate_excess(program: VariationalInequality, x: Array) -> Array:
-    """The second of `accurate_residuals` alone, which takes no product with A."""
-    excess = program.B.astype(np.longdouble) @ x.astype(np.longdouble) - program.g
-    return np.asarray(excess.astype(float))
-
-
 def solution_energy(program: VariationalInequality, x: Array, alpha: Array, norms: DualNorms) -> float:
     """S of a solution x (n,), α (m,)."""
     return _energy(program, x, float(norms((program.B.T @ alpha)[:, None])[0]))
@@ -190,7 +184,12 @@ def norms_by_solutions(functionals: Array, solutions: Array) -> Array:
 def round_off(B: SparseMatrix | Array, x: Array, g: Array) -> Array:
     """Bound (m,) of the round-off in B x − g (Higham 2002, §3.1), each row from its own terms."""
     terms = np.count_nonzero(B, axis=1) if isinstance(B, np.ndarray) else np.diff(sp.csr_array(B).indptr)
-    return np.asarray(1.01 * UNIT * (terms + 2.0) * (abs(B) @ np.abs(x) + np.abs(g)))
+    return round_off_of_terms(terms, abs(B) @ np.abs(x) + np.abs(g))
+
+
+def round_off_of_terms(entries: Indices, sizes: Array) -> Array:
+    """The same from numbers of entries of the rows (m,) and sums of absolute values of the terms (m,)."""
+    return np.asarray(1.01 * UNIT * (entries + 2.0) * sizes)
 
 
 def _over(value: float, scale: float) -> float:

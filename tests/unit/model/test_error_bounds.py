@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numerics import exact, space, spd
 
 from vibench.errors import NumericalError
-from vibench.highfidelity.active_set import ACCURACY
+from vibench.highfidelity.active_set import ACCURACY, HighFidelitySolver
 from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
 from vibench.model import error_bounds as module
@@ -23,15 +23,18 @@ from vibench.model.error_bounds import (
     ON_ABSENT_ROW,
     REFERENCE,
     ErrorBounds,
+    bound_errors_at,
     corrected_pair,
     error_bounds,
     find_correction,
     reference_bound,
 )
 from vibench.model.errors import Energy
+from vibench.offline.assemblies import assemblies
 from vibench.qp.verification import kkt_residuals
 from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity, energy_inf_sup
 from vibench.stability.infsup import InfSup
+from vibench_problems.obstacle import Obstacle
 
 V, W = space(6, 1), space(4, 2)
 ROUND_OFF = 1e-7
@@ -264,6 +267,27 @@ def test_of_the_residual_only_what_constraints_see_bounds_the_multiplier() -> No
     assert found.rho_range == pytest.approx(0.3)
     assert found.u_energy == pytest.approx(0.5)  # the error is 0.4
     assert found.lambda_natural == pytest.approx(0.3)  # which is the error
+
+
+def test_as_many_constraints_as_unknowns_see_all_of_a_residual_there() -> None:
+    """Every node of the obstacle constrains: what is left of r is its part on these, whichever way it is computed."""
+    problem = Obstacle(resolution=150)
+    mu = problem.parameters.upper
+    vi, of_A = assemblies(problem).at(mu), assemblies(problem).energy_at(mu)
+    on, rng = of_A.on_contact(vi), np.random.default_rng(0)
+    assert on.B.shape[0] == on.B.shape[1] < problem.V.dim
+    solution = HighFidelitySolver(problem).solve(mu)
+    u = solution.u + 1e-3 * np.abs(solution.u).max() * rng.standard_normal(len(solution.u))
+    K, r = vi.B @ of_A.factor.solve(vi.B.T.toarray()), vi.f - vi.A @ u - vi.B.T @ solution.lam
+    seen = vi.B @ of_A.factor.solve(r)
+    found = bound_errors_at(vi, of_A, Constant(1.0, True), Constant(1.0, True), u, solution.lam)
+    assert found.rho_range == pytest.approx(np.sqrt(seen @ np.linalg.solve(K, seen)), rel=1e-8)
+    assert found.rho_range < 0.99 * found.rho
+    for few in (1, 3, len(seen)):
+        multiplier = np.zeros(len(seen))
+        multiplier[:few] = rng.random(few)
+        assert on.force_norm(multiplier) == pytest.approx(np.sqrt(multiplier @ K @ multiplier), rel=1e-10)
+        assert on.of_force(multiplier).norm == pytest.approx(on.force_norm(multiplier), rel=1e-10)
 
 
 def test_what_is_not_proved_is_said() -> None:

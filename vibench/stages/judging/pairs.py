@@ -11,8 +11,16 @@ from vibench.arrays import Array
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineBound
-from vibench.model.error_bounds import ErrorBounds, error_bounds, residual
-from vibench.model.errors import UNMEASURABLE, Errors, ReferenceSolutions, errors, output_errors
+from vibench.model.error_bounds import ErrorBounds, error_bounds
+from vibench.model.errors import (
+    UNMEASURABLE,
+    Errors,
+    ReferenceSolutions,
+    energy_norms,
+    errors,
+    of_stiffness,
+    output_errors,
+)
 from vibench.model.high_fidelity_residuals import high_fidelity_residuals
 from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
 from vibench.offline.assemblies import assemblies
@@ -35,7 +43,8 @@ def pair_columns(
 ) -> list[Row]:
     """Columns of answers u (n×P), λ (m×P) at parameters (P×d): errors, their bounds, residuals and outputs."""
     energies = [assemblies(problem).energy_at(mu) for mu in mus]
-    residuals = [residual(vi, *pair) for vi, *pair in zip(vis, u.T, lam.T, strict=True)]
+    forces = of_stiffness(energies, u)
+    residuals = [vi.f - force - vi.B.T @ of_lam for vi, force, of_lam in zip(vis, forces.T, lam.T, strict=True)]
     bounds = error_bounds(vis, energies, constants, u, lam, reference.lam > 0.0, residuals)
     measured = zip(
         errors(problem, vis, energies, reference, u, lam),
@@ -44,8 +53,9 @@ def pair_columns(
         strict=True,
     )
     rows = [_columns(*one) for one in measured]
-    for row, vi, energy, pair, bound in zip(rows, vis, energies, zip(u.T, lam.T, strict=True), bounds, strict=True):
-        found = high_fidelity_residuals(vi, energy, *pair, bound.rho)
+    sizes = energy_norms(u, forces)
+    for row, bound, size, *pair in zip(rows, bounds, sizes, vis, energies, u.T, lam.T, strict=True):
+        found = high_fidelity_residuals(*pair, bound.rho, float(size))
         row |= {"hf_primal_residual": found.primal, "hf_dual_residual": found.dual, "hf_gap": found.gap}
     for row, of_query in zip(rows, output_errors(problem.outputs, mus, (u, lam), reference), strict=True):
         row["outputs"] = of_query
