@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -132,6 +134,12 @@ def test_an_enrichment_is_what_its_kind_says() -> None:
 @pytest.mark.parametrize("resolution", [150, 400])
 def test_bases_at_many_parameters_are_those_of_each(resolution: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a bulge B is one matrix times a number, and all share one array; with one each has its own."""
+    computed, added = list[Any](), ReducedModel._added
+
+    def counted(*given: Any) -> Any:
+        computed.append(given[2])
+        return added(*given)
+
     for bulge in (False, True):
         problem = Obstacle(resolution=resolution, bulge=bulge)
         mus = problem.parameters.lower + np.random.default_rng(1).random((9, len(problem.parameters.lower))) * (
@@ -143,10 +151,9 @@ def test_bases_at_many_parameters_are_those_of_each(resolution: int, monkeypatch
         cone = multipliers(chi / W.norm(chi), W)
         online = Enrichment(Kind.PER_PARAMETER, eta=cone.span)
         reduced = ReducedModel(problem, V.orthonormalise(rng.standard_normal((V.dim, 3))), online, cone.chi, cone.span)
-        computed: list[VariationalInequality] = []
+        computed.clear()
         with monkeypatch.context() as patch:
-            added = ReducedModel._added
-            patch.setattr(ReducedModel, "_added", lambda *given: computed.append(given[2]) or added(*given))
+            patch.setattr(ReducedModel, "_added", counted)
             found = list(reduced.primal_bases(iter(vis)))
             assert len(computed) == (len(vis) if bulge else 2)
             xs = list(rng.standard_normal((len(vis), found[0].shape[1])))
