@@ -54,8 +54,9 @@ def pair_columns(
     )
     rows = [_columns(*one) for one in measured]
     sizes = energy_norms(u, forces)
-    for row, bound, size, *pair in zip(rows, bounds, sizes, vis, energies, u.T, lam.T, strict=True):
-        found = high_fidelity_residuals(*pair, bound.rho, float(size))
+    pairs = zip(rows, bounds, sizes.tolist(), vis, energies, u.T, lam.T, strict=True)
+    for row, bound, size, vi, energy, of_u, of_lam in pairs:
+        found = high_fidelity_residuals(vi, energy, of_u, of_lam, bound.rho, size)
         row |= {"hf_primal_residual": found.primal, "hf_dual_residual": found.dual, "hf_gap": found.gap}
     for row, of_query in zip(rows, output_errors(problem.outputs, mus, (u, lam), reference), strict=True):
         row["outputs"] = of_query
