@@ -15,7 +15,7 @@ from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.highfidelity.contact_zone import coarse_contact, watched, zone_of
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky, symmetric_lu
-from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal
+from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal, dense_inverse
 from vibench.linalg.factorisations import DEFAULT, Factor, implementation
 from vibench.linalg.schur_complement import EliminationPattern, PrincipalSubmatrix, StaticCondensation
 from vibench.qp.scaling import row_norms
@@ -30,6 +30,9 @@ MAX_BORDER = 16
 ROUND_OFF = 1e-12
 """Entries of a bordered system below this, relative to their terms, may consist of round-off alone."""
 
+
+FEW_RETAINED = 1024
+"""Unknowns up to which liftings of half as many rows or more come from a dense inverse of a sparse Ŝ."""
 
 MOST = 4
 """The compliance of all rows serves active sets of more than this part of them."""
@@ -152,6 +155,8 @@ class CondensedStiffness:
         """B Ŝ⁻¹ (m×c) for rows B (m×c) of the retained unknowns."""
         if self._condensed.dense:
             return np.asarray(B @ self._compliance)
+        if len(self.retained) <= min(FEW_RETAINED, 2 * B.shape[0]):  # LAPACK inverts in less time than that takes
+            return np.asarray(B @ dense_inverse(self._condensed.dense_schur, "A"))
         return np.ascontiguousarray(self._schur_factor.solve(B.toarray().T).T)
 
     def represent(self, functionals: Array) -> tuple[Array, Array, Array]:
