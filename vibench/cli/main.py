@@ -159,7 +159,7 @@ def _conclude(name: str, outcome: Outcome, folder: Path, *, draw: int | None, fr
     if not nothing_ran:
         run_summary.print_summary(name, path, outcome.rows)
     echo(f"results: {path}, tables: {folder / 'tables'}")
-    if fresh or draw is not None:
+    if (fresh or draw is not None) and (folder / "figures").is_dir():
         from vibench.report import figures
 
         figures.remove(folder / "figures")

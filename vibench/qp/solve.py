@@ -10,10 +10,9 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import qpsolvers
 import scipy.sparse as sp
 from scipy.linalg.lapack import dtrtrs
 
@@ -26,6 +25,9 @@ from vibench.qp.scaling import Units, drive, near, row_norms, units_driven, unit
 from vibench.qp.settings import SETTINGS
 from vibench.qp.verification import QPSolution, QPSolver
 from vibench.text import one_line
+
+if TYPE_CHECKING:
+    import qpsolvers
 
 MARGIN = 0.5
 """Share of the accuracy that qpsolvers is asked for: residuals of its solvers come out up to 1.4 times below ours."""
@@ -183,6 +185,8 @@ def installed_solvers(extra: Iterable[str] = ()) -> list[str]:
 
     Only those of an installed distribution: any folder called like a solver can be imported from the working directory.
     """
+    import qpsolvers  # noqa: PLC0415  it loads every solver there is, which processes that use none of them need not
+
     installed = {name for name in qpsolvers.available_solvers if name in SETTINGS and solver_version(name)}
     return sorted(installed | set(extra))
 
@@ -199,6 +203,8 @@ def _call(program: VariationalInequality, solver: str, accuracy: float, start: M
     if solver in DIRECT and isinstance(program.A, np.ndarray) and isinstance(program.B, np.ndarray):
         solution = DIRECT[solver](program, **settings, **start)
     else:
+        import qpsolvers  # noqa: PLC0415  as above
+
         problem = qpsolvers.Problem(_as_csc(program.A), -program.f, _as_csc(program.B), program.g)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the status is part of the solution, which is verified later
