@@ -101,8 +101,8 @@ class Pairing:
                 f"x = {self._slave[0, -1]:.4g} m: the radius of disc 2 is too small"
             )
         macro, edge, x, weight = (self._cut if self._points is None else self._facing)(abscissae, macros)
-        begin = abscissae[edge]
-        right = weight * (x - begin) / (abscissae[edge + 1] - begin)
+        begin = abscissae.take(edge)
+        right = weight * (x - begin) / (abscissae.take(edge + 1) - begin)
         return macro, edge, weight - right, right
 
     def _beside_slave(self, rows: Indices, nodes: Indices, values: Array, count: int) -> SparseMatrix:
@@ -121,16 +121,16 @@ class Pairing:
         """Macro-edge, master edge, abscissa and weight of the midpoints of all segments between projected nodes."""
         begin, end, _ = macros.indices(len(self._height))
         nodes = self._slave[0, 2 * begin : 2 * end + 1]
-        first, last = abscissae.searchsorted(nodes[[0, -1]])
+        first, last = abscissae.searchsorted(nodes[0]), abscissae.searchsorted(nodes[-1])
         merged = np.concatenate([nodes, abscissae[first:last]])
         order = merged.argsort(kind="stable")
-        cuts, begun = merged[order], (order < len(nodes)).cumsum()[:-1]  # slave nodes up to each segment
+        cuts, begun = merged.take(order), (order < len(nodes)).cumsum()[:-1]  # slave nodes up to each segment
         # The other cuts are master nodes; the last one before a segment is the number of its master edge. It would be
         # −1 on the empty segment between two nodes that coincide on the axis.
         facing = np.maximum(np.arange(first, first + len(begun)) - begun, 0)
         x = 0.5 * (cuts[1:] + cuts[:-1])  # exact: the integrands are linear on every segment
         edges = begun + (2 * begin - 1)
-        return self._macros[edges], facing, x, (cuts[1:] - cuts[:-1]) * self._stretch[edges]
+        return self._macros.take(edges), facing, x, (cuts[1:] - cuts[:-1]) * self._stretch.take(edges)
 
     def _facing(self, abscissae: Array, macros: slice) -> tuple[Indices, Indices, Array, Array]:
         """Macro-edge, master edge, abscissa and weight of given points on the slave side."""
@@ -179,14 +179,14 @@ class Tested:
             As `Pairing.couple`.
         """
         macro, edge, left, right = self._pairing.halves(abscissae, self._macros)
-        points, begun = len(macro), np.flatnonzero(np.diff(edge, prepend=-1))
-        pointers = np.concatenate([begun, begun + points, [2 * points]])
-        entries = np.concatenate([left, right]), np.concatenate([macro, macro]), pointers
-        sums = sp.csr_array(entries, shape=(2 * len(begun), len(self._eta))) @ self._eta  # of the points of every edge
-        met = edge[begun]
-        loads = np.zeros((int(met[-1]) + 2, self._eta.shape[1]))
-        loads[met] = sums[: len(met)]
-        loads[met + 1] += sums[len(met) :]
+        points, edges = len(macro), int(edge[-1]) + 1
+        begun = edge.searchsorted(np.arange(edges + 1))  # points before every master edge
+        entries = np.concatenate([left, right]), np.concatenate([macro, macro])
+        pointers = np.concatenate([begun, begun[1:] + points])
+        sums = sp.csr_array((*entries, pointers), shape=(2 * edges, len(self._eta))) @ self._eta  # for its two nodes
+        loads = np.zeros((edges + 1, self._eta.shape[1]))
+        loads[:-1] = sums[:edges]
+        loads[1:] += sums[edges:]
         return loads
 
 

@@ -80,7 +80,7 @@ class ProjectedMember:
 
     def _unpacked(self, flat: Array) -> Array:
         """Members (…×shape) from their flat entries (…×size)."""
-        whole = flat if self.unpack is None else flat[..., self.unpack]
+        whole = flat if self.unpack is None else flat.take(self.unpack, axis=-1)
         return whole.reshape(*flat.shape[:-1], *self.shape)
 
 
