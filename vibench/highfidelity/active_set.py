@@ -186,7 +186,10 @@ class HighFidelitySolver:
 
     def condensed(self, vi: VariationalInequality) -> CondensedStiffness:
         """The stiffness of `vi` condensed on the constrained unknowns; one object where A is constant."""
-        outside = np.setdiff1d(sp.csr_array(vi.B).indices, self._constrained)
+        touched = np.zeros(vi.B.shape[1], bool)
+        touched[sp.csr_array(vi.B).indices] = True
+        touched[self._constrained] = False
+        outside = np.flatnonzero(touched)
         if len(outside):
             if self._problem.contact_dofs is not None:
                 undeclared = f"{len(outside)} unknowns outside the declared contact_dofs, the first is {outside[0]}"
@@ -258,8 +261,8 @@ def solve_unverified(
     lam = reading.multipliers(forces, len(vi.g))
     if _backward_error(vi, u, lam) > ROUND_OFF:  # a large rigid displacement amplifies it in the eliminated unknowns
         u = u + system.correct_eliminated(vi.f - vi.A @ u - vi.B.T @ lam)
-    if _backward_error(vi, u, lam) > ROUND_OFF:  # a stiff problem
-        u, lam = _refined(vi, stiffness, u, lam)
+        if _backward_error(vi, u, lam) > ROUND_OFF:  # a stiff problem
+            u, lam = _refined(vi, stiffness, u, lam)
     return ActiveSetSolution(u, lam, fallback, iterations)
 
 

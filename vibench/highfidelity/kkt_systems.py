@@ -85,14 +85,14 @@ class CondensedStiffness:
         if self._saddle is not None and self._saddle.is_definite:
             return
         if self._condensed.dense:
-            self._compliance  # noqa: B018  its Cholesky factorisation fails otherwise
+            self._blocks  # noqa: B018  their Cholesky factorisation fails otherwise
         else:
             SparseCholesky(self._condensed.schur, name)  # its message has this name
 
     def solve(self, right: Array) -> Array:
         """A⁻¹ r for right-hand sides (n, k)."""
         load, particular = self._condensed.eliminate(right)
-        retained = self._compliance @ load if self._condensed.dense else self._schur_factor.solve(load)
+        retained = self._blocks @ load if self._condensed.dense else self._schur_factor.solve(load)
         return self._condensed.recover(retained, particular)
 
     def dual_norms(self, functionals: Array) -> Array:
@@ -101,7 +101,7 @@ class CondensedStiffness:
             return self._saddle.dual_norms(functionals)
         if self._condensed.dense:
             load, eliminated = self._condensed.eliminated_squares(functionals)
-            retained = np.einsum("ik,ik->k", load, self._compliance @ load)
+            retained = np.einsum("ik,ik->k", load, self._blocks @ load)
             return np.asarray(np.sqrt(np.maximum(eliminated + retained, 0.0)))
         return norms_by_solutions(functionals, self.solve(functionals))
 
@@ -193,7 +193,7 @@ class CondensedStiffness:
         condensed = self._condensed
         load, particular = condensed.condense_load(vi.f)
         whole = self._pattern.whole
-        B = sp.csr_array(vi.B if whole else sp.csc_array(vi.B)[:, self._pattern.retained])
+        B = sp.csr_array(vi.B) if whole else self._pattern.on_retained(vi.B)
         solve_active: ActiveSolver
         if condensed.dense:
             solve_active = ComplianceSolver(self._blocks, self._unconstrained(load), B, vi.g)

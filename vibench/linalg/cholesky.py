@@ -215,8 +215,11 @@ class PartialCholesky:
     def eliminate(self, right: Array) -> tuple[Array, Array]:
         """For r (n,) or (n, k), X_ii⁻¹ r_i and the load of the Schur complement, r_c − X_ci X_ii⁻¹ r_i."""
         solved = np.ascontiguousarray(right[self.order], dtype=float)
-        if solved[: self._split].any():  # forces of the contact load no eliminated unknown
+        loading = solved[: self._split].any(axis=0)  # forces of the contact load no eliminated unknown
+        if loading.all():
             solved = np.asarray(self._lu.solve(solved))
+        elif loading.any():
+            solved[:, loading] = self._lu.solve(np.ascontiguousarray(solved[:, loading]))
         return solved[: self._split], solved[self._split :]
 
     def extend(self, last: Array) -> Array:

@@ -66,10 +66,11 @@ class BlockDiagonal:
             touched = np.unique(part.indices)
             if not len(touched):
                 continue
-            # of neighbours, that is without a copy, where the unknowns are numbered along the contact
+            # Few unknowns are neighbours where they are numbered along the contact. SciPy would copy a larger part.
             along = slice(touched[0], touched[-1] + 1)
-            part = part[:, along]
-            total += part @ np.ascontiguousarray((part @ block[along, along]).T)
+            if 2 * (along.stop - along.start) < len(unknowns):
+                part, block = part[:, along], block[along, along]
+            total += part @ np.ascontiguousarray((part @ block).T)
         return total
 
     def cholesky(self, name: str) -> BlockDiagonal:
@@ -134,4 +135,5 @@ def mirrored(lower: Array) -> Array:
 
 
 def _inverse(block: Array) -> Array:
-    return mirrored(np.asarray(dpotri(scipy.linalg.cholesky(block, lower=True), lower=True, overwrite_c=True)[0]))
+    """The inverse, row by row in memory: sparse products copy LAPACK's columns."""
+    return mirrored(np.asarray(dpotri(scipy.linalg.cholesky(block, lower=True), lower=True, overwrite_c=True)[0])).T

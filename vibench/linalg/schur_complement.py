@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.errors import NumericalError
 from vibench.linalg.cholesky import PartialCholesky
 from vibench.linalg.definite import BlockDiagonal
 from vibench.linalg.factorisations import DEFAULT, implementation
@@ -35,6 +36,24 @@ class EliminationPattern:
     def is_dense(self) -> bool:
         """Whether most entries of the Schur complement are non-zero."""
         return 2 * len(self.interface) > len(self.retained)
+
+    @cached_property
+    def _places(self) -> Indices:
+        """Positions of all unknowns (n,) among the retained ones, −1 of the others."""
+        places = np.full(max(self.retained.max(initial=-1), self.order.max(initial=-1)) + 1, -1)
+        places[self.retained] = np.arange(len(self.retained))
+        return places
+
+    def on_retained(self, B: SparseMatrix) -> SparseMatrix:
+        """The columns of B (m×n) of the retained unknowns, others have no entries: m×c, CSR.
+
+        Raises a `NumericalError` if others have some.
+        """
+        B = sp.csr_array(B)
+        columns = self._places[B.indices]
+        if columns.min(initial=0) < 0:
+            raise NumericalError("a constraint touches unknowns that are to be eliminated")
+        return sp.csr_array((B.data, columns, B.indptr), shape=(B.shape[0], len(self.retained)))
 
     @cached_property
     def factorised_block(self) -> PrincipalSubmatrix:

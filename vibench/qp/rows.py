@@ -8,6 +8,7 @@ part belongs to the one row, its negative part to the other. Rows that are absen
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import scipy.sparse as sp
@@ -126,9 +127,15 @@ def rows_that_matter(
     return Rows(kept, equal[kept], opposite[kept], ratio[kept], implied)
 
 
+@lru_cache(maxsize=4)
+def _random(count: int) -> Array:
+    """A random vector (count,)."""
+    return np.random.default_rng(0).standard_normal(count)
+
+
 def _parallel(B: SparseMatrix, lengths: Array, present: Mask) -> tuple[Indices, Indices, Array]:
     """The rows (p,) that are parallel to others, the number of the direction of each, and its sign in it."""
-    probes = B @ np.random.default_rng(0).standard_normal(B.shape[1]) / lengths
+    probes = B @ _random(B.shape[1]) / lengths
     rows = np.flatnonzero(present & (probes != 0.0))
     rows = rows[np.argsort(np.abs(probes[rows]), kind="stable")]
     sizes = np.abs(probes[rows])

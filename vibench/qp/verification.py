@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import scipy.linalg
@@ -139,9 +139,16 @@ def accurate_residuals(program: VariationalInequality, x: Array, alpha: Array) -
 
     Of a stiff A, double precision would leave round-off times the condition number in the norm of A⁻¹.
     """
-    A, B, u, lam = (member.astype(np.longdouble) for member in (program.A, program.B, x, alpha))
+    A, B, u, lam = map(_extended, (program.A, program.B, x, alpha))
     residual, excess = program.f - A @ u - B.T @ lam, B @ u - program.g
     return residual.astype(float), excess.astype(float)
+
+
+def _extended(array: Any) -> Any:
+    """A vector or a matrix in extended precision; a sparse one shares its indices."""
+    if not sp.issparse(array) or array.format not in ("csr", "csc"):
+        return array.astype(np.longdouble)
+    return type(array)((array.data.astype(np.longdouble), array.indices, array.indptr), shape=array.shape)
 
 
 def solution_energy(program: VariationalInequality, x: Array, alpha: Array, norms: DualNorms) -> float:
