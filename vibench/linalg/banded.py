@@ -11,13 +11,15 @@ of positive definiteness", BIT Numerical Mathematics 46, 2006, §2).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.linalg.lapack import dpbtrf
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from vibench.arrays import Array, SparseMatrix
+from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.linalg.cholesky import UNIT
 
 MOST_WORK = 1.5e8
@@ -45,16 +47,46 @@ def is_proved_by_band(parts: Sequence[SparseMatrix]) -> bool | None:
     return bool(dpbtrf(scaled, lower=1, overwrite_ab=1)[1] == 0)
 
 
-def _band(matrix: SparseMatrix, units: Array) -> Array | None:
-    """The lower half (b+1, n) of the band of S M S, S of `units` (n,), in another order; `None` if it is wide."""
-    size = matrix.shape[0]
+@dataclass(frozen=True)
+class _Order:
+    """Where the entries of symmetric matrices (n×n) of one sparsity pattern are in a narrow band.
+
+    Of those of the lower half of the band, which has `width` diagonals beside the main one: positions among all
+    entries, rows, columns, and places in the band (width+1, n), column by column.
+    """
+
+    width: int
+    entries: Indices
+    rows: Indices
+    columns: Indices
+    places: Indices
+
+
+@lru_cache(maxsize=2)
+def _narrow(pointers: bytes, indices: bytes, kind: str) -> _Order | None:
+    """The order for a pattern (CSR), given as bytes of index arrays of a kind; `None` if the band is wide.
+
+    Proofs ask for the same few patterns again and again.
+    """
+    starts, columns = np.frombuffer(pointers, kind), np.frombuffer(indices, kind)
+    size = len(starts) - 1
+    pattern = sp.csr_array((np.ones(len(columns)), columns, starts), shape=(size, size))
     place = np.empty(size, np.intp)
-    place[reverse_cuthill_mckee(matrix, symmetric_mode=True)] = np.arange(size)
-    rows, columns = np.repeat(np.arange(size), np.diff(matrix.indptr)), matrix.indices
+    place[reverse_cuthill_mckee(pattern, symmetric_mode=True)] = np.arange(size)
+    rows = np.repeat(np.arange(size), np.diff(starts))
     below = place[rows] - place[columns]
-    width, lower = int(below.max(initial=0)), below >= 0
+    width, lower = int(below.max(initial=0)), np.flatnonzero(below >= 0)
     if size * float(width) ** 2 > MOST_WORK:
         return None
-    rows, columns, band = rows[lower], columns[lower], np.zeros((width + 1, size), order="F")
-    band[below[lower], place[columns]] = units[rows] * matrix.data[lower] * units[columns]
-    return band
+    rows, columns = rows[lower], columns[lower].astype(np.intp)
+    return _Order(width, lower, rows, columns, below[lower] + (width + 1) * place[columns])
+
+
+def _band(matrix: SparseMatrix, units: Array) -> Array | None:
+    """The lower half (b+1, n) of the band of S M S, S of `units` (n,), in another order; `None` if it is wide."""
+    order = _narrow(matrix.indptr.tobytes(), matrix.indices.tobytes(), matrix.indices.dtype.str)
+    if order is None:
+        return None
+    band = np.zeros((matrix.shape[0], order.width + 1))
+    band.ravel()[order.places] = units[order.rows] * matrix.data[order.entries] * units[order.columns]
+    return band.T

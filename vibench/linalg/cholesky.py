@@ -175,6 +175,11 @@ class PartialCholesky:
         return lower
 
     @cached_property
+    def _coupling_factor(self) -> SparseMatrix:
+        """L_ci."""
+        return self._columns[self._split :]
+
+    @cached_property
     def _corner_factor(self) -> SparseMatrix:
         """L_iiᵀ."""
         corner = sp.csc_array(self._columns[: self._split])
@@ -246,7 +251,7 @@ class PartialCholesky:
         if last.size:
             last = scipy.linalg.solve_triangular(self.trailing_factor, last, check_finite=False)
         u[self.order[split:]] = last
-        corner, coupling = self._corner_factor, self._columns[split:].T
+        corner, coupling = self._corner_factor, self._coupling_factor.T
         first = _scale_rows(1.0 / self._root, y[:split]) - coupling @ last
         if first.size:
             u[self.order[:split]] = spsolve_triangular(corner, first, lower=False, unit_diagonal=True)
@@ -259,7 +264,7 @@ class PartialCholesky:
         if first.any():
             first = spsolve_triangular(self._corner_factor.T, first, lower=True, unit_diagonal=True)
             first = _scale_rows(1.0 / self._root, first)
-            last = last - self._columns[split:] @ _scale_rows(self._root, first)
+            last = last - self._coupling_factor @ _scale_rows(self._root, first)
         if last.size:
             last = scipy.linalg.solve_triangular(self.trailing_factor, last, trans="T", check_finite=False)
         return np.concatenate([first, last])

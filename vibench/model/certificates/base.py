@@ -19,7 +19,7 @@ from vibench.linalg.schur_complement import EliminationPattern, StaticCondensati
 from vibench.model.affine import AffineMember, Evaluation, coefficients, evaluated_members
 from vibench.model.certificates.inf_sup import OnlineInfSup, online_inf_sup
 from vibench.model.certificates.prepared_correction import constant_unknowns
-from vibench.model.certificates.spectral import SpectralBounds, leading_terms, rotated, spectral_bounds
+from vibench.model.certificates.spectral import SpectralBounds, combined, leading_terms, rotated, spectral_bounds
 from vibench.stability.coercivity import MARGINS, largest_quotient
 
 VERIFICATION = 16
@@ -140,8 +140,7 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
         samples = np.column_stack([evaluate(mu).get("A", ONE) for mu in training])
         rotation, terms = T, _ = rotated(A.terms, samples)
         leading = len(terms) if is_exact(problem, "A", A) else leading_terms(T @ samples)
-    last = None if rotation is None or leading == len(terms) else (rotation[leading:], terms[leading:])
-    load, stiffness, of_leading = _interpolation_errors(problem, X, members, evaluate, last)
+    load, stiffness, of_leading = _interpolation_errors(problem, X, members, evaluate, rotation, terms, leading)
     if not constant:
         spectral = spectral_bounds(problem, X, terms[:leading], lambda mu: T @ evaluate(mu).get("A", ONE), of_leading)
     pattern = EliminationPattern.of(X.matrix, dofs, X.factorisation)
@@ -187,29 +186,32 @@ def _interpolation_errors(
     X: InnerProduct,
     members: Mapping[str, AffineMember],
     evaluate: Callable[[Array], Mapping[str, Array]],
-    last: tuple[Array, Sequence[SparseMatrix]] | None,
+    rotation: Array | None,
+    terms: Sequence[SparseMatrix],
+    leading: int,
 ) -> tuple[float, float, float]:
-    """Bounds of the errors of f̃, of Ã, and of Ã without its last rotated terms, from random parameters.
+    """Bounds of the errors of f̃, of Ã, and of Ã of its leading terms alone, from random parameters.
 
-    These terms are given with their rows of the rotation (k×Q).
+    Rotation and terms are those of a `CertificateBase`.
     """
     A, f = members["A"], members["f"]
     exact = {name: is_exact(problem, name, member) for name, member in (("A", A), ("f", f))}
     if all(exact.values()):
         return 0.0, 0.0, 0.0
     load = stiffness = of_leading = 0.0
-    for mu in problem.parameters.sample(VERIFICATION, SEED):
-        vi, theta = checked_assembly(problem, mu), evaluate(mu)
+    mus = problem.parameters.sample(VERIFICATION, SEED)
+    thetas = [evaluate(mu) for mu in mus]
+    if not exact["A"]:
+        assert rotation is not None  # that of an A which is not exactly constant
+        of_A = rotation @ np.column_stack([theta.get("A", ONE) for theta in thetas])
+        sums = list(zip(combined(terms, of_A), combined(terms[:leading], of_A[:leading]), strict=True))
+    for k, mu in enumerate(mus):
+        vi = checked_assembly(problem, mu)
         if not exact["f"]:
-            interpolated = sum(t * term for t, term in zip(theta.get("f", ONE), f.terms, strict=True))
+            interpolated = sum(t * term for t, term in zip(thetas[k].get("f", ONE), f.terms, strict=True))
             load = max(load, float(np.linalg.norm(X.whiten_functional(vi.f - interpolated))))
         if not exact["A"]:
-            of_A = theta.get("A", ONE)
-            difference = vi.A - sum(t * term for t, term in zip(of_A, A.terms, strict=True))
-            missed = left_out = largest_quotient(difference, X)
-            if last is not None:
-                left = zip(last[0] @ of_A, last[1], strict=True)
-                left_out = largest_quotient(difference + sum(t * term for t, term in left), X)
+            missed, left_out = (largest_quotient(vi.A - part, X) for part in sums[k])
             stiffness, of_leading = max(stiffness, missed), max(of_leading, left_out)
     moved = SAFETY * (1.0 + MARGINS[0])
     return SAFETY * load, moved * stiffness, moved * of_leading

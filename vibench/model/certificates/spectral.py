@@ -18,7 +18,7 @@ interpolated, and η has been measured, the last directions hardly matter: they 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -138,15 +138,25 @@ def spectral_bounds(
 def rotated(terms: tuple[SparseMatrix, ...], theta: Array) -> tuple[Array, list[SparseMatrix]]:
     """Principal directions of Σ_q θ_q A_q over samples θ (Q×P): a rotation T (Q×Q) and terms for Tθ.
 
-    The new terms are orthonormal as vectors of entries, by falling norm of their coefficients over the samples.
+    The new terms are orthonormal as vectors of entries, by falling norm of their coefficients over the samples. They
+    have one sparsity pattern.
     """
     pattern = sp.csr_array(sum(abs(sp.csr_array(term)) for term in terms))
-    rows, columns = pattern.nonzero()
-    entries = np.column_stack([np.asarray(sp.csr_array(term)[rows, columns]).ravel() for term in terms])
+    pattern.sort_indices()
+    pattern.eliminate_zeros()
+    places = pattern.nonzero()
+    entries = np.column_stack([np.asarray(sp.csr_array(term)[places]).ravel() for term in terms])
     q, r = np.linalg.qr(entries)
     left, _, _ = np.linalg.svd(r @ theta)
-    modes = [sp.csr_array((mode, (rows, columns)), shape=pattern.shape) for mode in (q @ left).T]
+    rows = np.ascontiguousarray((q @ left).T)
+    modes = [sp.csr_array((mode, pattern.indices, pattern.indptr), shape=pattern.shape) for mode in rows]
     return np.asarray(left.T @ r), modes
+
+
+def combined(terms: Sequence[SparseMatrix], theta: Array) -> list[SparseMatrix]:
+    """Σ_q θ_q A_q of `rotated` terms for every column of θ (Q×k), whose entries are those of one product."""
+    entries, pattern = np.column_stack([term.data for term in terms]) @ theta, terms[0]
+    return [sp.csr_array((data, pattern.indices, pattern.indptr), shape=pattern.shape) for data in entries.T.copy()]
 
 
 def leading_terms(theta: Array) -> int:
