@@ -454,7 +454,10 @@ TIMINGS: Mapping[str, Column] = {
     "total_s": real("s", "Sum of the three."),
     "total_wall_s": real("s", "The same in wall seconds."),
     "block": text("Block of rounds, which cells that were timed together share; each block is a process of its own."),
-    "hf_s": real("s", "High-fidelity solution beside the queries, mean over the parameters of the round."),
+    "hf_s": real(
+        "s",
+        "High-fidelity solution, mean over the parameters of the round: that of the block, at the pace of the round.",
+    ),
     "pace": real(
         "1", "Factor by which the timings of this round exceed those of the other rounds of the block: the median."
     ),

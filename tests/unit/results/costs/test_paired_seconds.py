@@ -15,7 +15,15 @@ from scipy.stats import t as student
 
 from vibench.execution.timing_plan import STOPPING_TAIL
 from vibench.results.costs.break_even import TAIL, compared
-from vibench.results.costs.paired_seconds import CONDITIONS, CommonVariance, Estimate, PairedSeconds, blocks_of, paces
+from vibench.results.costs.paired_seconds import (
+    CONDITIONS,
+    CommonVariance,
+    Estimate,
+    PairedSeconds,
+    beside,
+    blocks_of,
+    paces,
+)
 
 GROUPS, CELLS, ROUNDS, SECONDS = 3, 6, 3, 0.08
 """Groups, cells of each, rounds of a block, and seconds of a cell's part of a round."""
@@ -58,9 +66,10 @@ def measured(
                         noise = conditions[group, which] + process[which] + 0.02 * rng.standard_t(2.5)
                         seconds[model, one, k] = np.exp(level + noise) * slow[model]
             pace = paces(seconds.reshape(-1, ROUNDS))
+            high_fidelity = beside(seconds[1], pace)
             rows += [
                 {"cell": f"{group}-{one}", "block": f"{group}/{block}", "pace": pace[k]}
-                | {"total_s": seconds[0, one, k], "hf_s": seconds[1, one, k]}
+                | {"total_s": seconds[0, one, k], "hf_s": high_fidelity * pace[k]}
                 for one in range(CELLS)
                 for k in range(ROUNDS)
             ]
@@ -164,17 +173,11 @@ def test_a_block_has_the_median_of_its_rounds_at_their_pace_and_that_of_their_ra
     assert np.exp(block.high_fidelity) == pytest.approx(4.0)
 
 
-def test_models_of_one_block_are_compared_by_the_solutions_beside_them() -> None:
-    """The machine was twice as slow while one of them was timed; without solutions nobody knows."""
-    for hf, expected in (((4.0, 8.0), 1.5), ((4.0, None), 3.0)):
-        rows = [
-            {"cell": cell, "block": str(k), "total_s": seconds, "hf_s": beside, "pace": 1.0}
-            for cell, seconds, beside in (("a", 1.0, hf[0]), ("b", 3.0, hf[1]))
-            for k in range(2)
-        ]
-        found = PairedSeconds(rows).ratio("a", "b")
-        assert found is not None
-        assert np.exp(found.mean) == pytest.approx(expected)
+def test_solutions_of_a_block_count_alike_beside_every_model() -> None:
+    pace = np.array([1.0, 2.0, 1.0])
+    seconds = np.array([[4.0, 8.0, 4.0], [9.0, 18.0, 900.0], [np.nan] * 3])
+    assert beside(seconds, pace) == pytest.approx(6.0)
+    assert np.isnan(beside(seconds[2:], pace))
 
 
 def test_without_other_models_an_interval_is_students() -> None:
