@@ -68,9 +68,9 @@ class BlockDiagonal:
                 continue
             # Few unknowns are neighbours where they are numbered along the contact. SciPy would copy a larger part.
             along = slice(touched[0], touched[-1] + 1)
-            if 2 * (along.stop - along.start) < len(unknowns):
-                part, block = part[:, along], block[along, along]
-            total += part @ np.ascontiguousarray((part @ block).T)
+            few = 2 * (along.stop - along.start) < len(unknowns)
+            part, compliance = (part[:, along], block[along, along]) if few else (part, block)
+            total += part @ np.ascontiguousarray((part @ compliance).T)
         return total
 
     def cholesky(self, name: str) -> BlockDiagonal:
