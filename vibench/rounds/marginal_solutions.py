@@ -31,7 +31,11 @@ LONG = 0.1
 round, and counts for all cells in it."""
 
 FIRST_SEED = 2
-"""Seeds of solutions in a round: those of the queries beside them are smaller, and no parameter is the same."""
+"""First of the seeds of solutions in a round: those of the queries beside them are smaller, so that no parameter is the
+same."""
+
+LAST_SEED = 5
+"""First of the seeds of assemblies that belong to no solution: there are at most three solutions."""
 
 SAME = 1e-6
 """Largest distance of a solution next to a parameter from that at it, relative to the largest solution."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 
@@ -18,7 +18,13 @@ from vibench.offline.correction import corrected_in_full
 from vibench.offline.models import AnyReducedModel
 from vibench.provenance import machine
 from vibench.results.costs.paired_seconds import beside, paces
-from vibench.rounds.marginal_solutions import MarginalSolution, MarginalSolutions, SolutionsBeside, parts_alike
+from vibench.rounds.marginal_solutions import (
+    LAST_SEED,
+    MarginalSolution,
+    MarginalSolutions,
+    SolutionsBeside,
+    parts_alike,
+)
 from vibench.rounds.timed_seconds import TimedCell, TimedRound, round_columns
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, Watch, build_problem
@@ -178,7 +184,8 @@ class _Rounds(Items):
         asked = stage.certificate is not None or stage.correction is not CorrectionMode.NONE
         for k, solution in alternated:
             near = queries.near(k, *seed)
-            if (seconds := _assembly(stage, queries.model, near, solution, assemble)) is not None:
+            further = partial(self._marginal.assemble, k, at, cell, LAST_SEED + warm_up)
+            if (seconds := _assembly(stage, queries.model, near, solution, further, assemble)) is not None:
                 assemble[k] = seconds
             query = stage.query(queries, k).repeated(stage.assembly.validation.seed, k, *seed)
             answer, solve[k] = query.prepare(watch)()
@@ -249,19 +256,22 @@ def _assembly(
     model: AnyReducedModel,
     near: Array,
     solution: MarginalSolution | None,
+    further: Callable[[], MarginalSolution],
     done: Mapping[int, Seconds],
 ) -> Seconds | None:
     """Seconds of the assembly of a query, `None` where it is not timed.
 
-    In full it costs the same at each parameter: some assemblies stand for all, those of the high-fidelity solutions.
+    In full it costs the same at each parameter: some assemblies stand for all, those of the high-fidelity solutions and
+    `further` ones until they are enough.
     """
     if stage.compilation is not None:
         return NO_TIME  # it is part of the solution
     if isinstance(model, HyperReducedModel):
         return timed(partial(model.assemble, near))[1]
-    if solution is None or sum(seconds.cpu for seconds in done.values()) > ASSEMBLY_SECONDS:
+    if sum(seconds.cpu for seconds in done.values()) > ASSEMBLY_SECONDS:
         return None
-    return solution.assembly + timed(partial(model.reduce, solution.vi))[1]
+    assembled = solution or further()
+    return assembled.assembly + timed(partial(model.reduce, assembled.vi))[1]
 
 
 def block_rows(stage: TimingRounds, timed: Sequence[TimedCell]) -> list[list[Row]]:

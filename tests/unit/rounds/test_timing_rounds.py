@@ -120,11 +120,12 @@ def test_every_ok_query_is_timed_and_no_other(store: SampleStore) -> None:
         assert all(row["total_s"] == row["assemble_s"] + row["solve_s"] for row in rows.values())
 
 
-@pytest.mark.parametrize(("enough", "in_full"), [(0.0, 1), (np.inf, 2)])
+@pytest.mark.parametrize(("enough", "in_full"), [(0.0, 1), (np.inf, VALIDATION)])
 def test_reduced_assembly_is_timed_at_every_query_and_full_assembly_at_as_many_as_are_enough(
     store: SampleStore, monkeypatch: pytest.MonkeyPatch, enough: float, in_full: int
 ) -> None:
     monkeypatch.setattr(timing_rounds, "ASSEMBLY_SECONDS", enough)
+    monkeypatch.setattr(timing_rounds, "SHARE", 1)
     timed = TimingRounds(CELLS, (EVERY,) * len(CELLS), 2).run(store).value
     assert [[len(each.assemble) for each in one.rounds.values()] for one in timed[:3]] == [[in_full] * 2] * 3
     assert all(each.assemble.keys() == each.solve.keys() for each in timed[3].rounds.values())
@@ -228,10 +229,12 @@ def test_matrices_in_full_are_those_of_the_solutions_and_none_is_assembled_twice
         marginal_solutions, "checked_assembly", lambda problem, mu: (calls.append(float(mu[0])), plain(problem, mu))[1]
     )
     monkeypatch.setattr(ReducedModel, "reduce", lambda model, vi: (reduced.append(vi), reduce(model, vi))[1])
+    monkeypatch.setattr(timing_rounds, "SHARE", 1)
+    monkeypatch.setattr(timing_rounds, "ASSEMBLY_SECONDS", np.inf)
     TimingRounds(CELLS[:3], (EVERY,) * 3, 4).run(store)
-    assert len(calls) == 3 * (1 + 4 * 3)  # a warm-up, then three solutions in each round, for every cell
+    assert len(calls) == 3 * (1 + 4 * (VALIDATION + 1))  # a warm-up, then every query and the last solution of a round
     assert len(set(calls)) == len(calls)
-    assert len(reduced) == 3 * (1 + 4 * 2)  # none after the last query
+    assert len(reduced) == 3 * (1 + 4 * VALIDATION)  # none after the last query
 
 
 def test_a_round_that_takes_long_ends_early(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
