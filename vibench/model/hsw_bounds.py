@@ -33,6 +33,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.interfaces.problem import Problem, VariationalInequality, is_absent
 from vibench.linalg.inner_product import InnerProduct
+from vibench.qp.verification import norms_by_solutions
 from vibench.reduction import cones
 from vibench.stability.coercivity import Stability
 
@@ -60,7 +61,8 @@ def hsw_bounds(
     where known.
     """
     residuals = residuals or [vi.f - vi.A @ u[:, k] - vi.B.T @ lam[:, k] for k, vi in enumerate(vis)]
-    dual_norms = np.linalg.norm(problem.V.whiten_functional(np.column_stack(residuals)), axis=0)
+    columns = np.column_stack(residuals)
+    dual_norms = norms_by_solutions(columns, problem.V.riesz(columns))
     excesses = (vi.B @ u[:, k] - vi.g for k, vi in enumerate(vis))
     return [
         None if is_absent(vis[k].g).any() else _bound(problem.W, s, lam[:, k], float(dual_norms[k]), constants[k])

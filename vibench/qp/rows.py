@@ -107,6 +107,9 @@ def rows_that_matter(
     dropped, equal, opposite, ratio = is_absent(g), np.zeros(m, bool), np.arange(m), np.ones(m)
     implied = dropped.copy()
     directions = directions or Directions.of(sp.csr_array(B), ~dropped)
+    if not len(directions.members):
+        kept = np.flatnonzero(~dropped)
+        return Rows(kept, equal[kept], kept, ratio[kept], implied)
     lengths, members, group, side = directions.lengths, directions.members, directions.group, directions.side
     bounds = g[members] / lengths[members]
     order = np.lexsort((members, bounds, side, group))
