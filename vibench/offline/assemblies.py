@@ -14,7 +14,7 @@ from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.errors import Energy
 from vibench.stability.coercivity import Constant, Quotients, coercivity, continuity, energy_inf_sup, share_of_diagonal
-from vibench.stability.contact_infsup import ContactInfSup
+from vibench.stability.contact_infsup import ContactInfSup, multiple_of
 
 LIMIT = 2**28
 """Size limit of the assemblies in bytes; the least recently used one is dropped first."""
@@ -109,19 +109,28 @@ class Assemblies:
         return self._betas[key]
 
     def _energy_inf_sup(self, mu: Array) -> Constant:
-        """By dense matrices of contact size where these are few, else by sparse ones."""
+        """By matrices of contact size, which are dense but for multiples of X_W; where they are large, by sparse ones."""
         vi, energy, W = self.at(mu), self.energy_at(mu), self._problem.W
         on, stiffness = energy.on_contact(vi), energy.stiffness
+        if stiffness.has_known_round_off and (theta := multiple_of(on.B, W)):
+            found = self._contact_at(mu).of_multiple(theta, on.B, W)
+            if found is not None:
+                return found
         if not on.is_dense:
             return energy_inf_sup(vi.A, vi.B, W)
-        squares = vi.A.diagonal()
-        if not stiffness.has_known_round_off:
-            return ContactInfSup(vi.A, squares, 0.0, stiffness.extend).energy_inf_sup(vi.B, on.liftings, W)
+        if stiffness.has_known_round_off:
+            return self._contact_at(mu).energy_inf_sup(on.B, on.liftings, W)
+        contact = ContactInfSup(vi.A, vi.A.diagonal(), 0.0, stiffness.extend)
+        return contact.energy_inf_sup(vi.B, on.liftings, W)
+
+    def _contact_at(self, mu: Array) -> ContactInfSup:
+        """A at mu (d,) as its factorisation has condensed it; one object where it is constant."""
         if self._contact is None or "A" not in self._problem.constant:
+            stiffness, squares = self.energy_at(mu).stiffness, self.at(mu).A.diagonal()
             schur, round_off = stiffness.schur_with_round_off(squares)
             lost = round_off / share if (share := self._share_at(mu)) > 0.0 else np.inf
             self._contact = ContactInfSup(schur, squares[stiffness.retained], lost)
-        return self._contact.energy_inf_sup(on.B, on.liftings, W)
+        return self._contact
 
     def _share_at(self, mu: Array) -> float:
         """A σ with A ≽ σ diag(A) at mu (d,), proved by α; 0 where α is not."""

@@ -18,6 +18,10 @@ symmetric part K of the computed BD, by a Cholesky factorisation of it that succ
 out (Rump 2006). Products of matrices have bounded round-off (Higham 2002, §3.5), and there is none with an inverse.
 
 The same with A in place of Ŝ, all unknowns in place of c and δ = 0 takes nothing for granted of who computed D.
+
+Where B = θX_W, of one multiplier for each unknown of c, B Ŝ⁻¹Bᵀ ≽ b² X_W means θ² X_W ≽ b² Ŝ, and D = τI, τ = b²/θ, is
+enough: BD + DᵀBᵀ − DᵀŜD = τ(B + Bᵀ) − τ²Ŝ ≽ b² X_W just for these b. Nothing is dense there, where Ŝ is sparse, and the
+largest of these b is θ over the root of the largest eigenvalue of Ŝ against X_W.
 """
 
 from __future__ import annotations
@@ -31,14 +35,28 @@ from scipy.linalg.lapack import dpotrf
 from vibench.arrays import Array, SparseMatrix
 from vibench.linalg.cholesky import UNIT
 from vibench.linalg.definite import BlockDiagonal
+from vibench.linalg.factorisations import DEFAULT, implementation, is_proved_definite
 from vibench.linalg.inner_product import InnerProduct
-from vibench.stability.coercivity import Constant, moved, smallest_root
+from vibench.linalg.lanczos import Lanczos
+from vibench.stability.coercivity import FEW, Constant, moved, smallest_root
 
 COLUMNS = 128
 """Columns of D at once: of all unknowns it may not fit in memory."""
 
 MOST_LOST = 0.5
 """Largest δ/σ: beyond, the factorisation of A is too inaccurate to say anything."""
+
+
+PROPORTIONAL = 1e-12
+"""Difference of B and θX_W, relative to the largest entry, that is taken for round-off: a bound is close only there."""
+
+
+def multiple_of(B: SparseMatrix, W: InnerProduct) -> float:
+    """θ where B (m×c) is θX_W, with more than a few rows; 0 elsewhere."""
+    if B.shape[0] != B.shape[1] or B.shape[0] <= FEW:
+        return 0.0
+    theta = float(B.diagonal().sum() / W.matrix.diagonal().sum())
+    return theta if abs(B - theta * W.matrix).max() <= PROPORTIONAL * abs(B).max() else 0.0
 
 
 class ContactInfSup:
@@ -93,6 +111,22 @@ class ContactInfSup:
 
         found = moved(smallest_root(scaled, mass), -1.0, stable)
         return found if found.proved else Constant(0.0, True)
+
+    def of_multiple(self, theta: float, B: SparseMatrix, W: InnerProduct) -> Constant | None:
+        """The same for B = θX_W and a sparse Ŝ, without liftings; `None` where no bound is proved so."""
+        S = self._schur
+        if isinstance(S, BlockDiagonal) or not self._lost <= MOST_LOST:
+            return None
+        iterations = Lanczos(lambda v: W.riesz(S @ v), W.matrix)
+
+        def stable(beta: float) -> bool:
+            square = beta**2 / (1.0 - 1.01 * self._lost)
+            tau = square / theta
+            parts = [2.0 * tau * B, -(tau**2) * S, -square * W.matrix]
+            return is_proved_definite(parts, implementation(DEFAULT))
+
+        found = moved(lambda accuracy: abs(theta) * iterations.largest(accuracy) ** -0.5, -1.0, stable)
+        return found if found.proved else None
 
     def _products(self, B: SparseMatrix, liftings: Array) -> tuple[Array, Array, Array]:
         """K (m×m), and the norms (m,) of the columns of S D and of S⁻¹R."""

@@ -12,7 +12,7 @@ from vibench.linalg.inner_product import InnerProduct
 from vibench.linalg.schur_complement import EliminationPattern
 from vibench.stability import coercivity, contact_infsup
 from vibench.stability.coercivity import MARGINS, Constant, energy_inf_sup, share_of_diagonal
-from vibench.stability.contact_infsup import ContactInfSup
+from vibench.stability.contact_infsup import ContactInfSup, multiple_of
 
 
 def condensed(A: sp.csc_array, retained: np.ndarray, lost: float = 0.0) -> tuple[ContactInfSup, CondensedStiffness]:
@@ -143,3 +143,41 @@ def test_a_matrix_with_a_wrong_entry_is_not_proved_positive(wrong: float, place:
     assert not contact_infsup._proved_positive(matrix.copy(), 1.0)  # more is left out than the smallest eigenvalue
     matrix[place] = matrix[place[::-1]] = wrong if place[0] == place[1] or not np.isfinite(wrong) else 2.0
     assert not contact_infsup._proved_positive(matrix, 1e-3)
+
+
+def string(n: int = 60, m: int = 40) -> tuple[sp.csc_array, np.ndarray, InnerProduct]:
+    """The stiffness of a string, the unknowns in its middle, and the inner product of multipliers there."""
+    A = sp.csc_array(sp.diags_array([2.0 * np.ones(n), -np.ones(n - 1), -np.ones(n - 1)], offsets=[0, 1, -1]) * (n + 1))
+    mass = sp.diags_array([4.0 * np.ones(m), np.ones(m - 1), np.ones(m - 1)], offsets=[0, 1, -1]) / (6.0 * m)
+    return A, np.arange(m) + (n - m) // 2, InnerProduct(mass)
+
+
+@pytest.mark.parametrize("theta", [-0.3, 2.0])
+def test_constraints_that_are_a_multiple_of_the_norm_need_no_liftings(theta: float) -> None:
+    """β_A is proved as closely, also with round-off of A that is not negligible; nothing above it is."""
+    A, retained, W = string()
+    mass = W.matrix.toarray()
+    compliance = np.linalg.inv(A.toarray())[np.ix_(retained, retained)]
+    exact = abs(theta) * np.sqrt(scipy.linalg.eigvalsh(mass @ compliance @ mass, mass)[0])
+    B = sp.csr_array(theta * W.matrix)
+    assert multiple_of(B, W) == pytest.approx(theta)
+    for lost in (0.0, 0.1):
+        contact, stiffness = condensed(A, retained, lost)
+        found = contact.of_multiple(theta, B, W)
+        assert found is not None
+        closest = np.sqrt(1.0 - 1.01 * lost) * exact
+        assert (1.0 - 2.0 * MARGINS[0]) * closest <= found.value <= (1.0 + 1e-12) * closest
+        assert found.value == pytest.approx(contact.energy_inf_sup(B, stiffness.liftings(B), W).value, rel=2e-3)
+        # whatever θ is taken for, what is proved is a bound
+        wrong = contact.of_multiple(1.5 * theta, B, W)
+        assert wrong is None or wrong.value <= exact
+
+
+def test_other_constraints_are_not_taken_for_a_multiple_of_the_norm() -> None:
+    _, _, W = string()
+    B = sp.csr_array(2.0 * W.matrix)
+    few = InnerProduct(W.matrix[:10, :10])
+    assert multiple_of(sp.csr_array(2.0 * few.matrix), few) == 0.0
+    assert multiple_of(sp.csr_array(sp.hstack([B, B])), W) == 0.0
+    B.data[3] *= 1.0 + 1e-9
+    assert multiple_of(B, W) == 0.0
