@@ -109,7 +109,7 @@ class Assemblies:
         return self._betas[key]
 
     def _energy_inf_sup(self, mu: Array) -> Constant:
-        """By matrices of contact size, which are dense but for multiples of X_W; where they are large, by sparse ones."""
+        """By matrices of contact size, dense but for multiples of X_W; where they are large, by sparse ones."""
         vi, energy, W = self.at(mu), self.energy_at(mu), self._problem.W
         on, stiffness = energy.on_contact(vi), energy.stiffness
         if stiffness.has_known_round_off and (theta := multiple_of(on.B, W)):

@@ -117,15 +117,18 @@ class ContactInfSup:
         S = self._schur
         if isinstance(S, BlockDiagonal) or not self._lost <= MOST_LOST:
             return None
-        iterations = Lanczos(lambda v: W.riesz(S @ v), W.matrix)
+        iterations, kept = Lanczos(lambda v: W.riesz(S @ v), W.matrix), 1.0 - 1.01 * self._lost
+
+        def estimate(accuracy: float) -> float:
+            return float(abs(theta) * np.sqrt(kept / iterations.largest(accuracy)))
 
         def stable(beta: float) -> bool:
-            square = beta**2 / (1.0 - 1.01 * self._lost)
+            square = beta**2 / kept
             tau = square / theta
             parts = [2.0 * tau * B, -(tau**2) * S, -square * W.matrix]
             return is_proved_definite(parts, implementation(DEFAULT))
 
-        found = moved(lambda accuracy: abs(theta) * iterations.largest(accuracy) ** -0.5, -1.0, stable)
+        found = moved(estimate, -1.0, stable)
         return found if found.proved else None
 
     def _products(self, B: SparseMatrix, liftings: Array) -> tuple[Array, Array, Array]:

@@ -145,7 +145,7 @@ def test_a_matrix_with_a_wrong_entry_is_not_proved_positive(wrong: float, place:
     assert not contact_infsup._proved_positive(matrix, 1e-3)
 
 
-def string(n: int = 60, m: int = 40) -> tuple[sp.csc_array, np.ndarray, InnerProduct]:
+def string(n: int = 200, m: int = 40) -> tuple[sp.csc_array, np.ndarray, InnerProduct]:
     """The stiffness of a string, the unknowns in its middle, and the inner product of multipliers there."""
     A = sp.csc_array(sp.diags_array([2.0 * np.ones(n), -np.ones(n - 1), -np.ones(n - 1)], offsets=[0, 1, -1]) * (n + 1))
     mass = sp.diags_array([4.0 * np.ones(m), np.ones(m - 1), np.ones(m - 1)], offsets=[0, 1, -1]) / (6.0 * m)
@@ -167,7 +167,8 @@ def test_constraints_that_are_a_multiple_of_the_norm_need_no_liftings(theta: flo
         assert found is not None
         closest = np.sqrt(1.0 - 1.01 * lost) * exact
         assert (1.0 - 2.0 * MARGINS[0]) * closest <= found.value <= (1.0 + 1e-12) * closest
-        assert found.value == pytest.approx(contact.energy_inf_sup(B, stiffness.liftings(B), W).value, rel=2e-3)
+        by_liftings = contact.energy_inf_sup(B, stiffness.liftings(B), W).value
+        assert found.value >= (1.0 - 2.0 * MARGINS[0]) * by_liftings
         # whatever θ is taken for, what is proved is a bound
         wrong = contact.of_multiple(1.5 * theta, B, W)
         assert wrong is None or wrong.value <= exact
