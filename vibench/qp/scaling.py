@@ -86,7 +86,8 @@ def drive(program: VariationalInequality, rows: Array) -> Drive:
     neither moves anything the solution is 0, and all units are 1.
     """
     A, f = program.A, program.f
-    load, curvature = peak(f), float(f @ (A @ f))
+    load = peak(f)
+    curvature = float(f @ (A @ f)) if load else 0.0
     moved = load * float(f @ f) / curvature if curvature > 0.0 else 0.0
     depth = -float((program.g / rows).min(initial=0.0))
     if moved > NO_LOAD * depth:

@@ -31,6 +31,8 @@ class SolverSettings:
         Keyword arguments for a warm start from x (n,), α (m,), if the solver has one.
     smallest
         The smallest tolerance that the solver accepts.
+    bounds
+        Whether bounds of the unknowns take it less time than rows of a matrix.
     """
 
     tolerances: Mapping[str, float]
@@ -39,6 +41,7 @@ class SolverSettings:
     iterations: str = ""
     start: Callable[[Array, Array], Mapping[str, Any]] | None = None
     smallest: float = 0.0
+    bounds: bool = False
 
     def at(self, accuracy: float) -> dict[str, Any]:
         """Keyword arguments for a relative accuracy."""
@@ -80,7 +83,7 @@ _CONIC = {"abstol": 0.1, "reltol": 0.1, "feastol": 0.1}
 
 SETTINGS: Mapping[str, SolverSettings] = {
     "piqp": SolverSettings(
-        _EPS | _DUALITY_GAP, {"max_iter": 500, "check_duality_gap": True}, "info.status", "info.iter"
+        _EPS | _DUALITY_GAP, {"max_iter": 500, "check_duality_gap": True}, "info.status", "info.iter", bounds=True
     ),
     "proxqp": SolverSettings(
         {"eps_abs": 0.1} | _DUALITY_GAP,
@@ -94,7 +97,11 @@ SETTINGS: Mapping[str, SolverSettings] = {
     ),
     "clarabel": SolverSettings({"tol_gap_abs": 0.1, "tol_gap_rel": 0.1, "tol_feas": 0.1}, status="status"),
     "daqp": SolverSettings(
-        {"primal_tol": 0.01, "dual_tol": 0.01}, {"zero_tol": 1e-14}, iterations="iterations", start=_primal_start
+        {"primal_tol": 0.01, "dual_tol": 0.01},
+        {"zero_tol": 1e-14},
+        iterations="iterations",
+        start=_primal_start,
+        bounds=True,
     ),
     "quadprog": SolverSettings({}, iterations="iterations"),
     "highs": SolverSettings({"primal_feasibility_tolerance": 0.1, "dual_feasibility_tolerance": 0.1}, smallest=1e-10),

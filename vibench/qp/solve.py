@@ -105,8 +105,12 @@ def _solve_in(
     solver: str,
     accuracy: float,
     extra: Mapping[str, QPSolver] | None,
+    bounds: bool = False,
 ) -> QPSolution:
-    """Solve a program in these units; an answer without x or without multipliers is none."""
+    """Solve a program in these units; an answer without x or without multipliers is none.
+
+    Constraints are `bounds` where B is minus the identity.
+    """
     if not len(program.f):
         return QPSolution(np.zeros(0), np.zeros(len(program.g)), "nothing to solve: no unknowns")
     scaled = units.scaled(program)
@@ -118,7 +122,7 @@ def _solve_in(
         warm_start, starter = dict[str, Any](), SETTINGS[solver].start
         if start is not None and starter is not None and start.x is not None and start.alpha is not None:
             warm_start |= starter(*units.to(start.x, start.alpha))
-        answer = _call(scaled, solver, accuracy, warm_start)
+        answer = _call(scaled, solver, accuracy, warm_start, bounds)
     status, iterations = _report(answer, program)
     if answer.x is None or answer.alpha is None:
         return QPSolution(None, None, status, iterations, answer.negative)
@@ -162,7 +166,7 @@ def _solve_dual(
     if start is not None and start.alpha is not None and start.x is not None:  # slack g − Bx of the constraints −α ≤ 0
         slack = np.maximum(program.g - program.B @ start.x, 0.0) / rows
         start = replace(start, x=rows * start.alpha, alpha=slack)
-    answer = solve(units_of_dual(dual, loaded), dual, start)
+    answer = solve(units_of_dual(dual, loaded), dual, start, bounds=True)
     if answer.x is None:
         return answer
     forces = np.maximum(answer.x, 0.0)
@@ -196,16 +200,22 @@ def takes_start(solver: str) -> bool:
     return solver in SETTINGS and SETTINGS[solver].start is not None
 
 
-def _call(program: VariationalInequality, solver: str, accuracy: float, start: Mapping[str, Any]) -> QPSolution:
-    """The answer of a solver to a program with data of order one; without qpsolvers where `DIRECT` has the solver."""
-    settings = SETTINGS[solver].at(MARGIN * accuracy)
+def _call(
+    program: VariationalInequality, solver: str, accuracy: float, start: Mapping[str, Any], bounds: bool
+) -> QPSolution:
+    """The answer of a solver to a program with data of order one; without qpsolvers where `DIRECT` has the solver.
+
+    Where B is minus the identity the constraints are `bounds`, which some solvers are given as such.
+    """
+    settings, bounds = SETTINGS[solver].at(MARGIN * accuracy), bounds and SETTINGS[solver].bounds
     solution: DirectSolution | qpsolvers.Solution
     if solver in DIRECT and isinstance(program.A, np.ndarray) and isinstance(program.B, np.ndarray):
-        solution = DIRECT[solver](program, **settings, **start)
+        solution = DIRECT[solver](program, bounds, **settings, **start)
     else:
         import qpsolvers  # noqa: PLC0415  as above
 
-        problem = qpsolvers.Problem(_as_csc(program.A), -program.f, _as_csc(program.B), program.g)
+        rows = {"lb": -program.g} if bounds else {"G": _as_csc(program.B), "h": program.g}
+        problem = qpsolvers.Problem(_as_csc(program.A), -program.f, **rows)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the status is part of the solution, which is verified later
             try:
@@ -213,9 +223,12 @@ def _call(program: VariationalInequality, solver: str, accuracy: float, start: M
             except qpsolvers.SolverError as error:  # cvxopt raises where no point is feasible
                 return QPSolution(None, None, message_of(error))
     status, iterations = SETTINGS[solver].report(solution)
-    if solution.x is None or solution.z is None:
+    z = solution.z
+    if bounds and isinstance(solution, qpsolvers.Solution):
+        z = None if solution.z_box is None else -solution.z_box
+    if solution.x is None or z is None:
         return QPSolution(None, None, status, iterations)
-    return QPSolution(np.asarray(solution.x, float), np.asarray(solution.z, float), status, iterations)
+    return QPSolution(np.asarray(solution.x, float), np.asarray(z, float), status, iterations)
 
 
 def _as_csc(matrix: Any) -> Any:
