@@ -221,10 +221,10 @@ class PartialCholesky:
         """For r (n,) or (n, k), X_ii⁻¹ r_i and the load of the Schur complement, r_c − X_ci X_ii⁻¹ r_i."""
         solved = np.ascontiguousarray(right[self.order], dtype=float)
         loading = solved[: self._split].any(axis=0)  # forces of the contact load no eliminated unknown
-        if loading.all():
-            solved = np.asarray(self._lu.solve(solved))
-        elif loading.any():
+        if loading.any() and not loading.all():
             solved[:, loading] = self._lu.solve(np.ascontiguousarray(solved[:, loading]))
+        elif loading.any():
+            solved = np.asarray(self._lu.solve(solved))
         return solved[: self._split], solved[self._split :]
 
     def extend(self, last: Array) -> Array:

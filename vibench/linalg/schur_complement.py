@@ -53,7 +53,8 @@ class EliminationPattern:
         columns = self._places[B.indices]
         if columns.min(initial=0) < 0:
             raise NumericalError("a constraint touches unknowns that are to be eliminated")
-        return sp.csr_array((B.data, columns, B.indptr), shape=(B.shape[0], len(self.retained)))
+        # copies, since libraries sort indices in place
+        return sp.csr_array((B.data.copy(), columns, B.indptr.copy()), shape=(B.shape[0], len(self.retained)))
 
     @cached_property
     def factorised_block(self) -> PrincipalSubmatrix:

@@ -45,6 +45,20 @@ def test_equilibrium_with_given_retained_unknowns(seed: int, count: int) -> None
     assert np.allclose((dense @ corrected - f)[others], 0.0, atol=1e-10)
 
 
+def test_columns_of_retained_unknowns_and_no_others() -> None:
+    A, retained = sparse_spd(12, np.random.default_rng(3)), np.array([2, 3, 7, 11])
+    pattern, B = EliminationPattern.of(A, retained), np.zeros((3, 12))
+    B[[0, 0, 2], [7, 2, 11]] = 1.0, 2.0, 3.0
+    given_rows = sp.csr_array(B)
+    found = pattern.on_retained(given_rows)
+    assert np.array_equal(found.toarray(), B[:, retained])
+    found.data[:] = 0.0
+    assert np.array_equal(given_rows.toarray(), B)
+    B[1, 4] = 1.0
+    with pytest.raises(NumericalError, match="touches unknowns that are to be eliminated"):
+        pattern.on_retained(sp.csr_array(B))
+
+
 @given(st.integers(0, 10_000), st.integers(0, 12))
 def test_submatrices_follow_their_matrix_through_changes_of_its_sparsity(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)

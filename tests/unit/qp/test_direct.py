@@ -10,7 +10,8 @@ from numerics import spd
 
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp import solve
-from vibench.qp.direct import DIRECT
+from vibench.qp.direct import DIRECT, DirectSolution
+from vibench.qp.settings import SETTINGS
 from vibench.qp.verification import QPSolution
 
 
@@ -44,6 +45,34 @@ def test_a_direct_call_is_the_call_of_qpsolvers(solver: str, monkeypatch: pytest
         for one, other in ((ours.x, theirs.x), (ours.alpha, theirs.alpha)):
             assert (one is None) == (other is None)
             assert one is None or other is None or one.tobytes() == other.tobytes()
+
+
+def test_multipliers_of_the_dual_program_are_bounds_and_constraints_are_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[bool] = []
+
+    def piqp(program: VariationalInequality, bounds: bool, **settings: object) -> DirectSolution:
+        told.append(bounds)
+        return DIRECT["piqp"](program, bounds, **settings)
+
+    monkeypatch.setattr(solve, "DIRECT", {"piqp": piqp})
+    vi = programs()[1]
+    for factor in (None, np.linalg.cholesky(vi.A)):
+        solve.solve_qp(vi, "piqp", 1e-9, factor=factor)
+    assert told == [False, True]
+
+
+@pytest.mark.parametrize("solver", sorted(set(DIRECT) & set(solve.installed_solvers())))
+def test_bounds_give_what_rows_give(solver: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def answers() -> list[QPSolution]:
+        return [solve.solve_qp(vi, solver, 1e-10, factor=np.linalg.cholesky(vi.A)) for vi in programs()[:-1]]
+
+    bounds = answers()
+    monkeypatch.setattr(solve, "SETTINGS", {solver: replace(SETTINGS[solver], bounds=False)})
+    for one, other in zip(bounds, answers(), strict=True):
+        assert one.x is not None
+        assert one.alpha is not None
+        assert np.allclose(one.x, other.x, rtol=0.0, atol=1e-8)
+        assert np.allclose(one.alpha, other.alpha, rtol=0.0, atol=1e-8)
 
 
 @pytest.mark.parametrize("solver", sorted(set(DIRECT) & set(solve.installed_solvers())))
