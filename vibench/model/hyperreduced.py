@@ -252,18 +252,19 @@ class HyperReducedModel:
 
     def _in_basis(self, mu: Array, samples: Samples, members: VariationalInequality) -> ReducedProblem:
         """The reduced problem at mu (d,) of members on Φ."""
-        space = self.space
-        A, f, B, g, Y = members.A, members.f, members.B, members.g, None
+        space, program, Y = self.space, members, None
         if space is not None:
             A, f, B, Y = _enriched(members, space.plain)
+            program = VariationalInequality(A, f, B, members.g)
             reconstruct = partial(_reconstructed, space, Y)
         else:
             reconstruct = partial(np.matmul, self.basis)
         known = space is None and self._operators.A.constant
-        if not isfinite((self._sum_of_stiffness if known else A.sum()) + f.sum() + B.sum() + g.sum()):
+        stiffness = self._sum_of_stiffness if known else program.A.sum()
+        if not isfinite(stiffness + program.f.sum() + program.B.sum() + program.g.sum()):
             raise NumericalError(f"the reduced problem has entries that are not finite at mu = {mu.tolist()}")
         evaluated = Evaluated(samples, None, Y, 0 if space is None else len(space.plain))
-        return ReducedProblem(VariationalInequality(A, f, B, g), reconstruct, self._operators.factor, evaluated)
+        return ReducedProblem(program, reconstruct, self._operators.factor, evaluated)
 
     @cached_property
     def _sum_of_stiffness(self) -> float:
