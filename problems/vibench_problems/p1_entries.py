@@ -79,6 +79,25 @@ def _on_triangles(corners: Array) -> tuple[Array, Array]:
     return (x[:, None] * x + y[:, None] * y) / (4.0 * areas), areas
 
 
+class Products:
+    """Sums over pairs of weights w_a w_b T_ab: products of two vectors that are both linear in the weights.
+
+    Parameters
+    ----------
+    terms
+        T (weights×weights×k).
+    """
+
+    def __init__(self, terms: Array) -> None:
+        self._first, self._second = np.triu_indices(len(terms))
+        halves = np.where(self._first == self._second, 0.5, 1.0)[:, None]
+        self._terms = halves * (terms[self._first, self._second] + terms[self._second, self._first])
+
+    def __call__(self, weights: Array) -> Array:
+        """The products (k,) at some weights."""
+        return np.asarray((weights.take(self._first) * weights.take(self._second)) @ self._terms)
+
+
 class StiffnessEntries:
     """Entries of ∫ ∇φ_i · ∇φ_j.
 
@@ -99,16 +118,15 @@ class StiffnessEntries:
         nodes = triangles[:, triangle]
         i, j = (np.argmax(nodes == wanted[entry], axis=0) for wanted in (rows, columns))
         # The third edge is needed for the area: on the diagonal the edges opposite to i and to j are the same.
-        edges = np.stack([_opposite(modes, nodes, local) for local in (i, j, (i + 1) % 3)], axis=2)
-        self._edges = edges.reshape(len(modes), -1)  # weight × (component, edge, contribution)
+        ei, ej, ek = (_opposite(modes, nodes, local) for local in (i, j, (i + 1) % 3))
+        self._products = Products(np.concatenate([0.5 * np.einsum("axk,bxk->abk", ei, ej), _cross(ei, ek)], axis=2))
         # `reduceat` returns a wrong value for an empty range: every entry must have a triangle, as neighbours do.
-        self._starts = np.searchsorted(entry, np.arange(len(rows)))
+        self._count, self._starts = len(entry), np.searchsorted(entry, np.arange(len(rows)))
 
     def __call__(self, weights: Array) -> Array:
         """The entries (k,) at some weights."""
-        (xi, xj, xk), (yi, yj, yk) = (weights @ self._edges).reshape(2, 3, -1)
-        contributions = 0.5 * (xi * xj + yi * yj) / np.abs(xi * yk - yi * xk)
-        return np.asarray(np.add.reduceat(contributions, self._starts))
+        found = self._products(weights)
+        return np.asarray(np.add.reduceat(found[: self._count] / np.abs(found[self._count :]), self._starts))
 
 
 class LoadEntries:
@@ -125,14 +143,17 @@ class LoadEntries:
     def __init__(self, modes: Array, triangles: NDArray[np.integer], rows: Indices) -> None:
         entry, triangle = _shared(triangles, rows, rows)
         nodes = triangles[:, triangle]
-        edges = np.stack([modes[:, :, nodes[k]] - modes[:, :, nodes[0]] for k in (1, 2)], axis=2)
-        self._edges = edges.reshape(len(modes), -1)
-        self._starts = np.searchsorted(entry, np.arange(len(rows)))
+        one, other = (modes[:, :, nodes[k]] - modes[:, :, nodes[0]] for k in (1, 2))
+        self._products, self._starts = Products(_cross(one, other) / 6.0), np.searchsorted(entry, np.arange(len(rows)))
 
     def __call__(self, weights: Array) -> Array:
         """The entries (k,) at some weights."""
-        (x1, x2), (y1, y2) = (weights @ self._edges).reshape(2, 2, -1)
-        return np.asarray(np.add.reduceat(np.abs(x1 * y2 - y1 * x2) / 6.0, self._starts))
+        return np.asarray(np.add.reduceat(np.abs(self._products(weights)), self._starts))
+
+
+def _cross(one: Array, other: Array) -> Array:
+    """x_a y_b − y_a x_b (weights×weights×k) of vectors by weight (weights×2×k)."""
+    return np.einsum("ak,bk->abk", one[:, 0], other[:, 1]) - np.einsum("ak,bk->abk", one[:, 1], other[:, 0])
 
 
 def _shared(triangles: NDArray[np.integer], rows: Indices, columns: Indices) -> tuple[Indices, Indices]:
