@@ -153,7 +153,8 @@ class LoadEntries:
 
 def _cross(one: Array, other: Array) -> Array:
     """x_a y_b − y_a x_b (weights×weights×k) of vectors by weight (weights×2×k)."""
-    return np.einsum("ak,bk->abk", one[:, 0], other[:, 1]) - np.einsum("ak,bk->abk", one[:, 1], other[:, 0])
+    products = np.einsum("ak,bk->abk", one[:, 0], other[:, 1]) - np.einsum("ak,bk->abk", one[:, 1], other[:, 0])
+    return np.asarray(products)
 
 
 def _shared(triangles: NDArray[np.integer], rows: Indices, columns: Indices) -> tuple[Indices, Indices]:

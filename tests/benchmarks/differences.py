@@ -19,7 +19,16 @@ import pandas as pd
 import vibench
 from vibench.results.columns import TABLES
 
-OF_THE_RUN = {"code", "versions", "machine", "peak_memory_mib", "slowdown", "disturbed", "timed_rounds", "timing_reason"}
+OF_THE_RUN = {
+    "code",
+    "versions",
+    "machine",
+    "peak_memory_mib",
+    "slowdown",
+    "disturbed",
+    "timed_rounds",
+    "timing_reason",
+}
 """Columns that differ between two runs of the same numbers, beside those of seconds."""
 
 
