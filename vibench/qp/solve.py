@@ -224,7 +224,7 @@ def _call(
                 return QPSolution(None, None, message_of(error))
     status, iterations = SETTINGS[solver].report(solution)
     z = solution.z
-    if bounds and isinstance(solution, qpsolvers.Solution):
+    if bounds and not isinstance(solution, DirectSolution):
         z = None if solution.z_box is None else -solution.z_box
     if solution.x is None or z is None:
         return QPSolution(None, None, status, iterations)
