@@ -49,7 +49,7 @@ def is_proved_by_band(parts: Sequence[SparseMatrix]) -> bool | None:
 
 @dataclass(frozen=True)
 class _Order:
-    """Where the entries of symmetric matrices (n×n) of one sparsity pattern are in a narrow band.
+    """Where the entries of symmetric matrices (n×n) of one sparsity pattern are in a band.
 
     Of those of the lower half of the band, which has `width` diagonals beside the main one: positions among all
     entries, rows, columns, and places in the band (width+1, n), column by column.
@@ -63,8 +63,8 @@ class _Order:
 
 
 @lru_cache(maxsize=2)
-def _narrow(pointers: bytes, indices: bytes, kind: str) -> _Order | None:
-    """The order for a pattern (CSR), given as bytes of index arrays of a kind; `None` if the band is wide.
+def _order(pointers: bytes, indices: bytes, kind: str) -> _Order:
+    """The order for a pattern (CSR), given as bytes of index arrays of a kind.
 
     Proofs ask for the same few patterns again and again.
     """
@@ -76,16 +76,14 @@ def _narrow(pointers: bytes, indices: bytes, kind: str) -> _Order | None:
     rows = np.repeat(np.arange(size), np.diff(starts))
     below = place[rows] - place[columns]
     width, lower = int(below.max(initial=0)), np.flatnonzero(below >= 0)
-    if size * float(width) ** 2 > MOST_WORK:
-        return None
     rows, columns = rows[lower], columns[lower].astype(np.intp)
     return _Order(width, lower, rows, columns, below[lower] + (width + 1) * place[columns])
 
 
 def _band(matrix: SparseMatrix, units: Array) -> Array | None:
     """The lower half (b+1, n) of the band of S M S, S of `units` (n,), in another order; `None` if it is wide."""
-    order = _narrow(matrix.indptr.tobytes(), matrix.indices.tobytes(), matrix.indices.dtype.str)
-    if order is None:
+    order = _order(matrix.indptr.tobytes(), matrix.indices.tobytes(), matrix.indices.dtype.str)
+    if matrix.shape[0] * float(order.width) ** 2 > MOST_WORK:
         return None
     band = np.zeros((matrix.shape[0], order.width + 1))
     band.ravel()[order.places] = units[order.rows] * matrix.data[order.entries] * units[order.columns]
