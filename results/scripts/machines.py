@@ -21,8 +21,8 @@ def main(results: str, target: str) -> None:
         target,
         "Other machines",
         "python results/scripts/machines.py results results/machines",
-        "The tables of the other machines are those that its study left in the folder; those of this repository's "
-        "machine are on the pages of the studies.",
+        "The tables of the other machine are those of the same commands there, with six digits; ours are on the pages "
+        "of the studies. Intervals of protocol 1 are those of one run, later ones include what differs between runs.",
     )
     folders = sorted(table.parent for table in Path(target).glob("*/*/cells.csv"))
     pairs = {folder: (read(Path(results) / folder.name), read(folder)) for folder in folders}
