@@ -53,7 +53,7 @@ FAULTS = (
     Fault(
         "rounds-drawn-apart",
         "vibench/results/costs/paired_seconds.py",
-        "[mine[name].online - others[name].online for name in common]",
+        "[x.online - y.online for x, y in common]",
         "[x.online - y.online for x, y in zip(mine.values(), reversed(others.values()), strict=False)]",
         ("tests/unit/results/costs/test_break_even.py",),
     ),
