@@ -18,7 +18,7 @@ from page import start
 
 from vibench.report.site.citation import Citation
 from vibench.report.site.publish import publish
-from vibench.results.columns import STORED
+from vibench.results.columns import STORED, TEXT
 from vibench.results.database import ResultsDatabase
 from vibench.results.sqlite.reading import FILE
 from vibench.study.cells import UNCORRECTED
@@ -66,8 +66,9 @@ def restore(tables: Path, folder: Path) -> Path:
 
 
 def rows(table: Path) -> list[dict[str, Any]]:
-    """Rows of a CSV table; what is empty is missing."""
-    frame = pd.read_csv(table, keep_default_na=False, na_values=[""])
+    """Rows of a CSV table; what is empty is missing, and a text such as a hash may look like a number."""
+    texts = {name: str for name, column in STORED[table.stem].items() if column.kind.startswith(TEXT)}
+    frame = pd.read_csv(table, keep_default_na=False, na_values=[""], dtype=texts)
     return [
         {str(name): None if pd.isna(value) else value for name, value in row.items()}
         for row in frame.to_dict("records")

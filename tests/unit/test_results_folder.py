@@ -132,6 +132,15 @@ def test_the_results_are_published_by_one_command(tmp_path: Path, monkeypatch: p
     assert machines >= {machine for file in others for machine in pd.read_csv(file)["machine"].dropna()}
 
 
+def test_a_hash_that_looks_like_a_number_is_a_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All cells of a study have one hash of it, and pandas reads a column of such as numbers."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    cells = pd.read_csv(RESULTS / "benefit" / "cells.csv").head(2).assign(study_hash="9369049480579e14")
+    cells.to_csv(tmp_path / "cells.csv", index=False)
+    rows = importlib.import_module("publish").rows(tmp_path / "cells.csv")
+    assert [row["study_hash"] for row in rows] == ["9369049480579e14"] * 2
+
+
 def test_other_machines_are_compared_row_by_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(SCRIPTS))
     here, there = tmp_path / "benefit", tmp_path / "machines" / "other" / "benefit"
