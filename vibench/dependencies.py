@@ -49,38 +49,6 @@ class _Definition:
     members: dict[str, _Definition] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Found:
-    """What a process has found in sources, for others that have the same ones: to parse them takes half a second.
-
-    Attributes
-    ----------
-    used
-        Values of `modules_used` by its arguments.
-    sources
-        Hashes of all sources that were parsed for them, by module.
-    """
-
-    used: dict[tuple[tuple[str, ...], bool], frozenset[str]] = field(default_factory=dict)
-    sources: dict[str, str] = field(default_factory=dict)
-
-
-_here, _elsewhere = Found(), Found()
-"""What this process has found, and what it has taken over."""
-
-
-def found() -> Found:
-    """What this process knows, of its own or from another one."""
-    return Found(_elsewhere.used | _here.used, _elsewhere.sources | _here.sources)
-
-
-def take_over(of_another: Found) -> None:
-    """Use what another process has found, if all sources that it has parsed are the same here."""
-    if all(_hash(module) == known for module, known in of_another.sources.items()):
-        _elsewhere.used.update(of_another.used)
-        _elsewhere.sources.update(of_another.sources)
-
-
 @cache
 def modules_used(*roots: str, whole: bool = False) -> frozenset[str]:
     """The modules of vibench that determine what is computed by "module:name" or "module:class.method".
@@ -88,13 +56,6 @@ def modules_used(*roots: str, whole: bool = False) -> frozenset[str]:
     Computation begins at the `roots`. With `whole` all methods of all classes that are reached count: others may call
     these, too.
     """
-    if (known := _elsewhere.used.get((roots, whole))) is not None:
-        return known
-    used = _here.used[roots, whole] = _modules_used(*roots, whole=whole)
-    return used
-
-
-def _modules_used(*roots: str, whole: bool) -> frozenset[str]:
     reached = _Reached(whole)
     for root in roots:
         module, _, path = root.partition(":")
@@ -144,7 +105,7 @@ def code_used(*roots: str, whole: bool = False) -> str:
     """Hash of the sources of `modules_used`."""
     content = hashlib.sha256()
     for module in sorted(modules_used(*roots, whole=whole)):
-        content.update(f"{module} {_hash(module)}\n".encode())
+        content.update(f"{module} {hashlib.sha256(_source(module)).hexdigest()}\n".encode())
     return content.hexdigest()[:12]
 
 
@@ -202,18 +163,12 @@ def _source(module: str) -> bytes:
 
 
 @cache
-def _hash(module: str) -> str:
-    return hashlib.sha256(_source(module)).hexdigest()
-
-
-@cache
 def _parsed(module: str) -> _Definition:
     """What a module imports and, as members, what it defines.
 
     A statement that defines nothing is left out: none changes what a name stands for, it only registers that.
     """
     defined, path = _Definition(), _file(module)
-    _here.sources[module] = _hash(module)
     package = module if path is not None and path.stem == "__init__" else module.rpartition(".")[0]
     ahead: list[ast.AST] = [ast.parse(_source(module))]
     while ahead:

@@ -21,7 +21,7 @@ from fake_stages import InItems, OfAPlugin, Whole
 from running import PATIENCE
 
 from vibench.execution import supervisor
-from vibench.execution.jobs import Batch, Begun, CurrentItem, ItemDone, Job
+from vibench.execution.jobs import Begun, Job
 from vibench.execution.supervisor import StoppedError, Supervisor
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, Stage, Unstored
@@ -219,43 +219,6 @@ def test_a_suspended_run_is_not_late(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     monkeypatch.setattr(supervisor.time, "monotonic", lambda: now + 3600.0)
     state.tick(30.0)
     assert 0.0 < state.seconds <= 1.0
-
-
-def shared_item() -> tuple[CurrentItem, CurrentItem]:
-    """What a worker writes, and what its supervisor reads."""
-    descriptor = CurrentItem.descriptor()
-    both = CurrentItem(descriptor), CurrentItem(descriptor)
-    os.close(descriptor)
-    return both
-
-
-def test_a_supervisor_reads_which_item_its_worker_is_in() -> None:
-    worker, watcher = shared_item()
-    assert watcher.read() == (0, None, False)
-    noted = [(0, False), (0, True), (0, False), (None, False), (123_456, True), (123_456, True)]
-    for changes, (number, watched) in enumerate(noted, 1):
-        worker.note(number, watched)
-        assert watcher.read() == (changes, number, watched)
-    worker._memory[0] = (2**31 - 1) << 32
-    worker.note(7)
-    assert watcher.read() == (0, 7, False)
-
-
-def test_a_message_of_an_item_that_is_done_says_nothing_of_the_next_one(tmp_path: Path) -> None:
-    """The worker goes on before the supervisor has read it; dying then costs the item that it is in."""
-    state = supervisor._JobState(Job(str(tmp_path), InItems(("fine",) * 3), 1.0, 30.0, 8.0), lambda _: None)
-    worker, watcher = shared_item()
-    state.start(Batch(frozenset(), (0, 1, 2), ends=True), watcher)
-    worker.note(0)
-    worker.note(1, True)
-    state.update(ItemDone(0, "value"))
-    assert (state.item, state.progress.done) == (1, {0: "value"})
-    state.update(ItemDone(1, "value"))
-    assert state.item is None
-    worker.note(None)
-    worker.note(2, True)
-    state.tick(30.0)
-    assert state.item == 2
 
 
 def test_limits_begin_when_the_work_begins(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -66,12 +65,8 @@ def core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def forget() -> None:
-    of_sources = dependencies._file, dependencies._source, dependencies._hash, dependencies._parsed
-    for cached in (modules_used, code_used, *of_sources):
+    for cached in (modules_used, code_used, dependencies._file, dependencies._source, dependencies._parsed):
         cached.cache_clear()  # type: ignore[attr-defined]
-    for known in (dependencies._here, dependencies._elsewhere):
-        known.used.clear()
-        known.sources.clear()
 
 
 USED = {
@@ -147,25 +142,6 @@ def test_the_hash_changes_with_every_module_that_counts_and_with_no_other(edit: 
         after = code_used("core.numbers:double")
         assert (after != before) == (name in {"numbers.py", "constants.py", "base.py"}), name
         before = after
-
-
-def test_what_another_process_has_found_is_used_while_its_sources_are_the_same(
-    edit: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root = "core:double"
-    hashed, theirs = code_used(root), pickle.loads(pickle.dumps(dependencies.found()))
-    forget()
-    with monkeypatch.context() as patch:
-        patch.setattr(dependencies, "_parsed", lambda module: pytest.fail(f"{module} is parsed again"))
-        dependencies.take_over(theirs)
-        assert code_used(root) == hashed
-        assert dependencies.found() == theirs
-    edit("tables.py")  # nobody has looked at it
-    dependencies.take_over(theirs)
-    assert dependencies.found() == theirs
-    edit("__init__.pyi")  # which only says where the name is defined: no code, but it may say something else now
-    dependencies.take_over(theirs)
-    assert not dependencies.found().used
 
 
 def test_a_cell_begins_where_there_is_code() -> None:

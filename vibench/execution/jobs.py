@@ -1,19 +1,13 @@
-"""What a supervisor and its worker processes say to each other: jobs, the batches they are done in, and reports.
-
-What is not urgent is left in memory that both share.
-"""
+"""What a supervisor and its worker processes say to each other: jobs, the batches they are done in, and reports."""
 
 from __future__ import annotations
 
-import mmap
-import os
-import tempfile
 from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any
 
-from vibench.dependencies import CELL, Found, code_used, found
+from vibench.dependencies import CELL, code_used
 from vibench.provenance import libraries
 from vibench.stages.base import Failed, ItemwiseStage, Stage
 
@@ -38,8 +32,6 @@ class Job:
     lost: Mapping[str, Failed] = field(default_factory=dict)
     """Dispensable stages that failed, by key."""
     code: str = field(default_factory=code_here)
-    found: Found = field(default_factory=found)
-    """What is known of the sources that the code is made of."""
 
 
 @dataclass(frozen=True)
@@ -95,41 +87,12 @@ class Share:
     share: float
 
 
-class CurrentItem:
-    """The item that a worker is in, in memory that it shares with its supervisor.
+@dataclass(frozen=True)
+class InItem:
+    """A worker is in an item; `watched` while it is in an operation with a time limit of its own."""
 
-    A supervisor that got messages of it would be woken four times a query, for nothing unless the worker hangs or dies.
-
-    Parameters
-    ----------
-    descriptor
-        Of the memory, of 8 bytes; it may be closed then.
-    """
-
-    def __init__(self, descriptor: int) -> None:
-        self._memory = memoryview(mmap.mmap(descriptor, 8)).cast("q")  # one number: it is written at once
-
-    @staticmethod
-    def descriptor() -> int:
-        """The descriptor of new memory."""
-        if hasattr(os, "memfd_create"):
-            descriptor = os.memfd_create("vibench")
-        else:
-            with tempfile.TemporaryFile() as file:
-                descriptor = os.dup(file.fileno())
-        os.truncate(descriptor, 8)
-        return descriptor
-
-    def note(self, number: int | None, watched: bool = False) -> None:
-        """A worker is in an item or in none; `watched` while it is in an operation with a time limit of its own."""
-        changes = ((self._memory[0] >> 32) + 1) & 0x7FFFFFFF
-        self._memory[0] = changes << 32 | (0 if number is None else number + 1) << 1 | watched
-
-    def read(self) -> tuple[int, int | None, bool]:
-        """How often it has changed, the number of the item, and whether it is watched."""
-        state = self._memory[0]
-        number = (state & 0xFFFFFFFF) >> 1
-        return state >> 32, number - 1 if number else None, bool(state & 1)
+    number: int
+    watched: bool
 
 
 @dataclass(frozen=True)

@@ -19,22 +19,10 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from multiprocessing.connection import Connection
-from multiprocessing.reduction import send_handle
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from vibench.execution.jobs import (
-    Batch,
-    BatchDone,
-    Begun,
-    CurrentItem,
-    ItemDone,
-    Job,
-    OutOfMemory,
-    Progress,
-    Share,
-    batches,
-)
+from vibench.execution.jobs import Batch, BatchDone, Begun, InItem, ItemDone, Job, OutOfMemory, Progress, Share, batches
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, ItemwiseStage, Unstored
 from vibench.timing import KEPT_MEMORY, ONE_THREAD
@@ -80,34 +68,21 @@ class _JobState:
     def __init__(self, job: Job, observe: Callable[[Any], None]) -> None:
         self.job, self.progress, self._observe = job, Progress(), observe
         self.seconds = self.share = 0.0
-        self._current: CurrentItem | None = None
-        self.start(Batch(frozenset(), (), ends=False), None)
+        self.start(Batch(frozenset(), (), ends=False))
 
-    def start(self, batch: Batch, current: CurrentItem | None) -> Progress:
-        """Note that a process is given a batch of the job; returns what it needs to know of the others.
-
-        `current` is the item that it is in.
-        """
-        self.batch, self._current = batch, current
+    def start(self, batch: Batch) -> Progress:
+        """Note that a process is given a batch of the job; returns what it needs to know of the others."""
+        self.batch = batch
         self._last, self._begun, self._starting = time.monotonic(), False, 0.0
-        self._changes = 0 if current is None else current.read()[0]
-        self._enter(None)
+        self._next_item()
         return self.progress if batch.ends else Progress()
 
-    def _enter(self, item: int | None, limit: float = float("inf")) -> None:
-        self.item, self._item_limit = item, limit
-
-    def look(self) -> None:
-        """See which item the worker is in."""
-        if self._current is not None:
-            changes, item, watched = self._current.read()
-            if changes != self._changes:
-                self._changes = changes
-                self._enter(item, self.seconds + self.job.query_seconds + GRACE if watched else float("inf"))
+    def _next_item(self) -> None:
+        self.item: int | None = None
+        self._item_limit = float("inf")
 
     def tick(self, limit: float) -> None:
         """Count the seconds since the last call; a `_WorkerLostError` beyond a limit, `limit` being the stage's."""
-        self.look()
         now = time.monotonic()
         step = min(now - self._last, 5.0 * POLL)
         self._last = now
@@ -124,17 +99,18 @@ class _JobState:
 
     def update(self, message: Any) -> Done | Failed | Unstored | BatchDone | None:
         """Process a message of the worker; returns the outcome if it is one."""
-        self.look()
         match message:
             case Begun():
                 self._begun, self._last = True, time.monotonic()
             case Share():
                 self.share = message.share
+            case InItem():
+                self.item = message.number
+                self._item_limit = self.seconds + self.job.query_seconds + GRACE if message.watched else float("inf")
             case ItemDone():
                 self.progress.done[message.number] = message.value
                 self._observe(message.value)
-                if self.item == message.number:  # it may be in the next one
-                    self._enter(None)
+                self._next_item()
             case OutOfMemory():
                 raise _WorkerLostError(message.failed)
             case Done() | Failed() | Unstored() | BatchDone():
@@ -142,13 +118,8 @@ class _JobState:
         return None
 
 
-class _Worker(NamedTuple):
-    """The connection to a worker process, the process, the mark of it and of what it starts, and the item it is in."""
-
-    connection: Connection
-    process: subprocess.Popen[bytes]
-    mark: str
-    current: CurrentItem
+_Worker = tuple[Connection, "subprocess.Popen[bytes]", str]
+"""The connection to a worker process, the process, and the mark of it and of what it starts."""
 
 
 class Supervisor:
@@ -240,11 +211,11 @@ class Supervisor:
     def _attempt_batch(self, state: _JobState, limit: float, batch: Batch) -> Done | Failed | Unstored | BatchDone:
         """Run a batch of a stage in one process."""
         try:
-            connection, process, _, current = self._worker(batch.packages)
+            connection, process, _ = self._worker(batch.packages)
         except OSError as error:
             return Failed(Status.CRASHED, f"no worker process could be started: {error.strerror}")
         try:
-            connection.send((state.job, state.start(batch, current), batch))
+            connection.send((state.job, state.start(batch), batch))
             while not self._stop.is_set():
                 if connection.poll(POLL):
                     outcome = state.update(connection.recv())
@@ -255,7 +226,6 @@ class Supervisor:
                 state.tick(limit)
         except (EOFError, OSError):  # the other end of the socket is closed
             if not self._stop.is_set():
-                state.look()
                 raise _WorkerLostError(Failed(Status.CRASHED, _cause_of_death(process))) from None
         raise StoppedError
 
@@ -266,11 +236,7 @@ class Supervisor:
             environment = _environment({**os.environ, **self._environment}) | {MARK: mark}
             with theirs:
                 process = start_worker(theirs.fileno(), str(self._log or os.devnull), environment)
-            connection, shared = Connection(ours.detach()), CurrentItem.descriptor()
-            self._workers[packages] = _Worker(connection, process, mark, CurrentItem(shared))
-            with contextlib.suppress(OSError, RuntimeError):  # a process that has died already is found to be so below
-                send_handle(connection, shared, process.pid)
-            os.close(shared)
+            self._workers[packages] = Connection(ours.detach()), process, mark
         self._workers.move_to_end(packages)
         return self._workers[packages]
 
@@ -279,7 +245,7 @@ class Supervisor:
         for packages in those or tuple(self._workers):
             if (worker := self._workers.pop(packages, None)) is None:
                 continue
-            connection, process, mark, _ = worker
+            connection, process, mark = worker
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()

@@ -14,21 +14,19 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache, partial
 from multiprocessing.connection import Connection
-from multiprocessing.reduction import recv_handle
 from pathlib import Path
 from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
 from vibench import interrupts
-from vibench.dependencies import take_over
 from vibench.errors import NumericalError, StorageError, UnsupportedError, VibenchError, in_a_line, message_of
 from vibench.execution.jobs import (
     OUT_OF_MEMORY,
     Batch,
     BatchDone,
     Begun,
-    CurrentItem,
+    InItem,
     ItemDone,
     Job,
     OutOfMemory,
@@ -61,12 +59,6 @@ def main() -> None:
     socket, log = int(sys.argv[1]), os.open(sys.argv[2], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
     os.set_inheritable(socket, False)  # children of plugins must not hold it open
     connection = Connection(socket)
-    try:
-        shared = recv_handle(connection)
-    except EOFError:
-        return
-    current = CurrentItem(shared)
-    os.close(shared)
     for stream in (1, 2):  # what plugins print must not look like output of vibench
         os.dup2(log, stream)
     faulthandler.enable()
@@ -92,7 +84,7 @@ def main() -> None:
             return
         first = False
         faulthandler.dump_traceback_later(2.0 * job.cell_seconds + 60.0, exit=True)  # in case the supervisor has died
-        send(perform(job, progress, batch, send, current))
+        send(perform(job, progress, batch, send))
         faulthandler.cancel_dump_traceback_later()
 
 
@@ -105,7 +97,7 @@ def _end_with(parent: int) -> None:
 
 
 def perform(
-    job: Job, progress: Progress, batch: Batch, send: Send, current: CurrentItem
+    job: Job, progress: Progress, batch: Batch, send: Send
 ) -> Done | BatchDone | Failed | Unstored | OutOfMemory:
     """Run a batch of a stage; an exception of a plugin is the reason of a failed stage and ends no run."""
     start = time.perf_counter()
@@ -118,7 +110,7 @@ def perform(
             items = _begun(job.stage, store)
             earlier = {number: items.lost(number, failed) for number, failed in progress.lost.items()} | progress.done
             items.resume(earlier)
-            done = earlier | _done(job, items, batch, send, current)
+            done = earlier | _done(job, items, batch, send)
             if not batch.ends:
                 return BatchDone()
             _last.clear()
@@ -141,7 +133,6 @@ def perform(
 
 def _check_code(job: Job, batch: Batch) -> None:
     """Refuse a job that was planned with other code than this process has: its artefact would have the wrong key."""
-    take_over(job.found)
     stage = job.stage
     stages = [stage.stage_of(number) for number in batch.numbers] if isinstance(stage, ItemwiseStage) else [stage]
     # Each once: stages reach the same plugins through many of their inputs.
@@ -164,15 +155,18 @@ def _begun(stage: ItemwiseStage, store: Store) -> Items:
     return _last[stage.key]
 
 
-def _done(job: Job, items: Items, batch: Batch, send: Send, current: CurrentItem) -> dict[int, Any]:
+def _done(job: Job, items: Items, batch: Batch, send: Send) -> dict[int, Any]:
     """The values of the items of a batch, which are done here."""
     done = {}
     for number in batch.numbers:
-        current.note(number)
-        value = _guarded(job.memory_gib, partial(items.item, number, partial(current.note, number)))
+
+        def watch(on: bool, number: int = number) -> None:
+            send(InItem(number, on))
+
+        watch(False)
+        value = _guarded(job.memory_gib, partial(items.item, number, watch))
         done[number] = items.lost(number, value) if isinstance(value, Failed) else value
         send(ItemDone(number, done[number]))
-        current.note(None)
     return done
 
 
