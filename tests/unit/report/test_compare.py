@@ -12,6 +12,7 @@ from running import DECIDED, Changed, Main, refused
 
 from vibench.cli.result_commands import diff_runs
 from vibench.errors import RequestError
+from vibench.provenance import PROTOCOL
 from vibench.report.comparison.compare import compare
 from vibench.report.comparison.differences import ChangeKind, agreement
 from vibench.report.comparison.runs import run_names
@@ -151,7 +152,7 @@ def test_times_of_another_machine_are_left_out(changed: Changed, quick_run: Path
 
 
 def test_times_of_another_version_of_the_benchmark_are_left_out(changed: Changed, quick_run: Path) -> None:
-    other = 'versions = replace(versions, \'"protocol": "2"\', \'"protocol": "0"\')'
+    other = f'versions = replace(versions, \'"protocol": "{PROTOCOL}"\', \'"protocol": "0"\')'
     later = changed(f"UPDATE cells SET {other}, online_s = 9 * online_s")
     found = compare([quick_run / FILE, later], 1.25)
     assert found.changes.empty

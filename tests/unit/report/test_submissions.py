@@ -14,6 +14,7 @@ from types import ModuleType
 import pandas as pd
 import pytest
 
+from vibench.provenance import PROTOCOL
 from vibench.report.site.citation import Citation
 from vibench.report.site.publish import publish
 from vibench.results.sqlite.reading import FILE
@@ -92,8 +93,8 @@ def test_what_is_wrong_is_named(
 
 def test_another_protocol_and_residuals_above_the_accuracy_are_named(script: ModuleType, quick_run: Path) -> None:
     cells, queries = (script.tables.read(quick_run / FILE, name) for name in ("cells", "queries"))
-    earlier = cells.assign(versions=cells["versions"].str.replace('"protocol": "2"', '"protocol": "0"'))
-    assert any("protocol 0, expected 2" in line for line in script.of_cells(earlier))
+    earlier = cells.assign(versions=cells["versions"].str.replace(f'"protocol": "{PROTOCOL}"', '"protocol": "0"'))
+    assert any(f"protocol 0, expected {PROTOCOL}" in line for line in script.of_cells(earlier))
     assert any("never timed" in line for line in script.of_cells(cells.assign(timing_rounds=0)))
     kinds = cells.set_index("cell")["enrichment_kind"]
     assert any("dual_residual" in line for line in script.of_queries(queries.assign(dual_residual=1.0), kinds))

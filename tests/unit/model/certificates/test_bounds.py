@@ -519,12 +519,13 @@ class Bump(Family):
 @pytest.mark.parametrize("member", ["A", "f"])
 @pytest.mark.parametrize("declared", ["", "A", "f"])
 def test_what_is_not_declared_is_not_certified_however_constant_it_was_found(member: str, declared: str) -> None:
-    """The measured errors are zero, and bounds are above errors but in the bump: those are worth what was measured."""
+    """The measured errors are zero to round-off, and bounds are above errors but in the bump, where nothing was measured."""
     problem = Bump(member, frozenset(declared))
     training = problem.training_set()
     members = affine_decomposition(problem, training, 1e-3)
     base = certificate_base(problem, members, training)
-    assert base.load_error == base.stiffness_error == 0.0
+    assert base.load_error == 0.0
+    assert base.stiffness_error <= 1e-14  # the round-off of sums over entries
     assert base.guarantee is Guarantee.VERIFIED
     model = ReducedModel(problem, problem.V.orthonormalise(np.eye(N)), Enrichment(Kind.NONE), np.eye(M), np.eye(M))
     reduced = HyperReducedModel(model, hyper_reduce(model, members))
