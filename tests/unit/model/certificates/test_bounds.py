@@ -519,7 +519,7 @@ class Bump(Family):
 @pytest.mark.parametrize("member", ["A", "f"])
 @pytest.mark.parametrize("declared", ["", "A", "f"])
 def test_what_is_not_declared_is_not_certified_however_constant_it_was_found(member: str, declared: str) -> None:
-    """The measured errors are zero to round-off; bounds are above errors but in the bump, where nothing was measured."""
+    """The measured errors are zero to round-off; bounds are above errors but in the bump, which nothing measured."""
     problem = Bump(member, frozenset(declared))
     training = problem.training_set()
     members = affine_decomposition(problem, training, 1e-3)
