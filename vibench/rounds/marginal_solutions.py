@@ -30,11 +30,11 @@ LONG = 0.1
 """CPU seconds from which on a solution averages over what changes the speed of the machine: one is enough for a
 round, and counts for all cells in it."""
 
-FIRST_SEED = 2
+SOLUTION_SEED = 2
 """First of the seeds of solutions in a round: those of the queries beside them are smaller, so that no parameter is the
 same."""
 
-LAST_SEED = 5
+ASSEMBLY_SEED = 5
 """First of the seeds of assemblies that belong to no solution: there are at most three solutions."""
 
 SAME = 1e-6
@@ -116,7 +116,7 @@ class SolutionsBeside:
     def _next(self, done: list[MarginalSolution], k: int, at: int, cell: int) -> MarginalSolution | None:
         if sum(one.seconds.cpu for one in done if one.seconds) > ENOUGH:
             return None
-        one = self._long.get(at) or self._marginal.solve(k, at, cell, FIRST_SEED + len(done))
+        one = self._long.get(at) or self._marginal.solve(k, at, cell, SOLUTION_SEED + len(done))
         if one.seconds and one.seconds.cpu > LONG and at not in self._long:
             self._long = {at: one._replace(vi=one.vi.copy())}
         done.append(one)

@@ -19,7 +19,7 @@ from vibench.offline.models import AnyReducedModel
 from vibench.provenance import machine
 from vibench.results.costs.paired_seconds import beside, paces
 from vibench.rounds.marginal_solutions import (
-    LAST_SEED,
+    ASSEMBLY_SEED,
     MarginalSolution,
     MarginalSolutions,
     SolutionsBeside,
@@ -184,7 +184,7 @@ class _Rounds(Items):
         asked = stage.certificate is not None or stage.correction is not CorrectionMode.NONE
         for k, solution in alternated:
             near = queries.near(k, *seed)
-            further = partial(self._marginal.assemble, k, at, cell, LAST_SEED + warm_up)
+            further = partial(self._marginal.assemble, k, at, cell, ASSEMBLY_SEED + warm_up)
             if (seconds := _assembly(stage, queries.model, near, solution, further, assemble)) is not None:
                 assemble[k] = seconds
             query = stage.query(queries, k).repeated(stage.assembly.validation.seed, k, *seed)
@@ -277,8 +277,9 @@ def _assembly(
 def block_rows(stage: TimingRounds, timed: Sequence[TimedCell]) -> list[list[Row]]:
     """Rows of the timings table of every cell of a block, from its rounds."""
     numbers = range(stage.first, stage.first + stage.rounds)
-    queries = [[one.rounds[k].cpu if k in one.rounds else np.nan for k in numbers] for one in timed]
-    solutions = np.array([[one.rounds[k].beside_cpu if k in one.rounds else np.nan for k in numbers] for one in timed])
+    rounds, nothing = [[one.rounds.get(k) for k in numbers] for one in timed], (np.nan, np.nan)
+    measured = np.array([[(one.cpu, one.beside_cpu) if one else nothing for one in cell] for cell in rounds])
+    queries, solutions = measured[:, :, 0], measured[:, :, 1]
     pace = paces(np.vstack([queries, solutions]))
     high_fidelity, at = beside(solutions, pace), dict(zip(numbers, map(float, pace), strict=True))
     block = stage.key.rpartition("-")[2]
