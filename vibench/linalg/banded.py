@@ -10,9 +10,10 @@ of positive definiteness", BIT Numerical Mathematics 46, 2006, §2).
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache, reduce
 
 import numpy as np
 import scipy.sparse as sp
@@ -31,8 +32,9 @@ def is_proved_by_band(parts: Sequence[SparseMatrix]) -> bool | None:
 
     The sum is that of their symmetric parts.
     """
-    total = sp.csr_array(sum(sp.csr_array(part) for part in parts))
-    total = sp.csr_array(0.5 * (total + total.T))
+    # of columns the transpose, whose symmetric part is the same: a conversion takes longer than the factorisation
+    rows = [part.T if part.format == "csc" else sp.csr_array(part) for part in parts]
+    total = sp.csr_array(reduce(operator.add, rows))
     diagonal, size = total.diagonal(), total.shape[0]
     if not np.all(np.isfinite(total.data)) or not np.all(diagonal > 0.0):
         return False
@@ -40,7 +42,7 @@ def is_proved_by_band(parts: Sequence[SparseMatrix]) -> bool | None:
     scaled = _band(total, units)
     if scaled is None:
         return None
-    sizes = units * sum(abs(part) @ units + abs(part).T @ units for part in parts) / 2.0
+    sizes = units * sum(part @ units + part.T @ units for part in map(abs, rows)) / 2.0
     terms = (len(scaled) + 1) * UNIT
     error = (8.0 + 2.0 * len(parts)) * UNIT * float(np.max(sizes, initial=0.0)) + size * terms / (1.0 - 2.0 * terms)
     scaled[0] -= 1.01 * error
@@ -49,42 +51,58 @@ def is_proved_by_band(parts: Sequence[SparseMatrix]) -> bool | None:
 
 @dataclass(frozen=True)
 class _Order:
-    """Where the entries of symmetric matrices (n×n) of one sparsity pattern are in a band.
+    """Where the entries of matrices (n×n) of one symmetric sparsity pattern are in a band.
 
     Of those of the lower half of the band, which has `width` diagonals beside the main one: positions among all
-    entries, rows, columns, and places in the band (width+1, n), column by column.
+    entries, those of the entries opposite the diagonal, rows, columns, and places in the band (width+1, n), column by
+    column.
     """
 
     width: int
     entries: Indices
+    opposite: Indices
     rows: Indices
     columns: Indices
     places: Indices
 
+    @cached_property
+    def band(self) -> Array:
+        """Memory of a band (n, width+1), which every matrix overwrites: to allocate it takes longer than to fill it."""
+        return np.empty((int(self.rows.max(initial=-1)) + 1, self.width + 1))
+
 
 @lru_cache(maxsize=2)
-def _order(pointers: bytes, indices: bytes, kind: str) -> _Order:
-    """The order for a pattern (CSR), given as bytes of index arrays of a kind.
+def _order(pointers: bytes, indices: bytes, kind: str) -> _Order | None:
+    """The order for a sorted pattern (CSR), given as bytes of index arrays of a kind; `None` if it is not symmetric.
 
     Proofs ask for the same few patterns again and again.
     """
     starts, columns = np.frombuffer(pointers, kind), np.frombuffer(indices, kind)
     size = len(starts) - 1
-    pattern = sp.csr_array((np.ones(len(columns)), columns, starts), shape=(size, size))
+    pattern = sp.csr_array((np.arange(len(columns)), columns, starts), shape=(size, size))
+    transposed = pattern.T.tocsr()
+    if not (np.array_equal(transposed.indptr, starts) and np.array_equal(transposed.indices, columns)):
+        return None
     place = np.empty(size, np.intp)
     place[reverse_cuthill_mckee(pattern, symmetric_mode=True)] = np.arange(size)
     rows = np.repeat(np.arange(size), np.diff(starts))
     below = place[rows] - place[columns]
     width, lower = int(below.max(initial=0)), np.flatnonzero(below >= 0)
     rows, columns = rows[lower], columns[lower].astype(np.intp)
-    return _Order(width, lower, rows, columns, below[lower] + (width + 1) * place[columns])
+    places = below[lower] + (width + 1) * place[columns]
+    return _Order(width, lower, transposed.data[lower], rows, columns, places)
 
 
 def _band(matrix: SparseMatrix, units: Array) -> Array | None:
-    """The lower half (b+1, n) of the band of S M S, S of `units` (n,), in another order; `None` if it is wide."""
+    """The lower half (b+1, n) of the band of ½ S (M + Mᵀ) S, S of `units` (n,), reordered; `None` if it is wide."""
+    matrix.sort_indices()
     order = _order(matrix.indptr.tobytes(), matrix.indices.tobytes(), matrix.indices.dtype.str)
+    if order is None:
+        return _band(sp.csr_array(0.5 * (matrix + matrix.T)), units)
     if matrix.shape[0] * float(order.width) ** 2 > MOST_WORK:
         return None
-    band = np.zeros((matrix.shape[0], order.width + 1))
-    band.ravel()[order.places] = units[order.rows] * matrix.data[order.entries] * units[order.columns]
+    band = order.band
+    band.fill(0.0)
+    values = 0.5 * (matrix.data[order.entries] + matrix.data[order.opposite])
+    band.ravel()[order.places] = units[order.rows] * values * units[order.columns]
     return band.T

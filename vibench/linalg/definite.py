@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.linalg
@@ -80,9 +81,9 @@ class BlockDiagonal:
         """
         return self._by_blocks(name, lambda block: np.asarray(scipy.linalg.cholesky(block)))
 
-    def inverse(self, name: str) -> BlockDiagonal:
-        """X⁻¹ of a symmetric positive definite X; raises as `cholesky` does."""
-        return self._by_blocks(name, _inverse)
+    def inverse(self, name: str, overwrite: bool = False) -> BlockDiagonal:
+        """X⁻¹ of a symmetric positive definite X, which may be overwritten; raises as `cholesky` does."""
+        return self._by_blocks(name, partial(_inverse, overwrite=overwrite))
 
     def solve_triangular(self, right: Array, transposed: bool = False) -> Array:
         """F⁻¹ r, or F⁻ᵀ r, for an upper triangular F and r (c,) or (c, k)."""
@@ -106,8 +107,8 @@ def dense_cholesky(matrix: Array, name: str) -> Array:
 
 
 def dense_inverse(matrix: Array, name: str) -> Array:
-    """The inverse of a symmetric positive definite X (c×c), likewise."""
-    return BlockDiagonal.of(matrix).inverse(name).toarray()
+    """The inverse of a symmetric positive definite X (c×c), which is overwritten; likewise."""
+    return BlockDiagonal.of(matrix).inverse(name, overwrite=True).toarray()
 
 
 def connected_blocks(matrix: Array) -> list[Indices]:
@@ -134,6 +135,7 @@ def mirrored(lower: Array) -> Array:
     return lower
 
 
-def _inverse(block: Array) -> Array:
+def _inverse(block: Array, overwrite: bool) -> Array:
     """The inverse, row by row in memory: sparse products copy LAPACK's columns."""
-    return mirrored(np.asarray(dpotri(scipy.linalg.cholesky(block, lower=True), lower=True, overwrite_c=True)[0])).T
+    factor = scipy.linalg.cholesky(block.T, lower=True, overwrite_a=overwrite)  # the transpose is the columns of rows
+    return mirrored(np.asarray(dpotri(factor, lower=True, overwrite_c=True)[0])).T

@@ -101,9 +101,10 @@ class Lanczos:
         k = self._size
         self._basis[k], self._images[k] = self._next / self._norm, self._image / self._norm
         done, images, w = self._basis[: k + 1], self._images[: k + 1], self._apply(self._basis[k])
-        along = images @ w
-        self._diagonal[k], w = along[k], w - along @ done
-        w -= (images @ w) @ done  # again, against round-off
+        last = slice(max(k - 1, 0), k + 1)  # in exact arithmetic w has no part along others
+        along = images[last] @ w
+        self._diagonal[k], w = along[-1], w - along @ done[last]
+        w -= (images @ w) @ done  # against round-off
         self._follow(w)
         self._beside[k], self._size = self._norm, k + 1
 

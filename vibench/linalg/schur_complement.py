@@ -168,6 +168,8 @@ class StaticCondensation:
     @property
     def dense_schur(self) -> Array:
         """Ŝ as an array."""
+        if not self.dense:  # both are asked for there, and the sparse one is kept
+            return np.asarray(self.schur.toarray(order="C"))
         schur, interface = self._retained_block.toarray(), self._pattern.interface
         schur[np.ix_(interface, interface)] = self._interface_schur
         return np.asarray(schur)

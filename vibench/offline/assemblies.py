@@ -40,6 +40,7 @@ class Assemblies:
         self._quotients: LRUCache[bytes, Quotients] = LRUCache(1)  # it holds vectors
         self._alphas: LRUCache[bytes, Constant] = LRUCache(MANY)
         self._gammas: LRUCache[bytes, Constant] = LRUCache(MANY)
+        self._digests: LRUCache[tuple[str, bytes], bytes] = LRUCache(2 * MANY)
         self._betas: LRUCache[tuple[bytes, bytes], Constant] = LRUCache(MANY)
 
     def at(self, mu: Array) -> VariationalInequality:
@@ -99,11 +100,20 @@ class Assemblies:
 
     def _stiffness_at(self, mu: Array) -> bytes:
         """What all parameters with the A of mu (d,) have in common: A often depends on a few of them alone."""
-        return b"" if "A" in self._problem.constant else digest(self.at(mu).A)
+        return self._digest_at(mu, "A")
+
+    def _digest_at(self, mu: Array, member: str) -> bytes:
+        """The digest of A or B at mu (d,); "" where it is constant."""
+        if member in self._problem.constant:
+            return b""
+        key = member, _key(mu)
+        if key not in self._digests:
+            self._digests[key] = digest(getattr(self.at(mu), member))
+        return self._digests[key]
 
     def energy_inf_sup_at(self, mu: Array) -> Constant:
         """Lower bound of β_A at mu (d,), computed once for all mu with one A and one B."""
-        key = self._stiffness_at(mu), b"" if "B" in self._problem.constant else digest(self.at(mu).B)
+        key = self._digest_at(mu, "A"), self._digest_at(mu, "B")
         if key not in self._betas:
             self._betas[key] = self._energy_inf_sup(mu)
         return self._betas[key]

@@ -53,3 +53,13 @@ def test_wide_bands_are_left_to_sparse_methods(monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -1.0, 0.0])
 def test_a_diagonal_that_is_not_positive_proves_nothing(wrong: float) -> None:
     assert is_proved_by_band([sp.csr_array(np.diag([1.0, wrong]))]) is False
+
+
+@pytest.mark.parametrize("kind", ["csr", "csc"])
+def test_what_counts_of_parts_is_their_symmetric_half(kind: str) -> None:
+    matrix = membrane(6)
+    above = (sp.triu(matrix, 1) + 0.5 * sp.diags_array(matrix.diagonal())).asformat(kind)
+    smallest = 8.0 * np.sin(0.5 * np.pi / 7.0) ** 2  # eigenvalue of the membrane
+    shift = sp.eye_array(36, format="csc")
+    assert is_proved_by_band([above, above, -0.99 * smallest * shift]) is True
+    assert is_proved_by_band([above, above, -1.01 * smallest * shift]) is False
