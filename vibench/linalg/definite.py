@@ -17,7 +17,7 @@ from vibench.errors import NumericalError
 MANY_UNKNOWNS = 1500
 """Dense work on at most so many unknowns takes less than to find out which of them it can do without."""
 
-MIRRORED = 256
+MIRRORED = 64
 """Number of rows of a triangle that are mirrored at once."""
 
 

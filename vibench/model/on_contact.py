@@ -212,9 +212,16 @@ class OnContact:
         """A factor of K in some rows (k,): active sets and kept rows are often those of the pair before."""
         key = rows.tobytes()
         if key not in self._factors:
-            all_of_them = len(rows) == len(self._compliance)
-            self._factors[key] = _Factor(self._compliance if all_of_them else self._compliance[np.ix_(rows, rows)])
+            self._factors[key] = _Factor(self._compliance_of(rows))
         return self._factors[key]
+
+    def _compliance_of(self, rows: Indices) -> Array:
+        """K in some rows (k,), of which all are computed only where they are asked for."""
+        if len(rows) == self.B.shape[0]:
+            return self._compliance
+        if "_compliance" in vars(self):
+            return self._compliance[np.ix_(rows, rows)]
+        return np.asarray(self.B[rows] @ self.liftings[rows].T)
 
 
 def representers(stiffness: CondensedStiffness, functionals: Array) -> list[Representer]:

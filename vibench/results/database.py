@@ -8,6 +8,7 @@ import os
 import resource
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -319,9 +320,7 @@ class ResultsDatabase:
 
     def _insert(self, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
         for row in rows:
-            names, marks = ", ".join(f'"{name}"' for name in row), ", ".join("?" * len(row))
-            values = tuple(storable(table, row).values())
-            self._db.execute(f"INSERT INTO {table} ({names}) VALUES ({marks})", values)
+            self._db.execute(_insertion(table, tuple(row)), tuple(storable(table, row).values()))
 
     def _add_columns(self, queries: Sequence[Mapping[str, Any]]) -> None:
         """Add a column for every parameter mu_1, mu_2, … of the rows."""
@@ -329,6 +328,13 @@ class ResultsDatabase:
         for name in dict.fromkeys(name for row in queries for name in row):
             if name not in there and name.startswith("mu_"):
                 self._db.execute(f'ALTER TABLE queries ADD COLUMN "{name}" REAL')
+
+
+@lru_cache(maxsize=32)
+def _insertion(table: str, names: tuple[str, ...]) -> str:
+    """The command that inserts a row with these columns: consecutive rows of a table have the same ones."""
+    quoted, marks = ", ".join(f'"{name}"' for name in names), ", ".join("?" * len(names))
+    return f"INSERT INTO {table} ({quoted}) VALUES ({marks})"
 
 
 def _refuse_other(path: Path, study: Mapping[str, Any]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from statistics import fmean, median
 
 import numpy as np
 
@@ -58,13 +58,13 @@ class TimedCell:
 
 def round_columns(one: TimedRound) -> Row:
     """Seconds of the parts of a query and of the whole, means over the queries of a round."""
-    return _columns(*(_of_all(np.mean, parts.values()) for parts in (one.assemble, one.solve, one.certify)))
+    return _columns(*(_of_all(fmean, parts.values()) for parts in (one.assemble, one.solve, one.certify)))
 
 
-def _of_all(average: Callable[..., Any], parts: Iterable[Seconds]) -> Array | None:
+def _of_all(average: Callable[[Sequence[float]], float], parts: Iterable[Seconds]) -> Array | None:
     """Average CPU and wall seconds (2,); `None` of none."""
-    every = np.array([(seconds.cpu, seconds.wall) for seconds in parts])
-    return np.asarray(average(every, axis=0)) if len(every) else None
+    every = [(seconds.cpu, seconds.wall) for seconds in parts]
+    return np.array([average(column) for column in zip(*every, strict=True)]) if every else None
 
 
 def _columns(assemble: Array | None, solve: Array | None, certify: Array | None) -> Row:
@@ -108,5 +108,5 @@ def seconds_of_queries(rounds: Sequence[TimedRound]) -> dict[int, Row]:
         assembled = [one.assemble[k] if k in one.assemble else next(iter(one.assemble.values())) for one in rounds]
         solved = [one.solve[k] for one in rounds if k in one.solve]
         certified = [one.certify[k] for one in rounds if k in one.certify]
-        rows[k] = _columns(*(_of_all(np.median, parts) for parts in (assembled, solved, certified)))
+        rows[k] = _columns(*(_of_all(median, parts) for parts in (assembled, solved, certified)))
     return rows

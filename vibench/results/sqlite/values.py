@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,9 @@ from vibench.text import LONGEST, brief, printable
 
 LONGEST_TEXT = 2 * LONGEST
 """Characters of a text in a column: a reason quotes what a plugin said, and adds to it."""
+
+REMEMBERED = 256
+"""Texts whose stored form is remembered: what names a cell is in all of its rows."""
 
 IDENTITY = (
     "cell",
@@ -45,11 +49,22 @@ def storable(table: str, row: Mapping[str, Any]) -> dict[str, Any]:
     columns = STORED[table]
     values: dict[str, Any] = {}
     for name, value in row.items():
+        column, kind = columns.get(name, PARAMETER), type(value)
+        if kind is float and column.kind == REAL and value == value:  # noqa: PLR0124  most values; NaN is no number
+            values[name] = value
+            continue
         try:
-            values[name] = stored(columns.get(name, PARAMETER), value)
+            short = kind is str and len(value) <= LONGEST
+            values[name] = _stored_text(column, value) if short else stored(column, value)
         except (TypeError, OverflowError) as error:
             raise UnstorableError(f"column '{name}' of the table '{table}': {error}") from None
     return values
+
+
+@lru_cache(maxsize=REMEMBERED)
+def _stored_text(column: Column, value: str) -> Any:
+    """The same of a short text."""
+    return stored(column, value)
 
 
 def error_row(cell: Mapping[str, Any], reason: str) -> dict[str, Any]:
@@ -61,8 +76,6 @@ def error_row(cell: Mapping[str, Any], reason: str) -> dict[str, Any]:
 
 def stored(column: Column, value: Any) -> Any:
     """A value in the type of its column; a `TypeError` or an `OverflowError` where there is none."""
-    if type(value) is float and column.kind == REAL and value == value:  # noqa: PLR0124  most values; NaN is no number
-        return value
     kind = column.kind.split()[0]
     if isinstance(value, np.generic):
         value = value.item()
