@@ -363,7 +363,7 @@ class SaddlePointSolver:
         A, B, self._order = sp.csr_array(A), sp.csr_array(B), slice(None) if ordered is None else ordered.chosen
         if ordered is not None:
             A, f = ordered.of(A), f[self._order]
-            B = sp.csr_array((B.data, np.argsort(ordered.chosen)[B.indices], B.indptr), shape=B.shape)
+            B = sp.csr_array((B.data, ordered.places[B.indices], B.indptr), shape=B.shape)
         self._ordered = ordered is not None
         stiffness = np.abs(A.diagonal())
         # Jacobi scaling: displacements and forces of steel in metres differ by 1e11, and `ROUND_OFF` compares them
@@ -372,7 +372,7 @@ class SaddlePointSolver:
         self._force = 1.0 / row_norms(B)
         self._A, self._f = _in_units(self._displacement, A, self._displacement), self._displacement * f
         self._B, self._g = _in_units(self._force, B, np.ones(len(f))), self._force * g
-        self._factorised_set = np.zeros(0, dtype=np.intp)
+        self._factorised_set, self._is_factorised = np.zeros(0, dtype=np.intp), np.zeros(len(g), bool)
         self._factorisation: _BorderedFactorisation | None = None
 
     def __call__(self, active: Indices) -> tuple[Array, Array]:
@@ -383,17 +383,18 @@ class SaddlePointSolver:
         RuntimeError
             If the system is exactly singular.
         """
-        solution = None
-        if self._factorisation is not None and len(np.setxor1d(active, self._factorised_set)) <= MAX_BORDER:
-            solution = self._solve_bordered(self._factorisation, active)
+        solution, is_active = None, np.zeros(len(self._g), bool)
+        is_active[active] = True
+        if self._factorisation is not None and np.count_nonzero(is_active != self._is_factorised) <= MAX_BORDER:
+            solution = self._solve_bordered(self._factorisation, active, is_active)
         if solution is None:
             # in this order: the set must stay that of the last factorisation where this one fails
             B = self._B[active]
             zero = sp.csr_array((len(active), len(active)))  # SciPy stacks blocks that are all CSR without triplets
             saddle = sp.block_array([[self._A, sp.csr_array(B.T)], [B, zero]], format="csr").T
             self._factorisation = _BorderedFactorisation(saddle, len(active) if self._ordered else None)
-            self._factorised_set = active
-            solution = self._solve_bordered(self._factorisation, active)
+            self._factorised_set, self._is_factorised = active, is_active
+            solution = self._solve_bordered(self._factorisation, active, is_active)
         assert solution is not None  # an empty border is always independent
         return solution
 
@@ -413,12 +414,18 @@ class SaddlePointSolver:
         x, forces = self._factorisation.split(functionals)
         return np.asarray(np.sqrt(np.maximum(np.einsum("ik,ik->k", x, functionals), 0.0) + forces))
 
-    def _solve_bordered(self, factorisation: _BorderedFactorisation, active: Indices) -> tuple[Array, Array] | None:
-        """The solution from the factorised set; `None` where the border is not clearly linearly independent."""
+    def _solve_bordered(
+        self, factorisation: _BorderedFactorisation, active: Indices, is_active: Mask
+    ) -> tuple[Array, Array] | None:
+        """The solution from the factorised set; `None` where the border is not clearly linearly independent.
+
+        The constraints that are active are given by their numbers (k,) and as a mask (m,).
+        """
         n, base = self._A.shape[0], self._factorised_set
-        added, removed = np.setdiff1d(active, base), np.flatnonzero(~np.isin(base, active))
+        added, removed = active[~self._is_factorised[active]], np.flatnonzero(~is_active[base])
         border = np.zeros((n + len(base), len(added) + len(removed)))
-        border[:n, : len(added)] = self._B[added].toarray().T
+        if len(added):
+            border[:n, : len(added)] = self._B[added].toarray().T
         border[n + removed, len(added) + np.arange(len(removed))] = 1.0
         values = np.concatenate([self._g[added], np.zeros(len(removed))])
         names = [*added.tolist(), *(-1 - removed).tolist()]

@@ -98,6 +98,11 @@ class PrincipalSubmatrix:
         self.chosen = chosen
         self._sparsity: tuple[Indices, Indices] | None = None
 
+    @cached_property
+    def places(self) -> Indices:
+        """Where the unknowns are in the submatrix, if all of them are chosen."""
+        return np.argsort(self.chosen)
+
     def of(self, A: SparseMatrix) -> SparseMatrix:
         """The submatrix of A (CSR)."""
         sparsity = A.indptr, A.indices
