@@ -140,8 +140,9 @@ class Obstacle(Problem):
         self.W = InnerProduct(fem.mass(disc)[nodes][:, nodes])
         masses = [weighted_mass.assemble(disc, density=rho)[nodes][:, nodes] for rho in densities]
         integrals = [weighted_paraboloid.assemble(disc, density=rho)[nodes] for rho in densities]
-        on_disc = AffineSum(tuple(-sp.csr_array(term) for term in masses), self._monomials)
-        g = AffineSum(tuple(-self.obstacle * term for term in integrals), self._monomials)
+        thetas = self._monomials  # one object: queries evaluate it once for both sums
+        on_disc = AffineSum(tuple(-sp.csr_array(term) for term in masses), thetas)
+        g = AffineSum(tuple(-self.obstacle * term for term in integrals), thetas)
         unknowns = sp.csr_array((np.ones(len(nodes)), (np.arange(len(nodes)), self._contact_dofs)))
         unknowns.resize((len(nodes), len(self.free)))
         self._B_on_disc, self.affine = on_disc, {"B": on_disc.mapped(lambda term: term @ unknowns), "g": g}

@@ -14,7 +14,7 @@ import scipy.sparse.linalg
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
-from vibench.interfaces.affine import entries_of
+from vibench.interfaces.affine import AffineSum, entries_of
 from vibench.interfaces.problem import MEMBERS, Problem, Sampler, is_absent, without_infinities
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct, svd
@@ -125,9 +125,21 @@ def coefficients(
 ) -> Callable[[Array], Mapping[str, Array]]:
     """The function that evaluates θ (Q,) at mu (d,) of members with sampled entries and of those declared affine."""
     sampler: Sampler = problem.sampler(sampled) if sampled else lambda _: {}
+    sums: list[tuple[AffineSum, list[str]]] = []
+    for name in declared:
+        of = problem.affine[name]
+        for first, names in sums:
+            if of.thetas is first.thetas and len(of.terms) == len(first.terms):  # they share its values
+                names.append(name)
+                break
+        else:
+            sums.append((of, [name]))
 
     def evaluate(mu: Array) -> Mapping[str, Array]:
-        return {name: problem.affine[name].coefficients(mu) for name in declared} | dict(sampler(mu))
+        values = dict(sampler(mu))
+        for first, names in sums:
+            values |= dict.fromkeys(names, first.coefficients(mu))
+        return values
 
     return evaluate
 

@@ -10,6 +10,7 @@ from types import MappingProxyType
 
 import numpy as np
 import scipy.linalg
+from scipy.linalg.lapack import dgeqp3, dorgqr
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError
@@ -68,7 +69,8 @@ class ProjectedMember:
         """The member with coefficients θ (Q,)."""
         if self.constant or theta is None:
             return self._constant_value
-        return self._unpacked(theta @ self.terms)
+        # of one term a product with a matrix takes three times as long
+        return self._unpacked(theta[0] * self.terms[0] if len(self.terms) == 1 else theta @ self.terms)
 
     def at_all(self, thetas: Sequence[Array]) -> Array:
         """The member with each of P coefficients θ (Q,), in one product (P×shape)."""
@@ -369,8 +371,7 @@ def _enriched(members: VariationalInequality, plain: Array) -> tuple[Array, Arra
     added = B[:count, N:].T[:, lengths > 0.0] / lengths[lengths > 0.0]
     Y = np.zeros((used, N))
     if added.size:
-        q, r, _ = scipy.linalg.qr(added, mode="economic", pivoting=True, overwrite_a=True, check_finite=False)
-        added = q[:, np.abs(np.diagonal(r)) > RANK_RTOL]
+        added = _pivoted_range(added)
         Y = np.zeros((used, N + added.shape[1]))
         Y[N:, N:] = added
     Y[:N, :N] = np.eye(N)
@@ -381,6 +382,18 @@ def _enriched(members: VariationalInequality, plain: Array) -> tuple[Array, Arra
     projected[N:, N:] = 0.5 * (projected[N:, N:] + projected[N:, N:].T)
     enriched = np.hstack([B[count:, :N], B[count:, N:] @ added])
     return projected, np.append(f[:N], f[N:used] @ added), enriched, Y
+
+
+def _pivoted_range(y: Array) -> Array:
+    """Orthonormal basis (n×r) of unit columns (n×k), as `orthonormal_range` computes it.
+
+    `scipy.linalg.qr` asks LAPACK for the sizes of its work arrays, which takes as long as the factorisation itself.
+    """
+    count = min(y.shape)
+    reflectors, _, tau, *_ = dgeqp3(y, overwrite_a=True)
+    kept = np.abs(np.diagonal(reflectors)) > RANK_RTOL
+    q, *_ = dorgqr(reflectors[:, :count], tau, overwrite_a=True)
+    return np.asarray(q[:, kept])
 
 
 def _reconstructed(space: PlainCoordinates, Y: Array, x: Array) -> Array:

@@ -33,7 +33,7 @@ Negative ones within a solver's tolerance are set to zero, which opens a gap.
 def row_norms(B: SparseMatrix | Array) -> Array:
     """Euclidean norms (m,) of the rows, 1 where a row is zero."""
     if isinstance(B, np.ndarray):
-        squares = np.asarray((B * B).sum(axis=1), float)
+        squares = np.asarray(np.einsum("ij,ij->i", B, B), float)
     else:  # as `B.multiply(B).sum(axis=1)`, without the matrices that it makes
         B = sp.csr_array(B)
         if not B.has_canonical_format:
@@ -42,7 +42,8 @@ def row_norms(B: SparseMatrix | Array) -> Array:
         rows = np.repeat(np.arange(B.shape[0]), np.diff(B.indptr))
         squares = np.bincount(rows, weights=B.data * B.data, minlength=B.shape[0])
     norms = np.sqrt(squares)
-    norms[norms == 0.0] = 1.0
+    if not norms.all():
+        norms[norms == 0.0] = 1.0
     return np.asarray(norms)
 
 
@@ -139,6 +140,10 @@ class Units:
         B = program.B / self.rows[:, None] if is_dense else sp.diags_array(1.0 / self.rows) @ program.B
         A, g = program.A / (self.force / self.length), program.g / (self.rows * self.length)
         return VariationalInequality(A, program.f / self.force, B, g)
+
+    def scaled_dual(self, dual: VariationalInequality) -> VariationalInequality:
+        """The same of a dual program, whose constraints, −α ≤ 0, are the same in all units."""
+        return VariationalInequality(dual.A / (self.force / self.length), dual.f / self.force, dual.B, dual.g)
 
     def to(self, x: Array, alpha: Array) -> tuple[Array, Array]:
         """A solution x (n,), α (m,) of a program as one of the program in these units."""

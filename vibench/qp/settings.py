@@ -53,6 +53,8 @@ class SolverSettings:
         status = _follow(solution.extras, self.status)
         text = ("found" if solution.found else "not found") if status is None else str(status)
         count = _follow(solution.extras, self.iterations)
+        if isinstance(count, int):  # tests for abstract classes take longer than a small program leaves
+            return text, count
         while isinstance(count, Sequence) or getattr(count, "shape", None):
             count = count[0]
         return text, None if count is None else int(count)
@@ -61,7 +63,7 @@ class SolverSettings:
 def _follow(extras: Mapping[str, Any], path: str) -> Any:
     value: Any = extras
     for step in path.split("."):
-        value = value.get(step) if isinstance(value, Mapping) else getattr(value, step, None)
+        value = value.get(step) if isinstance(value, dict) else getattr(value, step, None)
     return value
 
 

@@ -113,7 +113,7 @@ def _solve_in(
     """
     if not len(program.f):
         return QPSolution(np.zeros(0), np.zeros(len(program.g)), "nothing to solve: no unknowns")
-    scaled = units.scaled(program)
+    scaled = units.scaled_dual(program) if bounds else units.scaled(program)
     if extra and solver in extra:
         answer = extra[solver](scaled, accuracy)
         if not isinstance(answer, QPSolution):

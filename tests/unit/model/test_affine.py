@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from numerics import Varying, spd
 
 from vibench.errors import NumericalError
+from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.problem import MEMBERS, Contact, VariationalInequality
-from vibench.model.affine import Evaluation, affine_decomposition, decomposed, held_out_error
+from vibench.model.affine import Evaluation, affine_decomposition, coefficients, decomposed, held_out_error
 
 NEW = np.array([0.37])
 
@@ -246,6 +247,25 @@ def test_errors_outside_the_training_set_are_measured_whatever_the_kind_of_matri
         kind(matrix + 1e-3 * matrix.multiply(np.arange(matrix.shape[1]) == 3)) for matrix in map(sp.csr_array, new)
     ]
     assert 1e-5 < held_out_error(name, member, bumped, V) < 1e-2
+
+
+def test_a_function_of_several_members_is_evaluated_once() -> None:
+    asked: list[float] = []
+
+    def shared(mu: np.ndarray) -> list[float]:
+        asked.append(float(mu[0]))
+        return [1.0 + mu[0]]
+
+    problem = Varying()
+    matrix, vector = sp.csr_array(np.ones((2, 3))), np.ones(3)
+    problem.affine = {
+        "B": AffineSum((matrix,), shared),
+        "g": AffineSum((vector,), shared),
+        "f": AffineSum((vector,), lambda mu: [2.0 * mu[0]]),
+    }
+    found = coefficients(problem, {}, ("B", "g", "f"))(np.array([3.0]))
+    assert {name: theta.tolist() for name, theta in found.items()} == {"B": [4.0], "g": [4.0], "f": [6.0]}
+    assert asked == [3.0]
 
 
 def test_members_come_in_their_order() -> None:

@@ -47,6 +47,15 @@ def test_scaling_back_is_exact(seed: int, length: int, modulus: int, load: str) 
     assert np.allclose(np.linalg.norm(scaled.B, axis=1), 1.0)
 
 
+@given(seeds, st.integers(1, 6), st.booleans())
+def test_a_dual_program_is_scaled_as_any_other(seed: int, count: int, loaded: bool) -> None:
+    rng = np.random.default_rng(seed)
+    dual = VariationalInequality(spd(count, rng), rng.standard_normal(count), -np.eye(count), np.zeros(count))
+    units = units_of_dual(dual, loaded)
+    for name in MEMBERS:
+        assert np.array_equal(getattr(units.scaled_dual(dual), name), getattr(units.scaled(dual), name)), name
+
+
 @pytest.mark.parametrize("load", sorted(LOADS))
 @given(seed=seeds, length=exponents, modulus=exponents)
 def test_the_scaled_program_knows_no_units(load: str, seed: int, length: int, modulus: int) -> None:
