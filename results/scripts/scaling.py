@@ -30,7 +30,7 @@ from page import SECONDS, Page, made_by, start
 
 from vibench import Reduction, Stop, create, provenance, solve_qp
 from vibench.linalg.factorisations import IMPLEMENTATIONS
-from vibench.report.figures.style import STYLE, CaptionedFigure
+from vibench.report.figures.style import STYLE, CaptionedFigure, set_ticks
 from vibench.timing import median_seconds, timed
 
 ACCURACY = 1e-10
@@ -177,6 +177,8 @@ def draw(rows: pd.DataFrame, size: str) -> Figure:
                 axes[1, column].loglog(points.index, points["memory_mib"], label=stage, **style)
         axes[0, column].set_title(name)
         axes[1, column].set_xlabel("n, unknowns" if size == "n" else "R, generators")
+    for panel in axes.flat:
+        set_ticks(panel)
     axes[0, 0].set_ylabel("seconds")
     axes[1, 0].set_ylabel("peak memory [MiB]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right center")

@@ -17,7 +17,7 @@ from PIL import Image
 
 from vibench.execution.recorded_cell import recorded_study
 from vibench.report import html
-from vibench.report.figures.style import Sheet
+from vibench.report.figures.style import Sheet, styled
 from vibench.results import tables
 from vibench.results.sqlite.reading import FILE
 from vibench.study.matrix import expand
@@ -139,6 +139,18 @@ def test_a_hash_that_looks_like_a_number_is_a_text(tmp_path: Path, monkeypatch: 
     cells.to_csv(tmp_path / "cells.csv", index=False)
     rows = importlib.import_module("publish").rows(tmp_path / "cells.csv")
     assert [row["study_hash"] for row in rows] == ["9369049480579e14"] * 2
+
+
+def test_numbers_at_logarithmic_axes_are_text(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures show texts as they are: Matplotlib's own powers of ten would be its commands for them."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    script, rows = importlib.import_module("scaling"), pd.read_csv(RESULTS / "scaling" / "rows.csv")
+    with styled():
+        figure = script.draw(rows[rows["over"] == "mesh"], "n")
+        figure.draw_without_rendering()
+        labels = [text.get_text() for axes in figure.axes for text in (*axes.get_xticklabels(), *axes.get_yticklabels())]
+    assert "10³" in labels
+    assert not [label for label in labels if "$" in label]
 
 
 def test_other_machines_are_compared_row_by_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -63,7 +63,7 @@ class SolverSettings:
 def _follow(extras: Mapping[str, Any], path: str) -> Any:
     value: Any = extras
     for step in path.split("."):
-        value = value.get(step) if isinstance(value, dict) else getattr(value, step, None)
+        value = value.get(step) if isinstance(value, (dict, Mapping)) else getattr(value, step, None)
     return value
 
 

@@ -201,7 +201,7 @@ class Sheet:
             down, along = divmod(k, self._columns)
             left, bottom = along * column + layout.left, legend + (self._rows - 1 - down) * row + layout.below
             panel.set_position((left / wide, bottom / high, layout.width / wide, layout.height / high))
-            _ticks(panel)
+            set_ticks(panel)
         missing = sum(label_points(self.panels[k], points) for k, points in self._labels.items())
         unlabelled = f"{missing} points have no label, since others are too close." if missing else ""
         self.figure.caption = " ".join(f"{caption} {part} {unlabelled}".split())
@@ -253,7 +253,7 @@ def legend_label(text: str | None) -> str | None:
     return f" {text}" if text is not None and text.startswith("_") else text
 
 
-def _ticks(axes: Axes) -> None:
+def set_ticks(axes: Axes) -> None:
     """Set the ticks of logarithmic axes, however many decades they span."""
     for name, axis in (("x", axes.xaxis), ("y", axes.yaxis)):
         if axis.get_scale() != "log":
