@@ -148,7 +148,9 @@ def test_numbers_at_logarithmic_axes_are_text(monkeypatch: pytest.MonkeyPatch) -
     with styled():
         figure = script.draw(rows[rows["over"] == "mesh"], "n")
         figure.draw_without_rendering()
-        labels = [text.get_text() for axes in figure.axes for text in (*axes.get_xticklabels(), *axes.get_yticklabels())]
+        labels = [
+            text.get_text() for axes in figure.axes for text in (*axes.get_xticklabels(), *axes.get_yticklabels())
+        ]
     assert "10³" in labels
     assert not [label for label in labels if "$" in label]
 
