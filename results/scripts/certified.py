@@ -196,6 +196,10 @@ def main(certified: str, training: str, target: str) -> None:
     )
     linked = {"effectivities": effectivities(cells, queries, "max"), "training": equal_errors(trained)}
     page.add(f"Largest effectivities, and models of equal error: {', '.join(map(page.link, linked, linked.values()))}.")
+    page.add(
+        "Effectivities, violations and corrections at random parameters: [unseen.csv](unseen.csv), by "
+        "`python tests/benchmarks/certified.py runs/certified --table results/certified/unseen.csv`."
+    )
     failed = pd.concat(frame[frame["status"] != "ok"] for frame in (cells, trained))
     page.add(*(f"- {row.cell}: {row.status}, {row.reason}" for row in failed.itertuples()))
     page.write()

@@ -1,11 +1,12 @@
 """Certificates at online cost: violations at random parameters, effectivities, and seconds beside those of a query.
 
-Usage: python tests/benchmarks/certified.py RUN [COUNT [PROBLEM]]
+Usage: python tests/benchmarks/certified.py RUN [COUNT [PROBLEM]] [--table FILE]
 
 For every certified cell of a run, or of one problem of it: bounds at COUNT random parameters (10000 by default) that
 the model has not seen, compared with high-fidelity solutions, which the models of a problem share. The same of the
 corrected pairs, how many times more accurate λ is in W (at online cost, and at high-fidelity cost), and how often it is
 at all, in the queries where ω > ρ and in the others. Every tenth query is timed, and corrected at high-fidelity cost.
+`--table` also writes the numbers, without seconds, as CSV.
 
 Usage: python tests/benchmarks/certified.py --meshes [COUNT]
 
@@ -16,6 +17,7 @@ of the obstacle vary. COUNT parameters (200 by default), taken in turns; violati
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -23,6 +25,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import scipy.sparse as sp
 
 import vibench
@@ -136,17 +139,43 @@ class Tally:
     @property
     def corrected(self) -> str:
         """How much more accurate corrected pairs are."""
-        texts = []
+        return "".join(
+            f"\n    corrected {which}, {name}: {len(divided)} queries, error of λ in W divided by "
+            f"{np.median(divided):.2f} (median), smaller in {100.0 * np.mean(divided > 1.0):.1f} %"
+            for which, name, divided in self._divided()
+        )
+
+    def _divided(self) -> Iterator[tuple[str, str, Array]]:
+        """Factors by which corrections at some cost divide the error of λ in W, where ω > ρ and where not."""
         for which, of_all in self.gains.items():
             gains = np.array(of_all).reshape(-1, 2)
             for name, chosen in (("ω > ρ", gains[:, 1] == 1.0), ("ω ≤ ρ", gains[:, 1] == 0.0)):
                 if chosen.any():
-                    divided = gains[chosen, 0]
-                    texts.append(
-                        f"corrected {which}, {name}: {len(divided)} queries, error of λ in W divided by "
-                        f"{np.median(divided):.2f} (median), smaller in {100.0 * np.mean(divided > 1.0):.1f} %"
-                    )
-        return "".join(f"\n    {text}" for text in texts)
+                    yield which, name, gains[chosen, 0]
+
+    def numbers(self) -> dict[str, Any]:
+        """One row of a table: what does not depend on the machine."""
+        quantiles = {"least": 0.0, "median": 0.5, "largest": 1.0}
+        named = ("problem", "training", "dual", "primal", "primal_tol", "pod_tol", "dual_tol", "snapshots")
+        return {
+            **{name: self.row[name] for name in named},
+            "certificate": self.certificate.base.guarantee.value,
+            **{"parameters": self.parameters, "violations": self.violations, "without a bound": self.without},
+            **{
+                f"{name} effectivity of {vector}": float(np.quantile(values, level))
+                for vector, values in zip("uλ", np.array(self.effectivities).reshape(-1, 2).T, strict=True)
+                for name, level in quantiles.items()
+            },
+            **{
+                f"{what}, corrected {which}, {name}": value
+                for which, name, divided in self._divided()
+                for what, value in (
+                    ("queries", len(divided)),
+                    ("error of λ divided by (median)", float(np.median(divided))),
+                    ("smaller in", float(np.mean(divided > 1.0))),
+                )
+            },
+        }
 
 
 def compare(tallies: list[Tally], kept: Assemblies, mu: Array, exact: HighFidelitySolution) -> None:
@@ -165,10 +194,10 @@ def compare(tallies: list[Tally], kept: Assemblies, mu: Array, exact: HighFideli
             tally.judge(of_model, {which: next(columns) for which in of_model}, norms[:, 0])
 
 
-def main(run: str, count: int, only: str = "") -> int:
+def main(run: str, count: int, only: str = "", table: str | None = None) -> int:
     """Print one line per certified cell, every thousand parameters; the number of cells with a violation.
 
-    Models of one problem are compared with the same high-fidelity solutions.
+    Models of one problem are compared with the same high-fidelity solutions. At the end a table is written, if asked.
     """
     models: dict[Plugin, list[Tally]] = {}
     opened = vibench.open_run(run)
@@ -187,7 +216,10 @@ def main(run: str, count: int, only: str = "") -> int:
             compare(tallies, kept, mu, exact)
             if k % REPORTED == 0 or k == count:
                 print(*tallies, sep="\n", flush=True)
-    return sum(tally.violations > 0 for tallies in models.values() for tally in tallies)
+    every = [tally for tallies in models.values() for tally in tallies]
+    if table is not None:
+        pd.DataFrame([tally.numbers() for tally in every]).to_csv(table, index=False, float_format="%.6g")
+    return sum(tally.violations > 0 for tally in every)
 
 
 class Membrane(AffineProblem):
@@ -297,7 +329,22 @@ def meshes(count: int) -> int:
     return violations
 
 
+def asked() -> argparse.Namespace:
+    """What the command line says."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", nargs="?")
+    parser.add_argument("count", nargs="?", type=int, default=10_000)
+    parser.add_argument("problem", nargs="?", default="")
+    parser.add_argument("--table")
+    parser.add_argument("--meshes", nargs="?", type=int, const=200)
+    given = parser.parse_args()
+    if (given.run is None) == (given.meshes is None):
+        parser.error("either a run or --meshes is needed")
+    return given
+
+
 if __name__ == "__main__":
-    if sys.argv[1] == "--meshes":
-        sys.exit(meshes(int(sys.argv[2]) if len(sys.argv) > 2 else 200))
-    sys.exit(main(sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 10_000, *sys.argv[3:]))
+    given = asked()
+    if given.meshes is not None:
+        sys.exit(meshes(given.meshes))
+    sys.exit(main(given.run, given.count, given.problem, given.table))

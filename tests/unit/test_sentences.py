@@ -266,6 +266,39 @@ def of_certified() -> Sequence[str]:
     )
 
 
+def of_unseen_parameters() -> Sequence[str]:
+    """What the page on certified models says of random parameters that no training set has."""
+    table = pd.read_csv(ROOT / "results" / "certified" / "unseen.csv")
+    assert (table["violations"] == 0).all()
+    assert (table["without a bound"] == 0).all()
+    by = dict(list(table.groupby("problem")))
+    obstacle, hertz = by["obstacle"], by["hertz"]
+
+    def medians(rows: pd.DataFrame, vector: str) -> str:
+        values = rows[f"median effectivity of {vector}"]
+        return f"{values.min():.2f} to {values.max():.2f}"
+
+    def corrected(what: str, where: str, rows: pd.DataFrame) -> pd.Series:
+        return rows[f"{what}, corrected online, {where}"].dropna()
+
+    factors = {name: corrected("error of λ divided by (median)", "ω > ρ", rows) for name, rows in by.items()}
+    helped = {name: 100.0 * corrected("smaller in", "ω > ρ", rows) for name, rows in by.items()}
+    others = {name: 100.0 * corrected("smaller in", "ω ≤ ρ", rows) for name, rows in by.items()}
+    assert helped["obstacle"].min() == 100.0
+    return (
+        f"in the {table['parameters'].sum():,} queries of the {len(table)} models",
+        f"of u have medians of {medians(obstacle, 'u')} (obstacle) and {medians(hertz, 'u')} (Hertz), and are at least "
+        f"{obstacle['least effectivity of u'].min():.2f} and {hertz['least effectivity of u'].min():.3f}",
+        f"those of λ have medians of {medians(obstacle, 'λ')} and {medians(hertz, 'λ')}, and are at least "
+        f"{obstacle['least effectivity of λ'].min():.2f} and {hertz['least effectivity of λ'].min():.2f}",
+        f"in all queries (obstacle) and in {helped['hertz'].min():.1f} to {helped['hertz'].max():.1f} % (Hertz) of the "
+        "queries with $\\omega > \\rho$, by "
+        f"median factors of {factors['obstacle'].min():.1f} to {factors['obstacle'].max():.1f} and "
+        f"{factors['hertz'].min():.1f} to {factors['hertz'].max():.1f}, and in {others['obstacle'].min():.0f} to "
+        f"{others['obstacle'].max():.0f} % and {others['hertz'].min():.0f} to {others['hertz'].max():.0f} % of the",
+    )
+
+
 BARE, ONLINE, OFFLINE = "decorrelated", "online-supremizers", "offline-pga"
 
 
@@ -405,6 +438,7 @@ def of_space() -> Sequence[str]:
         ("docs/formulations.md", of_formulations),
         ("docs/formulations.md", of_break_evens),
         ("docs/certified.md", of_certified),
+        ("docs/certified.md", of_unseen_parameters),
         ("docs/three-dimensions.md", of_elliptic_contact),
         ("docs/three-dimensions.md", of_space),
     ],
