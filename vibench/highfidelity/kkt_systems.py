@@ -134,8 +134,7 @@ class CondensedStiffness:
         """Ŝ⁻¹ times loads (c,) or (c, k) of the retained unknowns."""
         if not self._condensed.dense:
             return self._schur_factor.solve(load)
-        pressed = np.flatnonzero(load if load.ndim == 1 else load.any(axis=1))
-        return np.asarray(self._compliance[:, pressed] @ load[pressed])
+        return self._blocks.times_sparse(load)
 
     def load(self, retained: Array) -> Array:
         """Ŝ times retained unknowns (c,), where it is sparse."""

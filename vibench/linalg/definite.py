@@ -50,6 +50,17 @@ class BlockDiagonal:
             product[unknowns] = block @ values[unknowns]
         return product
 
+    def times_sparse(self, values: Array) -> Array:
+        """X v of a symmetric X for values (c,) or (c, k) most rows of which may be zero."""
+        product = np.zeros((self.size, *values.shape[1:]))
+        for unknowns, block in self.blocks:
+            part = values[unknowns]
+            acting = np.flatnonzero(part if part.ndim == 1 else part.any(axis=1))
+            # rows are copied for it, and all of them take longer to copy than to multiply
+            few = 4 * len(acting) < len(unknowns)
+            product[unknowns] = block[acting].T @ part[acting] if few else block @ part
+        return product
+
     def toarray(self) -> Array:
         """The matrix (c×c)."""
         if len(self.blocks) == 1:

@@ -42,6 +42,17 @@ def test_factor_and_inverse_are_those_of_the_whole_matrix(seed: int, sizes: list
         assert np.allclose(F.T @ factor.solve_triangular(right, transposed=True), right)
 
 
+@given(st.integers(0, 10_000), st.lists(st.integers(1, 9), min_size=1, max_size=3), st.integers(0, 8))
+def test_values_that_are_mostly_zero_have_the_products_of_others(seed: int, sizes: list[int], acting: int) -> None:
+    X, _ = mixed_blocks(seed, sizes)
+    matrix, rng = BlockDiagonal.of(X), np.random.default_rng(seed)
+    for shape in ((len(X),), (len(X), 2)):
+        values = np.zeros(shape)
+        chosen = rng.permutation(len(X))[:acting]
+        values[chosen] = rng.standard_normal((len(chosen), *shape[1:]))
+        assert np.allclose(matrix.times_sparse(values), X @ values)
+
+
 def test_unknowns_in_a_chain_are_one_block() -> None:
     assert [block.tolist() for block in connected_blocks(np.eye(4) + np.eye(4, k=1) + np.eye(4, k=-1))] == [
         [0, 1, 2, 3]
