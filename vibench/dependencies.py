@@ -32,8 +32,14 @@ What a study asks for is in the fields of stages, an artefact is read as it was 
 COUNTED = "vibench.study.parameter_sets"
 """The module within `CARRIERS` that does determine numbers."""
 
+SOURCES = (".py", ".pyi")
+"""Suffixes of sources."""
+
 Place: TypeAlias = tuple[str, str]
 """Module and name of a definition; the name "" stands for the module itself."""
+
+Request: TypeAlias = tuple[tuple[str, ...], bool]
+"""What `code_used` is asked for: roots, and whether the whole classes count."""
 
 
 @dataclass(frozen=True)
@@ -100,9 +106,55 @@ class _Reached:
                 self.ahead += self._uncounted.pop(name, ())
 
 
+_own: dict[Request, tuple[str, str]] = {}
+"""Hashes that this process has returned, by what was asked for, each with that of all sources that it looked in."""
+
+_taken: dict[Request, tuple[str, str]] = {}
+"""Those of another process."""
+
+
+def code_found() -> dict[Request, tuple[str, str]]:
+    """What `code_used` has returned in this process, for `take_over` in another one."""
+    return dict(_own)
+
+
+def take_over(found: Mapping[Request, tuple[str, str]]) -> None:
+    """Let `code_used` return what it has returned in another process, where the sources are the same here."""
+    _taken.update(found)
+
+
 @cache
 def code_used(*roots: str, whole: bool = False) -> str:
     """Hash of the sources of `modules_used`."""
+    sources, taken = _all_sources(roots), _taken.get((roots, whole))
+    code = taken[1] if sources and taken is not None and taken[0] == sources else _hash_of_used(roots, whole)
+    _own[roots, whole] = sources, code
+    return code
+
+
+def _all_sources(roots: tuple[str, ...]) -> str:
+    """Hash of all sources in which `modules_used` looks from the roots; "" if they cannot be listed."""
+    packages = [_sources_in(name) for name in sorted({CORE.name, *map(_outermost, roots)})]
+    return " ".join(packages) if all(packages) else ""
+
+
+@cache
+def _sources_in(package: str) -> str:
+    """Hash of all sources of an outermost package, or of a module in none; "" if they cannot be listed."""
+    try:
+        path = _file(package)
+    except ValueError:  # it was not imported from a file
+        return ""
+    if path is None or path.suffix not in SOURCES:
+        return ""
+    content = hashlib.sha256(package.encode())
+    for source in sorted(path.parent.rglob("*.py*")) if path.stem == "__init__" else [path]:
+        if source.suffix in SOURCES:
+            content.update(f"{source.relative_to(path.parent).as_posix()}\0".encode() + source.read_bytes())
+    return content.hexdigest()
+
+
+def _hash_of_used(roots: tuple[str, ...], whole: bool) -> str:
     content = hashlib.sha256()
     for module in sorted(modules_used(*roots, whole=whole)):
         content.update(f"{module} {hashlib.sha256(_source(module)).hexdigest()}\n".encode())
@@ -138,8 +190,9 @@ def _definition(module: str, name: str) -> _Definition:
     return _parsed(module).members[name] if name else _Definition(members=_parsed(module).members)
 
 
-def _outermost(module: str) -> str:
-    return module.partition(".")[0]
+def _outermost(place: str) -> str:
+    """The package of a module, or of "module:name"."""
+    return place.partition(":")[0].partition(".")[0]
 
 
 @cache
@@ -159,7 +212,7 @@ def _file(module: str) -> Path | None:
 @cache
 def _source(module: str) -> bytes:
     path = _file(module)
-    return path.read_bytes() if path is not None and path.suffix in (".py", ".pyi") else b""
+    return path.read_bytes() if path is not None and path.suffix in SOURCES else b""
 
 
 @cache

@@ -21,7 +21,7 @@ from fake_stages import InItems, OfAPlugin, Whole
 from running import PATIENCE
 
 from vibench.execution import supervisor
-from vibench.execution.jobs import Begun, Job
+from vibench.execution.jobs import Begun, CurrentItem, Job
 from vibench.execution.supervisor import StoppedError, Supervisor
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, Stage, Unstored
@@ -333,3 +333,23 @@ def test_a_worker_does_not_outlive_its_supervisor(tmp_path: Path) -> None:
     else:
         pytest.fail("the worker goes on")
     assert not sleepers(seconds)
+
+
+def test_an_operation_that_raised_has_no_limit_afterwards(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(supervisor, "GRACE", 0.1)
+    found = run(InItems(("fine", "interrupt"), at_end="second"), query=0.2)
+    assert isinstance(found, Done)
+    assert found.value[1][1].status is Status.ERROR
+
+
+def test_the_current_item_is_what_the_worker_noted_last(tmp_path: Path) -> None:
+    with (tmp_path / "shared").open("w+b") as file:
+        file.truncate(CurrentItem.SIZE)
+        worker, watcher = CurrentItem(file.fileno()), CurrentItem(file.fileno())
+    assert watcher.read() == (0, None, False)
+    noted = [(0, False), (0, True), (2**31 - 1, True), (7, False)]
+    for changes, (number, watched) in enumerate(noted, 1):
+        worker.enter(number, watched=watched)
+        assert watcher.read() == (changes, number, watched)
+    worker.leave()
+    assert watcher.read() == (0, None, False)

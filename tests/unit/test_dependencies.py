@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from vibench import dependencies
-from vibench.dependencies import CELL, code_used, modules_used
+from vibench.dependencies import CELL, code_found, code_used, modules_used, take_over
 
 SOURCES = {
     "__init__.pyi": "from .numbers import double as double\nfrom . import tables as tables\n",
@@ -65,7 +65,8 @@ def core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def forget() -> None:
-    for cached in (modules_used, code_used, dependencies._file, dependencies._source, dependencies._parsed):
+    read = dependencies._file, dependencies._source, dependencies._parsed, dependencies._sources_in
+    for cached in (modules_used, code_used, *read):
         cached.cache_clear()  # type: ignore[attr-defined]
 
 
@@ -142,6 +143,20 @@ def test_the_hash_changes_with_every_module_that_counts_and_with_no_other(edit: 
         after = code_used("core.numbers:double")
         assert (after != before) == (name in {"numbers.py", "constants.py", "base.py"}), name
         before = after
+
+
+def test_the_hash_of_another_process_is_taken_for_the_same_sources_alone(
+    edit: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = "core.numbers:double"
+    code_used(root)
+    asked = (root,), False
+    monkeypatch.setattr(dependencies, "_taken", {})
+    take_over({asked: (code_found()[asked][0], "taken")})
+    forget()
+    assert code_used(root) == "taken"
+    edit("tables.py")  # of which nothing is used
+    assert code_used(root) != "taken"
 
 
 def test_a_cell_begins_where_there_is_code() -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any
 
-from vibench.dependencies import CELL, code_used
+from vibench.dependencies import CELL, Request, code_found, code_used
 from vibench.provenance import libraries
 from vibench.stages.base import Failed, ItemwiseStage, Stage
 
@@ -32,6 +33,8 @@ class Job:
     lost: Mapping[str, Failed] = field(default_factory=dict)
     """Dispensable stages that failed, by key."""
     code: str = field(default_factory=code_here)
+    found: Mapping[Request, tuple[str, str]] = field(default_factory=code_found)
+    """What was looked for in sources: a worker that has the same ones need not do it again."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,38 @@ class Progress:
     lost: dict[int, Failed] = field(default_factory=dict)
 
 
+class CurrentItem:
+    """The item that a worker is in, in memory that it shares with its supervisor.
+
+    A message would wake the supervisor before and after every query, which takes longer than a small one.
+
+    Parameters
+    ----------
+    file
+        Descriptor of an open file of `SIZE` bytes.
+    """
+
+    SIZE = 8
+    """One number, which is written at once: of changes (31 bits), the item (31) and whether it is watched (1)."""
+
+    def __init__(self, file: int) -> None:
+        self._memory = memoryview(mmap.mmap(file, self.SIZE)).cast("q")
+
+    def leave(self) -> None:
+        """Note that the worker is in no item; changes are counted anew."""
+        self._memory[0] = 0
+
+    def enter(self, number: int, *, watched: bool) -> None:
+        """Note that it is in an item; `watched` while it is in an operation with a time limit of its own."""
+        changes = (self._memory[0] >> 32) % 2**30 + 1
+        self._memory[0] = changes << 32 | number << 1 | watched
+
+    def read(self) -> tuple[int, int | None, bool]:
+        """How often that was noted, the item, and whether it is watched."""
+        noted = self._memory[0]
+        return noted >> 32, noted % 2**32 >> 1 if noted else None, bool(noted & 1)
+
+
 @dataclass(frozen=True)
 class Begun:
     """A worker has received its job."""
@@ -85,14 +120,6 @@ class Share:
     """A worker has done this share of its stage."""
 
     share: float
-
-
-@dataclass(frozen=True)
-class InItem:
-    """A worker is in an item; `watched` while it is in an operation with a time limit of its own."""
-
-    number: int
-    watched: bool
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections import OrderedDict
@@ -22,7 +23,18 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from vibench.execution.jobs import Batch, BatchDone, Begun, InItem, ItemDone, Job, OutOfMemory, Progress, Share, batches
+from vibench.execution.jobs import (
+    Batch,
+    BatchDone,
+    Begun,
+    CurrentItem,
+    ItemDone,
+    Job,
+    OutOfMemory,
+    Progress,
+    Share,
+    batches,
+)
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, ItemwiseStage, Unstored
 from vibench.timing import KEPT_MEMORY, ONE_THREAD
@@ -59,7 +71,7 @@ class _WorkerLostError(Exception):
 
 
 class _JobState:
-    """What workers have reported of a job: finished items, the current item and its deadline.
+    """What workers have reported of a job: finished items, the share that is done, the deadline of the current item.
 
     Time is added up in steps of bounded length, so that a suspended machine does not exhaust the limits. The start of a
     process counts separately: on a busy machine it may take longer than a limit.
@@ -68,18 +80,24 @@ class _JobState:
     def __init__(self, job: Job, observe: Callable[[Any], None]) -> None:
         self.job, self.progress, self._observe = job, Progress(), observe
         self.seconds = self.share = 0.0
-        self.start(Batch(frozenset(), (), ends=False))
+        self._begin(Batch(frozenset(), (), ends=False), None)
 
-    def start(self, batch: Batch) -> Progress:
+    def start(self, batch: Batch, current: CurrentItem) -> Progress:
         """Note that a process is given a batch of the job; returns what it needs to know of the others."""
-        self.batch = batch
-        self._last, self._begun, self._starting = time.monotonic(), False, 0.0
-        self._next_item()
+        current.leave()
+        self._begin(batch, current)
         return self.progress if batch.ends else Progress()
 
-    def _next_item(self) -> None:
-        self.item: int | None = None
-        self._item_limit = float("inf")
+    def _begin(self, batch: Batch, current: CurrentItem | None) -> None:
+        self.batch, self._current = batch, current
+        self._last, self._begun, self._starting = time.monotonic(), False, 0.0
+        self._changes, self._item_limit = 0, float("inf")
+
+    @property
+    def item(self) -> int | None:
+        """The item that the worker is in, or was in when it died."""
+        number = None if self._current is None else self._current.read()[1]
+        return None if number in self.progress.done else number
 
     def tick(self, limit: float) -> None:
         """Count the seconds since the last call; a `_WorkerLostError` beyond a limit, `limit` being the stage's."""
@@ -92,10 +110,18 @@ class _JobState:
                 raise _WorkerLostError(Failed(Status.CRASHED, f"no worker process began within {START_SECONDS:g} s"))
             return
         self.seconds += step
+        self._follow_item()
         if self.seconds > limit:
             raise _WorkerLostError(_beyond("cell_seconds", self.job.cell_seconds))
         if self.seconds > self._item_limit:
             raise _WorkerLostError(_beyond("query_seconds", self.job.query_seconds))
+
+    def _follow_item(self) -> None:
+        """Set the limit of an operation that was begun since the last call, and none where it has ended."""
+        changes, _, watched = (0, None, False) if self._current is None else self._current.read()
+        if changes != self._changes:
+            self._changes = changes
+            self._item_limit = self.seconds + self.job.query_seconds + GRACE if watched else float("inf")
 
     def update(self, message: Any) -> Done | Failed | Unstored | BatchDone | None:
         """Process a message of the worker; returns the outcome if it is one."""
@@ -104,13 +130,9 @@ class _JobState:
                 self._begun, self._last = True, time.monotonic()
             case Share():
                 self.share = message.share
-            case InItem():
-                self.item = message.number
-                self._item_limit = self.seconds + self.job.query_seconds + GRACE if message.watched else float("inf")
             case ItemDone():
                 self.progress.done[message.number] = message.value
                 self._observe(message.value)
-                self._next_item()
             case OutOfMemory():
                 raise _WorkerLostError(message.failed)
             case Done() | Failed() | Unstored() | BatchDone():
@@ -118,8 +140,8 @@ class _JobState:
         return None
 
 
-_Worker = tuple[Connection, "subprocess.Popen[bytes]", str]
-"""The connection to a worker process, the process, and the mark of it and of what it starts."""
+_Worker = tuple[Connection, "subprocess.Popen[bytes]", str, CurrentItem]
+"""The connection to a worker process, the process, the mark of it and of what it starts, and its current item."""
 
 
 class Supervisor:
@@ -211,11 +233,11 @@ class Supervisor:
     def _attempt_batch(self, state: _JobState, limit: float, batch: Batch) -> Done | Failed | Unstored | BatchDone:
         """Run a batch of a stage in one process."""
         try:
-            connection, process, _ = self._worker(batch.packages)
+            connection, process, _, current = self._worker(batch.packages)
         except OSError as error:
             return Failed(Status.CRASHED, f"no worker process could be started: {error.strerror}")
         try:
-            connection.send((state.job, state.start(batch), batch))
+            connection.send((state.job, state.start(batch, current), batch))
             while not self._stop.is_set():
                 if connection.poll(POLL):
                     outcome = state.update(connection.recv())
@@ -234,9 +256,12 @@ class Supervisor:
         if packages not in self._workers:
             (ours, theirs), mark = socket.socketpair(), secrets.token_hex(8)
             environment = _environment({**os.environ, **self._environment}) | {MARK: mark}
-            with theirs:
+            with theirs, tempfile.TemporaryFile() as shared:
+                shared.truncate(CurrentItem.SIZE)
+                socket.send_fds(ours, [b"+"], [shared.fileno()])
+                current = CurrentItem(shared.fileno())
                 process = start_worker(theirs.fileno(), str(self._log or os.devnull), environment)
-            self._workers[packages] = Connection(ours.detach()), process, mark
+            self._workers[packages] = Connection(ours.detach()), process, mark, current
         self._workers.move_to_end(packages)
         return self._workers[packages]
 
@@ -245,7 +270,7 @@ class Supervisor:
         for packages in those or tuple(self._workers):
             if (worker := self._workers.pop(packages, None)) is None:
                 continue
-            connection, process, mark = worker
+            connection, process, mark, _ = worker
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()

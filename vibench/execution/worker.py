@@ -7,6 +7,7 @@ import faulthandler
 import os
 import resource
 import signal
+import socket
 import sys
 import threading
 import time
@@ -20,13 +21,14 @@ from typing import Any, TypeVar
 from threadpoolctl import threadpool_limits
 
 from vibench import interrupts
+from vibench.dependencies import take_over
 from vibench.errors import NumericalError, StorageError, UnsupportedError, VibenchError, in_a_line, message_of
 from vibench.execution.jobs import (
     OUT_OF_MEMORY,
     Batch,
     BatchDone,
     Begun,
-    InItem,
+    CurrentItem,
     ItemDone,
     Job,
     OutOfMemory,
@@ -41,6 +43,8 @@ from vibench.storage.artefacts import Store
 
 T = TypeVar("T")
 Send = Callable[[Any], None]
+Enter = Callable[[int, bool], None]
+"""Notes the item that this process is in, and whether it is in an operation with a time limit of its own."""
 
 KEPT, SHARE_KEPT = 2**30, 0.125
 """Bytes of artefacts that this process keeps after it has read them, and the share of its memory limit that they take
@@ -56,9 +60,13 @@ class _NoMemoryError(Exception):
 
 def main() -> None:
     """Serve the supervisor at the other end of a socket until it closes the connection."""
-    socket, log = int(sys.argv[1]), os.open(sys.argv[2], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
-    os.set_inheritable(socket, False)  # children of plugins must not hold it open
-    connection = Connection(socket)
+    log = os.open(sys.argv[2], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    ours = socket.socket(fileno=int(sys.argv[1]))
+    ours.set_inheritable(False)  # children of plugins must not hold it open
+    _, (shared,), *_ = socket.recv_fds(ours, 1, 1)
+    current = CurrentItem(shared)
+    os.close(shared)
+    connection = Connection(ours.detach())
     for stream in (1, 2):  # what plugins print must not look like output of vibench
         os.dup2(log, stream)
     faulthandler.enable()
@@ -67,10 +75,17 @@ def main() -> None:
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     own, first = os.getpid(), True
 
-    def send(message: Any) -> None:
-        if os.getpid() != own:  # a plugin forked: the child must not use the socket
+    def end_in_child() -> None:
+        if os.getpid() != own:  # a plugin forked: the child must not speak to the supervisor
             os._exit(0)
+
+    def send(message: Any) -> None:
+        end_in_child()
         connection.send(message)
+
+    def enter(number: int, watched: bool) -> None:
+        end_in_child()
+        current.enter(number, watched=watched)
 
     while True:
         try:
@@ -84,7 +99,7 @@ def main() -> None:
             return
         first = False
         faulthandler.dump_traceback_later(2.0 * job.cell_seconds + 60.0, exit=True)  # in case the supervisor has died
-        send(perform(job, progress, batch, send))
+        send(perform(job, progress, batch, send, enter))
         faulthandler.cancel_dump_traceback_later()
 
 
@@ -97,7 +112,7 @@ def _end_with(parent: int) -> None:
 
 
 def perform(
-    job: Job, progress: Progress, batch: Batch, send: Send
+    job: Job, progress: Progress, batch: Batch, send: Send, enter: Enter
 ) -> Done | BatchDone | Failed | Unstored | OutOfMemory:
     """Run a batch of a stage; an exception of a plugin is the reason of a failed stage and ends no run."""
     start = time.perf_counter()
@@ -110,7 +125,7 @@ def perform(
             items = _begun(job.stage, store)
             earlier = {number: items.lost(number, failed) for number, failed in progress.lost.items()} | progress.done
             items.resume(earlier)
-            done = earlier | _done(job, items, batch, send)
+            done = earlier | _done(job, items, batch, send, enter)
             if not batch.ends:
                 return BatchDone()
             _last.clear()
@@ -133,10 +148,11 @@ def perform(
 
 def _check_code(job: Job, batch: Batch) -> None:
     """Refuse a job that was planned with other code than this process has: its artefact would have the wrong key."""
+    take_over(job.found)
     stage = job.stage
     stages = [stage.stage_of(number) for number in batch.numbers] if isinstance(stage, ItemwiseStage) else [stage]
     # Each once: stages reach the same plugins through many of their inputs.
-    used = dict.fromkeys(plugin for one in {one.key: one for one in stages}.values() for plugin in one.plugins())
+    used = dict.fromkeys(plugin for one in {one.key: one for one in stages}.values() for plugin in one.plugins)
     changed = [f"the {plugin}" for plugin in used if plugin.as_installed() != plugin]
     if job.code != code_here():
         changed.insert(0, "vibench or one of the libraries")
@@ -155,16 +171,17 @@ def _begun(stage: ItemwiseStage, store: Store) -> Items:
     return _last[stage.key]
 
 
-def _done(job: Job, items: Items, batch: Batch, send: Send) -> dict[int, Any]:
+def _done(job: Job, items: Items, batch: Batch, send: Send, enter: Enter) -> dict[int, Any]:
     """The values of the items of a batch, which are done here."""
     done = {}
     for number in batch.numbers:
 
         def watch(on: bool, number: int = number) -> None:
-            send(InItem(number, on))
+            enter(number, on)
 
         watch(False)
         value = _guarded(job.memory_gib, partial(items.item, number, watch))
+        watch(False)  # what has failed has not said so
         done[number] = items.lost(number, value) if isinstance(value, Failed) else value
         send(ItemDone(number, done[number]))
     return done

@@ -156,19 +156,18 @@ class Stage(ABC):
     def _fields(self) -> dict[str, Any]:
         return {part.name: getattr(self, part.name) for part in fields(self)}  # type: ignore[arg-type]
 
-    def plugins(self) -> Iterator[Plugin]:
-        """The plugins that the stage and its inputs depend on."""
-        for value in self._fields().values():
-            plugin = value.sampling if isinstance(value, ParameterSet) else value
-            if isinstance(plugin, Plugin):
-                yield plugin
-        for stage in self.inputs():
-            yield from stage.plugins()
+    @cached_property
+    def plugins(self) -> tuple[Plugin, ...]:
+        """The plugins that the stage and its inputs depend on, each once."""
+        values = self._fields().values()
+        named = [value.sampling if isinstance(value, ParameterSet) else value for value in values]
+        own = [value for value in named if isinstance(value, Plugin)]
+        return tuple(dict.fromkeys([*own, *(plugin for stage in self.inputs() for plugin in stage.plugins)]))
 
     @cached_property
     def packages(self) -> frozenset[str]:
         """Distributions of third parties whose code the stage runs; it shares no process with that of others."""
-        return frozenset(plugin.registered.package for plugin in self.plugins()) - {""}
+        return frozenset(plugin.registered.package for plugin in self.plugins) - {""}
 
     def inputs(self) -> tuple[Stage, ...]:
         """Stages whose artefacts `run` reads itself, by default those among the fields; theirs are not repeated."""

@@ -271,7 +271,7 @@ def gather(store: Store, chunks: tuple[Stage, ...]) -> TimedSnapshots:
     Raises a `NumericalError` if the problem was assembled otherwise for a chunk than it is in this process.
     """
     parts = [value_of(store, chunk) for chunk in chunks]
-    (problem,) = {plugin for chunk in chunks for plugin in chunk.plugins() if plugin.kind is PROBLEM}
+    (problem,) = {plugin for chunk in chunks for plugin in chunk.plugins if plugin.kind is PROBLEM}
     with faults_of(problem):
         here = fingerprint_here(problem)
         for deviation in (text for part in parts for text in part.fingerprint.deviations(here)):

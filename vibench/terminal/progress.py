@@ -144,7 +144,7 @@ class TimeLeft:
 
 
 def _sort(stage: Stage) -> _Sort:
-    return next((plugin for plugin in stage.plugins() if plugin.kind is PROBLEM), None), stage.sort
+    return next((plugin for plugin in stage.plugins if plugin.kind is PROBLEM), None), stage.sort
 
 
 def duration(seconds: float) -> str:

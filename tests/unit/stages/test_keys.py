@@ -112,7 +112,7 @@ def is_carrier(module: str) -> bool:
 def modules_behind(stage: Stage) -> Set[str]:
     """The modules whose code is in the key of a stage, by its own code or by that of its plugins."""
     roots = stage.code() or CELL
-    plugins = {plugin.registered.reference for plugin in stage.plugins()}
+    plugins = {plugin.registered.reference for plugin in stage.plugins}
     used = (modules_used(reference, whole=True) for reference in plugins)
     return modules_used(*roots, whole=roots is CELL).union(*used)
 
