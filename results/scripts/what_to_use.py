@@ -128,13 +128,16 @@ def which_solver(results: Results) -> str:
     """Which QP solver at which accuracy."""
     table = solvers(results)
     fine = table[table["all"]]
-    first = fine.drop_duplicates("accuracy")
-    answers = [f"{row['solver']} at {row['accuracy']} ({number(row['mean'])} times the fastest of each model in the "
-               f"mean, {row['seconds, in those of the fastest']} over all)" for _, row in first.iterrows()]  # fmt: skip
+    first = fine.drop_duplicates("accuracy").groupby(["solver", "seconds, in those of the fastest"], sort=False)
+    answers = [
+        f"{solver} at {', '.join(rows['accuracy'])} ({seconds} times the seconds of the fastest solver of a model)"
+        for (solver, seconds), rows in first
+    ]
     failed = table[~table["all"]]
     return question(
         "Which solver, at which accuracy?",
-        f"Of the solvers that solve every query: {'; '.join(answers)} ([solvers](../results/solvers/README.md)).",
+        f"Of the solvers that solve every query, the fastest in the mean: {'; '.join(answers)} "
+        "([solvers](../results/solvers/README.md)).",
         "these are small dense programs. Not every query is solved by "
         + "; ".join(
             f"{', '.join(group['solver'])} at {accuracy}" for accuracy, group in failed.groupby("accuracy", sort=False)
