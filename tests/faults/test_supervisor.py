@@ -335,11 +335,14 @@ def test_a_worker_does_not_outlive_its_supervisor(tmp_path: Path) -> None:
     assert not sleepers(seconds)
 
 
-def test_an_operation_that_raised_has_no_limit_afterwards(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_operation_that_raised_has_no_limit_afterwards(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(supervisor, "GRACE", 0.1)
-    found = run(InItems(("fine", "interrupt"), at_end="second"), query=0.2)
+    found = run(InItems(("fine", "interrupt"), at_end=f"linger {tmp_path / 'diary'}"), query=1.0)
     assert isinstance(found, Done)
     assert found.value[1][1].status is Status.ERROR
+    assert (tmp_path / "diary").read_text() == "begun\n"  # by one process, none was stopped and replaced
 
 
 def test_the_current_item_is_what_the_worker_noted_last(tmp_path: Path) -> None:

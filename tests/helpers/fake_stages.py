@@ -40,8 +40,8 @@ def misbehave(how: str) -> None:
         np.ones(2**36)
     elif how == "third":
         SHARE.get()(1.0 / 3.0)
-    elif how in ("moment", "second"):
-        time.sleep(0.05 if how == "moment" else 1.0)
+    elif how == "moment":
+        time.sleep(0.05)
     else:
         start(*how.split())
 
@@ -53,11 +53,18 @@ def meet(diary: Path) -> None:
 
 
 def start(kind: str = "", *seconds: str) -> None:
-    """Start a process that would outlive its parent; a daemon is in a session of its own, and soon nobody's child."""
+    """Start a process that would outlive its parent; a daemon is in a session of its own, and soon nobody's child.
+
+    Or "linger", after a note in a diary, the file that is given in place of seconds.
+    """
     if kind == "child":
         subprocess.Popen(["sleep", *seconds])
     elif kind == "daemon":
         subprocess.run(["sh", "-c", f"setsid sleep {seconds[0]} >/dev/null 2>&1 &"], check=True)
+    elif kind == "linger":
+        with Path(seconds[0]).open("a") as diary:
+            diary.write("begun\n")
+        time.sleep(2.0)
 
 
 @dataclass(frozen=True)
