@@ -153,7 +153,7 @@ class CondensedStiffness:
     def liftings(self, B: SparseMatrix) -> Array:
         """B Ŝ⁻¹ (m×c) for rows B (m×c) of the retained unknowns."""
         if self._condensed.dense:
-            return np.asarray(B @ self._compliance)
+            return np.asarray(B @ self.inverse)
         if len(self.retained) <= min(FEW_RETAINED, 2 * B.shape[0]):  # LAPACK inverts in less time than that takes
             return np.asarray(B @ dense_inverse(self._condensed.dense_schur, "A"))
         return np.ascontiguousarray(self._schur_factor.solve(B.toarray().T).T)
@@ -178,8 +178,8 @@ class CondensedStiffness:
         return SparseCholesky(self._condensed.schur, "A")
 
     @cached_property
-    def _compliance(self) -> Array:
-        """Ŝ⁻¹ (c×c)."""
+    def inverse(self) -> Array:
+        """Ŝ⁻¹ (c×c), of which liftings are products where Ŝ is dense."""
         return self._blocks.toarray()
 
     @cached_property

@@ -138,7 +138,7 @@ class OnContact:
         return self.B.astype(np.longdouble)
 
     @cached_property
-    def _compliance(self) -> Array:
+    def compliance(self) -> Array:
         """K (m×m), not symmetrised: what forces displace is to the last digit what B says of it."""
         return np.asarray(self.B @ self.liftings.T)
 
@@ -151,7 +151,7 @@ class OnContact:
         """‖Bᵀη‖ in A⁻¹ of a multiplier η (m,): from K alone, where it is computed."""
         if not self.is_dense:
             return self.of_force(multiplier).norm
-        return float(np.sqrt(max(float(multiplier @ (self._compliance @ multiplier)), 0.0)))
+        return float(np.sqrt(max(float(multiplier @ (self.compliance @ multiplier)), 0.0)))
 
     def _displaced(self, multiplier: Array) -> Array:
         """D η (c,) of a multiplier η (m,)."""
@@ -218,9 +218,9 @@ class OnContact:
     def _compliance_of(self, rows: Indices) -> Array:
         """K in some rows (k,), of which all are computed only where they are asked for."""
         if len(rows) == self.B.shape[0]:
-            return self._compliance
-        if "_compliance" in vars(self):
-            return self._compliance[np.ix_(rows, rows)]
+            return self.compliance
+        if "compliance" in vars(self):
+            return self.compliance[np.ix_(rows, rows)]
         return np.asarray(self.B[rows] @ self.liftings[rows].T)
 
 

@@ -129,7 +129,10 @@ class Assemblies:
         if not on.is_dense:
             return energy_inf_sup(vi.A, vi.B, W)
         if stiffness.has_known_round_off:
-            return self._contact_at(mu).energy_inf_sup(on.B, on.liftings, W)
+            known = self._contact_at(mu)
+            if known.has_inverse:
+                return known.of_inverse(on.B, on.compliance, W)
+            return known.energy_inf_sup(on.B, on.liftings, W)
         contact = ContactInfSup(vi.A, vi.A.diagonal(), 0.0, stiffness.extend)
         return contact.energy_inf_sup(vi.B, on.liftings, W)
 
@@ -139,7 +142,8 @@ class Assemblies:
             stiffness, squares = self.energy_at(mu).stiffness, self.at(mu).A.diagonal()
             schur, round_off = stiffness.schur_with_round_off(squares)
             lost = round_off / share if (share := self._share_at(mu)) > 0.0 else np.inf
-            self._contact = ContactInfSup(schur, squares[stiffness.retained], lost)
+            inverse = stiffness.inverse if stiffness.dense and "A" in self._problem.constant else None
+            self._contact = ContactInfSup(schur, squares[stiffness.retained], lost, inverse=inverse)
         return self._contact
 
     def _share_at(self, mu: Array) -> float:

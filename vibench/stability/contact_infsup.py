@@ -19,6 +19,9 @@ out (Rump 2006). Products of matrices have bounded round-off (Higham 2002, §3.5
 
 The same with A in place of Ŝ, all unknowns in place of c and δ = 0 takes nothing for granted of who computed D.
 
+Where A is constant and B is not, R is not computed anew: for a computed Ĉ ≈ Ŝ⁻¹ and E = I − ŜĈ, D = ĈBᵀ has R = EBᵀ,
+and the columns of S D and S⁻¹R are at most the sums of those of SĈ and S⁻¹E with weights |B|. A new B costs K alone.
+
 Where B = θX_W, of one multiplier for each unknown of c, B Ŝ⁻¹Bᵀ ≽ b² X_W means θ² X_W ≽ b² Ŝ, and D = τI, τ = b²/θ, is
 enough: BD + DᵀBᵀ − DᵀŜD = τ(B + Bᵀ) − τ²Ŝ ≽ b² X_W just for these b. Nothing is dense there, where Ŝ is sparse, and the
 largest of these b is θ over the root of the largest eigenvalue of Ŝ against X_W.
@@ -27,6 +30,7 @@ largest of these b is θ over the root of the largest eigenvalue of Ŝ against X
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -59,6 +63,10 @@ def multiple_of(B: SparseMatrix, W: InnerProduct) -> float:
     return theta if abs(B - theta * W.matrix).max() <= PROPORTIONAL * abs(B).max() else 0.0
 
 
+Products = tuple[Array, Array, Array]
+"""K (m×m), and bounds of the norms (m,) of the columns of S D and of S⁻¹R, with the round-off in what is computed."""
+
+
 class ContactInfSup:
     """Lower bounds of β_A for constraints with one A.
 
@@ -72,6 +80,8 @@ class ContactInfSup:
         δ/σ; 0 for A.
     extend
         From liftings (·, k) on the unknowns that constraints involve to columns (c, k) of D; for A these are more.
+    inverse
+        Ĉ (c×c), symmetric, where `of_inverse` is used.
     """
 
     def __init__(
@@ -80,8 +90,10 @@ class ContactInfSup:
         squares: Array,
         lost: float,
         extend: Callable[[Array], Array] = np.asarray,
+        inverse: Array | None = None,
     ) -> None:
         self._schur, self._scale, self._lost, self._extend = schur, np.sqrt(squares), lost, extend
+        self._inverse = inverse
         # the largest row sum of S⁻¹|Ŝ|S⁻¹, which bounds its norm, and the terms of an inner product with Ŝ
         parts = schur.blocks if isinstance(schur, BlockDiagonal) else ((np.arange(len(squares)), schur),)
         sums = [np.max((abs(part) @ (1.0 / self._scale[c])) / self._scale[c], initial=0.0) for c, part in parts]
@@ -90,11 +102,35 @@ class ContactInfSup:
 
     def energy_inf_sup(self, B: SparseMatrix, liftings: Array, W: InnerProduct) -> Constant:
         """Lower bound of β_A for B (m×c), from liftings (m×·) that `extend` makes Dᵀ; 0 where no other is proved."""
+        return self._proved(B, W, lambda: self._products(sp.csr_array(B), liftings))
+
+    @property
+    def has_inverse(self) -> bool:
+        """Whether `of_inverse` can be used."""
+        return self._inverse is not None
+
+    def of_inverse(self, B: SparseMatrix, compliance: Array, W: InnerProduct) -> Constant:
+        """The same from the compliance (m×m) that is computed as B(BĈ)ᵀ, the products row by row."""
+
+        def products() -> Products:
+            (lifted, residuals), weights = self._of_inverse, abs(sp.csr_array(B))
+            lifted, residuals = weights @ lifted, weights @ residuals
+            return compliance, lifted, residuals + _gamma(_most_entries(B) + 4) * self._norm * lifted
+
+        return self._proved(B, W, products)
+
+    @cached_property
+    def _of_inverse(self) -> tuple[Array, Array]:
+        """The norms (c,) of the columns of SĈ and of S⁻¹E."""
+        assert self._inverse is not None
+        return self._products(sp.eye_array(len(self._inverse), format="csr"), self._inverse)[1:]
+
+    def _proved(self, B: SparseMatrix, W: InnerProduct, products: Callable[[], Products]) -> Constant:
         if not B.shape[0]:
             return Constant(float("inf"), True)
         if not self._lost <= MOST_LOST:
             return Constant(0.0, True)
-        compliance, lifted, residuals = self._products(sp.csr_array(B), liftings)
+        compliance, lifted, residuals = products()
         if not np.all(np.diag(compliance) > 0.0):
             return Constant(0.0, True)
         sizes = np.sqrt(np.diag(compliance))
@@ -131,8 +167,8 @@ class ContactInfSup:
         found = moved(estimate, -1.0, stable)
         return found if found.proved else None
 
-    def _products(self, B: SparseMatrix, liftings: Array) -> tuple[Array, Array, Array]:
-        """K (m×m), and the norms (m,) of the columns of S D and of S⁻¹R."""
+    def _products(self, B: SparseMatrix, liftings: Array) -> Products:
+        """K, ‖S d_i‖ and ‖S⁻¹r_i‖ of `liftings`."""
         m, scale = B.shape[0], self._scale[:, None]
         compliance, lifted, residuals = np.empty((m, m)), np.empty(m), np.empty(m)
         for columns in (slice(first, first + COLUMNS) for first in range(0, m, COLUMNS)):
@@ -140,18 +176,24 @@ class ContactInfSup:
             compliance[:, columns], lifted[columns] = B @ D, np.linalg.norm(scale * D, axis=0)
             left = np.asarray(B[columns].T.toarray() - self._schur @ D)
             residuals[columns] = np.linalg.norm(left / scale, axis=0)
-        return compliance, lifted, residuals
+        return compliance, lifted, residuals + _gamma(self._terms + 4) * (self._forces(B) + self._norm * lifted)
+
+    def _forces(self, B: SparseMatrix) -> Array:
+        """The norms (m,) of the columns of S⁻¹Bᵀ."""
+        return np.asarray(sp.linalg.norm(sp.csr_array(B / self._scale), axis=1))
 
     def _left_out(self, B: SparseMatrix, lifted: Array, residuals: Array, sizes: Array) -> float:
         """A bound of the norm of DᵀR and of the round-off in K, both in units of t (m,), the roots of diag(K)."""
-        entries = int(np.max(np.diff(sp.csr_array(B).indptr)))
-        forces = sp.linalg.norm(sp.csr_array(B / self._scale), axis=1)
-        residuals = residuals + _gamma(self._terms + 4) * (forces + self._norm * lifted)
         # |x_i y_j| and its transpose, by whose mean each entry is bounded, have at most the norm |x||y|
         of_products = np.linalg.norm(lifted / sizes) * np.linalg.norm(
-            (residuals + _gamma(entries + 4) * forces) / sizes
+            (residuals + _gamma(_most_entries(B) + 4) * self._forces(B)) / sizes
         )
         return 1.01 * float(of_products + 8.0 * UNIT * len(sizes))
+
+
+def _most_entries(B: SparseMatrix) -> int:
+    """The number of entries of a row that has most."""
+    return int(np.max(np.diff(sp.csr_array(B).indptr)))
 
 
 def _scaled(matrix: SparseMatrix, sizes: Array) -> SparseMatrix:

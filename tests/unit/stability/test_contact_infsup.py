@@ -90,6 +90,33 @@ def test_liftings_on_all_unknowns_prove_it_without_a_factorisation(
         assert found.value == pytest.approx(energy_inf_sup(vi.A, vi.B, W).value, rel=1e-6)
 
 
+@pytest.mark.parametrize("angle", [0.3, 0.9])
+def test_a_known_inverse_proves_it_from_the_compliance_alone(angle: float) -> None:
+    """As closely as by residuals of this B where Ĉ is accurate; of an inaccurate one never more than β_A."""
+    vi, W, _ = varying(40)
+    A = sp.csc_array(vi.A)
+    stiffness = CondensedStiffness(A, EliminationPattern.of(A, np.unique(vi.B.indices)))
+    retained = stiffness.retained
+    schur, squares = stiffness.schur_with_round_off(A.diagonal())[0].toarray(), A.diagonal()[retained]
+    rng = np.random.default_rng(0)
+    matrix = np.where(vi.B.toarray()[:, retained] != 0.0, rng.uniform(-1.0, angle, (len(vi.g), len(retained))), 0.0)
+    B, accurate = sp.csr_array(matrix), np.linalg.inv(schur)
+    exact = np.sqrt(scipy.linalg.eigvalsh(B @ accurate @ B.T.toarray(), W.matrix.toarray())[0])
+    sizes = np.abs(accurate) * rng.standard_normal(accurate.shape)
+    for size in (0.0, 1e-13, 1e-9, 1e-6, 1e-3):
+        inverse = accurate + 0.5 * size * (sizes + sizes.T)
+        contact = ContactInfSup(sp.csc_array(schur), squares, 0.0, inverse=inverse)
+        liftings = np.asarray(B @ inverse)
+        found, by_liftings = contact.of_inverse(B, B @ liftings.T, W), contact.energy_inf_sup(B, liftings, W)
+        assert found.value <= exact
+        if size <= 1e-13:
+            assert found.proved
+            assert found.value == pytest.approx(by_liftings.value, rel=1e-6)
+    # too soft an inverse gives too large a compliance, which E takes back or refuses
+    contact = ContactInfSup(sp.csc_array(schur), squares, 0.0, inverse=1.01 * accurate)
+    assert contact.of_inverse(B, B @ np.asarray(B @ (1.01 * accurate)).T, W).value <= exact
+
+
 def test_what_a_complement_may_be_too_soft_by_is_taken_from_the_constant() -> None:
     """Ŝ of a matrix P with A ≼ P / (1 − δ/σ), here exactly so: without δ/σ more than β_A would be proved."""
     vi, W, exact = varying(40)
