@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any
 
@@ -32,6 +32,9 @@ DENSE_COLUMNS = 256
 """Number of consecutive longer columns that are multiplied as one dense matrix, on the rows that they have entries in:
 they belong to neighbouring separators, whose rows are nearly the same."""
 
+TOGETHER = 32
+"""Right-hand sides that SuperLU solves at once: of so few the vectors stay in the cache."""
+
 GROUP = 2**18
 """Entries of factors that are compared at once."""
 
@@ -45,6 +48,17 @@ def symmetric_lu(matrix: SparseMatrix, permutation: str) -> SuperLU:
     return splu(
         matrix, permc_spec=permutation, diag_pivot_thresh=0.0, panel_size=panel, options={"SymmetricMode": True}
     )
+
+
+def few_at_once(solve: Callable[[Array], Array], right: Array) -> Array:
+    """The solutions for right-hand sides (n,) or (n, k), `TOGETHER` at most at once."""
+    if right.ndim == 1 or right.shape[1] <= TOGETHER:
+        return np.asarray(solve(right))
+    solved = np.empty(right.shape, order="F")
+    for first in range(0, right.shape[1], TOGETHER):
+        columns = slice(first, first + TOGETHER)
+        solved[:, columns] = solve(np.asfortranarray(right[:, columns], dtype=float))
+    return solved
 
 
 class SparseCholesky:
@@ -96,7 +110,7 @@ class SparseCholesky:
 
     def solve(self, right: Array) -> Array:
         """X⁻¹ r for right-hand sides (n,) or (n, k)."""
-        return np.asarray(self._lu.solve(np.ascontiguousarray(right)))
+        return few_at_once(self._lu.solve, np.ascontiguousarray(right))
 
     def apply_factor(self, u: Array) -> Array:
         """F u, for u (n,) or (n, k)."""
@@ -107,7 +121,7 @@ class SparseCholesky:
         u = np.empty_like(y, dtype=float)
         if y.size:
             scaled = _scale_rows(1.0 / self._root, y)
-            u[self.order] = spsolve_triangular(self._lower.T, scaled, lower=False, unit_diagonal=True)
+            u[self.order] = _triangular_solutions(self._lower.T, scaled, lower=False)
         return u
 
     def solve_factor_transposed(self, right: Array) -> Array:
@@ -115,7 +129,7 @@ class SparseCholesky:
         permuted = np.ascontiguousarray(right[self.order])
         if not permuted.size:
             return permuted
-        return _scale_rows(1.0 / self._root, spsolve_triangular(self._lower, permuted, lower=True, unit_diagonal=True))
+        return _scale_rows(1.0 / self._root, _triangular_solutions(self._lower, permuted, lower=True))
 
 
 class PartialCholesky:
@@ -222,9 +236,9 @@ class PartialCholesky:
         solved = np.ascontiguousarray(right[self.order], dtype=float)
         loading = solved[: self._split].any(axis=0)  # forces of the contact load no eliminated unknown
         if loading.any() and not loading.all():
-            solved[:, loading] = self._lu.solve(np.ascontiguousarray(solved[:, loading]))
+            solved[:, loading] = few_at_once(self._lu.solve, np.ascontiguousarray(solved[:, loading]))
         elif loading.any():
-            solved = np.asarray(self._lu.solve(solved))
+            solved = few_at_once(self._lu.solve, solved)
         return solved[: self._split], solved[self._split :]
 
     def extend(self, last: Array) -> Array:
@@ -233,7 +247,7 @@ class PartialCholesky:
         right[: self._split] = -(self._coupling.T @ last)
         u = np.empty_like(right)
         if right.size:
-            u[self.order] = self._lu.solve(right)
+            u[self.order] = few_at_once(self._lu.solve, right)
         u[self.order[self._split :]] = last
         return u
 
@@ -254,7 +268,7 @@ class PartialCholesky:
         corner, coupling = self._corner_factor, self._coupling_factor.T
         first = _scale_rows(1.0 / self._root, y[:split]) - coupling @ last
         if first.size:
-            u[self.order[:split]] = spsolve_triangular(corner, first, lower=False, unit_diagonal=True)
+            u[self.order[:split]] = _triangular_solutions(corner, first, lower=False)
         return u
 
     def solve_factor_transposed(self, right: Array) -> Array:
@@ -262,7 +276,7 @@ class PartialCholesky:
         right, split = np.ascontiguousarray(right[self.order], dtype=float), self._split
         first, last = right[:split], right[split:]
         if first.any():
-            first = spsolve_triangular(self._corner_factor.T, first, lower=True, unit_diagonal=True)
+            first = _triangular_solutions(self._corner_factor.T, first, lower=True)
             first = _scale_rows(1.0 / self._root, first)
             last = last - self._coupling_factor @ _scale_rows(self._root, first)
         if last.size:
@@ -358,6 +372,11 @@ def _rows_of(matrix: SparseMatrix, rows: slice, columns: int) -> SparseMatrix:
     inside = slice(int(pointers[0]), int(pointers[-1]))
     entries = matrix.data[inside], matrix.indices[inside], pointers - pointers[0]
     return sp.csr_array(entries, shape=(rows.stop - rows.start, columns))
+
+
+def _triangular_solutions(factor: SparseMatrix, right: Array, *, lower: bool) -> Array:
+    """The solutions with a factor of unit diagonal (n×n) for right-hand sides (n,) or (n, k)."""
+    return few_at_once(lambda r: spsolve_triangular(factor, r, lower=lower, unit_diagonal=True), right)
 
 
 def _scale_rows(factors: Array, values: Array) -> Array:

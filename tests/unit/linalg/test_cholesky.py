@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numerics import spd
 
 from vibench.errors import NumericalError
-from vibench.linalg.cholesky import PartialCholesky, SparseCholesky, elimination_order
+from vibench.linalg.cholesky import TOGETHER, PartialCholesky, SparseCholesky, elimination_order
 
 
 @given(st.integers(0, 10_000))
@@ -27,6 +27,22 @@ def test_the_factor_is_upper_triangular_in_its_order_and_gives_the_matrix(seed: 
     assert np.allclose(factor.solve(r), np.linalg.solve(X, r))
     assert np.allclose(factor.solve_factor(r), np.linalg.solve(F, r))
     assert np.allclose(factor.solve_factor_transposed(r), np.linalg.solve(F.T, r))
+
+
+@pytest.mark.parametrize("columns", [TOGETHER - 1, TOGETHER, TOGETHER + 1, 2 * TOGETHER + 3])
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_many_right_hand_sides_are_solved_as_few_are(columns: int, order: str) -> None:
+    rng = np.random.default_rng(columns)
+    X, r = spd(9, rng), np.asarray(rng.standard_normal((9, columns)), order=order)
+    whole, partial = SparseCholesky(sp.csc_array(X)), PartialCholesky(sp.csc_array(X), np.arange(9), 2)
+    F, F_partial = whole.apply_factor(np.eye(9)), partial.apply_factor(np.eye(9))
+    assert np.allclose(whole.solve(r), np.linalg.solve(X, r))
+    assert np.allclose(whole.solve_factor(r), np.linalg.solve(F, r))
+    assert np.allclose(whole.solve_factor_transposed(r), np.linalg.solve(F.T, r))
+    assert np.allclose(partial.eliminate(r)[0], np.linalg.solve(X[:7, :7], r[:7]))
+    assert np.allclose(partial.extend(r[:2]), np.vstack([-np.linalg.solve(X[:7, :7], X[:7, 7:] @ r[:2]), r[:2]]))
+    assert np.allclose(partial.solve_factor(r), np.linalg.solve(F_partial, r))
+    assert np.allclose(partial.solve_factor_transposed(r), np.linalg.solve(F_partial.T, r))
 
 
 def partly_eliminated(seed: int, count: int, bodies: bool) -> tuple[np.ndarray, np.ndarray, PartialCholesky]:
