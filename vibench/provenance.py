@@ -12,7 +12,7 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
 
-PROTOCOL = "3"
+PROTOCOL = "4"
 """Version of the benchmark: what is measured, and how seconds are. Results say by which they were measured.
 
 It changes with every change after which seconds, or the meaning of a number, can no longer be compared with earlier

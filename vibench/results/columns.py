@@ -208,7 +208,9 @@ CELLS: Mapping[str, Column] = {
     "timed_rounds": integer("Rounds that were timed: they end when all comparisons of the cell are decided."),
     "timing_reason": text("Why rounds are missing."),
     "hf_setup_s": real(
-        "s", "Set-up of the high-fidelity solver, once: the time by which the first solution exceeds its repetition."
+        "s",
+        "Set-up of the high-fidelity solver, once: the time by which the first solution exceeds its repetition from a "
+        "known contact set.",
     ),
     "hf_s": real(
         "s",

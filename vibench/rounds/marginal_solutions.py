@@ -50,8 +50,10 @@ def _solver_of(problem: Problem) -> HighFidelitySolver:
 class MarginalSolutions:
     """Solutions of a problem at its validation parameters, after the set-up.
 
-    Each starts from the contact set of the nearest parameter before its own in the same part of the sweep, as that
-    does, and is solved at a parameter next to its own. The first one in a process does the set-up.
+    Each starts from the contact set of the nearest parameter before its own in the same part of the sweep, the first
+    one of a part from that of the nearest after it: to start from none, which takes several times as long, happens
+    once, however many solutions follow, and is part of the set-up. Each is solved at a parameter next to its own. The
+    first one in a process does the set-up.
     """
 
     def __init__(self, problem: Problem, reference: TimedSnapshots, seed: int) -> None:
@@ -131,14 +133,18 @@ class SolutionsBeside:
         return Seconds(share * sum(s.cpu for _, s in right), share * sum(s.wall for _, s in right))
 
 
-def _starts(problem: Problem, reference: TimedSnapshots) -> Iterator[Mask | None]:
-    """The contact set (m,) that each solution of the sweep starts from; `None` for the first ones of its parts."""
+def _starts(problem: Problem, reference: TimedSnapshots) -> Iterator[Mask]:
+    """The contact set (m,) that each solution starts from: that of the nearest before it in its part of the sweep.
+
+    The first of a part starts from that of the nearest after it, or from its own where it is the only one.
+    """
     box = problem.parameters
     width = np.maximum(box.upper - box.lower, np.finfo(float).tiny)
     for first, end in pairwise(chunk_edges(len(reference.mu))):
         for k in range(first, end):
-            distances = np.linalg.norm((reference.mu[first:k] - reference.mu[k]) / width, axis=1)
-            yield reference.lam[:, first + int(np.argmin(distances))] > 0.0 if k > first else None
+            others = slice(first, k) if k > first else slice(min(first + 1, end - 1), end)
+            distances = np.linalg.norm((reference.mu[others] - reference.mu[k]) / width, axis=1)
+            yield reference.lam[:, others][:, int(np.argmin(distances))] > 0.0
 
 
 def parts_alike(seconds: Sequence[float], parts: int) -> tuple[tuple[int, ...], ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -54,7 +54,7 @@ class TimedSnapshots(Snapshots):
     seconds: tuple[Seconds, ...]
     """Seconds per solution, assembly included and set-up excluded: the median of repeats at validation parameters."""
     setups: tuple[Seconds, ...]
-    """Seconds of the set-up, once per chunk: what the first solution took beyond its repetition from the same start."""
+    """Seconds of the set-up, once per chunk: what the first solution took beyond its repetition from a known start."""
     fallbacks: tuple[str, ...]
     """Fallbacks of the active set method per solution, "" where it needed none."""
     fingerprint: Fingerprint
@@ -71,6 +71,11 @@ class _SetUp:
 
     solver: HighFidelitySolver | None = None
     seconds: Seconds | None = None
+
+    def done(self, solver: HighFidelitySolver, seconds: Seconds) -> None:
+        """The set-up is that of the first chunk; the others have none."""
+        if self.seconds is None:
+            self.solver, self.seconds = solver, seconds
 
 
 @lru_cache(maxsize=1)
@@ -139,16 +144,13 @@ class SnapshotStage(Stage):
             with explained(mu, vi):
                 return vi, solver.solve_assembled(mu, vi)
 
+        solutions: list[ActiveSetSolution] = []
         for k, mu in enumerate(mus):
-            near = (nearby(problem.parameters, mu, self.parameters.seed, k, repeat) for repeat in itertools.count())
-            if kept.seconds is None:  # with the set-up; what it costs without is measured next to it
-                (vi, unverified), beginning = timed(partial(solve, mu))
-                _, marginal = self._measure(solve, near)
-                kept.solver, kept.seconds = solver, beginning.beyond(marginal)
-            else:
-                (vi, unverified), marginal = self._measure(solve, itertools.chain([mu], near))
-            seconds.append(marginal)  # verification, which is what follows, is not timed
-            if k == 0 or self.parameters.role != "training":
+            # the first one without repetitions: what it takes from a known start is measured in the end
+            repeated = itertools.chain([mu], self._near(problem, mu, k))
+            (vi, unverified), taken = self._measure(solve, repeated, self._runs if k else 1)
+            seconds.append(taken)  # verification, which is what follows, is not timed
+            if self._runs > 1:
                 vi = checked_assembly(problem, mu)  # repetitions at other parameters may have written into its arrays
             with explained(mu, vi):
                 solution = solver.verify(mu, vi, unverified)
@@ -156,9 +158,13 @@ class SnapshotStage(Stage):
                 solver.check_coercive(mu, vi)
             reference.refuse_false_constants(mu, vi)
             solver.remember(mu, solution)
+            solutions.append(solution)
             u[:, k], lam[:, k] = solution.u, solution.lam
             fallbacks.append(solution.fallback)
             SHARE.get()((k + 1) / len(mus))
+        if solutions:
+            beginning, seconds[0] = seconds[0], self._once_started(problem, solver, solve, solutions, mus)
+            kept.done(solver, beginning.beyond(seconds[0]))
         reference.refuse_rewritten_constants()
         refuse_shifted()
         setups = () if kept.seconds is None else (kept.seconds,)
@@ -175,16 +181,37 @@ class SnapshotStage(Stage):
             except NumericalError as error:
                 raise NumericalError(f"at mu = {mu.tolist()}: {error}") from error
 
-    def _measure(self, work: Callable[[Array], T], mus: Iterator[Array]) -> tuple[T, Seconds]:
-        """A training solution is an offline cost, timed once; of a validation solution the median of a few counts.
+    def _once_started(
+        self,
+        problem: Problem,
+        solver: HighFidelitySolver,
+        solve: Callable[[Array], object],
+        solutions: Sequence[ActiveSetSolution],
+        mus: Array,
+    ) -> Seconds:
+        """Seconds of the first solution from the contact set of the nearest of the others, or from its own without any.
 
-        The result is the one at the first parameter.
+        To start from none takes several times as long, and happens once, however many solutions follow.
         """
+        solver.forget()
+        for mu, solution in list(zip(mus, solutions, strict=True))[min(1, len(solutions) - 1) :]:
+            solver.remember(mu, solution)
+        return self._measure(solve, self._near(problem, mus[0], 0), self._runs)[1]
+
+    @property
+    def _runs(self) -> int:
+        """A training solution is an offline cost, timed once; of a validation solution the median of a few counts."""
+        return 1 if self.parameters.role == "training" else RUNS
+
+    def _near(self, problem: Problem, mu: Array, number: int) -> Iterator[Array]:
+        """Parameters next to one of the chunk."""
+        return (nearby(problem.parameters, mu, self.parameters.seed, number, again) for again in itertools.count())
+
+    def _measure(self, work: Callable[[Array], T], mus: Iterator[Array], runs: int) -> tuple[T, Seconds]:
+        """The result at the first parameter, and the median of runs at so many, or of one that is slow."""
         result, first = timed(partial(work, next(mus)))
-        runs = [first]
-        if self.parameters.role != "training" and first.wall <= SLOW:
-            runs += [timed(partial(work, next(mus)))[1] for _ in range(RUNS - 1)]
-        return result, median_of(runs)
+        rest = range(runs - 1) if first.wall <= SLOW else ()
+        return result, median_of([first, *(timed(partial(work, next(mus)))[1] for _ in rest)])
 
     def _diagnostics(self, problem: Problem, mus: Array, first: int) -> tuple[History, ...]:
         by_quantity: dict[str, list[float]] = {}

@@ -134,7 +134,7 @@ def test_reduced_assembly_is_timed_at_every_query_and_full_assembly_at_as_many_a
 def test_high_fidelity_solutions_start_where_those_of_the_sweep_do(
     store: SampleStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From the contact set of the nearest parameter before, and without any at the first one of a part."""
+    """From the contact set of the nearest parameter before; the first one of a part from that of the nearest after."""
     stage = TimingRounds(CELLS, (EVERY,) * len(CELLS), 1)
     reference = gather(store, stage.solutions)
     starts: list[Any] = []
@@ -144,12 +144,9 @@ def test_high_fidelity_solutions_start_where_those_of_the_sweep_do(
     )
     marginal = MarginalSolutions(PROBLEM.create(), reference, 1)
     assert all(one.seconds and one.seconds.cpu > one.assembly.cpu for one in (marginal.solve(k, 0) for k in EVERY))
-    edges = [0, 2, 3, 4, 6]
-    for k, start in enumerate(starts):
-        before = range(max(edge for edge in edges if edge <= k), k)
-        assert (start is None) == (not before)
-        if start is not None:
-            assert any(np.array_equal(start, reference.lam[:, number] > 0.0) for number in before)
+    sources = [[1], [0], [2], [3], [5], [4]]  # in parts of two, one, one and two
+    for start, numbers in zip(starts, sources, strict=True):
+        assert any(np.array_equal(start, reference.lam[:, number] > 0.0) for number in numbers)
     wrong = replace(reference, u=reference.u[:, ::-1].copy())
     assert MarginalSolutions(PROBLEM.create(), wrong, 1).solve(0, 0).seconds is None
 

@@ -245,6 +245,29 @@ def test_the_set_up_is_no_part_of_the_seconds_of_a_solution(
     np.testing.assert_array_equal(found.value.u, alone.value.u)  # whatever was solved before
 
 
+class Beginning(Factorising):
+    """A solver that takes 5 s more from no contact set than from one, too."""
+
+    def solve_assembled(self, mu: Array, vi: VariationalInequality) -> HighFidelitySolution:
+        Factorising.now += 0.0 if self._solved else 5.0
+        return super().solve_assembled(mu, vi)
+
+
+@pytest.mark.parametrize(("role", "count"), [("training", 0), ("validation", 4), ("validation", 18)])
+def test_to_start_from_no_contact_set_is_a_part_of_the_set_up(
+    role: Literal["training", "validation"], count: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """It happens once, however many solutions follow: the share of parts that start anew falls with their size."""
+    monkeypatch.setattr(snapshots, "HighFidelitySolver", Beginning)
+    monkeypatch.setattr(snapshots, "_set_up", lru_cache(snapshots._set_up.__wrapped__))
+    for clock in ("process_time", "perf_counter"):
+        monkeypatch.setattr(timing, clock, lambda: Factorising.now)
+    for chunk in (1, 0):  # which share the set-up of this process
+        found = SnapshotStage(PROBLEM, ParameterSet(role, count, 3), chunk).run(SampleStore(tmp_path)).value
+        assert found.setups == (Seconds(15.0, 15.0),)
+        assert set(found.seconds) == {Seconds(1.0, 1.0)}
+
+
 def test_a_slow_query_is_a_timeout(store: SampleStore) -> None:
     impatient = replace(cell("decorrelated", None), query_seconds=1e-9)
     rows = impatient.run(store).value

@@ -215,13 +215,13 @@ class GrowingTrainer(Trainer):
             return vi, self._solver.solve_assembled(mu, vi)
 
         (vi, unverified), seconds = timed(work)
-        if not self.solved:
-            _, marginal = timed(work)
-            self.setup, seconds = seconds.beyond(marginal), marginal
         solution = self._solver.verify(mu, vi, unverified)  # as what follows, this is not timed
         self._solver.check_coercive(mu, vi)
         self._reference.refuse_false_constants(mu, vi)
         self._solver.remember(mu, solution)
+        if not self.solved:  # without a start, which later ones have; with one it is a solution like those
+            (vi, _), marginal = timed(work)
+            self.setup, seconds = seconds.beyond(marginal), marginal
         note, growing = timed(lambda: self._model.add(vi, solution))
         fallback = "; ".join(filter(None, (solution.fallback, note)))
         self.solved.append(Solved(mu, solution, seconds, bound, self._evaluated, fallback))
