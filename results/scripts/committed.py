@@ -38,6 +38,14 @@ class Results:
         return {problem: self.table(f"paper-{problem}") for problem in PROBLEMS}
 
     @cached_property
+    def full(self) -> dict[str, pd.DataFrame]:
+        """The cells of that study and of `benefit` in full assembly, by problem, with the study."""
+        benefit = self.table("benefit").assign(study="benefit")
+        every = pd.concat([benefit, *(cells.assign(study="paper") for cells in self.papers.values())])
+        full = every[every["assembly"] == "full"]
+        return {problem: full[full["problem"] == problem] for problem in PROBLEMS}
+
+    @cached_property
     def gains(self) -> pd.DataFrame:
         """The models of `benefit` against the high-fidelity model: errors, gains, break-evens, with intervals."""
         against = self.against("benefit")[["cell_b", *GAINS]]
@@ -97,11 +105,11 @@ def when(row: pd.Series) -> str:
 
 
 def enriched(cells: pd.DataFrame, error: str) -> pd.Series:
-    """The mean error without enrichment over that with one, for every enriched model in full assembly."""
-    table = cells[cells["assembly"] == "full"]
-    plain = table[table["primal"] == "decorrelated"].set_index(CONE)[error]
-    others = table[table["primal"] != "decorrelated"].set_index(CONE)
-    return plain.reindex(others.index) / others[error]
+    """The mean error without enrichment over that with one, for every enriched model of a study."""
+    table = cells.set_index(["study", *CONE])
+    is_plain = table["primal"] == "decorrelated"
+    others = table[~is_plain]
+    return table.loc[is_plain, error].reindex(others.index) / others[error]
 
 
 def unavailable(cells: pd.DataFrame) -> str:

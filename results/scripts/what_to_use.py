@@ -20,6 +20,11 @@ def question(heading: str, answer: str, fails: str, *more: str) -> str:
     return "\n\n".join([f"## {heading}", answer, f"*Where this fails:* {fails}", *more])
 
 
+def break_even(offline: pd.Series, online: pd.Series) -> pd.Series:
+    """From how many queries on more seconds offline are made up for by fewer in a query; empty where they are not."""
+    return (offline / online).where(online > 0.0).clip(lower=0.0)
+
+
 def enrich(results: Results) -> str:
     """Enrich or not, and which enrichment."""
     pairs = pd.concat(
@@ -27,17 +32,19 @@ def enrich(results: Results) -> str:
     )
     pairs = pairs[pairs["cell_a"].notna() & (pairs["assembly_a"] == pairs["assembly_b"])]
     compared = [
-        f"{how} assembly {span(mine['gain'])} ({p}; surely above 1 in {surely_above_one(mine)})"
+        f"{how} assembly {span(mine['gain'])} ({p}; the interval is above 1 in {surely_above_one(mine)}, below 1 in "
+        f"{of(int((mine['gain_high'] < 1.0).sum()), len(mine))})"
         for (how, p), mine in pairs.groupby(["assembly_a", "problem"], sort=False)
         if how in ("full", "reduced")
     ]
-    worse = {p: enriched(cells, "error_u_mean") for p, cells in results.papers.items()}
+    worse = {p: enriched(cells, "error_u_mean") for p, cells in results.full.items()}
     return question(
         "Enrich or not?",
-        f"With mCPG, enrich offline: it divides the error of λ by {_factor(results, 'mcpg')}. "
+        f"With mCPG, enrich offline: it divides the error of λ, in the norm of W, by {_factor(results, 'mcpg')}. "
         f"The seconds of a query with online supremizers are those of one with a fixed enrichment times: "
         f"{'; '.join(compared)} ([paper-obstacle](../results/paper-obstacle/README.md), "
         "[paper-hertz](../results/paper-hertz/README.md), [benefit](../results/benefit/README.md)).",
+        "a ratio below 1 says that the enrichment with its many vectors is slower than the few supremizers of a query; "
         f"with CPG the factor is {_factor(results, 'cpg')}, so that there may be nothing to gain; the error of u "
         "becomes larger in "
         + " and ".join(f"{of(int((w < 1.0).sum()), len(w))} models ({p})" for p, w in worse.items())
@@ -47,7 +54,7 @@ def enrich(results: Results) -> str:
 
 
 def _factor(results: Results, dual: str) -> str:
-    by = {p: enriched(cells[cells["dual"] == dual], "error_lambda_mean") for p, cells in results.papers.items()}
+    by = {p: enriched(cells[cells["dual"] == dual], "error_lambda_mean") for p, cells in results.full.items()}
     return " and ".join(f"{span(values)} ({p})" for p, values in by.items())
 
 
@@ -138,7 +145,7 @@ def which_solver(results: Results) -> str:
         "Which solver, at which accuracy?",
         f"Of the solvers that solve every query, the fastest in the mean: {'; '.join(answers)} "
         "([solvers](../results/solvers/README.md)).",
-        "these are small dense programs. Not every query is solved by "
+        f"these are small dense programs. {_default(table)} Not every query is solved by "
         + "; ".join(
             f"{', '.join(group['solver'])} at {accuracy}" for accuracy, group in failed.groupby("accuracy", sort=False)
         )
@@ -146,6 +153,13 @@ def which_solver(results: Results) -> str:
         "Seconds of the solver alone; the column mean is geometric, over the models in which all queries are ok:",
         formats.to_markdown(table.drop(columns="all")).strip(),
     )
+
+
+def _default(table: pd.DataFrame) -> str:
+    """What the solver of most other pages takes."""
+    mine = table[(table["solver"] == "piqp") & table["all"]]
+    said = ", ".join(f"{row['seconds, in those of the fastest']} ({row['accuracy']})" for _, row in mine.iterrows())
+    return f"Most other pages use piqp, which takes {said} times the seconds of the fastest."
 
 
 def which_assembly(results: Results) -> str:
@@ -161,12 +175,18 @@ def which_assembly(results: Results) -> str:
         if mine["gain"].isna().all()
     ]
     slow = gains[(gains["assembly"] == "full") & (gains["gain_high"] < 1.0)]
+    models = gains.set_index([*MODEL, "assembly"])[["offline_s", "online_s"]]
+    program, reduced = (models.xs(how, level="assembly").dropna() for how in ("compiled", "reduced"))
+    reduced = reduced.reindex(program.index)
+    later = break_even(program["offline_s"] - reduced["offline_s"], reduced["online_s"] - program["online_s"])
     return question(
         "Full, reduced or compiled?",
         f"Reduced, compiled where there is a program. Gains against high-fidelity solutions over the models of "
         f"[benefit](../results/benefit/README.md), errors unchanged: {said}.",
         f"in full assembly {of(len(slow), int((gains['assembly'] == 'full').sum()))} models are surely slower than "
-        "what they replace; problems with a member that can only be assembled as a whole are assembled in full"
+        f"what they replace; a program takes {span(program['offline_s'])} s offline, the model in reduced assembly "
+        f"{span(reduced['offline_s'])} s, so that the program is cheaper from {span(later)} queries on; problems with "
+        "a member that can only be assembled as a whole are assembled in full"
         + ("; there is no C program " + "; ".join(none) if none else "")
         + ".",
     )
@@ -188,8 +208,9 @@ def which_training(results: Results) -> str:
         "Greedy or fixed training?",
         f"Fixed, unless a solution costs much more than here: at equal error, {said} "
         "([certified](../results/certified/README.md)).",
-        f"where solutions take minutes, fewer of them decide; in {of(len(table) - len(equal), len(table))} comparisons "
-        "no greedy model reaches all four errors of the fixed one.",
+        "where a solution takes minutes, the number of solutions decides; in "
+        f"{of(len(table) - len(equal), len(table))} comparisons no greedy model reaches all four errors of the "
+        "fixed one.",
     )
 
 
@@ -210,13 +231,27 @@ def when_not(results: Results) -> str:
         "When not to reduce at all?",
         "For fewer queries than "
         + " and ".join(f"{number(value)} ({p})" for p, value in least.items())
-        + ", the smallest lower end of the intervals of all break-evens with the high-fidelity model, no model pays "
+        + ", the smallest lower end of the intervals of all break-evens with the high-fidelity model, no mixed model "
+        "of these studies pays "
         "([benefit](../results/benefit/README.md), [paper-obstacle](../results/paper-obstacle/README.md), "
         "[paper-hertz](../results/paper-hertz/README.md)).",
-        "seconds are those of small plane problems on one core; high-fidelity solutions start from the nearest contact "
-        "set that is known. `vibench show RUN --table best --queries N` says it for yours.",
+        f"other formulations may pay earlier, from {_formulations(results)} queries on "
+        "([formulations](../results/formulations/README.md)); seconds are those of small plane problems on one core; "
+        "high-fidelity solutions start from the nearest contact set that is known. `vibench show RUN --table best "
+        "--queries N` says it for yours.",
         "| problem | assembly | models | cheaper than high-fidelity solutions | never | as fast or undecided |\n"
         "| --- | --- | --- | --- | --- | --- |\n" + "\n".join(parts),
+    )
+
+
+def _formulations(results: Results) -> str:
+    """From how many queries on the first model of another formulation is cheaper than high-fidelity solutions."""
+    cells = results.table("formulations")
+    cells = cells[(cells["status"] == "ok") & cells["problem"].isin(PROBLEMS) & (cells["formulation"] != "mixed")]
+    queries = break_even(cells["offline_s"] - cells["hf_setup_s"], cells["hf_s"] - cells["online_s"])
+    least = cells.assign(queries=queries).loc[queries.groupby(cells["problem"]).idxmin()]
+    return " and ".join(
+        f"{number(row['queries'])} ({row['problem']}, `{row['formulation']}`)" for _, row in least.iterrows()
     )
 
 
