@@ -5,6 +5,7 @@ python results/scripts/machines.py results results/machines
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pandas as pd
@@ -33,7 +34,8 @@ def main(results: str, target: str) -> None:
         "Both machines decide a row where neither calls it undecided; it is contradicted where one is cheaper on one "
         "machine and dearer on the other, or as fast on one with intervals of the gain that are apart. The number of "
         "queries at break-even and the gain are ratios of seconds, and may be compared; seconds may not. Gains are "
-        "those here over those there: the median over the rows, and the smallest and the largest.",
+        "those here over those there: the median over the rows, and the smallest and the largest. Where the versions "
+        "of the protocol differ, rows with the high-fidelity model are left out: its seconds are not the same.",
     )
     page.section(
         "Numbers without seconds",
@@ -65,6 +67,8 @@ def run(target: str, folder: Path, both: tuple[Tables, Tables]) -> str:
 def compared(folder: Path, here: Tables, there: Tables) -> dict[str, object]:
     """How often verdicts agree, and how gains differ."""
     ours, theirs = here[1], there[1]
+    if protocols(here[0]) != protocols(there[0]):
+        ours, theirs = (table[table["primal_a"] != HIGH_FIDELITY] for table in (ours, theirs))
     found = agreement(ours, theirs)
     row: dict[str, object] = {
         "study": folder.name,
@@ -81,6 +85,11 @@ def compared(folder: Path, here: Tables, there: Tables) -> dict[str, object]:
         ratio = (gains[0] / gains[1]).dropna()
         row[name] = f"{ratio.median():.2f} ({ratio.min():.2f}–{ratio.max():.2f})" if len(ratio) else "–"
     return row
+
+
+def protocols(cells: pd.DataFrame) -> set[str]:
+    """The versions of the protocol by which cells were measured."""
+    return {json.loads(versions)["protocol"] for versions in cells["versions"].dropna().unique()}
 
 
 def numbers(folder: Path, here: Tables, there: Tables) -> dict[str, object]:

@@ -178,6 +178,15 @@ def test_other_machines_are_compared_row_by_row(tmp_path: Path, monkeypatch: pyt
     assert verdicts[4] == "1"  # the one that is contradicted
     assert verdicts[6:] == ["2.00 (2.00–2.00)"] * 2
     assert apart[3:] == ["0.0e+00"] * 4 + ["1.0e-03", "0.0e+00"]
+    # seconds of the high-fidelity model are not those of an earlier protocol
+    cells["versions"] = cells["versions"].str.replace(r'"protocol": "\d+"', '"protocol": "0"', regex=True)
+    cells.to_csv(there / "cells.csv", index=False)
+    importlib.import_module("machines").main(str(tmp_path), str(tmp_path / "machines"))
+    lines = (tmp_path / "machines" / "README.md").read_text(encoding="utf-8").splitlines()
+    verdicts = next([part.strip() for part in line.split("|")[1:-1]] for line in lines if line.startswith("| benefit"))
+    assert verdicts[2] == str(int((rows["primal_a"] != "high-fidelity").sum()))
+    assert verdicts[4] == "0"
+    assert verdicts[6:] == ["–", "2.00 (2.00–2.00)"]
 
 
 def test_the_readme_says_what_a_query_is_compared_with() -> None:
