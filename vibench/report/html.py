@@ -112,7 +112,7 @@ def _page(path: Path, pool: ProcessPoolExecutor | None, *, figures: bool) -> str
         standings=leaderboard(cells, paired),
         criteria=Criterion,
         largest_band=LARGEST_BAND,
-        way=_way,
+        way=way,
         vanishes=VANISHES,
         short=lambda cell: str(cell)[:key_length],
         findings=first,
@@ -170,7 +170,7 @@ def tasks_of(name: str, data: Data) -> Iterator[FigureTask]:
     return figures_of(name, replace(data, extent=Extent.BEGINNING), list(ranked)[:MOST_DUALS])
 
 
-def _way(winner: Winner) -> str:
+def way(winner: Winner) -> str:
     """The model of a cell that wins: its enrichment, cone, dimensions and, where that has a part in it, solver."""
     cell = winner.cell
     if not cell["cell"]:

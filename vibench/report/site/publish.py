@@ -8,8 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from vibench.files import TEMPORARY
 from vibench.provenance import distribution_version
 from vibench.report import html
@@ -20,6 +18,7 @@ from vibench.report.site.citation import Citation, requirements
 from vibench.report.site.identifying import cleaned, left
 from vibench.report.site.published_run import FILTERED, SHOWN_CELLS, PublishedRun, folder_names
 from vibench.results import formats, tables
+from vibench.results.costs.paired_seconds import PairedSeconds
 from vibench.results.costs.ranking import Criterion, Standings, leaderboard
 from vibench.results.plugin_columns import faults_of
 from vibench.results.sqlite.reading import FILE, open_read_only
@@ -89,7 +88,7 @@ def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation, *, figur
     comparisons = {study: compare([run.run.path for run in group], LIMIT) for study, group in _comparable(runs)}
     faults = [line for run in runs for line in _write_run(site / "runs" / run.folder, run, pages, figures)]
     links = {run.run.name: f"runs/{run.folder}/index.html" for run in runs}
-    pages.write(site / "leaderboard.html", "leaderboard", "", boards=list(_boards(runs)), links=links)
+    pages.write(site / "leaderboard.html", "leaderboard", "", boards=list(_boards(runs)), links=links, way=html.way)
     sections = [_section(site, number, *item) for number, item in enumerate(comparisons.items(), start=1)]
     pages.write(site / "comparison.html", "comparison", "", sections=sections, limit=LIMIT)
     filters = {name: sorted({value for run in runs for value in run.values[name]}) for name in FILTERED}
@@ -129,14 +128,11 @@ def _comparable(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, list[Publis
             yield study, comparable
 
 
-def _boards(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, tuple[Standings, ...]]]:
-    """The leaderboards of every machine: seconds are compared within one."""
-    machines = dict.fromkeys(machine for run in runs for machine in run.run.machines)
-    for machine in machines:
-        rows = [
-            row | {"run": run.run.name} for run in runs for row in run.run.cells.values() if row["machine"] == machine
-        ]
-        yield machine, leaderboard(pd.DataFrame(rows))
+def _boards(runs: Sequence[PublishedRun]) -> Iterator[tuple[PublishedRun, tuple[Standings, ...]]]:
+    """The leaderboard of every run: seconds of other runs may have come from a busier machine, or other parameters."""
+    for run in runs:
+        cells, timings = (tables.read(run.run.path, name) for name in ("cells", "timings"))
+        yield run, leaderboard(tables.in_order(cells), PairedSeconds(timings.to_dict("records")))
 
 
 def _section(site: Path, number: int, study: str, comparison: Comparison) -> dict[str, Any]:
