@@ -12,6 +12,7 @@ from typing import Any
 
 from vibench.packs.manifest import Manifest
 from vibench.results.columns import CELLS, PARAMETER, STORED, THRESHOLDS, UNITS, Column, shown_columns
+from vibench.results.costs.best import ADDED
 from vibench.study.described import keys, places
 from vibench.study.spec import Study
 
@@ -64,6 +65,11 @@ def benefits() -> str:
     return _for_reading(THRESHOLDS)
 
 
+def best() -> str:
+    """What the table of the cheapest models has beside columns of the cells."""
+    return _for_reading(ADDED)
+
+
 def _for_reading(table: Mapping[str, Column]) -> str:
     rows = [
         (c.heading, "ms" if c.heading.endswith("[ms]") else c.unit or "–", c.meaning)
@@ -79,9 +85,9 @@ def markdown(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     return "\n".join("| " + " | ".join(text.replace("|", "\\|") for text in row) + " |" for row in cells)
 
 
-GENERATED = {"study": study_fields, "pack": pack_fields, "units": units, "summary": summary, "benefits": benefits} | {
-    table: lambda table=table: columns(table) for table in STORED
-}
+GENERATED = {
+    "study": study_fields, "pack": pack_fields, "units": units, "summary": summary, "best": best, "benefits": benefits,
+} | {table: lambda table=table: columns(table) for table in STORED}  # fmt: skip
 """What may stand in a page, by name."""
 
 PLACE = re.compile(r"<!-- generated: ([\w-]+) -->\n.*?<!-- end: \1 -->", re.DOTALL)

@@ -6,6 +6,7 @@ from collections.abc import Collection
 
 from vibench.errors import unknown_name
 from vibench.results.columns import STORED
+from vibench.results.costs.best import ADDED
 from vibench.study.described import Key, keys, places
 from vibench.study.spec import Study
 
@@ -19,10 +20,11 @@ def meanings(topic: str, commands: Collection[str]) -> list[str]:
         If nothing is called so, with what was probably meant; `commands` are names, too.
     """
     fields = list(keys(Study.model_json_schema()))
-    columns = [(table, name, of) for table, described in STORED.items() for name, of in described.items()]
+    described = {**STORED, "best": ADDED}
+    columns = [(table, name, of) for table, own in described.items() for name, of in own.items()]
     tables: dict[str, list[str]] = {}  # those in which a column means the same, by what is said of it
     for table, name, of in columns:
-        if topic in (name, of.heading):
+        if topic in (name, of.heading, of.heading.partition(" [")[0]):  # also without its unit
             tables.setdefault(f"{name}{f' [{of.unit}]' * bool(of.unit)}, in {{}}: {of.meaning}", []).append(table)
     lines = [_of_key(field) for field in fields if field.name == topic]
     lines += [line.replace("{}", ", ".join(names), 1) for line, names in tables.items()]

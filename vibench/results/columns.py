@@ -514,7 +514,7 @@ THRESHOLDS: Mapping[str, Column] = {
         "1", "Number n* of queries at break-even; empty if there is none, or none is claimed.", "break-even", 20
     ),
     "threshold_low": real("1", "Lower end of the 95 % interval of n*; if undecided, the smallest n*."),
-    "threshold_high": real("1", "Upper end of the 95 % interval of n*.", "interval", 21),
+    "threshold_high": real("1", "Upper end of the 95 % interval of n*; tables for reading show both.", "interval", 21),
     "meaning": text(
         "When b is cheaper than a in total: from n* on, until n*, never or at once; as fast where the seconds of their "
         "queries differ by less than a factor of 1.25; or undecided."

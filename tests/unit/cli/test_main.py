@@ -18,6 +18,7 @@ from samples import STUDY, changed, write_study
 from vibench.cli.plugin_commands import LISTS
 from vibench.qp.settings import SETTINGS
 from vibench.results.columns import CELLS, STORED, TABLES
+from vibench.results.costs.best import ADDED
 from vibench.results.sqlite.reading import FILE
 from vibench.results.tables import read
 from vibench.study import kinds, registry
@@ -425,6 +426,18 @@ def test_help_on_a_column_is_what_it_means(name: str, main: Main) -> None:
     code, out, _ = main("help", name)
     assert code == 0
     assert f"online_s [s], in cells: {CELLS['online_s'].meaning}" in out.splitlines()
+
+
+@pytest.mark.parametrize(
+    "name", ["total_s", "total [s]", "total", "certified error", "cheapest_until", "until", "sure"]
+)
+def test_help_on_a_column_of_a_computed_table_is_its_meaning_there(name: str, main: Main) -> None:
+    code, out, _ = main("help", name)
+    assert code == 0
+    names = {"total [s]": "total_s", "total": "total_s", "sure": "probability"}
+    column = names.get(name, name.replace(" ", "_"))
+    unit = f" [{ADDED[column].unit}]" * bool(ADDED[column].unit)
+    assert f"{column}{unit}, in best: {ADDED[column].meaning}" in out.splitlines()
 
 
 def test_help_on_a_key_of_study_files_is_what_it_means_wherever_it_stands(main: Main) -> None:

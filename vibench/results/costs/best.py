@@ -22,11 +22,14 @@ CERTIFIED_BOUNDS: Mapping[str, str] = {"u_energy": "u", "lambda_natural": "λ"}
 COLUMNS: Mapping[str, Column] = {
     **HEADINGS,
     "total_s": real("s", "Offline seconds and those of the queries.", "total [s]", 24),
-    "total_low_s": real("s", "Lower end of the 95 % interval of this sum."),
-    "total_high_s": real("s", "Upper end of this interval.", "interval [s]", 25),
+    "total_low_s": real(
+        "s", "Lower end of the 95 % interval of this sum, in seconds of a high-fidelity solution as this run measured "
+        "it; the sum of the high-fidelity model has none."
+    ),
+    "total_high_s": real("s", "Upper end of the interval of the total; a table shows both.", "interval [s]", 25),
     "certified_error": real(
-        "1", "Mean over the queries of the larger bound of the relative errors of u and λ, in energy, at online cost; "
-        "empty without a certificate.", "certified error", 22,
+        "1", "Mean over the queries of the larger bound of the relative errors of u and λ, in energy, at online cost, "
+        "of this model; empty if no cell of the run has its certificate.", "certified error", 22,
     ),
     "cheapest_from": real("1", "Number of queries from which it is the cheapest.", "cheapest from", 26),
     "cheapest_until": real("1", "Number of queries until which it is; infinite if for ever.", "until", 27),
@@ -36,6 +39,13 @@ COLUMNS: Mapping[str, Column] = {
     ),
 }  # fmt: skip
 """Columns of the table: those of the cells, and what a number of queries adds to them."""
+
+ADDED: Mapping[str, Column] = {name: column for name, column in COLUMNS.items() if name not in CELLS}
+"""What it has beside those of the cells."""
+
+
+OF_ONE_MODEL = ("model", "correction", "solver", "accuracy")
+"""What cells have in common whose queries have the same solutions, with certificates or without."""
 
 
 class Candidate(NamedTuple):
@@ -91,21 +101,25 @@ def cheapest(
     rows = list[dict[str, Any]]()
     for _, mine in cells[fine].groupby(["problem", "problem_options", "machine"], dropna=False, sort=False):
         levels = reached_errors(measured[mine.index]) if within is None else [within]
-        every = list(candidates(mine, paired))
+        every, bounds = list(candidates(mine, paired)), dict(_of_models(mine, certified))
         for level in levels:
             allowed = {None, *mine["cell"][measured[mine.index] <= level * (1.0 + 1e-12)]}
             row = _winner([one for one in every if one.key in allowed], paired, queries)
-            rows.append(row | {BAND: level, "certified_error": _of(certified, row["cell"])})
+            bound = bounds.get(tuple(row[name] for name in OF_ONE_MODEL))
+            rows.append(row | {BAND: level, "certified_error": bound})
     return pd.DataFrame(_without_repeats(rows), columns=["problem", BAND, *_other_columns(cells)])
 
 
 def _other_columns(cells: pd.DataFrame) -> list[str]:
-    return [*cells.columns.drop("problem"), *(name for name in COLUMNS if name not in CELLS and name != BAND)]
+    return [*cells.columns.drop("problem"), *(name for name in ADDED if name != BAND)]
 
 
-def _of(values: pd.Series | None, cell: str) -> float | None:
-    value = None if values is None else values.get(cell)
-    return None if value is None or pd.isna(value) else float(value)
+def _of_models(cells: pd.DataFrame, certified: pd.Series | None) -> Iterator[tuple[tuple[Any, ...], float]]:
+    """Bounds of mean errors by `OF_ONE_MODEL`: the fastest cell of a model is seldom the one with certificates."""
+    known = {} if certified is None else certified.dropna()
+    for cell, *key in cells[["cell", *OF_ONE_MODEL]].itertuples(index=False):
+        if cell in known:
+            yield tuple(key), float(known[cell])
 
 
 def _without_repeats(rows: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
@@ -119,7 +133,8 @@ def candidates(cells: pd.DataFrame, paired: PairedSeconds) -> Iterator[Candidate
     """The high-fidelity model and the cells of a problem, with total costs at one speed of the machine.
 
     Cells of different groups are timed at different times: seconds of a query are those of a high-fidelity solution,
-    which is timed in all of them, divided by the gain.
+    which is timed in all of them, divided by the gain. These solutions are the unit of all totals: draws are of what
+    the ratios to them may be in other runs, whose machine may be faster or slower as a whole.
     """
     rng, rows = np.random.default_rng(0), [dict(row) for row in cells.to_dict("records")]
     solution = float(np.exp(np.mean(np.log([row["hf_s"] for row in rows]))))
@@ -139,11 +154,11 @@ def _winner(every: Sequence[Candidate], paired: PairedSeconds, queries: float) -
     drawn = np.array([one.offline_draws + queries * one.online_draws for one in every])
     first = int(np.argmin(totals))
     best, others = every[first], [one for k, one in enumerate(every) if k != first]
-    low, high = np.quantile(drawn[first], (TAIL, 1.0 - TAIL))
+    low, high = np.quantile(drawn[first], (TAIL, 1.0 - TAIL)).tolist() if best.key else (None, None)
     begin, end = _cheapest_between(best, others)
     ties = sum(_ties(best, one, paired, queries) for one in others)
     sure = float(np.mean(np.argmin(drawn, axis=0) == first))
-    numbers = {"total_s": float(totals[first]), "total_low_s": float(low), "total_high_s": float(high)}
+    numbers = {"total_s": float(totals[first]), "total_low_s": low, "total_high_s": high}
     between = {"cheapest_from": begin, "cheapest_until": end}
     return {**best.row, "online_s": best.online, **numbers, **between, "probability": sure, "ties": ties}
 

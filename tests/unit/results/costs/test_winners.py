@@ -114,7 +114,10 @@ def test_the_cheapest_models_are_those_of_the_raw_rows(raw: Raw, folder: Path, q
                 totals[cell["cell"]] = cell["offline_s"] + queries * solution / raw.gain(cell["cell"])
         assert row["cell"] == min(totals, key=totals.__getitem__)
         assert row["total_s"] == pytest.approx(min(totals.values()))
-        assert row["total_low_s"] <= row["total_s"] <= row["total_high_s"]
+        if row["cell"]:
+            assert row["total_low_s"] <= row["total_s"] <= row["total_high_s"]
+        else:  # the unit of all totals
+            assert pd.isna([row["total_low_s"], row["total_high_s"]]).all()
         assert row["cheapest_from"] <= queries <= row["cheapest_until"]
         assert 0.0 < row["probability"] <= 1.0
 
@@ -173,6 +176,23 @@ def test_certified_errors_are_means_of_relative_bounds() -> None:
     found = certified_errors(pd.DataFrame(rows))
     assert found["a"] == pytest.approx(0.6)  # of ‖u‖ = 10, beside 0.5 of ‖λ‖ = 2
     assert np.isnan(found["b"])
+
+
+def test_the_certified_error_is_that_of_the_model_whichever_of_its_cells_is_the_cheapest() -> None:
+    """Not of the same model with another solver or corrected, whose solutions are others."""
+    plain = model("reduced", 10.0, 0.1) | {"model": "m1"}
+    certified = model("certified", 12.0, 0.2) | {"model": "m1"}
+    others = [
+        model("corrected", 12.0, 0.2) | {"model": "m1", "correction": "feasible"},
+        model("loose", 12.0, 0.2) | {"model": "m1", "accuracy": 1e-3},
+        model("another", 12.0, 0.2) | {"model": "m2"},
+    ]
+    cells = cells_of(plain, certified, *others)
+    bounds = pd.Series({"certified": 0.02, "corrected": 0.3, "loose": 0.4, "another": 0.5})
+    (row,) = cheapest(cells, timed(cells), 1000, within=1e-2, certified=bounds).to_dict("records")
+    assert (row["cell"], row["certified_error"]) == ("reduced", 0.02)
+    (row,) = cheapest(cells, timed(cells), 1000, within=1e-2, certified=bounds.drop("certified")).to_dict("records")
+    assert pd.isna(row["certified_error"])
 
 
 @pytest.mark.parametrize(
