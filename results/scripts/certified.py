@@ -157,13 +157,11 @@ HEADINGS = {"primal_tol": "δ", "pod_tol": "δ_POD", "dual_tol": "δ_dual"}
 def main(certified: str, training: str, target: str) -> None:
     cells, queries, trained = read(certified, "cells"), read(certified, "queries"), read(training, "cells")
     trained["query [ms]"] = 1e3 * trained["online_s"]
-    counts = [f"{int((frame['disturbed'] == 1).sum())} of {len(frame)}" for frame in (cells, trained)]
     page = Page(
         target,
         "certified",
         made_by("certified", "certified", "certified", "training", options=" --no-figures"),
         SECONDS,
-        f"{counts[0]} cells of `certified` and {counts[1]} of `training` are marked as disturbed.",
         machine=origin(cells, trained),
     )
     page.section(

@@ -2,7 +2,7 @@
 
 python results/scripts/everything.py FOLDER
 
-Runs are kept in FOLDER/runs, pages are written into FOLDER/results and FOLDER/docs. A study that several pages need
+Runs are kept in FOLDER/runs, pages are written into FOLDER/results, FOLDER/docs and FOLDER/README.md. A study that several pages need
 runs once. `--list` as FOLDER prints the commands.
 """
 
@@ -30,6 +30,14 @@ SMALLER = {
 """What writes a page with files that are smaller than those of the command that it names."""
 
 
+CONCLUSIONS = (
+    "python tests/benchmarks/certified.py runs/certified --table results/certified/unseen.csv",
+    "python results/scripts/first_page.py results README.md",
+    "python results/scripts/what_to_use.py results docs/what-to-use.md",
+)
+"""What is made from tables of several pages, in the end."""
+
+
 def main(folder: str) -> None:
     if folder == "--list":
         print("\n".join(commands()))
@@ -37,6 +45,7 @@ def main(folder: str) -> None:
     target = Path(folder)
     for part in ("results", "docs", "tests", "examples"):
         shutil.copytree(ROOT / part, target / part, dirs_exist_ok=True)
+    shutil.copy(ROOT / "README.md", target)
     for command in commands():
         print(command, flush=True)
         subprocess.run(command, shell=True, check=True, cwd=target, env=os.environ)
@@ -56,6 +65,7 @@ def commands() -> Iterator[str]:
         studies[study] = max(studies.get(study, ""), run, key=len)
     yield from studies.values()
     yield from dict.fromkeys(part for part in parts if not part.startswith("vibench run "))
+    yield from CONCLUSIONS
 
 
 if __name__ == "__main__":

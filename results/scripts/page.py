@@ -34,6 +34,8 @@ LIMITATIONS = {
     "speed": f"{ONE_MACHINE} The transcription is ours and not the code of the authors.",
     "stability-per-vector": "One mesh and one pair of N and R for each problem; the counts are those of the training set.",  # noqa: E501
     "three-dimensions": f"{ONE_MACHINE} One problem, a convex contact without friction, on the meshes named above; one factorisation.",  # noqa: E501
+    "machines": "Two machines, both virtual with two cores; a host that is disturbed changes ratios of seconds, too. Tables of an earlier protocol stay until they are measured again.",  # noqa: E501
+    "paper-figures": "Curves of the paper were not digitised: its statements are compared with our curves. Meshes and quadrature of the paper are not published, so that N, R and constants differ.",  # noqa: E501
     "exact-answers": "The problem has radial symmetry and a circular contact; rates of other problems are not shown.",
     "hertz-theory": "The theory assumes small deformations and half-planes, whereas the problem has discs of finite size: deviations of some per cent are due to the difference of the models, and not to the discretisation alone.",  # noqa: E501
 }
@@ -99,14 +101,34 @@ class Page:
 
     def write(self) -> None:
         """Write the page."""
-        if limits := LIMITATIONS.get(self.folder.name):
-            self.section("Limitations", limits)
-        (self.folder / self._file).write_text(self.text, encoding="utf-8")
+        (self.folder / self._file).write_text(self.text + limitations(self.folder), encoding="utf-8")
+
+
+def limitations(folder: Path) -> str:
+    """The end of a page of a folder: what it does not show; "" where nothing is said of it."""
+    limits = LIMITATIONS.get(folder.name)
+    return f"\n## Limitations\n\n{limits}\n" if limits else ""
 
 
 def alternative(figure: Figure, name: str) -> str:
-    """A sentence that stands where a figure is not shown: the first one of its caption, or what its name says."""
-    return escaped(first_sentence(caption_of(figure)) or f"Figure {name}.").replace("[", "(").replace("]", ")")
+    """A sentence that stands where a figure is not shown: what its panels have on their axes, and who is in them.
+
+    Of a figure without labels at its axes it is the first one of the caption, or what its name says.
+    """
+    panels = [axes for axes in figure.axes if axes.get_visible() and axes.get_xlabel() and axes.get_ylabel()]
+    if not panels:
+        return _in_brackets(first_sentence(caption_of(figure)) or f"Figure {name}.")
+    shown = dict.fromkeys(f"{axes.get_ylabel()} over {axes.get_xlabel()}" for axes in panels)
+    legends = [*figure.legends, *filter(None, (axes.get_legend() for axes in panels))]
+    named = dict.fromkeys(text.get_text() for legend in legends for text in legend.get_texts())
+    whom = f", for {', '.join(named)}" if named else ""
+    number = "One panel shows" if len(panels) == 1 else f"{len(panels)} panels show"
+    return _in_brackets(" ".join(f"{number} {'; '.join(shown)}{whom}.".split()))
+
+
+def _in_brackets(text: str) -> str:
+    """A text that may stand in the square brackets of a picture."""
+    return escaped(text).replace("[", "(").replace("]", ")")
 
 
 def escaped(text: str) -> str:
@@ -144,14 +166,19 @@ def read(run: str | Path, table: str) -> pd.DataFrame:
 
 
 def origin(*cells: pd.DataFrame) -> str:
-    """The machines that measured the cells of some runs, the libraries that computed them, and the commit."""
+    """The machines that measured the cells of some runs, the libraries that computed them, and the commit.
+
+    In the end the share of the timed cells whose machine was disturbed meanwhile.
+    """
     every = pd.concat(cells)
     named: dict[str, set[str]] = {}
     for row in every["versions"].dropna().unique():
         for name, text in json.loads(row).items():
             named.setdefault(name, set()).add(text)
     versions = ", ".join(f"{name} {' and '.join(sorted(texts))}" for name, texts in named.items())
-    return "; ".join([*every["machine"].dropna().unique(), versions])
+    timed, disturbed = int(every["disturbed"].notna().sum()), int((every["disturbed"] == 1).sum())
+    share = f"{disturbed} of {timed} timed cells marked as disturbed"
+    return "; ".join([*every["machine"].dropna().unique(), versions, share])
 
 
 def start(main: Callable[..., None]) -> None:

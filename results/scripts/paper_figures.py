@@ -8,7 +8,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from page import start, use_palette
+from page import limitations, start, use_palette
 
 from vibench.report.figures.publication import draw_published
 from vibench.results import tables
@@ -19,6 +19,9 @@ def main(obstacle: str, hertz: str, direct: str, target: str) -> None:
     shutil.rmtree(target, ignore_errors=True)
     for file in draw_published(paths, Path(target), ("png",), note=print):
         use_palette(file)
+    (written,) = Path(target).glob("*.md")
+    with written.open("a", encoding="utf-8") as end:
+        end.write(limitations(Path(target)))
 
 
 if __name__ == "__main__":

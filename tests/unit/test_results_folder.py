@@ -212,7 +212,13 @@ def test_a_smaller_picture_keeps_its_caption_and_is_described_in_a_sentence(
     file = page.write_figure(figure, tmp_path, "errors")
     with Image.open(file) as picture:
         assert picture.text["Description"] == "Errors at δ = 0.5 of [all] models. More of it."
-    assert page.alternative(figure, "errors") == "Errors at δ = 0.5 of (all) models."
+    assert page.alternative(figure, "errors") == "Errors at δ = 0.5 of (all) models."  # without labels at its axes
+    sheet = Sheet(1, 2)
+    for panel in sheet.panels:
+        panel.set(xlabel="seconds", ylabel="error [1]")
+        panel.plot([1.0, 2.0], [3.0, 4.0], label="a model")
+    sheet.figure.legend()
+    assert page.alternative(sheet.figure, "errors") == "2 panels show error (1) over seconds, for a model."
 
 
 def test_the_lock_file_has_every_distribution_that_is_needed() -> None:
