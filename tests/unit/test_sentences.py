@@ -1,8 +1,9 @@
 """Sentences of README and documentation that sum up tables under `results/`: they are written here from the tables.
 
 The first page and "What to use" are made whole by their scripts. Numbers that no committed table has are not
-checked here: those of the pages on export, limits, packs, reports, and what
-is said of runs whose queries are not committed. The commands beside them print them.
+checked here: those of the pages on export, limits, packs, reports, measurement (cold runs) and the tutorial, the
+seconds of `quick` in README, what the page on `field` says beside the sentences below, and what is said of runs whose
+queries are not committed. The commands beside them print them.
 """
 
 from __future__ import annotations
