@@ -2,8 +2,8 @@
 
 python results/scripts/everything.py FOLDER
 
-Runs are kept in FOLDER/runs, pages are written into FOLDER/results, FOLDER/docs and FOLDER/README.md. A study that several pages need
-runs once. `--list` as FOLDER prints the commands.
+Runs are kept in FOLDER/runs, pages are written into FOLDER/results, FOLDER/docs and FOLDER/README.md. A study that
+several pages need runs once. `--list` as FOLDER prints the commands.
 """
 
 from __future__ import annotations

@@ -5,11 +5,10 @@ python results/scripts/machines.py results results/machines
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pandas as pd
-from page import Page, origin, start
+from page import Page, origin, protocols, start
 
 from vibench.report.comparison.differences import agreement
 from vibench.results.costs.break_even import HIGH_FIDELITY
@@ -85,11 +84,6 @@ def compared(folder: Path, here: Tables, there: Tables) -> dict[str, object]:
         ratio = (gains[0] / gains[1]).dropna()
         row[name] = f"{ratio.median():.2f} ({ratio.min():.2f}–{ratio.max():.2f})" if len(ratio) else "–"
     return row
-
-
-def protocols(cells: pd.DataFrame) -> set[str]:
-    """The versions of the protocol by which cells were measured."""
-    return {json.loads(versions)["protocol"] for versions in cells["versions"].dropna().unique()}
 
 
 def numbers(folder: Path, here: Tables, there: Tables) -> dict[str, object]:

@@ -24,7 +24,7 @@ LIMITATIONS = {
     "paper-hertz": f"{ONE_MACHINE} Quadrature and master mesh of the paper are not published; N and R depend on them (page hertz-quadrature). Full assembly does not make use of A being constant.",  # noqa: E501
     "benefit": f"{ONE_MACHINE} One cone (mCPG), two pairs of dimensions and one solver for each problem. Gains are those of models with different errors: compare rows with equal errors.",  # noqa: E501
     "field": f"{ONE_MACHINE} One mesh of medium size for each problem, one solver, 32 validation parameters. Strategies of others are our implementations, with their default options.",  # noqa: E501
-    "certified": f"{ONE_MACHINE} One cone (mCPG) in `certified`. Effectivities are those at 64 parameters; bounds of the obstacle rely on interpolation errors that were measured at other parameters.",  # noqa: E501
+    "certified": f"{ONE_MACHINE} One cone (mCPG) in `certified`. Effectivities are those at 64 parameters; bounds of the obstacle rely on interpolation errors that were measured at other parameters. Greedy training chooses among bounds that are nearly equal: on another processor, with other round-off, it may choose others.",  # noqa: E501
     "formulations": f"{ONE_MACHINE} Formulations are our implementations of published methods on assembled operators, with their default options and one accuracy; methods of their authors may differ in what they integrate and solve.",  # noqa: E501
     "hertz-quadrature": "One problem; eight validation parameters. Variants that are not in the table, such as other pairings, were not tried.",  # noqa: E501
     "meshes": "Two obstacle meshes and three of Hertz contact, all of one size: what holds on finer ones is not shown.",
@@ -40,6 +40,9 @@ LIMITATIONS = {
     "hertz-theory": "The theory assumes small deformations and half-planes, whereas the problem has discs of finite size: deviations of some per cent are due to the difference of the models, and not to the discretisation alone.",  # noqa: E501
 }
 """What a page does not show, by its folder; it is said at its end."""
+
+NAMED = 6
+"""Curves whose names the alternative text of a figure gives."""
 
 SECONDS = "Seconds are CPU seconds on one thread."
 
@@ -120,8 +123,9 @@ def alternative(figure: Figure, name: str) -> str:
         return _in_brackets(first_sentence(caption_of(figure)) or f"Figure {name}.")
     shown = dict.fromkeys(f"{axes.get_ylabel()} over {axes.get_xlabel()}" for axes in panels)
     legends = [*figure.legends, *filter(None, (axes.get_legend() for axes in panels))]
-    named = dict.fromkeys(text.get_text() for legend in legends for text in legend.get_texts())
-    whom = f", for {', '.join(named)}" if named else ""
+    named = list(dict.fromkeys(text.get_text() for legend in legends for text in legend.get_texts()))
+    more = f" and {len(named) - NAMED} others" if len(named) > NAMED else ""
+    whom = f", for {'; '.join(named[:NAMED])}{more}" if named else ""
     number = "One panel shows" if len(panels) == 1 else f"{len(panels)} panels show"
     return _in_brackets(" ".join(f"{number} {'; '.join(shown)}{whom}.".split()))
 
@@ -179,6 +183,11 @@ def origin(*cells: pd.DataFrame) -> str:
     timed, disturbed = int(every["disturbed"].notna().sum()), int((every["disturbed"] == 1).sum())
     share = f"{disturbed} of {timed} timed cells marked as disturbed"
     return "; ".join([*every["machine"].dropna().unique(), versions, share])
+
+
+def protocols(cells: pd.DataFrame) -> set[str]:
+    """The versions of the protocol by which cells were measured."""
+    return {json.loads(versions)["protocol"] for versions in cells["versions"].dropna().unique()}
 
 
 def start(main: Callable[..., None]) -> None:

@@ -236,7 +236,8 @@ def when_not(results: Results) -> str:
         "([benefit](../results/benefit/README.md), [paper-obstacle](../results/paper-obstacle/README.md), "
         "[paper-hertz](../results/paper-hertz/README.md)).",
         f"other formulations may pay earlier, from {_formulations(results)} queries on "
-        "([formulations](../results/formulations/README.md)); seconds are those of small plane problems on one core; "
+        "([formulations](../results/formulations/README.md), by the protocol that this page names); seconds are those "
+        "of small plane problems on one core; "
         "high-fidelity solutions start from the nearest contact set that is known. `vibench show RUN --table best "
         "--queries N` says it for yours.",
         "| problem | assembly | models | cheaper than high-fidelity solutions | never | as fast or undecided |\n"
