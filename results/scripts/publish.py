@@ -31,6 +31,7 @@ OTHERS = "machines/*/*/cells.csv"
 CITATION = Citation(
     "vibench: results of the reduced-order models of the paper and of the field",
     ("The vibench developers",),
+    date="2026",
 )
 
 

@@ -221,6 +221,24 @@ def test_a_smaller_picture_keeps_its_caption_and_is_described_in_a_sentence(
     assert page.alternative(sheet.figure, "errors") == "2 panels show error (1) over seconds, for a model."
 
 
+def test_vibench_is_cited_alike_everywhere() -> None:
+    """Title, author, version and year in README, on the page of the benchmark and in CITATION.cff."""
+    entry = re.compile(r"^@software\{vibench,\n.*?^\}$", re.MULTILINE | re.DOTALL)
+    first, second = (
+        entry.findall(path.read_text(encoding="utf-8")) for path in (ROOT / "README.md", ROOT / "docs" / "benchmark.md")
+    )
+    assert len(first) == 1
+    assert first == second
+    fields = {name: value.strip("{}") for name, value in re.findall(r"^  (\w+) = \{(.*)\},$", first[0], re.MULTILINE)}
+    text = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert text.count(f'title: "{fields["title"]}"') == 2
+    assert text.count(f'- name: "{fields["author"]}"') == 2
+    assert text.count(f"version: {fields['version']}\n") == 2
+    assert f"  year: {fields['year']}\n" in text
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert fields["version"] == project["version"]
+
+
 def test_the_lock_file_has_every_distribution_that_is_needed() -> None:
     locked = set(re.findall(r"^([\w.-]+)==\S+ \\\n +--hash=sha256:[0-9a-f]{64}$", LOCK.read_text(), re.MULTILINE))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

@@ -119,6 +119,7 @@ def publish_runs(
     ] = None,
     doi: Annotated[str, Option(help="DOI of the deposit, such as 10.5281/zenodo.1234567.")] = "",
     url: Annotated[str, Option(help="Address of the site.")] = "",
+    date: Annotated[str, Option(help="Date or year of publication, such as 2026-11-26.")] = "",
     figures: Annotated[bool, Option("--figures/--no-figures", help="Add pictures to the reports.")] = True,
     yes: Annotated[bool, Option("--yes", "-y", help="Do not ask.")] = False,
 ) -> None:
@@ -141,7 +142,7 @@ def publish_runs(
             echo("what could identify somebody:", *(f"  {line}" for line in lines))
             typer.confirm("Publish it?", abort=True)
 
-    citation = Citation(title, tuple(author or ()), doi, url)
+    citation = Citation(title, tuple(author or ()), doi, url, date)
     page = publish([tables.results_file(one) for one in run], site, citation, warn=warn, figures=figures, ask=ask)
     echo(f"site of {len(run)} run{'s' * (len(run) > 1)}: {page}")
 

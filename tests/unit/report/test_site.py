@@ -232,14 +232,14 @@ def of_yaml(text: str) -> dict[str, str]:
 
 @pytest.mark.parametrize("title", ["plain", "an { open brace", "100 % \\ of } it", "{}{", "a \\{ b", "#1 & ~ ^ $ _"])
 def test_bibtex_has_balanced_braces_and_no_empty_field(title: str) -> None:
-    bib = Citation(title, ("Doe, {Jane", "A group"), url="https://example.org/{a}_b").bibtex()
+    bib = Citation(title, ("Doe, {Jane", "A group"), url="https://example.org/{a}_b", date="2026").bibtex()
     depth = 0
     for at, character in enumerate(bib):
         depth += {"{": 1, "}": -1}.get(character, 0)
         assert depth > 0 or at < len("@misc") or at >= len(bib.rstrip()) - 1
     assert depth == 0
     fields = re.findall(r"^  (\w+) = \{(.*)\},$", bib, re.MULTILINE)
-    assert [name for name, _ in fields] == ["title", "author", "url", "note"]  # there is no DOI
+    assert [name for name, _ in fields] == ["title", "author", "year", "url", "note"]  # there is no DOI
     assert all(value for _, value in fields)
     with pytest.raises(RequestError, match="is no DOI"):
         Citation("braces", doi="10.5281/zenodo.{1}")
@@ -258,8 +258,15 @@ def test_a_citation_is_valid_and_its_texts_are_data(site: Path) -> None:
     assert of_yaml(without)["title"] == 'a "title": #1 - b'
     assert "doi" not in of_yaml(without)
     assert "# doi:" in without
+    assert "date-released" not in of_yaml(Citation("a", date="2026").cff())  # it would need a day
     with pytest.raises(RequestError, match="is no DOI, expected such as"):
         Citation("a", doi="https://doi.org/10.5281/zenodo.1")
+
+
+@pytest.mark.parametrize("text", ["26", "2026-02-30", "2026-1-1", "2026-11", "0000", "20261126", "٢٠٢٦", "soon"])
+def test_what_is_no_date_is_refused(text: str) -> None:
+    with pytest.raises(RequestError, match="is no date, expected a year or such as 2026-11-26"):
+        Citation("a", date=text)
 
 
 @pytest.mark.parametrize(
@@ -343,11 +350,13 @@ def test_the_command_writes_a_site(
     three: list[Path], main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(html, "page", lambda *_, **__: REPORT)
-    arguments = ("--title", "Ours", "--author", "Doe, Jane", "--url", "https://example.org/")
+    arguments = ("--title", "Ours", "--author", "Doe, Jane", "--url", "https://example.org/", "--date", "2026-11-26")
     code, out, err = main("publish", "--yes", *map(str, three), str(tmp_path / "new" / "site"), *arguments)
     assert (code, err) == (0, "")
     assert out == f"site of 3 runs: {tmp_path / 'new' / 'site' / 'index.html'}\n"
-    assert of_yaml((tmp_path / "new" / "site" / "CITATION.cff").read_text())["url"] == "https://example.org/"
+    known = of_yaml((tmp_path / "new" / "site" / "CITATION.cff").read_text())
+    assert (known["url"], known["date-released"]) == ("https://example.org/", "2026-11-26")
+    assert "  year = {2026},\n" in (tmp_path / "new" / "site" / "citation.bib").read_text()
 
 
 def test_folders_have_names_that_a_link_needs_no_escapes_for() -> None:

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import date
 
 from vibench.errors import RequestError
 from vibench.provenance import distribution_version, solver_distribution
@@ -15,6 +16,9 @@ from vibench.text import unbroken
 
 DOI = re.compile(r"10\.\d{4,9}/[!-~]+")
 """A DOI without a resolver before it (DOI Handbook, section 2.2)."""
+
+DATE = re.compile(r"\d{4}(-\d{2}-\d{2})?")
+"""A year, or a date (ISO 8601)."""
 
 SOFTWARE = "vibench: a benchmark framework for reduced-order models of parametrised variational inequalities"
 
@@ -29,7 +33,7 @@ NO_DISTRIBUTION = frozenset({"protocol", "python"})
 class Citation:
     """What a site is called, by whom it is, and where it is deposited.
 
-    Raises a `RequestError` if the DOI is none.
+    Raises a `RequestError` if the DOI or the date is none.
     """
 
     title: str
@@ -39,10 +43,14 @@ class Citation:
     """DOI of the deposit, "" where there is none yet."""
     url: str = ""
     """Address of the site, "" where it has none yet."""
+    date: str = ""
+    """When it was or will be published, "2026-11-26" or only the year; "" where nobody says."""
 
     def __post_init__(self) -> None:
         if self.doi and (not DOI.fullmatch(self.doi) or set("{}") & {*self.doi}):  # braces would end a field of BibTeX
             raise RequestError(f"'{unbroken(self.doi)}' is no DOI, expected such as 10.5281/zenodo.1234567")
+        if self.date and not _is_date(self.date):
+            raise RequestError(f"'{unbroken(self.date)}' is no date, expected a year or such as 2026-11-26")
 
     def cff(self) -> str:
         """The file CITATION.cff (Citation File Format 1.2.0)."""
@@ -55,6 +63,7 @@ class Citation:
             *(line for author in self.authors or ("unnamed",) for line in _cff_author(author)),
             f"doi: {_yaml(self.doi)}" if self.doi else "# doi: 10.…/…   of the deposit, once it has one",
             *([f"url: {_yaml(self.url)}"] if self.url else []),
+            *([f"date-released: {_yaml(self.date)}"] if "-" in self.date else []),
             "references:",
             "  - type: software",
             f"    title: {_yaml(SOFTWARE)}",
@@ -70,12 +79,24 @@ class Citation:
         fields = {
             "title": f"{{{_in_braces(self.title)}}}",
             "author": " and ".join(name if "," in name else f"{{{name}}}" for name in names),
+            "year": self.date.partition("-")[0],
             "doi": self.doi,
             "url": unbroken(self.url).replace("{", "%7B").replace("}", "%7D"),
             "note": f"Computed by vibench {distribution_version('vibench')}",
         }
         lines = (f"  {name} = {{{value}}}," for name, value in fields.items() if value)
         return "@misc{vibench-results,\n" + "\n".join(lines) + "\n}\n"
+
+
+def _is_date(text: str) -> bool:
+    """Whether a text is a year, or a day that the calendar has."""
+    if not DATE.fullmatch(text) or not text.isascii():
+        return False
+    try:
+        date.fromisoformat(text if "-" in text else f"{text}-01-01")
+    except ValueError:
+        return False
+    return True
 
 
 def _in_braces(text: str) -> str:
