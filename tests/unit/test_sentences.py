@@ -1,9 +1,15 @@
 """Sentences of README and documentation that sum up tables under `results/`: they are written here from the tables.
 
 The first page and "What to use" are made whole by their scripts. Numbers that no committed table has are not
-checked here: those of the pages on export, limits, packs, reports, measurement (cold runs) and the tutorial, the
-seconds of `quick` in README, what the page on `field` says beside the sentences below, and what is said of runs whose
-queries are not committed. The commands beside them print them.
+checked here; the commands beside them print them:
+
+- the pages on export, limits, packs and reports;
+- README: the seconds of `quick`, and of it beside other processes;
+- measurement.md: what five cold runs of two studies scatter by, and the simulations of intervals;
+- tutorial.md: errors and seconds of its own study on a coarse mesh;
+- three-dimensions.md: wall times, memory, the coarse mesh, and what `tests/benchmarks/space.py` prints;
+- field.md: shares between the numbers of vectors that the page of results has, and at how many training parameters a
+  share is missed: both stand in the histories of the run.
 """
 
 from __future__ import annotations
@@ -104,6 +110,167 @@ def of_slowest() -> Sequence[str]:
     )
 
 
+def of_setting() -> Sequence[str]:
+    """What it says of the meshes, and of Gram matrices whose generators are linearly dependent."""
+    table = cells("field")
+    assert set(table["queries"]) == {32}
+    size = {name: rows[["dim_V", "dim_W", "snapshots"]].iloc[0] for name, rows in table.groupby("problem")}
+    dependent = table["rank"] < table["R"]
+    condition = table["gram_condition"]
+    assert size["hertz"]["snapshots"] == 81
+    return (
+        f"*Obstacle* ({size['obstacle']['dim_V']} unknowns, {size['obstacle']['dim_W']} multipliers)",
+        f"*Hertz* has {size['hertz']['dim_V']} unknowns and {size['hertz']['dim_W']} multipliers",
+        f"they are above 1e{np.floor(np.log10(condition[dependent].min())):.0f}, or infinite, where the generators are "
+        f"linearly dependent, and at most {condition[~dependent].max():.2g} elsewhere",
+    )
+
+
+def tight(table: pd.DataFrame, *, control: bool = False) -> pd.DataFrame:
+    """The cells of `field` in full at the tighter tolerances, with cones in W⁺ or those of the negative control."""
+    of_control = table["dual"].str.startswith("pod-dual")
+    return table[(table["assembly"] == "full") & (table["pod_tol"] == 1e-3) & (of_control == control)]
+
+
+def percent(values: pd.Series, digits: int = 2) -> list[str]:
+    """The smallest and the largest of some shares in per cent."""
+    return [f"{float(f'{100.0 * end:.{digits}g}'):g}" for end in (values.min(), values.max())]
+
+
+def of_cones_and_controls() -> Sequence[str]:
+    """What it says of the best and the worst cones, and of cells without enrichment."""
+    table = cells("field")
+    chosen = tight(table)
+    online = chosen[chosen["primal"] == ONLINE].set_index(["problem", "dual"])
+    for problem, rows in online.groupby("problem"):
+        assert rows["gram_condition"].idxmin() == (problem, "orthant")
+    assert online.loc["obstacle", "error_lambda_mean"].idxmin() == "orthant"
+    assert online.loc["obstacle", "R"].idxmin() == "nmf"
+    assert online.loc["hertz", "error_lambda_mean"].idxmin() == "dictionary"
+    assert online.loc[("hertz", "dictionary"), "R"] == 9 * online.loc[("hertz", "cpg"), "R"]
+    assert online.loc[("obstacle", "nmf"), "fallbacks"] == "the factorisation was stopped after 1000 iterations"
+    assert online.loc[("obstacle", "mcpg"), "rank"] == online.loc[("obstacle", "mcpg"), "R"]
+    control = tight(table, control=True)
+    bare = control[control["primal"] == BARE].sort_values("problem")["error_lambda_mean"]
+    plain = [f"{float(f'{error:.2g}'):g}" for error in bare]
+    low = {
+        name: percent(rows["error_lambda_mean"]) for name, rows in control[control["primal"] != BARE].groupby("problem")
+    }
+    bare = chosen[chosen["primal"] == BARE].set_index(["problem", "dual"])
+    snapshots = ["angle-greedy", "cpg", "dictionary"]  # generators that are snapshots
+    cone, error = bare["beta_cone_lower_min"], bare["error_lambda_mean"]
+    digits = {"mcpg": 1, "enlarged-cpg": 1, "nmf": 2, "orthant": 2}
+    of = {dual: percent(error.loc[[("hertz", dual)]], count)[0] for dual, count in digits.items()}
+    enriched = chosen[chosen["primal"] != BARE].groupby(["problem", "dual"])["beta_cone_lower_min"].min()
+    assert cone.loc["hertz"].loc[snapshots].nunique() == 1
+    assert cone.loc["obstacle"].idxmin() == "orthant"
+    return (
+        f"the error of λ is {' to '.join(low['hertz'])} % on Hertz and {' to '.join(low['obstacle'])} % on the "
+        "obstacle with any enrichment; without enrichment it is {} and {} times the size of λ".format(*plain),
+        f"Over the span β is {bare['beta_span_min'].max():.0e} at best".replace("e-05", "e-5"),
+        f"min β over the cone on Hertz is {cone['hertz', 'cpg']:.2f}, and the mean error of λ is "
+        f"{percent(error.loc['hertz'].loc[snapshots])[1]} % at most",
+        f"the error of λ is {of['mcpg']} % with `mcpg`, {of['enlarged-cpg']} % with `enlarged-cpg`, "
+        f"{of['nmf']} % with `nmf`, and {of['orthant']} % with `orthant`",
+        f"{cone['obstacle', 'cpg']:.3f} with `cpg` and {cone['obstacle', 'orthant']:.0e} with `orthant`, where every "
+        f"enrichment reaches at least {enriched['obstacle', 'cpg']:.3f} and "
+        f"{enriched['obstacle', 'orthant']:.3f}".replace("e-04", "e-4"),
+        "Errors of λ are between {} % and {} %".format(*percent(error.loc["obstacle"])),
+    )
+
+
+def of_enrichments() -> Sequence[str]:
+    """What it says of vectors and shares with the cone of mCPG, and of prescribed shares that are missed."""
+    table = cells("field")
+    mine = tight(table)[lambda rows: rows["dual"] == "mcpg"].set_index(["problem", "primal", "primal_tol"])
+    hertz, obstacle = mine.loc["hertz"], mine.loc["obstacle"]
+    assert hertz["offline_enrichment_s"].idxmax()[0] == "pod-supremizers"
+    (numbers,) = [one for one in page_tables("field") if "infsup-greedy" in one and "pod_tol" in one]
+    numbers = numbers[(numbers["problem"] == "hertz") & (numbers["pod_tol"] == 1e-3)]
+    ways = ("infsup-greedy", "offline-pga", "offline-pga (stop on β)", "pod-supremizers")
+    for row in numbers.to_dict("records"):  # a share of 0.3, 0.5, 0.7 and 0.9
+        *loose, last = zip(*([int(word) for word in row[way].split(" / ")] for way in ways), strict=True)
+        assert all(min(share) == share[-1] for share in loose)
+        assert (min(last), max(last)) == (last[0], last[-1])
+    greedy = [rows.loc[("infsup-greedy", 0.7), "enrichment"] for rows in (hertz, obstacle)]
+    pga, stopped = hertz.loc[("offline-pga", 0.6)], hertz.loc[("offline-pga (stop on β)", 0.7)]
+    more, other = hertz.loc[("offline-pga", 0.3)], hertz.loc[("offline-pga (stop on β)", 0.9)]
+    loose, fine = hertz.loc[("pod-supremizers", 0.1)], obstacle.loc[("pod-supremizers", 0.01)]
+    online = tight(table)[lambda rows: (rows["primal"] == ONLINE) & (rows["dual"] == "mcpg")].set_index("problem")
+    above = [
+        rows[name] / online.loc[problem, name] - 1.0
+        for problem, rows in (("hertz", loose), ("obstacle", fine))
+        for name in ("error_u_mean", "error_lambda_mean")
+    ]
+    assert loose["enrichment"] == fine["enrichment"] == 59
+    assert f"{100.0 * max(above):.1f}" == "0.1"
+    stops = table["primal"].isin(["infsup-greedy", "offline-pga (stop on β)"])
+    prescribed = table[stops].drop_duplicates(MODEL)
+    short = prescribed[prescribed["share_validation"] < prescribed["primal_tol"] * (1.0 - 1e-9)]
+    worst = short.loc[(short["share_validation"] / short["primal_tol"]).idxmin()]
+    assert set(short["problem"]) == {"hertz"}
+    assert set(short["dual"]) == {"orthant", "dictionary"}
+    recorded = table[table["share_guaranteed"].notna()].drop_duplicates(MODEL)
+    near = recorded.loc[(recorded["share_validation"] - recorded["share_guaranteed"]).idxmin()]
+    assert (near["dual"], near["problem"], near["pod_tol"]) == ("nmf", "hertz", 1e-2)
+
+    def short_of(value: float) -> str:
+        return f"{value:.1e}".replace("e-0", "e-")
+
+    return (
+        f"it has {loose['enrichment']} vectors and a share of {loose['share_training']:.2f}",
+        f"with 0.7 it stops at {greedy[0]} vectors on Hertz and at {greedy[1]} on the obstacle",
+        f"its {pga['enrichment']} vectors reach {pga['share_training']:.2f} over the training set and "
+        f"{pga['share_validation']:.2f} over the validation set",
+        f"{stopped['enrichment']} vectors for 0.7, where σ guarantees {stopped['share_guaranteed']:.2f}, and "
+        f"{other['enrichment']} for 0.9",
+        f"{more['enrichment']} instead of {stopped['enrichment']} lower the error of u from "
+        f"{short_of(stopped['error_u_mean'])} to {short_of(more['error_u_mean'])} and that of λ from "
+        f"{short_of(stopped['error_lambda_mean'])} to {short_of(more['error_lambda_mean'])}",
+        f"the closest is {near['share_validation']:.5f} against {near['share_guaranteed']:.5f}",
+        f"miss it in {len(short)} of {len(prescribed)} enrichments, all on Hertz with `orthant` or `dictionary`, at "
+        f"worst with {worst['share_validation']:.3f} instead of {worst['primal_tol']:g}",
+        f"With {fine['R']} generators and {fine['N']} modes",
+        f"such as {fine['enrichment']} of `pod-supremizers`, have errors that are at most {100.0 * max(above):.1f} %",
+    )
+
+
+def of_fronts() -> Sequence[str]:
+    """What it says of Pareto fronts and of the fastest queries."""
+    table = cells("field")
+    (front,) = [one for one in page_tables("field") if {"cost", "is"} <= set(one)]
+    sized = front[front["cost"] == "N + S + R"]
+    hertz, obstacle = (sized[sized["problem"] == name] for name in ("hertz", "obstacle"))
+
+    def ends(dual: str, low: float, high: float) -> tuple[int, int]:
+        on = obstacle[(obstacle["dual"] == dual) & obstacle["is"].between(low, high)]["is"]
+        assert set(obstacle[obstacle["is"].between(on.min(), on.max())]["dual"]) == {dual}
+        return int(on.min()), int(on.max())
+
+    reduced = table[(table["assembly"] == "reduced") & (table["pod_tol"] == 1e-3)]
+    plain = reduced[(reduced["primal"] == BARE) & (reduced["problem"] == "hertz")].set_index("dual")
+    assert plain.loc["cpg", "error_lambda_mean"] == plain.loc["angle-greedy", "error_lambda_mean"]
+    assert plain.loc["dictionary", "N"] == 9
+    # their errors are equal but for round-off, which decides who is on the front
+    first = hertz[hertz["dual"].isin(["angle-greedy", "cpg"]) & (hertz["primal"] == BARE)].iloc[0]
+    second = hertz[(hertz["dual"] == "nmf") & (hertz["error λ"] < first["error λ"])].iloc[0]
+    orthant = obstacle[obstacle["dual"] == "orthant"].set_index("primal")
+    small = [f"{float(error):.1e}".replace("e-0", "e-") for error in (first["error λ"], second["error λ"])]
+    errors = [orthant.loc[name, "error λ"] for name in ("pod-supremizers, δ = 0.01", ONLINE)]
+    return (
+        f"with an error of {plain.loc['dictionary', 'error_lambda_mean']:.1e}".replace("e-0", "e-"),
+        f"`cpg` without enrichment ({first['is']:.0f}, {small[0]}), whose cone is that of `angle-greedy` there, and "
+        f"`nmf` with online supremizers ({second['is']:.0f}, {small[1]})",
+        "`nmf` is on the front from dimension {} to {} and `orthant` from {};".format(
+            *ends("nmf", 100, 200), ends("orthant", 100, 200)[0]
+        ),
+        "`nmf` is on the front at {} and {}, and `enlarged-cpg` from {} to {}".format(
+            *ends("nmf", 25, 40), *ends("enlarged-cpg", 0, 100)
+        ),
+        f"an error of {errors[0]:.1e} with `pod-supremizers`, and of {errors[1]:.1e} with".replace("e-0", "e-"),
+    )
+
+
 def span(values: pd.Series) -> str:
     """The range of some numbers, to two digits."""
     return f"{values.min():.2g} to {values.max():.2g}"
@@ -193,6 +360,12 @@ def of_break_evens() -> Sequence[str]:
     assert {some(of == name, "never") for name in ("penalty", "proximal")} == {16}
     local = (kind == "local") & (table["dual"] == "mcpg")
     assert set(table["dual"][sparse & (meaning == "never")]) == {"mcpg"}
+    offline = undecided & table["rounds_missing"].isna()
+    (missing,) = table["rounds_missing"][undecided & ~offline]
+    timed = pd.read_csv(ROOT / "results" / "formulations" / "cells.csv").set_index("cell")
+    (other,) = table["cell_b"][undecided & ~offline]
+    done, most = timed.loc[other, "timed_rounds"], timed.loc[other, "timing_rounds"]
+    assert done + missing > 2 * most
     return (
         f"radial basis functions is cheaper at once in {some(of == 'regression (radial)', 'at once')} of 16;",
         f"at once in {some(processes, 'at once')} and from {number(processes, 'from')} on in {some(processes, 'from')}",
@@ -203,6 +376,9 @@ def of_break_evens() -> Sequence[str]:
         f"{some(sparse, 'never')}",
         f"in {some(hyper, 'until')} of {hyper.sum()}, and is cheaper there until {number(hyper, 'until')} only",
         f"{undecided.sum()} of the {len(table)} pairs are undecided, {(undecided & hyper).sum()} of them of `hyper",
+        f"In {offline.sum()} of the {undecided.sum()} the offline seconds are too close, which no further rounds would "
+        f"change; the other one would need {missing:.0f} rounds more (`rounds_missing`) after {done:.0f}, more than "
+        f"twice the permitted {most:.0f},",
     )
 
 
@@ -436,6 +612,10 @@ def of_space() -> Sequence[str]:
         ("docs/field.md", of_cones),
         ("docs/field.md", of_guarantees),
         ("docs/field.md", of_slowest),
+        ("docs/field.md", of_setting),
+        ("docs/field.md", of_cones_and_controls),
+        ("docs/field.md", of_enrichments),
+        ("docs/field.md", of_fronts),
         ("docs/formulations.md", of_formulations),
         ("docs/formulations.md", of_break_evens),
         ("docs/certified.md", of_certified),
