@@ -147,10 +147,10 @@ class SnapshotStage(Stage):
         solutions: list[ActiveSetSolution] = []
         for k, mu in enumerate(mus):
             # the first one without repetitions: what it takes from a known start is measured in the end
-            repeated = itertools.chain([mu], self._near(problem, mu, k))
-            (vi, unverified), taken = self._measure(solve, repeated, self._runs if k else 1)
+            runs, repeated = self._runs if k else 1, itertools.chain([mu], self._near(problem, mu, k))
+            (vi, unverified), taken = self._measure(solve, repeated, runs)
             seconds.append(taken)  # verification, which is what follows, is not timed
-            if self._runs > 1:
+            if runs > 1:
                 vi = checked_assembly(problem, mu)  # repetitions at other parameters may have written into its arrays
             with explained(mu, vi):
                 solution = solver.verify(mu, vi, unverified)

@@ -434,7 +434,7 @@ def test_help_on_a_column_is_what_it_means(name: str, main: Main) -> None:
 def test_help_on_a_column_of_a_computed_table_is_its_meaning_there(name: str, main: Main) -> None:
     code, out, _ = main("help", name)
     assert code == 0
-    names = {"total [s]": "total_s", "total": "total_s", "sure": "probability"}
+    names = {"total [s]": "total_s", "total": "total_s", "until": "cheapest_until", "sure": "probability"}
     column = names.get(name, name.replace(" ", "_"))
     unit = f" [{ADDED[column].unit}]" * bool(ADDED[column].unit)
     assert f"{column}{unit}, in best: {ADDED[column].meaning}" in out.splitlines()
