@@ -251,7 +251,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     page = Page(
         asked.out or Path(),
         f"{asked.problem}, resolution {resolution}: the published algorithms and ours",
-        f"python tests/benchmarks/as_published.py {asked.problem} --repeats {asked.repeats}",
+        f"python tests/benchmarks/as_published.py {asked.problem} --repeats {asked.repeats}"
+        + (f" --out {asked.out}" if asked.out else ""),
         ABOUT + (f" No compiled program: {sides.ours.not_compiled}." if sides.ours.not_compiled else ""),
         machine=where,
         file=f"as-published-{asked.problem}.md",
