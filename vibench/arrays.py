@@ -24,3 +24,15 @@ SparseMatrix: TypeAlias = Any
 def digest(matrix: SparseMatrix) -> bytes:
     """What two sparse matrices (CSR or CSC) of one format have in common exactly if their arrays are equal."""
     return sha256(b"".join(array.tobytes() for array in (matrix.indptr, matrix.indices, matrix.data))).digest()
+
+
+def times_dense(sparse: SparseMatrix, dense: Array) -> Array:
+    """The product of a sparse M (CSR, m×c) and a dense matrix (c×k).
+
+    Rows with one entry, such as those of nodal constraints, are multiples of rows, which SciPy would add to zeros.
+    """
+    rows = sparse.indices
+    if not np.array_equal(sparse.indptr, np.arange(sparse.shape[0] + 1)):
+        return np.asarray(sparse @ dense)
+    chosen = dense if np.array_equal(rows, np.arange(len(dense))) else dense[rows]
+    return np.asarray(sparse.data[:, None] * chosen)

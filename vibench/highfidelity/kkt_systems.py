@@ -11,11 +11,11 @@ import scipy.linalg
 import scipy.sparse as sp
 from scipy.sparse.linalg import SuperLU, splu
 
-from vibench.arrays import Array, Indices, Mask, SparseMatrix
+from vibench.arrays import Array, Indices, Mask, SparseMatrix, times_dense
 from vibench.highfidelity.contact_zone import coarse_contact, watched, zone_of
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky, symmetric_lu
-from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal, dense_inverse
+from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal
 from vibench.linalg.factorisations import DEFAULT, Factor, implementation
 from vibench.linalg.schur_complement import EliminationPattern, PrincipalSubmatrix, StaticCondensation
 from vibench.qp.scaling import row_norms
@@ -62,6 +62,7 @@ class CondensedStiffness:
         self._A, self._pattern, self._factorisation = A, pattern, factorisation
         self._saddle: SaddlePointSolver | None = None
         self._last: tuple[Array, Array] | None = None
+        self._by_inverse = pattern.is_dense
         self._condense()
 
     def _condense(self) -> None:
@@ -108,7 +109,7 @@ class CondensedStiffness:
     @property
     def nbytes(self) -> int:
         """Memory, about, without `factor`."""
-        return self._condensed.nbytes + (8 * len(self.retained) ** 2 if self.dense else 0)
+        return self._condensed.nbytes + (8 * len(self.retained) ** 2 if self._by_inverse else 0)
 
     @property
     def retained(self) -> Indices:
@@ -128,13 +129,21 @@ class CondensedStiffness:
     @property
     def dense(self) -> bool:
         """Whether the Schur complement Ŝ is treated as a dense matrix."""
-        return self._condensed.dense
+        return self._pattern.is_dense
+
+    def serve_many(self, rows: int) -> None:
+        """Prepare for many loads and the liftings of so many rows: where these need Ŝ⁻¹, loads are multiplied by it."""
+        self._by_inverse = self._inverts_for(rows)
+
+    def _inverts_for(self, rows: int) -> bool:
+        """Whether the liftings of so many rows come from Ŝ⁻¹: LAPACK inverts in less time than systems take."""
+        return self.dense or len(self.retained) <= min(FEW_RETAINED, 2 * rows)
 
     def compliance(self, load: Array) -> Array:
         """Ŝ⁻¹ times loads (c,) or (c, k) of the retained unknowns."""
-        if not self._condensed.dense:
-            return self._schur_factor.solve(load)
-        return self._blocks.times_sparse(load)
+        if self._by_inverse:
+            return self._blocks.times_sparse(load)
+        return self._schur_factor.solve(load)
 
     def load(self, retained: Array) -> Array:
         """Ŝ times retained unknowns (c,), where it is sparse."""
@@ -152,10 +161,8 @@ class CondensedStiffness:
 
     def liftings(self, B: SparseMatrix) -> Array:
         """B Ŝ⁻¹ (m×c) for rows B (m×c) of the retained unknowns."""
-        if self._condensed.dense:
-            return np.asarray(B @ self.inverse)
-        if len(self.retained) <= min(FEW_RETAINED, 2 * B.shape[0]):  # LAPACK inverts in less time than that takes
-            return np.asarray(B @ dense_inverse(self._condensed.dense_schur, "A"))
+        if self._inverts_for(B.shape[0]):
+            return times_dense(B, self.inverse)
         return np.ascontiguousarray(self._schur_factor.solve(B.toarray().T).T)
 
     def represent(self, functionals: Array) -> tuple[Array, Array, Array]:
@@ -179,7 +186,7 @@ class CondensedStiffness:
 
     @cached_property
     def inverse(self) -> Array:
-        """Ŝ⁻¹ (c×c), of which liftings are products where Ŝ is dense."""
+        """Ŝ⁻¹ (c×c), of which liftings are products where Ŝ is dense or small."""
         return self._blocks.toarray()
 
     @cached_property

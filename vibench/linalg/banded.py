@@ -21,7 +21,7 @@ from scipy.linalg.lapack import dpbtrf
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.linalg.cholesky import UNIT
+from vibench.linalg.cholesky import UNIT, have_one_pattern
 
 MOST_WORK = 1.5e8
 """Multiplications n b² up to which a band is taken for narrow."""
@@ -34,7 +34,7 @@ def is_proved_by_band(parts: Sequence[SparseMatrix]) -> bool | None:
     """
     # of columns the transpose, whose symmetric part is the same: a conversion takes longer than the factorisation
     rows = [part.T if part.format == "csc" else sp.csr_array(part) for part in parts]
-    total = sp.csr_array(reduce(operator.add, rows))
+    total, magnitude = _sum(rows), _sum([abs(part) for part in rows])
     diagonal, size = total.diagonal(), total.shape[0]
     if not np.all(np.isfinite(total.data)) or not np.all(diagonal > 0.0):
         return False
@@ -42,11 +42,20 @@ def is_proved_by_band(parts: Sequence[SparseMatrix]) -> bool | None:
     scaled = _band(total, units)
     if scaled is None:
         return None
-    sizes = units * sum(part @ units + part.T @ units for part in map(abs, rows)) / 2.0
+    sizes = units * (magnitude @ units + magnitude.T @ units) / 2.0
     terms = (len(scaled) + 1) * UNIT
     error = (8.0 + 2.0 * len(parts)) * UNIT * float(np.max(sizes, initial=0.0)) + size * terms / (1.0 - 2.0 * terms)
     scaled[0] -= 1.01 * error
     return bool(dpbtrf(scaled, lower=1, overwrite_ab=1)[1] == 0)
+
+
+def _sum(parts: Sequence[SparseMatrix]) -> SparseMatrix:
+    """The sum of matrices (CSR), entry by entry where all have one pattern, as A and X_V of one mesh have."""
+    first, *others = parts
+    if not all(have_one_pattern(first, other) for other in others):
+        return sp.csr_array(reduce(operator.add, parts))
+    values = reduce(operator.add, (part.data for part in parts))
+    return sp.csr_array((values, first.indices.copy(), first.indptr.copy()), shape=first.shape)
 
 
 @dataclass(frozen=True)

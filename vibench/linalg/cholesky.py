@@ -25,8 +25,9 @@ those of displacements in space; of other matrices it is with panels of one."""
 UNIT = float(np.finfo(float).eps) / 2.0
 """The unit round-off."""
 
-SPARSE_COLUMN = 256
-"""Columns of a factor with at most so many entries are multiplied as sparse ones, which needs few operations there."""
+SPARSE_COLUMN, SPARSE_SHARE = 256, 1 / 8
+"""Columns of a factor with at most so many entries, and at most this share of all rows, are multiplied as sparse ones,
+which needs few operations there."""
 
 DENSE_COLUMNS = 256
 """Number of consecutive longer columns that are multiplied as one dense matrix, on the rows that they have entries in:
@@ -286,8 +287,8 @@ class PartialCholesky:
 
 def _less_products(corner: SparseMatrix, columns: SparseMatrix) -> Array:
     """X_cc − C Cᵀ (c×c) for a sparse C of which most columns have few entries, and some nearly all."""
-    entries = np.diff(columns.indptr)
-    few, many = columns[:, entries <= SPARSE_COLUMN], np.flatnonzero(entries > SPARSE_COLUMN)
+    entries, limit = np.diff(columns.indptr), min(SPARSE_COLUMN, SPARSE_SHARE * columns.shape[0])
+    few, many = columns[:, entries <= limit], np.flatnonzero(entries > limit)
     result, place = (corner - few @ few.T).toarray(order="F"), np.empty(len(entries) and corner.shape[0], np.intp)
     for first in range(0, len(many), DENSE_COLUMNS):
         block = columns[:, many[first : first + DENSE_COLUMNS]]

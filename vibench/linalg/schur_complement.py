@@ -174,7 +174,7 @@ class StaticCondensation:
     def dense_schur(self) -> Array:
         """Ŝ as an array."""
         if not self.dense:  # both are asked for there, and the sparse one is kept
-            return np.asarray(self.schur.toarray(order="C"))
+            return np.asarray(sp.csr_array(self.schur).toarray())  # of columns it would go through memory row by row
         schur, interface = self._retained_block.toarray(), self._pattern.interface
         schur[np.ix_(interface, interface)] = self._interface_schur
         return np.asarray(schur)

@@ -20,7 +20,7 @@ import scipy.linalg
 import scipy.sparse as sp
 from cachetools import LRUCache
 
-from vibench.arrays import Array, Indices, Mask, SparseMatrix
+from vibench.arrays import Array, Indices, Mask, SparseMatrix, times_dense
 from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality, is_absent
 from vibench.qp.rows import Directions
@@ -118,8 +118,8 @@ class OnContact:
     @cached_property
     def stiffnesses(self) -> Array:
         """Upper bounds b A bᵀ / |b|⁴ (m,) of the stiffness 1 / b A⁻¹ bᵀ of a row, by Cauchy and Schwarz."""
-        B = sp.csr_array(self.vi.B)
-        squares, energies = (np.asarray((B * other).sum(axis=1)) for other in (B, B @ self.vi.A))
+        B, A = self.B, sp.csr_array(self.vi.A)[self._retained][:, self._retained]
+        squares, energies = (np.asarray((B * other).sum(axis=1)) for other in (B, B @ A))
         return np.asarray(np.divide(energies, squares**2, out=np.zeros_like(squares), where=squares > 0.0))
 
     @cached_property
@@ -140,7 +140,7 @@ class OnContact:
     @cached_property
     def compliance(self) -> Array:
         """K (m×m), not symmetrised: what forces displace is to the last digit what B says of it."""
-        return np.asarray(self.B @ self.liftings.T)
+        return np.ascontiguousarray(times_dense(self.B, self.liftings.T))
 
     def of_force(self, multiplier: Array) -> Representer:
         """The representer of a force Bᵀη of a multiplier η (m,)."""

@@ -60,6 +60,8 @@ class Assemblies:
         found, self._last = self._energies.get(key), None  # two large ones might not fit in memory
         if found is None:
             found = replace(self.energy_of(vi), shared=True)
+            if "A" not in self._problem.constant:  # else it is factorised once, and timed code uses it, too
+                found.stiffness.serve_many(len(vi.g))
             found.on_contact(vi)  # is of its size
             if self._own_bytes(found) <= self._energies.maxsize:
                 self._energies[key] = found

@@ -131,3 +131,36 @@ def test_what_is_left_after_elimination_shows_whether_a_stiffness_is_definite(co
     A[8, 8] = 0.2 if coupled else -1.0  # a quarter is taken from it where it is coupled
     with pytest.raises(NumericalError, match=r"A( somewhere)? is not positive definite"):
         CondensedStiffness(sp.csr_array(A), pattern).check_definite("A somewhere")
+
+
+@pytest.mark.parametrize("kind", ["one entry a row", "several entries a row"])
+def test_what_serves_many_loads_multiplies_by_the_inverse(monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    rng = np.random.default_rng(5)
+    line = sp.diags_array([-np.ones(11), 3.0 * np.ones(12), -np.ones(11)], offsets=[-1, 0, 1])
+    coupling = sp.coo_array(([-0.01, -0.01], ([12, 13], [13, 12])), shape=(25, 25))
+    A = sp.csr_array(sp.block_diag([spd(13, rng), line]) + coupling)
+    B = sp.csr_array(np.diag(rng.uniform(1.0, 2.0, 12))[::-1])
+    B = B if kind == "one entry a row" else sp.csr_array(B + 0.5 * sp.eye_array(12))
+    stiffness = CondensedStiffness(A, EliminationPattern.of(A, np.arange(13, 25)))
+    loads, schur = rng.standard_normal((12, 3)), np.linalg.inv(np.linalg.inv(A.toarray())[13:, 13:])
+    assert not stiffness.dense
+    by_factor, before = stiffness.compliance(loads), stiffness.nbytes
+    stiffness.serve_many(12)
+    assert stiffness.nbytes == before + 8 * 12**2
+    monkeypatch.setattr(kkt_systems, "SparseCholesky", None)
+    del vars(stiffness)["_schur_factor"]
+    for found, expected in (
+        (by_factor, np.linalg.solve(schur, loads)),
+        (stiffness.compliance(loads), np.linalg.solve(schur, loads)),
+        (stiffness.liftings(B), B @ np.linalg.inv(schur)),
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
+
+
+def test_few_rows_have_their_liftings_from_a_factor() -> None:
+    line = sp.diags_array([-np.ones(19), 3.0 * np.ones(20), -np.ones(19)], offsets=[-1, 0, 1], format="csr")
+    stiffness = CondensedStiffness(line)
+    stiffness.serve_many(9)
+    B = sp.csr_array(np.eye(9, 20))
+    np.testing.assert_allclose(stiffness.liftings(B), np.linalg.inv(line.toarray())[:9], rtol=1e-12)
+    assert "inverse" not in vars(stiffness)

@@ -63,3 +63,19 @@ def test_what_counts_of_parts_is_their_symmetric_half(kind: str) -> None:
     shift = sp.eye_array(36, format="csc")
     assert is_proved_by_band([above, above, -0.99 * smallest * shift]) is True
     assert is_proved_by_band([above, above, -1.01 * smallest * shift]) is False
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["sorted", "unsorted"])
+def test_parts_of_one_pattern_are_summed_and_left_as_they_are(turned: bool) -> None:
+    """As those of other patterns are, with the shift between two of its eigenvalues and with all of its sizes."""
+    matrix = membrane(6)
+    if turned:
+        matrix = sp.csr_array(sp.csr_array(matrix[:, ::-1])[:, ::-1])
+    shifted = -sp.csr_array((0.5 * matrix.data, matrix.indices, matrix.indptr))
+    given = [part.copy() for part in (matrix, shifted)]
+    assert is_proved_by_band([matrix, shifted]) is True
+    assert is_proved_by_band([matrix, 2.0001 * shifted]) is False
+    assert is_proved_by_band([1e16 * matrix, matrix, -1e16 * matrix]) is False  # round-off is that of the parts
+    for part, before in zip((matrix, shifted), given, strict=True):
+        assert np.array_equal(part.indices, before.indices)
+        assert np.array_equal(part.data, before.data)

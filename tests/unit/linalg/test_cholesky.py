@@ -92,7 +92,8 @@ def test_the_tail_is_a_factor_of_the_schur_complement(seed: int, count: int, bod
     rest = np.setdiff1d(np.arange(9), last)
     taken = X[np.ix_(last, rest)] @ np.linalg.solve(X[np.ix_(rest, rest)], X[np.ix_(rest, last)])
     S, F = X[np.ix_(last, last)] - taken, factor.trailing_factor
-    with mock.patch.multiple("vibench.linalg.cholesky", SPARSE_COLUMN=short, DENSE_COLUMNS=2):  # the rest are long
+    lengths = {"SPARSE_COLUMN": short, "SPARSE_SHARE": 1.0, "DENSE_COLUMNS": 2}  # the rest are long
+    with mock.patch.multiple("vibench.linalg.cholesky", **lengths):
         assert np.allclose(factor.schur(), S)
     assert np.allclose(F.T @ F, S)
     assert np.array_equal(F, np.triu(F))
