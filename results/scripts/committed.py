@@ -47,9 +47,13 @@ class Results:
 
     @cached_property
     def gains(self) -> pd.DataFrame:
-        """The models of `benefit` against the high-fidelity model: errors, gains, break-evens, with intervals."""
-        against = self.against("benefit")[["cell_b", *GAINS]]
-        return self.table("benefit").merge(against, left_on="cell", right_on="cell_b", how="left")
+        """The models of `benefit` with their gains."""
+        return self.gains_of("benefit")
+
+    def gains_of(self, study: str) -> pd.DataFrame:
+        """The models of a study against the high-fidelity model: errors, gains, break-evens, with intervals."""
+        against = self.against(study)[["cell_b", *GAINS]]
+        return self.table(study).merge(against, left_on="cell", right_on="cell_b", how="left")
 
     @cached_property
     def cones(self) -> pd.DataFrame:

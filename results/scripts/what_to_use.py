@@ -144,7 +144,7 @@ def which_solver(results: Results) -> str:
     return question(
         "Which solver, at which accuracy?",
         f"Of the solvers that solve every query, the fastest in the mean: {'; '.join(answers)} "
-        "([solvers](../results/solvers/README.md)).",
+        "([solvers](../results/solvers/README.md)). " + _whole_queries(results, fine),
         f"these are small dense programs. {_default(table)} Not every query is solved by "
         + "; ".join(
             f"{', '.join(group['solver'])} at {accuracy}" for accuracy, group in failed.groupby("accuracy", sort=False)
@@ -152,6 +152,24 @@ def which_solver(results: Results) -> str:
         + ".",
         "Seconds of the solver alone; the column mean is geometric, over the models in which all queries are ok:",
         formats.to_markdown(table.drop(columns="all")).strip(),
+    )
+
+
+def _whole_queries(results: Results, fine: pd.DataFrame) -> str:
+    """In how many models the fastest solver is surely faster than others that solve every query at every accuracy.
+
+    Whole queries are compared, by the intervals of their gains over the high-fidelity model.
+    """
+    accuracies = fine["accuracy"].nunique()
+    first, *others = (solver for solver, rows in fine.groupby("solver", sort=False) if len(rows) == accuracies)
+    cells = results.gains_of("solvers")
+    gains = cells[cells["status"] == "ok"].set_index(["accuracy", *MODEL, "solver"])
+    low, high = gains["gain_low"].unstack(), gains["gain_high"].unstack()
+    above = [f"{solver} in {of(int((low[first] > high[solver]).sum()), len(low))}" for solver in others]
+    how = " and ".join(cells["assembly"].unique())
+    return (
+        f"In whole queries, assembled in {how}, the interval of the gain of {first} over high-fidelity solutions lies "
+        f"above that of {', '.join(above)} models."
     )
 
 
@@ -165,9 +183,12 @@ def _default(table: pd.DataFrame) -> str:
 def which_assembly(results: Results) -> str:
     """Full, reduced or compiled."""
     gains = results.gains
-    by = {key: span(mine) for key, mine in gains.dropna(subset="gain").groupby(["assembly", "problem"])["gain"]}
+    by = {
+        key: f"{span(mine['gain'])}, intervals within {span([mine['gain_low'].min(), mine['gain_high'].max()])}"
+        for key, mine in gains.dropna(subset="gain").groupby(["assembly", "problem"])
+    }
     said = "; ".join(
-        f"{how} {', '.join(f'{by[how, p]} ({p})' for p in PROBLEMS if (how, p) in by)}" for how in ASSEMBLIES
+        f"{how} {' and '.join(f'{by[how, p]} ({p})' for p in PROBLEMS if (how, p) in by)}" for how in ASSEMBLIES
     )
     none = [
         f"of {problem} ({unavailable(mine)})"
@@ -236,8 +257,7 @@ def when_not(results: Results) -> str:
         "([benefit](../results/benefit/README.md), [paper-obstacle](../results/paper-obstacle/README.md), "
         "[paper-hertz](../results/paper-hertz/README.md)).",
         f"other formulations may pay earlier, from {_formulations(results)} queries on "
-        "([formulations](../results/formulations/README.md), by the protocol that this page names); seconds are those "
-        "of small plane problems on one core; "
+        "([formulations](../results/formulations/README.md)); seconds are those of small plane problems on one core; "
         "high-fidelity solutions start from the nearest contact set that is known. `vibench show RUN --table best "
         "--queries N` says it for yours.",
         "| problem | assembly | models | cheaper than high-fidelity solutions | never | as fast or undecided |\n"
