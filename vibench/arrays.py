@@ -27,12 +27,12 @@ def digest(matrix: SparseMatrix) -> bytes:
 
 
 def times_dense(sparse: SparseMatrix, dense: Array) -> Array:
-    """The product of a sparse M (CSR, m×c) and a dense matrix (c×k).
+    """The product of a sparse M (m×c) and a dense matrix (c×k).
 
-    Rows with one entry, such as those of nodal constraints, are multiples of rows, which SciPy would add to zeros.
+    Rows (CSR) with one entry, such as those of nodal constraints, scale rows, which SciPy would add to zeros.
     """
-    rows = sparse.indices
-    if not np.array_equal(sparse.indptr, np.arange(sparse.shape[0] + 1)):
+    if sparse.format != "csr" or not np.array_equal(sparse.indptr, np.arange(sparse.shape[0] + 1)):
         return np.asarray(sparse @ dense)
+    rows = sparse.indices
     chosen = dense if np.array_equal(rows, np.arange(len(dense))) else dense[rows]
     return np.asarray(sparse.data[:, None] * chosen)
