@@ -595,7 +595,14 @@ def of_space() -> Sequence[str]:
     sized = table.set_index(["dual", "primal", "pod_tol", "dual_tol", "assembly", "N", "R", "enrichment"])
     finer, coarser = (sized.loc[sized["dim_V"] == edge, "online_s"] for edge in (costs.index[-1], costs.index[0]))
     ratios = (finer / coarser).dropna()
+    (pairs,) = [one for one in page_tables("three-dimensions") if "pays, in queries" in one]
+    pays = pairs[pairs["in place of"] == ONLINE].groupby("assembly")["pays, in queries"].value_counts()
+    assert pays["reduced"].to_dict() == {"at once": len(meshes) * 4}
+    assert set(pays["certified"].index) == {"undecided", "as fast"}
+    of_certified = pays["certified"]
     return [
+        f"for certified ones this is undecided in {of_certified['undecided']} of {of_certified.sum()} pairs, and in "
+        f"{of_certified['as fast']} the queries are as fast",
         *(f"| {name} | {' | '.join(one.get(name, '–') for one in columns)} |" for name in columns[0]),
         f"{span(certified['effectivity_online_u_energy_median'])} for u and "
         f"{span(certified['effectivity_online_lambda_natural_median'])} for λ",

@@ -85,7 +85,7 @@ class CondensedStiffness:
         """
         if self._saddle is not None and self._saddle.is_definite:
             return
-        if self._condensed.dense:
+        if self.dense:
             self._blocks  # noqa: B018  their Cholesky factorisation fails otherwise
         else:
             SparseCholesky(self._condensed.schur, name)  # its message has this name
@@ -93,14 +93,13 @@ class CondensedStiffness:
     def solve(self, right: Array) -> Array:
         """A⁻¹ r for right-hand sides (n, k)."""
         load, particular = self._condensed.eliminate(right)
-        retained = self._blocks @ load if self._condensed.dense else self._schur_factor.solve(load)
-        return self._condensed.recover(retained, particular)
+        return self._condensed.recover(self.compliance(load), particular)
 
     def dual_norms(self, functionals: Array) -> Array:
         """‖ℓ‖ in A⁻¹ of functionals (n, k)."""
         if self._saddle is not None and self._saddle.is_definite:
             return self._saddle.dual_norms(functionals)
-        if self._condensed.dense:
+        if self.dense:
             load, eliminated = self._condensed.eliminated_squares(functionals)
             retained = np.einsum("ik,ik->k", load, self._blocks @ load)
             return np.asarray(np.sqrt(np.maximum(eliminated + retained, 0.0)))
