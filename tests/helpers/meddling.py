@@ -15,7 +15,7 @@ from fake_plugins import Wire, careful
 from vibench import Array, QPSolution, VariationalInequality
 
 solve_problem = qpsolvers.solve_problem
-known: dict[bytes, QPSolution] = {}
+known: list[tuple[list[Array], QPSolution]] = []
 
 
 def refuse(*arguments: Any, **options: Any) -> Any:
@@ -50,10 +50,24 @@ def meddling(program: VariationalInequality, accuracy: float) -> QPSolution:
 
 
 def forgetful(program: VariationalInequality, accuracy: float) -> QPSolution:
-    """Returns an earlier answer where three digits of the program are the same."""
-    key = b"".join((np.round(one, 3) + 0.0).tobytes() for one in (program.A, program.f, program.B, program.g))
+    """Returns an earlier answer where three digits of the program are the same.
+
+    They are compared, not rounded: rounded, entries next to a boundary would tell two programs apart at some seeds, and
+    which seed a query is timed with depends on the seconds of the machine.
+    """
+    members = [np.asarray(one) for one in (program.A, program.f, program.B, program.g)]
     qpsolvers.solve_problem = solve_problem
-    return known.setdefault(key, careful(program, accuracy))
+    answer = careful(program, accuracy)
+    for others, earlier in known:
+        if all(map(alike, members, others)):
+            return earlier
+    known.append((members, answer))
+    return answer
+
+
+def alike(one: Array, other: Array) -> bool:
+    """Whether two members of programs agree to a thousandth of their largest entry."""
+    return one.shape == other.shape and bool(np.all(abs(one - other) <= 1e-3 * np.max(abs(other), initial=0.0)))
 
 
 MEMBERS = {
