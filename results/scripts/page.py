@@ -6,10 +6,11 @@ import inspect
 import json
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image, PngImagePlugin
 
@@ -118,16 +119,25 @@ def alternative(figure: Figure, name: str) -> str:
 
     Of a figure without labels at its axes it is the first one of the caption, or what its name says.
     """
-    panels = [axes for axes in figure.axes if axes.get_visible() and axes.get_xlabel() and axes.get_ylabel()]
-    if not panels:
+    panels = [axes for axes in figure.axes if axes.get_visible()]
+    across, up = _labels(panels, Axes.get_xlabel, "colspan"), _labels(panels, Axes.get_ylabel, "rowspan")
+    labels = [(x, y) for x, y in zip(across, up, strict=True) if x and y]
+    if not labels:
         return _in_brackets(first_sentence(caption_of(figure)) or f"Figure {name}.")
-    shown = dict.fromkeys(f"{axes.get_ylabel()} over {axes.get_xlabel()}" for axes in panels)
+    shown = dict.fromkeys(f"{y} over {x}" for x, y in labels)
     legends = [*figure.legends, *filter(None, (axes.get_legend() for axes in panels))]
     named = list(dict.fromkeys(text.get_text() for legend in legends for text in legend.get_texts()))
     more = f" and {len(named) - NAMED} others" if len(named) > NAMED else ""
     whom = f", for {'; '.join(named[:NAMED])}{more}" if named else ""
-    number = "One panel shows" if len(panels) == 1 else f"{len(panels)} panels show"
+    number = "One panel shows" if len(labels) == 1 else f"{len(labels)} panels show"
     return _in_brackets(" ".join(f"{number} {'; '.join(shown)}{whom}.".split()))
+
+
+def _labels(panels: Sequence[Axes], get: Callable[[Axes], str], span: str) -> list[str]:
+    """The labels at one axis of panels; of a panel that has none, the one in its column or row of the grid."""
+    spans = [getattr(axes.get_subplotspec(), span, None) for axes in panels]
+    there = {place: label for axes, place in zip(panels, spans, strict=True) if place and (label := get(axes))}
+    return [get(axes) or there.get(place, "") for axes, place in zip(panels, spans, strict=True)]
 
 
 def _in_brackets(text: str) -> str:

@@ -219,6 +219,11 @@ def test_a_smaller_picture_keeps_its_caption_and_is_described_in_a_sentence(
         panel.plot([1.0, 2.0], [3.0, 4.0], label="a model")
     sheet.figure.legend()
     assert page.alternative(sheet.figure, "errors") == "2 panels show error (1) over seconds, for a model."
+    grid = Sheet(2, 2)
+    for place, panel in enumerate(grid.panels):  # a label for a row on its left, for a column below it
+        panel.set(xlabel="seconds" if place > 1 else "", ylabel=("error", "", "gain", "")[place])
+    shown = page.alternative(grid.figure, "errors")
+    assert shown == "4 panels show error over seconds; gain over seconds."
 
 
 def test_vibench_is_cited_alike_everywhere() -> None:
