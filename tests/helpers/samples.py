@@ -34,6 +34,9 @@ STUDY: Mapping[str, Any] = {
 RECORDED: Mapping[str, Any] = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}
 """What a results file records of a study."""
 
+SOLVERS_OF_TESTS = ("cvxopt", "osqp", "piqp", "proxqp")
+"""Those of the dependencies and of the extra `test`. Others that are installed may be too inexact for a test."""
+
 ROUNDS = 3
 """Timing rounds of runs whose seconds no test looks at."""
 

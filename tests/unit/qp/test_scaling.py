@@ -8,11 +8,12 @@ import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
 from numerics import exact, spd
+from samples import SOLVERS_OF_TESTS
 
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.qp import verification
 from vibench.qp.scaling import drive, near_rows, row_norms, stiffness, units_of, units_of_dual
-from vibench.qp.solve import installed_solvers, solve_qp
+from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution
 
@@ -102,7 +103,7 @@ def test_data_that_are_zero_have_units_too() -> None:
     assert all(units_of_dual(dual, loaded).length > 0.0 for loaded in (True, False))
 
 
-@pytest.mark.parametrize("solver", sorted({"piqp", "proxqp", "osqp", "cvxopt"} & set(installed_solvers())))
+@pytest.mark.parametrize("solver", SOLVERS_OF_TESTS)
 @pytest.mark.parametrize(("length", "modulus"), [(0, 0), (-2, 0), (-6, 11), (4, -6)])
 @pytest.mark.parametrize("form", ["primal", "dual"])
 def test_a_program_without_load_is_solved_to_the_accuracy_asked_for(

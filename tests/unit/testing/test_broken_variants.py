@@ -9,9 +9,9 @@ from pathlib import Path
 import broken_variants
 import pytest
 from other_problems import Block, Put, Torsion
+from samples import SOLVERS_OF_TESTS
 
 from vibench import testing
-from vibench.qp.solve import installed_solvers
 from vibench.testing.checks import Verdict
 from vibench.testing.solvers import of_qpsolvers
 
@@ -103,6 +103,6 @@ def test_what_is_right_passes_without_a_warning(create) -> None:
     assert [symbol for symbol in ("α = ", "γ_a = ", "β_HF = ") if symbol not in constants] == []
 
 
-@pytest.mark.parametrize("solver", installed_solvers())
-def test_every_installed_solver_passes(solver: str) -> None:
+@pytest.mark.parametrize("solver", SOLVERS_OF_TESTS)
+def test_the_solvers_of_the_dependencies_pass(solver: str) -> None:
     assert messages(testing.examine_solver(partial(of_qpsolvers, solver=solver))) == {}
