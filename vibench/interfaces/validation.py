@@ -105,6 +105,10 @@ def _finite_parameters(problem: Problem, name: str, mus: Array, count: int | Non
     return mus
 
 
+LARGEST = 1e100
+"""Entries beyond this, and matrices below its inverse, are refused: not even their cubes would be numbers."""
+
+
 def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
     """`problem.assemble(mu)`, refused if shapes are wrong or values not real and finite.
 
@@ -121,9 +125,18 @@ def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
             raise NumericalError(f"{name} has {where}; the spaces V and W require {shape}")
         if np.iscomplexobj(value):
             raise NumericalError(f"{name} is complex at mu = {mu.tolist()}; vibench is for real problems")
-        if not np.all(np.isfinite(value if isinstance(value, np.ndarray) else value.data)):
+        entries = value if isinstance(value, np.ndarray) else value.data
+        peak = max(np.max(entries, initial=0.0), -np.min(entries, initial=0.0))
+        if not np.isfinite(peak):
             infinite = "; +inf, which means that a row constrains nothing, is allowed" if name == "g" else ""
             raise NumericalError(f"{name} has entries that are not finite at mu = {mu.tolist()}{infinite}")
+        too_large = peak > LARGEST and name != "g"  # rows of it may be far
+        too_small = 0.0 < peak < 1.0 / LARGEST and name in ("A", "B")
+        if too_large or too_small:
+            raise NumericalError(
+                f"{name} has entries of up to {peak:.0e} at mu = {mu.tolist()}; products of such numbers over- or "
+                f"underflow: choose units in which they are between {1.0 / LARGEST:.0e} and {LARGEST:.0e}"
+            )
     return vi
 
 

@@ -151,10 +151,10 @@ class PackReader:
             raise RequestError(f"{what}: every point needs {d} values, one for each of {', '.join(self._names)}")
         else:
             mus = np.array(given.points, dtype=float)
-        if mus.ndim != 2 or mus.shape[1] != d:
-            transposed = "; it is transposed" if mus.ndim == 2 and mus.shape[0] == d else ""
+        if mus.ndim != 2 or mus.shape[1] != d or not len(mus):
+            transposed = "; it is transposed" if mus.ndim == 2 and mus.shape[0] == d != mus.shape[1] else ""
             raise RequestError(
-                f"{what}: an array {size_of(mus.shape)}; expected P×{d}, a row per parameter{transposed}"
+                f"{what}: an array {size_of(mus.shape)}; expected P×{d} with P > 0, a row per parameter{transposed}"
             )
         if box is not None:
             for k, i in np.argwhere(box.outside(mus))[:1]:
@@ -242,13 +242,21 @@ class PackReader:
         return columns
 
     def _contact(self, members: Mapping[str, PackMember], n: int) -> Indices:
-        if self._manifest.spaces.contact is not None and members:
-            named = np.unique(self._files.indices(self._manifest.spaces.contact, "spaces.contact", self._all))
-            return named if self._free is None else np.flatnonzero(np.isin(self._free, named))
         touched = np.zeros(n, dtype=bool)
         for matrix in members["B"].arrays if members else ():
             touched[sp.csr_array(matrix).indices] = True
-        return np.flatnonzero(touched)
+        if self._manifest.spaces.contact is None or not members:
+            return np.flatnonzero(touched)
+        named = self._files.indices(self._manifest.spaces.contact, "spaces.contact", self._all)
+        numbers = np.arange(n) if self._free is None else self._free
+        contact = np.isin(numbers, named)
+        missing = numbers[touched & ~contact] + self._manifest.index_base
+        if len(missing):
+            raise RequestError(
+                f"spaces.contact: {len(missing)} unknowns that B touches are not in it, the first is {missing[0]}; "
+                "leave it out, and they are found"
+            )
+        return np.flatnonzero(contact)
 
     def _reference(self, given: schema.Solutions, n: int, m: int) -> PackSolutions:
         lam = self._columns(given.lam, "solutions.lam", m, None)

@@ -41,6 +41,14 @@ def test_an_ordinary_assembly_passes() -> None:
     assert np.isclose(problem.multiplier_integrals().sum(), problem.W.matrix.sum())
 
 
+def test_far_rows_of_g_and_small_loads_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = Varying()
+    good = problem.assemble(np.array([0.3]))
+    far = replace(good, g=np.append(good.g[:-1], 1e250), f=1e-200 * good.f)
+    monkeypatch.setattr(problem, "assemble", lambda mu: far)
+    assert checked_assembly(problem, np.array([0.3])) is far
+
+
 @pytest.mark.parametrize(
     ("member", "wrong", "message"),
     [
@@ -48,6 +56,11 @@ def test_an_ordinary_assembly_passes() -> None:
         ("g", lambda vi: np.append(vi.g, 1.0), r"g has shape \(9,\)"),
         ("f", lambda vi: vi.f * np.nan, "f has entries that are not finite"),
         ("B", lambda vi: sp.csr_array(vi.B * np.inf), "B has entries that are not finite"),
+        ("f", lambda vi: np.where(np.arange(30) == 3, -np.inf, vi.f), "f has entries that are not finite"),
+        ("g", lambda vi: vi.g * np.nan, "g has entries that are not finite"),
+        ("A", lambda vi: sp.csr_array(vi.A * 1e200), "A has entries of up to .e.2.*: choose units"),
+        ("B", lambda vi: sp.csr_array(vi.B * 1e-200), "B has entries of up to .e-2.*: choose units"),
+        ("f", lambda vi: vi.f - 1e150, r"f has entries of up to 1e\+150 at mu = \[0.3\]; .* 1e-100 and 1e\+100"),
     ],
 )
 def test_a_wrong_assembly_is_named(monkeypatch: pytest.MonkeyPatch, member, wrong, message) -> None:

@@ -394,6 +394,19 @@ def transposed_constraint(content: Content, cable: Cable, folder: Path) -> None:
     cable.X_W, cable.B = sp.csr_array(cable.X_W[:5, :5]), sp.csr_array(cable.B[:, :5])
 
 
+@mistake("parameters.training: an array 0×2; expected P×2 with P > 0, a row per parameter$")
+def no_points(content: Content, cable: Cable, folder: Path) -> None:
+    np.savez(folder / "points.npz", none=np.empty((0, 2)))
+    content["parameters"]["training"] = "points.npz:none"
+
+
+@mistake("spaces.contact: 9 unknowns that B touches are not in it, the first is 1; leave it out, and they are found")
+def contact_without_unknowns_of_constraints(content: Content, cable: Cable, folder: Path) -> None:
+    """As of numbers that were stored in a type too small for them."""
+    np.savez(folder / "contact.npz", few=np.array([0, 2, 2, 3], np.uint8))
+    content["spaces"]["contact"] = "contact.npz:few"
+
+
 @mistake("operators.B is zero: no constraint acts")
 def no_constraint(content: Content, cable: Cable, folder: Path) -> None:
     cable.B = 0.0 * cable.B
