@@ -154,6 +154,7 @@ class Chatty(Wire):
 
 
 def segfault() -> None:
+    print("the last words")
     ctypes.string_at(0)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import faulthandler
+import io
 import os
 import resource
 import signal
@@ -69,6 +70,8 @@ def main() -> None:
     connection = Connection(ours.detach())
     for stream in (1, 2):  # what plugins print must not look like output of vibench
         os.dup2(log, stream)
+    if isinstance(sys.stdout, io.TextIOWrapper):  # what was printed before a crash would be lost with its buffer
+        sys.stdout.reconfigure(line_buffering=True)
     faulthandler.enable()
     interrupts.ignore()
     threadpool_limits(1)
