@@ -44,6 +44,7 @@ BAD_PRIMALS: Mapping[str, tuple[set[str], str]] = {
     "enrichment-shape": ({"error"}, "in enrichment: the vectors of the enrichment have shape (11, 1), expected (12, "),
     "enrichment-long": ({"error"}, "in enrichment: the vectors of the enrichment are not orthonormal in V"),
     "enrichment-supply": ({"error"}, "in assembly: the enrichment supplied vectors of shape (12,), expected (12, "),
+    "enrichment-writes": ({"error"}, "in enrichment: ValueError: assignment destination is read-only"),
     "enrichment-nothing": ({"error"}, "in enrichment: the primal strategy returned a NoneType, expected an Enrichm"),
 }
 BAD_SOLVERS: Mapping[str, tuple[set[str], str]] = {

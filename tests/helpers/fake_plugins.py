@@ -175,7 +175,7 @@ class BadCone(DualStrategy):
 class BadVectors(PrimalStrategy):
     """Returns vectors that are broken in the way asked for."""
 
-    def __init__(self, how: Literal["nan", "shape", "long", "supply", "nothing"]) -> None:
+    def __init__(self, how: Literal["nan", "shape", "long", "supply", "nothing", "writes"]) -> None:
         self.how = how
 
     def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
@@ -183,6 +183,9 @@ class BadVectors(PrimalStrategy):
             return Enrichment(Kind.PER_PARAMETER, supply=flat_supply)
         if self.how == "nothing":
             return None  # type: ignore[return-value]
+        if self.how == "writes":
+            assert not any(given.flags.writeable for given in (offline.cone.generators, offline.span))
+            offline.basis[:] = 0.0  # which others are given, too
         one = offline.problem.V.orthonormalise(np.ones((offline.problem.V.dim, 1)), offline.basis)
         broken = {"nan": one * np.nan, "shape": one[1:], "long": 2.0 * one}[self.how]
         return Enrichment(Kind.FIXED, vectors=broken)

@@ -68,7 +68,10 @@ def dumps(value: Any) -> bytes:
 
 
 def loads(content: bytes) -> Any:
-    """The value that `dumps` wrote; arrays have the same entries, shape and order in memory, and may be written to.
+    """The value that `dumps` wrote; arrays have the same entries, shape and order in memory.
+
+    Dense ones are read-only: a process keeps values for several stages, and a plugin that wrote into those that it is
+    given would change the results of others.
 
     Raises a `DamagedArtefactError` if the content is anything else. It imports and runs nothing that the content names.
     """
@@ -156,14 +159,14 @@ class _Reader:
     """Makes a value from its description and its arrays."""
 
     def __init__(self, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
-        self._arrays = arrays
+        self._arrays, self._views = arrays, dict[str, np.ndarray[Any, Any]]()
         self._sorts: dict[str, Callable[[Any], Any]] = {
             "float": lambda text: {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}[text],
             "tuple": lambda parts: tuple(map(self.value, parts)),
             "list": lambda parts: list(map(self.value, parts)),
             "dict": lambda parts: {self.value(key): self.value(part) for key, part in parts},
-            "array": lambda number: self._arrays[number],
-            "columnwise": lambda number: self._arrays[number].T,
+            "array": self._read_only,
+            "columnwise": lambda number: self._read_only(number).T,
             "scalar": lambda number: self._arrays[number][()],
             "sparse": lambda parts: self._sparse(*parts),
             "member": lambda parts: _class(parts[0], Enum)[parts[1]],
@@ -179,8 +182,22 @@ class _Reader:
         ((sort, content),) = described.items()
         return self._sorts[sort](content)
 
+    def _read_only(self, number: str) -> np.ndarray[Any, Any]:
+        """A view of an array, the same one wherever it occurs."""
+        if number not in self._views:
+            self._views[number] = self._arrays[number].view()
+            self._views[number].flags.writeable = False
+        return self._views[number]
+
+    def _part(self, described: tuple[str, str]) -> np.ndarray[Any, Any]:
+        """An array of a sparse matrix, which SciPy sorts in place."""
+        sort, number = described
+        if sort not in ("array", "columnwise"):
+            raise TypeError("a sparse matrix without arrays")
+        return self._arrays[number].T if sort == "columnwise" else self._arrays[number]
+
     def _sparse(self, wanted: str, kind: str, array: bool, shape: list[int], parts: list[Any]) -> SparseMatrix:
-        arrays = [self.value(part) for part in parts]
+        arrays = [self._part(*part.items()) for part in parts]
         if kind not in SPARSE or wanted not in {*SPARSE, "lil", "dok"} or len(arrays) != len(SPARSE[kind]):
             raise ValueError("no format of a sparse matrix")
         make = getattr(sp, f"{kind}_{'array' if array else 'matrix'}")
