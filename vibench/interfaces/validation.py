@@ -110,7 +110,7 @@ LARGEST = 1e100
 
 
 def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
-    """`problem.assemble(mu)`, refused if shapes are wrong or values not real and finite.
+    """`problem.assemble(mu)`, refused if shapes are wrong, values not real and finite, or out of range (`LARGEST`).
 
     Raises
     ------
