@@ -1,4 +1,4 @@
-"""What mkdocs does beside its own work: formulas, the pages of `results/` and their files, a check of every page."""
+"""What mkdocs does beside its own work: formulas, sentences, the pages of `results/`, a check of every page."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import Any
 from formulas import Formulas
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
+from reference import filled
+from sentences import rendered
 
 RESULTS = "results"
 """Folder of the repository, and of the site, with the pages of results."""
@@ -36,7 +38,8 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Correct links between `docs/` and `results/`: side by side in the repository, nested on the site."""
+    """Render sentences and reference tables, and correct links to `results/`, which is nested on the site."""
+    markdown = filled(rendered(markdown))
     up = "../" * page.file.src_uri.count("/")
     if page.file.src_uri.startswith(f"{RESULTS}/"):
         return markdown.replace(f"]({up}docs/", f"]({up}")

@@ -50,38 +50,52 @@ def test_scripts_lie_apart_from_what_they_wrote() -> None:
     assert {path for path in FILES if path.suffix == ".py"} == {path for path in FILES if SCRIPTS in path.parents}
 
 
-def test_every_file_is_a_page_or_a_script_or_on_a_page() -> None:
+def test_every_file_is_on_a_page_every_link_resolves_and_the_overview_has_all_pages() -> None:
     pages = {*PAGES, ROOT / "README.md", *(ROOT / "docs").rglob("*.md")}
     shown = set().union(*map(linked, pages))
     assert [path for path in FILES if path.suffix not in {".md", ".py"} and path not in shown] == []
-
-
-@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_link_of_a_page_resolves(page: Path) -> None:
-    assert [path for path in linked(page) if not path.exists()] == []
-
-
-def test_every_page_is_in_the_overview() -> None:
+    targets = {page: linked(page) for page in [*PAGES, ROOT / "README.md"]}
+    assert [(page, path) for page, paths in targets.items() for path in paths if not path.exists()] == []
     overview = RESULTS / "README.md"
     assert {page for page in PAGES if page != overview} <= linked(overview)
 
 
-@pytest.mark.parametrize(
-    "path",
-    sorted({*SCRIPTS.glob("*.py")} - {SCRIPTS / "page.py", SCRIPTS / "committed.py"}),
-    ids=lambda path: path.stem,
-)
-def test_the_command_of_a_script_has_the_arguments_that_it_takes(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True)
+def scripts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scripts of the pages can be imported."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
-    script = importlib.import_module(path.stem)
-    (command,) = re.findall(rf"python results/scripts/{path.name}((?: [^>\s]+)*)", script.__doc__ or "")
-    assert len(command.split()) == len(inspect.signature(script.main).parameters)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_the_page_of_a_study_names_the_command_that_makes_the_tables_of_all_queries(name: str) -> None:
-    text = (RESULTS / name / "README.md").read_text(encoding="utf-8")
-    assert f"`vibench run {name}` leaves the tables of all queries and histories under `runs/{name}/tables`" in text
+def test_the_command_of_a_script_has_the_arguments_that_it_takes() -> None:
+    for path in sorted({*SCRIPTS.glob("*.py")} - {SCRIPTS / "page.py", SCRIPTS / "committed.py"}):
+        script = importlib.import_module(path.stem)
+        (command,) = re.findall(rf"python results/scripts/{path.name}((?: [^>\s]+)*)", script.__doc__ or "")
+        assert len(command.split()) == len(inspect.signature(script.main).parameters), path
+
+
+def test_the_page_of_a_study_names_the_command_that_makes_the_tables_of_all_queries() -> None:
+    for name in NAMES:
+        text = (RESULTS / name / "README.md").read_text(encoding="utf-8")
+        assert f"`vibench run {name}` leaves the tables of all queries and histories under `runs/{name}/tables`" in text
+
+
+def test_the_first_page_and_what_to_use_are_made_from_the_tables() -> None:
+    committed, first_page, what_to_use = map(importlib.import_module, ("committed", "first_page", "what_to_use"))
+    results, page = committed.Results(RESULTS), (ROOT / "README.md").read_text(encoding="utf-8")
+    assert first_page.PLACE.search(page)
+    assert first_page.filled(page, results) == page
+    assert what_to_use.what_to_use(results) == (ROOT / "docs" / "what-to-use.md").read_text(encoding="utf-8")
+
+
+def test_sentences_of_the_documentation_are_rendered_from_the_tables(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    sentences = importlib.import_module("sentences")
+    page = (ROOT / "docs" / "field.md").read_text(encoding="utf-8")
+    stale = page.replace("it has 57 generators", "it has 58 generators")
+    assert stale != page
+    assert sentences.rendered(stale) == sentences.rendered(page)
+    named = {name for path in (ROOT / "docs").glob("*.md") for name, _ in sentences.PLACE.findall(path.read_text())}
+    assert named == set(sentences.TOPICS)
 
 
 def test_a_page_made_anew_is_as_light(quick_run: Path, tmp_path: Path) -> None:
@@ -107,7 +121,6 @@ def test_a_page_made_anew_is_as_light(quick_run: Path, tmp_path: Path) -> None:
 
 
 def test_the_results_are_published_by_one_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(SCRIPTS))
     script = importlib.import_module("publish")
     monkeypatch.setattr(html, "page", lambda *_, **__: "<!doctype html>")
     script.main(str(tmp_path / "site"))
@@ -132,18 +145,16 @@ def test_the_results_are_published_by_one_command(tmp_path: Path, monkeypatch: p
     assert machines >= {machine for file in others for machine in pd.read_csv(file)["machine"].dropna()}
 
 
-def test_a_hash_that_looks_like_a_number_is_a_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hash_that_looks_like_a_number_is_a_text(tmp_path: Path) -> None:
     """All cells of a study have one hash of it, and pandas reads a column of such as numbers."""
-    monkeypatch.syspath_prepend(str(SCRIPTS))
     cells = pd.read_csv(RESULTS / "benefit" / "cells.csv").head(2).assign(study_hash="9369049480579e14")
     cells.to_csv(tmp_path / "cells.csv", index=False)
     rows = importlib.import_module("publish").rows(tmp_path / "cells.csv")
     assert [row["study_hash"] for row in rows] == ["9369049480579e14"] * 2
 
 
-def test_numbers_at_logarithmic_axes_are_text(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_numbers_at_logarithmic_axes_are_text() -> None:
     """Figures show texts as they are: Matplotlib's own powers of ten would be its commands for them."""
-    monkeypatch.syspath_prepend(str(SCRIPTS))
     script, rows = importlib.import_module("scaling"), pd.read_csv(RESULTS / "scaling" / "rows.csv")
     with styled():
         figure = script.draw(rows[rows["over"] == "mesh"], "n")
@@ -155,8 +166,7 @@ def test_numbers_at_logarithmic_axes_are_text(monkeypatch: pytest.MonkeyPatch) -
     assert not [label for label in labels if "$" in label]
 
 
-def test_other_machines_are_compared_row_by_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(SCRIPTS))
+def test_other_machines_are_compared_row_by_row(tmp_path: Path) -> None:
     here, there = tmp_path / "benefit", tmp_path / "machines" / "other" / "benefit"
     for folder in (here, there):
         folder.mkdir(parents=True)
@@ -203,10 +213,7 @@ def test_the_readme_says_what_a_query_is_compared_with() -> None:
     assert all(row[k] == "–" or re.fullmatch(r"\S+ \(\S+–\S+\)", row[k]) for row in rows for k in gains)
 
 
-def test_a_smaller_picture_keeps_its_caption_and_is_described_in_a_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.syspath_prepend(str(SCRIPTS))
+def test_a_smaller_picture_keeps_its_caption_and_is_described_in_a_sentence(tmp_path: Path) -> None:
     page = importlib.import_module("page")
     figure = Sheet(1, 1).finish("Errors at δ = 0.5 of [all] models. More of it.")
     file = page.write_figure(figure, tmp_path, "errors")

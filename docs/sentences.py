@@ -1,30 +1,24 @@
-"""Sentences of README and documentation that sum up tables under `results/`: they are written here from the tables.
+"""Parts of sentences that are rendered from the tables under `results/` whenever the documentation is built.
 
-The first page and "What to use" are made whole by their scripts. Numbers that no committed table has are not
-checked here; the commands beside them print them:
-
-- the pages on export, limits, packs and reports;
-- README: the seconds of `quick`, and of it beside other processes;
-- measurement.md: what five cold runs of two studies scatter by, and the simulations of intervals;
-- tutorial.md: errors and seconds of its own study on a coarse mesh;
-- three-dimensions.md: wall times, memory, the coarse mesh, and what `tests/benchmarks/space.py` prints;
-- field.md: shares between the numbers of vectors that the page of results has, and at how many training parameters a
-  share is missed: both stand in the histories of the run.
+On a page such a part stands between `<!-- NAME NUMBER -->` and `<!-- -->`, as it was rendered last; NAME is a function
+of this module that returns all parts of its topic, and NUMBER counts them. `python docs/sentences.py` renders the pages
+themselves. The functions assert what a sentence claims beside its numbers, so that the build fails where a claim is no
+longer true. Other numbers come from the commands that the pages name beside them.
 """
 
 from __future__ import annotations
 
-import importlib
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pytest
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 MODEL = ["problem", "dual", "primal", "primal_options", "pod_tol", "pod_size", "dual_tol", "dual_size", "primal_tol"]
+BARE, ONLINE, OFFLINE = "decorrelated", "online-supremizers", "offline-pga"
+PLACE = re.compile(r"<!-- (\w+) (\d+) -->.*?<!-- -->", re.DOTALL)
 
 
 def cells(study: str) -> pd.DataFrame:
@@ -33,7 +27,7 @@ def cells(study: str) -> pd.DataFrame:
     return table[table["solver"] == "piqp"]
 
 
-def of_cones() -> Sequence[str]:
+def cones() -> Sequence[str]:
     """What the page on the study `field` says of cones: sizes, errors, conditioning."""
     table = cells("field")
     chosen = table[
@@ -77,7 +71,7 @@ def misses(study: str, problem: str) -> tuple[int, pd.DataFrame]:
     return len(recorded), recorded[below]
 
 
-def of_guarantees() -> Sequence[str]:
+def guarantees() -> Sequence[str]:
     """What the page on the study `field` says of shares off the training set."""
     in_field = [misses("field", problem) for problem in ("hertz", "obstacle")]
     assert [len(missed) for _, missed in in_field] == [0, 0]
@@ -92,7 +86,7 @@ def of_guarantees() -> Sequence[str]:
     )
 
 
-def of_slowest() -> Sequence[str]:
+def slowest() -> Sequence[str]:
     """What it says of the enrichment with the slowest queries."""
     table = cells("field")
     table = table[~table["dual"].str.startswith("pod-dual")]
@@ -110,7 +104,7 @@ def of_slowest() -> Sequence[str]:
     )
 
 
-def of_setting() -> Sequence[str]:
+def setting() -> Sequence[str]:
     """What it says of the meshes, and of Gram matrices whose generators are linearly dependent."""
     table = cells("field")
     assert set(table["queries"]) == {32}
@@ -137,7 +131,7 @@ def percent(values: pd.Series, digits: int = 2) -> list[str]:
     return [f"{float(f'{100.0 * end:.{digits}g}'):g}" for end in (values.min(), values.max())]
 
 
-def of_cones_and_controls() -> Sequence[str]:
+def cones_and_controls() -> Sequence[str]:
     """What it says of the best and the worst cones, and of cells without enrichment."""
     table = cells("field")
     chosen = tight(table)
@@ -179,7 +173,7 @@ def of_cones_and_controls() -> Sequence[str]:
     )
 
 
-def of_enrichments() -> Sequence[str]:
+def enrichments() -> Sequence[str]:
     """What it says of vectors and shares with the cone of mCPG, and of prescribed shares that are missed."""
     table = cells("field")
     mine = tight(table)[lambda rows: rows["dual"] == "mcpg"].set_index(["problem", "primal", "primal_tol"])
@@ -235,7 +229,7 @@ def of_enrichments() -> Sequence[str]:
     )
 
 
-def of_fronts() -> Sequence[str]:
+def fronts() -> Sequence[str]:
     """What it says of Pareto fronts and of the fastest queries."""
     table = cells("field")
     (front,) = [one for one in page_tables("field") if {"cost", "is"} <= set(one)]
@@ -276,7 +270,7 @@ def span(values: pd.Series) -> str:
     return f"{values.min():.2g} to {values.max():.2g}"
 
 
-def of_formulations() -> Sequence[str]:
+def formulations() -> Sequence[str]:
     """What the page on formulations says of times and errors beside those of `mixed`, and of less training."""
     table = pd.read_csv(ROOT / "results" / "formulations" / "cells.csv")
     assert (table["queries_ok"] == table["queries"]).all()
@@ -329,7 +323,7 @@ def of_formulations() -> Sequence[str]:
         f"`hyper-reduced` has {errors(['hyper-reduced'], mcpg)} times its errors of λ with `mcpg`, "
         f"{errors(['hyper-reduced'], ~mcpg)} times with a dictionary, and takes {times('hyper-reduced')} times as long",
         f"grow by factors of {span(growth.loc['mixed', 'inner'])}, those of `regression` of "
-        f"{span(regression['inner'])}; with half",
+        f"{span(regression['inner'])}",
         f"with half of the solutions, of {span(growth.loc['mixed', 'half'])} and {span(regression['half'])}",
         f"in {table['queries'].sum():,} queries",
         f"radial basis functions {beside('offline_s', 'regression (radial)')} times, with Gaussian processes "
@@ -341,7 +335,7 @@ def of_formulations() -> Sequence[str]:
     )
 
 
-def of_break_evens() -> Sequence[str]:
+def break_evens() -> Sequence[str]:
     """What the page on formulations says of when they are cheaper than `mixed`."""
     table = pd.read_csv(ROOT / "results" / "formulations" / "thresholds.csv")
     assert (table["formulation_a"] == "mixed").all()
@@ -395,7 +389,7 @@ def page_tables(study: str) -> list[pd.DataFrame]:
     return found
 
 
-def of_certified() -> Sequence[str]:
+def certified() -> Sequence[str]:
     """What the page on certified models says of effectivities, corrections, certificates and greedy training."""
     medians, largest, costs, corrected, *_ = page_tables("certified")
     u, in_V, natural, in_W = "u in the energy norm", "u in V", "λ in the natural norm", "λ in W"
@@ -444,7 +438,7 @@ def of_certified() -> Sequence[str]:
     )
 
 
-def of_unseen_parameters() -> Sequence[str]:
+def unseen_parameters() -> Sequence[str]:
     """What the page on certified models says of random parameters that no training set has."""
     table = pd.read_csv(ROOT / "results" / "certified" / "unseen.csv")
     assert (table["violations"] == 0).all()
@@ -475,9 +469,6 @@ def of_unseen_parameters() -> Sequence[str]:
         f"{factors['hertz'].min():.1f} to {factors['hertz'].max():.1f}, and in {others['obstacle'].min():.0f} to "
         f"{others['obstacle'].max():.0f} % and {others['hertz'].min():.0f} to {others['hertz'].max():.0f} % of the",
     )
-
-
-BARE, ONLINE, OFFLINE = "decorrelated", "online-supremizers", "offline-pga"
 
 
 def ladder(rows: pd.DataFrame, column: str, dual: str, primal: str, digits: int = 2) -> str:
@@ -544,7 +535,7 @@ def of_costs(rows: pd.DataFrame, page: str) -> dict[str, str]:
     }
 
 
-def of_elliptic_contact() -> Sequence[str]:
+def elliptic_contact() -> Sequence[str]:
     """What the page on three dimensions says of differences from Hertz's contact; orders are asserted below `fine`."""
     page = (ROOT / "results" / "three-dimensions" / "README.md").read_text(encoding="utf-8")
     lines = [line.strip("| ").split("|") for line in re.findall(r"^\| (?:coarse|medium|paper|fine) .*$", page, re.M)]
@@ -572,7 +563,7 @@ def of_elliptic_contact() -> Sequence[str]:
     )
 
 
-def of_space() -> Sequence[str]:
+def space() -> Sequence[str]:
     """The table of the page on three dimensions, by mesh and in the plane."""
     table = pd.read_csv(ROOT / "results" / "three-dimensions" / "cells.csv")
     assert (table["queries_ok"] == table["queries"]).all()
@@ -614,45 +605,32 @@ def of_space() -> Sequence[str]:
     ]
 
 
-@pytest.mark.parametrize(
-    ("page", "sentences"),
-    [
-        ("docs/field.md", of_cones),
-        ("docs/field.md", of_guarantees),
-        ("docs/field.md", of_slowest),
-        ("docs/field.md", of_setting),
-        ("docs/field.md", of_cones_and_controls),
-        ("docs/field.md", of_enrichments),
-        ("docs/field.md", of_fronts),
-        ("docs/formulations.md", of_formulations),
-        ("docs/formulations.md", of_break_evens),
-        ("docs/certified.md", of_certified),
-        ("docs/certified.md", of_unseen_parameters),
-        ("docs/three-dimensions.md", of_elliptic_contact),
-        ("docs/three-dimensions.md", of_space),
-    ],
-)
-def test_a_page_says_what_the_tables_say(page: str, sentences: object) -> None:
-    assert callable(sentences)
-    text = " ".join((ROOT / page).read_text(encoding="utf-8").split())
-    assert [sentence for sentence in sentences() if sentence not in text] == []
+TOPICS: dict[str, Callable[[], Sequence[str]]] = {
+    topic.__name__: topic
+    for topic in (
+        cones, guarantees, slowest, setting, cones_and_controls, enrichments, fronts, formulations, break_evens,
+        certified, unseen_parameters, elliptic_contact, space,
+    )
+}  # fmt: skip
 
 
-@pytest.fixture
-def scripts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "results" / "scripts"))
+def rendered(page: str) -> str:
+    """The text of a page with its parts as the tables have them today."""
+    parts = {name: TOPICS[name]() for name, _ in PLACE.findall(page)}
+
+    def part(place: re.Match[str]) -> str:
+        return f"<!-- {place[1]} {place[2]} -->{parts[place[1]][int(place[2])].strip('| ')}<!-- -->"
+
+    return PLACE.sub(part, page)
 
 
-@pytest.mark.usefixtures("scripts")
-def test_the_results_on_the_first_page_are_made_from_the_tables() -> None:
-    committed, first_page = map(importlib.import_module, ("committed", "first_page"))
-    page = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert first_page.PLACE.search(page)
-    assert first_page.filled(page, committed.Results(ROOT / "results")) == page
+def main() -> None:
+    """Render the parts of all pages."""
+    for path in sorted(Path(__file__).parent.glob("*.md")):
+        text = path.read_text(encoding="utf-8")
+        if (made := rendered(text)) != text:
+            path.write_text(made, encoding="utf-8")
 
 
-@pytest.mark.usefixtures("scripts")
-def test_the_page_what_to_use_is_made_from_the_tables() -> None:
-    committed, what_to_use = map(importlib.import_module, ("committed", "what_to_use"))
-    page = (ROOT / "docs" / "what-to-use.md").read_text(encoding="utf-8")
-    assert what_to_use.what_to_use(committed.Results(ROOT / "results")) == page
+if __name__ == "__main__":
+    main()
