@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.interfaces.problem import VariationalInequality
+from vibench.linalg import EPS
 
 GROUPS = 64
 """Multipliers of the coarse problem; each takes one solution with A."""
@@ -62,7 +63,7 @@ def coarse_contact(solve: Callable[[Array], Array], vi: VariationalInequality) -
     displacements = solve(np.column_stack([coarse.toarray().T, vi.f]))
     K, excess = coarse @ displacements[:, :-1], coarse @ displacements[:, -1] - bounds
     values, vectors = np.linalg.eigh(0.5 * (K + K.T))
-    kept = values > np.finfo(float).eps * len(values) * np.max(values, initial=0.0)
+    kept = values > EPS * len(values) * np.max(values, initial=0.0)
     root = np.sqrt(values[kept])
     try:
         forces, _ = nnls(root[:, None] * vectors[:, kept].T, (vectors[:, kept].T @ excess) / root)

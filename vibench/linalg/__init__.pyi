@@ -5,3 +5,6 @@ from .inner_product import orthonormal_range as orthonormal_range
 from .inner_product import project_out as project_out
 from .inner_product import singular_values as singular_values
 from .inner_product import svd as svd
+
+EPS: float
+UNIT_ROUND_OFF: float

@@ -21,7 +21,8 @@ from scipy.linalg.lapack import dpbtrf
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.linalg.cholesky import UNIT, have_one_pattern
+from vibench.linalg import UNIT_ROUND_OFF
+from vibench.linalg.cholesky import have_one_pattern
 
 MOST_WORK = 1.5e8
 """Multiplications n b² up to which a band is taken for narrow."""
@@ -43,8 +44,10 @@ def is_proved_by_band(parts: Sequence[SparseMatrix]) -> bool | None:
     if scaled is None:
         return None
     sizes = units * (magnitude @ units + magnitude.T @ units) / 2.0
-    terms = (len(scaled) + 1) * UNIT
-    error = (8.0 + 2.0 * len(parts)) * UNIT * float(np.max(sizes, initial=0.0)) + size * terms / (1.0 - 2.0 * terms)
+    terms = (len(scaled) + 1) * UNIT_ROUND_OFF
+    error = (8.0 + 2.0 * len(parts)) * UNIT_ROUND_OFF * float(np.max(sizes, initial=0.0)) + size * terms / (
+        1.0 - 2.0 * terms
+    )
     scaled[0] -= 1.01 * error
     return bool(dpbtrf(scaled, lower=1, overwrite_ab=1)[1] == 0)
 

@@ -16,14 +16,12 @@ from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
+from vibench.linalg import UNIT_ROUND_OFF
 from vibench.linalg.definite import BlockDiagonal, dense_cholesky, mirrored
 
 SPACE, PANEL = 32, 20
 """Entries of a row from which on factors are so full that SuperLU is the fastest with panels of so many columns, as
 those of displacements in space; of other matrices it is with panels of one."""
-
-UNIT = float(np.finfo(float).eps) / 2.0
-"""The unit round-off."""
 
 SPARSE_COLUMN, SPARSE_SHARE = 256, 1 / 8
 """Columns of a factor with at most so many entries, and at most this share of all rows, are multiplied as sparse ones,
@@ -327,7 +325,7 @@ def round_off_of_factors(lu: SuperLU, split: int, corner: SparseMatrix, weights:
     """
     lower, upper = lu.L.tocsr(), lu.U  # sorted rows of the one; columns of the other are rows of its transpose
     terms = int(np.max(np.diff(lower.indptr), initial=0)) + 8
-    gamma, pivots = terms * UNIT / (1.0 - terms * UNIT), upper.diagonal()[:split]
+    gamma, pivots = terms * UNIT_ROUND_OFF / (1.0 - terms * UNIT_ROUND_OFF), upper.diagonal()[:split]
     w_i, w_c = weights[:split], weights[split:]
     back = abs(lower[split:, :split]).T @ w_c
     inner, across = np.zeros(split), np.zeros(split)

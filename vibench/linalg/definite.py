@@ -44,7 +44,12 @@ class BlockDiagonal:
             return cls(len(matrix), ((sets[0], matrix),))
         return cls(len(matrix), tuple((block, matrix[np.ix_(block, block)]) for block in sets))
 
+    def __len__(self) -> int:
+        return self.size
+
     def __matmul__(self, values: Array) -> Array:
+        if len(self.blocks) == 1:
+            return np.asarray(self.blocks[0][1] @ values)
         product = np.empty((self.size, *values.shape[1:]))
         for unknowns, block in self.blocks:
             product[unknowns] = block @ values[unknowns]
@@ -72,16 +77,18 @@ class BlockDiagonal:
 
     def congruent(self, rows: SparseMatrix) -> Array:
         """R X Rᵀ (k×k) for a sparse R (k×c)."""
-        total, rows = np.zeros((rows.shape[0], rows.shape[0])), sp.csc_array(rows)
+        total, rows = np.zeros((rows.shape[0], rows.shape[0])), sp.csr_array(rows)
         for unknowns, block in self.blocks:
-            part = sp.csr_array(rows[:, unknowns])
-            touched = np.unique(part.indices)
-            if not len(touched):
+            part, compliance = rows if len(self.blocks) == 1 else rows[:, unknowns], block
+            if not part.nnz:
                 continue
-            # Few unknowns are neighbours where they are numbered along the contact. SciPy would copy a larger part.
-            along = slice(touched[0], touched[-1] + 1)
-            few = 2 * (along.stop - along.start) < len(unknowns)
-            part, compliance = (part[:, along], block[along, along]) if few else (part, block)
+            # Rows touch a short range of unknowns where these are numbered along the contact. SciPy copies slices of
+            # dense matrices, which does not pay for a long range.
+            along = slice(int(part.indices.min()), int(part.indices.max()) + 1)
+            if 2 * (along.stop - along.start) < len(unknowns):
+                shape = part.shape[0], along.stop - along.start
+                part = sp.csr_array((part.data, part.indices - along.start, part.indptr), shape=shape)
+                compliance = block[along, along]
             total += part @ np.ascontiguousarray((part @ compliance).T)
         return total
 

@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError, RequestError, unknown_name
+from vibench.linalg import UNIT_ROUND_OFF
 from vibench.linalg.banded import is_proved_by_band
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky, elimination_order
 from vibench.linalg.definite import BlockDiagonal
@@ -27,8 +28,6 @@ from vibench.text import brief
 
 COLUMNS = 128
 """Columns of a Schur complement that are solved for at once, where an implementation has no better way to it."""
-
-UNIT = float(np.finfo(float).eps) / 2.0
 
 
 class Factor(ABC):
@@ -187,7 +186,7 @@ IMPLEMENTATIONS = {
 }  # fmt: skip
 """All implementations by name, the default first."""
 
-DEFAULT = next(iter(IMPLEMENTATIONS))
+DEFAULT: str = next(iter(IMPLEMENTATIONS))
 
 AVAILABLE = "available"
 """Asks for the first of `PREFERRED` that is installed."""
@@ -292,11 +291,11 @@ def is_proved_definite(parts: Sequence[SparseMatrix], chosen: Implementation, or
         scale = sp.diags_array(1.0 / np.sqrt(matrix.diagonal()), format="csc")
         sizes = scale @ sum(abs(sp.csc_array(part)) for part in parts) @ scale
         scaled = sp.csc_array(scale @ (0.5 * (matrix + matrix.T)) @ scale)
-        rounded = (8.0 + 2.0 * len(parts)) * UNIT * float(np.max(sizes.sum(axis=0), initial=0.0))
+        rounded = (8.0 + 2.0 * len(parts)) * UNIT_ROUND_OFF * float(np.max(sizes.sum(axis=0), initial=0.0))
         shift, identity = first_shift(scaled), sp.eye_array(matrix.shape[0], format="csc")
         for _ in range(ATTEMPTS):
             factor = chosen.factorise(sp.csc_array(scaled - shift * identity), "")
-            error = 1.01 * (2.0 * UNIT * (factor.entries(matrix.shape[0]) + matrix.shape[0]) + rounded)
+            error = 1.01 * (2.0 * UNIT_ROUND_OFF * (factor.entries(matrix.shape[0]) + matrix.shape[0]) + rounded)
             if error <= shift:
                 return True
             shift = 1.01 * error

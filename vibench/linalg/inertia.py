@@ -24,7 +24,8 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import SuperLU
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.linalg.cholesky import UNIT, have_one_pattern, round_off_of_factors, symmetric_lu
+from vibench.linalg import UNIT_ROUND_OFF
+from vibench.linalg.cholesky import have_one_pattern, round_off_of_factors, symmetric_lu
 
 FIRST_SHIFT, PLANE = 1e-11, 16.0
 """τ of the first attempt, and the entries of a row from which on it is larger by their share: factors of matrices of
@@ -62,7 +63,7 @@ def proved_positive(parts: Sequence[SparseMatrix], scale: Array, order: Indices 
         pivots = lu.U.diagonal()
         if not np.array_equal(lu.perm_r, lu.perm_c) or not np.all(np.isfinite(pivots)):
             return 0
-        added = (2 * len(parts) + 2) * UNIT * (inverse * sizes + shift)
+        added = (2 * len(parts) + 2) * UNIT_ROUND_OFF * (inverse * sizes + shift)
         error = float(np.max(_factorisation_error(lu, inverse) + added, initial=0.0))
         if error <= shift:
             return int(np.sum(pivots > 0.0))

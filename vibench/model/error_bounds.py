@@ -61,7 +61,7 @@ from vibench.arrays import Array, Indices, Mask
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import active_set_iterations
 from vibench.interfaces.problem import VariationalInequality, is_absent
-from vibench.linalg.cholesky import UNIT
+from vibench.linalg import UNIT_ROUND_OFF
 from vibench.model.equalities import Equalities
 from vibench.model.errors import Energy, rieszes
 from vibench.model.on_contact import OnContact, Representer
@@ -456,4 +456,6 @@ def _slack(on: OnContact, u: Array, w: Array) -> Array:
 
 def _round_off(on: OnContact, u: Array, w: Array) -> Array:
     """Bound (m,) of the round-off in `_slack` (Higham 2002, §3.1)."""
-    return np.asarray(1.01 * (on.entries + 4.0) * UNIT * (on.sizes @ (np.abs(w) + np.abs(u)) + np.abs(on.vi.g)))
+    return np.asarray(
+        1.01 * (on.entries + 4.0) * UNIT_ROUND_OFF * (on.sizes @ (np.abs(w) + np.abs(u)) + np.abs(on.vi.g))
+    )

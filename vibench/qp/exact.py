@@ -16,6 +16,7 @@ from scipy.optimize import nnls
 
 from vibench.arrays import Array, Indices, Mask
 from vibench.interfaces.problem import ABSENT, VariationalInequality
+from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import project_out
 from vibench.qp.scaling import row_norms, size
@@ -26,7 +27,7 @@ ROUND_OFF = 1e-12
 DEPENDENT = 1e-10
 """Constraints are dependent where a pivot of their factorisation is below this fraction of the largest."""
 
-CANCELLED = 32.0 * float(np.finfo(float).eps)
+CANCELLED = 32.0 * EPS
 """Round-off in B x, relative to what the load alone would make of it."""
 
 FARTHEST = 1e-50 * ABSENT

@@ -15,9 +15,10 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.interfaces.problem import VariationalInequality, is_absent
+from vibench.linalg import EPS
 from vibench.qp.scaling import row_norms
 
-PARALLEL = 8.0 * float(np.finfo(float).eps)
+PARALLEL = 8.0 * EPS
 """Largest difference of entries of two parallel rows of length 1, which were scaled with a rounding."""
 
 CLOSE = 1e-12

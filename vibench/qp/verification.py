@@ -37,12 +37,11 @@ from scipy.optimize import nnls
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import VariationalInequality
+from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.qp.scaling import row_norms
 from vibench.qp.status import Status
 from vibench.text import above
-
-UNIT = float(np.finfo(float).eps)
 
 DualNorms = Callable[[Array], Array]
 """From functionals, the columns of an array (n×k), to their norms (k,) in A⁻¹."""
@@ -196,7 +195,7 @@ def round_off(B: SparseMatrix | Array, x: Array, g: Array) -> Array:
 
 def round_off_of_terms(entries: Indices, sizes: Array) -> Array:
     """The same from numbers of entries of the rows (m,) and sums of absolute values of the terms (m,)."""
-    return np.asarray(1.01 * UNIT * (entries + 2.0) * sizes)
+    return np.asarray(1.01 * EPS * (entries + 2.0) * sizes)
 
 
 def _over(value: float, scale: float) -> float:

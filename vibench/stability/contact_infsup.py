@@ -37,7 +37,7 @@ import scipy.sparse as sp
 from scipy.linalg.lapack import dpotrf
 
 from vibench.arrays import Array, SparseMatrix
-from vibench.linalg.cholesky import UNIT
+from vibench.linalg import UNIT_ROUND_OFF
 from vibench.linalg.definite import BlockDiagonal
 from vibench.linalg.factorisations import DEFAULT, implementation, is_proved_definite
 from vibench.linalg.inner_product import InnerProduct
@@ -143,7 +143,7 @@ class ContactInfSup:
             weight = beta**2 / (1.0 - 1.01 * self._lost)
             shifted = (-weight * mass).toarray()
             shifted += scaled
-            return _proved_positive(shifted, lost + 8.0 * UNIT * weight * of_mass)
+            return _proved_positive(shifted, lost + 8.0 * UNIT_ROUND_OFF * weight * of_mass)
 
         found = moved(smallest_root(scaled, mass), -1.0, stable)
         return found if found.proved else Constant(0.0, True)
@@ -188,7 +188,7 @@ class ContactInfSup:
         of_products = np.linalg.norm(lifted / sizes) * np.linalg.norm(
             (residuals + _gamma(_most_entries(B) + 4) * self._forces(B)) / sizes
         )
-        return 1.01 * float(of_products + 8.0 * UNIT * len(sizes))
+        return 1.01 * float(of_products + 8.0 * UNIT_ROUND_OFF * len(sizes))
 
 
 def _most_entries(B: SparseMatrix) -> int:
@@ -216,4 +216,4 @@ def _proved_positive(scaled: Array, lost: float) -> bool:
 
 def _gamma(terms: int) -> float:
     """γ_k of sums of k products."""
-    return terms * UNIT / (1.0 - terms * UNIT)
+    return terms * UNIT_ROUND_OFF / (1.0 - terms * UNIT_ROUND_OFF)

@@ -22,7 +22,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
@@ -30,6 +29,8 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.interfaces.problem import Contact
+from vibench.linalg import EPS
+from vibench.linalg.definite import BlockDiagonal
 from vibench.model.certificates.complementarity import complementary
 from vibench.model.certificates.tied_correction import tied_correction
 from vibench.model.error_bounds import ATTEMPTS, MARGIN
@@ -40,13 +41,8 @@ EXTENSIONS = 10
 NEGLIGIBLE = 1e-6
 """Below this share of what a row lacks, a multiplier of it does not move the minimiser."""
 
-MOST_BLOCKS = 8
-"""Largest number of blocks of C that are treated one by one."""
-
 REGULAR = 1e-13
 """Share of the diagonal of S_II that is added to it, so that dependent rows have a factorisation."""
-
-UNIT = float(np.finfo(float).eps)
 
 
 @dataclass(frozen=True)
@@ -75,60 +71,6 @@ class ContactCorrection:
     nu: Array | None
     gap: float
     eta: float = 0.0
-
-
-@dataclass(frozen=True)
-class BlockDiagonal:
-    """A symmetric matrix (l×l) of blocks on the diagonal: bodies that only the constraint couples have one block each.
-
-    Attributes
-    ----------
-    ends
-        Where blocks begin and end (blocks + 1,), rising from 0 to l.
-    blocks
-        The blocks.
-    """
-
-    ends: tuple[int, ...]
-    blocks: tuple[Array, ...]
-
-    @classmethod
-    def of(cls, matrix: Array) -> BlockDiagonal:
-        """The smallest blocks that have all of the entries that are not zero; one of an empty matrix."""
-        nonzero, size = matrix != 0.0, len(matrix)
-        if not size:
-            return cls((0, 0), (matrix,))
-        last = np.maximum(
-            np.where(nonzero.any(axis=1), size - 1 - np.argmax(nonzero[:, ::-1], axis=1), 0), np.arange(size)
-        )
-        ends = (0, *(np.flatnonzero(np.maximum.accumulate(last) == np.arange(size)) + 1).tolist())
-        if len(ends) > MOST_BLOCKS + 1:
-            ends = (0, size)
-        return cls(ends, tuple(np.ascontiguousarray(matrix[a:b, a:b]) for a, b in pairwise(ends)))
-
-    def __len__(self) -> int:
-        return self.ends[-1]
-
-    def __matmul__(self, x: Array) -> Array:
-        """The product with a vector (l,)."""
-        if len(self.blocks) == 1:
-            return np.asarray(self.blocks[0] @ x)
-        pairs = zip(self.blocks, pairwise(self.ends), strict=True)
-        return np.concatenate([block @ x[a:b] for block, (a, b) in pairs])
-
-    def between(self, rows: SparseMatrix) -> Array:
-        """R C Rᵀ (i×i) for rows R (i×l)."""
-        if len(self.blocks) == 1:
-            return np.asarray(rows @ (rows @ self.blocks[0]).T)
-        total = np.zeros((rows.shape[0], rows.shape[0]))
-        numbers = np.repeat(np.arange(rows.shape[0]), np.diff(rows.indptr))
-        for block, (a, b) in zip(self.blocks, pairwise(self.ends), strict=True):
-            kept = (rows.indices >= a) & (rows.indices < b)
-            counts = np.bincount(numbers[kept], minlength=rows.shape[0])
-            of_block = rows.data[kept], rows.indices[kept] - a, np.concatenate([[0], np.cumsum(counts)])
-            part = sp.csr_array(of_block, (rows.shape[0], b - a))
-            total += part @ (part @ block).T
-        return total
 
 
 @dataclass(frozen=True)
@@ -187,7 +129,7 @@ def find_contact_correction(
     if not B.has_canonical_format or len(B.indices) > B.nnz:
         B = B.copy()
         B.sum_duplicates()
-    size, terms = sp.csr_array((np.abs(B.data), B.indices, B.indptr), B.shape), 1.01 * UNIT * (np.diff(B.indptr) + 4.0)
+    size, terms = sp.csr_array((np.abs(B.data), B.indices, B.indptr), B.shape), 1.01 * EPS * (np.diff(B.indptr) + 4.0)
     excess = B @ on_contact - contact.g
     round_off = 1.01 * (size @ uncertain) + terms * (size @ np.abs(on_contact) + np.abs(contact.g))
     reach = size @ compliance.root
@@ -234,7 +176,7 @@ class _Program:
                 lacking = np.where(self.near, lacking, far)
                 if np.all(lacking <= 0.0):  # NaN is not
                     kappa, pushing = max(0.0, float(self.lam @ slack)), np.maximum(nu, 0.0)
-                    pulls = np.any(nu < -8.0 * UNIT * self.lam)  # beyond the round-off in ν − λ + λ
+                    pulls = np.any(nu < -8.0 * EPS * self.lam)  # beyond the round-off in ν − λ + λ
                     return load, norm, kappa, None if pulls else pushing, max(0.0, float(pushing @ slack))
                 if np.any(lacking[~self.near] > 0.0):
                     return None
@@ -265,7 +207,7 @@ class _Program:
         block, wanted = _selected_rows(self.B, chosen), excess[rows]
         if difference.any():
             wanted = wanted - block @ (self.compliance @ (self.B.T @ difference)) / self.gamma
-        S = self.compliance.between(block) / self.gamma
+        S = self.compliance.congruent(block) / self.gamma
         units = np.sqrt(S.diagonal())  # of rows, which may have any scale
         units[~(units > 0.0)] = 1.0
         S /= np.outer(units, units)

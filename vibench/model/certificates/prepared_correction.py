@@ -19,15 +19,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
+from vibench.linalg import EPS
+from vibench.linalg.definite import connected_blocks
 from vibench.model.certificates.complementarity import complementary
-from vibench.model.certificates.contact_correction import UNIT, BlockDiagonal
 from vibench.model.error_bounds import ATTEMPTS, MARGIN
 
 LARGEST_CONDITION = 1e9
@@ -60,7 +60,7 @@ class PreparedCorrections:
     directions
         Coordinates (j×K) of the rows J of B₀ as functionals, in the basis of residuals.
     terms
-        Bound of the number of round-off errors, of size `UNIT`, in an entry of s and of B w; but for those of B.
+        Bound of the number of round-off errors, of size `EPS`, in an entry of s and of B w; but for those of B.
     """
 
     moved: Indices
@@ -116,7 +116,7 @@ class PreparedCorrections:
         theta, terms = (B, self.terms) if isinstance(B, float) else (1.0, self.terms + int(np.diff(B.indptr).max()))
         if theta == 0.0:
             return None
-        excess, size, unit = _times(B, self.basis @ y) - g, _times(abs(B), self.sizes), 1.01 * terms * UNIT
+        excess, size, unit = _times(B, self.basis @ y) - g, _times(abs(B), self.sizes), 1.01 * terms * EPS
         round_off = unit * (float(y @ y) ** 0.5 * size[:, 0] + g_size)
         margin, here = MARGIN * round_off, lam[self.rows]
         for _ in range(ATTEMPTS):
@@ -152,9 +152,8 @@ def constant_unknowns(compliance: Array, constraints: list[SparseMatrix]) -> Mas
     for other in constraints[1:]:
         difference = sp.csc_array(abs(sp.csc_array(other) - first))
         same &= np.asarray(difference.max(axis=0).todense()).ravel() == 0.0
-    ends = BlockDiagonal.of(compliance).ends
-    for a, b in pairwise(ends):
-        same[a:b] = same[a:b].all()
+    for block in connected_blocks(compliance):
+        same[block] = same[block].all()
     return same
 
 

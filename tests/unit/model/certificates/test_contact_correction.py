@@ -12,7 +12,6 @@ from numerics import exact, spd
 from vibench.interfaces.problem import Contact, VariationalInequality
 from vibench.model.certificates import complementarity
 from vibench.model.certificates.contact_correction import (
-    BlockDiagonal,
     ContactCompliance,
     ContactCorrection,
     find_contact_correction,
@@ -117,19 +116,6 @@ def test_a_larger_uncertainty_of_u_asks_for_more() -> None:
     assert plain is not None
     assert careful is not None
     assert np.all((contact.B @ values(C, careful))[:1] >= (contact.B @ values(C, plain))[:1] + 0.2)
-
-
-def test_bodies_that_only_the_constraint_couples_have_a_block_of_the_compliance_each() -> None:
-    rng = np.random.default_rng(4)
-    dense = np.zeros((9, 9))
-    dense[:4, :4], dense[4:5, 4:5], dense[5:, 5:] = spd(4, rng, 9.0), 2.0, spd(4, rng, 9.0)
-    blocks, rows = BlockDiagonal.of(dense), sp.csr_array(rng.standard_normal((5, 9)) * (rng.random((5, 9)) < 0.6))
-    x = rng.standard_normal(9)
-    assert blocks.ends == (0, 4, 5, 9)
-    assert blocks @ x == pytest.approx(dense @ x)
-    assert blocks.between(rows) == pytest.approx(rows.toarray() @ dense @ rows.toarray().T)
-    dense[0, 8] = dense[8, 0] = 0.1
-    assert BlockDiagonal.of(dense).ends == (0, 9)
 
 
 def test_multipliers_of_rows_with_much_slack_take_part() -> None:
