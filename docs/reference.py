@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from vibench.packs.manifest import Manifest
+from vibench.plugins.options import keys, places
 from vibench.results.columns import CELLS, PARAMETER, STORED, THRESHOLDS, UNITS, Column, shown_columns
 from vibench.results.costs.best import ADDED
-from vibench.study.described import keys, places
 from vibench.study.spec import Study
 
 

@@ -26,10 +26,10 @@ from unsynced import leave_syncing_to_the_system
 from vibench.cli import start
 from vibench.execution import supervisor
 from vibench.library import runs
+from vibench.plugins import registry
+from vibench.plugins.kinds import STUDY
 from vibench.results.sqlite.reading import FILE
 from vibench.storage.artefacts import CACHE_VARIABLE
-from vibench.study import registry
-from vibench.study.kinds import STUDY
 
 # The examples of a test are the same ones every time and everywhere; `--hypothesis-profile=explore` draws new ones.
 settings.register_profile("same", deadline=None, derandomize=True, database=None)

@@ -32,14 +32,14 @@ from .interfaces.formulations import FormulationAnswer as FormulationAnswer
 from .interfaces.formulations import FormulationModel as FormulationModel
 from .interfaces.formulations import Multiplier as Multiplier
 from .interfaces.formulations import Outcome as Outcome
-from .interfaces.nested_start import NestedStart as NestedStart
 from .interfaces.outputs import Output as Output
+from .interfaces.parameters import ParameterBox as ParameterBox
 from .interfaces.pictures import MeshFields as MeshFields
 from .interfaces.pictures import Picture as Picture
 from .interfaces.problem import MEMBERS as MEMBERS
 from .interfaces.problem import Contact as Contact
 from .interfaces.problem import ContactLoads as ContactLoads
-from .interfaces.problem import ParameterBox as ParameterBox
+from .interfaces.problem import NestedStart as NestedStart
 from .interfaces.problem import Problem as Problem
 from .interfaces.problem import Sampler as Sampler
 from .interfaces.problem import VariationalInequality as VariationalInequality
@@ -76,6 +76,7 @@ from .offline.models import Model as Model
 from .offline.models import Solution as Solution
 from .offline.reduction import Reduction as Reduction
 from .offline.sweep import Snapshots as Snapshots
+from .plugins.registry import create as create
 from .qp.status import Status as Status
 from .qp.verification import QPSolution as QPSolution
 from .qp.verification import QPSolver as QPSolver
@@ -85,5 +86,4 @@ from .reduction.pod import POD as POD
 from .results.costs.break_even import BreakEven as BreakEven
 from .results.costs.break_even import break_even as break_even
 from .study.matrix import read_study as read_study
-from .study.registry import create as create
 from .study.spec import Study as Study

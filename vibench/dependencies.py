@@ -22,7 +22,8 @@ CELL = ("vibench.stages.cell_queries:cell_queries", "vibench.rounds.timing_round
 """Where the computation of a cell begins: with its last stage, whose inputs lead to all others, and with its timing."""
 
 CARRIERS = (
-    "vibench.study", "vibench.storage", "vibench.stages.base", "vibench.provenance", "vibench.errors", "vibench.text",
+    "vibench.study", "vibench.plugins", "vibench.storage", "vibench.stages.base", "vibench.provenance",
+    "vibench.errors", "vibench.text",
 )  # fmt: skip
 """Packages and modules that determine no number: they hand over what does, and that counts by itself.
 

@@ -13,10 +13,10 @@ from page import Page, made_by, start
 
 from vibench import Reduction, Stop, create, project_on_cone
 from vibench.arrays import Array
+from vibench.plugins import registry
+from vibench.plugins.kinds import PluginKind
 from vibench.reduction.supremizers import constraint_classes, projected_supremizers
 from vibench.stability.infsup import beta_span
-from vibench.study import registry
-from vibench.study.kinds import PluginKind
 
 DIMENSIONS = {"hertz": (46, 12), "obstacle": (45, 50)}
 """Prescribed N and R: for Hertz those of the paper, for the obstacle about those of δ_POD = 1e-4 and δ = 1e-2."""

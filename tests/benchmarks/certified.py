@@ -43,9 +43,9 @@ from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.offline.assemblies import Assemblies
 from vibench.offline.correction import Answer, Corrector
 from vibench.offline.models import Model
+from vibench.plugins.plugin import Plugin
 from vibench.qp.solve import solve_qp
 from vibench.stages.judging.pairs import VIOLATION
-from vibench.study.plugin import Plugin
 
 SEED = 2027
 

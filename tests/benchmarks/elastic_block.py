@@ -30,8 +30,8 @@ from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolve
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.error_bounds import ErrorBounds, bound_errors_at
 from vibench.offline.assemblies import Assemblies
+from vibench.plugins.plugin import Plugin
 from vibench.stages.base import build_problem
-from vibench.study.plugin import Plugin
 from vibench.timing import timed
 
 

@@ -25,11 +25,11 @@ from vibench.arrays import Array
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.validation import checked_assembly
+from vibench.plugins.plugin import Plugin
 from vibench.results import formats
 from vibench.stages.base import build_problem
 from vibench.stages.snapshots import SnapshotStage
 from vibench.study.parameter_sets import CHUNKS, ParameterSet
-from vibench.study.plugin import Plugin
 from vibench.timing import median_interval, timed
 
 SEED = 2022

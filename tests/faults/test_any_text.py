@@ -21,6 +21,7 @@ from outputs import clean, elements
 from samples import cell_row, query_rows
 
 from vibench.interfaces.problem import VariationalInequality
+from vibench.plugins import registry
 from vibench.qp.verification import QPSolution
 from vibench.report import html
 from vibench.report.figures import dimension, problems
@@ -30,7 +31,6 @@ from vibench.results.columns import STORED, TABLES
 from vibench.results.database import ResultsDatabase
 from vibench.results.sqlite.reading import FILE
 from vibench.stages.query import Query, run_query
-from vibench.study import registry
 from vibench.terminal.console import print_frame
 
 ANYTHING = st.text(st.characters(), max_size=50) | st.sampled_from([LABEL, ODD, "$$", "_", "[/b]", "=1", "|", "\\", ""])

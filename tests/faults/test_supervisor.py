@@ -23,12 +23,12 @@ from running import PATIENCE
 from vibench.execution import supervisor
 from vibench.execution.jobs import Begun, CurrentItem, Job
 from vibench.execution.supervisor import StoppedError, Supervisor
+from vibench.plugins.kinds import PROBLEM
+from vibench.plugins.plugin import Plugin
+from vibench.plugins.registry import find
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, Stage, Unstored
 from vibench.storage.artefacts import Store
-from vibench.study.kinds import PROBLEM
-from vibench.study.plugin import Plugin
-from vibench.study.registry import find
 
 Run = Callable[..., "Done | Failed | Unstored"]
 

@@ -16,9 +16,9 @@ import fake_plugins
 import numpy as np
 from forking import SUPERVISOR
 
+from vibench.plugins.plugin import Plugin
 from vibench.stages.base import SHARE, Failed, Items, ItemwiseStage, Result, Stage
 from vibench.storage.artefacts import Store
-from vibench.study.plugin import Plugin
 from vibench.timing import Seconds
 
 

@@ -32,12 +32,12 @@ from vibench.cli.main import app
 from vibench.errors import RequestError
 from vibench.execution import run as execution
 from vibench.execution.timing_plan import TimingPlan
+from vibench.plugins import registry
+from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, SAMPLING, STUDY, PluginKind
+from vibench.plugins.registry import registered
 from vibench.results import columns, tables
-from vibench.study import registry
 from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
-from vibench.study.kinds import DUAL, FORMULATION, PRIMAL, SAMPLING, STUDY, PluginKind
 from vibench.study.matrix import expand, read_study
-from vibench.study.registry import registered
 from vibench.study.spec import Limits, Study, ToleranceTable
 from vibench.testing import check_figure, check_problem
 

@@ -11,16 +11,16 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Stop
+from vibench.plugins.kinds import PROBLEM
+from vibench.plugins.plugin import Plugin
+from vibench.plugins.registry import find
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.judging.cell_goal import CellRows
 from vibench.stages.offline import ConeStage, PODStage
-from vibench.study.kinds import PROBLEM
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
-from vibench.study.registry import find
 
 
 class NoContact(Wire):

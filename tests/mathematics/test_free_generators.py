@@ -15,6 +15,9 @@ from vibench.highfidelity import active_set
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment, Kind, Stop
 from vibench.model.galerkin import ReducedModel
+from vibench.plugins.kinds import PluginKind
+from vibench.plugins.plugin import Plugin
+from vibench.plugins.registry import find
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import kkt_residuals, verify
@@ -27,10 +30,7 @@ from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.judging.cell_goal import CellRows
 from vibench.stages.offline import ConeStage, PODStage
-from vibench.study.kinds import PluginKind
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
-from vibench.study.registry import find
 
 seeds = st.integers(0, 10_000)
 

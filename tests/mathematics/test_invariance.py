@@ -17,6 +17,7 @@ from samples import SampleStore, carry_out
 from transformed import Transformed
 
 from vibench.interfaces.strategies import Stop
+from vibench.plugins.plugin import Plugin
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
@@ -25,7 +26,6 @@ from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.judging.cell_goal import CellRows
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
 
 BASES: Mapping[str, dict[str, Any]] = {
     "obstacle": {"resolution": 100},

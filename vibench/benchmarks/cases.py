@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
+from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SOLVER
+from vibench.plugins.registry import find, find_named, registered
 from vibench.qp.solve import installed_solvers
-from vibench.study.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SOLVER
 from vibench.study.matrix import read_study
-from vibench.study.registry import find, find_named, registered
 
 Resolution = str | int
 """A name that a problem knows, or a number of nodes."""

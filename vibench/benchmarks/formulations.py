@@ -14,8 +14,8 @@ from vibench.errors import UnsupportedError
 from vibench.interfaces.formulations import Formulation, FormulationAnswer, axes_of
 from vibench.offline.formulated import Formulated
 from vibench.offline.reduction import Reduction
-from vibench.study.kinds import FORMULATION
-from vibench.study.registry import find
+from vibench.plugins.kinds import FORMULATION
+from vibench.plugins.registry import find
 
 
 def time_formulation(inputs: StageInputs, formulation: str) -> Timing:

@@ -18,9 +18,9 @@ from vibench.model.affine import AffineMember, affine_decomposition
 from vibench.model.errors import ReferenceSolutions
 from vibench.offline.reduction import Reduction
 from vibench.offline.sweep import Snapshots, high_fidelity_sweep
+from vibench.plugins.kinds import DUAL, PRIMAL, PROBLEM
+from vibench.plugins.registry import find
 from vibench.reduction.pod import pod
-from vibench.study.kinds import DUAL, PRIMAL, PROBLEM
-from vibench.study.registry import find
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -20,12 +20,12 @@ from vibench.interfaces.validation import check_cone, check_enrichment, checked_
 from vibench.linalg.inner_product import InnerProduct, project_out, singular_values
 from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
 from vibench.model.galerkin import ReducedModel
+from vibench.plugins.kinds import DUAL, PRIMAL
+from vibench.plugins.registry import find
 from vibench.qp.verification import Residuals
 from vibench.reduction.cones import project_on_cone
 from vibench.reduction.pod import POD, pod
 from vibench.reduction.supremizers import supremizers
-from vibench.study.kinds import DUAL, PRIMAL
-from vibench.study.registry import find
 
 SOME = 9
 """Training parameters at which a figure is computed that takes long."""

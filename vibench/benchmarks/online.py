@@ -21,9 +21,9 @@ from vibench.model.galerkin import ReducedProblem, project
 from vibench.model.hyperreduced import HyperReducedModel, ReducedOperators, hyper_reduce
 from vibench.offline.assemblies import assemblies
 from vibench.offline.models import AnyReducedModel
+from vibench.plugins.registry import qp_solver
 from vibench.qp.solve import solve_qp
 from vibench.qp.verification import QPSolution, verify
-from vibench.study.registry import qp_solver
 
 SMALLEST = 1e-8
 """Tolerance of the POD that has all modes which a reduced program may have."""

@@ -29,11 +29,11 @@ from vibench.benchmarks.offline import OFFLINE
 from vibench.benchmarks.online import ONLINE, LeftOutError
 from vibench.errors import VibenchError
 from vibench.execution.watched import WatchedWork, watched
+from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SOLVER
+from vibench.plugins.registry import registered
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.stages.base import Failed
-from vibench.study.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SOLVER
-from vibench.study.registry import registered
 
 BENCHMARKS: Mapping[str, Callable[..., Timing]] = {
     function.__name__.removeprefix("time_"): function for function in OFFLINE + ONLINE + FORMULATIONS

@@ -17,8 +17,8 @@ from pathlib import Path
 import typer
 
 from vibench.errors import VibenchError
+from vibench.plugins.kinds import CHECKED, FORMULATION, SOLVER, STUDY, PluginKind
 from vibench.results.columns import TABLES
-from vibench.study.kinds import CHECKED, FORMULATION, SOLVER, STUDY, PluginKind
 
 SHOWN = ("summary", "best", "benefits", *TABLES)
 """Tables that `vibench show` prints."""
@@ -160,7 +160,7 @@ def plugins(incomplete: str) -> list[str]:
 
 def plugin_options(context: typer.Context, incomplete: str) -> list[str]:
     """Completes the options of the plugin named before, as "resolution=", without importing it."""
-    from vibench.study.registry import find
+    from vibench.plugins.registry import find
 
     word, colon, name = (context.params.get("plugin") or "".join(context.args[:1])).rpartition(":")
     kinds = [CHECKED[word]] if word in CHECKED else [] if colon else CHECKED.values()
@@ -236,7 +236,7 @@ cell_columns = words(lambda: TABLES["cells"])
 
 
 def _registered(*kinds: PluginKind) -> set[str]:
-    from vibench.study.registry import registered
+    from vibench.plugins.registry import registered
 
     return {name for kind in kinds for name in registered(kind)}
 

@@ -29,13 +29,13 @@ from vibench.execution.solver_trials import solver_trials
 from vibench.files import locked
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.factorisations import IMPLEMENTATIONS
+from vibench.plugins.kinds import SOLVER, STUDY, PluginKind
+from vibench.plugins.registry import RegisteredPlugin, find, registered, unreadable
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.storage.artefacts import CACHE_VARIABLE, LOCK, Store, default_folder
-from vibench.study.kinds import SOLVER, STUDY, PluginKind
 from vibench.study.matrix import read_study
-from vibench.study.registry import RegisteredPlugin, find, registered, unreadable
 from vibench.terminal.console import new_console, shown
 from vibench.terminal.output import echo
 from vibench.timing import DISTURBED, WAITED, Calibration, Stopwatch

@@ -33,7 +33,7 @@ from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
 from vibench.cli.result_commands import At, compare_runs, diff_runs, places_of, replay_query, show
 from vibench.errors import RequestError, VibenchError
 from vibench.interrupts import INTERRUPTED, Interrupted, interrupted_at_once, interruptible
-from vibench.study.kinds import DUAL, PRIMAL, PROBLEM
+from vibench.plugins.kinds import DUAL, PRIMAL, PROBLEM
 from vibench.terminal.output import echo, warn
 from vibench.text import unbroken
 

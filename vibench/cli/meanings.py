@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from vibench.errors import unknown_name
+from vibench.plugins.options import Key, keys, places
 from vibench.results.columns import STORED
 from vibench.results.costs.best import ADDED
-from vibench.study.described import Key, keys, places
 from vibench.study.spec import Study
 
 

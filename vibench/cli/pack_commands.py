@@ -13,7 +13,7 @@ from vibench.cli.completion import names
 from vibench.cli.plugin_commands import key_value
 from vibench.errors import NumericalError
 from vibench.files import write_atomically
-from vibench.study.kinds import DUAL, PROBLEM
+from vibench.plugins.kinds import DUAL, PROBLEM
 from vibench.terminal.output import echo
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def pack_problem(
     Members that the problem declares constant are written once, the others at every training and validation parameter.
     """
     from vibench.packs import writer
-    from vibench.study.registry import find
+    from vibench.plugins.registry import find
 
     plugin = find(PROBLEM, problem)
     created, source = plugin.create(dict(map(key_value, option or []))), f"{plugin} of {plugin.origin}"
@@ -75,10 +75,10 @@ def reduce_cones(
     from vibench.packs.checks import read_model_pack
     from vibench.packs.pack import pack_multipliers, reduce_multipliers
     from vibench.packs.reader import naming
+    from vibench.plugins.registry import find, registered
     from vibench.report.figures.convergence import cone_errors
     from vibench.report.figures.style import save, styled
     from vibench.results.formats import to_csv
-    from vibench.study.registry import find, registered
     from vibench.terminal.console import print_frame
 
     pack = read_model_pack(folder)

@@ -13,7 +13,7 @@ from typer import Argument, Exit, Option
 
 from vibench.cli.completion import lists, plugin_options, plugins, runs
 from vibench.errors import RequestError, VibenchError, in_a_line, unknown_name
-from vibench.study.kinds import CHECKED, FIGURE, PROBLEM, SAMPLING, SOLVER, STUDY, PluginKind
+from vibench.plugins.kinds import CHECKED, FIGURE, PROBLEM, SAMPLING, SOLVER, STUDY, PluginKind
 from vibench.terminal.output import echo
 from vibench.text import parsed_json
 
@@ -25,7 +25,7 @@ HEADINGS = ("name", "from", "what", "options")
 Row = tuple[str, str, str, str]
 
 if TYPE_CHECKING:
-    from vibench.study.registry import RegisteredPlugin
+    from vibench.plugins.registry import RegisteredPlugin
 
     NewKind = str
 else:
@@ -53,7 +53,7 @@ def list_plugins(
     """
     if sizes and what != PROBLEM.plural:
         raise RequestError(f"--sizes is for `vibench list {PROBLEM.plural}`")
-    from vibench.study.registry import unreadable
+    from vibench.plugins.registry import unreadable
     from vibench.terminal.console import print_rows
 
     if what is None:
@@ -172,7 +172,7 @@ def new_plugin(
 
 def _read_rows(kind: PluginKind) -> Iterator[Row]:
     """Name, origin, description and names of the options of every plugin of a kind, none of which is imported."""
-    from vibench.study.registry import registered
+    from vibench.plugins.registry import registered
 
     for name, plugin in registered(kind).items():
         if plugin.conflict:
@@ -183,7 +183,7 @@ def _read_rows(kind: PluginKind) -> Iterator[Row]:
 
 def _loaded_rows(kind: PluginKind, sizes: bool = False) -> Iterator[Row]:
     """Name, origin, description and options of every plugin of a kind; of one that does not load, the error."""
-    from vibench.study.registry import registered
+    from vibench.plugins.registry import registered
 
     for name, plugin in registered(kind).items():
         lines: list[str] = []
@@ -213,7 +213,7 @@ def _number_of_cells(study: str) -> str:
 
 def _parameters(problem: type) -> Iterator[str]:
     """The parameters of a class of problems, each in a line; of one whose options determine them, none."""
-    from vibench.interfaces.problem import ParameterBox
+    from vibench.interfaces.parameters import ParameterBox
 
     box = getattr(problem, "parameters", None)
     if isinstance(box, ParameterBox):
@@ -255,9 +255,9 @@ def _solvers_by_version() -> list[Row]:
 def _solver_rows() -> Iterator[Row]:
     """QP solvers, their versions, and whether they can be loaded."""
     from vibench import provenance
+    from vibench.plugins.registry import find, registered
     from vibench.qp.settings import SETTINGS
     from vibench.qp.solve import installed_solvers
-    from vibench.study.registry import find, registered
 
     installed = installed_solvers(registered(SOLVER))
     for name in sorted({*SETTINGS, *registered(SOLVER)}):
@@ -270,8 +270,8 @@ def _find(text: str) -> RegisteredPlugin:
 
     Raises a `RequestError` if there is no such plugin, or several.
     """
+    from vibench.plugins.registry import find_named, registered
     from vibench.qp.solve import installed_solvers
-    from vibench.study.registry import find_named, registered
 
     prefix, colon, rest = text.partition(":")
     if colon and prefix not in CHECKED:
@@ -287,7 +287,7 @@ def _find_object(module: str, name: str) -> RegisteredPlugin:
     import importlib
     from importlib.metadata import EntryPoint
 
-    from vibench.study.registry import RegisteredPlugin
+    from vibench.plugins.registry import RegisteredPlugin
 
     where = f"{module}:{name}"
     title = f"'{where}'"

@@ -10,9 +10,9 @@ from pathlib import Path
 from string import Template
 
 from vibench.errors import RequestError, StorageError
+from vibench.plugins.kinds import SOLVER, STUDY, PluginKind
+from vibench.plugins.registry import find
 from vibench.provenance import distribution_version
-from vibench.study.kinds import SOLVER, STUDY, PluginKind
-from vibench.study.registry import find
 
 NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 MAX_LENGTH = 40

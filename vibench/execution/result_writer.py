@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any
 
 from vibench import provenance
+from vibench.plugins.plugin import Plugin
 from vibench.results.columns import KEYS
 from vibench.results.database import ResultsDatabase
 from vibench.rounds.timed_seconds import TimedRound, seconds_of_cell, seconds_of_queries
@@ -17,7 +18,6 @@ from vibench.stages.judging.cell_goal import CellRows
 from vibench.storage.artefacts import History, Store
 from vibench.study.cells import NO_SUCH_AXIS, Axes, Cell, digest
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
 from vibench.study.spec import Study
 
 

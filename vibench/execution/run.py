@@ -19,6 +19,9 @@ from vibench.execution.result_writer import ResultWriter, labels_of
 from vibench.execution.run_folder import LOG, claimed, clear, ended_by_smaller_limits, keep_limits
 from vibench.execution.timing_plan import TimingPlan
 from vibench.linalg.factorisations import DEFAULT, implementation
+from vibench.plugins.kinds import SAMPLING, SOLVER
+from vibench.plugins.plugin import Plugin
+from vibench.plugins.registry import FACTORISATION, find, registered
 from vibench.provenance import solver_distribution
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
@@ -32,10 +35,7 @@ from vibench.stages.judging.cell_goal import CellRows
 from vibench.stages.pictures import PictureStage
 from vibench.storage.artefacts import Store, usable_store
 from vibench.study.cells import Cell
-from vibench.study.kinds import SAMPLING, SOLVER
 from vibench.study.matrix import expand
-from vibench.study.plugin import Plugin
-from vibench.study.registry import FACTORISATION, find, registered
 from vibench.study.spec import Study
 
 CHECK_INTERVAL = 5.0

@@ -9,14 +9,14 @@ from itertools import chain, count
 
 from vibench.execution.watched import WatchedWork, watched
 from vibench.interfaces.problem import VariationalInequality
+from vibench.plugins import registry
+from vibench.plugins.kinds import SOLVER
 from vibench.qp.repeats import in_units, units
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, verify
 from vibench.stages.base import Failed, Stage
 from vibench.storage.serialisation import dumps, loads, storable
-from vibench.study import registry
-from vibench.study.kinds import SOLVER
 from vibench.study.spec import Limits
 from vibench.timing import NO_TIME, Seconds, median_seconds
 

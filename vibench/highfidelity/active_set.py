@@ -10,8 +10,7 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Mask, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness, condensed_stiffness
-from vibench.interfaces.nested_start import NestedStart
-from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.problem import NestedStart, Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky

@@ -3,110 +3,23 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.spatial import KDTree
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
-from vibench.errors import RequestError, unknown_name
 from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.outputs import Output
+from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.pictures import MeshFields, Picture
 from vibench.linalg.factorisations import DEFAULT
 from vibench.linalg.inner_product import InnerProduct
-from vibench.text import normal_name
-
-if TYPE_CHECKING:
-    from vibench.interfaces.nested_start import NestedStart
-
-OUTSIDE_RTOL = 1e-12
-"""Largest distance of a parameter from the box, relative to its bounds."""
-
-
-@dataclass(frozen=True)
-class ParameterBox:
-    """The parameter domain D: a box.
-
-    Attributes
-    ----------
-    names
-        One name per parameter.
-    lower, upper
-        Bounds (d,).
-    units
-        One unit per parameter, "1" if dimensionless.
-    listed
-        The only parameters (L×d) at which the problem can be assembled; `None` if it can be everywhere in the box.
-    """
-
-    names: tuple[str, ...]
-    lower: Array
-    upper: Array
-    units: tuple[str, ...]
-    listed: Array | None = None
-
-    @property
-    def dim(self) -> int:
-        """Number d of parameters."""
-        return len(self.names)
-
-    @property
-    def widths(self) -> Array:
-        """Widths (d,) by which distances of parameters are measured; never zero."""
-        return np.where(self.upper > self.lower, self.upper - self.lower, np.maximum(np.abs(self.lower), 1.0))
-
-    def grid(self, *counts: int) -> Array:
-        """Regular grid (P×d) with `counts` points per direction; the last parameter varies fastest."""
-        axes = [np.linspace(a, b, k) for a, b, k in zip(self.lower, self.upper, counts, strict=True)]
-        return np.stack([m.ravel() for m in np.meshgrid(*axes, indexing="ij")], axis=1)
-
-    def sample(self, count: int, seed: int) -> Array:
-        """`count` uniform random points (count×d), the same for the same seed."""
-        uniform = np.random.default_rng(seed).random((count, self.dim))
-        return np.asarray(self.lower + uniform * (self.upper - self.lower))
-
-    def outside(self, mus: Array) -> Mask:
-        """Which components of points (…×d) lie outside the box, by more than round-off."""
-        slack = OUTSIDE_RTOL * np.maximum(np.abs(self.lower), np.abs(self.upper))
-        return np.asarray((mus < self.lower - slack) | (mus > self.upper + slack))
-
-    def from_unit(self, unit: Array, log: Sequence[str] = ()) -> Array:
-        """The points (P×d) of the box at the places `unit` (P×d) of the unit cube, some parameters on a log scale.
-
-        Raises
-        ------
-        RequestError
-            If `log` names no parameter, or one whose lower bound is not positive.
-        """
-        linear = np.asarray(self.lower + unit * (self.upper - self.lower))
-        for i in self.logarithmic(log):
-            low, high = np.log(self.lower[i]), np.log(self.upper[i])
-            linear[:, i] = np.clip(np.exp(low + unit[:, i] * (high - low)), self.lower[i], self.upper[i])
-        return linear
-
-    def to_unit(self, mus: Array) -> Array:
-        """The places (…×d) of points (…×d) in the unit cube; the inverse of `from_unit` without `log`."""
-        return np.asarray((mus - self.lower) / self.widths)
-
-    def logarithmic(self, log: Sequence[str]) -> list[int]:
-        """Numbers of the parameters that `log` names; with the errors of `from_unit`."""
-        chosen = list(dict.fromkeys(map(self.index, log)))
-        for name, low in ((self.names[i], self.lower[i]) for i in chosen):
-            if low <= 0.0:
-                raise RequestError(f"'{name}' cannot have a log scale: its lower bound is {low:g}, expected > 0")
-        return chosen
-
-    def index(self, name: str) -> int:
-        """Number of the parameter with this name; raises a `RequestError` if there is none."""
-        known = {normal_name(one): number for number, one in enumerate(self.names)}
-        if normal_name(name) not in known:
-            raise unknown_name("parameter", name, self.names)
-        return known[normal_name(name)]
-
 
 ABSENT = 1e100
 """g of a row that constrains nothing: a finite number, so that no sum with it, and no product with zero, is NaN."""
@@ -368,3 +281,28 @@ class Problem(ABC):
     def diagnostics(self, mu: Array) -> Mapping[str, float]:  # noqa: ARG002
         """Scalars recorded with a high-fidelity solution at mu (d,), such as mesh quality; none by default."""
         return {}
+
+
+class NestedStart:
+    """A problem on a coarser mesh, whose contact set is the initial one at the constraints of a finer mesh.
+
+    The edge of a contact set moves by about one row of nodes in an iteration of the active set method. From the
+    interpolated set it has to move by as many as there are on a coarse cell, however fine the mesh. A coarse problem
+    with a `start` of its own makes a hierarchy: the iterations of a solution no longer grow with its mesh
+    (nested iteration, Hackbusch 1985).
+
+    Parameters
+    ----------
+    coarse
+        The problem on the coarser mesh, for the same parameters.
+    coarse_points, points
+        Places of the constraints (dim×M) and (dim×m), one for each row of B, on one reference domain.
+    """
+
+    def __init__(self, coarse: Problem, coarse_points: Array, points: Array) -> None:
+        self.coarse, self._coarse_points, self._points = coarse, np.atleast_2d(coarse_points), np.atleast_2d(points)
+
+    @cached_property
+    def nearest(self) -> Indices:
+        """The nearest coarse constraint of every fine one (m,)."""
+        return np.asarray(KDTree(self._coarse_points.T).query(self._points.T)[1])

@@ -17,7 +17,8 @@ import numpy as np
 
 from vibench.arrays import Array, Mask
 from vibench.errors import RequestError
-from vibench.interfaces.problem import ParameterBox, Problem, VariationalInequality
+from vibench.interfaces.parameters import ParameterBox
+from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.linalg.inner_product import InnerProduct
 from vibench.text import brief
 

@@ -23,13 +23,13 @@ from vibench.model.error_bounds import ErrorBounds, bound_errors_at
 from vibench.model.high_fidelity_residuals import high_fidelity_residuals, residual_multiplier
 from vibench.offline.assemblies import assemblies
 from vibench.offline.models import Parameters, parameter_in
+from vibench.plugins import registry
 from vibench.qp.repeats import RECOGNISED
 from vibench.qp.solve import solve_qp, takes_start
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, verify
 from vibench.reduction.pod import POD
 from vibench.storage.serialisation import storable
-from vibench.study import registry
 from vibench.text import brief
 from vibench.timing import timed
 

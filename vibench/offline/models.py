@@ -15,7 +15,8 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import RequestError, unknown_name
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
-from vibench.interfaces.problem import ParameterBox, Problem
+from vibench.interfaces.parameters import ParameterBox
+from vibench.interfaces.problem import Problem
 from vibench.model.certificates.base import contact_unknowns
 from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate, OnlineCorrection
 from vibench.model.error_bounds import CorrectionMode, ErrorBounds, bound_errors_at
@@ -25,12 +26,12 @@ from vibench.model.output_bounds import error_bound, weights
 from vibench.offline.assemblies import assemblies
 from vibench.offline.correction import Answer, Corrector
 from vibench.offline.shown import about_model, about_solution, html
+from vibench.plugins import registry
+from vibench.plugins.kinds import SOLVER
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers, solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import Residuals, verify
-from vibench.study import registry
-from vibench.study.kinds import SOLVER
 from vibench.text import brief, normal_name
 from vibench.timing import timed
 

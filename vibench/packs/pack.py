@@ -18,7 +18,8 @@ from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.affine import AffineSum, Thetas, entries_of
 from vibench.interfaces.expressions import Expression
 from vibench.interfaces.outputs import Output
-from vibench.interfaces.problem import MEMBERS, ParameterBox, VariationalInequality
+from vibench.interfaces.parameters import ParameterBox
+from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.interfaces.strategies import Cone, DualStrategy, Stop
 from vibench.interfaces.validation import check_cone
 from vibench.linalg.inner_product import InnerProduct

@@ -11,7 +11,8 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
-from vibench.interfaces.problem import ParameterBox, VariationalInequality
+from vibench.interfaces.parameters import ParameterBox
+from vibench.interfaces.problem import VariationalInequality
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, verify
 

@@ -21,14 +21,14 @@ from vibench.execution.recorded_cell import RecordedCell, recorded_cells
 from vibench.execution.solver_trials import Trial, solver_trials
 from vibench.files import PART, TEMPORARY, write_atomically, writing
 from vibench.interfaces.problem import VariationalInequality
+from vibench.plugins.kinds import SOLVER
+from vibench.plugins.registry import registered
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, verify
 from vibench.results.formats import to_csv
 from vibench.results.solver_agreement import vectors
 from vibench.study.cells import COMPILED, NOT_MOVED
-from vibench.study.kinds import SOLVER
-from vibench.study.registry import registered
 
 CHECKER = "check.py"
 """Script in an exported test set that recomputes its residuals; it needs only NumPy."""

@@ -17,11 +17,11 @@ import pandas as pd
 
 from vibench.errors import RequestError, VibenchError, in_a_line
 from vibench.interfaces.figures import EXTENSIBLE, DerivedColumn, FigurePlugin
+from vibench.plugins.kinds import FIGURE
+from vibench.plugins.registry import find, registered
 from vibench.results.columns import INTEGER, REAL, STORED, TEXT, THRESHOLDS, Column
 from vibench.results.costs import ranking
 from vibench.results.sqlite.values import stored
-from vibench.study.kinds import FIGURE
-from vibench.study.registry import find, registered
 from vibench.text import brief
 
 TYPES: Mapping[type, str] = {float: REAL, int: INTEGER, str: TEXT}

@@ -19,6 +19,7 @@ from vibench.model.hyperreduced import HyperReducedModel, ProjectedMember, Reduc
 from vibench.offline.assemblies import assemblies
 from vibench.offline.models import AnyReducedModel
 from vibench.offline.reduction import Reduction
+from vibench.plugins.plugin import Plugin
 from vibench.qp.exact import ExactSolution, exact_solution
 from vibench.reduction.supremizers import ContactCoordinates, LoadCoordinates, SpannedCoordinates
 from vibench.stages.base import Result, Stage, build_problem, value_of
@@ -27,7 +28,6 @@ from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Cell
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
-from vibench.study.plugin import Plugin
 from vibench.timing import timed
 
 for _kind in (

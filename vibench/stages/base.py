@@ -14,12 +14,12 @@ from typing import Any, ClassVar
 from vibench.dependencies import code_used
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import Problem
+from vibench.plugins.plugin import Plugin
 from vibench.provenance import libraries
 from vibench.qp.status import Status
 from vibench.storage.artefacts import History, Store
 from vibench.study.cells import Axes, digest
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, Seconds
 
 Row = dict[str, Any]

@@ -13,6 +13,7 @@ from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.error_bounds import CorrectionMode
 from vibench.offline.correction import Corrector
+from vibench.plugins.plugin import Plugin
 from vibench.qp.exact import ExactSolution
 from vibench.results.solver_agreement import vectors
 from vibench.stability.infsup import share
@@ -28,7 +29,6 @@ from vibench.stages.query import Queries, Query, error_columns, run_query
 from vibench.storage.artefacts import Store
 from vibench.study.cells import CERTIFIED, COMPILED, Cell
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
 
 CLEAR_GAP = 10.0
 """A rank is in doubt where the singular values on both sides of the threshold differ by less than this factor."""

@@ -15,6 +15,7 @@ from vibench.errors import NumericalError
 from vibench.interfaces.strategies import Enrichment, Kind, Offline, PrimalStrategy
 from vibench.interfaces.validation import check_enrichment
 from vibench.offline.reduction import Reduction
+from vibench.plugins.plugin import Plugin
 from vibench.reduction.nested import Grown, Milestone, grow_through
 from vibench.reduction.supremizers import ConstraintClasses, projected_supremizers
 from vibench.stability.infsup import ProjectedSupremizers
@@ -24,7 +25,6 @@ from vibench.stages.snapshots import parameters_in
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes, Cell
-from vibench.study.plugin import Plugin
 from vibench.timing import Seconds, timed
 
 for _kind in (Kind, Grown, Milestone):

@@ -11,6 +11,7 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.model.galerkin import ReducedModel
 from vibench.offline.assemblies import assemblies
+from vibench.plugins.plugin import Plugin
 from vibench.reduction.supremizers import ConstraintClasses
 from vibench.stability.coercivity import Constant, Stability
 from vibench.stability.infsup import (
@@ -28,7 +29,6 @@ from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
 from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_edges, chunk_of, chunk_size
-from vibench.study.plugin import Plugin
 
 for _kind in (ConstraintClasses, Stability, Constant, InfSup):
     storable(_kind)

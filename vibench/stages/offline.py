@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from vibench.interfaces.strategies import Cone, Stop
 from vibench.interfaces.validation import check_cone
+from vibench.plugins.plugin import Plugin
 from vibench.reduction.cones import orthogonality
 from vibench.reduction.pod import POD, pod
 from vibench.reduction.supremizers import ConstraintClasses, constraint_classes, isometric_supremizers
@@ -16,7 +17,6 @@ from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
-from vibench.study.plugin import Plugin
 from vibench.timing import timed
 
 for _kind in (POD, Cone, Multipliers, ConstraintClasses):

@@ -10,8 +10,9 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
+from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.pictures import Picture
-from vibench.interfaces.problem import ParameterBox
+from vibench.plugins.plugin import Plugin
 from vibench.results.pictures import ARRAYS, TEXTS, failure_rows, picture_rows
 from vibench.stages.base import Result, Row, Stage, build_problem
 from vibench.stages.snapshots import gather, solution_stages
@@ -19,7 +20,6 @@ from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
-from vibench.study.plugin import Plugin
 from vibench.text import one_line
 
 storable(Picture)

@@ -10,7 +10,8 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import in_a_line
-from vibench.interfaces.problem import ParameterBox, Problem, VariationalInequality
+from vibench.interfaces.parameters import ParameterBox
+from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.model.error_bounds import CorrectionMode
 from vibench.model.errors import UNMEASURABLE, ReferenceSolutions
@@ -18,6 +19,7 @@ from vibench.model.galerkin import ReducedModel
 from vibench.offline.assemblies import assemblies
 from vibench.offline.correction import Answer, Corrector
 from vibench.offline.models import AnyReducedModel
+from vibench.plugins import registry
 from vibench.qp.exact import ExactSolution
 from vibench.qp.repeats import check_answer, in_units, nearby, units
 from vibench.qp.scaling import ratio
@@ -30,7 +32,6 @@ from vibench.stages.assembly import AssemblyStage, ReducedPrograms
 from vibench.stages.base import Row, Watch, value_of
 from vibench.stages.judging.pairs import online_columns, pair_columns
 from vibench.storage.artefacts import Store
-from vibench.study import registry
 from vibench.study.parameter_sets import ParameterSet
 from vibench.timing import SLOW, Seconds, timed
 

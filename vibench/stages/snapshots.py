@@ -21,14 +21,14 @@ from vibench.model.certificates.growing import GrowingTrainer
 from vibench.model.error_bounds import reference_bound
 from vibench.offline.assemblies import assemblies
 from vibench.offline.sweep import Snapshots
+from vibench.plugins.kinds import PROBLEM
+from vibench.plugins.plugin import Plugin
 from vibench.qp.repeats import nearby
 from vibench.stages.base import SHARE, Result, Stage, build_problem, faults_of, value_of
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes
-from vibench.study.kinds import PROBLEM
 from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_of, chunk_size
-from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, SLOW, Seconds, median_of, timed
 
 T = TypeVar("T")

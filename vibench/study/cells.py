@@ -13,10 +13,10 @@ from vibench.dependencies import CELL, code_used
 from vibench.errors import RequestError, unknown_name
 from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Stop
-from vibench.study.kinds import SOLVER
+from vibench.plugins.kinds import SOLVER
+from vibench.plugins.plugin import Plugin
+from vibench.plugins.registry import find
 from vibench.study.parameter_sets import OWN, OWN_TRAINING, ParameterSet
-from vibench.study.plugin import Plugin
-from vibench.study.registry import find
 
 CERTIFIED = "certified"
 """Assembly of queries that are assembled as reduced ones, and have certificates."""

@@ -21,10 +21,10 @@ from pydantic import (
 )
 
 from vibench.interfaces.formulations import AXES, MIXED, axes_of
-from vibench.study.kinds import FORMULATION, PluginKind
+from vibench.plugins.kinds import FORMULATION, PluginKind
+from vibench.plugins.plugin import GivenPlugin, Plugin, give
+from vibench.plugins.registry import RegisteredPlugin, find
 from vibench.study.parameter_sets import OWN
-from vibench.study.plugin import GivenPlugin, Plugin, give
-from vibench.study.registry import RegisteredPlugin, find
 
 Size: TypeAlias = Annotated[int, Ge(1), Le(100_000)]
 Name: TypeAlias = Annotated[str, MinLen(1)]

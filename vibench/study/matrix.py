@@ -13,14 +13,14 @@ from typing import Any, TypeAlias, TypeVar
 from vibench.errors import RequestError, requested
 from vibench.files import read_regular
 from vibench.interfaces.strategies import Stop
+from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SAMPLING, STUDY, PluginKind
+from vibench.plugins.options import BESIDE
+from vibench.plugins.plugin import GivenPlugin, Plugin
+from vibench.plugins.registry import find, registered
 from vibench.reduction.nested import NestedStrategy
 from vibench.study.cells import COMPILED, NO_SUCH_AXIS, UNCORRECTED, Cell
 from vibench.study.entries import Entry, FormulationEntry, ProblemEntry, SamplingEntry
-from vibench.study.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SAMPLING, STUDY, PluginKind
-from vibench.study.options import BESIDE
 from vibench.study.parameter_sets import OWN, ParameterSet
-from vibench.study.plugin import GivenPlugin, Plugin
-from vibench.study.registry import find, registered
 from vibench.study.spec import Study, ToleranceTable
 
 

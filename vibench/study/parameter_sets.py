@@ -13,7 +13,7 @@ from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import AdaptiveSampling, Sampling
 from vibench.interfaces.validation import training_parameters, validation_parameters
-from vibench.study.plugin import Plugin
+from vibench.plugins.plugin import Plugin
 
 OWN = "own"
 """Name of the training and the validation set that a problem itself has."""

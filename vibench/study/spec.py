@@ -23,6 +23,9 @@ from vibench.errors import RequestError, fault_line, unknown_name
 from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Stop
 from vibench.linalg.factorisations import DEFAULT
+from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SAMPLING, SOLVER, PluginKind
+from vibench.plugins.plugin import Plugin
+from vibench.plugins.registry import FACTORISATION, find, registered
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.study.entries import (
@@ -37,10 +40,7 @@ from vibench.study.entries import (
     Validation,
     as_list,
 )
-from vibench.study.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SAMPLING, SOLVER, PluginKind
 from vibench.study.parameter_sets import OWN, ParameterSet, check_sets, is_available
-from vibench.study.plugin import Plugin
-from vibench.study.registry import FACTORISATION, find, registered
 
 Tolerance: TypeAlias = Annotated[float, Gt(0.0), Lt(1.0), AllowInfNan(False)]
 Seconds: TypeAlias = Annotated[float, Gt(0.0), Le(1e7), AllowInfNan(False)]

@@ -12,11 +12,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from vibench.execution.run import Agenda, Observer
+from vibench.plugins.kinds import PROBLEM
+from vibench.plugins.plugin import Plugin
 from vibench.qp.status import Status
 from vibench.stages.base import Stage
 from vibench.study.cells import Cell
-from vibench.study.kinds import PROBLEM
-from vibench.study.plugin import Plugin
 from vibench.terminal.console import print_line
 from vibench.terminal.run_summary import REASONS, kind_of_failure
 from vibench.text import printable

@@ -16,8 +16,8 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import NumericalError, in_a_line
 from vibench.interfaces.problem import MEMBERS, Problem
+from vibench.plugins.options import options_of
 from vibench.storage.serialisation import dumps, loads
-from vibench.study.options import options_of
 from vibench.testing.checks import SECONDS, ConformanceError, Doubt, Note, plugin_line
 from vibench.testing.comparisons import Arrays, at, copies, differences
 from vibench.testing.processes import NotImportableError, call_in_other_process

@@ -11,8 +11,9 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.highfidelity import active_set
 from vibench.interfaces.outputs import Output
+from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.pictures import MeshFields, Picture
-from vibench.interfaces.problem import MEMBERS, ParameterBox
+from vibench.interfaces.problem import MEMBERS
 from vibench.interfaces.validation import training_parameters, validation_parameters
 from vibench.linalg.inner_product import InnerProduct, singular_values
 from vibench.model.affine import INTERPOLATION_RTOL, MISSED, assembled_members, decomposed, held_out_error

@@ -12,7 +12,7 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import RequestError
-from vibench.interfaces.problem import ParameterBox
+from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.strategies import AdaptiveSampling, Sampling, Trainer, check_sample
 from vibench.testing.case import Case
 from vibench.testing.checks import Check, Conformance, ConformanceError, Doubt, Note, raised

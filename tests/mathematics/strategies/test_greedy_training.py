@@ -9,12 +9,12 @@ import pytest
 from samples import SampleStore, carry_out
 
 from vibench import AdaptiveSampling, Array, HighFidelitySolver, ParameterBox, Stop, Trainer, create
+from vibench.plugins.plugin import Plugin
 from vibench.stages.assembly import AffineDecomposition
 from vibench.stages.base import value_of
 from vibench.stages.offline import ConstraintMatrices, PODStage
 from vibench.stages.snapshots import gather, parameters_in, solution_stages
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
 from vibench_strategies.samplings.candidates import Candidates
 
 BOX = ParameterBox(("x", "y"), np.zeros(2), np.array([2.0, 1.0]), ("1", "1"))

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from vibench import Array, ParameterBox, RequestError, Sampling, create
 from vibench.interfaces.strategies import check_sample
-from vibench.study.kinds import SAMPLING
-from vibench.study.registry import registered
+from vibench.plugins.kinds import SAMPLING
+from vibench.plugins.registry import registered
 
 BOX = ParameterBox(("a", "b", "c"), np.array([1e-3, -2.0, 5.0]), np.array([1e3, 3.0, 5.5]), ("m", "1", "N"))
 DRAWN = ("random", "sobol", "latin-hypercube")

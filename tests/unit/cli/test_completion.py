@@ -16,14 +16,13 @@ from running import Main, Register
 from vibench.cli import completion
 from vibench.cli.main import app
 from vibench.cli.plugin_commands import LISTS
+from vibench.plugins.kinds import DUAL, STUDY
+from vibench.plugins.registry import find, first_sentence, registered
 from vibench.qp.settings import SETTINGS
 from vibench.results import tables
 from vibench.results.columns import TABLES
 from vibench.results.sqlite.reading import FILE
 from vibench.results.views import VIEWS
-from vibench.study.kinds import DUAL, STUDY
-from vibench.study.registry import find, registered
-from vibench.study.source import first_sentence
 
 GROUP: Any = typer.main.get_command(app)
 

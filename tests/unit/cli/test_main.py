@@ -16,16 +16,16 @@ from running import Main, Register, refused
 from samples import STUDY, changed, write_study
 
 from vibench.cli.plugin_commands import LISTS
+from vibench.plugins import kinds, registry
+from vibench.plugins.kinds import PROBLEM
+from vibench.plugins.registry import find, registered
 from vibench.qp.settings import SETTINGS
 from vibench.results.columns import CELLS, STORED, TABLES
 from vibench.results.costs.best import ADDED
 from vibench.results.sqlite.reading import FILE
 from vibench.results.tables import read
-from vibench.study import kinds, registry
 from vibench.study.entries import ProblemEntry
-from vibench.study.kinds import PROBLEM
 from vibench.study.matrix import expand, read_study
-from vibench.study.registry import find, registered
 from vibench.study.spec import Study
 from vibench.text import printable
 

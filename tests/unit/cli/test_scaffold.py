@@ -19,8 +19,8 @@ from samples import wire_study, write_study
 from vibench import HighFidelitySolver, create
 from vibench.cli import scaffold
 from vibench.errors import RequestError
-from vibench.study.kinds import CHECKED, DUAL, PROBLEM
-from vibench.study.registry import registered
+from vibench.plugins.kinds import CHECKED, DUAL, PROBLEM
+from vibench.plugins.registry import registered
 
 NAMES = {
     "problem": "my-rope", "primal": "tied", "dual": "cone", "solver": "for-rope", "sampling": "strata",

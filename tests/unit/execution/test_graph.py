@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vibench.execution.graph import Graph
+from vibench.plugins.kinds import STUDY
+from vibench.plugins.registry import registered
 from vibench.stages.base import Result, Stage
 from vibench.stages.cell_queries import cell_queries
 from vibench.stages.pictures import PictureStage
 from vibench.storage.artefacts import Store
-from vibench.study.kinds import STUDY
 from vibench.study.matrix import expand, read_study
-from vibench.study.registry import registered
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from samples import SOLVERS_OF_TESTS
 
 from vibench.cli.doctor import ACCURACY, UNKNOWNS, wire
 from vibench.execution.solver_trials import SECONDS, Trial, solver_trials
+from vibench.plugins import registry
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
-from vibench.study import registry
 
 
 def attempts(solvers: Sequence[str], seconds: float = SECONDS) -> dict[str, Trial]:

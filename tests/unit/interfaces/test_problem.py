@@ -8,7 +8,8 @@ import scipy.sparse as sp
 from numerics import Varying
 
 from vibench.errors import NumericalError
-from vibench.interfaces.problem import ParameterBox, VariationalInequality
+from vibench.interfaces.parameters import ParameterBox
+from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 
 BOX = ParameterBox(("a", "b"), np.array([0.0, -1.0]), np.array([1.0, 3.0]), ("1", "m"))

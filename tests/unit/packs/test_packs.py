@@ -24,9 +24,9 @@ from vibench.packs import writer
 from vibench.packs.checks import read_model_pack
 from vibench.packs.pack import ModelPack, reduce_multipliers
 from vibench.packs.reader import pack_digest
-from vibench.study.kinds import PROBLEM
-from vibench.study.plugin import Plugin
-from vibench.study.registry import create, find
+from vibench.plugins.kinds import PROBLEM
+from vibench.plugins.plugin import Plugin
+from vibench.plugins.registry import create, find
 from vibench.testing import check_problem
 
 MU = np.array([5.0, 0.2])

@@ -15,9 +15,12 @@ from samples import carry_out
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
-from vibench.interfaces.problem import MEMBERS, ParameterBox, VariationalInequality
+from vibench.interfaces.parameters import ParameterBox
+from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.interfaces.strategies import Stop
 from vibench.model.hyperreduced import HyperReducedModel
+from vibench.plugins import registry
+from vibench.plugins.plugin import Plugin
 from vibench.qp.repeats import APART, in_units, nearby, units
 from vibench.qp.solve import solve_qp
 from vibench.qp.verification import QPSolution
@@ -31,9 +34,7 @@ from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.query import Query
 from vibench.stages.snapshots import SnapshotStage
 from vibench.storage.artefacts import Store
-from vibench.study import registry
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
 
 PROBLEM = Plugin("problem", "obstacle", '{"resolution": 150}', "repeats")
 EVERY = tuple(range(3))

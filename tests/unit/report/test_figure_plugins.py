@@ -15,11 +15,11 @@ from running import Changed, Main, Register
 import vibench
 from vibench.errors import RequestError
 from vibench.interfaces.figures import FigurePlugin, ProblemTables
+from vibench.plugins import registry
+from vibench.plugins.kinds import FIGURE
 from vibench.report import CaptionedFigure, Looks, Series, Sheet, figures, html, scatter
 from vibench.report.figures import publication
 from vibench.report.figures.plugins import FigureError
-from vibench.study import registry
-from vibench.study.kinds import FIGURE
 
 GROUP, HERE = "vibench.figures", __name__
 

@@ -17,10 +17,10 @@ import vibench
 from vibench.cli.main import app
 from vibench.errors import RequestError
 from vibench.execution.recorded_cell import RecordedCell, recorded_cell, recorded_cells
+from vibench.plugins import registry
 from vibench.qp import verification
 from vibench.qp.solve import installed_solvers, solve_qp
 from vibench.report import replay
-from vibench.study import registry
 
 STUDY = """
 name = "small"

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from matplotlib.backends.backend_agg import RendererAgg
 from matplotlib.figure import Figure
 
+from vibench.plugins.kinds import DUAL, PRIMAL
+from vibench.plugins.registry import registered
 from vibench.report.figures.data import file_names
 from vibench.report.figures.looks import COLOURS, Looks, Series, look_of
 from vibench.report.figures.style import WRITTEN, Sheet, caption_of, plot, styled, write_figure
-from vibench.study.kinds import DUAL, PRIMAL
-from vibench.study.registry import registered
 from vibench.text import printable
 
 SOLVERS = ("piqp", "proxqp", "osqp", "clarabel", "daqp", "quadprog", "highs", "scs", "cvxopt", "ecos")

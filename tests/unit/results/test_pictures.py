@@ -13,13 +13,13 @@ from samples import SampleStore, carry_out
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.pictures import Picture
+from vibench.plugins.plugin import Plugin
 from vibench.results import pictures
 from vibench.results.database import ResultsDatabase
 from vibench.results.pictures import Shown
 from vibench.results.sqlite.reading import FILE
 from vibench.stages import base
 from vibench.stages.pictures import PictureStage
-from vibench.study.plugin import Plugin
 
 OBSTACLE = Plugin("problem", "obstacle", '{"resolution": 200}', "test")
 KEYS = {"problem": "membrane", "problem_options": OBSTACLE.options}

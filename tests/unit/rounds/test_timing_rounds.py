@@ -14,6 +14,7 @@ from samples import SampleStore, carry_out
 
 from vibench.interfaces.strategies import Stop
 from vibench.model.galerkin import ReducedModel
+from vibench.plugins.plugin import Plugin
 from vibench.qp.status import Status
 from vibench.rounds import marginal_solutions, timing_rounds
 from vibench.rounds.marginal_solutions import MarginalSolution, MarginalSolutions, SolutionsBeside, parts_alike
@@ -26,7 +27,6 @@ from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.snapshots import gather
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, Seconds
 
 PROBLEM = Plugin("problem", "obstacle", '{"resolution": 200}', "test")

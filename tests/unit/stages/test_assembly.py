@@ -15,6 +15,7 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.model.affine import Evaluation
 from vibench.model.galerkin import ReducedModel, project
 from vibench.model.hyperreduced import HyperReducedModel
+from vibench.plugins.plugin import Plugin
 from vibench.results.columns import CELLS as CELL_COLUMNS
 from vibench.results.costs.ranking import too_loose
 from vibench.stages.assembly import AffineDecomposition, AssemblyStage
@@ -23,7 +24,6 @@ from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
 
 OBSTACLE = Plugin("problem", "obstacle", '{"resolution": 200}', "test")
 RADIAL = Plugin("problem", "radial-obstacle", '{"resolution": 300}', "test")

@@ -15,16 +15,16 @@ from samples import SampleStore, carry_out
 
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import Stop
+from vibench.plugins.kinds import PROBLEM
+from vibench.plugins.plugin import Plugin
+from vibench.plugins.registry import find
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Row, value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.pictures import PictureStage
-from vibench.study.kinds import PROBLEM
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
-from vibench.study.registry import find
 
 OBSTACLE = find(PROBLEM, "obstacle").load()
 PROBLEMS: Mapping[str, Callable[[], Problem]] = {

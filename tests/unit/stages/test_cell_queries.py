@@ -12,9 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import SampleStore, carry_out
 
-from vibench.interfaces.problem import ParameterBox, VariationalInequality
+from vibench.interfaces.parameters import ParameterBox
+from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Stop
 from vibench.offline.assemblies import Assemblies
+from vibench.plugins.plugin import Plugin
 from vibench.qp import verification
 from vibench.qp.solve import solve_qp, takes_start
 from vibench.stages import cell_queries
@@ -26,7 +28,6 @@ from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.query import error_columns, path_before, query_before
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
 
 BOX = ParameterBox(("a", "b"), np.array([0.0, 0.0]), np.array([1.0, 100.0]), ("1", "1"))
 PROBLEM = Plugin("problem", "radial-obstacle", '{"resolution": 200}', "test")

@@ -5,6 +5,7 @@ import pytest
 from samples import SampleStore, carry_out
 
 from vibench.interfaces.strategies import Stop
+from vibench.plugins.plugin import Plugin
 from vibench.stability.infsup import InfSup, inf_sup_full, inf_sup_on
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
@@ -12,7 +13,6 @@ from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
 
 PROBLEMS = {
     "obstacle": Plugin("problem", "obstacle", '{"resolution": 200}', "test"),

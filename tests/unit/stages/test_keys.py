@@ -16,6 +16,9 @@ from samples import SampleStore, small_study
 from vibench import dependencies
 from vibench.dependencies import CARRIERS, CELL, COUNTED, code_used, modules_used
 from vibench.offline.assemblies import assemblies
+from vibench.plugins import registry
+from vibench.plugins.kinds import DUAL, PRIMAL, PROBLEM, SAMPLING
+from vibench.plugins.plugin import Plugin
 from vibench.rounds import timing_rounds
 from vibench.rounds.offline_repeats import OfflineRepeat
 from vibench.rounds.timing_rounds import TimingRounds
@@ -26,10 +29,7 @@ from vibench.stages.formulations.queries import FormulationQueries
 from vibench.stages.pictures import PictureStage
 from vibench.stages.snapshots import fingerprint_here
 from vibench.storage.artefacts import Artefact, Store
-from vibench.study import registry
-from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SAMPLING
 from vibench.study.matrix import expand
-from vibench.study.plugin import Plugin
 from vibench.study.spec import Study
 
 COMPILED = ["compiled"] if shutil.which("cc") else []
@@ -181,7 +181,7 @@ def test_no_code_counts_that_only_requests_records_or_shows() -> None:
 SOLUTIONS, MATRICES = "high-fidelity solutions", "constraint matrices"
 CONSTANTS, REFERENCE = "high-fidelity constants", "high-fidelity inf-sup constants"
 SHOWN = (
-    "report.html", "results.columns", "results.costs.break_even", "study.spec", "study.registry", "errors", "text",
+    "report.html", "results.columns", "results.costs.break_even", "study.spec", "plugins.registry", "errors", "text",
     "storage.artefacts", "storage.serialisation", "stages.base", "provenance", "execution.run", "cli.main",
     "library.runs",
 )  # fmt: skip

@@ -19,6 +19,7 @@ from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Kind, Stop
+from vibench.plugins.plugin import Plugin
 from vibench.qp.status import Status
 from vibench.reduction.nested import Milestone
 from vibench.stability.coercivity import Stability
@@ -32,7 +33,6 @@ from vibench.stages.judging.cell_summary import summarise
 from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage
 from vibench.stages.snapshots import SnapshotStage, gather, solution_stages
 from vibench.study.parameter_sets import CHUNKS, OWN_TRAINING, ParameterSet, chunk_of
-from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, Seconds
 
 PROBLEM = Plugin("problem", "obstacle", '{"resolution": 200}', "test")

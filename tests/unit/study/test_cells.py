@@ -15,12 +15,12 @@ from samples import REMOVE, STUDY, changed, write_study
 
 from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
+from vibench.plugins import registry
+from vibench.plugins.plugin import Plugin
 from vibench.study import cells as module
-from vibench.study import registry
 from vibench.study.cells import Cell, digest
 from vibench.study.matrix import expand, read_study
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
 
 Expand = Callable[[Mapping[str, Any]], list[Cell]]
 

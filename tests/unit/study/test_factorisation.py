@@ -14,11 +14,11 @@ from vibench.highfidelity import kkt_systems
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.linalg import factorisations, inner_product
 from vibench.linalg.factorisations import IMPLEMENTATIONS
+from vibench.plugins.kinds import PROBLEM
+from vibench.plugins.plugin import Plugin
+from vibench.plugins.registry import find
 from vibench.reduction import supremizers
-from vibench.study.kinds import PROBLEM
 from vibench.study.matrix import expand
-from vibench.study.plugin import Plugin
-from vibench.study.registry import find
 from vibench.study.spec import Study
 
 STUDY = {

@@ -14,11 +14,11 @@ from packs import Cable, manifest, write_cable, write_manifest
 from samples import STUDY, changed, write_study
 
 from vibench.errors import RequestError
-from vibench.interfaces.problem import ParameterBox
+from vibench.interfaces.parameters import ParameterBox
+from vibench.plugins.plugin import Plugin
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, read_study, study_of_cell
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet, parameters_of
-from vibench.study.plugin import Plugin
 
 SOBOL = {"name": "sobol", "size": 8, "seed": 1}
 

@@ -17,6 +17,7 @@ from samples import STUDY, changed, write_study
 from vibench.execution.graph import Graph
 from vibench.execution.run import Agenda
 from vibench.interfaces.strategies import Stop
+from vibench.plugins.plugin import Plugin
 from vibench.stages.base import Stage
 from vibench.stages.cell_queries import CellQueries, cell_queries
 from vibench.stages.offline import PODStage
@@ -24,7 +25,6 @@ from vibench.stages.snapshots import SnapshotStage
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, read_study
 from vibench.study.parameter_sets import CHUNKS, OWN_TRAINING
-from vibench.study.plugin import Plugin
 from vibench.terminal.progress import ALIKE, DrawingDisplay, ProgressDisplay, TimeLeft, duration
 
 PROBLEM = Plugin("problem", "p", "{}", "")  # there is none: nothing is built to estimate seconds

@@ -22,8 +22,8 @@ from running import Main, failures, refused
 
 from vibench import testing
 from vibench.interfaces.strategies import DualStrategy
-from vibench.study.kinds import CHECKED
-from vibench.study.registry import create, find
+from vibench.plugins.kinds import CHECKED
+from vibench.plugins.registry import create, find
 from vibench.testing import solvers
 from vibench.testing.checks import Check, Conformance, Doubt, Note, Verdict
 from vibench.testing.comparisons import JUMP, WIDTH, difference, find_jump

@@ -26,7 +26,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, SparseMatrix, digest
-from vibench.interfaces.problem import ParameterBox, Problem
+from vibench.interfaces.parameters import ParameterBox
+from vibench.interfaces.problem import Problem
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct
 from vibench.stability.coercivity import Constant, coercivity_and_continuity, operator_norm

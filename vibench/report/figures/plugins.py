@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 
 from vibench.errors import VibenchError, in_a_line
 from vibench.interfaces.figures import Drawing, FigurePlugin
+from vibench.plugins.kinds import FIGURE
+from vibench.plugins.registry import registered
 from vibench.report.figures.data import Data, file_names
 from vibench.report.figures.style import set_caption
 from vibench.results.plugin_columns import loaded
-from vibench.study.kinds import FIGURE
-from vibench.study.registry import registered
 
 
 class FigureError(VibenchError):

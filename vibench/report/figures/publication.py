@@ -15,13 +15,13 @@ from matplotlib.figure import Figure
 from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.interfaces.figures import Drawing
+from vibench.plugins.kinds import FIGURE
+from vibench.plugins.registry import registered
 from vibench.report.figures.data import Data, file_names, problems
 from vibench.report.figures.plugins import FigureError, draw_guarded, named
 from vibench.report.figures.style import FORMATS, caption_of, first_sentence, save, styled
 from vibench.results.plugin_columns import loaded
 from vibench.results.sqlite.reading import read_meta, study_of
-from vibench.study.kinds import FIGURE
-from vibench.study.registry import registered
 from vibench.text import unbroken
 
 PAGE = "paper-figures.md"

@@ -12,12 +12,12 @@ from typing import Any
 import pandas as pd
 
 from vibench.interfaces.formulations import MIXED
+from vibench.plugins.kinds import STUDY
+from vibench.plugins.registry import registered
 from vibench.report.comparison.runs import ComparedRun
 from vibench.report.figures.data import way
 from vibench.results.formats import asked, cell_text, solver_text
 from vibench.results.sqlite.reading import FILE
-from vibench.study.kinds import STUDY
-from vibench.study.registry import registered
 
 FILTERED = ("study", "problem", "dual", "primal", "solver", "machine", "vibench")
 """What the list of runs is filtered by."""

@@ -13,6 +13,7 @@ from vibench.model.hyperreduced import ReducedOperators
 from vibench.offline.formulated import ACCURACY, Formulated, check_built
 from vibench.offline.reduction import Reduction
 from vibench.offline.sweep import Snapshots
+from vibench.plugins.plugin import Plugin
 from vibench.stages.assembly import AffineDecomposition, HyperReduction
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.stages.enrichment import EnrichmentStage
@@ -21,7 +22,6 @@ from vibench.stages.snapshots import gather, solution_stages
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
 from vibench.timing import timed
 
 

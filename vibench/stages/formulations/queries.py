@@ -16,6 +16,7 @@ from vibench.interfaces.strategies import Kind
 from vibench.model.certificates.base import Guarantee
 from vibench.offline.assemblies import assemblies
 from vibench.offline.formulated import CellSolver, Formulated
+from vibench.plugins.plugin import Plugin
 from vibench.qp.repeats import nearby
 from vibench.qp.status import Status
 from vibench.results.solver_agreement import answer_row
@@ -28,7 +29,6 @@ from vibench.stages.query import query_before
 from vibench.storage.artefacts import Store
 from vibench.study.cells import Cell
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
 from vibench.timing import SLOW, Seconds, timed
 
 

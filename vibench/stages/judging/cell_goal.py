@@ -17,6 +17,9 @@ from vibench.errors import in_a_line
 from vibench.interfaces.problem import Problem
 from vibench.model.errors import ReferenceSolutions, output_scales, summarise_outputs, zeros
 from vibench.offline.assemblies import assemblies
+from vibench.plugins.kinds import SOLVER
+from vibench.plugins.plugin import Plugin
+from vibench.plugins.registry import find
 from vibench.provenance import machine
 from vibench.qp.status import Status
 from vibench.stability.coercivity import Stability
@@ -27,10 +30,7 @@ from vibench.stages.judging.cell_summary import summarise
 from vibench.stages.offline import ConstraintMatrices
 from vibench.stages.snapshots import TimedSnapshots, gather, solution_stages
 from vibench.storage.artefacts import Artefact, Store
-from vibench.study.kinds import SOLVER
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
-from vibench.study.registry import find
 from vibench.timing import median_of
 
 JUDGED = 1.5

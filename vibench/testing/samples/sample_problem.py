@@ -11,7 +11,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.interfaces.problem import ParameterBox, Problem, Sampler, VariationalInequality
+from vibench.interfaces.parameters import ParameterBox
+from vibench.interfaces.problem import Problem, Sampler, VariationalInequality
 from vibench.interfaces.strategies import Cone, DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, Stop
 from vibench.linalg.inner_product import InnerProduct
 from vibench.offline.reduction import Reduction

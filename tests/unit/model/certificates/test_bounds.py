@@ -15,7 +15,8 @@ from numerics import exact, space, spd
 
 from vibench.errors import UnsupportedError
 from vibench.interfaces.affine import AffineSum
-from vibench.interfaces.problem import Contact, ParameterBox, Problem, Sampler, VariationalInequality
+from vibench.interfaces.parameters import ParameterBox
+from vibench.interfaces.problem import Contact, Problem, Sampler, VariationalInequality
 from vibench.interfaces.strategies import Enrichment, Kind
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import affine_decomposition

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from numerics import space, spd
 
 from vibench import InnerProduct, create
-from vibench.interfaces.problem import ParameterBox, Problem, VariationalInequality
+from vibench.interfaces.parameters import ParameterBox
+from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.model.certificates import spectral
 from vibench.model.certificates.spectral import ANCHORS, LEFT_OUT, anchors, leading_terms, rotated, spectral_bounds
 from vibench.stability.coercivity import Constant, operator_norm

@@ -21,11 +21,11 @@ from samples import FAKES, install
 from vibench.errors import RequestError
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
-from vibench.study import registry
-from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SOLVER, STUDY, PluginKind
+from vibench.plugins import registry
+from vibench.plugins.kinds import DUAL, PRIMAL, PROBLEM, SOLVER, STUDY, PluginKind
+from vibench.plugins.plugin import Plugin
+from vibench.plugins.registry import find, registered
 from vibench.study.matrix import read_study
-from vibench.study.plugin import Plugin
-from vibench.study.registry import find, registered
 from vibench.study.spec import Entry
 
 HERE = __name__

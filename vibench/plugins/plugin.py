@@ -16,11 +16,11 @@ from typing import Any
 import cloudpickle
 
 from vibench.errors import RequestError, in_a_line, message_of
+from vibench.plugins.fingerprint import fingerprint_of, is_computed_again, is_importable, module_version
+from vibench.plugins.kinds import PluginKind
+from vibench.plugins.options import named
+from vibench.plugins.registry import RegisteredPlugin, find
 from vibench.provenance import distribution_version
-from vibench.study.fingerprint import fingerprint_of, is_computed_again, is_importable, module_version
-from vibench.study.kinds import PluginKind
-from vibench.study.options import named
-from vibench.study.registry import RegisteredPlugin, find
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import inspect
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from inspect import Parameter
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, NamedTuple, get_type_hints
 
 from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
@@ -135,6 +135,70 @@ def _words(schema: Mapping[str, Any]) -> str:
         return repr(schema["const"])
     kind = str(schema.get("type", "any value"))
     python = {"integer": "int", "number": "float", "string": "str", "boolean": "bool", "array": "list"}.get(kind, kind)
-    signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
-    bounds = [f"{sign} {schema[key]:g}" for key, sign in signs.items() if key in schema]
+    bounds = [f"{sign} {schema[key]:g}" for key, sign in SIGNS.items() if key in schema]
     return " ".join([python, " and ".join(bounds)]).strip()
+
+
+KINDS = {"integer": "int", "number": "float", "string": "text", "boolean": "true or false"}
+SIGNS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+
+
+class Key(NamedTuple):
+    """A key of a file."""
+
+    table: str
+    """Name of the model of the table it stands in; "" for the file itself."""
+    name: str
+    expected: str
+    """What its value may be."""
+    required: bool
+    default: str
+    """What stands for a missing one, as JSON; "" if that is nothing."""
+    meaning: str
+
+
+def keys(schema: Mapping[str, Any], link: Callable[[str], str] = lambda _: "table") -> Iterator[Key]:
+    """The keys of a file and of the tables in it; `link` writes what refers to the table of a model."""
+    for table, model in {"": schema, **schema["$defs"]}.items():
+        required = model.get("required", [])
+        for name, field in model["properties"].items():
+            words = _expected(field, link)
+            yield Key(table, name, words, name in required, _preset(field.get("default")), field["description"])
+
+
+def places(schema: Mapping[str, Any], model: str) -> list[str]:
+    """The keys that hold a table of a model."""
+    reference = json.dumps(f"#/$defs/{model}")
+    tables = [schema, *schema["$defs"].values()]
+    held = [key for table in tables for key, field in table["properties"].items() if reference in json.dumps(field)]
+    return list(dict.fromkeys(held))
+
+
+def _preset(value: Any) -> str:
+    if value in (None, "", {}) or (isinstance(value, dict) and "query_seconds" in value):
+        return ""
+    if isinstance(value, list) and value and isinstance(value[0], dict):  # entries, which may be given by their names
+        value = [entry["name"] for entry in value]
+    return json.dumps(value)
+
+
+def _expected(schema: Mapping[str, Any], link: Callable[[str], str]) -> str:
+    """What a schema expects, in words."""
+    for key in ("anyOf", "oneOf"):
+        if key in schema:
+            return " or ".join(_expected(part, link) for part in schema[key] if part.get("type") != "null")
+    if "$ref" in schema:
+        return link(schema["$ref"].rsplit("/", 1)[-1])
+    if "enum" in schema or "const" in schema:
+        return " or ".join(f"`{json.dumps(value)}`" for value in schema.get("enum", [schema.get("const")]))
+    if schema["type"] == "array":
+        return f"list of {_expected(schema['items'], link)}"
+    if schema["type"] == "object":
+        values = schema["additionalProperties"]
+        return "table" if values is True else f"table: name = {_expected(values, link)}"
+    bounds = [f"{sign} {_number(schema[key])}" for key, sign in SIGNS.items() if key in schema]
+    return " ".join([KINDS[schema["type"]], " and ".join(bounds)]).strip()
+
+
+def _number(value: float) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -6,8 +6,11 @@ imported at the top.
 
 from __future__ import annotations
 
+import ast
 import importlib.metadata
-from collections.abc import Mapping, Sequence
+import importlib.util
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.metadata import Distribution, EntryPoint
@@ -15,13 +18,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vibench.errors import RequestError, in_a_line, requested, unknown_name
+from vibench.plugins.kinds import PROBLEM, SAMPLING, SOLVER, STUDY, PluginKind
 from vibench.provenance import distribution_version, package_hash, solver_version
-from vibench.study import source
-from vibench.study.kinds import PROBLEM, SAMPLING, SOLVER, STUDY, PluginKind
 
 if TYPE_CHECKING:
+    from vibench.plugins.options import Option
     from vibench.qp.verification import QPSolver
-    from vibench.study.options import Option
 
 
 FACTORISATION = "factorisation"
@@ -101,16 +103,16 @@ class RegisteredPlugin:
     def summary(self) -> str:
         """What it is, in a line: that of its documentation, or of the comment at the top of a study."""
         if self.kind is not STUDY:
-            return source.docstring(self._entry.module, self._entry.attr)
+            return docstring(self._entry.module, self._entry.attr)
         try:
-            return source.top_comment(Path(self.load()))
+            return top_comment(Path(self.load()))
         except RequestError:
             return ""
 
     @property
     def names_of_options(self) -> list[str]:
         """Names of its options, as its source has them."""
-        return [option for entry in self.entries for option in source.names_of_options(entry.module, entry.attr)]
+        return [option for entry in self.entries for option in names_of_options(entry.module, entry.attr)]
 
     def load(self) -> Any:
         """The object that its entry point refers to.
@@ -162,7 +164,7 @@ class RegisteredPlugin:
     @property
     def options(self) -> Mapping[str, Option]:
         """Its options by name, read from its constructor."""
-        from vibench.study.options import options_of
+        from vibench.plugins.options import options_of
 
         return options_of(self.load())
 
@@ -176,7 +178,7 @@ class RegisteredPlugin:
 
         Raises a `RequestError` if an option is unknown, missing, or not of its type.
         """
-        from vibench.study.options import checked_arguments
+        from vibench.plugins.options import checked_arguments
 
         if self.conflict:
             return dict(given)
@@ -198,7 +200,7 @@ class RegisteredPlugin:
 
     def canonical_options(self, given: Mapping[str, Any]) -> str:
         """Checked options as canonical JSON, without those that equal their default."""
-        from vibench.study.options import options_as_json
+        from vibench.plugins.options import options_as_json
 
         checked, options = self.check_options(given), {} if self.conflict else self.options
         return options_as_json(
@@ -323,3 +325,55 @@ def _distribution_name(distribution: Distribution) -> str:
         return str(getattr(distribution, "_normalized_name", None) or distribution.metadata["Name"])
     except Exception:  # noqa: BLE001  as above
         return str(distribution)
+
+
+def docstring(module: str, name: str) -> str:
+    """The first line of the documentation of a class."""
+    documented = next(_definitions(module, name), None)
+    text = "" if documented is None else ast.get_docstring(documented)
+    return (text or "").split("\n")[0]
+
+
+def names_of_options(module: str, name: str) -> list[str]:
+    """Names of the arguments of a class's constructor, its own or inherited."""
+    methods = (node for one in _definitions(module, name) for node in one.body if isinstance(node, ast.FunctionDef))
+    constructor = next((node.args for node in methods if node.name == "__init__"), None)
+    return [] if constructor is None else [one.arg for one in (*constructor.args[1:], *constructor.kwonlyargs)]
+
+
+def _definitions(module: str, name: str, below: tuple[tuple[str, str], ...] = ()) -> Iterator[ast.ClassDef]:
+    """The definition of a class, and those of the classes that it inherits from; `below` are those that inherit it.
+
+    Only modules of the package of the first class are read: to find others, packages that hold them are imported.
+    """
+    if (module, name) in below or (below and module.partition(".")[0] != below[0][0].partition(".")[0]):
+        return
+    tree = _syntax_tree(module)
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name]
+    yield from classes
+    origins = [(module, base.id) for node in classes for base in node.bases if isinstance(base, ast.Name)]
+    for node in tree.body if not classes else ():
+        if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            origins += [(node.module, part.name) for part in node.names if name == (part.asname or part.name)]
+    for origin in origins:
+        yield from _definitions(*origin, (*below, (module, name)))
+
+
+def _syntax_tree(module: str) -> ast.Module:
+    try:
+        spec = importlib.util.find_spec(module)
+        return ast.parse(Path(str(spec.origin)).read_bytes() if spec is not None else b"")
+    except Exception:  # noqa: BLE001  finding a module imports the packages that hold it
+        return ast.Module([], [])
+
+
+def top_comment(file: Path) -> str:
+    """The first sentence of the comment at the top of a study file; "" where it has none or is none."""
+    lines = file.read_text(encoding="utf-8").split("\n") if file.is_file() else []
+    top = lines[: next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))]
+    return first_sentence(" ".join(line.removeprefix("#").strip() for line in top))
+
+
+def first_sentence(text: str) -> str:
+    """The first sentence of a text, without its point; one before no capital letter is that of an abbreviation."""
+    return re.split(r"\.\s+(?=[A-Z])", text, maxsplit=1)[0].removesuffix(".")

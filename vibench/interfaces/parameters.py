@@ -1,0 +1,94 @@
+"""The parameter domain of a problem."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vibench.arrays import Array, Mask
+from vibench.errors import RequestError, unknown_name
+from vibench.text import normal_name
+
+
+@dataclass(frozen=True)
+class ParameterBox:
+    """The parameter domain D: a box.
+
+    Attributes
+    ----------
+    names
+        One name per parameter.
+    lower, upper
+        Bounds (d,).
+    units
+        One unit per parameter, "1" if dimensionless.
+    listed
+        The only parameters (L×d) at which the problem can be assembled; `None` if it can be everywhere in the box.
+    """
+
+    names: tuple[str, ...]
+    lower: Array
+    upper: Array
+    units: tuple[str, ...]
+    listed: Array | None = None
+
+    @property
+    def dim(self) -> int:
+        """Number d of parameters."""
+        return len(self.names)
+
+    @property
+    def widths(self) -> Array:
+        """Widths (d,) by which distances of parameters are measured; never zero."""
+        return np.where(self.upper > self.lower, self.upper - self.lower, np.maximum(np.abs(self.lower), 1.0))
+
+    def grid(self, *counts: int) -> Array:
+        """Regular grid (P×d) with `counts` points per direction; the last parameter varies fastest."""
+        axes = [np.linspace(a, b, k) for a, b, k in zip(self.lower, self.upper, counts, strict=True)]
+        return np.stack([m.ravel() for m in np.meshgrid(*axes, indexing="ij")], axis=1)
+
+    def sample(self, count: int, seed: int) -> Array:
+        """`count` uniform random points (count×d), the same for the same seed."""
+        uniform = np.random.default_rng(seed).random((count, self.dim))
+        return np.asarray(self.lower + uniform * (self.upper - self.lower))
+
+    def outside(self, mus: Array) -> Mask:
+        """Which components of points (…×d) lie outside the box, by more than round-off."""
+        # Bounds and parameters are often computed, or read from decimals: the last digits must not refuse one.
+        slack = 1e-12 * np.maximum(np.abs(self.lower), np.abs(self.upper))
+        return np.asarray((mus < self.lower - slack) | (mus > self.upper + slack))
+
+    def from_unit(self, unit: Array, log: Sequence[str] = ()) -> Array:
+        """The points (P×d) of the box at the places `unit` (P×d) of the unit cube, some parameters on a log scale.
+
+        Raises
+        ------
+        RequestError
+            If `log` names no parameter, or one whose lower bound is not positive.
+        """
+        linear = np.asarray(self.lower + unit * (self.upper - self.lower))
+        for i in self.logarithmic(log):
+            low, high = np.log(self.lower[i]), np.log(self.upper[i])
+            linear[:, i] = np.clip(np.exp(low + unit[:, i] * (high - low)), self.lower[i], self.upper[i])
+        return linear
+
+    def to_unit(self, mus: Array) -> Array:
+        """The places (…×d) of points (…×d) in the unit cube; the inverse of `from_unit` without `log`."""
+        return np.asarray((mus - self.lower) / self.widths)
+
+    def logarithmic(self, log: Sequence[str]) -> list[int]:
+        """Numbers of the parameters that `log` names; with the errors of `from_unit`."""
+        chosen = list(dict.fromkeys(map(self.index, log)))
+        for name, low in ((self.names[i], self.lower[i]) for i in chosen):
+            if low <= 0.0:
+                raise RequestError(f"'{name}' cannot have a log scale: its lower bound is {low:g}, expected > 0")
+        return chosen
+
+    def index(self, name: str) -> int:
+        """Number of the parameter with this name; raises a `RequestError` if there is none."""
+        known = {normal_name(one): number for number, one in enumerate(self.names)}
+        if normal_name(name) not in known:
+            raise unknown_name("parameter", name, self.names)
+        return known[normal_name(name)]
