@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import unicodedata
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 LONGEST = 2000
 """Characters that are kept of a message or a status."""
@@ -77,3 +82,27 @@ def _cut(shown: str, length: int, longest: int) -> str:
 def normal_name(name: str) -> str:
     """A name in the Unicode form NFKC, in which Python compares names: the micro sign µ is the letter μ."""
     return unicodedata.normalize("NFKC", name)
+
+
+def new_console() -> Console:
+    """A console for the standard output that interprets no markup; of 10,000 columns where the output is no terminal.
+
+    A positive integer in `COLUMNS` sets the width.
+    """
+    from rich.console import Console  # noqa: PLC0415  most commands and the library print without it
+
+    # Rich would take 0 for a width, and fail on some other texts.
+    columns = os.environ.get("COLUMNS", "")
+    prescribed = re.fullmatch("0*[1-9][0-9]{0,5}", columns) is not None
+    environment = {name: value for name, value in os.environ.items() if prescribed or name != "COLUMNS"}
+    console = Console(highlight=False, markup=False, emoji=False, _environ=environment)
+    if not console.is_terminal and not prescribed:
+        console.width = 10_000
+    return console
+
+
+def print_line(console: Console, line: str) -> None:
+    """Print a line that may hold text from others; the terminal wraps it."""
+    from rich.text import Text  # noqa: PLC0415  as above
+
+    console.print(Text(printable(line)), soft_wrap=True)

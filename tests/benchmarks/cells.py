@@ -26,10 +26,9 @@ import vibench
 from vibench import InnerProduct, ParameterBox, Problem, VariationalInequality
 from vibench.arrays import Array
 from vibench.execution.run import Options, run_study
+from vibench.library.progress import ProgressDisplay
 from vibench.results.sqlite.reading import FILE
 from vibench.storage.artefacts import CACHE_VARIABLE
-from vibench.terminal.console import new_console
-from vibench.terminal.progress import ProgressDisplay
 
 GRIDS = {200: (5, 4), 2_000: (20, 10), 20_000: (50, 40)}
 """Tolerances of the POD and of the cone, by the number of cells; each pair has `ACCURACIES`."""
@@ -73,7 +72,7 @@ def study_of(cells: int) -> vibench.Study:
 def run(cells: int, folder: Path) -> None:
     """Run a study in this process and note what that took."""
     start = time.process_time()
-    with ProgressDisplay(new_console()) as progress:
+    with ProgressDisplay() as progress:
         run_study(study_of(cells), folder, progress, Options(jobs=2))
     spent = time.process_time() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20  # KiB on Linux

@@ -20,6 +20,7 @@ from odd_plugins import LABEL, ODD
 from outputs import clean, elements
 from samples import cell_row, query_rows
 
+from vibench.cli.console import print_frame
 from vibench.interfaces.problem import VariationalInequality
 from vibench.plugins import registry
 from vibench.qp.verification import QPSolution
@@ -31,7 +32,6 @@ from vibench.results.columns import STORED, TABLES
 from vibench.results.database import ResultsDatabase
 from vibench.results.sqlite.reading import FILE
 from vibench.stages.query import Query, run_query
-from vibench.terminal.console import print_frame
 
 ANYTHING = st.text(st.characters(), max_size=50) | st.sampled_from([LABEL, ODD, "$$", "_", "[/b]", "=1", "|", "\\", ""])
 """All of Unicode, lone surrogates included."""

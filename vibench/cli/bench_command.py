@@ -10,11 +10,24 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Argument, Exit, Option
 
 from vibench.cli.completion import plugins, studies
+from vibench.cli.console import echo, print_frame
 from vibench.cli.result_commands import FormOption
 from vibench.errors import RequestError
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from vibench.benchmarks.files import Timed
+
+
+REST = "--format csv"
+"""Option that prints the columns for which a terminal is too narrow."""
+
+PRIORITY = (
+    "verdict", "problem", "dual", "primal", "formulation", "size", "solver", "accuracy", "median [ms]", "before [ms]",
+    "after [ms]", "ratio", "quartiles [ms]", "reached", "status", "rounds", "apart",
+)  # fmt: skip
+"""Columns, those that matter most first."""
 
 
 def bench_plugins(
@@ -57,7 +70,7 @@ def bench_plugins(
         timed, failed = _timed(plugin or [], out, resolution or ["coarse"], study, seconds)
     frame = comparison.table_of(timed, earlier, limit)
     if form == "terminal":
-        comparison.print_benchmarks(timed, earlier, limit, failed)
+        print_benchmarks(timed, earlier, limit, failed)
     else:
         sys.stdout.write(formats.FORMS[form](frame))
     if failed or (earlier is not None and comparison.regressions(frame)):
@@ -94,3 +107,73 @@ def _tell(line: str) -> None:
 
     sys.stderr.write(f"{printable(line)}\n")
     sys.stderr.flush()
+
+
+def print_benchmarks(timed: Timed, earlier: Timed | None, limit: float, failed: int = 0) -> None:
+    """Print a table for everything that was timed, beside an earlier file if there is one, and how many failed."""
+    import pandas as pd
+
+    from vibench.benchmarks.comparison import remarks, table_of
+    from vibench.benchmarks.files import AXES
+
+    frame = table_of(timed, earlier, limit)
+    if len(frame):
+        for group, rows in frame.groupby("group", sort=False):
+            shown = _measured(rows) if earlier is None else _compared(rows)
+            named = [axis for axis in AXES if (rows[axis] != "").any()]
+            print_frame(pd.concat([rows[named], shown], axis=1), str(group), PRIORITY, rest=REST)
+            echo("")
+    if earlier is None:
+        counts = f"{len(frame)} benchmarks" + (f", {failed} failed" if failed else "")
+        echo(f"{counts}; times are CPU times of a call on one thread")
+    else:
+        echo(*remarks(earlier, timed, limit))
+
+
+def _measured(rows: pd.DataFrame) -> pd.DataFrame:
+    import pandas as pd
+
+    from vibench.results.formats import cell_text
+
+    quartiles = zip(1e3 * rows["q1_s"], 1e3 * rows["q3_s"], strict=True)
+    reached = [name for name in rows.columns if name.startswith("reached_")]
+    return pd.DataFrame(
+        {
+            "median [ms]": 1e3 * rows["median_s"],
+            "quartiles [ms]": [f"{cell_text(low)}–{cell_text(high)}" for low, high in quartiles],
+            "rounds": rows["rounds"],
+            "reached": [_largest(row) for row in rows[reached].to_dict("records")],
+            "status": rows["status"],
+        },
+        index=rows.index,
+    )
+
+
+def _largest(reached: dict[str, float | None]) -> str:
+    """The largest figure of accuracy of a benchmark; those of its table are of the same kind."""
+    import pandas as pd
+
+    from vibench.results.formats import cell_text
+
+    figures = {name.removeprefix("reached_"): value for name, value in reached.items() if pd.notna(value)}
+    name = max(figures, key=lambda name: figures[name] or 0.0, default="")
+    return f"{name} {cell_text(figures[name])}" if name else ""
+
+
+def _compared(rows: pd.DataFrame) -> pd.DataFrame:
+    import pandas as pd
+
+    from vibench.results.formats import cell_text
+
+    changes = rows[["figure", "before", "after"]].itertuples(index=False, name=None)
+    return pd.DataFrame(
+        {
+            "before [ms]": 1e3 * rows["before_s"],
+            "after [ms]": 1e3 * rows["after_s"],
+            "ratio": rows["ratio"],
+            "apart": rows["apart"],
+            "reached": [f"{name} {cell_text(was)} → {cell_text(now)}" if name else "" for name, was, now in changes],
+            "verdict": rows["verdict"],
+        },
+        index=rows.index,
+    )

@@ -24,6 +24,7 @@ from rich.text import Text
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from vibench import provenance
+from vibench.cli.console import echo, shown
 from vibench.errors import RequestError, in_a_line
 from vibench.execution.solver_trials import solver_trials
 from vibench.files import locked
@@ -36,8 +37,7 @@ from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.storage.artefacts import CACHE_VARIABLE, LOCK, Store, default_folder
 from vibench.study.matrix import read_study
-from vibench.terminal.console import new_console, shown
-from vibench.terminal.output import echo
+from vibench.text import new_console
 from vibench.timing import DISTURBED, WAITED, Calibration, Stopwatch
 
 ACCURACY = 1e-7

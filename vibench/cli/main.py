@@ -20,6 +20,7 @@ from typer import Argument, Option
 from vibench.cli import output_commands
 from vibench.cli.bench_command import bench_plugins
 from vibench.cli.completion import CORRECTIONS, examples, formulations, names, solvers, studies, whole_words, words
+from vibench.cli.console import echo, warn
 from vibench.cli.output_commands import (
     draw_figures,
     export_mesh_fields,
@@ -34,7 +35,6 @@ from vibench.cli.result_commands import At, compare_runs, diff_runs, places_of, 
 from vibench.errors import RequestError, VibenchError
 from vibench.interrupts import INTERRUPTED, Interrupted, interrupted_at_once, interruptible
 from vibench.plugins.kinds import DUAL, PRIMAL, PROBLEM
-from vibench.terminal.output import echo, warn
 from vibench.text import unbroken
 
 if TYPE_CHECKING:
@@ -117,9 +117,8 @@ def run_study_command(
     """Run a study. An interrupted run resumes where it stopped."""
     with interrupted_at_once():  # the libraries and plugins of a study take a second to import
         from vibench.execution.run import Options, run_study
+        from vibench.library.progress import ProgressDisplay
         from vibench.study.matrix import expand
-        from vibench.terminal.console import new_console
-        from vibench.terminal.progress import ProgressDisplay
 
         overrides = {
             "problem": problem, "formulation": formulation, "dual": dual, "primal": primal, "solvers": solver,
@@ -134,16 +133,16 @@ def run_study_command(
         _warn_of_open_scheduler(scheduler, executor)
     folder = out or Path("runs") / loaded.name
     options = Options(jobs, fresh, retry, executor, scheduler, repeats)
-    with ProgressDisplay(new_console()) as progress:
+    with ProgressDisplay() as progress:
         outcome = run_study(loaded, folder, progress, options)
     _conclude(loaded.name, outcome, folder, draw=options.workers if draw else None, fresh=fresh, strict=strict)
 
 
 def _conclude(name: str, outcome: Outcome, folder: Path, *, draw: int | None, fresh: bool, strict: bool) -> None:
     """Export, print and draw what a run found, on as many processes as `draw` says; exit as its statuses ask for."""
+    from vibench.cli import run_summary
     from vibench.qp.status import Status
     from vibench.results import tables
-    from vibench.terminal import run_summary
 
     path = tables.results_file(str(folder))
     tables.export(path, folder / "tables", warn)
@@ -214,8 +213,8 @@ def clean(
     """
     import pandas as pd
 
+    from vibench.cli.console import print_frame
     from vibench.storage.artefacts import usable_store
-    from vibench.terminal.console import print_frame
 
     store = usable_store()
     stored = pd.DataFrame(store.contents(), columns=["stored", "MiB", "days"])
@@ -255,8 +254,9 @@ def help_on(
     if topic in ("", *COMMANDS):
         app(args=[*topic.split(), "--help"], standalone_mode=False)
         return
+    from vibench.cli.console import shown
     from vibench.cli.meanings import meanings
-    from vibench.terminal.console import new_console, shown
+    from vibench.text import new_console
 
     for line in meanings(topic, COMMANDS):
         new_console().print(shown(line))

@@ -12,9 +12,9 @@ import typer
 from typer import Argument, Exit, Option
 
 from vibench.cli.completion import cells, runs
+from vibench.cli.console import echo, run_argument, warn
 from vibench.cli.result_commands import At, RunArgument, places_of
 from vibench.errors import RequestError
-from vibench.terminal.output import echo, run_argument, warn
 
 if TYPE_CHECKING:
     from vibench.model.chebyshev import AffinePolynomial
@@ -78,12 +78,11 @@ def draw_figures(
 
 def draw_paper(paths: list[Path], folder: Path, formats: tuple[str, ...]) -> None:
     """Draw the figures of publications again, and say where their page is."""
+    from vibench.library.progress import DrawingDisplay
     from vibench.report.figures.publication import PAGE, draw_published
-    from vibench.terminal.console import new_console
-    from vibench.terminal.progress import DrawingDisplay
 
     notes: list[str] = []
-    with DrawingDisplay(new_console()) as display:
+    with DrawingDisplay() as display:
         drawn = draw_published(paths, folder, formats, display.show, notes.append)
     echo(*dict.fromkeys(notes), f"{len(drawn)} figures: {folder}", f"page: {folder / PAGE}")
 
@@ -91,13 +90,12 @@ def draw_paper(paths: list[Path], folder: Path, formats: tuple[str, ...]) -> Non
 def draw_run(path: Path, folder: Path, jobs: int, formats: tuple[str, ...] = ("png", "svg")) -> None:
     """Draw all figures of a results file and say so; Ctrl-C leaves those that are drawn, and the results."""
     from vibench import provenance
+    from vibench.library.progress import DrawingDisplay
     from vibench.report import figures
-    from vibench.terminal.console import new_console
-    from vibench.terminal.progress import DrawingDisplay
 
     cores, failures = provenance.cores(), list[str]()
     try:
-        with DrawingDisplay(new_console()) as display:
+        with DrawingDisplay() as display:
             drawn = figures.draw_all(path, folder, formats, min(jobs or cores, cores), display.show, failures.append)
     except KeyboardInterrupt:
         echo(

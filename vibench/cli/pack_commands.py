@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Argument, Option
 
 from vibench.cli.completion import names
+from vibench.cli.console import echo
 from vibench.cli.plugin_commands import key_value
 from vibench.errors import NumericalError
 from vibench.files import write_atomically
 from vibench.plugins.kinds import DUAL, PROBLEM
-from vibench.terminal.output import echo
 
 if TYPE_CHECKING:
     from vibench.packs.pack import ModelPack
@@ -72,6 +72,7 @@ def reduce_cones(
     """
     import pandas as pd
 
+    from vibench.cli.console import print_frame
     from vibench.packs.checks import read_model_pack
     from vibench.packs.pack import pack_multipliers, reduce_multipliers
     from vibench.packs.reader import naming
@@ -79,7 +80,6 @@ def reduce_cones(
     from vibench.report.figures.convergence import cone_errors
     from vibench.report.figures.style import save, styled
     from vibench.results.formats import to_csv
-    from vibench.terminal.console import print_frame
 
     pack = read_model_pack(folder)
     with naming(folder):

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from typer import Argument, Exit, Option
 
 from vibench.cli.completion import lists, plugin_options, plugins, runs
+from vibench.cli.console import echo
 from vibench.errors import RequestError, VibenchError, in_a_line, unknown_name
 from vibench.plugins.kinds import CHECKED, FIGURE, PROBLEM, SAMPLING, SOLVER, STUDY, PluginKind
-from vibench.terminal.output import echo
 from vibench.text import parsed_json
 
 LISTS = {kind.plural: kind for kind in PluginKind}
@@ -53,8 +53,8 @@ def list_plugins(
     """
     if sizes and what != PROBLEM.plural:
         raise RequestError(f"--sizes is for `vibench list {PROBLEM.plural}`")
+    from vibench.cli.console import print_rows
     from vibench.plugins.registry import unreadable
-    from vibench.terminal.console import print_rows
 
     if what is None:
         for kind in PluginKind:

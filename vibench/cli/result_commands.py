@@ -10,8 +10,8 @@ from typing import Annotated, Literal
 from typer import Argument, Exit, Option
 
 from vibench.cli.completion import SHOWN, cell_columns, cells, column_names, error_measures, runs, table_names
+from vibench.cli.console import echo, run_argument, warn
 from vibench.errors import RequestError
-from vibench.terminal.output import echo, run_argument, warn
 
 EXAMPLE = "solver = 'piqp' and beta_span_min < 1e-3"
 """Condition in the help of `--where`."""
@@ -80,9 +80,10 @@ def show(
 
     On a terminal, columns that do not fit are left out; csv and json have the values and names of the results file.
     """
+    from vibench.cli.console import print_frame, shown
     from vibench.results import formats, tables, views
     from vibench.results.selection import parts
-    from vibench.terminal.console import new_console, print_frame, shown
+    from vibench.text import new_console
 
     path = tables.results_file(run)
     measured = partial(views.look_up, path, table, cell=cell, error=error, largest=within, queries=queries)
@@ -116,9 +117,9 @@ def diff_runs(
     form: FormOption = "terminal",
 ) -> None:
     """List changes between two runs; exit code 1 on a regression."""
+    from vibench.cli import comparison
     from vibench.report.comparison.compare import compare
     from vibench.results import formats, tables
-    from vibench.terminal import comparison
 
     compared = compare([tables.results_file(a), tables.results_file(b)], limit)
     if form == "terminal":
@@ -148,9 +149,9 @@ def compare_runs(
 
     Numbers are compared with the first run, seconds with the first run of the same machine.
     """
+    from vibench.cli import comparison
     from vibench.report.comparison.compare import compare
     from vibench.results import formats, tables
-    from vibench.terminal import comparison
 
     compared = compare([tables.results_file(one) for one in run], limit)
     if column:
@@ -174,9 +175,9 @@ def replay_query(
     at: At = None,
 ) -> None:
     """Solve the program of one query again with every solver."""
+    from vibench.cli.console import print_frame
     from vibench.execution.recorded_cell import recorded_cell
     from vibench.report import replay
-    from vibench.terminal.console import print_frame
 
     recorded = recorded_cell(run, cell, places_of(at))
     number = replay.worst_query(recorded) if query is None else query

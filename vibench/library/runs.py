@@ -247,10 +247,9 @@ def _following(observer: Observer | None, progress: bool) -> AbstractContextMana
     """Who follows a run."""
     if observer is not None or not progress:
         return nullcontext(observer or Observer())
-    from vibench.terminal.console import new_console  # noqa: PLC0415  loads rich
-    from vibench.terminal.progress import ProgressDisplay  # noqa: PLC0415  loads rich
+    from vibench.library.progress import ProgressDisplay  # noqa: PLC0415  loads rich
 
-    return ProgressDisplay(new_console())
+    return ProgressDisplay()
 
 
 @requested

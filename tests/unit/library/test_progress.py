@@ -17,6 +17,7 @@ from samples import STUDY, changed, write_study
 from vibench.execution.graph import Graph
 from vibench.execution.run import Agenda
 from vibench.interfaces.strategies import Stop
+from vibench.library.progress import ALIKE, DrawingDisplay, ProgressDisplay, TimeLeft, duration
 from vibench.plugins.plugin import Plugin
 from vibench.stages.base import Stage
 from vibench.stages.cell_queries import CellQueries, cell_queries
@@ -25,7 +26,6 @@ from vibench.stages.snapshots import SnapshotStage
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, read_study
 from vibench.study.parameter_sets import CHUNKS, OWN_TRAINING
-from vibench.terminal.progress import ALIKE, DrawingDisplay, ProgressDisplay, TimeLeft, duration
 
 PROBLEM = Plugin("problem", "p", "{}", "")  # there is none: nothing is built to estimate seconds
 PODS: list[Stage] = [PODStage(PROBLEM, Stop(size=k)) for k in range(1, 5)]
@@ -58,7 +58,7 @@ def test_stages_of_one_sort_are_taken_to_last_as_long() -> None:
 def test_a_stage_that_tells_its_share_counts_before_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """After 10 s a quarter of the first of four parts is done; what is done of it is not left."""
     now = [100.0]
-    monkeypatch.setattr("vibench.terminal.progress.monotonic", lambda: now[0])
+    monkeypatch.setattr("vibench.library.progress.monotonic", lambda: now[0])
     left = TimeLeft(CHUNK[:4], 2)
     left.begin(CHUNK[0])
     assert left.shares([(CHUNK[0], 0.0)]) == 0.0
@@ -92,7 +92,7 @@ def test_a_problem_never_seen_is_taken_to_be_as_quick_as_the_others() -> None:
 
 def test_the_set_up_of_a_long_stage_is_not_expected_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    monkeypatch.setattr("vibench.terminal.progress.monotonic", lambda: now[0])
+    monkeypatch.setattr("vibench.library.progress.monotonic", lambda: now[0])
     left = TimeLeft(CHUNK[:2], 1)
     left.begin(CHUNK[0])
     for seconds, share in ((30.0, 0.1), (35.0, 0.2), (37.0, 0.2), (40.0, 0.3)):
@@ -122,7 +122,7 @@ def test_a_run_in_space_says_in_its_first_minute_how_long_it_will_take(monkeypat
     )
     for cell in cells:
         graph.add_goal(cell_queries(cell, 20.0), lambda _: False)
-    monkeypatch.setattr("vibench.terminal.progress.monotonic", lambda: now[0])
+    monkeypatch.setattr("vibench.library.progress.monotonic", lambda: now[0])
     left = TimeLeft(list(graph.stages.values()), 2)
     while graph.waiting or running:
         for stage in graph.begin(2 - len(running)):
@@ -239,7 +239,7 @@ def test_where_nothing_is_to_be_done_nobody_works(report: Make) -> None:
 
 def test_a_long_first_part_says_how_long_the_run_will_take(report: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr("vibench.terminal.progress.monotonic", lambda: now[0])
+    monkeypatch.setattr("vibench.library.progress.monotonic", lambda: now[0])
     made, printed = report()
     made.start(agenda(1, CHUNK, 1))
     made.begin(CHUNK[0])

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-import os
-import re
+import shlex
+import sys
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rich import box
-from rich.cells import cell_len
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
+import typer
 
-from vibench.text import printable, printable_lines
+from vibench.text import new_console, printable, printable_lines
 
-if TYPE_CHECKING:  # lists of plugins are printed without it
+# help texts are printed without these, and lists of plugins without pandas
+if TYPE_CHECKING:
     import pandas as pd
-
-WIDTH = 10_000
-"""Columns where the output is no terminal and `COLUMNS` is no positive integer: whoever reads it can scroll."""
-
-POSITIVE = re.compile("0*[1-9][0-9]{0,5}")
-"""Values of `COLUMNS` that are a width; Rich would take 0 for one, and fail on some others."""
+    from rich.text import Text
 
 SHORT = 24
 """A text of more characters may be wrapped, between words if it can."""
@@ -36,20 +29,21 @@ LONG = 60
 """Characters of a line of a long text, where there is room."""
 
 
-def new_console() -> Console:
-    """A console for the standard output, which takes no text for markup."""
-    columns = os.environ.get("COLUMNS", "")
-    prescribed = POSITIVE.fullmatch(columns) is not None
-    environment = {name: value for name, value in os.environ.items() if prescribed or name != "COLUMNS"}
-    console = Console(highlight=False, markup=False, emoji=False, _environ=environment)
-    if not console.is_terminal and not prescribed:
-        console.width = WIDTH
-    return console
+def echo(*lines: str) -> None:
+    """Print lines; what is not printable in them, such as an escape sequence or a line break, is shown as an escape."""
+    if lines:
+        typer.echo("\n".join(map(printable, lines)))
 
 
-def print_line(console: Console, line: str) -> None:
-    """Print a line that may hold text from others; the terminal wraps it."""
-    console.print(Text(printable(line)), soft_wrap=True)
+def warn(*lines: str) -> None:
+    """Print lines on standard error, each as those of errors begin: what is printed may go into a file."""
+    for line in lines:
+        sys.stderr.write(f"vibench: {printable(line)}\n")
+
+
+def run_argument(folder: Path) -> str:
+    """How a command names a run folder."""
+    return shlex.quote(folder.name if folder == Path("runs") / folder.name else str(folder))
 
 
 def print_frame(
@@ -83,6 +77,9 @@ def print_frame(
     rest
         The command, or its option, that prints the columns that are left out, if there is one.
     """
+    from rich import box
+    from rich.table import Table
+
     columns = table if isinstance(table, list) else _columns_of(table)
     console = new_console()
     count = len(columns[0].cells) if columns else 0
@@ -97,7 +94,7 @@ def print_frame(
     own = [column for column in columns if column not in shared]
     own, kept = _arranged(own, priority, axes, console.width)
     drawn = [column for column in own if column in kept]
-    whole = sum(max(column.width, cell_len(column.heading)) + 2 for column in drawn) <= console.width + 2
+    whole = sum(max(column.width, _length(column.heading)) + 2 for column in drawn) <= console.width + 2
     # the box has a blank between columns; there is another where there is room
     printed = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, int(whole), 0, 0))
     for column, width in zip(drawn, _widths(drawn, console.width, whole), strict=True):
@@ -146,14 +143,12 @@ class PrintedColumn:
             *self.heading.split(),
             *(word for cell in self.cells for word in printable_lines(cell).split() if self.long),
         ]
-        return max([min(cell_len(word), SHORT) for word in words] + [1 if self.long else self.longest])
+        return max([min(_length(word), SHORT) for word in words] + [1 if self.long else self.longest])
 
     @cached_property
     def longest(self) -> int:
         """Characters of its longest line."""
-        return max(
-            (cell_len(line) for cell in map(printable_lines, self.cells) for line in cell.split("\n")), default=1
-        )
+        return max((_length(line) for cell in map(printable_lines, self.cells) for line in cell.split("\n")), default=1)
 
 
 def _arranged(
@@ -191,7 +186,7 @@ def _fitting(columns: Sequence[PrintedColumn], width: int) -> list[PrintedColumn
 
 def _widths(columns: Sequence[PrintedColumn], width: int, whole: bool) -> list[int]:
     """Characters of every column: what it needs, and of what is left as much as long texts may use."""
-    widths = [max(column.width, cell_len(column.heading)) if whole else column.width for column in columns]
+    widths = [max(column.width, _length(column.heading)) if whole else column.width for column in columns]
     spare = width - sum(widths) - (1 + whole) * (len(widths) - 1)
     long = sorted((min(column.longest, LONG) - widths[k], k) for k, column in enumerate(columns) if column.long)
     for left, (wanted, k) in zip(range(len(long), 0, -1), long, strict=True):
@@ -202,4 +197,13 @@ def _widths(columns: Sequence[PrintedColumn], width: int, whole: bool) -> list[i
 
 def shown(text: str) -> Text:
     """A text of some lines in a table, without markup and without what is not printable."""
+    from rich.text import Text
+
     return Text(printable_lines(text))
+
+
+def _length(text: str) -> int:
+    """Columns of a terminal that a text takes."""
+    from rich.cells import cell_len
+
+    return cell_len(text)

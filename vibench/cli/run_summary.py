@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vibench.cli.console import echo, print_frame, run_argument
+from vibench.library.progress import REASONS, kind_of_failure
 from vibench.qp.status import Status
 from vibench.results import formats, invariants, tables, views
 from vibench.results.solver_agreement import sentence
-from vibench.terminal.console import print_frame
-from vibench.terminal.output import echo, run_argument
 
 if TYPE_CHECKING:
     import pandas as pd
 
 WHOLE = 20
 """Cells up to which the summary is printed whole."""
-
-REASONS = 10
-"""Reasons for which cells are not ok that are printed."""
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -93,11 +89,6 @@ def reasons(rows: Rows) -> str:
     distinct = list(dict.fromkeys(str(row["reason"]) for row in rows))
     more = [f"{len(distinct) - REASONS} other reasons"] if len(distinct) > REASONS else []
     return "; ".join([*distinct[:REASONS], *more])
-
-
-def kind_of_failure(row: Mapping[str, Any]) -> tuple[str, str]:
-    """Status and reason of a cell without the numbers in it."""
-    return row["status"], re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?", "#", row["reason"] or "")
 
 
 def next_steps(folder: Path, cells: int, not_ok: int, *, figures: bool) -> None:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pandas as pd
 
+from vibench.cli.console import echo, print_frame
 from vibench.report.comparison.compare import Comparison
 from vibench.report.comparison.differences import MOVED, ChangeKind
 from vibench.results.formats import cell_text
-from vibench.terminal.console import print_frame
-from vibench.terminal.output import echo
 
 MOST = 40
 """Changes that are printed; the other formats have all."""

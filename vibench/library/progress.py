@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,15 +18,16 @@ from vibench.plugins.plugin import Plugin
 from vibench.qp.status import Status
 from vibench.stages.base import Stage
 from vibench.study.cells import Cell
-from vibench.terminal.console import print_line
-from vibench.terminal.run_summary import REASONS, kind_of_failure
-from vibench.text import printable
+from vibench.text import new_console, print_line, printable
 
 LINE_EVERY = 4
 """Parts of a stage that share one line of progress."""
 
 CELL_LINES = 25
 """Lines about ok cells where there is no terminal: of larger runs, some cells have one."""
+
+REASONS = 10
+"""Reasons for which cells are not ok that are printed."""
 
 ALIKE = 3
 """Lines about cells that are not ok for reasons that differ in their numbers alone."""
@@ -165,7 +167,8 @@ def progress_bar(console: Console) -> Progress:
 class DrawingDisplay:
     """Shows which figure is being drawn: a bar on a terminal, one line elsewhere."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console | None = None) -> None:
+        console = console or new_console()
         self._bar = progress_bar(console) if console.is_terminal else None
         if self._bar is None:
             print_line(console, "figures …")
@@ -190,8 +193,8 @@ class DrawingDisplay:
 class ProgressDisplay(Observer):
     """Shows the progress of a run: a bar on a terminal, lines elsewhere; the observer of `run_study`."""
 
-    def __init__(self, console: Console) -> None:
-        self._console = console
+    def __init__(self, console: Console | None = None) -> None:
+        self._console = console or new_console()
         self._left = TimeLeft([], 1)
         self._cells = self._total = 0
         self._parts: Counter[str] = Counter()
@@ -283,3 +286,8 @@ class ProgressDisplay(Observer):
     def _left_text(self, before: str = "") -> str:
         seconds = self._left.seconds()
         return "" if seconds is None or seconds < 1.0 else f"{before}about {duration(seconds)} left"
+
+
+def kind_of_failure(row: Mapping[str, Any]) -> tuple[str, str]:
+    """Status and reason of a cell without the numbers in it."""
+    return row["status"], re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?", "#", row["reason"] or "")

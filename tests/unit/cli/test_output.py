@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from vibench.terminal.console import new_console, print_frame, print_line
-from vibench.terminal.output import echo
+from vibench.cli.console import echo, print_frame
+from vibench.text import new_console, print_line
 
 ANYTHING = st.text(st.characters())
 

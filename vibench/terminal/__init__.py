@@ -1,1 +1,0 @@
-"""What a terminal or a notebook shows: tables, lines and the progress of a run."""
