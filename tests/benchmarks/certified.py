@@ -34,10 +34,9 @@ from vibench.execution.recorded_cell import recorded_cells
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.strategies import Enrichment, Kind
 from vibench.model.affine import affine_decomposition
+from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import Guarantee, certificate_base
-from vibench.model.certificates.bounds import OnlineCertificate
-from vibench.model.certificates.preparation import prepare
-from vibench.model.error_bounds import CorrectionMode
+from vibench.model.certificates.bounds import OnlineCertificate, prepare
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.offline.assemblies import Assemblies

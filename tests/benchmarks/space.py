@@ -84,7 +84,7 @@ def unseen(resolution: str, count: str = "1000") -> int:
     violations = dict.fromkeys(models, 0)
     for mu in problem.parameters.sample(int(count), 2027):
         exact, vi, energy, row = solver.solve(mu), kept.at(mu), kept.energy_at(mu), []
-        on, size = energy.on_contact(vi), energy.norm(exact.u)
+        on, size = energy.contact_form(vi), energy.norm(exact.u)
         for name, model in models.items():
             found = model.solve(mu)
             assert found.bound is not None

@@ -8,9 +8,8 @@ from vibench.arrays import Array, Indices
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import Problem
 from vibench.linalg.inner_product import InnerProduct
-from vibench.model.certificates.base import contact_unknowns
+from vibench.model.certificates.base import contact_unknowns, output_coefficients
 from vibench.model.certificates.bounds import OnlineCertificate
-from vibench.model.output_bounds import coefficients
 from vibench.offline.models import Model
 
 
@@ -33,7 +32,9 @@ def arrays(model: Model, basis: Array, generators: Array, certificate: OnlineCer
     problem, outputs = model.problem, linear(model.problem)
     if not outputs:
         return {}
-    of_u, of_lam = (np.array(rows) for rows in zip(*(coefficients(problem, output) for output in outputs), strict=True))
+    of_u, of_lam = (
+        np.array(rows) for rows in zip(*(output_coefficients(problem, output) for output in outputs), strict=True)
+    )
     found = {"outputs_x": of_u @ basis, "outputs_alpha": of_lam @ generators}
     if certificate is not None and certificate.prepared is not None:
         B, X = certificate.base.constraint[certificate.prepared.rows], certificate.base.X

@@ -18,7 +18,7 @@ from vibench.execution.recorded_cell import recorded_cell
 from vibench.execution.run import Observer, Options, run_study
 from vibench.execution.run_folder import REPORT
 from vibench.files import writing
-from vibench.model.error_bounds import CorrectionMode
+from vibench.model.bound_terms import CorrectionMode
 from vibench.offline.formulated import Formulated
 from vibench.offline.models import Model
 from vibench.results import tables, views

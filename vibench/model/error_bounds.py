@@ -41,8 +41,8 @@ d for which w is feasible at u_N + d, too, gives a bound of ε; d = 0 where w is
 dependent and d is lost in round-off. The norms ρ, ρ_B and ω and the product κ are evaluated in floating-point
 arithmetic without such a bound.
 
-Equalities, a row and its opposite, leave no room for a margin. A w' that holds them is within η of the computed w
-(`vibench.model.equalities`), and satisfies the other rows where w does by a margin. (ii) holds for w', with ω + η, with
+Equalities, a row and its opposite, leave no room for a margin. A w' that holds them is within η of the computed w (see
+`Equalities`), and satisfies the other rows where w does by a margin. (ii) holds for w', with ω + η, with
 ‖r + A w‖_{A⁻¹} + η in the duality gap, and with 2 λ_Nᵀ|B(w' − w)| added to 2κ. λ is not unique there, nor is it where
 other rows are dependent: β_A is zero, and its error is bounded in the norm ‖Bᵀε‖_{A⁻¹} alone.
 """
@@ -51,7 +51,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from functools import cached_property
 
 import numpy as np
@@ -62,31 +61,23 @@ from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import active_set_iterations
 from vibench.interfaces.problem import VariationalInequality, is_absent
 from vibench.linalg import UNIT_ROUND_OFF
-from vibench.model.equalities import Equalities
-from vibench.model.errors import Energy, rieszes
-from vibench.model.on_contact import OnContact, Representer
+from vibench.model.bound_terms import (
+    ATTEMPTS,
+    IMPLAUSIBLE,
+    IMPLIED,
+    MARGIN,
+    NO_ROOM,
+    REFERENCE,
+    BoundNote,
+    BoundTerms,
+    Equalities,
+)
+from vibench.model.contact_form import ContactForm, Representer
+from vibench.model.errors import EnergyNorm, riesz_representatives
 from vibench.qp.exact import least_distance_solution
 from vibench.qp.rows import Rows, rows_that_matter
 from vibench.qp.scaling import ratio
 from vibench.stability.coercivity import Constant, Stability
-
-NO_ROOM = 1e-12
-"""Opposite rows are an equality where there is less room between them than this share of the terms of B u_N − g."""
-
-IMPLIED = 1e4
-"""Equalities that depend on others hold with them up to this multiple of round-off, or the problem has no solution."""
-
-REFERENCE = 1e-6
-"""Largest error bound of a high-fidelity solution, relative to it in the energy norms."""
-
-MARGIN = 4.0
-"""The first margin of s, as a multiple of the round-off in s."""
-
-IMPLAUSIBLE = 1e8
-"""Multipliers this many times those that rows alone would have are of dependent constraints, solved in round-off."""
-
-ATTEMPTS = 4
-"""Margins that are tried, each at least ten times the one before."""
 
 
 @dataclass(frozen=True)
@@ -122,16 +113,9 @@ class ErrorBounds:
         return cls(inf, inf, inf, inf, inf, inf, inf, inf, note)
 
 
-NOT_IN_CONE = "λ_N has negative coefficients"
-ON_ABSENT_ROW = "λ_N is not zero on a row whose g is infinite"
-NO_CORRECTION = "no w with B w ≥ s was found"
-ESTIMATED = "α is estimated"
-NOT_UNIQUE = "λ has no bound in W: no β_A > 0 is proved, as where rows are dependent or equalities"
-
-
 def error_bounds(
     vis: Sequence[VariationalInequality],
-    energies: Sequence[Energy],
+    energies: Sequence[EnergyNorm],
     constants: Sequence[Stability],
     u: Array,
     lam: Array,
@@ -145,15 +129,15 @@ def error_bounds(
     """
     residuals = residuals or [residual(vi, u[:, k], lam[:, k]) for k, vi in enumerate(vis)]
     starts = [None] * len(vis) if pressed is None else pressed.T
-    given = zip(vis, energies, constants, u.T, lam.T, rieszes(energies, residuals), starts, strict=True)
+    given = zip(vis, energies, constants, u.T, lam.T, riesz_representatives(energies, residuals), starts, strict=True)
     return [_bounds(vi, energy, c.coercivity, c.energy_inf_sup, *one) for vi, energy, c, *one in given]
 
 
 def bound_errors_at(
-    vi: VariationalInequality, energy: Energy, alpha: Constant, beta: Constant, u: Array, lam: Array
+    vi: VariationalInequality, energy: EnergyNorm, alpha: Constant, beta: Constant, u: Array, lam: Array
 ) -> ErrorBounds:
     """Bounds (ii) of one reduced u (n,) and λ (m,), from lower bounds of α and of β_A."""
-    (riesz,) = rieszes([energy], [residual(vi, u, lam)])
+    (riesz,) = riesz_representatives([energy], [residual(vi, u, lam)])
     return _bounds(vi, energy, alpha, beta, u, lam, riesz)
 
 
@@ -164,7 +148,7 @@ def residual(vi: VariationalInequality, u: Array, lam: Array) -> Array:
 
 def _bounds(
     vi: VariationalInequality,
-    energy: Energy,
+    energy: EnergyNorm,
     alpha: Constant,
     beta: Constant,
     u: Array,
@@ -174,23 +158,23 @@ def _bounds(
 ) -> ErrorBounds:
     """Bounds (ii), with the representer A⁻¹r, and rows (m,) that the multiplier presses."""
     if np.min(lam, initial=0.0) < 0.0:
-        return ErrorBounds.none(NOT_IN_CONE)
+        return ErrorBounds.none(BoundNote.NOT_IN_CONE)
     if np.any(lam[is_absent(vi.g)]):
-        return ErrorBounds.none(ON_ABSENT_ROW)
+        return ErrorBounds.none(BoundNote.ON_ABSENT_ROW)
     correction = find_correction(vi, energy, u, lam, pressed)
     if correction is None:
-        return ErrorBounds.none(NO_CORRECTION)
+        return ErrorBounds.none(BoundNote.NO_CORRECTION)
     of_u = terms(correction, u, lam, riesz)
     with_d = _with_constrained_residual(correction, u, lam, riesz)
     of_lam = min((of_u, *with_d), key=lambda terms: terms.rho)
     in_V = of_u.primal / float(np.sqrt(alpha.value))
     in_W = of_lam.dual / beta.value if beta.value > 0.0 else float("inf")
     terms_of_both = of_u.rho, of_lam.rho, of_u.omega, of_u.kappa
-    notes = [ESTIMATED] * (not alpha.proved) + [NOT_UNIQUE] * (not beta.value > 0.0)
+    notes = [BoundNote.ESTIMATED] * (not alpha.proved) + [BoundNote.NOT_UNIQUE] * (not beta.value > 0.0)
     return ErrorBounds(of_u.primal, in_V, of_lam.dual, in_W, *terms_of_both, "; ".join(notes))
 
 
-def reference_bound(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> float:
+def reference_bound(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam: Array) -> float:
     """Δ_A / S of a high-fidelity solution u (n,) and λ ≥ 0 (m,), S² = ‖u‖²_A + ‖Bᵀλ‖²_{A⁻¹}; infinite without a w.
 
     Residuals say less: what is κ in Δ_A is only the square of an error. `vi` and `energy` are of the same parameter.
@@ -203,7 +187,7 @@ def reference_bound(vi: VariationalInequality, energy: Energy, u: Array, lam: Ar
     correction = find_correction(vi, energy, u, lam)
     if correction is None:
         return float("inf")
-    (riesz,) = rieszes([energy], [residual(vi, u, lam)])
+    (riesz,) = riesz_representatives([energy], [residual(vi, u, lam)])
     bound = terms(correction, u, lam, riesz).primal
     on = correction.on
     size = float(np.hypot(energy.norm(u), on.force_norm(lam)))
@@ -215,18 +199,6 @@ def reference_bound(vi: VariationalInequality, energy: Energy, u: Array, lam: Ar
             f"above {REFERENCE:.0e}"
         )
     return ratio(bound, size)
-
-
-class CorrectionMode(StrEnum):
-    """Which solutions are corrected: none, all, or those whose violation dominates the bound, ω > ρ."""
-
-    NONE = "none"
-    FEASIBLE = "feasible"
-    AUTO = "auto"
-
-    def applies(self, omega: float, rho: float) -> bool:
-        """Whether a solution with these ω and ρ is corrected."""
-        return self is CorrectionMode.FEASIBLE or (self is CorrectionMode.AUTO and omega > rho)
 
 
 @dataclass(frozen=True)
@@ -243,49 +215,28 @@ class CorrectedPair:
     rho: float
 
 
-def corrected_pair(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> CorrectedPair | None:
+def corrected_pair(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam: Array) -> CorrectedPair | None:
     """The pair that the correction of u_N (n,) and λ_N ≥ 0 (m,) leads to; `None` without one."""
     correction = find_correction(vi, energy, u, lam)
     if correction is None:
         return None
-    (riesz,) = rieszes([energy], [residual(vi, u, lam)])
+    (riesz,) = riesz_representatives([energy], [residual(vi, u, lam)])
     found = terms(correction, u, lam, riesz)
     return CorrectedPair(u - correction.w, np.maximum(correction.nu, 0.0), found.omega, found.rho)
-
-
-@dataclass(frozen=True)
-class Terms:
-    """The terms of (ii), and ‖r + A w‖_{A⁻¹}, that need no constants."""
-
-    rho: float
-    omega: float
-    kappa: float
-    feasible_rho: float
-
-    @property
-    def primal(self) -> float:
-        """Δ_A."""
-        return float(np.sqrt(self.rho**2 + self.omega**2 + 2.0 * self.kappa))
-
-    @property
-    def dual(self) -> float:
-        """The bound of ‖Bᵀε‖ in the norm of A⁻¹."""
-        gap = self.feasible_rho**2 + 2.0 * self.kappa  # twice the duality gap
-        return min(float(np.sqrt(gap)), self.omega + self.primal)
 
 
 @dataclass(frozen=True)
 class Constraints:
     """The rows of one inequality that matter, and those of them that are equalities."""
 
-    on: OnContact
+    on: ContactForm
     rows: Rows
     equalities: Equalities | None
 
     @classmethod
-    def of(cls, vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Constraints:
+    def of(cls, vi: VariationalInequality, energy: EnergyNorm, u: Array, lam: Array) -> Constraints:
         """As a correction of u_N with retained unknowns u (c,) and λ_N (m,) reads them."""
-        on = energy.on_contact(vi)
+        on = energy.contact_form(vi)
         room = NO_ROOM * (on.sizes @ np.abs(u) + np.abs(vi.g))
         rows, equalities = rows_that_matter(on.B, vi.g, room, lam, on.directions), None
         if rows.equal.any():
@@ -332,7 +283,7 @@ class Correction:
     constraints: Constraints
 
     @property
-    def on(self) -> OnContact:
+    def on(self) -> ContactForm:
         """The inequality on the retained unknowns."""
         return self.constraints.on
 
@@ -342,22 +293,24 @@ class Correction:
         return self.on.extended(self.values)
 
 
-def terms(correction: Correction, u: Array, lam: Array, riesz: Representer) -> Terms:
+def terms(correction: Correction, u: Array, lam: Array, riesz: Representer) -> BoundTerms:
     """The terms with a correction of u_N (n,) and λ_N ≥ 0 (m,), from A⁻¹r; A⁻¹(r + A w) = A⁻¹r + w."""
     return _terms(correction, correction.on.values(u), lam, riesz, riesz.norm)
 
 
-def _terms(correction: Correction, u: Array, lam: Array, riesz: Representer, largest: float) -> Terms:
+def _terms(correction: Correction, u: Array, lam: Array, riesz: Representer, largest: float) -> BoundTerms:
     """The same for u_N with retained unknowns u (c,), and an A⁻¹r that is a difference of terms of a norm `largest`."""
     on, eta, equalities = correction.on, correction.eta, correction.constraints.equalities
     kappa, w = max(0.0, float(lam @ _slack(on, u, correction.values))), Representer(correction.values, correction.load)
     if equalities is not None:
         kappa += eta * float(lam @ equalities.reach)
     of_feasible = on.norm(riesz.plus(w), largest) + eta
-    return Terms(on.norm(riesz, largest), w.norm + eta, kappa, of_feasible)
+    return BoundTerms(on.norm(riesz, largest), w.norm + eta, kappa, of_feasible)
 
 
-def _with_constrained_residual(correction: Correction, u: Array, lam: Array, riesz: Representer) -> Iterator[Terms]:
+def _with_constrained_residual(
+    correction: Correction, u: Array, lam: Array, riesz: Representer
+) -> Iterator[BoundTerms]:
     """The terms for u + d, whose residual is the part of r in the range of Bᵀ, if w is feasible for it and d exists.
 
     d is A⁻¹r without the displacement A⁻¹Bᵀξ of the forces that hold B d = 0, which is A⁻¹ times the residual left.
@@ -379,7 +332,7 @@ def _with_constrained_residual(correction: Correction, u: Array, lam: Array, rie
 
 
 def find_correction(
-    vi: VariationalInequality, energy: Energy, u: Array, lam: Array, pressed: Mask | None = None
+    vi: VariationalInequality, energy: EnergyNorm, u: Array, lam: Array, pressed: Mask | None = None
 ) -> Correction | None:
     """A correction of s = B u − g that is close to the best one; `None` if none was found.
 
@@ -392,7 +345,7 @@ def find_correction(
     pressed
         Rows (m,) where active sets start; those that λ_N presses by default.
     """
-    on = energy.on_contact(vi)
+    on = energy.contact_form(vi)
     u = on.values(u)
     constraints = Constraints.of(vi, energy, u, lam)
     kept, equal = constraints.rows.kept, constraints.rows.equal
@@ -422,8 +375,8 @@ def find_correction(
 
 
 def _minimisers(
-    on: OnContact,
-    energy: Energy,
+    on: ContactForm,
+    energy: EnergyNorm,
     kept: Indices,
     lam: Array,
     least: Array,
@@ -449,12 +402,12 @@ def _minimisers(
         yield on.values(nearest[0]), nearest[1]
 
 
-def _slack(on: OnContact, u: Array, w: Array) -> Array:
+def _slack(on: ContactForm, u: Array, w: Array) -> Array:
     """B w − s (m,), from retained unknowns (c,)."""
     return np.asarray(on.B @ w - (on.B @ u - on.vi.g))
 
 
-def _round_off(on: OnContact, u: Array, w: Array) -> Array:
+def _round_off(on: ContactForm, u: Array, w: Array) -> Array:
     """Bound (m,) of the round-off in `_slack` (Higham 2002, §3.1)."""
     return np.asarray(
         1.01 * (on.entries + 4.0) * UNIT_ROUND_OFF * (on.sizes @ (np.abs(w) + np.abs(u)) + np.abs(on.vi.g))

@@ -1,4 +1,12 @@
-"""Errors of reduced solutions and of their quantities of interest against high-fidelity ones, and the energy norm."""
+"""Errors of reduced solutions and of their quantities of interest against high-fidelity ones, and the energy norm.
+
+How well a pair solves the high-fidelity problem: its natural KKT residuals, in matrices of contact size.
+
+They are those of `vibench.qp.verification` of the high-fidelity program, whatever the model was that found the pair: a
+quadratic program, a penalty or a regression. With S² = ‖u‖²_A + ‖Bᵀλ‖²_{A⁻¹} and s = B u − g,
+
+    primal max_i (s_i)₊ / ‖B_i‖_{A⁻¹} / S,    dual ‖f − A u − Bᵀλ‖_{A⁻¹} / S,    gap |λᵀs| / S².
+"""
 
 from __future__ import annotations
 
@@ -7,14 +15,17 @@ from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
+import scipy.sparse as sp
 
-from vibench.arrays import Array, Mask, SparseMatrix
+from vibench.arrays import Array, Indices, Mask, SparseMatrix
+from vibench.highfidelity.active_set import solve_unverified
 from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.outputs import Output
-from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.problem import Problem, VariationalInequality, is_absent
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.model.on_contact import OnContact, Representer, representers
+from vibench.model.contact_form import ContactForm, Representer, representers
 from vibench.qp.scaling import ratio
+from vibench.qp.verification import Residuals, accurate_residuals, round_off_of_terms
 
 T = TypeVar("T")
 
@@ -24,7 +35,7 @@ training solution. High-fidelity solutions have residuals up to 1e-10, so that e
 
 
 @dataclass(frozen=True)
-class Energy:
+class EnergyNorm:
     """The energy norm at one parameter and its dual norm, from factorisations of A(µ).
 
     Attributes
@@ -39,22 +50,22 @@ class Energy:
     stiffness: CondensedStiffness
     shared: bool = False
     """Whether the errors of many solutions are measured with it: what they have in common is worth more work then."""
-    _on_contact: list[OnContact] = field(default_factory=list, repr=False, compare=False)
+    _on_contact: list[ContactForm] = field(default_factory=list, repr=False, compare=False)
 
     @property
     def nbytes(self) -> int:
         """Memory, about, once everything is computed."""
-        return self.stiffness.nbytes + self.nbytes_on_contact
+        return self.stiffness.nbytes + self.contact_nbytes
 
     @property
-    def nbytes_on_contact(self) -> int:
+    def contact_nbytes(self) -> int:
         """Memory of what belongs to the constraints, once everything is computed."""
         return sum(one.nbytes for one in self._on_contact)
 
-    def on_contact(self, vi: VariationalInequality) -> OnContact:
+    def contact_form(self, vi: VariationalInequality) -> ContactForm:
         """The constraints of `vi`, whose A this is, on contact; those of the last inequality are kept."""
         if not self._on_contact or self._on_contact[0].vi is not vi:
-            self._on_contact[:] = [OnContact(vi, self.stiffness, shared=self.shared)]
+            self._on_contact[:] = [ContactForm(vi, self.stiffness, shared=self.shared)]
         return self._on_contact[0]
 
     def norm(self, v: Array) -> float:
@@ -71,7 +82,7 @@ class Energy:
         return float(np.sqrt(max(float(functional @ self.factor.solve(functional)), 0.0)))
 
 
-def of_stiffness(energies: Sequence[Energy], vectors: Array) -> Array:
+def of_stiffness(energies: Sequence[EnergyNorm], vectors: Array) -> Array:
     """A v (n×P) of vectors (n×P), each at its own parameter; those of one A are multiplied in one block."""
     product = np.empty_like(vectors)
     for numbers in _with_one_stiffness(energies):
@@ -84,7 +95,7 @@ def energy_norms(vectors: Array, products: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(np.einsum("ik,ik->k", vectors, products), 0.0)))
 
 
-def _with_one_stiffness(energies: Sequence[Energy]) -> list[list[int]]:
+def _with_one_stiffness(energies: Sequence[EnergyNorm]) -> list[list[int]]:
     """Numbers of the energies that share a stiffness."""
     numbers: dict[int, list[int]] = {}
     for k, energy in enumerate(energies):
@@ -92,7 +103,7 @@ def _with_one_stiffness(energies: Sequence[Energy]) -> list[list[int]]:
     return list(numbers.values())
 
 
-def rieszes(energies: Sequence[Energy], functionals: Sequence[Array]) -> list[Representer]:
+def riesz_representatives(energies: Sequence[EnergyNorm], functionals: Sequence[Array]) -> list[Representer]:
     """A⁻¹ℓ of functionals (n,), each at its own parameter; those of one A are solved in one block."""
     found: dict[int, Representer] = {}
     for numbers in _with_one_stiffness(energies):
@@ -126,10 +137,10 @@ class ReferenceSolutions:
         """‖u‖_V and ‖λ‖_W (P,)."""
         return self._once("norms", lambda: (problem.V.norm(self.u), problem.W.norm(self.lam)))
 
-    def energies(self, number: int, vi: VariationalInequality, energy: Energy) -> tuple[float, float]:
+    def energies(self, number: int, vi: VariationalInequality, energy: EnergyNorm) -> tuple[float, float]:
         """‖u‖ in the norm of A and ‖Bᵀλ‖ in that of A⁻¹ of one solution, whose inequality is `vi`."""
         u, lam = self.u[:, number], self.lam[:, number]
-        return self._once(number, lambda: (energy.norm(u), energy.on_contact(vi).force_norm(lam)))
+        return self._once(number, lambda: (energy.norm(u), energy.contact_form(vi).force_norm(lam)))
 
     def values(self, outputs: Sequence[Output], mus: Array) -> list[Array]:
         """Values (P,) of the outputs of the problem at their parameters (P×d)."""
@@ -188,7 +199,7 @@ def zeros(problem: Problem, reference: ReferenceSolutions) -> tuple[Mask, Mask]:
 def errors(
     problem: Problem,
     vis: Sequence[VariationalInequality],
-    energies: Sequence[Energy],
+    energies: Sequence[EnergyNorm],
     reference: ReferenceSolutions,
     u: Array,
     lam: Array,
@@ -201,7 +212,7 @@ def errors(
     excesses = [vi.B @ u[:, k] - vi.g for k, vi in enumerate(vis)]
     in_energies, rows = energy_norms(du, of_stiffness(energies, du)), []
     for k, (vi, energy) in enumerate(zip(vis, energies, strict=True)):
-        in_energy, natural = float(in_energies[k]), energy.on_contact(vi).force_norm(dlam[:, k])
+        in_energy, natural = float(in_energies[k]), energy.contact_form(vi).force_norm(dlam[:, k])
         energy_u, natural_lam = reference.energies(k, vi, energy)
         rows.append(
             Errors(
@@ -272,3 +283,71 @@ def summarise_outputs(
             "error_scaled_max": max(scaled, default=None),
         })  # fmt: skip
     return rows
+
+
+BLOCK = 8
+"""Rows whose norms in A⁻¹ are computed at once where there is no compliance of all."""
+
+
+def high_fidelity_residuals(
+    vi: VariationalInequality,
+    energy: EnergyNorm,
+    u: Array,
+    lam: Array,
+    rho: float = np.inf,
+    u_energy: float | None = None,
+) -> Residuals:
+    """Residuals of u (n,) and λ (m,).
+
+    `rho` is ‖f − A u − Bᵀλ‖_{A⁻¹} where that is known, and finite, `u_energy` is ‖u‖_A where that is.
+    """
+    on = energy.contact_form(vi)
+    values = on.values(u)
+    if not np.isfinite(rho):
+        residual, _ = accurate_residuals(vi, u, lam)
+        rho = representers(energy.stiffness, residual[:, None])[0].norm
+    excess = np.asarray(on.in_extended_precision @ values.astype(np.longdouble) - vi.g, dtype=float)
+    size = float(np.hypot(energy.norm(u) if u_energy is None else u_energy, on.force_norm(lam)))
+    violated = np.flatnonzero(excess > round_off_of_terms(on.entries, on.sizes @ np.abs(values) + np.abs(vi.g)))
+    pressed = lam > 0.0  # elsewhere s may be infinite
+    gap = abs(float(lam[pressed] @ excess[pressed]))
+    return Residuals(
+        primal=ratio(_largest_step(on, energy, violated, excess[violated]), size),
+        dual=ratio(rho, size),
+        gap=ratio(gap, size * size),
+    )
+
+
+def _largest_step(on: ContactForm, energy: EnergyNorm, rows: Indices, excess: Array) -> float:
+    """The largest s_i / ‖B_i‖_{A⁻¹} over violated rows (k,), whose s are given.
+
+    ‖B_i‖⁻¹ is bounded from above without A⁻¹, so that the rows with the largest bounds are enough.
+    """
+    if on.is_dense:
+        return float(np.max(excess / np.sqrt(on.squares[rows]), initial=0.0))
+    bounds = excess * np.sqrt(on.stiffnesses[rows])
+    largest, order = 0.0, np.argsort(-bounds, kind="stable")
+    for start in range(0, len(order), BLOCK):
+        block = order[start : start + BLOCK]
+        if bounds[block[0]] <= largest:
+            break
+        loads = sp.csr_array(on.B)[rows[block]].toarray().T
+        squares = np.einsum("ik,ik->k", loads, energy.stiffness.compliance(loads))
+        largest = max(largest, float(np.max(excess[block] / np.sqrt(squares))))
+    return largest
+
+
+def residual_multiplier(vi: VariationalInequality, energy: EnergyNorm, u: Array) -> Array:
+    """The λ ≥ 0 (m,) whose residual f − A u − Bᵀλ is the smallest in the norm of A⁻¹.
+
+    Its KKT conditions are those of the variational inequality with the load f − A u and g = 0 where it is finite:
+    A w + Bᵀλ = f − A u, B w ≤ 0, λ ≥ 0 and λᵀB w = 0.
+
+    Raises
+    ------
+    NumericalError
+        If none is found.
+    """
+    g = np.where(is_absent(vi.g), vi.g, 0.0)
+    homogeneous = VariationalInequality(vi.A, vi.f - vi.A @ u, vi.B, g)
+    return np.asarray(np.maximum(solve_unverified(homogeneous, energy.stiffness).lam, 0.0))

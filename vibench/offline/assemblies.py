@@ -12,7 +12,7 @@ from vibench.arrays import Array, digest
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
-from vibench.model.errors import Energy
+from vibench.model.errors import EnergyNorm
 from vibench.stability.coercivity import Constant, Quotients, coercivity, continuity, energy_inf_sup, share_of_diagonal
 from vibench.stability.contact_infsup import ContactInfSup, multiple_of
 
@@ -33,8 +33,8 @@ class Assemblies:
     def __init__(self, problem: Problem, limit: int = LIMIT) -> None:
         self._problem = problem
         self._kept: LRUCache[bytes, VariationalInequality] = LRUCache(limit, getsizeof=_bytes)
-        self._energies: LRUCache[bytes, Energy] = LRUCache(FACTORS, getsizeof=self._own_bytes)
-        self._last: tuple[bytes, Energy] | None = None
+        self._energies: LRUCache[bytes, EnergyNorm] = LRUCache(FACTORS, getsizeof=self._own_bytes)
+        self._last: tuple[bytes, EnergyNorm] | None = None
         self._solver = HighFidelitySolver(problem, condensing=True)
         self._contact: ContactInfSup | None = None
         self._quotients: LRUCache[bytes, Quotients] = LRUCache(1)  # it holds vectors
@@ -52,7 +52,7 @@ class Assemblies:
                 self._kept[_key(mu)] = vi
         return vi
 
-    def energy_at(self, mu: Array) -> Energy:
+    def energy_at(self, mu: Array) -> EnergyNorm:
         """Factorisations of A at mu (d,) and what errors and bounds at mu share; a constant A is factorised once."""
         vi, key = self.at(mu), _key(mu)
         if self._last is not None and self._last[0] == key:
@@ -62,7 +62,7 @@ class Assemblies:
             found = replace(self.energy_of(vi), shared=True)
             if "A" not in self._problem.constant:  # else it is factorised once, and timed code uses it, too
                 found.stiffness.serve_many(len(vi.g))
-            found.on_contact(vi)  # is of its size
+            found.contact_form(vi)  # is of its size
             if self._own_bytes(found) <= self._energies.maxsize:
                 self._energies[key] = found
         self._last = key, found
@@ -73,9 +73,9 @@ class Assemblies:
         sizes = (self._kept.maxsize, _bytes(self.at(mu))), (self._energies.maxsize, self._own_bytes(self.energy_at(mu)))
         return max(1, min(int(limit // max(size, 1)) for limit, size in sizes))
 
-    def energy_of(self, vi: VariationalInequality) -> Energy:
+    def energy_of(self, vi: VariationalInequality) -> EnergyNorm:
         """Factorisations of an assembled A, which are not kept unless it is constant: this may be timed."""
-        return Energy(vi.A, self._solver.condensed(vi))
+        return EnergyNorm(vi.A, self._solver.condensed(vi))
 
     def coercivity_at(self, mu: Array) -> Constant:
         """Lower bound of α at mu (d,), with the factorisation of `energy_at`; computed once for all mu with one A."""
@@ -123,7 +123,7 @@ class Assemblies:
     def _energy_inf_sup(self, mu: Array) -> Constant:
         """By matrices of contact size, dense but for multiples of X_W; where they are large, by sparse ones."""
         vi, energy, W = self.at(mu), self.energy_at(mu), self._problem.W
-        on, stiffness = energy.on_contact(vi), energy.stiffness
+        on, stiffness = energy.contact_form(vi), energy.stiffness
         if stiffness.has_known_round_off and (theta := multiple_of(on.B, W)):
             found = self._contact_at(mu).of_multiple(theta, on.B, W)
             if found is not None:
@@ -158,9 +158,9 @@ class Assemblies:
     def _norm_share(self) -> float:
         return share_of_diagonal(self._problem.V)
 
-    def _own_bytes(self, energy: Energy) -> int:
+    def _own_bytes(self, energy: EnergyNorm) -> int:
         """Memory of what is of one parameter alone."""
-        return energy.nbytes if "A" not in self._problem.constant else energy.nbytes_on_contact
+        return energy.nbytes if "A" not in self._problem.constant else energy.contact_nbytes
 
 
 @lru_cache(maxsize=1)

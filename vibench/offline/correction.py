@@ -10,9 +10,10 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.interfaces.problem import VariationalInequality
+from vibench.model.bound_terms import BoundNote, CorrectionMode
 from vibench.model.certificates.base import Guarantee, contact_unknowns
 from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate
-from vibench.model.error_bounds import NO_CORRECTION, NOT_IN_CONE, CorrectedPair, CorrectionMode, corrected_pair
+from vibench.model.error_bounds import CorrectedPair, corrected_pair
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline.assemblies import Assemblies, assemblies
@@ -61,11 +62,11 @@ class Corrector:
     def in_full(self, mu: Array, u: Array, lam: Array) -> Answer:
         """The answer at high-fidelity cost."""
         if lam.min(initial=0.0) < 0.0:
-            return Answer(u, lam, note=NOT_IN_CONE)
+            return Answer(u, lam, note=BoundNote.NOT_IN_CONE)
         kept = assemblies(self.model.problem)
         pair = corrected_pair(kept.at(mu), kept.energy_at(mu), u, lam)
         if pair is None:
-            return Answer(u, lam, note=NO_CORRECTION)
+            return Answer(u, lam, note=BoundNote.NO_CORRECTION)
         share = _share(pair.omega, pair.rho)
         if not self.mode.applies(pair.omega, pair.rho):
             return Answer(u, lam, share=share)

@@ -20,7 +20,7 @@ from vibench.interfaces.formulations import Asked, Formulation, FormulationAnswe
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment, Kind
 from vibench.model.error_bounds import ErrorBounds, bound_errors_at
-from vibench.model.high_fidelity_residuals import high_fidelity_residuals, residual_multiplier
+from vibench.model.errors import high_fidelity_residuals, residual_multiplier
 from vibench.offline.assemblies import assemblies
 from vibench.offline.models import Parameters, parameter_in
 from vibench.plugins import registry

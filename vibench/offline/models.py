@@ -17,12 +17,12 @@ from vibench.errors import RequestError, unknown_name
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import Problem
-from vibench.model.certificates.base import contact_unknowns
-from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate, OnlineCorrection
-from vibench.model.error_bounds import CorrectionMode, ErrorBounds, bound_errors_at
+from vibench.model.bound_terms import CorrectionMode
+from vibench.model.certificates.base import contact_unknowns, output_weights
+from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate, OnlineCorrection, output_error_bound
+from vibench.model.error_bounds import ErrorBounds, bound_errors_at
 from vibench.model.galerkin import ReducedModel, ReducedProblem
 from vibench.model.hyperreduced import HyperReducedModel
-from vibench.model.output_bounds import error_bound, weights
 from vibench.offline.assemblies import assemblies
 from vibench.offline.correction import Answer, Corrector
 from vibench.offline.shown import about_model, about_solution, html
@@ -144,7 +144,9 @@ class Solution:
         bound, certificate, found = self.bound, self._model.certificate, self._model.output_weights
         if bound is None or certificate is None:
             return dict.fromkeys(found, inf)
-        return {name: inf if of is None else error_bound(of, certificate.base, bound) for name, of in found.items()}
+        return {
+            name: inf if of is None else output_error_bound(of, certificate.base, bound) for name, of in found.items()
+        }
 
     @cached_property
     def error_bounds(self) -> ErrorBounds:
@@ -288,7 +290,7 @@ class Model:
         certificate, found = self.certificate, dict[str, tuple[float, float] | None]()
         for output in self.problem.outputs:
             known = None if certificate is None or not output.linear else certificate.base
-            found[output.name] = None if known is None else weights(self.problem, known, output)
+            found[output.name] = None if known is None else output_weights(self.problem, known, output)
         return found
 
     def solve_all(

@@ -28,9 +28,8 @@ from vibench.interfaces.strategies import (
 from vibench.interfaces.validation import check_cone, check_enrichment, reference_assembly, training_parameters
 from vibench.model.affine import INTERPOLATION_RTOL, AffineMember, affine_decomposition
 from vibench.model.certificates.base import CertificateBase, certificate_base
-from vibench.model.certificates.bounds import OnlineCertificate
-from vibench.model.certificates.growing import GrowingTrainer
-from vibench.model.certificates.preparation import prepare
+from vibench.model.certificates.bounds import OnlineCertificate, prepare
+from vibench.model.certificates.greedy import GreedyTrainer
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel, ReducedOperators, hyper_reduce, reason_for_full_assembly
 from vibench.offline.formulated import Formulated, check_built
@@ -130,7 +129,7 @@ class Reduction:
         """High-fidelity solutions at the training parameters; an adaptive sampling strategy chooses these itself."""
         if not isinstance(self.training, AdaptiveSampling):
             return high_fidelity_sweep(self.problem, training_parameters(self.problem, self.training))
-        trainer = GrowingTrainer(self.problem, reference_assembly(self.problem))
+        trainer = GreedyTrainer(self.problem, reference_assembly(self.problem))
         self.training.train(self.problem.parameters, trainer)
         mus, solutions = np.array([s.mu for s in trainer.solved]), [s.solution for s in trainer.solved]
         return Snapshots(mus, np.column_stack([s.u for s in solutions]), np.column_stack([s.lam for s in solutions]))

@@ -10,8 +10,8 @@ import numpy as np
 
 from vibench.arrays import Array, Indices
 from vibench.interfaces.validation import checked_assembly
+from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.bounds import OnlineCertificate
-from vibench.model.error_bounds import CorrectionMode
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline.assemblies import Assemblies
 from vibench.offline.correction import corrected_in_full

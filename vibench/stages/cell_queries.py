@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from vibench.interfaces.formulations import Multiplier
 from vibench.interfaces.strategies import Kind
 from vibench.model.affine import MISSED
+from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineCertificate
-from vibench.model.error_bounds import CorrectionMode
 from vibench.offline.correction import Corrector
 from vibench.plugins.plugin import Plugin
 from vibench.qp.exact import ExactSolution

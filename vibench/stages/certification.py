@@ -6,10 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 from vibench.model.affine import AffineMember
-from vibench.model.certificates.base import CertificateBase, certificate_base
+from vibench.model.certificates.base import CertificateBase, OnlineInfSup, certificate_base
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.certificates.contact_correction import ContactCompliance
-from vibench.model.certificates.inf_sup import OnlineInfSup
 from vibench.model.certificates.prepared_correction import PreparedCorrections
 from vibench.model.certificates.residual import ResidualBasis
 from vibench.model.certificates.spectral import SpectralBounds

@@ -13,7 +13,7 @@ from vibench.errors import in_a_line
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Kind
-from vibench.model.error_bounds import CorrectionMode
+from vibench.model.bound_terms import CorrectionMode
 from vibench.model.errors import UNMEASURABLE, ReferenceSolutions
 from vibench.model.galerkin import ReducedModel
 from vibench.offline.assemblies import assemblies

@@ -17,7 +17,7 @@ from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolve
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import Fingerprint, checked_assembly, reference_assembly
 from vibench.linalg.inner_product import InnerProduct
-from vibench.model.certificates.growing import GrowingTrainer
+from vibench.model.certificates.greedy import GreedyTrainer
 from vibench.model.error_bounds import reference_bound
 from vibench.offline.assemblies import assemblies
 from vibench.offline.sweep import Snapshots
@@ -246,7 +246,7 @@ class AdaptiveTraining(Stage):
         with faults_of(self.problem):
             problem, strategy = build_problem(self.problem), self.training.sampling.create()
             reference = reference_assembly(problem)
-            trainer = GrowingTrainer(problem, reference)
+            trainer = GreedyTrainer(problem, reference)
             strategy.train(problem.parameters, trainer)
             reference.refuse_rewritten_constants()
         solved = trainer.solved

@@ -20,7 +20,7 @@ from vibench.interfaces.formulations import (
     axes_of,
 )
 from vibench.interfaces.strategies import Cone, no_free
-from vibench.model.high_fidelity_residuals import residual_multiplier
+from vibench.model.errors import residual_multiplier
 from vibench.offline.assemblies import assemblies
 from vibench.offline.formulated import ACCURACY, CellSolver, Formulated, check_built
 from vibench.offline.reduction import Reduction
@@ -224,7 +224,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         kept = assemblies(problem)
         energy, vi, u = kept.energy_at(mu), kept.at(mu), result.pair[0]
         lam = residual_multiplier(vi, energy, u) if result.pair[1] is None else result.pair[1]
-        on = energy.on_contact(vi)
+        on = energy.contact_form(vi)
         of_u = energy.norm(u - snapshots.u[:, 0]) / energy.norm(snapshots.u[:, 0])
         of_lam = on.of_force(lam - snapshots.lam[:, 0]).norm / on.of_force(snapshots.lam[:, 0]).norm
         for what, error in (("u", of_u), ("λ", of_lam)):

@@ -19,7 +19,7 @@ from vibench.interfaces.outputs import Output
 from vibench.library.export import export_model, exported
 from vibench.library.reduced_model import Model as Exported
 from vibench.library.reduced_model_certificate import Model as WithBounds
-from vibench.model.certificates import complementarity
+from vibench.model.certificates import contact_correction as complementarity
 from vibench.model.chebyshev import AffinePolynomial, products
 from vibench.offline import c_source
 from vibench.qp.exact import exact_solution

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vibench.library import reduced_model_certificate
-from vibench.model.certificates import complementarity
+from vibench.model.certificates import contact_correction as complementarity
 
 
 def test_the_script_has_the_correction_where_exchanging_all_at_once_cycles() -> None:

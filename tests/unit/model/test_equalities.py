@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import spd
 
-from vibench.model.equalities import Equalities
+from vibench.model.bound_terms import Equalities
 
 
 @given(st.integers(0, 10_000), st.booleans(), st.sampled_from([1.0, 1e-8]))

@@ -15,13 +15,8 @@ from vibench.highfidelity.active_set import ACCURACY, HighFidelitySolver
 from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
 from vibench.model import error_bounds as module
+from vibench.model.bound_terms import REFERENCE, BoundNote
 from vibench.model.error_bounds import (
-    ESTIMATED,
-    NO_CORRECTION,
-    NOT_IN_CONE,
-    NOT_UNIQUE,
-    ON_ABSENT_ROW,
-    REFERENCE,
     ErrorBounds,
     bound_errors_at,
     corrected_pair,
@@ -29,7 +24,7 @@ from vibench.model.error_bounds import (
     find_correction,
     reference_bound,
 )
-from vibench.model.errors import Energy
+from vibench.model.errors import EnergyNorm
 from vibench.offline.assemblies import assemblies
 from vibench.qp.verification import kkt_residuals
 from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity, energy_inf_sup
@@ -44,8 +39,8 @@ EXACT = 1e-12
 """Round-off in the solution of a small inequality, relative."""
 
 
-def energy(vi: VariationalInequality) -> Energy:
-    return Energy(vi.A, CondensedStiffness(vi.A))
+def energy(vi: VariationalInequality) -> EnergyNorm:
+    return EnergyNorm(vi.A, CondensedStiffness(vi.A))
 
 
 def stability(vi: VariationalInequality) -> Stability:
@@ -68,7 +63,7 @@ def bounds_or_note(
 
 def bounds(vi: VariationalInequality, u: np.ndarray, lam: np.ndarray) -> ErrorBounds:
     found = bounds_or_note(vi, u, lam)
-    assert found.note == ("" if np.isfinite(found.lam) else NOT_UNIQUE)
+    assert found.note == ("" if np.isfinite(found.lam) else BoundNote.NOT_UNIQUE)
     return found
 
 
@@ -274,7 +269,7 @@ def test_as_many_constraints_as_unknowns_see_all_of_a_residual_there() -> None:
     problem = Obstacle(resolution=150)
     mu = problem.parameters.upper
     vi, of_A = assemblies(problem).at(mu), assemblies(problem).energy_at(mu)
-    on, rng = of_A.on_contact(vi), np.random.default_rng(0)
+    on, rng = of_A.contact_form(vi), np.random.default_rng(0)
     assert on.B.shape[0] == on.B.shape[1] < problem.V.dim
     solution = HighFidelitySolver(problem).solve(mu)
     u = solution.u + 1e-3 * np.abs(solution.u).max() * rng.standard_normal(len(solution.u))
@@ -294,9 +289,9 @@ def test_what_is_not_proved_is_said() -> None:
     vi, u, lam = scalar(lam=0.8, u=0.6)
     known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, False), Constant(9.0, False), Constant(0.0, True))
     found = bounds_or_note(vi, u, lam, known)
-    assert found.note == f"{ESTIMATED}; {NOT_UNIQUE}"
+    assert found.note == f"{BoundNote.ESTIMATED}; {BoundNote.NOT_UNIQUE}"
     assert found.lam == np.inf
-    assert bounds_or_note(vi, u, -lam, known) == ErrorBounds.none(NOT_IN_CONE)
+    assert bounds_or_note(vi, u, -lam, known) == ErrorBounds.none(BoundNote.NOT_IN_CONE)
 
 
 def test_opposite_rows_are_an_equality_that_corrections_hold_without_a_margin() -> None:
@@ -307,9 +302,11 @@ def test_opposite_rows_are_an_equality_that_corrections_hold_without_a_margin() 
     known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, True), Constant(9.0, True), Constant(0.0, True))
     found = bounds_or_note(vi, np.array([0.6]), np.array([0.8, 0.0]), known)
     assert numbers(found) == pytest.approx(numbers(ErrorBounds(0.2, 0.4, 0.2, np.inf, 0.0, 0.0, 0.2, 0.0)), abs=1e-7)
-    assert found.note == NOT_UNIQUE
+    assert found.note == BoundNote.NOT_UNIQUE
     empty = VariationalInequality(vi.A, vi.f, vi.B, np.array([1.0, -1.001]))
-    assert bounds_or_note(empty, np.array([0.6]), np.array([0.8, 0.0]), known) == ErrorBounds.none(NO_CORRECTION)
+    assert bounds_or_note(empty, np.array([0.6]), np.array([0.8, 0.0]), known) == ErrorBounds.none(
+        BoundNote.NO_CORRECTION
+    )
 
 
 def test_what_equalities_may_miss_is_in_every_term(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -355,7 +352,7 @@ def test_rows_that_are_absent_bound_nothing() -> None:
     absent = VariationalInequality(vi.A, vi.f, sp.csr_array([[2.0], [3.0]]), np.array([1.0, np.inf]))
     known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, True), Constant(9.0, True), Constant(0.5, True))
     assert bounds_or_note(absent, u, np.append(lam, 0.0), known) == bounds_or_note(vi, u, lam, known)
-    assert bounds_or_note(absent, u, np.append(lam, 0.1), known) == ErrorBounds.none(ON_ABSENT_ROW)
+    assert bounds_or_note(absent, u, np.append(lam, 0.1), known) == ErrorBounds.none(BoundNote.ON_ABSENT_ROW)
 
 
 def test_an_active_set_method_that_fails_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,8 +11,9 @@ from numerics import spd
 from vibench.highfidelity.active_set import solve_high_fidelity
 from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
-from vibench.model.error_bounds import NOT_UNIQUE, bound_errors_at, corrected_pair
-from vibench.model.errors import Energy
+from vibench.model.bound_terms import BoundNote
+from vibench.model.error_bounds import bound_errors_at, corrected_pair
+from vibench.model.errors import EnergyNorm
 from vibench.stability.coercivity import Constant
 
 KINDS = ["plain", "opposite", "dependent", "nearly dependent", "copies", "opposite copies", "opposite dependent"]
@@ -44,7 +45,7 @@ def test_solutions_are_right_and_bounds_exist_and_hold(kind: str, seed: int) -> 
     vi, rng = hard(kind, seed), np.random.default_rng(seed)
     solution = solve_high_fidelity(vi)
     u, lam = exact_decimal(vi, solution.lam > 0.0)
-    norm = Energy(vi.A, CondensedStiffness(vi.A))
+    norm = EnergyNorm(vi.A, CondensedStiffness(vi.A))
     exact_u, exact_lam = np.asarray(u, float), np.asarray(lam, float)
     size = norm.norm(exact_u) + norm.dual_norm(vi.B.T @ exact_lam)
     assert norm.norm(difference(u, solution.u)) <= 1e-12 * size
@@ -59,7 +60,7 @@ def test_solutions_are_right_and_bounds_exist_and_hold(kind: str, seed: int) -> 
     assert pair is not None
     for v, nu in ((u_N, lam_N), (pair.u, pair.lam)):
         found = bound_errors_at(vi, norm, Constant(1.0, True), Constant(0.0, True), v, nu)
-        assert found.note == NOT_UNIQUE
+        assert found.note == BoundNote.NOT_UNIQUE
         errors = norm.norm(difference(u, v)), norm.dual_norm(vi.B.T @ difference(lam, nu))
         assert errors[0] <= found.u_energy + 1e-13 * size
         assert errors[1] <= found.lambda_natural + 1e-13 * size

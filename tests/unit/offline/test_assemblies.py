@@ -74,7 +74,7 @@ def test_factors_too_large_to_be_kept_are_those_of_the_last_parameter_alone(monk
     kept, one, two = Assemblies(Varying()), np.array([0.2]), np.array([0.5])
     first = kept.energy_at(one)
     assert kept.energy_at(one) is first
-    assert kept.energy_at(one).on_contact(kept.at(one)) is first.on_contact(kept.at(one))
+    assert kept.energy_at(one).contact_form(kept.at(one)) is first.contact_form(kept.at(one))
     assert (kept.energy_at(two).A != first.A).nnz
     assert kept.energy_at(one) is not first
 

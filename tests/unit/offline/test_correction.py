@@ -11,8 +11,8 @@ from samples import small_study
 
 import vibench
 from vibench.interfaces.validation import validation_parameters
+from vibench.model.bound_terms import BoundNote, CorrectionMode
 from vibench.model.certificates.bounds import OnlineCertificate
-from vibench.model.error_bounds import NO_CORRECTION, NOT_IN_CONE, CorrectionMode
 from vibench.offline import correction as module
 from vibench.offline.assemblies import assemblies
 from vibench.offline.correction import NO_PAIR, Corrector
@@ -119,9 +119,16 @@ def test_a_query_that_cannot_be_corrected_says_why(corrected: vibench.Run, monke
     model = corrected.model(corrected.cells["cell"].iloc[0])
     corrector, mu = Corrector(model.reduced, None, CorrectionMode.FEASIBLE), model.parameters.sample(1, seed=3)[0]
     u, lam = np.zeros(model.problem.V.dim), np.zeros(model.problem.W.dim)
-    assert corrector.in_full(mu, u, lam - 1.0)._replace(u=u, lam=lam) == (u, lam, None, False, None, NOT_IN_CONE)
+    assert corrector.in_full(mu, u, lam - 1.0)._replace(u=u, lam=lam) == (
+        u,
+        lam,
+        None,
+        False,
+        None,
+        BoundNote.NOT_IN_CONE,
+    )
     monkeypatch.setattr(module, "corrected_pair", lambda *_: None)
-    assert corrector.in_full(mu, u, lam).note == NO_CORRECTION
+    assert corrector.in_full(mu, u, lam).note == BoundNote.NO_CORRECTION
     model = corrected.model(corrected.cells.set_index("assembly").loc["certified", "cell"].iloc[0])
     solution = model.solve(model.parameters.sample(1, seed=3)[0], corrected=False)
     corrector = Corrector(model.reduced, model.certificate, CorrectionMode.FEASIBLE)

@@ -13,7 +13,7 @@ from samples import SMALL, small_study
 import vibench
 from vibench.interfaces.problem import MEMBERS
 from vibench.interfaces.validation import validation_parameters
-from vibench.model.certificates.inf_sup import ON_BODIES
+from vibench.model.bound_terms import BoundNote
 from vibench.model.galerkin import ReducedProblem
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline import models
@@ -217,7 +217,7 @@ def test_a_certified_model_bounds_its_errors_and_says_whether_they_keep_a_tolera
 def test_the_bound_of_the_multiplier_is_in_rows_and_says_what_it_rests_on(certified: vibench.Run) -> None:
     row = certified.cells.set_index("assembly").loc["certified"]
     rows = certified.queries[certified.queries["cell"] == row["cell"]]
-    assert set(rows["beta_energy_online_note"]) == {ON_BODIES}
+    assert set(rows["beta_energy_online_note"]) == {BoundNote.ON_BODIES}
     assert (rows["beta_energy_online"] <= rows["beta_energy"] * (1.0 + 1e-2)).all()  # both are moved outwards
     assert (rows["bound_online_lambda"] >= rows["error_lambda_absolute"]).all()
     assert row["effectivity_online_lambda_median"] == pytest.approx(rows["effectivity_online_lambda"].median())

@@ -13,7 +13,7 @@ from vibench.highfidelity import active_set
 from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
 from vibench.model.error_bounds import error_bounds
-from vibench.model.errors import UNMEASURABLE, Energy, ReferenceSolutions, errors
+from vibench.model.errors import UNMEASURABLE, EnergyNorm, ReferenceSolutions, errors
 from vibench.model.hsw_bounds import hsw_bounds
 from vibench.reduction.supremizers import constraint_classes
 from vibench.stability.coercivity import Stability, coercivity_and_continuity, energy_inf_sup
@@ -27,8 +27,8 @@ from vibench.stability.infsup import (
 )
 
 
-def energy(vi: VariationalInequality) -> Energy:
-    return Energy(vi.A, CondensedStiffness(vi.A))
+def energy(vi: VariationalInequality) -> EnergyNorm:
+    return EnergyNorm(vi.A, CondensedStiffness(vi.A))
 
 
 def test_errors_as_defined() -> None:

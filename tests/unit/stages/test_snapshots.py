@@ -17,7 +17,7 @@ from running import Register
 
 from vibench import NumericalError, Problem, VariationalInequality
 from vibench.interfaces.validation import AGREEMENT_RTOL, Fingerprint, ReferenceAssembly, fingerprint
-from vibench.model.error_bounds import REFERENCE
+from vibench.model.bound_terms import REFERENCE
 from vibench.plugins.plugin import Plugin
 from vibench.stages.base import build_problem
 from vibench.stages.snapshots import fingerprint_here, gather, solution_stages

@@ -1,26 +1,122 @@
-"""What certificates of all reduced models of a problem have in common: the inner product, A against it, and B₀."""
+"""Lower bounds of the inf-sup constant β_A(µ) at online cost, from one number that is proved offline.
+
+β_A(µ)² is the smallest eigenvalue of B A⁻¹Bᵀ against X_W. With A ≼ γ X it is at least that of B X⁻¹Bᵀ/γ, and
+
+- where B(µ) = θ(µ) B₀ is declared, β_A ≥ |θ| β₀/√γ;
+- where X has a block for every one of several bodies and B(µ) = B₀ + B₁(µ), B₀ on some of the bodies and B₁ on the
+  others, B X⁻¹Bᵀ = B₀X⁻¹B₀ᵀ + B₁X⁻¹B₁ᵀ, hence β_A ≥ β₀/√γ. That B is B₀ on these bodies is verified at the parameter.
+
+Here β₀² is the smallest eigenvalue of B₀X⁻¹B₀ᵀ against X_W, see `vibench.stability.coercivity` for its proof.
+
+What certificates of all reduced models of a problem have in common: the inner product, A against it, and B₀.
+
+Bounds of the errors of linear outputs, from those of u and λ at online cost.
+
+An output s(u, λ) = l(u) + m(λ) has the error l(e) + m(ε), e = u − u_N and ε = λ − λ_N. With α X ≼ A(µ) ≼ γ X,
+
+    |l(e)| ≤ ‖l‖_{A⁻¹} ‖e‖_A ≤ ‖l‖_{X⁻¹} ‖e‖_A / √α,
+
+and where B(µ) = θ B₀, or B₀ on the bodies on which it is constant with θ = 1, for any z and with S = B₀ X⁻¹B₀ᵀ,
+
+    |m(ε)| ≤ c ‖B₀ᵀε‖_{X⁻¹} ≤ c √γ/|θ| ‖Bᵀε‖_{A⁻¹},    c = √(zᵀS z) + ‖m − S z‖_{W⁻¹}/β₀,
+
+since β₀ ‖ε‖_W ≤ ‖B₀ᵀε‖_{X⁻¹}. z = S⁻¹m makes c small also where β₀ is, which the modes of ε on single elements decide.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
+from math import inf, sqrt
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
 
-from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.errors import UnsupportedError
+from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import Contact, Problem
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.definite import dense_inverse
 from vibench.linalg.inner_product import InnerProduct
 from vibench.linalg.schur_complement import EliminationPattern, StaticCondensation
 from vibench.model.affine import AffineMember, Evaluation, coefficients, evaluated_members
-from vibench.model.certificates.inf_sup import OnlineInfSup, online_inf_sup
+from vibench.model.bound_terms import BoundNote
 from vibench.model.certificates.prepared_correction import constant_unknowns
 from vibench.model.certificates.spectral import SpectralBounds, combined, leading_terms, rotated, spectral_bounds
-from vibench.stability.coercivity import MARGINS, largest_quotient
+from vibench.stability.coercivity import MARGINS, energy_inf_sup, largest_quotient
+
+
+@dataclass(frozen=True)
+class OnlineInfSup:
+    """What bounds β_A(µ) from below at online cost; see above.
+
+    Attributes
+    ----------
+    value
+        β₀; 0 where there is none.
+    constraint
+        B₀ (m×k) on the contact unknowns.
+    bodies
+        Contact unknowns (k,) on which B(µ) must be B₀; `None` where B(µ) = θ(µ) B₀ is declared.
+    reason
+        Why there is none, or "".
+    """
+
+    value: float
+    constraint: SparseMatrix
+    bodies: Mask | None
+    reason: str = ""
+
+    def at(self, theta: float, B: SparseMatrix | None, gamma: float) -> tuple[float, str]:
+        """A lower bound of β_A(µ), 0 if there is none, and which it is or why there is none.
+
+        Parameters
+        ----------
+        theta
+            θ(µ) where B(µ) = θ(µ) B₀ is declared.
+        B
+            B(µ) (m×k) on the contact unknowns; else.
+        gamma
+            γ(µ).
+        """
+        if self.reason:
+            return 0.0, self.reason
+        if self.bodies is None:
+            return abs(theta) * self.value / sqrt(gamma), BoundNote.SCALED
+        assert B is not None  # evaluated where B is no multiple of one matrix
+        difference = sp.csr_array(sp.csr_array(B) - self.constraint)
+        if np.any(difference.data[self.bodies[difference.indices]] != 0.0):  # NaN is not zero
+            return 0.0, BoundNote.NOT_CONSTANT
+        return self.value / sqrt(gamma), BoundNote.ON_BODIES
+
+
+def online_inf_sup(
+    X: InnerProduct, W: InnerProduct, contact: Indices, constraint: SparseMatrix, same: Mask | None
+) -> OnlineInfSup:
+    """Prove β₀ for B₀, which is a part of a matrix (m×k) on the contact unknowns (k,).
+
+    `same` (k,) are the unknowns on which B was the same at the training parameters; `None` where B(µ) is declared to be
+    a multiple of the matrix, which is B₀ then. Bodies are unknowns that X couples, directly or by others.
+    """
+    bodies = None
+    if same is not None:
+        body = connected_components(X.matrix, directed=False)[1][contact]
+        bodies = ~np.isin(body, body[~same])
+        constraint = sp.csr_array(constraint @ sp.diags_array(bodies.astype(float)))
+        if not bodies.any():
+            return OnlineInfSup(0.0, constraint, bodies, BoundNote.NO_BODY)
+    entries = sp.coo_array(constraint)
+    rows, columns = entries.coords
+    B = sp.csr_array((entries.data, (rows, contact[columns])), shape=(constraint.shape[0], X.dim))
+    found = energy_inf_sup(X.matrix, B, W)
+    proved = found.proved and found.value > 0.0
+    return OnlineInfSup(found.value if proved else 0.0, constraint, bodies, "" if proved else BoundNote.NOT_PROVED)
+
 
 VERIFICATION = 16
 """Random parameters at which interpolation errors are measured."""
@@ -215,3 +311,39 @@ def _interpolation_errors(
             stiffness, of_leading = max(stiffness, missed), max(of_leading, left_out)
     moved = SAFETY * (1.0 + MARGINS[0])
     return SAFETY * load, moved * stiffness, moved * of_leading
+
+
+def output_coefficients(problem: Problem, output: Output) -> tuple[Array, Array]:
+    """Coefficients (n,) of u and (m,) of λ of a linear output.
+
+    Raises
+    ------
+    NumericalError
+        If they have another shape.
+    """
+    sizes = problem.V.dim, problem.W.dim
+    output.values(problem.parameters.lower[None], *(np.zeros((size, 1)) for size in sizes))
+    given = zip((output.u, output.lam), sizes, strict=True)
+    of_u, of_lam = (np.zeros(size) if weights is None else np.asarray(weights, float) for weights, size in given)
+    return of_u, of_lam
+
+
+def output_weights(problem: Problem, base: CertificateBase, output: Output) -> tuple[float, float]:
+    """‖l‖_{X⁻¹} and c of a linear output; c is infinite where no β₀ is proved."""
+    of_u, of_lam = output_coefficients(problem, output)
+    return float(np.linalg.norm(base.X.whiten_functional(of_u))), _of_multiplier(problem, base, of_lam)
+
+
+def _of_multiplier(problem: Problem, base: CertificateBase, of_lam: Array) -> float:
+    beta, B = base.inf_sup.value, base.inf_sup.constraint
+    if not of_lam.any():
+        return 0.0
+    if not beta > 0.0 or base.inf_sup.reason:
+        return inf
+    S = np.asarray(B @ np.asarray(B @ base.compliance).T)
+    S, found = 0.5 * (S + S.T), [float(np.linalg.norm(problem.W.whiten_functional(of_lam))) / beta]
+    with suppress(np.linalg.LinAlgError):  # rows that are dependent up to round-off
+        z = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), of_lam)
+        rest = float(np.linalg.norm(problem.W.whiten_functional(of_lam - S @ z)))
+        found.append(float(np.sqrt(max(0.0, z @ S @ z))) + rest / beta)
+    return min(found)

@@ -6,7 +6,7 @@ With an inner product X that does not depend on the parameter, bounds α X ≼ A
 
 follow from the bounds (ii) there, as ‖r‖²_{A⁻¹} ≤ ρ²/α and ‖w‖²_A ≤ γ ω². Where A does not depend on the parameter X is
 A, α = γ = 1, and nothing is lost. Elsewhere X is A at the centre of the parameter box. In W, ‖ε‖_W ≤ ‖Bᵀε‖_{A⁻¹}/β_A
-where there is one of the lower bounds of β_A in `vibench.model.certificates.inf_sup`.
+where there is one of the lower bounds of β_A in `vibench.model.certificates.base`.
 
 - ρ comes from coordinates of the residual in an orthonormal basis (`vibench.model.certificates.residual`). Its terms
   are those of f, of A times the basis of the reduced space, and of Bᵀ times the generators. Where B is assembled on
@@ -32,10 +32,12 @@ the first norm at most ρ/√α + ½ (γ − α)/√α ‖w‖_X for c = ½ (α 
 the residual alone is left. This *corrected pair* is better where ω > ρ.
 
 Δ bounds both errors together. Where A varies and corrections are not prepared, which is where programs of contact size
-are solved in any case, `vibench.model.certificates.defect_correction` has bounds of each; the smaller ones are taken.
+are solved in any case, `vibench.model.certificates.contact_correction` has bounds of each; the smaller ones are taken.
 
 Round-off is bounded where it decides whether w is feasible, and in the coordinates of the residual: it may be all that
 is left of Δ² + 2 rᵀw, in which these are multiplied with those of X w.
+
+Preparation of what bounds the errors of one reduced model at online cost, from arrays of mesh size.
 """
 
 from __future__ import annotations
@@ -46,22 +48,35 @@ from functools import cached_property
 from math import inf, sqrt
 
 import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.interfaces.problem import Contact, Problem
-from vibench.model.certificates.base import ONE, CertificateBase, Guarantee, contact_at
-from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction
-from vibench.model.certificates.defect_correction import defect_corrected_bounds
-from vibench.model.certificates.prepared_correction import PreparedCorrections
-from vibench.model.certificates.residual import ResidualBasis
-from vibench.model.error_bounds import NO_CORRECTION, NOT_IN_CONE, CorrectionMode
+from vibench.arrays import Array, Indices, Mask, SparseMatrix
+from vibench.errors import UnsupportedError
+from vibench.highfidelity.active_set import FALLBACK_SOLVER
+from vibench.interfaces.problem import Problem
+from vibench.linalg.factorisations import implementation
+from vibench.model.affine import AffineMember
+from vibench.model.bound_terms import BoundNote, CorrectionMode
+from vibench.model.certificates.base import ONE, CertificateBase, Guarantee, contact_at, contact_unknowns, is_exact
+from vibench.model.certificates.contact_correction import (
+    ContactCompliance,
+    defect_corrected_bounds,
+    find_contact_correction,
+    held_rows,
+)
+from vibench.model.certificates.prepared_correction import PreparedCorrections, prepare_corrections
+from vibench.model.certificates.residual import (
+    ColumnBlock,
+    ContactFunctionals,
+    ResidualBasis,
+    ResidualTerms,
+    residual_basis,
+    residual_coefficients,
+)
 from vibench.model.galerkin import Evaluated, ReducedProblem
-
-NOT_PREPARED = "no prepared correction satisfies B w ≥ s: the best w was computed at the parameter"
-
-NOT_COERCIVE = "no positive lower bound of the coercivity of A was found at this parameter"
-
-OUTSIDE = "mu is outside the parameter box: interpolation errors are known inside it"
+from vibench.model.hyperreduced import HyperReducedModel
+from vibench.qp.solve import solve_qp
 
 
 @dataclass(frozen=True)
@@ -126,7 +141,7 @@ class OnlineCorrection:
 
 @dataclass(frozen=True)
 class OnlineCertificate:
-    """What bounds the errors of one reduced model at online cost; from `vibench.model.certificates.preparation`.
+    """What bounds the errors of one reduced model at online cost; from `vibench.model.certificates.bounds`.
 
     Attributes
     ----------
@@ -173,16 +188,16 @@ class OnlineCertificate:
         """Bounds of a solution x (N',), α (R,) of a reduced program that a `HyperReducedModel` assembled at mu (d,)."""
         lam, base = self.generators @ alpha, self.base
         if lam.min(initial=0.0) < 0.0:
-            return OnlineBound.none(NOT_IN_CONE)
+            return OnlineBound.none(BoundNote.NOT_IN_CONE)
         evaluated = reduced.evaluated
         if self.forces is not None and evaluated.contact is None:
             evaluated = replace(evaluated, contact=contact_at(problem, mu))
         if not base.is_exact and problem.parameters.outside(mu).any():
-            return OnlineBound.none(OUTSIDE)
+            return OnlineBound.none(BoundNote.OUTSIDE)
         y, theta = evaluated.in_space(x), base.coefficients(evaluated.samples)
         lower, upper = (1.0, 1.0) if base.spectral is None else base.spectral.at(mu, theta["A"])
         if not lower > base.stiffness_error:
-            return OnlineBound.none(NOT_COERCIVE)
+            return OnlineBound.none(BoundNote.NOT_COERCIVE)
         corrected, note = self._corrected(problem, mu, evaluated, y, lam, upper)
         if corrected is None:
             return OnlineBound.none(note)
@@ -295,9 +310,14 @@ class OnlineCertificate:
         contact = evaluated.contact or contact_at(problem, mu)
         correction = find_contact_correction(self.compliance, contact, *self._on_contact(y), lam, gamma)
         if correction is None:
-            return None, NO_CORRECTION
+            return None, BoundNote.NO_CORRECTION
         along = correction.load @ self.contact_directions[correction.unknowns]
-        return (along, correction.norm, correction.kappa, correction.eta), "" if prepared is None else NOT_PREPARED
+        return (
+            along,
+            correction.norm,
+            correction.kappa,
+            correction.eta,
+        ), "" if prepared is None else BoundNote.NOT_PREPARED
 
     def _constraint(
         self, problem: Problem, mu: Array, evaluated: Evaluated
@@ -310,18 +330,98 @@ class OnlineCertificate:
         return float(theta[0]), self.base.bound_terms @ of_g, self._bound_sizes @ np.abs(of_g)
 
 
-def residual_coefficients(
-    theta: Mapping[str, Array], y: Array, forces: Array | None, contact: Contact | None, alpha: Array, lam: Array
-) -> Array:
-    """Coefficients (Z,) of a residual: those of f, of A for every vector of Φ, and of Bᵀλ_N.
+SAMPLES = 200
+"""Training parameters at most whose reduced solutions tell what terms of the residual contribute."""
 
-    The last ones are θ_q α_i of all Bᵀ_q χ_i (Q R,) where B is exactly the sum of its terms. Where it is assembled on
-    the contact, and there are `forces`, they are what B₀ᵀλ_N lacks, on the contact unknowns, and α for the vectors
-    B₀ᵀχ (k+R,).
+RINGS = 1
+"""Rings of rows around the support of the generators whose contact unknowns corrections usually involve."""
+
+SAMPLE_ACCURACY = 1e-8
+
+
+def prepare(
+    model: HyperReducedModel, members: Mapping[str, AffineMember], base: CertificateBase, training: Array
+) -> OnlineCertificate:
+    """Prepare what bounds the errors of a reduced model, from the members it was made of and `certificate_base`.
+
+    Sharpness alone depends on `training` (P×d), parameters that show which terms of residuals contribute.
     """
-    if forces is None:
-        of_lam = (theta["B"][:, None] * alpha).ravel()
+    problem, Phi, chi, B = model.problem, model.basis, model.generators, members["B"]
+    X, dofs, scaled = base.X.matrix, contact_unknowns(problem), base.bound_terms is not None
+    factor = implementation(base.X.factorisation).eliminate_with_factor(X, dofs, "A")
+    forces = None if is_exact(problem, "B", B) else np.asarray(base.constraint.T @ chi)
+
+    def known(functionals: Array) -> ColumnBlock:
+        return ColumnBlock(factor.solve_factor_transposed(np.asarray(functionals)))
+
+    blocks: list[ResidualTerms] = [known(np.column_stack(members["f"].terms))]
+    if base.spectral is None:
+        blocks.append(ColumnBlock(factor.apply_factor(Phi)))  # A is X
     else:
-        assert contact is not None  # evaluated where B is assembled on the contact
-        of_lam = np.concatenate([contact.B.T @ lam - forces @ alpha, alpha])
-    return np.concatenate([theta["f"], (-theta["A"][:, None] * y).ravel(), -of_lam])
+        blocks += [known(term @ Phi) for term in base.terms]
+    on_contact = ContactFunctionals(factor.trailing_factor, len(X.indptr) - 1)
+    if forces is None:
+        blocks += [known(B_q.T @ chi) for B_q in B.terms]
+    else:
+        blocks += [on_contact, ColumnBlock(on_contact.combined(forces))]
+    compliance = ContactCompliance(base.compliance, _near(problem, chi, training))
+    contact_basis = np.ascontiguousarray(Phi[dofs])
+    z, typical, held = _sampled(model, base, compliance, contact_basis, forces, training)
+    residual, U = residual_basis(blocks, z, typical, len(dofs))
+    directions = scipy.linalg.solve_triangular(factor.trailing_factor, U)
+    corrections = prepare_corrections(base.constraint, scaled, base.compliance, held, contact_basis, directions)
+    return OnlineCertificate(base, residual, directions, compliance, contact_basis, chi, forces, corrections)
+
+
+def _near(problem: Problem, chi: Array, training: Array) -> Indices:
+    """Contact unknowns that rows in the support of a generator, or next to it, touch at some training parameter."""
+    near = np.zeros(len(contact_unknowns(problem)), bool)
+    for mu in training:
+        contact = contact_at(problem, mu)
+        touches, rows = abs(sp.csr_array(contact.B)) > 0.0, np.any(chi > 0.0, axis=1)
+        for _ in range(RINGS):
+            rows = touches @ (touches.T @ rows)
+        near |= touches.T @ rows
+    return np.flatnonzero(near)
+
+
+def _sampled(
+    model: HyperReducedModel,
+    base: CertificateBase,
+    compliance: ContactCompliance,
+    rows: Array,
+    forces: Array | None,
+    training: Array,
+) -> tuple[Array, float, Mask]:
+    """What reduced solutions at training parameters have.
+
+    Coefficients (Z×S) of their residuals, the median norm of corrections, and the rows (m,) that some of these hold.
+    `rows` are those of Φ (k×d) at the contact unknowns, `forces` those of `residual_coefficients`.
+    """
+    problem, residuals, norms = model.problem, [], [0.0]
+    held = np.zeros(len(model.generators), bool)
+    for number, mu in enumerate(training[:: -(-len(training) // SAMPLES)]):
+        reduced = model.assemble(mu)
+        answer = solve_qp(reduced.program, FALLBACK_SOLVER, SAMPLE_ACCURACY, factor=reduced.factor)
+        if answer.x is None or answer.alpha is None or not np.all(np.isfinite(answer.x)):
+            continue
+        evaluated, alpha = reduced.evaluated, np.maximum(answer.alpha, 0.0)
+        lam, y = model.generators @ alpha, evaluated.in_space(answer.x)
+        contact, theta = evaluated.contact or contact_at(problem, mu), base.coefficients(evaluated.samples)
+        residuals.append(residual_coefficients(theta, y, forces, contact, alpha, lam))
+        held |= held_rows(compliance, contact, rows @ y, lam)
+        if number % 8 == 0:
+            correction = find_contact_correction(compliance, contact, rows @ y, np.zeros(len(rows)), lam, 1.0)
+            norms += [] if correction is None else [correction.norm]
+    if not residuals:
+        raise UnsupportedError("no reduced program at a training parameter has a solution")
+    return np.column_stack(residuals), float(np.median(norms)), held
+
+
+def output_error_bound(of_output: tuple[float, float], base: CertificateBase, bound: OnlineBound) -> float:
+    """Bound of the error of an output with these `weights`, where u and λ have these bounds; or infinity."""
+    (of_u, of_lam), beta = of_output, base.inf_sup.value
+    if bound.guarantee is Guarantee.NONE or (of_lam and not bound.inf_sup > 0.0):
+        return inf
+    in_u = of_u * bound.u_energy / sqrt(bound.coercivity)
+    return in_u + (of_lam * beta * bound.lam if of_lam else 0.0)

@@ -1,4 +1,19 @@
-"""Corrections of constraint violations that are known by their values on the contact unknowns, at the cost of those.
+"""Linear complementarity problems of corrections: ν = ν₀ + M v ≥ 0, v ≥ 0, νᵀv = 0, with M symmetric positive definite.
+
+They have one solution. The primal-dual active set method exchanges all unknowns with the wrong sign at once and takes
+few steps, but it may cycle where M is no M-matrix. Then v is found as the minimiser of ½ vᵀM v + ν₀ᵀv over v ≥ 0 by the
+method of Lawson and Hanson for nonnegative least squares (Solving Least Squares Problems, 1974, chapter 23). Its
+objective falls in every step, so that it meets no set twice and ends. What decides here is round-off where ν and v are
+both zero: ν counts as negative beyond its round-off alone, and an unknown that would not become positive is passed
+over. SciPy's own method, which has no such bounds, returns wrong solutions in such cases (1.17.1).
+
+Corrections of constraints among which there are equalities, by their values on the contact unknowns.
+
+No margin covers an equality, and the rows of a row and its opposite are dependent. The program of
+`vibench.model.certificates.contact_correction` is then solved as a least distance problem in y, w_E = L y, with
+C = L Lᵀ and ‖w‖ = |y|. The w' that holds the equalities is within η of w (`vibench.model.bound_terms`).
+
+Corrections of constraint violations that are known by their values on the contact unknowns, at the cost of those.
 
 Of all w with given values w_E on the contact unknowns E, w = X⁻¹ E c with c = C⁻¹ w_E, C = Eᵀ X⁻¹ E, has the smallest
 norm ‖w‖² = cᵀ C c. As B w depends on w_E alone, the minimiser of
@@ -9,31 +24,170 @@ is of this form with γ c = Bᵀ(ν − λ), multipliers ν ≥ 0 and complement
 be the rows with λ_i > 0 in which releasing λ_i alone violates the constraint, λ_i S_ii > −s_i, and those that other w
 violate; on the other rows, J, ν = 0. Then ν = λ + S_II⁻¹(s + v + S_IJ λ_J) on I: a linear complementarity problem for
 v ≥ 0 and ν ≥ 0, solved from v = 0, where λ > 0 costs nothing, by a primal-dual active set method (Hintermüller, Ito and
-Kunisch, 2002) and by one that always ends where that cycles (`vibench.model.certificates.complementarity`). Few rows
+Kunisch, 2002) and by one that always ends where that cycles (`vibench.model.certificates.contact_correction`). Few rows
 leave v = 0, so that one factorisation of S_II serves all steps.
 
 Any w with B w ≥ s is as good as another for a bound to hold. Optimality is not verified, feasibility is: s is raised by
 a margin above its round-off. Rows far from the contact are not evaluated where |B w| ≤ Σ_j |B_ij| √C_jj ‖w‖, which is
 the inequality of Cauchy and Schwarz, suffices.
+
+Bounds of u and of λ from one step of defect correction, at online cost.
+
+The identity (i) of `vibench.model.error_bounds` bounds the sum of both errors by the residual. Where one error is much
+smaller than the other, its bound is that of the larger one. They are told apart by a better pair, which solves the
+inequality with c X in place of A(µ), c > 0, for the residual r = f − A u_N − Bᵀλ_N,
+
+    c X (û − u_N) + Bᵀ(ν − λ_N) = r,     B û ≤ g,    ν ≥ 0,    νᵀ(B û − g) = 0.
+
+Its residual is f − A û − Bᵀν = (c X − A)(û − u_N), it violates nothing, and (i) gives, with c = ½ (α + γ) and
+α X ≼ A ≼ γ X, hence |c X − A| ≼ ½ (γ − α) X,
+
+    max(‖u − û‖_A, ‖Bᵀ(λ − ν)‖_{A⁻¹}) ≤ δ = ½ (γ − α)/√α ‖û − u_N‖_X,
+    ‖u − u_N‖_A ≤ √γ ‖û − u_N‖_X + δ,         ‖Bᵀ(λ − λ_N)‖_{A⁻¹} ≤ ‖Bᵀ(ν − λ_N)‖_{X⁻¹}/√α + δ.
+
+What of r is orthogonal to all Bᵀη moves û alone. Where A is constant, δ = 0 and the pair is the high-fidelity solution.
+
+With z = X⁻¹r, û = u_N + z/c − w and c X w = Bᵀ(ν − λ_N): w is the correction of `contact_correction` for u_N + z/c in
+place of u_N. Of r only the part r_U in the span of the basis of residuals is used; the rest, and what is not known of
+r, adds its norm to that of the residual. Then z has the coordinates of r_U, and its values on the contact unknowns are
+the products of these with the coordinates of the functionals that act on one unknown each.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from math import inf, sqrt
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse as sp
-from scipy.linalg.lapack import dpotrf, dpotrs
+from scipy.linalg.lapack import dposv, dpotrf, dpotrs
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.interfaces.problem import Contact
 from vibench.linalg import EPS
 from vibench.linalg.definite import BlockDiagonal
-from vibench.model.certificates.complementarity import complementary
-from vibench.model.certificates.tied_correction import tied_correction
-from vibench.model.error_bounds import ATTEMPTS, MARGIN
+from vibench.model.bound_terms import ATTEMPTS, MARGIN, NO_ROOM, Equalities
+from vibench.qp.exact import least_distance
+from vibench.qp.rows import rows_that_matter
+from vibench.qp.scaling import row_norms
+
+STEPS = 30
+"""Steps of the primal-dual active set method."""
+
+MOST = 20
+"""Steps of the other one, as a multiple of the number of unknowns; about as many as unknowns are usual."""
+
+
+def complementary(fixed: Array, rows_of: Callable[[Indices], Array], released: Mask) -> Array:
+    """ν (i,) of the problem above up to round-off; whether what it is for is feasible has to be verified in any case.
+
+    Parameters
+    ----------
+    fixed, released
+        ν₀ (i,), and where v may be positive at first (i,); the systems that are solved have the size of such sets.
+    rows_of
+        Gives rows of M (·×i) from their numbers.
+    """
+    for _ in range(STEPS):
+        rows = released.nonzero()[0]
+        nu, wrong = fixed, fixed < 0.0
+        if len(rows):
+            among = rows_of(rows)
+            _, v, singular = dposv(among[:, rows], -fixed[rows])
+            if singular:
+                break
+            nu = fixed + v @ among
+            nu[rows] = 0.0
+            wrong = nu < 0.0
+            wrong[rows] = v < 0.0
+        if not wrong.any():
+            return nu
+        released = released != wrong
+    return fixed + descent(rows_of(np.arange(len(fixed))), fixed)
+
+
+def descent(M: Array, fixed: Array) -> Array:
+    """M v (i,) for the minimiser v ≥ 0 of ½ vᵀM v + ν₀ᵀv, up to round-off.
+
+    Lawson and Hanson's `w` is −ν here, their `z` is the solution on the set of positive unknowns.
+    """
+    size, unit = len(fixed), 1.0 / np.sqrt(M.diagonal())
+    v, positive, passed = np.zeros(size), np.zeros(size, bool), np.zeros(size, bool)
+    for _ in range(MOST * size):
+        nu = fixed + M @ v + EPS * size * (np.abs(fixed) + np.abs(M) @ v)
+        nu[positive | passed] = 0.0
+        entering = int(np.argmin(nu * unit))
+        if nu[entering] >= 0.0:
+            break
+        positive[entering], first = True, True
+        while (rows := positive.nonzero()[0]).size:
+            z = np.zeros(size)
+            _, z[rows], singular = dposv(M[np.ix_(rows, rows)], -fixed[rows])
+            if singular:
+                return np.asarray(M @ v)
+            if first and not z[entering] > 0.0:  # NaN is not
+                positive[entering], passed[entering] = False, True
+                break
+            blocking, first = positive & (z <= 0.0), False
+            if not blocking.any():
+                v, passed = z, np.zeros(size, bool)
+                break
+            steps = np.full(size, np.inf)
+            steps[blocking] = v[blocking] / (v[blocking] - z[blocking])
+            v = v + steps.min() * (z - v)
+            positive &= ~(blocking & (steps <= steps.min())) & (v > 0.0)
+            v[~positive] = 0.0
+    return np.asarray(M @ v)
+
+
+def tied_correction(
+    C: Array, contact: Contact, excess: Array, round_off: Array, size: Array, lam: Array, gamma: float
+) -> tuple[Array, float, float, Array, float, float] | None:
+    """C (k,), ‖w'‖, λᵀ(B w' − s), ν (m,), νᵀ(B w' − s) and η; `None` without equalities, or if no w was found.
+
+    Parameters
+    ----------
+    C, contact
+        C (k×k), and B (m×k) and g (m,).
+    excess, round_off, size
+        s (m,), a bound of its round-off, and of its terms.
+    lam, gamma
+        λ ≥ 0 (m,) and γ.
+    """
+    B = sp.csr_array(contact.B)
+    rows = rows_that_matter(B, contact.g, NO_ROOM * size, lam)
+    if not rows.equal.any():
+        return None
+    L, kept, lengths = np.linalg.cholesky(C), rows.kept, row_norms(B)[rows.kept]
+    whitened = np.asarray((B @ L).T)
+    equalities = Equalities.of(whitened[:, rows.equalities], lambda y: np.asarray(L @ y), B)
+    K, load = -whitened[:, kept] / lengths / np.sqrt(gamma), -(whitened @ lam) / np.sqrt(gamma)
+    margin = np.where(rows.equal, 0.0, MARGIN * round_off[kept])
+    for _ in range(ATTEMPTS):
+        forces = least_distance(K, load, -(excess[kept] + margin) / lengths, rows.equal)
+        if forces is None:
+            return None
+        w = L @ (load - K @ forces) / np.sqrt(gamma)
+        missed = (B @ w - excess)[rows.equalities]
+        w = w - equalities.step(missed)
+        slack = B @ w - excess
+        rounded = round_off + 1.01 * EPS * (np.diff(B.indptr) + 4.0) * (abs(B) @ np.abs(w))
+        eta = equalities.distance((np.abs(slack) + rounded)[rows.equalities])
+        eta += equalities.distance(np.abs(missed))  # ν belongs to the w before the step
+        reach = equalities.reach * eta
+        lacking = np.where(rows.implied, 0.0, rounded + reach - slack)
+        if np.all(lacking <= 0.0):  # NaN is not
+            y = scipy.linalg.solve_triangular(L, w, lower=True)
+            nu = rows.multipliers(np.where(rows.equal, forces, np.maximum(forces, 0.0)) / lengths, len(lam))
+            products = [max(0.0, float(of @ np.where(of > 0.0, slack, 0.0))) + float(of @ reach) for of in (lam, nu)]
+            c = scipy.linalg.solve_triangular(L, y, lower=True, trans="T")
+            return c, float(np.linalg.norm(y)) + eta, products[0], nu, products[1], eta
+        margin = 10.0 * np.maximum(margin, np.where(rows.equal, 0.0, np.nan_to_num(lacking[kept], posinf=0.0)))
+    return None
+
 
 EXTENSIONS = 10
 """How often rows are added to I."""
@@ -241,3 +395,44 @@ def _complementary(factor: Array, excess: Array, lam: Array) -> Array:
         return inverse[rows]
 
     return np.maximum(complementary(fixed, rows_of_inverse, fixed < 0.0), 0.0)
+
+
+def defect_corrected_bounds(
+    compliance: ContactCompliance,
+    directions: Array,
+    contact: Contact,
+    solution: tuple[Array, Array, Array],
+    residual: tuple[Array, float],
+    spectrum: tuple[float, float],
+) -> tuple[float, float]:
+    """Bounds of ‖u − u_N‖_A and of ‖Bᵀ(λ − λ_N)‖_{A⁻¹}; infinite where no correction was found.
+
+    Parameters
+    ----------
+    compliance, directions
+        C, and the coordinates (k×K) of the contact unknowns, as functionals, in the basis of residuals.
+    contact
+        B (m×k) and g (m,).
+    solution
+        u_N (k,) on the contact unknowns, a bound (k,) of its round-off, and λ_N ≥ 0 (m,).
+    residual
+        Its coordinates (K,), and the norm of what they lack.
+    spectrum
+        α > 0 and γ.
+    """
+    (on_contact, uncertain, lam), (coordinates, outside), (lower, upper) = solution, residual, spectrum
+    middle = 0.5 * (lower + upper)
+    moved = coordinates / middle  # z/c
+    shift, terms = directions @ moved, len(moved) + 4.0
+    uncertain = uncertain + terms * EPS * (np.linalg.norm(directions, axis=1) * np.linalg.norm(moved) + np.abs(shift))
+    found = find_contact_correction(compliance, contact, on_contact + shift, uncertain, lam, middle)
+    if found is None or found.nu is None:
+        return inf, inf
+    along = found.load @ directions[found.unknowns]  # the coordinates of X w, whose rest is orthogonal to z
+    beside = max(0.0, found.norm**2 - float(along @ along))
+    round_off = terms * EPS * (float(np.linalg.norm(moved)) + found.norm)
+    distance = float(np.linalg.norm(moved - along)) + round_off
+    distance = sqrt(distance**2 + beside + terms * EPS * found.norm**2)
+    left = (outside + 0.5 * (upper - lower) * distance + middle * (found.eta + round_off)) / sqrt(lower)
+    delta = sqrt(left**2 + 2.0 * found.gap) + found.eta * sqrt(upper)
+    return sqrt(upper) * distance + delta, middle * found.norm / sqrt(lower) + delta

@@ -6,8 +6,8 @@ it: those that the best w holds at a training parameter. The minimiser of the pr
 
     ν = λ + (γ/θ²) M (s + v) ≥ 0,    v = B w − s ≥ 0,    νᵀv = 0,    M = S₀⁻¹,    S₀ = B₀ C B₀ᵀ,    on J,
 
-where M does not depend on the parameter. The method of `vibench.model.certificates.complementarity` starts from v = 0
-where λ > 0 costs nothing, as there, and its systems have the size of the rows with v > 0, which are few.
+where M does not depend on the parameter. The method of `vibench.model.certificates.contact_correction` starts from
+v = 0 where λ > 0 costs nothing, as there, and its systems have the size of the rows with v > 0, which are few.
 
 Where B(µ) is θ(µ) B₀ everywhere, w is the best one, but for λ beyond J, in rows that do not touch. Where it is so on
 some bodies alone, w is the best of those that deform no other body: of two equal ones in contact the correction of one
@@ -27,8 +27,8 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.linalg import EPS
 from vibench.linalg.definite import connected_blocks
-from vibench.model.certificates.complementarity import complementary
-from vibench.model.error_bounds import ATTEMPTS, MARGIN
+from vibench.model.bound_terms import ATTEMPTS, MARGIN
+from vibench.model.certificates.contact_correction import complementary
 
 LARGEST_CONDITION = 1e9
 """Rows of a B₀ whose S₀ has a larger condition number are treated as dependent: S₀ is not inverted."""

@@ -15,8 +15,9 @@ Sharpness alone depends on d: samples of z give it, and how much is left out is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Protocol
 
@@ -25,6 +26,8 @@ import scipy.linalg
 from scipy.linalg.blas import dgemm
 
 from vibench.arrays import Array, Indices
+from vibench.interfaces.problem import Contact
+from vibench.linalg import EPS
 from vibench.linalg.inner_product import project_out
 
 TERMS, DIRECTIONS = 0.05, 0.4
@@ -33,8 +36,6 @@ those that are kept."""
 
 NEGLIGIBLE = 1e-12
 """Contributions below this share of the largest one are not worth computing."""
-
-UNIT = float(np.finfo(float).eps)
 
 FEW, SHARE_OF_FEW = 1000, 0.25
 """All principal directions of up to so many terms are computed, and this share of the above is left out."""
@@ -49,7 +50,7 @@ BLOCK = 100
 """Directions that the randomised method computes at once."""
 
 
-class Terms(Protocol):
+class ResidualTerms(Protocol):
     """Some of the F⁻ᵀt_j, of which not all may be wanted."""
 
     @property
@@ -64,7 +65,7 @@ class Terms(Protocol):
 
 
 @dataclass(frozen=True)
-class Known:
+class ColumnBlock:
     """All of them, as an array (n×p)."""
 
     values: Array
@@ -81,6 +82,35 @@ class Known:
     def combined(self, samples: Array) -> Array:
         """Their sums (n×S) with coefficients (p×S)."""
         return np.asarray(self.values @ samples)
+
+
+@dataclass(frozen=True)
+class ContactFunctionals:
+    """The functionals that act on one contact unknown each, in coordinates that have these unknowns at the end.
+
+    There X = FᵀF with F upper triangular, and `trailing` is its last block (k×k); n is the dimension of the space.
+    """
+
+    trailing: Array
+    dim: int
+
+    @cached_property
+    def norms(self) -> Array:
+        """Their norms (k,)."""
+        inverse = scipy.linalg.solve_triangular(self.trailing, np.eye(len(self.trailing)), check_finite=False)
+        return np.asarray(np.linalg.norm(inverse, axis=1))
+
+    def columns(self, chosen: Indices) -> Array:
+        """The chosen ones (n×c)."""
+        return self.combined(np.eye(len(self.trailing))[:, chosen])
+
+    def combined(self, samples: Array) -> Array:
+        """Their sums (n×S) with coefficients (k×S)."""
+        result = np.zeros((self.dim, samples.shape[1]))
+        if samples.size:
+            last = scipy.linalg.solve_triangular(self.trailing, samples, trans="T", check_finite=False)
+            result[self.dim - len(self.trailing) :] = last
+        return result
 
 
 @dataclass(frozen=True)
@@ -124,7 +154,7 @@ class ResidualBasis:
 
 
 def residual_basis(
-    blocks: Sequence[Terms], samples: Array, beside: float, last: int | None = None
+    blocks: Sequence[ResidualTerms], samples: Array, beside: float, last: int | None = None
 ) -> tuple[ResidualBasis, Array]:
     """Basis of the F⁻ᵀt_j, given as blocks (n×·), from samples of their coefficients (Z×S), and U itself (n×K).
 
@@ -147,7 +177,7 @@ def residual_basis(
     reach = float(np.linalg.norm(inverse[:, None] * samples[kept], axis=0).mean())
     U, remainder = _directions(R, scale[kept], DIRECTIONS * typical / max(reach, np.finfo(float).tiny))
     norms[kept], factor = 0.0, U.T @ R
-    round_off = 1.01 * UNIT * (len(kept) + 8.0) * float(np.linalg.norm(factor * scale[kept]))
+    round_off = 1.01 * EPS * (len(kept) + 8.0) * float(np.linalg.norm(factor * scale[kept]))
     basis = ResidualBasis(kept, factor, inverse, remainder + round_off, norms)
     return basis, U if last is None else U[len(U) - last :]
 
@@ -221,3 +251,20 @@ def _random_range(R: Array, scale: Array, allowed: float) -> tuple[Array, Array,
         bases.append(Q)
         rests.append(float(np.linalg.norm(left)))
     return np.hstack(bases), np.vstack(parts), rests[-1]
+
+
+def residual_coefficients(
+    theta: Mapping[str, Array], y: Array, forces: Array | None, contact: Contact | None, alpha: Array, lam: Array
+) -> Array:
+    """Coefficients (Z,) of a residual: those of f, of A for every vector of Φ, and of Bᵀλ_N.
+
+    The last ones are θ_q α_i of all Bᵀ_q χ_i (Q R,) where B is exactly the sum of its terms. Where it is assembled on
+    the contact, and there are `forces`, they are what B₀ᵀλ_N lacks, on the contact unknowns, and α for the vectors
+    B₀ᵀχ (k+R,).
+    """
+    if forces is None:
+        of_lam = (theta["B"][:, None] * alpha).ravel()
+    else:
+        assert contact is not None  # evaluated where B is assembled on the contact
+        of_lam = np.concatenate([contact.B.T @ lam - forces @ alpha, alpha])
+    return np.concatenate([theta["f"], (-theta["A"][:, None] * y).ravel(), -of_lam])

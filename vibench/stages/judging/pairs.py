@@ -18,10 +18,10 @@ from vibench.model.errors import (
     ReferenceSolutions,
     energy_norms,
     errors,
+    high_fidelity_residuals,
     of_stiffness,
     output_errors,
 )
-from vibench.model.high_fidelity_residuals import high_fidelity_residuals
 from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
 from vibench.offline.assemblies import assemblies
 from vibench.qp.scaling import ratio

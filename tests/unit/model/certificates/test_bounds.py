@@ -20,16 +20,14 @@ from vibench.interfaces.problem import Contact, Problem, Sampler, VariationalIne
 from vibench.interfaces.strategies import Enrichment, Kind
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import affine_decomposition
+from vibench.model.bound_terms import BoundNote
 from vibench.model.certificates import base as base_module
 from vibench.model.certificates import bounds as bounds_module
 from vibench.model.certificates import contact_correction
 from vibench.model.certificates.base import CertificateBase, Guarantee, certificate_base, unsupported
-from vibench.model.certificates.bounds import NOT_COERCIVE, NOT_PREPARED, OUTSIDE, OnlineBound, OnlineCertificate
-from vibench.model.certificates.inf_sup import NO_BODY, NOT_CONSTANT, ON_BODIES, SCALED
-from vibench.model.certificates.preparation import prepare
+from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate, prepare
 from vibench.model.certificates.prepared_correction import prepare_corrections
-from vibench.model.certificates.residual import Known, residual_basis
-from vibench.model.error_bounds import NOT_IN_CONE
+from vibench.model.certificates.residual import ColumnBlock, residual_basis
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 
@@ -189,14 +187,14 @@ def test_no_error_is_above_its_bound(kind: tuple[str, bool, str], seed: int, siz
     x = x + size * rng.standard_normal(len(x))
     alpha = np.maximum(alpha + size * rng.standard_normal(len(alpha)), 0.0)
     bound, error, natural, norm = found(given, mu, x, alpha)
-    assert bound.note in {"", NOT_PREPARED}
+    assert bound.note in {"", BoundNote.NOT_PREPARED}
     scale = norm + np.linalg.norm(x) + np.linalg.norm(alpha)
     assert error <= bound.u_energy + 1e-7 * scale
     assert natural <= bound.lambda_natural + 1e-7 * scale
     assert error <= bound.relative * norm * (1.0 + 1e-9) + 1e-7 * scale
 
 
-BETA = {"moving": NO_BODY, "scaled": SCALED, "half": ON_BODIES}
+BETA = {"moving": BoundNote.NO_BODY, "scaled": BoundNote.SCALED, "half": BoundNote.ON_BODIES}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -331,7 +329,7 @@ def test_where_a_constant_body_moves_at_a_parameter_there_is_no_inf_sup_constant
     moved = Turned("constant", "half")
     reduced = replace(reduced, evaluated=replace(reduced.evaluated, contact=moved.contact(mu)))
     bound = certificate.evaluate(moved, mu, reduced, *solution)
-    assert (bound.inf_sup, bound.inf_sup_note, bound.lam) == (0.0, NOT_CONSTANT, np.inf)
+    assert (bound.inf_sup, bound.inf_sup_note, bound.lam) == (0.0, BoundNote.NOT_CONSTANT, np.inf)
     assert np.isfinite(bound.lambda_natural)
 
 
@@ -385,7 +383,7 @@ def test_where_no_prepared_correction_is_feasible_the_best_one_is_computed_and_i
         reduced = model.assemble(mu)
         solution = exact(reduced.program)
         bound, error, natural, _ = found((problem, model, few), mu, *solution)
-        assert bound == replace(without.evaluate(problem, mu, reduced, *solution), note=NOT_PREPARED)
+        assert bound == replace(without.evaluate(problem, mu, reduced, *solution), note=BoundNote.NOT_PREPARED)
         assert error <= bound.u_energy
         assert natural <= bound.lambda_natural
 
@@ -411,7 +409,7 @@ def test_small_residuals_keep_their_digits(constraint: str) -> None:
         if certificate.forces is not None:
             of_lam = force[CONTACT]
         z = np.concatenate([np.ones(1), -x, -of_lam])
-        whitened = [Known(certificate.base.X.whiten_functional(block)) for block in blocks]
+        whitened = [ColumnBlock(certificate.base.X.whiten_functional(block)) for block in blocks]
         basis, _ = residual_basis(whitened, z[:, None], 0.0)
         exact_norm = size * float(np.sqrt(away @ np.linalg.solve(A, away)))
         assert basis.norm(z) == pytest.approx(exact_norm, rel=1e-5)
@@ -476,7 +474,7 @@ def test_where_interpolation_errors_are_as_large_as_the_coercivity_there_is_no_b
     for mu in BOX.sample(40, 3):
         bound, error, *_ = found(given, mu, *exact(reduced.assemble(mu).program))
         refused += bound.guarantee is Guarantee.NONE
-        assert (bound.note == NOT_COERCIVE) == (bound.guarantee is Guarantee.NONE) == np.isinf(bound.u_energy)
+        assert (bound.note == BoundNote.NOT_COERCIVE) == (bound.guarantee is Guarantee.NONE) == np.isinf(bound.u_energy)
         assert error <= bound.u_energy
         assert bound.u_energy == np.inf or bound.coercivity > base.stiffness_error
     assert refused
@@ -488,7 +486,7 @@ def test_outside_the_box_only_exact_models_have_bounds() -> None:
     for stiffness, has_bound in (("affine", True), ("interpolated", False)):
         given = prepared(stiffness, constraint="scaled")
         bound, error, natural, _ = found(given, mu, *exact(given[1].assemble(mu).program))
-        assert (bound.note == OUTSIDE) != has_bound
+        assert (bound.note == BoundNote.OUTSIDE) != has_bound
         assert (bound.guarantee is Guarantee.CERTIFIED) == has_bound == np.isfinite(bound.u_energy)
         assert error <= bound.u_energy
         assert natural <= bound.lambda_natural
@@ -538,7 +536,7 @@ def test_what_is_not_declared_is_not_certified_however_constant_it_was_found(mem
     assert error > 10.0 * bound.u_energy
     mu = np.array([2.3, 0.4])
     outside, *_ = found(given, mu, *exact(reduced.assemble(mu).program))
-    assert outside.note == OUTSIDE
+    assert outside.note == BoundNote.OUTSIDE
 
 
 def test_interpolation_errors_are_in_the_bound() -> None:
@@ -564,7 +562,7 @@ def test_multipliers_outside_the_cone_have_no_bound() -> None:
     given = prepared("constant")
     mu, alpha = np.array([1.0, 0.0]), np.array([-10.0, 0.0, 0.0])
     bound = given[2].evaluate(given[0], mu, given[1].assemble(mu), np.zeros(4), alpha)
-    assert (bound.guarantee, bound.note, bound.u_energy) == (Guarantee.NONE, NOT_IN_CONE, np.inf)
+    assert (bound.guarantee, bound.note, bound.u_energy) == (Guarantee.NONE, BoundNote.NOT_IN_CONE, np.inf)
 
 
 def test_problems_that_cannot_be_certified_say_why() -> None:

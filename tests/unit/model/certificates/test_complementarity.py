@@ -7,8 +7,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from vibench.model.certificates import complementarity
-from vibench.model.certificates.complementarity import complementary, descent
+from vibench.model.certificates import contact_correction as complementarity
+from vibench.model.certificates.contact_correction import complementary, descent
 
 
 def by_enumeration(M: np.ndarray, fixed: np.ndarray) -> np.ndarray:

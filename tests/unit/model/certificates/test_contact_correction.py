@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numerics import exact, spd
 
 from vibench.interfaces.problem import Contact, VariationalInequality
-from vibench.model.certificates import complementarity
+from vibench.model.certificates import contact_correction as complementarity
 from vibench.model.certificates.contact_correction import (
     ContactCompliance,
     ContactCorrection,

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from numerics import exact, spd
 
 from vibench.interfaces.problem import Contact, VariationalInequality
-from vibench.model.certificates.contact_correction import ContactCompliance
-from vibench.model.certificates.defect_correction import defect_corrected_bounds
+from vibench.model.certificates.contact_correction import ContactCompliance, defect_corrected_bounds
 
 N, M = 9, 4
 CONTACT = np.arange(2, 8)

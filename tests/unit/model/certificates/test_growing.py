@@ -13,8 +13,8 @@ from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySo
 from vibench.interfaces.problem import Contact, Problem, VariationalInequality
 from vibench.interfaces.validation import ReferenceAssembly
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.model.certificates import contact_estimates
-from vibench.model.certificates.growing import GrowingModel, GrowingTrainer
+from vibench.model.certificates import greedy as contact_estimates
+from vibench.model.certificates.greedy import GreedyTrainer, IncrementalModel
 from vibench.reduction import part_in_cone
 
 PROBLEMS = {
@@ -27,7 +27,7 @@ PROBLEMS = {
 def test_bounds_hold_everywhere_and_vanish_at_the_solutions(make: Callable[[], Problem]) -> None:
     problem = make()
     solver = HighFidelitySolver(problem)
-    model = GrowingModel(problem, solver)
+    model = IncrementalModel(problem, solver)
     solved = problem.parameters.sample(4, 1)
     for mu in [*solved, solved[0]]:  # one of them twice
         vi = problem.assemble(mu).copy()
@@ -51,7 +51,7 @@ def test_bounds_hold_everywhere_and_vanish_at_the_solutions(make: Callable[[], P
 def test_the_cone_has_every_multiplier_and_grows_by_what_it_lacks(case: str) -> None:
     problem: Problem = PROBLEMS[case]()
     solver, W = HighFidelitySolver(problem), problem.W
-    model, found = GrowingModel(problem, solver), []
+    model, found = IncrementalModel(problem, solver), []
     for mu in problem.parameters.sample(5, 1):
         vi = problem.assemble(mu).copy()
         found.append(solver.solve_assembled(mu, vi))
@@ -73,7 +73,7 @@ def test_estimates_are_about_what_bounds_are(name: str, resolution: int, share: 
     """At the cost of the contact; where A is constant they are the same."""
     problem = create("problem", name, {"resolution": resolution})
     solver = HighFidelitySolver(problem)
-    model = GrowingModel(problem, solver)
+    model = IncrementalModel(problem, solver)
     for mu in problem.parameters.sample(4, 1):
         vi = problem.assemble(mu).copy()
         model.add(vi, solver.solve_assembled(mu, vi))
@@ -85,7 +85,7 @@ def test_estimates_are_bounds_where_no_stiffness_and_no_load_vary_unless_round_o
     """The cost of the mesh is paid for residuals of which the sum of squares says nothing."""
     problem = create("problem", "hertz", {"resolution": 300})
     solver = HighFidelitySolver(problem)
-    model, solved = GrowingModel(problem, solver), problem.parameters.sample(4, 1)
+    model, solved = IncrementalModel(problem, solver), problem.parameters.sample(4, 1)
     for mu in solved:
         vi = problem.assemble(mu).copy()
         model.add(vi, solver.solve_assembled(mu, vi))
@@ -124,14 +124,14 @@ class Rewriting(Problem):
 def test_a_solution_starts_from_what_a_bound_has_left_only_at_its_parameter(rewritten: bool) -> None:
     obstacle = create("problem", "obstacle", {"resolution": 160})
     problem = Rewriting(obstacle) if rewritten else obstacle
-    trainer = GrowingTrainer(problem, ReferenceAssembly(problem, problem.assemble(problem.training_set()[0])))
+    trainer = GreedyTrainer(problem, ReferenceAssembly(problem, problem.assemble(problem.training_set()[0])))
     first, *others, last = problem.parameters.sample(8, 5)
     trainer.solve(first)
     for mu in others:
         estimate, bound = trainer.estimate(mu), trainer.bound(mu)
         assert estimate == pytest.approx(bound, rel=0.3)
         trainer.solve(mu)
-    fresh = GrowingModel(problem, HighFidelitySolver(problem))
+    fresh = IncrementalModel(problem, HighFidelitySolver(problem))
     for one in trainer.solved:
         fresh.add(obstacle.assemble(one.mu), one.solution)
     bound = trainer.bound(last)
@@ -153,12 +153,12 @@ def test_what_is_kept_of_a_candidate_changes_no_estimate(monkeypatch: pytest.Mon
     monkeypatch.setattr(contact_estimates, "KEPT", kept)
     problem = create("problem", "obstacle", {"resolution": 160})
     solver, candidates = HighFidelitySolver(problem), problem.parameters.sample(6, 4)
-    growing, solved = GrowingModel(problem, solver), list[tuple[VariationalInequality, HighFidelitySolution]]()
+    growing, solved = IncrementalModel(problem, solver), list[tuple[VariationalInequality, HighFidelitySolution]]()
     for mu in problem.parameters.sample(5, 1):
         vi = problem.assemble(mu).copy()
         solved.append((vi, solver.solve(mu)))
         growing.add(*solved[-1])
-        fresh = GrowingModel(problem, solver)
+        fresh = IncrementalModel(problem, solver)
         for one in solved:
             fresh.add(*one)
         again = [growing.estimate(mu) for mu in candidates]
@@ -170,7 +170,7 @@ def test_what_is_kept_of_a_candidate_changes_no_estimate(monkeypatch: pytest.Mon
 def test_without_contact_unknowns_there_are_no_estimates() -> None:
     problem = Varying()
     first, second = problem.parameters.sample(2, 1)
-    trainer = GrowingTrainer(problem, ReferenceAssembly(problem, problem.assemble(first)))
+    trainer = GreedyTrainer(problem, ReferenceAssembly(problem, problem.assemble(first)))
     trainer.solve(first)
     assert trainer.estimate(second) is None
     assert trainer.bound(second) > 0.0
@@ -180,7 +180,7 @@ def test_what_chooses_follows_large_errors_of_the_multiplier() -> None:
     """In the norm of A⁻¹ they are eight times smaller here."""
     problem = Varying()
     solver, W = HighFidelitySolver(problem), problem.W
-    model = GrowingModel(problem, solver)
+    model = IncrementalModel(problem, solver)
     for mu in problem.parameters.sample(5, 1):
         vi = problem.assemble(mu).copy()
         model.add(vi, solver.solve_assembled(mu, vi))
@@ -198,7 +198,7 @@ def test_a_model_without_contact_has_bounds_of_u_alone() -> None:
     solver, mu = HighFidelitySolver(problem), np.array([0.5])
     vi = problem.assemble(mu)
     free = vi.__class__(vi.A, 1e-6 * vi.f, vi.B, vi.g)  # a load too small for contact
-    model = GrowingModel(problem, solver)
+    model = IncrementalModel(problem, solver)
     model.add(free, solver.solve_assembled(mu, free))
     reduced = model.solution(vi)
     assert reduced is not None
@@ -208,7 +208,7 @@ def test_a_model_without_contact_has_bounds_of_u_alone() -> None:
 
 def test_a_trainer_counts_bounds_and_seconds() -> None:
     problem = Varying()
-    trainer = GrowingTrainer(problem, ReferenceAssembly(problem, problem.assemble(np.array([0.0]))))
+    trainer = GreedyTrainer(problem, ReferenceAssembly(problem, problem.assemble(np.array([0.0]))))
     given = np.array([0.5])
     trainer.solve(given)
     given[0] = 7.0  # what is kept is a copy

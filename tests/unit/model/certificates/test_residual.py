@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from numerics import space
 
 from vibench.model.certificates import residual
-from vibench.model.certificates.residual import Known, residual_basis
+from vibench.model.certificates.residual import ColumnBlock, residual_basis
 
 X = space(40, 5)
 rng = np.random.default_rng(1)
 DECAY = np.exp(-0.25 * np.arange(60))
 BLOCKS = [rng.standard_normal((40, 50)), rng.standard_normal((40, 10)), np.zeros((40, 2))]
-WHITENED = [Known(X.whiten_functional(block)) for block in BLOCKS]
+WHITENED = [ColumnBlock(X.whiten_functional(block)) for block in BLOCKS]
 SAMPLES = np.append(DECAY, [1.0, 0.0])[:, None] * rng.standard_normal((62, 30))
 
 
@@ -43,7 +43,7 @@ def test_small_residuals_of_large_terms_keep_their_digits() -> None:
     """Two terms that cancel to 1e-9: the square root of a sum of products would see 1e-8 of noise."""
     term = rng.standard_normal((40, 1))
     blocks = [term, term * (1.0 + 1e-9)]
-    basis, _ = residual_basis([Known(X.whiten_functional(block)) for block in blocks], np.ones((2, 3)), 0.0)
+    basis, _ = residual_basis([ColumnBlock(X.whiten_functional(block)) for block in blocks], np.ones((2, 3)), 0.0)
     difference = np.array([1.0, -1.0])
     assert basis.norm(difference) == pytest.approx(1e-9 * float(np.linalg.norm(X.whiten_functional(term))), rel=1e-5)
 
@@ -84,8 +84,8 @@ def test_rows_that_few_terms_enter_are_made_fewer() -> None:
     few[:33, :4] = rng.standard_normal((33, 4))
     few[33:] = rng.standard_normal((7, 12))
     samples = rng.standard_normal((12, 20))
-    whole, U = residual_basis([Known(few)], samples, 0.0)
-    reduced, tail = residual_basis([Known(few)], samples, 0.0, last)
+    whole, U = residual_basis([ColumnBlock(few)], samples, 0.0)
+    reduced, tail = residual_basis([ColumnBlock(few)], samples, 0.0, last)
     assert tail.shape[0] == last
     functional = rng.standard_normal(last)
     for z in rng.standard_normal((5, 12)):

@@ -15,11 +15,82 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 import scipy.linalg
 
 from vibench.arrays import Array, Indices, SparseMatrix
+
+NO_ROOM = 1e-12
+"""Opposite rows are an equality where there is less room between them than this share of the terms of B u_N − g."""
+
+IMPLIED = 1e4
+"""Equalities that depend on others hold with them up to this multiple of round-off, or the problem has no solution."""
+
+REFERENCE = 1e-6
+"""Largest error bound of a high-fidelity solution, relative to it in the energy norms."""
+
+MARGIN = 4.0
+"""The first margin of s, as a multiple of the round-off in s."""
+
+IMPLAUSIBLE = 1e8
+"""Multipliers this many times those that rows alone would have are of dependent constraints, solved in round-off."""
+
+ATTEMPTS = 4
+"""Margins that are tried, each at least ten times the one before."""
+
+
+class BoundNote(StrEnum):
+    """Reason why a bound is missing, estimated or not from prepared data, and which bound of β_A is used."""
+
+    NOT_IN_CONE = "λ_N has negative coefficients"
+    ON_ABSENT_ROW = "λ_N is not zero on a row whose g is infinite"
+    NO_CORRECTION = "no w with B w ≥ s was found"
+    ESTIMATED = "α is estimated"
+    NOT_UNIQUE = "λ has no bound in W: no β_A > 0 is proved, as where rows are dependent or equalities"
+    NOT_PREPARED = "no prepared correction satisfies B w ≥ s: the best w was computed at the parameter"
+    NOT_COERCIVE = "no positive lower bound of the coercivity of A was found at this parameter"
+    OUTSIDE = "mu is outside the parameter box: interpolation errors are known inside it"
+    SCALED = "beta_A from B(mu) = theta(mu) B_0"
+    ON_BODIES = "beta_A from the bodies on which B is constant"
+    NO_BODY = "no beta_A: B is declared to be no multiple of one matrix, and constant on no body"
+    NOT_PROVED = "no beta_A: no positive lower bound of the inf-sup constant of the constant part of B is proved"
+    NOT_CONSTANT = "no beta_A: B is not at this parameter what it is at the training parameters on any body"
+
+
+class CorrectionMode(StrEnum):
+    """Which solutions are corrected: none, all, or those whose violation dominates the bound, ω > ρ."""
+
+    NONE = "none"
+    FEASIBLE = "feasible"
+    AUTO = "auto"
+
+    def applies(self, omega: float, rho: float) -> bool:
+        """Whether a solution with these ω and ρ is corrected."""
+        return self is CorrectionMode.FEASIBLE or (self is CorrectionMode.AUTO and omega > rho)
+
+
+@dataclass(frozen=True)
+class BoundTerms:
+    """The terms of (ii), and ‖r + A w‖_{A⁻¹}, that need no constants."""
+
+    rho: float
+    omega: float
+    kappa: float
+    feasible_rho: float
+
+    @property
+    def primal(self) -> float:
+        """Δ_A."""
+        return float(np.sqrt(self.rho**2 + self.omega**2 + 2.0 * self.kappa))
+
+    @property
+    def dual(self) -> float:
+        """The bound of ‖Bᵀε‖ in the norm of A⁻¹."""
+        gap = self.feasible_rho**2 + 2.0 * self.kappa  # twice the duality gap
+        return min(float(np.sqrt(gap)), self.omega + self.primal)
+
 
 DEPENDENT = 1e-12
 """Equalities are dependent where a pivot of R is below this."""

@@ -57,7 +57,7 @@ class Representer:
         return Representer(self.values + force.values, self.load + force.load, self.rest + force.rest)
 
 
-class OnContact:
+class ContactForm:
     """The constraints and the energy norm of one parameter on the c retained unknowns.
 
     Parameters
