@@ -12,8 +12,8 @@ from typing import Any
 
 from vibench.packs.manifest import Manifest
 from vibench.plugins.options import keys, places
-from vibench.results.columns import CELLS, PARAMETER, STORED, THRESHOLDS, UNITS, Column, shown_columns
-from vibench.results.costs.best import ADDED
+from vibench.results.ranking import ADDED
+from vibench.results.schema import BREAK_EVEN, CELLS, PARAMETER, STORED, UNITS, Column, shown_columns
 from vibench.study.spec import Study
 
 
@@ -62,7 +62,7 @@ def summary() -> str:
 
 def benefits() -> str:
     """The columns of the break-evens for reading."""
-    return _for_reading(THRESHOLDS)
+    return _for_reading(BREAK_EVEN)
 
 
 def best() -> str:

@@ -45,31 +45,31 @@ class Fault:
 FAULTS = (
     Fault(
         "decided-whatever-the-rounds-say",
-        "vibench/results/costs/break_even.py",
+        "vibench/results/break_even.py",
         "if np.mean(drawn[measured.meaning]) < 1.0 - tail:",
         "if np.mean(drawn[measured.meaning]) < 0.0:",
-        ("tests/unit/results/costs/test_break_even.py",),
+        ("tests/unit/results/test_break_even.py",),
     ),
     Fault(
         "rounds-drawn-apart",
-        "vibench/results/costs/paired_seconds.py",
+        "vibench/results/paired_timing.py",
         "[x.online - y.online for x, y in common]",
         "[x.online - y.online for x, y in zip(mine.values(), reversed(others.values()), strict=False)]",
-        ("tests/unit/results/costs/test_break_even.py",),
+        ("tests/unit/results/test_break_even.py",),
     ),
     Fault(
         "other-runs-left-out",
-        "vibench/results/costs/paired_seconds.py",
+        "vibench/results/paired_timing.py",
         "return None if within is None else within.of_other_runs()",
         "return within",
-        ("tests/unit/results/costs/test_paired_seconds.py",),
+        ("tests/unit/results/test_paired_timing.py",),
     ),
     Fault(
         "as-fast-whatever-the-rounds-say",
-        "vibench/results/costs/break_even.py",
+        "vibench/results/break_even.py",
         "if all(abs(end) <= margin for end in ratio.interval(tail)):",
         "if abs(ratio.mean) <= margin:",
-        ("tests/unit/results/costs/test_break_even.py",),
+        ("tests/unit/results/test_break_even.py",),
     ),
     Fault(
         "cell-after-cell",
@@ -469,7 +469,7 @@ FAULTS = (
         "vibench/qp/verification.py",
         "half = 0.5 * (first.linear + second.linear)",
         "half = 500.0 * (first.linear + second.linear)",
-        ("tests/unit/results/test_solver_agreement.py",),
+        ("tests/unit/results/test_consistency.py",),
     ),
     Fault(
         "validated-on-the-training-set",
@@ -487,10 +487,10 @@ FAULTS = (
     ),
     Fault(
         "threshold-the-other-way-round",
-        "vibench/results/costs/break_even.py",
+        "vibench/results/break_even.py",
         "Meaning.FROM if dearer > 0.0 else Meaning.UNTIL",
         "Meaning.UNTIL if dearer > 0.0 else Meaning.FROM",
-        ("tests/unit/results/costs/test_break_even.py",),
+        ("tests/unit/results/test_break_even.py",),
     ),
     Fault(
         "warm-up-counted",
@@ -508,7 +508,7 @@ FAULTS = (
     ),
     Fault(
         "rows-not-compared-with-their-digests",
-        "vibench/results/sqlite/digests.py",
+        "vibench/results/sqlite.py",
         "if written.get(key, NONE) != now.get(key, NONE)",
         "if False",
         ("tests/faults/test_damaged_files.py",),

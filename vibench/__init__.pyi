@@ -83,7 +83,7 @@ from .qp.verification import QPSolver as QPSolver
 from .reduction.nested import NestedStrategy as NestedStrategy
 from .reduction.nested import Step as Step
 from .reduction.pod import POD as POD
-from .results.costs.break_even import BreakEven as BreakEven
-from .results.costs.break_even import break_even as break_even
+from .results.break_even import BreakEven as BreakEven
+from .results.break_even import break_even as break_even
 from .study.matrix import read_study as read_study
 from .study.spec import Study as Study

@@ -16,7 +16,7 @@ from page import SECONDS, Page, made_by, origin, read, start
 
 from vibench.report.figures.looks import Looks, Series
 from vibench.report.figures.style import Sheet, scatter, styled
-from vibench.results import formats, tables
+from vibench.results import formats
 
 ROUND_OFF = 1e-10
 """An error above its bound by more than this share of the solution violates it; less is round-off."""
@@ -130,7 +130,7 @@ def uncertainty(queries: pd.DataFrame) -> pd.DataFrame:
 
 def pairs(thresholds: pd.DataFrame) -> pd.DataFrame:
     """The break-evens of formulations with `mixed`, of the problems' own training sets."""
-    return thresholds[tables.between_formulations(thresholds) & (thresholds["training"] == "own")]
+    return thresholds[formats.between_formulations(thresholds) & (thresholds["training"] == "own")]
 
 
 def break_evens(compared: pd.DataFrame) -> pd.DataFrame:

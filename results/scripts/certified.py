@@ -14,7 +14,7 @@ from page import SECONDS, Page, made_by, origin, read, start
 
 from vibench.report.figures.looks import look_of
 from vibench.report.figures.style import Sheet, scatter, styled
-from vibench.results.costs import ranking
+from vibench.results import ranking
 from vibench.study.cells import CERTIFIED, FEASIBLE, UNCORRECTED
 from vibench.study.parameter_sets import OWN
 from vibench_problems.paper.published import PROBLEMS

@@ -20,8 +20,9 @@ from vibench.errors import VibenchError
 from vibench.provenance import PROTOCOL
 from vibench.qp.status import Status
 from vibench.report.comparison.runs import ComparedRun
-from vibench.results import invariants, tables
-from vibench.results.sqlite.reading import FILE
+from vibench.results import consistency
+from vibench.results.read import read_table
+from vibench.results.sqlite import FILE
 
 FILES = ("index.html", "CITATION.cff", "citation.bib")
 OF_RUN = (FILE, "provenance.json", "requirements.txt", "index.html")
@@ -55,7 +56,7 @@ def of_run(folder: Path) -> Iterator[str]:
         return
     try:
         run = ComparedRun(folder / FILE, folder.name)
-        cells, queries = tables.read(folder / FILE, "cells"), tables.read(folder / FILE, "queries")
+        cells, queries = read_table(folder / FILE, "cells"), read_table(folder / FILE, "queries")
     except (VibenchError, OSError) as error:
         yield f"{FILE}: {error}"
         return
@@ -89,7 +90,7 @@ def of_queries(queries: pd.DataFrame, kinds: pd.Series) -> Iterator[str]:
         above = ok[~(ok[name] <= ok["accuracy"])]
         if len(above):
             yield f"{len(above)} queries are ok with a {name} above the accuracy"
-    yield from map(str, invariants.violations(queries, kinds))
+    yield from map(str, consistency.violations(queries, kinds))
 
 
 def of_provenance(path: Path, run: ComparedRun) -> Iterator[str]:

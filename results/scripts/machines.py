@@ -11,7 +11,7 @@ import pandas as pd
 from page import Page, origin, protocols, start
 
 from vibench.report.comparison.differences import agreement
-from vibench.results.costs.break_even import HIGH_FIDELITY
+from vibench.results.break_even import HIGH_FIDELITY
 
 BOTH = ["cell_a", "cell_b"]
 

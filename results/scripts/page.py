@@ -16,7 +16,8 @@ from PIL import Image, PngImagePlugin
 
 from vibench import provenance
 from vibench.report.figures.style import caption_of, first_sentence, save
-from vibench.results import formats, tables
+from vibench.results import formats
+from vibench.results.read import in_order, read_table, results_file
 
 ONE_MACHINE = "All seconds were measured on one machine."
 
@@ -176,7 +177,7 @@ def made_by(script: str, target: str, *studies: str, options: str = "") -> str:
 
 def read(run: str | Path, table: str) -> pd.DataFrame:
     """A table of a run, its rows in the order of the axes."""
-    return tables.in_order(tables.read(tables.results_file(str(run)), table))
+    return in_order(read_table(results_file(str(run)), table))
 
 
 def origin(*cells: pd.DataFrame) -> str:

@@ -11,11 +11,11 @@ from pathlib import Path
 from page import limitations, start, use_palette
 
 from vibench.report.figures.publication import draw_published
-from vibench.results import tables
+from vibench.results.read import results_file
 
 
 def main(obstacle: str, hertz: str, direct: str, target: str) -> None:
-    paths = [tables.results_file(run) for run in (obstacle, hertz, direct)]
+    paths = [results_file(run) for run in (obstacle, hertz, direct)]
     shutil.rmtree(target, ignore_errors=True)
     for file in draw_published(paths, Path(target), ("png",), note=print):
         use_palette(file)

@@ -18,9 +18,9 @@ from page import start
 
 from vibench.report.site.citation import Citation
 from vibench.report.site.publish import publish
-from vibench.results.columns import STORED, TEXT
 from vibench.results.database import ResultsDatabase
-from vibench.results.sqlite.reading import FILE
+from vibench.results.schema import STORED, TEXT
+from vibench.results.sqlite import FILE
 from vibench.study.cells import UNCORRECTED
 from vibench.study.matrix import expand, read_study
 

@@ -17,7 +17,7 @@ import pandas as pd
 from page import start
 
 from vibench.report.figures.data import Data, problems
-from vibench.results import tables
+from vibench.results.read import results_file
 from vibench_problems.paper.claims import DIMENSION, MESH, ORDER, RATIO, WIDEST, Agreement, Claim, typeset
 from vibench_problems.paper.evidence import Evidence
 from vibench_problems.paper.published import HERTZ
@@ -97,7 +97,7 @@ def variants() -> dict[str, int]:
 
 def the_problem_of(run: str) -> Data:
     """The tables of the only problem of a run."""
-    ((_, data),) = problems(tables.results_file(run))
+    ((_, data),) = problems(results_file(run))
     return data
 
 

@@ -14,8 +14,9 @@ from page import SECONDS, Page, alternative, escaped, made_by, origin, read, sta
 
 from vibench.report import figures
 from vibench.report.figures.style import caption_of, styled
-from vibench.results import tables
-from vibench.results.costs.best import CERTIFIED_BOUNDS, relative_bounds
+from vibench.results import formats
+from vibench.results.ranking import CERTIFIED_BOUNDS, relative_bounds
+from vibench.results.read import read_table, results_file
 from vibench.study.cells import CERTIFIED
 from vibench_problems.paper.evidence import SOLVER, Evidence
 from vibench_problems.paper.tables import columns
@@ -39,7 +40,7 @@ REPEATED = {"benefit": " --repeats 3"} | dict.fromkeys(PAPER, " --repeats 3")
 
 
 def main(run: str, target: str) -> None:
-    path, name, cells = tables.results_file(run), Path(target).name, read(run, "cells")
+    path, name, cells = results_file(run), Path(target).name, read(run, "cells")
     shutil.rmtree(target, ignore_errors=True)
     page = Page(
         target,
@@ -59,10 +60,10 @@ def main(run: str, target: str) -> None:
             comparison(evidence),
             f"Columns of vibench: {SOLVER}, full assembly; break-even by the paper's formula, with its 95 % interval.",
         )
-    page.section("All cells", *outcomes(cells), tables.summary(cells))
-    of_enrichments = tables.read(path, "thresholds").dropna(subset="cell_a")
+    page.section("All cells", *outcomes(cells), formats.summary(cells))
+    of_enrichments = read_table(path, "thresholds").dropna(subset="cell_a")
     if len(of_enrichments):
-        page.section("Break-even of fixed enrichments", tables.benefits(of_enrichments))
+        page.section("Break-even of fixed enrichments", formats.break_even_table(of_enrichments))
     page.section("Figures", *dict(sorted(drawn(path, page.folder))).values())
     written = {table: frame for table in TABLES if len(frame := read(run, table))}
     if (cells["assembly"] == CERTIFIED).any():
@@ -112,7 +113,7 @@ def comparison(evidence: Evidence) -> pd.DataFrame:
     rows = []
     for column in columns(evidence):
         pair, on, off = column.pair, column.on, column.off
-        break_even = tables.benefits(column.break_even.to_frame().T).iloc[0]
+        break_even = formats.break_even_table(column.break_even.to_frame().T).iloc[0]
         rows.append(
             {
                 "prescribed": ", ".join(f"{key} = {value:g}" for key, value in pair.prescribed.items()),

@@ -27,7 +27,7 @@ from vibench import InnerProduct, ParameterBox, Problem, VariationalInequality
 from vibench.arrays import Array
 from vibench.execution.run import Options, run_study
 from vibench.library.progress import ProgressDisplay
-from vibench.results.sqlite.reading import FILE
+from vibench.results.sqlite import FILE
 from vibench.storage.artefacts import CACHE_VARIABLE
 
 GRIDS = {200: (5, 4), 2_000: (20, 10), 20_000: (50, 40)}

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 import vibench
-from vibench.results.columns import TABLES
+from vibench.results.schema import TABLES
 
 OF_THE_RUN = {
     "code",

@@ -18,8 +18,8 @@ import pandas as pd
 
 from vibench.library.runs import open_run
 from vibench.report.comparison.differences import Agreement, agreement
-from vibench.results.costs.break_even import HIGH_FIDELITY, Meaning
-from vibench.results.costs.paired_seconds import PairedSeconds
+from vibench.results.break_even import HIGH_FIDELITY, Meaning
+from vibench.results.paired_timing import PairedTiming
 
 
 def main() -> None:
@@ -40,7 +40,7 @@ def main() -> None:
         f"{total.overlapping} of {total.both} pairs of intervals overlap, {total.opposite} of {total.decided} pairs of "
         "decided rows are opposite"
     )
-    timings = [PairedSeconds(run.table("timings").to_dict("records")) for run in runs.values()]
+    timings = [PairedTiming(run.table("timings").to_dict("records")) for run in runs.values()]
     for models, others in (("the high-fidelity model", False), ("other models", True)):
         print(f"gains against {models}: {spread(quiet, others=others)}")
         print(f"  standard deviation beyond their blocks: {beyond_blocks(timings, quiet[0], others=others):.1%}")
@@ -60,7 +60,7 @@ def spread(runs: list[pd.DataFrame], *, others: bool) -> str:
     )
 
 
-def beyond_blocks(runs: list[PairedSeconds], rows: pd.DataFrame, *, others: bool) -> float:
+def beyond_blocks(runs: list[PairedTiming], rows: pd.DataFrame, *, others: bool) -> float:
     """Standard deviation of the logarithm of a gain over the runs, without the variance that blocks account for."""
     excess = list[float]()
     for a, b in rows[(rows["primal_a"] == HIGH_FIDELITY) != others][["cell_a", "cell_b"]].itertuples(index=False):

@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 from browsing import chromium, complaints, look
 from many_cells import write_many
 
-from vibench.results.sqlite.reading import FILE
+from vibench.results.sqlite import FILE
 
 SIZES = {704: 32, 20_000: 1}
 """Cells, and queries of each."""

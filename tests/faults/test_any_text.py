@@ -27,10 +27,11 @@ from vibench.qp.verification import QPSolution
 from vibench.report import html
 from vibench.report.figures import dimension, problems
 from vibench.report.figures.style import styled, write_figure
-from vibench.results import formats, pictures, tables
-from vibench.results.columns import STORED, TABLES
+from vibench.results import formats, pictures
 from vibench.results.database import ResultsDatabase
-from vibench.results.sqlite.reading import FILE
+from vibench.results.read import in_order, read_table
+from vibench.results.schema import STORED, TABLES
+from vibench.results.sqlite import FILE
 from vibench.stages.query import Query, run_query
 
 ANYTHING = st.text(st.characters(), max_size=50) | st.sampled_from([LABEL, ODD, "$$", "_", "[/b]", "=1", "|", "\\", ""])
@@ -90,9 +91,9 @@ def recorded(folder: Path, text: str, count: Any) -> Path:
 
 def outputs(path: Path) -> list[str]:
     """Every table of a results file in every format, and the summary as it is shown."""
-    read = {table: tables.in_order(tables.read(path, table)) for table in TABLES}
+    read = {table: in_order(read_table(path, table)) for table in TABLES}
     found = [form(frame) for frame in read.values() for form in formats.FORMS.values()]
-    summary = tables.summary(read["cells"])
+    summary = formats.summary(read["cells"])
     with contextlib.redirect_stdout(io.StringIO()) as out:
         print_frame(summary, "summary")
         print_frame(read["disagreements"], "disagreements")
@@ -127,8 +128,8 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
 def test_any_text_and_any_count_go_through(own: set[str], text: str, count: Any) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = recorded(Path(folder), text, count)
-        assert [row["status"] for row in tables.read(path, "cells").to_dict("records")] == ["ok", "error"]
-        iterations = tables.read(path, "queries")["iterations"].iloc[0]
+        assert [row["status"] for row in read_table(path, "cells").to_dict("records")] == ["ok", "error"]
+        iterations = read_table(path, "queries")["iterations"].iloc[0]
         assert iterations == count if isinstance(count, int) and 0 <= count < 2**63 else pd.isna(iterations)
         report, picture = page(path), drawn(path)
         assert [found for found in [*outputs(path), report, picture] if not clean(found)] == []

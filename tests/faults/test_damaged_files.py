@@ -17,10 +17,10 @@ from samples import write_study
 from vibench.errors import RequestError
 from vibench.execution import run  # noqa: F401  lists the classes of all stages
 from vibench.report.comparison.compare import compare
-from vibench.results import tables
-from vibench.results.columns import STORED
 from vibench.results.database import ResultsDatabase
-from vibench.results.sqlite.reading import FILE, read_meta, read_rows, study_of
+from vibench.results.read import results_file
+from vibench.results.schema import STORED
+from vibench.results.sqlite import FILE, read_meta, read_rows, study_of
 from vibench.storage.artefacts import CACHE_VARIABLE, SUFFIX, Store
 from vibench.storage.serialisation import dumps
 
@@ -86,7 +86,7 @@ def truncations(seed: int, count: int) -> Iterator[Damage]:
 
 def everything(path: Path) -> list[Any]:
     """All that commands read of a results file."""
-    found = tables.results_file(str(path))
+    found = results_file(str(path))
     read = [[names, *rows] for names, rows in (read_rows(found, table) for table in STORED)]
     return [study_of(found, read_meta(found)), *read]
 

@@ -20,7 +20,7 @@ from forking import forked
 from running import Vibench, assert_same_numbers, rows, without_seconds
 from samples import wire_study, write_study
 
-from vibench.results.sqlite.reading import FILE
+from vibench.results.sqlite import FILE
 from vibench.storage.artefacts import CACHE_VARIABLE
 
 WIRES = [{"name": "wire", "label": f"{nodes}", "options": {"nodes": nodes}} for nodes in (20, 40)]

@@ -15,7 +15,7 @@ from forking import forked
 from running import PATIENCE, Main, Vibench, read_until, rows, run_again, started, without_seconds, workers
 from samples import ROUNDS, wire_study, write_study
 
-from vibench.results import tables
+from vibench.results import read
 
 RUN = ("run", "study.toml", "--jobs", "2", "--no-figures")
 
@@ -182,5 +182,5 @@ def test_an_interrupt_ends_any_command_with_a_line(main: Main, monkeypatch: pyte
     def interrupted(_: str) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(tables, "results_file", interrupted)
+    monkeypatch.setattr(read, "results_file", interrupted)
     assert main("show", "quick") == (130, "", "vibench: interrupted\n")

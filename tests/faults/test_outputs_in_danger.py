@@ -17,7 +17,7 @@ from samples import wire_study, write_study
 
 from vibench.library.runs import Run
 from vibench.report.site import folder
-from vibench.results.sqlite.reading import FILE
+from vibench.results.sqlite import FILE
 from vibench.testing.samples.sample_run import write_sample_run
 
 KILLS = 2

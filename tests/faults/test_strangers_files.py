@@ -22,8 +22,9 @@ from vibench.errors import NumericalError, RequestError
 from vibench.execution.run_folder import LOCK, REPORT, claimed
 from vibench.files import locked, write_atomically
 from vibench.report import figures
-from vibench.results import tables
-from vibench.results.sqlite.reading import FILE
+from vibench.results.read import read_table, results_file
+from vibench.results.show import export as write_export
+from vibench.results.sqlite import FILE
 from vibench.storage import artefacts
 from vibench.storage.artefacts import CACHE_VARIABLE, SUFFIX, Artefact, Store, usable_store
 from vibench.timing import NO_TIME
@@ -161,7 +162,7 @@ def test_links_in_place_of_tables_are_replaced_and_not_followed(run: Path, tmp_p
     folder.mkdir()
     for name in ("cells.csv", "cells.csv.part", "summary.md"):
         (folder / name).symlink_to(valuable)
-    tables.export(run / FILE, folder)
+    write_export(run / FILE, folder)
     (run / REPORT).symlink_to(valuable)
     write_report(str(run), figures=False)
     assert valuable.read_text() == "kept"
@@ -185,7 +186,7 @@ from vibench.benchmarks.files import read_benchmarks
 from vibench.errors import RequestError
 from vibench.report.figures import read_captions
 from vibench.results.database import ResultsDatabase
-from vibench.results.tables import read
+from vibench.results.read import read_table
 from vibench.study.matrix import read_study
 
 folder = Path(sys.argv[1])
@@ -199,7 +200,7 @@ def said(name, call):
     (folder / name).unlink()
 
 for end in ("-wal", "-shm", "-journal"):
-    said(f"results.sqlite{end}", lambda: read(folder / "results.sqlite", "cells"))
+    said(f"results.sqlite{end}", lambda: read_table(folder / "results.sqlite", "cells"))
     said(f"results.sqlite{end}", lambda: ResultsDatabase(folder, {}, anew=True))
 (folder / "results.sqlite").unlink()
 said("results.sqlite", lambda: ResultsDatabase(folder, {}))
@@ -229,7 +230,7 @@ def test_paths_are_names_and_nothing_else(name: str, run: Path, tmp_path: Path) 
     folder = tmp_path / name
     folder.mkdir(parents=True)
     shutil.copy(run / FILE, folder)
-    assert len(tables.read(tables.results_file(str(folder)), "cells")) == 36
+    assert len(read_table(results_file(str(folder)), "cells")) == 36
 
 
 def test_an_address_of_a_host_is_no_run() -> None:

@@ -15,9 +15,9 @@ from running import Vibench, rows
 from samples import install, wire_study, write_study
 
 from vibench.results import formats, pictures
-from vibench.results.columns import TABLES
-from vibench.results.sqlite.reading import FILE
-from vibench.results.sqlite.values import LONGEST_TEXT
+from vibench.results.database import LONGEST_TEXT
+from vibench.results.schema import TABLES
+from vibench.results.sqlite import FILE
 from vibench.text import printable
 
 PLUGINS = {

@@ -13,8 +13,8 @@ from typing import Any
 
 from running import seal
 
-from vibench.results.costs.break_even import HIGH_FIDELITY
-from vibench.results.sqlite.reading import FILE
+from vibench.results.break_even import HIGH_FIDELITY
+from vibench.results.sqlite import FILE
 
 CLONED = ("cells", "queries", "histories", "thresholds")
 """Tables whose rows are cloned; the others keep theirs, or those of cells that are there no more are removed."""

@@ -15,9 +15,8 @@ import pandas as pd
 from typer.testing import CliRunner
 
 from vibench.cli.main import app
-from vibench.results.columns import KEYS, STORED, TABLES
-from vibench.results.sqlite.digests import Digests
-from vibench.results.sqlite.reading import FILE, read_text
+from vibench.results.schema import KEYS, STORED, TABLES
+from vibench.results.sqlite import FILE, Digests, read_text
 from vibench.testing.checks import CheckResult, Verdict
 
 Vibench = Callable[..., "subprocess.CompletedProcess[str]"]

@@ -14,7 +14,7 @@ import fake_plugins
 import pandas as pd
 
 import vibench
-from vibench.results.columns import CELLS, QUERIES
+from vibench.results.schema import CELLS, QUERIES
 from vibench.stages.base import Stage
 from vibench.storage.artefacts import Artefact, Store
 

@@ -6,7 +6,7 @@ import os
 import sqlite3
 
 from vibench.results import database
-from vibench.results.sqlite.digests import Digests
+from vibench.results.sqlite import Digests
 
 
 class Unsynced(Digests):

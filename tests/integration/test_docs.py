@@ -35,7 +35,7 @@ from vibench.execution.timing_plan import TimingPlan
 from vibench.plugins import registry
 from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, SAMPLING, STUDY, PluginKind
 from vibench.plugins.registry import registered
-from vibench.results import columns, tables
+from vibench.results import formats, schema
 from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
 from vibench.study.matrix import expand, read_study
 from vibench.study.spec import Limits, Study, ToleranceTable
@@ -168,11 +168,11 @@ def test_the_plugins_of_the_pages_run_through_the_whole_benchmark(
 
 
 def test_every_column_of_every_table_has_a_unit_and_a_meaning() -> None:
-    everything = [column for of_table in columns.STORED.values() for column in of_table.values()]
-    for column in [*everything, columns.PARAMETER]:
-        assert column.unit in columns.UNITS
+    everything = [column for of_table in schema.STORED.values() for column in of_table.values()]
+    for column in [*everything, schema.PARAMETER]:
+        assert column.unit in schema.UNITS
         assert column.meaning.strip().endswith((".", "…"))
-    assert {column.unit for name, column in columns.QUERIES.items() if name.endswith("_s")} == {"s"}
+    assert {column.unit for name, column in schema.QUERIES.items() if name.endswith("_s")} == {"s"}
 
 
 @pytest.mark.parametrize("table", ["cells", "thresholds"])
@@ -189,8 +189,8 @@ def test_the_tables_for_reading_have_the_columns_that_are_described(table: str, 
             **zero,
         }
     )  # with one for all, or none, they have no columns
-    empty = several.reindex(columns=list(columns.STORED[table])).astype({"accuracy": float})
-    name, view = {"cells": ("summary", tables.summary), "thresholds": ("benefits", tables.benefits)}[table]
+    empty = several.reindex(columns=list(schema.STORED[table])).astype({"accuracy": float})
+    name, view = {"cells": ("summary", formats.summary), "thresholds": ("benefits", formats.break_even_table)}[table]
     headings = re.findall(r"^\| (?!column|---)([^|]+?) \|", reference.GENERATED[name](), re.MULTILINE)
     assert list(view(empty).columns) == headings
     assert len(headings) == len(set(headings)) > 10
@@ -206,7 +206,7 @@ def test_every_field_of_a_study_file_is_described_and_in_the_reference(reference
 
 
 def test_the_reference_has_a_line_for_every_column_and_the_pages_have_all_its_tables(reference: ModuleType) -> None:
-    for table, stored in columns.STORED.items():
+    for table, stored in schema.STORED.items():
         names = re.findall(r"^\| `([^`]+)` ", reference.GENERATED[table](), re.MULTILINE)
         assert names == [*stored, *(["mu_1, mu_2, …"] if table == "queries" else [])]
     text = "".join(page.read_text(encoding="utf-8") for page in PAGES)

@@ -8,19 +8,19 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vibench.results import tables
-from vibench.results.invariants import violations
+from vibench.results.consistency import violations
+from vibench.results.read import read_table
 
 
 @pytest.fixture(scope="module")
 def queries(quick_run: Path) -> pd.DataFrame:
-    frame = tables.read(quick_run / "results.sqlite", "queries")
-    kinds = tables.read(quick_run / "results.sqlite", "cells").set_index("cell")["enrichment_kind"]
+    frame = read_table(quick_run / "results.sqlite", "queries")
+    kinds = read_table(quick_run / "results.sqlite", "cells").set_index("cell")["enrichment_kind"]
     return frame.assign(kind=frame["cell"].map(kinds))
 
 
 def test_every_cell_of_the_quick_matrix_has_a_row(quick_run: Path) -> None:
-    cells = tables.read(quick_run / "results.sqlite", "cells")
+    cells = read_table(quick_run / "results.sqlite", "cells")
     assert len(cells) == 2 * 2 * 3 * 3
     assert set(cells["problem"]) == {"obstacle", "hertz"}
     assert set(cells["primal"]) == {"decorrelated", "online-supremizers", "offline-pga"}
@@ -37,7 +37,7 @@ def test_every_ok_query_is_as_accurate_as_the_study_asks(queries: pd.DataFrame) 
 
 
 def test_invariants_of_the_inf_sup_constants_hold_in_every_row(quick_run: Path, queries: pd.DataFrame) -> None:
-    kinds = tables.read(quick_run / "results.sqlite", "cells").set_index("cell")["enrichment_kind"]
+    kinds = read_table(quick_run / "results.sqlite", "cells").set_index("cell")["enrichment_kind"]
     assert violations(queries, kinds) == []
     for kind, prefix in (("per-parameter", "beta_full_"), ("none", "beta_plain_")):
         some = queries[queries["kind"] == kind]
@@ -46,7 +46,7 @@ def test_invariants_of_the_inf_sup_constants_hold_in_every_row(quick_run: Path, 
 
 
 def test_span_constants_vanish_exactly_below_the_rank(quick_run: Path, queries: pd.DataFrame) -> None:
-    cells = tables.read(quick_run / "results.sqlite", "cells").set_index("cell")
+    cells = read_table(quick_run / "results.sqlite", "cells").set_index("cell")
     short = cells["N"] + cells["enrichment"] < cells["rank"]
     assert short.any()
     assert not short.all()
@@ -73,10 +73,10 @@ def test_solvers_agree_on_what_they_solved(queries: pd.DataFrame) -> None:
 
 @pytest.mark.parametrize("problem", ["obstacle", "hertz"])
 def test_the_modified_cone_is_no_larger_and_better_conditioned(quick_run: Path, problem: str) -> None:
-    cells = tables.read(quick_run / "results.sqlite", "cells")
+    cells = read_table(quick_run / "results.sqlite", "cells")
     sizes = cells[cells["problem"] == problem].groupby("dual")["R"].first()
     assert sizes["mcpg"] <= sizes["cpg"]
-    histories = tables.read(quick_run / "results.sqlite", "histories")
+    histories = read_table(quick_run / "results.sqlite", "histories")
     orth = histories[(histories["quantity"] == "e_orth") & (histories["problem"] == problem)]
     common = orth.groupby("dual")["step"].max().min()
     medians = orth[(orth["step"] > 0) & (orth["step"] <= common)].groupby("dual")["value"].median()
@@ -84,7 +84,7 @@ def test_the_modified_cone_is_no_larger_and_better_conditioned(quick_run: Path, 
 
 
 def test_fixed_enrichments_keep_their_promise_on_the_training_set_of_both_problems(quick_run: Path) -> None:
-    histories = tables.read(quick_run / "results.sqlite", "histories")
+    histories = read_table(quick_run / "results.sqlite", "histories")
     keys = ["problem", "dual", "primal", "primal_tol", "step"]
     own, full = (
         histories[histories["quantity"] == quantity].set_index(keys)["value"].sort_index()

@@ -16,7 +16,7 @@ from rich.cells import cell_len
 from running import Main, Shared, refused, rows
 
 import vibench
-from vibench.results.columns import CELLS
+from vibench.results.schema import CELLS
 
 STUDY = """
 name = "mine"

@@ -19,8 +19,8 @@ from samples import ROUNDS, write_study
 from sources import SOURCES, mentions
 
 from vibench.interfaces.problem import MEMBERS
-from vibench.results.sqlite.reading import FILE
-from vibench.results.tables import read
+from vibench.results.read import read_table
+from vibench.results.sqlite import FILE
 from vibench.storage.artefacts import CACHE_VARIABLE
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "vibench-rope"
@@ -81,7 +81,7 @@ def cells(python: Python, command: str, example: Path) -> tuple[pd.DataFrame, pd
     """Cells and queries of a small study of the rope, and what the run printed."""
     done = python(command, "run", write_study(example.parent, STUDY), "--jobs", "1", "--strict", "--no-figures")
     path = example.parent / "runs" / STUDY["name"] / FILE
-    return read(path, "cells"), read(path, "queries"), done.stdout
+    return read_table(path, "cells"), read_table(path, "queries"), done.stdout
 
 
 def test_the_package_is_found_through_its_entry_points_alone(python: Python, command: str) -> None:

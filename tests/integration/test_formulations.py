@@ -12,7 +12,7 @@ from fake_plugins import Wire
 from formulations import Nearest, Program
 
 from vibench import RequestError, Run, Study, open_run, run
-from vibench.results.invariants import violations
+from vibench.results.consistency import violations
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, study_of_cell
 

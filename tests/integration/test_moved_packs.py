@@ -14,7 +14,7 @@ from running import Main, Shared, refused, rows
 from samples import toml
 
 import vibench
-from vibench.results.sqlite.reading import FILE
+from vibench.results.sqlite import FILE
 
 STUDY: dict[str, Any] = {
     "name": "cables", "validation": 2, "solvers": ["piqp"], "dual": ["mcpg"], "primal": ["decorrelated"],

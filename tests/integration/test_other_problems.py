@@ -17,8 +17,8 @@ from samples import install, write_study
 
 from vibench.model.errors import UNMEASURABLE
 from vibench.report.findings import findings
-from vibench.results.sqlite.reading import FILE
-from vibench.results.tables import read
+from vibench.results.read import read_table
+from vibench.results.sqlite import FILE
 
 REGISTERED = {"vibench.problems": {"torsion": "Torsion", "put": "Put", "block": "Block"}}
 
@@ -67,12 +67,12 @@ def run(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def cells(run: Path) -> pd.DataFrame:
-    return read(run / FILE, "cells")
+    return read_table(run / FILE, "cells")
 
 
 @pytest.fixture(scope="module")
 def queries(run: Path) -> pd.DataFrame:
-    return read(run / FILE, "queries")
+    return read_table(run / FILE, "queries")
 
 
 def test_every_cell_has_every_query_ok(cells: pd.DataFrame) -> None:

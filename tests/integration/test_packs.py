@@ -9,7 +9,7 @@ import pandas as pd
 from running import MEASURED, Vibench
 from samples import write_study
 
-from vibench.results import tables
+from vibench.results.read import read_table
 
 STUDY = {
     "name": "packed",
@@ -31,8 +31,8 @@ RESOLUTION = {"obstacle": 160, "hertz": 300}
 
 def numbers(folder: Path, table: str, problem: str) -> pd.DataFrame:
     """Rows of a problem without columns that are measured or name it, in the order of cells and queries."""
-    found = tables.read(folder / "runs" / "packed" / "results.sqlite", table)
-    cells = tables.read(folder / "runs" / "packed" / "results.sqlite", "cells").set_index("cell")
+    found = read_table(folder / "runs" / "packed" / "results.sqlite", table)
+    cells = read_table(folder / "runs" / "packed" / "results.sqlite", "cells").set_index("cell")
     if table == "solutions":
         found = found.join(cells[["problem", "dual", "primal", "assembly"]], on="cell")
     if table == "histories":

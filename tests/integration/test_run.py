@@ -17,8 +17,8 @@ from running import Vibench, assert_same_numbers, by_solver, execute, rows, run_
 from samples import wire_study, write_study
 
 import vibench.execution.run  # noqa: F401  lists the classes of all stages
-from vibench.results.columns import TABLES
-from vibench.results.sqlite.reading import FILE
+from vibench.results.schema import TABLES
+from vibench.results.sqlite import FILE
 from vibench.storage.artefacts import CACHE_VARIABLE, SUFFIX, Store, encoded
 from vibench.study.parameter_sets import CHUNKS
 
@@ -252,7 +252,7 @@ def test_only_an_edit_of_what_computes_numbers_runs_anything_again(
         "report/html.py",
         "report/figures/style.py",
         "cli/main.py",
-        "results/tables.py",
+        "results/read.py",
         "testing/sample.py",
     ):
         edit(module)

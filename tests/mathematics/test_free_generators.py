@@ -22,7 +22,7 @@ from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import kkt_residuals, verify
 from vibench.reduction.cones import orthogonality, project_on_cone
-from vibench.results.invariants import EFFECTIVITIES, violations
+from vibench.results.consistency import EFFECTIVITIES, violations
 from vibench.stability.infsup import inf_sup, multipliers
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of

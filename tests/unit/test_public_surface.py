@@ -85,7 +85,7 @@ def test_naming_the_qp_solvers_loads_no_numpy() -> None:
 
 
 def test_reading_results_loads_no_stage_and_no_solver() -> None:
-    code = "import vibench.results.tables\nassert not any(name.startswith('vibench.stages') for name in sys.modules)"
+    code = "import vibench.results.read\nassert not any(name.startswith('vibench.stages') for name in sys.modules)"
     assert loaded(code) & {"qpsolvers", "matplotlib", "skfem"} == set()
 
 

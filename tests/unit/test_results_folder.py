@@ -18,8 +18,8 @@ from PIL import Image
 from vibench.execution.recorded_cell import recorded_study
 from vibench.report import html
 from vibench.report.figures.style import Sheet, styled
-from vibench.results import tables
-from vibench.results.sqlite.reading import FILE
+from vibench.results.read import read_table
+from vibench.results.sqlite import FILE
 from vibench.study.matrix import expand
 
 ROOT = Path(__file__).parents[2]
@@ -128,7 +128,7 @@ def test_the_results_are_published_by_one_command(tmp_path: Path, monkeypatch: p
     for name in NAMES:
         own = tmp_path / "site" / "runs" / name
         assert f'href="runs/{name}/index.html"' in index
-        committed, published = pd.read_csv(RESULTS / name / "cells.csv"), tables.read(own / FILE, "cells")
+        committed, published = pd.read_csv(RESULTS / name / "cells.csv"), read_table(own / FILE, "cells")
         assert set(committed["cell"]) == set(published["cell"])
         both = committed.merge(published, on="cell")
         assert both["online_s_x"].equals(both["online_s_y"])
@@ -141,7 +141,7 @@ def test_the_results_are_published_by_one_command(tmp_path: Path, monkeypatch: p
     assert others
     published_runs = list((tmp_path / "site" / "runs").glob(f"*/{FILE}"))
     assert len(published_runs) == len(list(RESULTS.glob("*/cells.csv"))) + len(others)
-    machines = {machine for file in published_runs for machine in tables.read(file, "cells")["machine"].dropna()}
+    machines = {machine for file in published_runs for machine in read_table(file, "cells")["machine"].dropna()}
     assert machines >= {machine for file in others for machine in pd.read_csv(file)["machine"].dropna()}
 
 

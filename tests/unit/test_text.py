@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from vibench.benchmarks import files
 from vibench.errors import RequestError, in_a_line
-from vibench.results.sqlite.reading import study_of
+from vibench.results.sqlite import study_of
 from vibench.text import LONGEST, above, brief, one_line, parsed_json, printable, printable_lines, unbroken
 
 ANYTHING = st.text(st.characters())

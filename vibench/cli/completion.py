@@ -18,7 +18,7 @@ import typer
 
 from vibench.errors import VibenchError
 from vibench.plugins.kinds import CHECKED, FORMULATION, SOLVER, STUDY, PluginKind
-from vibench.results.columns import TABLES
+from vibench.results.schema import TABLES
 
 SHOWN = ("summary", "best", "benefits", *TABLES)
 """Tables that `vibench show` prints."""
@@ -191,17 +191,17 @@ def solvers(incomplete: str) -> list[str]:
 
 def runs(incomplete: str) -> list[str]:
     """Completes names of the runs under `runs/`."""
-    from vibench.results.sqlite.reading import FILE
+    from vibench.results.sqlite import FILE
 
     return _beginning(incomplete, (path.parent.name for path in Path("runs").glob(f"*/{FILE}")))
 
 
 def cells(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:
     """Completes keys of the cells of the run named before, each with a description."""
-    from vibench.results import tables
+    from vibench.results.read import read_table, results_file
 
     try:
-        table = tables.read(tables.results_file(str(context.params.get("run"))), "cells")
+        table = read_table(results_file(str(context.params.get("run"))), "cells")
     except (VibenchError, OSError, sqlite3.Error):
         return []
     rows = table[["cell", "problem", "dual", "primal", "solver"]].astype(str).itertuples(index=False)
@@ -220,14 +220,14 @@ def column_names(context: typer.Context, incomplete: str) -> list[str]:
 
 def _added(table: str) -> Iterable[str]:
     """Columns that a table for reading has beside those of the results file."""
-    from vibench.results.costs import ranking
+    from vibench.results import ranking
 
     return {"best": [ranking.BAND], "benefits": ranking.ERROR_COLUMNS}.get(table, ())
 
 
 def error_measures(incomplete: str) -> list[str]:
     """Completes measures of errors; names of outputs are those of a run."""
-    from vibench.results.costs.ranking import OF_SOLUTION, OUTPUT
+    from vibench.results.ranking import OF_SOLUTION, OUTPUT
 
     return _beginning(incomplete, [*OF_SOLUTION, OUTPUT])
 

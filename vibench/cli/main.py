@@ -142,10 +142,11 @@ def _conclude(name: str, outcome: Outcome, folder: Path, *, draw: int | None, fr
     """Export, print and draw what a run found, on as many processes as `draw` says; exit as its statuses ask for."""
     from vibench.cli import run_summary
     from vibench.qp.status import Status
-    from vibench.results import tables
+    from vibench.results import show
+    from vibench.results.read import results_file
 
-    path = tables.results_file(str(folder))
-    tables.export(path, folder / "tables", warn)
+    path = results_file(str(folder))
+    show.export(path, folder / "tables", warn)
     if outcome.damaged:
         echo(f"computed again, as their rows were damaged: {', '.join(outcome.damaged)}")
     if outcome.interrupted:

@@ -6,8 +6,8 @@ from collections.abc import Collection
 
 from vibench.errors import unknown_name
 from vibench.plugins.options import Key, keys, places
-from vibench.results.columns import STORED
-from vibench.results.costs.best import ADDED
+from vibench.results.ranking import ADDED
+from vibench.results.schema import STORED
 from vibench.study.spec import Study
 
 

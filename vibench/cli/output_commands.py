@@ -39,9 +39,9 @@ def write_report(
     from vibench import provenance
     from vibench.execution.run_folder import REPORT
     from vibench.report import html
-    from vibench.results import tables
+    from vibench.results.read import results_file
 
-    path = tables.results_file(run)
+    path = results_file(run)
     written = html.write(path, out or path.parent / REPORT, provenance.cores(), figures=figures)
     echo(f"report: {written}")
 
@@ -63,9 +63,9 @@ def draw_figures(
 ) -> None:
     """Draw the figures of runs, with captions."""
     from vibench.report.figures.style import FORMATS
-    from vibench.results import tables
+    from vibench.results.read import results_file
 
-    paths = list({tables.results_file(name).resolve(): tables.results_file(name) for name in names}.values())
+    paths = list({results_file(name).resolve(): results_file(name) for name in names}.values())
     forms = tuple(dict.fromkeys(map(str, formats or FORMATS)))
     if paper:
         draw_paper(paths, out or Path("paper-figures"), forms)
@@ -128,7 +128,7 @@ def publish_runs(
     """
     from vibench.report.site.citation import Citation
     from vibench.report.site.publish import publish
-    from vibench.results import tables
+    from vibench.results.read import results_file
 
     if not title.strip():
         raise RequestError("--title is empty; a site needs one to be cited")
@@ -141,7 +141,7 @@ def publish_runs(
             typer.confirm("Publish it?", abort=True)
 
     citation = Citation(title, tuple(author or ()), doi, url, date)
-    page = publish([tables.results_file(one) for one in run], site, citation, warn=warn, figures=figures, ask=ask)
+    page = publish([results_file(one) for one in run], site, citation, warn=warn, figures=figures, ask=ask)
     echo(f"site of {len(run)} run{'s' * (len(run) > 1)}: {page}")
 
 

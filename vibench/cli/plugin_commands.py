@@ -92,7 +92,7 @@ def check_plugin(
 
     One line per requirement of the interface, as soon as it is checked; exit code 1 if one is violated.
     """
-    from vibench.results.tables import results_file
+    from vibench.results.read import results_file
     from vibench.testing import Verdict
     from vibench.testing.processes import Examination, examine_in_process
 

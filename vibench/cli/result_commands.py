@@ -81,12 +81,13 @@ def show(
     On a terminal, columns that do not fit are left out; csv and json have the values and names of the results file.
     """
     from vibench.cli.console import print_frame, shown
-    from vibench.results import formats, tables, views
+    from vibench.results import formats, show
+    from vibench.results.read import results_file
     from vibench.results.selection import parts
     from vibench.text import new_console
 
-    path = tables.results_file(run)
-    measured = partial(views.look_up, path, table, cell=cell, error=error, largest=within, queries=queries)
+    path = results_file(run)
+    measured = partial(show.look_up, path, table, cell=cell, error=error, largest=within, queries=queries)
     view = measured(columns=parts(columns), where=where, sort=parts(sort), limit=limit)
     warn(*view.faults)
     if form == "terminal" and cell and table == "summary" and not columns and len(view.rows):
@@ -119,9 +120,10 @@ def diff_runs(
     """List changes between two runs; exit code 1 on a regression."""
     from vibench.cli import comparison
     from vibench.report.comparison.compare import compare
-    from vibench.results import formats, tables
+    from vibench.results import formats
+    from vibench.results.read import results_file
 
-    compared = compare([tables.results_file(a), tables.results_file(b)], limit)
+    compared = compare([results_file(a), results_file(b)], limit)
     if form == "terminal":
         comparison.print_changes(compared, limit)
     else:
@@ -151,9 +153,10 @@ def compare_runs(
     """
     from vibench.cli import comparison
     from vibench.report.comparison.compare import compare
-    from vibench.results import formats, tables
+    from vibench.results import formats
+    from vibench.results.read import results_file, whole_numbers
 
-    compared = compare([tables.results_file(one) for one in run], limit)
+    compared = compare([results_file(one) for one in run], limit)
     if column:
         title, frame = f"{column} of the cells", compared.values(column)
     elif table is None and form == "terminal":
@@ -164,7 +167,7 @@ def compare_runs(
     if form == "terminal":
         comparison.print_table(compared, frame, title)
     else:
-        sys.stdout.write(formats.FORMS[form](tables.whole_numbers(frame)))
+        sys.stdout.write(formats.FORMS[form](whole_numbers(frame)))
 
 
 def replay_query(

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 from vibench.cli.console import echo, print_frame, run_argument
 from vibench.library.progress import REASONS, kind_of_failure
 from vibench.qp.status import Status
-from vibench.results import formats, invariants, tables, views
-from vibench.results.solver_agreement import sentence
+from vibench.results import consistency, formats, show
+from vibench.results.consistency import sentence
+from vibench.results.read import read_in_parts, read_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,8 +24,8 @@ Rows = Sequence[Mapping[str, Any]]
 
 def print_summary(study: str, path: Path, rows: Rows) -> None:
     """Print the summary of a run, why cells are not ok, and violated invariants."""
-    cells = tables.read(path, "cells")
-    table = views.look_up(path, "summary" if len(cells) <= WHOLE else "best")
+    cells = read_table(path, "cells")
+    table = show.look_up(path, "summary" if len(cells) <= WHOLE else "best")
     if len(table.rows):
         title = study if len(cells) <= WHOLE else f"{study}, the fastest query at every error reached"
         print_frame(table.readable, title, table.priority, axes=table.axes)
@@ -40,17 +41,17 @@ def print_summary(study: str, path: Path, rows: Rows) -> None:
         echo(f"invariant: {len(violations) - REASONS} more like these")
     if queries and not violations:
         echo(f"invariants of the constants and the error bounds hold in all {queries} queries")
-    if agreement := sentence(tables.read(path, "disagreements"), cells["solver"].nunique()):
+    if agreement := sentence(read_table(path, "disagreements"), cells["solver"].nunique()):
         echo(agreement)
 
 
-def _judged_queries(path: Path, cells: pd.DataFrame) -> tuple[int, list[invariants.Violation]]:
+def _judged_queries(path: Path, cells: pd.DataFrame) -> tuple[int, list[consistency.Violation]]:
     """Number of queries, and the invariants that they violate; queries may be more than memory holds."""
-    kinds, count, violations = cells.set_index("cell")["enrichment_kind"], 0, list[invariants.Violation]()
-    for part in tables.read_in_parts(path, "queries"):
+    kinds, count, violations = cells.set_index("cell")["enrichment_kind"], 0, list[consistency.Violation]()
+    for part in read_in_parts(path, "queries"):
         count += len(part)
-        violations += invariants.violations(part, kinds)
-    return count, invariants.added_up(violations)
+        violations += consistency.violations(part, kinds)
+    return count, consistency.added_up(violations)
 
 
 def failures(rows: Rows, run: str) -> Iterator[str]:

@@ -22,10 +22,9 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.offline.formulated import Formulated
 from vibench.offline.models import AnyReducedModel
-from vibench.results import tables
+from vibench.results.read import read_table, results_file
 from vibench.results.selection import key_of
-from vibench.results.sqlite.reading import read_meta, read_rows, study_of
-from vibench.results.tables import results_file
+from vibench.results.sqlite import read_meta, read_rows, study_of
 from vibench.stages.assembly import assembly_stage
 from vibench.stages.base import Done, Stage
 from vibench.stages.cell_queries import CellQueries, cell_queries
@@ -164,7 +163,7 @@ KEY = re.compile(r"[0-9a-f]{16}")
 def _rows(run: str) -> tuple[Path, list[dict[str, Any]]]:
     """Results file of a run, and its cells; refuses keys that could name a file elsewhere."""
     path = results_file(run)
-    rows = [{str(name): value for name, value in row.items()} for row in tables.read(path, "cells").to_dict("records")]
+    rows = [{str(name): value for name, value in row.items()} for row in read_table(path, "cells").to_dict("records")]
     for row in rows:
         if not KEY.fullmatch(str(row["cell"])):
             raise RequestError(f"'{path}' has a cell named {str(row['cell'])[:60]!a}, expected 16 hexadecimal digits")

@@ -10,8 +10,8 @@ from typing import Any
 
 from vibench import provenance
 from vibench.plugins.plugin import Plugin
-from vibench.results.columns import KEYS
 from vibench.results.database import ResultsDatabase
+from vibench.results.schema import KEYS
 from vibench.rounds.timed_seconds import TimedRound, seconds_of_cell, seconds_of_queries
 from vibench.stages.base import Row, Stage, value_of
 from vibench.stages.judging.cell_goal import CellRows

@@ -25,9 +25,9 @@ from vibench.plugins.registry import FACTORISATION, find, registered
 from vibench.provenance import solver_distribution
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
-from vibench.results.costs.break_even import break_even_rows
+from vibench.results.break_even import break_even_rows
+from vibench.results.consistency import disagreement_rows
 from vibench.results.database import ResultsDatabase
-from vibench.results.solver_agreement import disagreement_rows
 from vibench.rounds.timing_rounds import SHARE, TimingRounds
 from vibench.stages.base import Done, Failed, Stage, Unstored
 from vibench.stages.cell_queries import cell_queries

@@ -12,7 +12,8 @@ from vibench.execution.jobs import OUT_OF_MEMORY
 from vibench.files import locked
 from vibench.qp.status import Status
 from vibench.results.database import ResultsDatabase
-from vibench.results.sqlite.reading import (
+from vibench.results.show import EXPORTED
+from vibench.results.sqlite import (
     DAMAGED,
     FILE,
     WRITE_AHEAD_LOG,
@@ -21,7 +22,6 @@ from vibench.results.sqlite.reading import (
     set_aside,
     study_of,
 )
-from vibench.results.tables import EXPORTED
 from vibench.study.spec import Limits
 
 LOCK = ".lock"

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from vibench.execution.result_writer import ResultWriter
-from vibench.results.costs.break_even import FEWEST_ROUNDS, Comparison, Meaning, compared
-from vibench.results.costs.paired_seconds import FEWEST_BLOCKS, PairedSeconds
+from vibench.results.break_even import FEWEST_ROUNDS, Comparison, Meaning, compared
+from vibench.results.paired_timing import FEWEST_BLOCKS, PairedTiming
 from vibench.rounds.timed_seconds import TimedCell, TimedRound
 from vibench.rounds.timing_rounds import SHARE, TimingRounds, block_rows
 from vibench.stages.base import Failed, Row, Stage
@@ -62,7 +62,7 @@ class TimingPlan:
     rounds: int
     writer: ResultWriter
     fewest: int = 0
-    paired: PairedSeconds = field(default_factory=PairedSeconds)
+    paired: PairedTiming = field(default_factory=PairedTiming)
     """All that was measured so far: the scatter of a cell's few blocks is judged together with that of others."""
     _groups: dict[tuple[object, ...], list[Cell]] = field(default_factory=dict)
     _open: dict[tuple[object, ...], set[Cell]] = field(default_factory=dict)

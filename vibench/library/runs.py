@@ -21,11 +21,11 @@ from vibench.files import writing
 from vibench.model.bound_terms import CorrectionMode
 from vibench.offline.formulated import Formulated
 from vibench.offline.models import Model
-from vibench.results import tables, views
-from vibench.results.columns import TABLES
-from vibench.results.costs import ranking
+from vibench.results import formats, ranking, show
 from vibench.results.plugin_columns import Extended
-from vibench.results.sqlite.reading import read_meta, study_of
+from vibench.results.read import cells_with_errors, extended, in_order, results_file
+from vibench.results.schema import TABLES
+from vibench.results.sqlite import read_meta, study_of
 from vibench.study.cells import NOT_MOVED
 from vibench.study.spec import Study
 
@@ -72,14 +72,14 @@ class Run:
         """
         if name not in TABLES:
             raise unknown_name("table", name, TABLES)
-        return tables.in_order(self._extended(name).frame)
+        return in_order(self._extended(name).frame)
 
     def _extended(self, name: str) -> Extended:
         """A table with the columns of plugins; what cannot be used is a warning."""
-        extended = tables.extended(self.path, name)
-        for line in extended.faults:
+        table = extended(self.path, name)
+        for line in table.faults:
             warnings.warn(line, stacklevel=4)
-        return extended
+        return table
 
     @property
     def cells(self) -> pd.DataFrame:
@@ -118,7 +118,7 @@ class Run:
         RequestError
             If there is no such measure, or the largest error is not positive.
         """
-        rows = ranking.with_errors(self.thresholds, *tables.measured(self.path, error))
+        rows = ranking.with_errors(self.thresholds, *cells_with_errors(self.path, error))
         return rows if within is None else ranking.within(rows, within).reset_index(drop=True)
 
     @requested
@@ -144,13 +144,13 @@ class Run:
             If a number is not positive, there is an error without a number of queries, or no such measure.
         """
         of_solution = "" if measure == ranking.SOLUTION else measure
-        return views.look_up(self.path, "best", error=of_solution, largest=error, queries=queries).rows
+        return show.look_up(self.path, "best", error=of_solution, largest=error, queries=queries).rows
 
     @property
     def summary(self) -> pd.DataFrame:
         """The table that `vibench show` prints."""
         extended = self._extended("cells")
-        return tables.summary(extended.frame, extended.columns)
+        return formats.summary(extended.frame, extended.columns)
 
     @property
     def findings(self) -> dict[str, list[str]]:
@@ -184,7 +184,7 @@ class Run:
         """Write every table as CSV, and the summary as Markdown; into `tables` beside the results file by default."""
         target = self.path.parent / "tables" if folder is None else Path(folder)
         with writing(target):
-            return tables.export(self.path, target, partial(warnings.warn, stacklevel=4))
+            return show.export(self.path, target, partial(warnings.warn, stacklevel=4))
 
     @requested
     def write_figures(
@@ -268,7 +268,7 @@ def open_run(path: Path | str, *, at: Mapping[str, str] = NOT_MOVED) -> Run:
     RequestError
         If there is no results file, or it has another schema.
     """
-    return Run(tables.results_file(str(path)), {name: str(Path(place).absolute()) for name, place in at.items()})
+    return Run(results_file(str(path)), {name: str(Path(place).absolute()) for name, place in at.items()})
 
 
 @requested

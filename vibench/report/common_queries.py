@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import pandas as pd
 
 from vibench.qp.status import Status
-from vibench.results.columns import KEYS
+from vibench.results.schema import KEYS
 from vibench.study.cells import COMPILED
 
 FEWEST = 0.5

@@ -27,10 +27,10 @@ from vibench.report.figures.data import (
     problems,
     whole,
 )
-from vibench.results import formats, invariants, tables
-from vibench.results.columns import KEYS
-from vibench.results.costs.paired_seconds import PairedSeconds
-from vibench.results.costs.ranking import (
+from vibench.results import consistency, formats
+from vibench.results.consistency import sentence
+from vibench.results.paired_timing import PairedTiming
+from vibench.results.ranking import (
     LARGEST_BAND,
     LARGEST_SHARE,
     Criterion,
@@ -39,7 +39,8 @@ from vibench.results.costs.ranking import (
     leaderboard,
     too_loose,
 )
-from vibench.results.solver_agreement import sentence
+from vibench.results.read import read_table
+from vibench.results.schema import KEYS
 from vibench.stability.infsup import VANISHES
 from vibench.study.cells import FEASIBLE, UNCORRECTED
 
@@ -70,7 +71,7 @@ def findings(path: Path) -> dict[str, list[str]]:
     """Sentences on completeness, stability, errors, costs and solvers by subject, "" for the whole run."""
     by_subject = defaultdict[str, list[str]](list)
     # as recorded: no finding is on a column of a plugin
-    read = {name: tables.read(path, name) for name in dict.fromkeys((*READ, *TABLES))}
+    read = {name: read_table(path, name) for name in dict.fromkeys((*READ, *TABLES))}
     for one in all_findings(read, problems(path, read)):
         by_subject[one.subject].append(one.text)
     return dict(by_subject)
@@ -85,7 +86,7 @@ def all_findings(read: Mapping[str, pd.DataFrame], by_problem: Iterable[tuple[st
 
     They are made from the tables `READ` of the run, and from what `problems` gives: names and data of its problems.
     """
-    paired = PairedSeconds(read["timings"].to_dict("records"))
+    paired = PairedTiming(read["timings"].to_dict("records"))
     for weight, text in _whole_run(read):
         yield Finding("", text, weight)
     for name, data in by_problem:
@@ -128,7 +129,7 @@ def _whole_run(read: Mapping[str, pd.DataFrame]) -> Iterator[tuple[Weight, str]]
         f"{_number(len(cells), 'cell')}, {ok} with every query ok; {accurate} of {count} queries meet the prescribed "
         "accuracy in their recomputed KKT residuals.",
     )
-    violated = invariants.violations(queries, cells.set_index("cell")["enrichment_kind"]) if len(queries) else []
+    violated = consistency.violations(queries, cells.set_index("cell")["enrichment_kind"]) if len(queries) else []
     if violated:
         yield (
             Weight.ALARM,
@@ -182,7 +183,7 @@ def _are(items: pd.DataFrame | list[Any]) -> str:
     return "is" if len(items) == 1 else "are"
 
 
-def _answer(data: Data, paired: PairedSeconds) -> Iterator[str]:
+def _answer(data: Data, paired: PairedTiming) -> Iterator[str]:
     """The fastest query of a problem in the widest and in the narrowest band of the leaderboard."""
     for standings in leaderboard(data.cells, paired):
         if not standings.bands:

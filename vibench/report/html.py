@@ -25,14 +25,14 @@ from vibench.report.figures.data import TABLES, Data, Extent, label_of, problems
 from vibench.report.page import plots
 from vibench.report.page.grids import TableGrid, grid_of, grid_of_cells, grid_of_thresholds, script_safe, to_json
 from vibench.report.page.images import image_of
-from vibench.results import pictures, tables
-from vibench.results.costs import best
-from vibench.results.costs.break_even import MARGIN
-from vibench.results.costs.paired_seconds import PairedSeconds
-from vibench.results.costs.ranking import LARGEST_BAND, Criterion, Winner, leaderboard
+from vibench.results import formats, pictures, ranking
+from vibench.results.break_even import MARGIN
+from vibench.results.paired_timing import PairedTiming
 from vibench.results.plugin_columns import Extended, faults_of
+from vibench.results.ranking import LARGEST_BAND, Criterion, Winner, leaderboard
+from vibench.results.read import extended_tables, in_order
 from vibench.results.selection import short_keys
-from vibench.results.sqlite.reading import read_meta, study_of
+from vibench.results.sqlite import read_meta, study_of
 from vibench.stability.infsup import VANISHES
 from vibench.text import printable
 
@@ -88,9 +88,9 @@ def page(path: Path, jobs: int = 1, *, figures: bool = True) -> str:
 
 
 def _page(path: Path, pool: ProcessPoolExecutor | None, *, figures: bool) -> str:
-    study, extended = study_of(path, read_meta(path)), tables.extended_tables(path, READ)
+    study, extended = study_of(path, read_meta(path)), extended_tables(path, READ)
     faults, read = faults_of(extended.values()), {name: one.frame for name, one in extended.items()}
-    cells, data_of = tables.in_order(read["cells"]), dict(problems(path, read))
+    cells, data_of = in_order(read["cells"]), dict(problems(path, read))
     del extended["histories"], read["histories"]  # of a large study millions of rows, which `data_of` has in order
     grids = list(_grids({**extended, "cells": extended["cells"].of(cells)}))
     everything = list(findings.all_findings(read, data_of.items()))
@@ -99,8 +99,8 @@ def _page(path: Path, pool: ProcessPoolExecutor | None, *, figures: bool) -> str
     key_length = short_keys(cells["cell"])
     rows = {str(cell): k for k, cell in enumerate(cells["cell"])}
     live = [plot for name, data in data_of.items() for plot in plots.plots(name, data, rows)]
-    paired = PairedSeconds(read["timings"].to_dict("records"))
-    certified = best.certified_errors(read["queries"])
+    paired = PairedTiming(read["timings"].to_dict("records"))
+    certified = ranking.certified_errors(read["queries"])
     first_plots = [p for name, data in data_of.items() for p in plots.overview(name, data, rows, paired, certified)]
     tasks = [task for name, data in data_of.items() for task in tasks_of(name, data)] if figures else []
     rendered = render(tasks, image_of, pool)
@@ -206,7 +206,7 @@ def _grids(read: Mapping[str, Extended]) -> Iterator[TableGrid]:
         grid_of_cells(read["cells"], ERRORS),
     ]
     model = thresholds.frame["cell_a"].isna()
-    formulations = tables.between_formulations(thresholds.frame)
+    formulations = formats.between_formulations(thresholds.frame)
     caption = (
         "When b is cheaper than a, offline and online together, by the number of queries, with its 95 % interval; "
         f"as fast where the seconds of queries differ by less than a factor of {MARGIN:g}; undecided where the rounds "
@@ -220,7 +220,7 @@ def _grids(read: Mapping[str, Extended]) -> Iterator[TableGrid]:
         if len(rows):
             grids.append(grid_of_thresholds(name, title, caption, thresholds.of(rows), cells))
     caption = "Any two solvers on one reduced model: relative differences of u in V, and the differences allowed."
-    disagreements = tables.in_order(read["disagreements"].frame)
+    disagreements = in_order(read["disagreements"].frame)
     disagreements = disagreements[["solver_a", *disagreements.columns.drop(["solver_a", "problem_options"])]]
     axes = ["problem", "dual", "primal", "primal_tol", "accuracy", "assembly", "solver_a", "solver_b"]
     grids.append(grid_of("disagreements", "Agreement of the solvers", caption, disagreements, axes, keys))

@@ -26,8 +26,8 @@ from vibench.plugins.registry import registered
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, verify
+from vibench.results.consistency import vectors
 from vibench.results.formats import to_csv
-from vibench.results.solver_agreement import vectors
 from vibench.study.cells import COMPILED, NOT_MOVED
 
 CHECKER = "check.py"

@@ -9,12 +9,17 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any
 
 import pandas as pd
 
 from vibench.interfaces.formulations import MIXED
-from vibench.study.cells import NO_SUCH_AXIS
+from vibench.qp.status import Status
+from vibench.results.break_even import Meaning
+from vibench.results.read import in_order
+from vibench.results.schema import BREAK_EVEN, CELLS, INTEGER, Column, shown_columns
+from vibench.study.cells import NO_SUCH_AXIS, UNCORRECTED
 from vibench.text import printable_lines, unbroken
 
 
@@ -171,3 +176,83 @@ def decimal_interval(low: float, high: float) -> str:
 
 FORMS = {"markdown": to_markdown, "csv": to_csv, "latex": to_latex, "json": to_json}
 """Formats in which a table is printed when the output is not a terminal."""
+
+
+def summary(cells: pd.DataFrame, plugins: Mapping[str, Column] = MappingProxyType({})) -> pd.DataFrame:
+    """The summary of a run: one row per cell, the columns with a heading in `CELLS`, and those of plugins with one."""
+    return _for_reading(in_order(cells), {**CELLS, **plugins})
+
+
+def break_even_table(
+    break_even_rows: pd.DataFrame, plugins: Mapping[str, Column] = MappingProxyType({})
+) -> pd.DataFrame:
+    """The break-even table: the number of queries from which, or until which, b is cheaper than a."""
+    return _for_reading(in_order(break_even_rows), {**BREAK_EVEN, **plugins})
+
+
+def between_formulations(break_even_rows: pd.DataFrame) -> pd.Series:
+    """Which break-evens are those of a formulation with another one, the high-fidelity model apart."""
+    return break_even_rows["cell_a"].notna() & (break_even_rows["formulation_a"] != break_even_rows["formulation_b"])
+
+
+def _for_reading(frame: pd.DataFrame, table: Mapping[str, Column]) -> pd.DataFrame:
+    """The columns that have a heading, under it; some only where they say something."""
+    return under_headings(frame, [name for name in shown_columns(table) if says_something(frame, name)], table)
+
+
+USUAL = {
+    "correction": UNCORRECTED, "certificate": "none",
+    **dict.fromkeys(("formulation", "formulation_a", "formulation_b"), MIXED),
+}  # fmt: skip
+"""Values of columns that say nothing where all cells have them."""
+
+
+def says_something(frame: pd.DataFrame, name: str) -> bool:
+    """Whether to show a column unasked: accuracy and training sets if they vary, corrections and zeros if any."""
+    if name == "accuracy":
+        return bool(frame[name].nunique() > 1)
+    if name in USUAL:
+        return bool((~frame[name].dropna().isin([USUAL[name], ""])).any())
+    if name in ("training", "snapshots"):
+        return bool(frame["training"].nunique() > 1)
+    if name == "rounds_missing":
+        return bool((frame["meaning"] == Meaning.UNDECIDED).any())
+    if name == "status":
+        return bool((frame[name] != Status.OK).any())
+    zero = re.fullmatch(r"queries_zero_(u|lambda)|error_(u|lambda)_zero_max", name)
+    return zero is None or bool((frame[f"queries_zero_{zero[1] or zero[2]}"] > 0).any())
+
+
+def under_headings(frame: pd.DataFrame, names: Sequence[str], table: Mapping[str, Column]) -> pd.DataFrame:
+    """Columns of a table under their headings, in the form and unit that these name; others as they are."""
+    headed = {name: column for name, column in table.items() if column.heading}
+    shown = {
+        headed[name].heading if name in headed else name: _shown(frame, name, headed[name])
+        if name in headed
+        else frame[name]
+        for name in names
+    }
+    return pd.DataFrame(shown, index=frame.index)
+
+
+INTERVALS: Mapping[str, tuple[str, Callable[..., str]]] = {
+    "threshold_high": ("threshold_low", interval), "total_high_s": ("total_low_s", decimal_interval),
+}  # fmt: skip
+"""Columns that are shown as the upper end of an interval: its lower end, and how it is written."""
+
+
+def _shown(frame: pd.DataFrame, name: str, column: Column) -> pd.Series | list[str]:
+    """One column under its heading; some combine several columns of the results file."""
+    if name in ("pod_tol", "dual_tol"):
+        axis = name.removesuffix("_tol")
+        return [asked(row, axis) for row in frame[[name, f"{axis}_size"]].to_dict("records")]
+    if name == "queries_ok":
+        return [f"{fine:.0f}/{count:.0f}" for fine, count in zip(frame[name], frame["queries"], strict=True)]
+    if name == "benefit_threshold":
+        return [break_even(*row) for row in zip(frame["meaning"], frame[name], strict=True)]
+    if name in INTERVALS:
+        low, shown = INTERVALS[name]
+        return [shown(*ends) for ends in zip(frame[low], frame[name], strict=True)]
+    if column.kind == INTEGER:
+        return frame[name].astype("Int64")
+    return 1e3 * frame[name] if column.unit == "s" and column.heading.endswith("[ms]") else frame[name]

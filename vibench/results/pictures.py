@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from vibench.interfaces.pictures import Picture
-from vibench.results.sqlite.reading import read_rows
+from vibench.results.sqlite import read_rows
 from vibench.text import printable
 
 ARRAYS = tuple(field.name for field in fields(Picture) if field.type in {"Array", "Indices"})

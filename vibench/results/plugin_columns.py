@@ -19,9 +19,9 @@ from vibench.errors import RequestError, VibenchError, in_a_line
 from vibench.interfaces.figures import EXTENSIBLE, DerivedColumn, FigurePlugin
 from vibench.plugins.kinds import FIGURE
 from vibench.plugins.registry import find, registered
-from vibench.results.columns import INTEGER, REAL, STORED, TEXT, THRESHOLDS, Column
-from vibench.results.costs import ranking
-from vibench.results.sqlite.values import stored
+from vibench.results import ranking
+from vibench.results.database import stored
+from vibench.results.schema import BREAK_EVEN, INTEGER, REAL, STORED, TEXT, Column
 from vibench.text import brief
 
 TYPES: Mapping[type, str] = {float: REAL, int: INTEGER, str: TEXT}
@@ -29,7 +29,7 @@ TYPES: Mapping[type, str] = {float: REAL, int: INTEGER, str: TEXT}
 AFTER = 100
 """Places of columns of plugins in a table for reading: after all others."""
 
-_SHOWN = {**ranking.HEADINGS, **THRESHOLDS, **ranking.ERROR_COLUMNS}
+_SHOWN = {**ranking.HEADINGS, **BREAK_EVEN, **ranking.ERROR_COLUMNS}
 
 RESERVED = {"pair", *_SHOWN, *(name.lower() for table in STORED.values() for name in table)}
 """Names of columns of results files, for which SQLite knows no case, and of those that figures and summaries add."""

@@ -14,10 +14,9 @@ import pandas as pd
 
 from vibench.arrays import Array
 from vibench.errors import RequestError, unknown_name
-from vibench.results.columns import PARAMETER, STORED
 from vibench.results.plugin_columns import Extended
-from vibench.results.sqlite.digests import of_cells
-from vibench.results.sqlite.reading import open_read_only
+from vibench.results.schema import PARAMETER, STORED
+from vibench.results.sqlite import of_cells, open_read_only
 from vibench.text import printable
 
 LONGEST = 1000

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vibench.results.costs.break_even import NORMAL_95, SCATTER
+from vibench.results.break_even import NORMAL_95, SCATTER
 from vibench.stages.base import Result, Row, Stage
 from vibench.stages.judging.cell_goal import CellGoal
 from vibench.storage.artefacts import Store

@@ -9,7 +9,7 @@ from statistics import fmean, median
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.results.costs.paired_seconds import blocks_of, mean_seconds
+from vibench.results.paired_timing import blocks_of, mean_seconds
 from vibench.stages.base import Row
 from vibench.timing import DISTURBED, Seconds
 

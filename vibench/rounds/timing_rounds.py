@@ -17,7 +17,7 @@ from vibench.offline.assemblies import Assemblies
 from vibench.offline.correction import corrected_in_full
 from vibench.offline.models import AnyReducedModel
 from vibench.provenance import machine
-from vibench.results.costs.paired_seconds import beside, paces
+from vibench.results.paired_timing import beside, paces
 from vibench.rounds.marginal_solutions import (
     ASSEMBLY_SEED,
     MarginalSolution,

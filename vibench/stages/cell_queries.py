@@ -15,7 +15,7 @@ from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.offline.correction import Corrector
 from vibench.plugins.plugin import Plugin
 from vibench.qp.exact import ExactSolution
-from vibench.results.solver_agreement import vectors
+from vibench.results.consistency import vectors
 from vibench.stability.infsup import share
 from vibench.stages.assembly import AssemblyStage, ExactSolutions, assembly_stage
 from vibench.stages.base import Row, Stage, Watch, value_of

@@ -26,7 +26,7 @@ from vibench.qp.scaling import ratio
 from vibench.qp.solve import solve_qp, takes_start
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, slack, verify
-from vibench.results.solver_agreement import solution_row
+from vibench.results.consistency import solution_row
 from vibench.stability.coercivity import Stability
 from vibench.stages.assembly import AssemblyStage, ReducedPrograms
 from vibench.stages.base import Row, Watch, value_of

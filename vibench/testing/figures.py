@@ -17,8 +17,8 @@ from vibench.interfaces.figures import EXTENSIBLE, DerivedColumn, FigurePlugin
 from vibench.report.figures.data import Data, problems
 from vibench.report.figures.plugins import draw_guarded, named
 from vibench.report.figures.style import caption_of, styled
-from vibench.results import tables
 from vibench.results.plugin_columns import Copies, column_values, declared, name_faults
+from vibench.results.read import read_table, results_file
 from vibench.testing.case import Examined
 from vibench.testing.checks import Check, Conformance, Doubt, Note
 from vibench.testing.samples.sample_run import write_sample_run
@@ -55,7 +55,7 @@ class FigureCase(Examined[FigurePlugin]):
     @cached_property
     def path(self) -> Path:
         """The results file: of the run that is given, or of the made-up one."""
-        return write_sample_run(self.folder / "run") if self.run is None else tables.results_file(str(self.run))
+        return write_sample_run(self.folder / "run") if self.run is None else results_file(str(self.run))
 
     @cached_property
     def recorded(self) -> Copies:
@@ -159,7 +159,7 @@ class FigureCase(Examined[FigurePlugin]):
 
 def _read(path: Path) -> Copies:
     """The tables of a results file that columns are made from."""
-    recorded = Copies(partial(tables.read, path))
+    recorded = Copies(partial(read_table, path))
     for table in EXTENSIBLE:
         recorded.of(table)
     return recorded

@@ -14,7 +14,7 @@ from running import Changed
 
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.report.figures.data import Data, problems
-from vibench.results import tables
+from vibench.results.read import read_table
 from vibench_problems.hertz import Hertz
 from vibench_problems.line_contact import theory
 from vibench_problems.obstacle import RADIUS, Obstacle
@@ -107,7 +107,7 @@ def test_projection_errors_stand_beside_the_published_sizes(quick_run: Path) -> 
     crosses = "paper: size for a tolerance"
     np.testing.assert_array_equal(line_called(left, crosses), [(19, 1e-3), (51, 1e-4), (89, 1e-6)])
     np.testing.assert_array_equal(line_called(right, crosses), [(50, 1e-2), (70, 1e-3)])
-    cells = tables.read(path, "cells")
+    cells = read_table(path, "cells")
     mine = cells[(cells["problem"] == "obstacle") & (cells["dual"] == "mcpg")].iloc[0]
     assert f"N for δ_POD = 0.001: {mine['N']}" in figure.compared
     assert f"R for δ_mCPG = 0.01: {mine['R']}" in figure.compared
@@ -165,7 +165,7 @@ def test_figures_and_the_page_of_claims_have_the_same_verdicts(problem: str, cha
 def test_constants_of_the_third_pair_are_over_the_only_parameter(changed: Changed) -> None:
     path = changed(*HERTZ)
     figure = twins(path, "hertz")["figure-13"]()
-    queries = tables.read(path, "queries")
+    queries = read_table(path, "queries")
     mine = queries[(queries["problem"] == "hertz") & (queries["dual"] == "mcpg") & (queries["primal_tol"] == 0.4)]
     mine = mine[mine["solver"] == "piqp"].sort_values("mu_1")
     expected = mine[["mu_1", "beta_plain_span"]].to_numpy(float)
@@ -178,7 +178,7 @@ def test_the_greedy_algorithm_is_that_of_the_histories(changed: Changed) -> None
     path = changed(*HERTZ)
     figure = twins(path, "hertz")["figure-14"]()
     sigma, least, _ = figure.axes
-    histories = tables.read(path, "histories")
+    histories = read_table(path, "histories")
     mine = histories[
         (histories["problem"] == "hertz") & (histories["dual"] == "mcpg") & (histories["primal_tol"] == 0.3)
     ]

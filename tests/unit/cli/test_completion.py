@@ -19,10 +19,10 @@ from vibench.cli.plugin_commands import LISTS
 from vibench.plugins.kinds import DUAL, STUDY
 from vibench.plugins.registry import find, first_sentence, registered
 from vibench.qp.settings import SETTINGS
-from vibench.results import tables
-from vibench.results.columns import TABLES
-from vibench.results.sqlite.reading import FILE
-from vibench.results.views import VIEWS
+from vibench.results.read import read_table
+from vibench.results.schema import TABLES
+from vibench.results.show import VIEWS
+from vibench.results.sqlite import FILE
 
 GROUP: Any = typer.main.get_command(app)
 
@@ -111,7 +111,7 @@ class TestFiles:
     def test_cells_are_those_of_the_run_named_before(self, quick_run: Path) -> None:
         Path("runs").mkdir()
         Path("runs/quick").symlink_to(quick_run)
-        keys = sorted(tables.read(quick_run / FILE, "cells")["cell"])
+        keys = sorted(read_table(quick_run / FILE, "cells")["cell"])
         assert completed("vibench replay quick ") == keys
         assert completed(f"vibench replay quick {keys[0][:6]}") == [keys[0]]
         assert completed("vibench replay nothing ") == []

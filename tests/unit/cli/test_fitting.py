@@ -17,8 +17,9 @@ from running import Main
 
 from vibench.cli.completion import SHOWN
 from vibench.cli.console import new_console, print_frame
-from vibench.results import formats, tables, views
-from vibench.results.columns import CELLS
+from vibench.results import formats, show
+from vibench.results.read import read_table, results_file
+from vibench.results.schema import CELLS
 
 WIDTHS = (80, 120, 200)
 
@@ -41,7 +42,7 @@ def test_every_table_of_a_run_fits(
     assert code == 0
     assert max(map(cell_len, out.splitlines())) <= width
     assert "…" not in out
-    found = views.look_up(tables.results_file(str(quick_run)), table, limit=60)
+    found = show.look_up(results_file(str(quick_run)), table, limit=60)
     frame = found.readable
     texts = [*map(str, frame.columns), *(formats.cell_text(value) for name in frame for value in frame[name])]
     whole = {word for text in texts for word in text.split()} | {f"{width}"}
@@ -173,13 +174,13 @@ class TestShow:
         asked = ("--where", "solver = 'piqp' and N > 0", "--sort", "-error_u_mean", "--limit", "5")
         _, out, _ = main("show", str(quick_run), "--table", "cells", *asked, "--format", "csv")
         found = pd.read_csv(io.StringIO(out))
-        cells = tables.read(tables.results_file(str(quick_run)), "cells")
+        cells = read_table(results_file(str(quick_run)), "cells")
         best = cells[cells["solver"] == "piqp"].nlargest(5, "error_u_mean")
         assert list(found["cell"]) == list(best["cell"])
 
     def test_keys_of_the_summary_are_those_that_replay_takes(self, main: Main, quick_run: Path) -> None:
         _, out, _ = main("show", str(quick_run), "--columns", "cell,solver", "--limit", "3")
-        keys = tables.read(tables.results_file(str(quick_run)), "cells")["cell"]
+        keys = read_table(results_file(str(quick_run)), "cells")["cell"]
         for line in out.splitlines()[3:]:
             assert keys.str.startswith(line.split()[0]).sum() == 1
 
@@ -187,7 +188,7 @@ class TestShow:
     def test_json_has_numbers_as_numbers(self, table: str, main: Main, quick_run: Path) -> None:
         _, out, _ = main("show", str(quick_run), "--table", table, "--format", "json", "--limit", "20")
         found = pd.read_json(io.StringIO(out))
-        source = tables.read(tables.results_file(str(quick_run)), views.VIEWS[table].source)
+        source = read_table(results_file(str(quick_run)), show.VIEWS[table].source)
         for name in found.columns.intersection(source.columns):
             if source[name].dtype.kind in "if" and found[name].notna().any():
                 assert found[name].dtype.kind in "if", name
@@ -204,7 +205,7 @@ class TestShow:
         self, main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setenv("COLUMNS", "200")
-        cells = tables.read(tables.results_file(str(quick_run)), "cells")
+        cells = read_table(results_file(str(quick_run)), "cells")
         row = cells.iloc[3]
         code, out, _ = main("show", str(quick_run), row["cell"][:6])
         body, empty = out.split("\nempty: ")
@@ -225,7 +226,7 @@ class TestShow:
     def test_a_cell_is_not_ignored_where_a_table_or_a_condition_has_none_of_its_rows(
         self, main: Main, quick_run: Path
     ) -> None:
-        cell = tables.read(tables.results_file(str(quick_run)), "cells")["cell"][0]
+        cell = read_table(results_file(str(quick_run)), "cells")["cell"][0]
         assert main("show", str(quick_run), cell, "--where", "N > 1000")[:2] == (
             0,
             f"{quick_run.name}: summary: no rows\n",

@@ -20,10 +20,10 @@ from vibench.plugins import kinds, registry
 from vibench.plugins.kinds import PROBLEM
 from vibench.plugins.registry import find, registered
 from vibench.qp.settings import SETTINGS
-from vibench.results.columns import CELLS, STORED, TABLES
-from vibench.results.costs.best import ADDED
-from vibench.results.sqlite.reading import FILE
-from vibench.results.tables import read
+from vibench.results.ranking import ADDED
+from vibench.results.read import read_table
+from vibench.results.schema import CELLS, STORED, TABLES
+from vibench.results.sqlite import FILE
 from vibench.study.entries import ProblemEntry
 from vibench.study.matrix import expand, read_study
 from vibench.study.spec import Study
@@ -142,7 +142,7 @@ class TestOutputFolder:
     ) -> None:
         shutil.copytree(quick_run, "other")
         refused(main("run", write_study(tmp_path), "--out", "other", *fresh), "other", "study", "quick", "sample")
-        assert len(read(Path("other", FILE), "cells")) == len(expand(read_study("quick")))
+        assert len(read_table(Path("other", FILE), "cells")) == len(expand(read_study("quick")))
 
     def test_another_seed_is_another_study(self, main: Main, quick_run: Path, tmp_path: Path) -> None:
         shutil.copytree(quick_run, "other")
@@ -318,7 +318,7 @@ def test_the_list_of_studies_counts_their_cells(main: Main) -> None:
 def test_show_prints_the_summary(main: Main, quick_run: Path) -> None:
     code, out, err = main("show", str(quick_run))
     assert (code, err) == (0, "")
-    frame = read(quick_run / FILE, "cells")
+    frame = read_table(quick_run / FILE, "cells")
     lines = [line for line in out.splitlines() if any(solver in line for solver in frame["solver"].unique())]
     assert len(lines) == len(frame)
     assert "…" not in out
@@ -326,7 +326,7 @@ def test_show_prints_the_summary(main: Main, quick_run: Path) -> None:
 
 def test_a_run_ends_with_the_summary_and_says_where_things_are(quick_run: Path) -> None:
     printed = (quick_run / "printed.txt").read_text(encoding="utf-8")
-    fine = read(quick_run / FILE, "cells")["status"] == "ok"
+    fine = read_table(quick_run / FILE, "cells")["status"] == "ok"
     assert f"{len(fine)} cells, {fine.sum()} ok, {len(fine) - fine.sum()} not ok" in printed
     assert str(quick_run / FILE) in printed
     assert "next:\n  vibench show " in printed
@@ -347,7 +347,7 @@ def test_show_prints_every_table_as_csv(table: str, main: Main, quick_run: Path)
     assert (code, err) == (0, "")
     rows = list(csv.DictReader(io.StringIO(out)))
     source = {"summary": "cells", "benefits": "thresholds"}.get(table, table)
-    assert len(rows) == len(read(quick_run / FILE, source)) > 0
+    assert len(rows) == len(read_table(quick_run / FILE, source)) > 0
     if table == source:
         assert [name for name in rows[0] if not name.startswith("mu_")] == list(TABLES[table])
 
@@ -373,7 +373,7 @@ def test_show_finds_a_run_by_its_name(main: Main, quick_run: Path) -> None:
     Path("runs/quick").symlink_to(quick_run)
     code, out, _ = main("show", "quick", "--format", "csv")
     assert code == 0
-    assert len(out.splitlines()) == 1 + len(read(quick_run / FILE, "cells"))
+    assert len(out.splitlines()) == 1 + len(read_table(quick_run / FILE, "cells"))
 
 
 @pytest.mark.parametrize("run", ["[/b]", "//x", "//x/y", "file:x", "a\x1b[2J\nb", "\udcff", "x?mode=rwc", ""])

@@ -14,9 +14,9 @@ from samples import cell_row
 from vibench.cli.console import run_argument
 from vibench.cli.main import app
 from vibench.cli.run_summary import REASONS, WHOLE, failures, next_steps, print_summary
-from vibench.results.costs.ranking import NO_BEST_CELL
 from vibench.results.database import ResultsDatabase
-from vibench.results.sqlite.reading import FILE
+from vibench.results.ranking import NO_BEST_CELL
+from vibench.results.sqlite import FILE
 
 
 def row(cell: str, reason: str, status: str = "inaccurate", **more: Any) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from samples import SampleStore, carry_out
 
 from vibench.execution import offline_plan
 from vibench.execution.offline_plan import OfflinePlan
-from vibench.results.costs.break_even import SCATTER
+from vibench.results.break_even import SCATTER
 from vibench.rounds.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
 from vibench.stages.assembly import ExactSolutions
 from vibench.stages.base import Stage

@@ -11,7 +11,7 @@ from samples import STUDY, changed, write_study
 
 from vibench.execution.result_writer import axis_columns, cell_columns, labels_of
 from vibench.interfaces.strategies import Stop
-from vibench.results.columns import HISTORY_KEYS, KEYS
+from vibench.results.schema import HISTORY_KEYS, KEYS
 from vibench.stages.base import Stage
 from vibench.stages.cell_queries import cell_queries
 from vibench.stages.enrichment import NestedEnrichment

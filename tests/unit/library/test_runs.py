@@ -17,7 +17,7 @@ import vibench
 from vibench.execution.run import Agenda, Observer
 from vibench.library.runs import _following
 from vibench.report import figures
-from vibench.results import tables
+from vibench.results import formats, show
 
 SETTINGS: dict[str, Any] = {
     "name": "small",
@@ -56,7 +56,7 @@ def test_a_run_has_its_tables(run: vibench.Run) -> None:
     assert len(run.queries) == 16
     assert set(run.histories["dual"].dropna()) == {"cpg", "mcpg"}
     assert len(run.thresholds)
-    pd.testing.assert_frame_equal(run.summary, tables.summary(run.cells))
+    pd.testing.assert_frame_equal(run.summary, formats.summary(run.cells))
     assert run.study == {"name": "small", "seed": 0, "validation": 4}
 
 
@@ -123,7 +123,7 @@ def test_progress_in_a_notebook_is_lines(monkeypatch: pytest.MonkeyPatch, capsys
 
 def test_what_a_run_writes(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figures, "OF_PROBLEM", {"errors": figures.OF_PROBLEM["errors"]})
-    assert {file.name for file in run.write_tables(tmp_path / "tables")} == set(tables.EXPORTED)
+    assert {file.name for file in run.write_tables(tmp_path / "tables")} == set(show.EXPORTED)
     drawn = run.write_figures(tmp_path / "figures")
     assert {file.suffix for file in drawn} == {".png", ".svg"}
     assert all(file.stat().st_size for file in drawn)

@@ -11,7 +11,7 @@ from running import execute
 from selenium.webdriver import Chrome
 
 from vibench.report import html
-from vibench.results.sqlite.reading import FILE
+from vibench.results.sqlite import FILE
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ from vibench.provenance import PROTOCOL
 from vibench.report.comparison.compare import compare
 from vibench.report.comparison.differences import ChangeKind, agreement
 from vibench.report.comparison.runs import run_names
-from vibench.results.sqlite.reading import FILE
+from vibench.results.sqlite import FILE
 
 STEADY = (
     "UPDATE cells SET offline_low_s = offline_s, offline_high_s = offline_s, disturbed = 0",

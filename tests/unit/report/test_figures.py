@@ -25,8 +25,8 @@ from vibench.report.figures import FORMATS, OF_DUAL, OF_HISTORIES, OF_PROBLEM, c
 from vibench.report.figures import problems as of_file
 from vibench.report.figures.data import Extent, _per_combination
 from vibench.report.figures.style import save, styled
-from vibench.results import tables
-from vibench.results.sqlite.reading import FILE
+from vibench.results.read import read_table
+from vibench.results.sqlite import FILE
 from vibench.study.matrix import read_study
 
 Drawn = dict[str, Figure]
@@ -188,7 +188,7 @@ def test_lines_that_have_to_be_told_apart_have_names_and_looks_of_their_own(draw
 
 
 def test_projection_errors_are_those_of_the_histories(drawn: Drawn, results: Path) -> None:
-    histories = tables.read(results, "histories")
+    histories = read_table(results, "histories")
     for problem in problems():
         pod, cones = drawn[f"{problem}-errors"].axes
         mine = histories[(histories["problem"] == problem) & (histories["quantity"] == "error")]
@@ -215,7 +215,7 @@ def test_orthogonality_has_a_line_per_dual_strategy(drawn: Drawn) -> None:
 
 
 def test_the_enrichment_shows_sigma_and_beta(drawn: Drawn, results: Path) -> None:
-    queries = tables.read(results, "queries")
+    queries = read_table(results, "queries")
     for problem in problems():
         for dual in read_study("quick").dual:
             sigma, beta, validation = drawn[f"{problem}-{dual.title}-enrichment"].axes
@@ -233,7 +233,7 @@ def test_the_enrichment_shows_sigma_and_beta(drawn: Drawn, results: Path) -> Non
 
 
 def test_the_inf_sup_figure_shows_every_strategy_and_the_high_fidelity_pair(drawn: Drawn, results: Path) -> None:
-    queries = tables.read(results, "queries")
+    queries = read_table(results, "queries")
     for problem in problems():
         for dual in read_study("quick").dual:
             span, cone = drawn[f"{problem}-{dual.title}-inf-sup"].axes
@@ -420,7 +420,7 @@ def test_errors_in_a_figure_are_those_on_common_queries(change: Callable[..., No
         f"UPDATE queries SET status = 'inaccurate' WHERE {few} = 'offline-pga' AND query < 9",
     )
     figures = draw("work-precision", "dimension")
-    queries = tables.read(results, "queries")
+    queries = read_table(results, "queries")
     fine = queries[(queries["problem"] == "obstacle") & (queries["query"] >= 6)]
     means = fine.groupby("cell")[["error_u", "error_lambda"]].mean()
     for kind in ("work-precision", "dimension"):
@@ -510,7 +510,7 @@ def test_a_solver_that_never_answered_is_in_the_profile(change: Callable[..., No
 
 
 def test_shares_on_and_off_the_training_set_are_those_of_the_cells(drawn: Drawn, quick_run: Path) -> None:
-    cells = tables.read(quick_run / FILE, "cells")
+    cells = read_table(quick_run / FILE, "cells")
     for problem in problems():
         mine = cells[(cells["problem"] == problem) & cells["share_training"].notna()].drop_duplicates(
             ["dual", "primal"]
@@ -534,7 +534,7 @@ def test_precision_is_over_the_programs_that_every_solver_solved_at_every_accura
         "UPDATE queries SET status = 'inaccurate' WHERE solver = 'osqp' AND query < 4 AND accuracy = 1e-4",
     )
     (figure,) = draw("precision").values()
-    queries = tables.read(results, "queries")
+    queries = read_table(results, "queries")
     kept = queries[(queries["problem"] == "obstacle") & (queries["query"] >= 4)]
     assert f"{len(kept) // 6} programs" in figure.get_suptitle()
     for solver, mine in kept.groupby("solver"):
@@ -650,7 +650,7 @@ def test_panels_that_are_compared_share_their_axes(drawn: Drawn) -> None:
 
 
 def test_every_point_has_its_dimensions_or_its_tolerance(drawn: Drawn, results: Path) -> None:
-    cells = tables.read(results, "cells")
+    cells = read_table(results, "cells")
     mine = cells[(cells["problem"] == "obstacle") & (cells["dual"] == "mcpg") & (cells["primal"] == "offline-pga")]
     size = f"({mine['N'].iloc[0]:.0f}, {mine['R'].iloc[0]:.0f}), δ = 0.5"
     axes = next(axes for axes in drawn["obstacle-dimension"].axes if axes.get_title() == "mcpg")

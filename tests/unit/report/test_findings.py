@@ -10,8 +10,9 @@ from running import DECIDED, Changed
 
 from vibench.report.figures.data import problems
 from vibench.report.findings import MOST, READ, Finding, Weight, all_findings, findings, leading
-from vibench.results import tables
-from vibench.results.sqlite.reading import FILE
+from vibench.results import formats
+from vibench.results.read import read_table
+from vibench.results.sqlite import FILE
 
 
 @pytest.fixture
@@ -76,7 +77,7 @@ def test_errors_of_strategies_are_those_on_common_queries(said: Said, quick_run:
         f"UPDATE queries SET status = 'inaccurate' WHERE {failed} AND query < 6",
         f"UPDATE cells SET queries_ok = 10 WHERE {failed}",
     )
-    queries = tables.read(quick_run / FILE, "queries")
+    queries = read_table(quick_run / FILE, "queries")
     mine = queries[(queries["problem"] == "obstacle") & (queries["dual"] == "mcpg") & (queries["query"] >= 6)]
     (about,) = [found for subject, found in texts.items() if subject.startswith("obstacle, mcpg, (N, R)")]
     for primal, beginning in (("decorrelated", "Without enrichment"), ("offline-pga", "offline-pga")):
@@ -100,7 +101,7 @@ def test_cells_with_few_ok_queries_are_counted_and_their_errors_left_out(said: S
 
 def test_solvers_are_compared_on_common_programs(said: Said, quick_run: Path) -> None:
     texts = said("UPDATE queries SET status = 'inaccurate' WHERE solver = 'osqp' AND problem = 'hertz' AND query < 4")
-    queries = tables.read(quick_run / FILE, "queries")
+    queries = read_table(quick_run / FILE, "queries")
     mine = queries[(queries["problem"] == "hertz") & (queries["query"] >= 4)]
     for solver, found in mine.groupby("solver"):
         median = f"with a median of {1e3 * found['solve_s'].median():.3g} ms over the 72 programs that all solved."
@@ -117,7 +118,7 @@ def test_a_violated_invariant_is_not_hidden(said: Said) -> None:
 
 
 def test_stability_and_cost_are_those_of_the_tables(said: Said, quick_run: Path) -> None:
-    cells = tables.read(quick_run / FILE, "cells")
+    cells = read_table(quick_run / FILE, "cells")
     mine = cells[(cells["problem"] == "obstacle") & (cells["dual"] == "mcpg")]
     size = mine.iloc[0]
     others_are_slow = "UPDATE cells SET online_s = 99 * online_s WHERE solver != 'piqp'"
@@ -172,7 +173,7 @@ def test_a_break_even_is_the_same_number_in_findings_and_tables(said: Said, chan
     against = [text for found in said(statement).values() for text in found if text.startswith("Break-even")]
     assert against
     assert all(text.endswith("from 203 queries, 95 % interval 203–205.") for text in against)
-    benefits = tables.benefits(tables.read(changed(statement), "thresholds"))
+    benefits = formats.break_even_table(read_table(changed(statement), "thresholds"))
     assert set(benefits["break-even"]) == {"from 203"}
     assert set(benefits["interval"]) == {"203–205"}
 
@@ -232,7 +233,7 @@ def test_where_no_model_is_good_enough_that_is_said(said: Said) -> None:
 def test_the_fastest_of_a_problem_is_named_with_its_errors(said: Said, quick_run: Path) -> None:
     slow = "UPDATE cells SET online_s = 1e-3 * rowid, hf_s = 1, error_lambda_mean = 0.02, error_u_mean = 0.001"
     texts = said(slow)["hertz"]
-    cells = tables.read(quick_run / FILE, "cells")
+    cells = read_table(quick_run / FILE, "cells")
     mine = cells[cells["problem"] == "hertz"]
     assert len(texts) == 1
     assert texts[0].startswith(f"Of {len(mine)} cells with mean errors of at most 10 %, the fastest query is that of")
@@ -240,7 +241,7 @@ def test_the_fastest_of_a_problem_is_named_with_its_errors(said: Said, quick_run
 
 
 def test_findings_that_say_most_come_first_and_every_subject_has_a_turn(quick_run: Path) -> None:
-    read = {name: tables.read(quick_run / FILE, name) for name in READ}
+    read = {name: read_table(quick_run / FILE, name) for name in READ}
     found = list(all_findings(read, problems(quick_run / FILE, read)))
     first = leading(found)
     assert len(first) == MOST < len(found)

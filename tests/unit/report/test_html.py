@@ -16,10 +16,10 @@ from vibench.report import html
 from vibench.report.figures.data import problems
 from vibench.report.findings import MOST, findings
 from vibench.report.page.grids import FIRST
-from vibench.results import tables
-from vibench.results.columns import CELLS, TABLES
-from vibench.results.costs.ranking import leaderboard
-from vibench.results.sqlite.reading import FILE
+from vibench.results.ranking import leaderboard
+from vibench.results.read import extended_tables, in_order, read_table
+from vibench.results.schema import CELLS, TABLES
+from vibench.results.sqlite import FILE
 from vibench.text import brief
 
 
@@ -56,7 +56,7 @@ def test_every_heading_says_what_it_means(made: Path) -> None:
 def test_without_javascript_tables_have_their_first_rows(made: Path, reported: Path) -> None:
     page = made.read_text(encoding="utf-8")
     (table,) = re.findall(r'data-table="summary"></div>\n<noscript>(.*?)</noscript>', page, re.DOTALL)
-    cells = tables.read(reported / FILE, "cells")
+    cells = read_table(reported / FILE, "cells")
     assert table.count("<tr>") == 1 + min(len(cells), FIRST)
     assert "error λ</th>" in table
     assert all(f"<td>{value:.3g}</td>" in table for value in cells["error_lambda_mean"][:FIRST])
@@ -70,7 +70,7 @@ def test_findings_tables_and_facts_are_in_it(made: Path, reported: Path) -> None
     first = page.split('<section id="findings">')[1].split("<details>")[0]
     assert first.count("<li>") == MOST < len(texts)
     assert page.index('id="leaderboard"') < page.index('id="findings"') < page.index('id="summary"')
-    cells = tables.read(reported / FILE, "cells")
+    cells = read_table(reported / FILE, "cells")
     assert cells["machine"].iloc[0] in page
     embedded = data(page, "table-data")["summary"]
     assert embedded["rows"] == len(cells)
@@ -80,7 +80,7 @@ def test_findings_tables_and_facts_are_in_it(made: Path, reported: Path) -> None
     assert {"break-even", "interval"}.isdisjoint(break_even["axes"]), "results, not axes of the study"
     whole = {column["name"]: column for column in embedded["columns"]}
     assert whole["error λ"]["numbers"] == [
-        pytest.approx(error, rel=1e-5) for error in tables.in_order(cells)["error_lambda_mean"]
+        pytest.approx(error, rel=1e-5) for error in in_order(cells)["error_lambda_mean"]
     ]
     assert "None: every query of every cell is ok." in page
 
@@ -117,7 +117,7 @@ def test_every_failure_has_its_reason_and_nothing_is_markup(changed: Changed) ->
         "UPDATE queries SET status = 'failed', reason = 'one of many' WHERE solver = 'osqp' AND query = 5",
         "INSERT INTO pictures (problem, problem_options, number, reason) VALUES ('wire', '{}', 0, 'no <mesh>')",
     )
-    failed = int((tables.read(results, "cells")["solver"] == "osqp").sum())
+    failed = int((read_table(results, "cells")["solver"] == "osqp").sum())
     page = html.page(results, figures=False)
     assert "<script>alert" not in page
     embedded = data(page, "table-data")
@@ -170,7 +170,7 @@ def test_a_run_without_any_query_has_a_report(changed: Changed) -> None:
 
 def test_a_strategy_that_is_labelled_high_fidelity_is_no_high_fidelity_model(changed: Changed) -> None:
     path = changed("UPDATE thresholds SET primal_a = 'high-fidelity'")
-    read = tables.extended_tables(path, html.READ)
+    read = extended_tables(path, html.READ)
     thresholds = read["thresholds"].frame
     found = {grid.name: len(grid.frame) for grid in html._grids(read)}
     assert found["enrichments"] == thresholds["cell_a"].notna().sum() > 0
@@ -180,7 +180,7 @@ def test_a_strategy_that_is_labelled_high_fidelity_is_no_high_fidelity_model(cha
 def test_a_large_study_has_pictures_of_the_cones_that_win(changed: Changed, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(html, "MOST_DUALS", 1)
     path = changed("UPDATE cells SET error_lambda_mean = 0.05, error_u_mean = 0.01")
-    (hertz, _) = leaderboard(tables.in_order(tables.read(path, "cells")))
+    (hertz, _) = leaderboard(in_order(read_table(path, "cells")))
     (winner, *_) = hertz.bands[0].winners
     ((name, data), _) = problems(path)
     names = [task[0] for task in html.tasks_of(name, data)]
@@ -195,7 +195,7 @@ def test_only_rows_of_a_disturbed_machine_are_said_to_be_marked(changed: Changed
     assert data(page, "table-data")["summary"]["disturbed"] == []
     path = changed(calm, "UPDATE cells SET disturbed = 1 WHERE rowid IN (3, 4)")
     page = html.page(path, figures=False)
-    keys = tables.in_order(tables.read(path, "cells"))
+    keys = in_order(read_table(path, "cells"))
     embedded = data(page, "table-data")
     assert embedded["summary"]["disturbed"] == list(keys.index[keys["disturbed"] == 1])
     assert len(embedded["summary"]["disturbed"]) == 2

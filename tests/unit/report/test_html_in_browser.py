@@ -19,8 +19,9 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
 from vibench.report import html
-from vibench.results import formats, tables
-from vibench.results.sqlite.reading import FILE
+from vibench.results import formats
+from vibench.results.read import in_order, read_table
+from vibench.results.sqlite import FILE
 
 MATTERS = {"cell", "problem", "dual", "primal", "δ", "solver", "error λ", "error u", "online [ms]", "offline [s]"}
 """Columns that are seen at 1280 pixels without scrolling."""
@@ -71,7 +72,7 @@ def made(reported: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def cells(reported: Path) -> pd.DataFrame:
-    return tables.in_order(tables.read(reported / FILE, "cells"))
+    return in_order(read_table(reported / FILE, "cells"))
 
 
 def awaited(browser: Chrome, condition: Callable[[Chrome], Any]) -> Any:
@@ -337,7 +338,7 @@ def test_a_page_of_many_cells_shows_some_rows_at_a_time(browser: Chrome, quick_r
     assert {row["cell"] for row in first}.isdisjoint(row["cell"] for row in shown_rows(browser))
     # a value that all rows have is in the page once
     look(browser, page, fragment="#summary?show=solver&show=accuracy&page=2")
-    accuracy = formats.cell_text(tables.read(tmp_path / "many" / FILE, "cells")["accuracy"].iloc[0])
+    accuracy = formats.cell_text(read_table(tmp_path / "many" / FILE, "cells")["accuracy"].iloc[0])
     assert [(row["solver"], row["accuracy"]) for row in shown_rows(browser)] == [("piqp", accuracy)] * 50
     assert complaints(browser) == []
 

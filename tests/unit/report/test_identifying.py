@@ -16,8 +16,8 @@ from samples import toml
 from vibench.report.site import identifying
 from vibench.report.site.citation import Citation, requirements
 from vibench.report.site.publish import publish
-from vibench.results import tables
-from vibench.results.sqlite.reading import FILE
+from vibench.results.read import read_table
+from vibench.results.sqlite import FILE
 
 STUDY: dict[str, Any] = {
     "name": "cables", "validation": {"name": "file", "path": "points.csv"}, "solvers": ["piqp"], "dual": ["mcpg"],
@@ -73,7 +73,7 @@ def test_a_site_names_neither_home_nor_user_nor_host(made: Path, main: Main, tmp
     assert row["validation_options"] == '{"path": "points.csv"}'
     assert row["cell"] == rows(made)[0]["cell"]
     assert row["reason"] == "…'s pack '…/cable' at …/main.py:3 or …, on …"
-    assert len(tables.read(published, "queries")) == 4  # its digests fit
+    assert len(read_table(published, "queries")) == 4  # its digests fit
     at = [
         f"{name}={made.parent / place}"
         for name, place in (("packs/cable", "packs/cable"), ("points.csv", "points.csv"))

@@ -9,7 +9,7 @@ from vibench.report.figures import OF_DUAL, OF_HISTORIES, OF_PROBLEM, drawings, 
 from vibench.report.figures.data import problems
 from vibench.report.html import tasks_of
 from vibench.report.page.images import image_of
-from vibench.results.sqlite.reading import FILE
+from vibench.results.sqlite import FILE
 
 
 def test_several_processes_draw_the_same_pictures_in_the_same_order(quick_run: Path) -> None:

@@ -21,10 +21,10 @@ from vibench.report.site import folder
 from vibench.report.site.citation import Citation, requirements
 from vibench.report.site.publish import publish
 from vibench.report.site.published_run import folder_names
-from vibench.results import tables
-from vibench.results.costs.paired_seconds import PairedSeconds
-from vibench.results.costs.ranking import leaderboard
-from vibench.results.sqlite.reading import FILE
+from vibench.results.paired_timing import PairedTiming
+from vibench.results.ranking import leaderboard
+from vibench.results.read import in_order, read_table
+from vibench.results.sqlite import FILE
 
 CITATION = Citation("Tests & <trials>", ("Doe, Jane", "The {team}"), "10.5281/zenodo.1234567")
 
@@ -137,7 +137,7 @@ def test_filters_of_the_list_of_runs_filter(site: Path, browser: Chrome) -> None
 
 def test_filters_of_cells_filter(site: Path, browser: Chrome) -> None:
     seen = observed(browser, site / "runs" / "later" / "index.html", FILTER.replace("SERVER", "proxqp OFFLINE"))
-    cells = tables.read(site / "runs" / "later" / FILE, "cells")
+    cells = read_table(site / "runs" / "later" / FILE, "cells")
     chosen = cells[(cells["solver"] == "proxqp") & (cells["primal"] == "offline-pga")]
     assert len(seen["start"]) == 36
     assert sorted(seen["text"]) == sorted(key[:8] for key in chosen["cell"])
@@ -147,9 +147,9 @@ def test_a_run_has_its_report_its_data_and_where_it_comes_from(site: Path, three
     own = site / "runs" / "server-1"
     assert (own / "report.html").read_text(encoding="utf-8") == REPORT
     for name in ("cells", "queries", "thresholds", "timings", "solutions", "pictures"):
-        pd.testing.assert_frame_equal(tables.read(own / FILE, name), tables.read(three[1], name))
+        pd.testing.assert_frame_equal(read_table(own / FILE, name), read_table(three[1], name))
     page = (own / "index.html").read_text(encoding="utf-8")
-    row = tables.read(three[1], "cells").iloc[0]
+    row = read_table(three[1], "cells").iloc[0]
     for text in ("measured on a &lt;server&gt;", "a server, 64 cores", row["code"], row["study_hash"]):
         assert text in page
     known = json.loads((own / "provenance.json").read_text())
@@ -162,7 +162,7 @@ def test_every_row_has_the_command_that_makes_it_again(site: Path, main: Main, m
     own = site / "runs" / "server-1"
     page = (own / "index.html").read_text(encoding="utf-8")
     commands = re.findall(r"<code>vibench (run results.sqlite --cell (\w+) --out again)</code>", page)
-    assert [key for _, key in commands] == list(tables.in_order(tables.read(own / FILE, "cells"))["cell"])
+    assert [key for _, key in commands] == list(in_order(read_table(own / FILE, "cells"))["cell"])
     monkeypatch.chdir(own)
     command, key = commands[5]
     code, out, err = main(*command.split(), "--dry-run")
@@ -174,7 +174,7 @@ def test_requirements_are_the_versions_recorded_and_nothing_that_pip_would_act_o
     site: Path, three: list[Path]
 ) -> None:
     text = (site / "runs" / "here" / "requirements.txt").read_text()
-    versions = json.loads(tables.read(three[0], "cells")["versions"].iloc[0])
+    versions = json.loads(read_table(three[0], "cells")["versions"].iloc[0])
     assert f"numpy=={versions['numpy']}\n" in text
     assert {"piqp", "osqp", "proxsuite"} <= {line.split("==")[0] for line in text.splitlines()}
     evil = {"numpy": "1.0 --index-url http://x", "-r /etc/passwd": "1", "scipy": "1\n-e .", "piqp": "1.0, 2.0", "a": ""}
@@ -192,8 +192,8 @@ def test_every_run_has_a_leaderboard_with_ties_and_links_its_cells(site: Path, t
         linked = set(re.findall(r'index.html#(\w+)"', section))
         assert linked
         assert linked <= set(cells["cell"])
-        timings, rows = (tables.read(path, name) for name in ("timings", "cells"))
-        boards = leaderboard(tables.in_order(rows), PairedSeconds(timings.to_dict("records")))
+        timings, rows = (read_table(path, name) for name in ("timings", "cells"))
+        boards = leaderboard(in_order(rows), PairedTiming(timings.to_dict("records")))
         ties = [len(winner.ties) for one in boards for band in one.bands for winner in band.winners]
         shown = re.findall(r'<td class="number">(\d+)</td><td>(?:<a|</td>)', section)
         assert [int(text) for text in shown] == ties

@@ -17,7 +17,7 @@ import pytest
 from vibench.provenance import PROTOCOL
 from vibench.report.site.citation import Citation
 from vibench.report.site.publish import publish
-from vibench.results.sqlite.reading import FILE
+from vibench.results.sqlite import FILE
 
 SCRIPTS = Path(__file__).parents[3] / "results" / "scripts"
 

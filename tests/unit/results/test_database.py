@@ -19,10 +19,9 @@ from samples import RECORDED, cell_row, query_rows
 
 from vibench.errors import RequestError, StorageError
 from vibench.results import database as module
-from vibench.results.columns import CELLS, TABLES, VERSION
-from vibench.results.database import ResultsDatabase
-from vibench.results.sqlite.reading import FILE, read_meta, read_rows
-from vibench.results.sqlite.values import LONGEST_TEXT
+from vibench.results.database import LONGEST_TEXT, ResultsDatabase
+from vibench.results.schema import CELLS, TABLES, VERSION
+from vibench.results.sqlite import FILE, read_meta, read_rows
 
 
 def seen(folder: Path, table: str) -> list[tuple[Any, ...]]:

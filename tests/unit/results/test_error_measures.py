@@ -18,10 +18,10 @@ from vibench.report.figures import caption_of
 from vibench.report.figures.costs import break_even
 from vibench.report.figures.costs import outputs as figure_of_outputs
 from vibench.report.figures.data import problems
-from vibench.results.columns import CELLS, KEYS, OUTPUTS
-from vibench.results.costs.break_even import break_even_rows
-from vibench.results.costs.ranking import BAND, errors_of, fastest, measures, with_errors, within
+from vibench.results.break_even import break_even_rows
 from vibench.results.database import FILE, ResultsDatabase
+from vibench.results.ranking import BAND, errors_of, fastest, measures, with_errors, within
+from vibench.results.schema import CELLS, KEYS, OUTPUTS
 from vibench.testing.samples.sample_run import write_sample_run
 
 MODELS = {

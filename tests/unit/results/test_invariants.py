@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vibench.results.columns import CONSTANTS
-from vibench.results.invariants import EFFECTIVITIES, added_up, violations
+from vibench.results.consistency import EFFECTIVITIES, added_up, violations
+from vibench.results.schema import CONSTANTS
 
 GOOD: dict[str, float | str] = dict.fromkeys(CONSTANTS, 0.1) | dict.fromkeys(EFFECTIVITIES, 1.0)
 GOOD |= {f"beta_full_{what}": 0.2 for what in ("span", "cone_lower", "cone_upper")}

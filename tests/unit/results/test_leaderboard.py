@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import cells_of, row_of
 
-from vibench.results.costs.paired_seconds import PairedSeconds
-from vibench.results.costs.ranking import COMPARED, LARGEST_BAND, Criterion, Standings, leaderboard
+from vibench.results.paired_timing import PairedTiming
+from vibench.results.ranking import COMPARED, LARGEST_BAND, Criterion, Standings, leaderboard
 
 
 def won(standings: Standings, criterion: Criterion) -> list[tuple[float, str]]:
@@ -61,7 +61,7 @@ def test_whose_interval_contains_no_difference_shares_the_place() -> None:
         for k in range(12):
             seconds = {"total_s": row["online_s"] * np.exp(0.02 * rng.standard_normal()), "hf_s": 1.0, "pace": 1.0}
             timings.append({"cell": row["cell"], "block": str(k // 3)} | seconds)
-    (found,) = leaderboard(cells, PairedSeconds(timings))
+    (found,) = leaderboard(cells, PairedTiming(timings))
     ties = {one.criterion: one.ties for one in found.bands[0].winners}
     assert ties[Criterion.QUERY] == ("b",)
     # errors are equal, and so are offline seconds, of which all phases are the same

@@ -10,8 +10,8 @@ from samples import cell_row, query_rows
 
 from vibench.errors import RequestError
 from vibench.results.database import ResultsDatabase
-from vibench.results.sqlite.reading import FILE, parameters_of
-from vibench.results.views import Table, look_up
+from vibench.results.show import Table, look_up
+from vibench.results.sqlite import FILE, parameters_of
 
 NAMES = (("radius", "m"), ("friction", "1"))
 

@@ -17,7 +17,7 @@ from vibench.plugins.plugin import Plugin
 from vibench.results import pictures
 from vibench.results.database import ResultsDatabase
 from vibench.results.pictures import Shown
-from vibench.results.sqlite.reading import FILE
+from vibench.results.sqlite import FILE
 from vibench.stages import base
 from vibench.stages.pictures import PictureStage
 

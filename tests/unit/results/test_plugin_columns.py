@@ -19,11 +19,11 @@ from vibench import DerivedColumn, FigurePlugin, RunTables
 from vibench.report import figures, html
 from vibench.report.comparison.compare import compare
 from vibench.report.page.grids import grid_of_cells
-from vibench.results import tables
-from vibench.results.costs.ranking import fastest
 from vibench.results.database import ResultsDatabase
 from vibench.results.plugin_columns import extended_tables
-from vibench.results.sqlite.reading import FILE
+from vibench.results.ranking import fastest
+from vibench.results.read import extended, read_table
+from vibench.results.sqlite import FILE
 from vibench.testing.samples.sample_run import write_sample_run
 
 GROUP, HERE = "vibench.figures", __name__
@@ -87,7 +87,7 @@ def column(**given: Any) -> Sequence[DerivedColumn]:
 
 def test_columns_are_derived_from_all_tables_in_the_order_of_the_rows(register: Register, path: Path) -> None:
     register((GROUP, "savings", f"{HERE}:Savings"))
-    found = tables.extended(path, "cells")
+    found = extended(path, "cells")
     assert found.faults == ()
     assert list(found.columns) == ["speedup", "slowest_s", "unknowns", "size"]
     assert list(found.frame["cell"]) == ["b", "c", "a"]
@@ -95,7 +95,7 @@ def test_columns_are_derived_from_all_tables_in_the_order_of_the_rows(register: 
     np.testing.assert_allclose(found.frame["slowest_s"], [0.0, 0.1, 0.2])
     assert list(found.frame["unknowns"]) == [2, 5, 8]
     assert list(found.frame["size"]) == ["small", "small", "large"]
-    assert list(tables.extended(path, "queries").frame["odd"]) == [0, 1] * 3
+    assert list(extended(path, "queries").frame["odd"]) == [0, 1] * 3
     assert list(found.frame["N"]) == [0, 1, 2]
 
 
@@ -112,7 +112,7 @@ def test_tables_are_read_and_plugins_created_once_for_all_tables(
 
     def recorded(name: str) -> pd.DataFrame:
         read.append(name)
-        return tables.read(path, name)
+        return read_table(path, name)
 
     monkeypatch.setattr(Savings, "__init__", create)
     found = extended_tables(names, recorded)
@@ -162,7 +162,7 @@ def test_the_list_names_them(register: Register, main: Main) -> None:
 
 def test_a_report_offers_them(register: Register, path: Path) -> None:
     register((GROUP, "savings", f"{HERE}:Savings"))
-    grid = grid_of_cells(tables.extended(path, "cells"), "")
+    grid = grid_of_cells(extended(path, "cells"), "")
     assert {"speed-up", "slowest_s", "unknowns", "size"} <= set(grid.frame.columns)
     assert "slowest_s" in grid.hidden
     assert "speed-up" not in grid.hidden
@@ -215,7 +215,7 @@ def test_what_cannot_be_used_is_a_line_and_costs_no_other_column(
 ) -> None:
     monkeypatch.setattr(One, "made", staticmethod(made))
     register((GROUP, "one", f"{HERE}:One"), (GROUP, "savings", f"{HERE}:Savings"))
-    found = tables.extended(path, "cells")
+    found = extended(path, "cells")
     assert found.faults == (line,)
     assert {"speedup", "slowest_s", "unknowns", "size"} <= set(found.columns)
     with pytest.warns(UserWarning, match="figure plugin 'one'"):
@@ -224,7 +224,7 @@ def test_what_cannot_be_used_is_a_line_and_costs_no_other_column(
 
 def test_a_name_that_two_plugins_have_is_the_column_of_the_first(register: Register, path: Path) -> None:
     register((GROUP, "a-savings", f"{HERE}:Savings"), (GROUP, "rival", f"{HERE}:Rival"))
-    found = tables.extended(path, "cells")
+    found = extended(path, "cells")
     assert found.faults == (
         "column 'Speedup' of figure plugin 'rival' has the name of a column of figure plugin 'a-savings', and needs "
         "another",
@@ -304,7 +304,7 @@ def test_missing_values_stay_missing(
 ) -> None:
     monkeypatch.setattr(One, "made", staticmethod(lambda: column(values=lambda found: values, kind=kind)))
     register((GROUP, "one", f"{HERE}:One"))
-    found = tables.extended(path, "cells")
+    found = extended(path, "cells")
     assert found.faults == ()
     assert str(found.frame["mine"].dtype) == dtype
     assert list(found.frame["mine"].isna()) == [pd.isna(value) for value in values]
@@ -351,7 +351,7 @@ def test_a_column_may_be_called_error(
     given = staticmethod(lambda: column(name="error", kind=int, unit="", values=lambda found: [3, 4, 5]))
     monkeypatch.setattr(One, "made", given)
     register((GROUP, "one", f"{HERE}:One"))
-    found = tables.extended(path, "cells").frame.assign(
+    found = extended(path, "cells").frame.assign(
         error_u_mean=1e-3,
         error_lambda_mean=[1e-3, 2e-3, 0.01],
         beta_span_min=0.5,

@@ -21,15 +21,14 @@ from hypothesis import strategies as st
 from samples import QUICK_ROUNDS, cell_row, query_rows
 
 from vibench.errors import RequestError
-from vibench.results import tables
-from vibench.results.columns import CELLS, HISTORIES, KEYS, QUERIES, TABLES, THRESHOLDS, VERSION
-from vibench.results.costs.break_even import break_even_rows
+from vibench.results import read, sqlite
+from vibench.results.break_even import break_even_rows
 from vibench.results.database import ResultsDatabase
-from vibench.results.formats import cell_text, to_csv, to_json, to_latex, to_markdown
-from vibench.results.sqlite import digests
-from vibench.results.sqlite.reading import FILE
-from vibench.results.tables import benefits, export, in_order, read, results_file, summary
-from vibench.results.views import look_up
+from vibench.results.formats import break_even_table, cell_text, summary, to_csv, to_json, to_latex, to_markdown
+from vibench.results.read import in_order, read_table, results_file
+from vibench.results.schema import BREAK_EVEN, CELLS, HISTORIES, KEYS, QUERIES, TABLES, VERSION
+from vibench.results.show import export, look_up
+from vibench.results.sqlite import FILE
 from vibench.study.matrix import expand, read_study
 from vibench.text import printable_lines
 
@@ -82,14 +81,14 @@ def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
 
 
 def test_another_schema_is_refused(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tables, "VERSION", VERSION + 1)
+    monkeypatch.setattr(read, "VERSION", VERSION + 1)
     with pytest.raises(RequestError, match=f"schema {VERSION}.*reads {VERSION + 1}"):
         results_file(str(run))
 
 
 @pytest.mark.parametrize("table", TABLES)
 def test_a_table_is_read_with_all_its_columns(table: str, run: Path) -> None:
-    frame = read(run / FILE, table)
+    frame = read_table(run / FILE, table)
     assert [name for name in frame.columns if not name.startswith("mu_")] == list(TABLES[table])
     assert len(frame) == {"cells": 2, "queries": 4}.get(table, 1)
 
@@ -97,15 +96,15 @@ def test_a_table_is_read_with_all_its_columns(table: str, run: Path) -> None:
 def test_reading_changes_nothing(run: Path) -> None:
     before = (run / FILE).read_bytes()
     with pytest.raises(RequestError, match="cannot be read: no such table"):
-        read(run / FILE, "cells; DELETE FROM cells")
-    read(run / FILE, "queries")
+        read_table(run / FILE, "cells; DELETE FROM cells")
+    read_table(run / FILE, "queries")
     assert (run / FILE).read_bytes() == before
 
 
 def test_reading_leaves_no_files_behind(run: Path) -> None:
     before = sorted(path.name for path in run.iterdir())
     for table in TABLES:
-        read(run / FILE, table)
+        read_table(run / FILE, table)
     assert sorted(path.name for path in run.iterdir()) == before
 
 
@@ -119,12 +118,12 @@ def test_everything_is_exported(run: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rows", [1, 3, 4096])
 def test_large_tables_are_read_and_written_in_parts(run: Path, rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(digests, "PART", rows)
+    monkeypatch.setattr(sqlite, "PART", rows)
     path = results_file(str(run))
-    assert [len(part) for part in tables.read_in_parts(path, "queries")] == {1: [1] * 4, 3: [3, 1], 4096: [4]}[rows]
+    assert [len(part) for part in read.read_in_parts(path, "queries")] == {1: [1] * 4, 3: [3, 1], 4096: [4]}[rows]
     export(path, run / "tables")
     for table in TABLES:
-        whole = to_csv(tables.whole_numbers(in_order(read(path, table))))
+        whole = to_csv(read.whole_numbers(in_order(read_table(path, table))))
         assert (run / "tables" / f"{table}.csv").read_text() == whole
 
 
@@ -140,7 +139,7 @@ def test_csv_holds_every_digit(table: str, run: Path, tmp_path: Path) -> None:
     export(run / FILE, tmp_path)
     with (tmp_path / f"{table}.csv").open(encoding="utf-8", newline="") as file:
         found = list(csv.DictReader(file))
-    expected = in_order(read(run / FILE, table))
+    expected = in_order(read_table(run / FILE, table))
     assert len(found) == len(expected)
     for name in expected:
         if pd.api.types.is_numeric_dtype(expected[name]):
@@ -172,7 +171,7 @@ def test_the_order_does_not_depend_on_who_was_first(order: list[int]) -> None:
 
 
 def test_the_summary_has_a_line_for_every_cell(run: Path) -> None:
-    frame = summary(read(run / FILE, "cells"))
+    frame = summary(read_table(run / FILE, "cells"))
     first, second = frame.to_dict("records")
     assert (first["solver"], first["ok"]) == ("osqp", "0/4")
     assert (second["solver"], second["ok"]) == ("piqp", "4/4")
@@ -209,7 +208,7 @@ def rounds(cells: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def test_the_benefits_say_from_when_on_a_strategy_pays() -> None:
     a = CELL | {"cell": "a", "enrichment_kind": "per-parameter", "primal": "varying", "online_s": 0.004, "hf_s": 0.1}
     b = CELL | {"cell": "b", "enrichment_kind": "fixed", "primal": "fixed", "offline_s": 2.5, "hf_s": 0.1}
-    frame = benefits(pd.DataFrame(break_even_rows([a, b], rounds([a, b])), columns=list(THRESHOLDS)))
+    frame = break_even_table(pd.DataFrame(break_even_rows([a, b], rounds([a, b])), columns=list(BREAK_EVEN)))
     paired = frame[(frame["a"] == "varying") & (frame["b"] == "fixed")].iloc[0]
     assert paired["break-even"] == f"from {(2.5 - 1.5) / (0.004 - 0.0025):.0f}"
     assert (paired["offline a [s]"], paired["online a [ms]"], paired["online b [ms]"]) == pytest.approx((1.5, 4.0, 2.5))
@@ -221,13 +220,13 @@ def test_the_benefits_say_from_when_on_a_strategy_pays() -> None:
 def test_benefits_without_a_number_are_words() -> None:
     slow = CELL | {"hf_s": 0.001, "enrichment_kind": "none"}
     assert list(
-        benefits(pd.DataFrame(break_even_rows([slow], rounds([slow])), columns=list(THRESHOLDS)))["break-even"]
+        break_even_table(pd.DataFrame(break_even_rows([slow], rounds([slow])), columns=list(BREAK_EVEN)))["break-even"]
     ) == ["never"]
 
 
 def test_tables_of_nothing_are_empty() -> None:
     assert summary(cells()).empty
-    assert benefits(pd.DataFrame(columns=list(THRESHOLDS))).empty
+    assert break_even_table(pd.DataFrame(columns=list(BREAK_EVEN))).empty
     for columns in (CELLS, QUERIES, HISTORIES):
         assert in_order(pd.DataFrame(columns=list(columns))).empty
 
@@ -375,12 +374,12 @@ def test_a_real_run_exports_its_whole_matrix(quick_run: Path) -> None:
 
 
 def test_a_real_run_times_what_its_cells_are_made_of(quick_run: Path) -> None:
-    frame = read(quick_run / FILE, "cells")
+    frame = read_table(quick_run / FILE, "cells")
     parts = [f"offline_{part}_s" for part in ("snapshots", "pod", "cone", "enrichment", "assembly")]
     np.testing.assert_allclose(frame[parts].sum(axis=1), frame["offline_s"])
-    queries = read(quick_run / FILE, "queries")
+    queries = read_table(quick_run / FILE, "queries")
     fine = queries[queries["status"] == "ok"].groupby("cell")
-    by_cell = read(quick_run / FILE, "timings").set_index("cell")
+    by_cell = read_table(quick_run / FILE, "timings").set_index("cell")
     np.testing.assert_allclose(by_cell["assemble_s"] + by_cell["solve_s"], by_cell["total_s"])
     quartiles = by_cell.groupby("cell")["total_s"].quantile([0.25, 0.5, 0.75]).unstack().loc[frame["cell"]]
     np.testing.assert_allclose(quartiles[[0.25, 0.75]], frame[["online_q1_s", "online_q3_s"]])
@@ -399,16 +398,16 @@ def test_a_real_run_times_what_its_cells_are_made_of(quick_run: Path) -> None:
 def test_the_first_rows_are_those_of_the_whole_table_and_others_are_not_read(
     table: str, where: str, sort: tuple[str, ...], quick_run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, read = quick_run / FILE, tables.read
+    path, read_all = quick_run / FILE, read.read_table
     whole = look_up(path, table, where=where, sort=sort)
     sizes = []
 
     def noted(path: Path, name: str, cells: Sequence[str] = ()) -> pd.DataFrame:
-        found = read(path, name, cells)
+        found = read_all(path, name, cells)
         sizes.extend([len(found)] * (name == table))
         return found
 
-    monkeypatch.setattr(tables, "read", noted)
+    monkeypatch.setattr(read, "read_table", noted)
     first = look_up(path, table, where=where, sort=sort, limit=3)
     pd.testing.assert_frame_equal(first.rows, whole.rows.head(3))
     assert (first.columns, first.varying) == (whole.columns, whole.varying)
@@ -417,4 +416,4 @@ def test_the_first_rows_are_those_of_the_whole_table_and_others_are_not_read(
     mine = whole.rows[whole.rows["cell"] == cell].reset_index(drop=True)
     pd.testing.assert_frame_equal(of_cell.rows, mine, check_dtype=False)
     assert len(sizes) == 2
-    assert max(sizes) < len(read(path, table)) / 4
+    assert max(sizes) < len(read_all(path, table)) / 4

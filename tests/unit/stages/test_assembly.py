@@ -16,8 +16,8 @@ from vibench.model.affine import Evaluation
 from vibench.model.galerkin import ReducedModel, project
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.plugins.plugin import Plugin
-from vibench.results.columns import CELLS as CELL_COLUMNS
-from vibench.results.costs.ranking import too_loose
+from vibench.results.ranking import too_loose
+from vibench.results.schema import CELLS as CELL_COLUMNS
 from vibench.stages.assembly import AffineDecomposition, AssemblyStage
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries

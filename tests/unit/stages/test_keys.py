@@ -181,7 +181,7 @@ def test_no_code_counts_that_only_requests_records_or_shows() -> None:
 SOLUTIONS, MATRICES = "high-fidelity solutions", "constraint matrices"
 CONSTANTS, REFERENCE = "high-fidelity constants", "high-fidelity inf-sup constants"
 SHOWN = (
-    "report.html", "results.columns", "results.costs.break_even", "study.spec", "plugins.registry", "errors", "text",
+    "report.html", "results.schema", "results.break_even", "study.spec", "plugins.registry", "errors", "text",
     "storage.artefacts", "storage.serialisation", "stages.base", "provenance", "execution.run", "cli.main",
     "library.runs",
 )  # fmt: skip

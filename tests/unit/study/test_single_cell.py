@@ -10,8 +10,9 @@ from running import Changed, Main, refused
 
 from vibench.errors import RequestError
 from vibench.execution.recorded_cell import recorded_study
-from vibench.results import formats, tables
-from vibench.results.sqlite.reading import FILE
+from vibench.results import formats
+from vibench.results.read import read_table
+from vibench.results.sqlite import FILE
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, only_cell, read_study, study_of_cell
 from vibench.study.spec import Study
@@ -46,7 +47,7 @@ def test_a_definition_without_parameter_sets_is_one_with_those_of_the_problem() 
 
 
 def test_a_row_is_made_again_from_its_results_file(quick_run: Path, main: Main) -> None:
-    row = tables.read(quick_run / FILE, "cells").iloc[3]
+    row = read_table(quick_run / FILE, "cells").iloc[3]
     study = recorded_study(str(quick_run / FILE), row["cell"][:6])
     assert [cell.key for cell in expand(study)] == [row["cell"]]
     assert (study.name, study.timing_rounds) == ("quick", row["timing_rounds"])
@@ -63,7 +64,7 @@ def test_what_is_no_cell_is_refused(quick_run: Path, changed: Changed, main: Mai
     refused(main("run", results, "--cell", "a", "--solver", "piqp"), "leave out solvers")
     for definition in ("", "[]", "{}", '{"problem": 3}'):
         broken = changed(f"UPDATE cells SET definition = '{definition}'")
-        key = tables.read(broken, "cells")["cell"].iloc[0]
+        key = read_table(broken, "cells")["cell"].iloc[0]
         refused(main("run", str(broken), "--cell", key), key, "cannot be read")
 
 

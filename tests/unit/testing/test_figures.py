@@ -14,8 +14,8 @@ from running import Main, failures, refused
 
 from vibench import DerivedColumn, FigurePlugin, ProblemTables, testing
 from vibench.report.figures import OF_DUAL, OF_PROBLEM, drawings
-from vibench.results import tables
-from vibench.results.columns import TABLES
+from vibench.results.read import read_table
+from vibench.results.schema import TABLES
 from vibench.testing.samples.sample_run import write_sample_run
 
 counter = itertools.count()
@@ -136,14 +136,14 @@ def test_the_command_checks_on_a_run(main: Main, quick_run: Path) -> None:
 
 def test_the_made_up_run_is_one_that_vibench_reads_and_draws(tmp_path: Path) -> None:
     path = write_sample_run(tmp_path / "run")
-    assert {name for name in TABLES if tables.read(path, name).empty} == {"disagreements"}
-    cells = tables.read(path, "cells")
+    assert {name for name in TABLES if read_table(path, name).empty} == {"disagreements"}
+    cells = read_table(path, "cells")
     assert list(cells["status"]).count("crashed") == 1
     filled = cells[cells["status"] == "ok"].drop(columns=["pod_size", "dual_size", "primal_tol"])
     assert set(filled.columns[filled.isna().any()]) == {"bound_online_violations"}
     again = write_sample_run(tmp_path / "again")
     for name in TABLES:
-        pd.testing.assert_frame_equal(tables.read(path, name), tables.read(again, name))
+        pd.testing.assert_frame_equal(read_table(path, name), read_table(again, name))
     figures = [(name, draw, figure) for name, draw, data in drawings(path) for figure in draw(data)]
     drawn = {draw for _, draw, _ in figures}
     missing = {kind for kind, draw in (OF_PROBLEM | OF_DUAL).items() if draw not in drawn}

@@ -28,8 +28,8 @@ from vibench.report.comparison.differences import (
 )
 from vibench.report.comparison.runs import AXES, ComparedRun, compared_runs
 from vibench.results import formats
-from vibench.results.columns import CELLS
-from vibench.results.costs.break_even import FEWEST_ROUNDS
+from vibench.results.break_even import FEWEST_ROUNDS
+from vibench.results.schema import CELLS
 from vibench.timing import median_interval
 
 COLUMNS = [

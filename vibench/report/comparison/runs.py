@@ -12,9 +12,9 @@ from typing import Any
 import pandas as pd
 
 from vibench.qp.status import Status
-from vibench.results import tables
 from vibench.results.plugin_columns import Extended
-from vibench.results.sqlite.reading import FILE, read_meta, study_of
+from vibench.results.read import extended, in_order, read_table
+from vibench.results.sqlite import FILE, read_meta, study_of
 
 AXES = ("problem", "formulation", "dual", "primal", "asked", "solver", "accuracy", "assembly", "correction")
 """Columns that tell cells apart in a comparison; "asked" has all tolerances, or sizes."""
@@ -30,13 +30,13 @@ class ComparedRun:
     @cached_property
     def cells(self) -> dict[str, dict[str, Any]]:
         """Rows of the table of cells in the order of the axes, by key."""
-        rows = tables.in_order(self.extended.frame).to_dict("records")
+        rows = in_order(self.extended.frame).to_dict("records")
         return {str(row["cell"]): {str(name): value for name, value in row.items()} for row in rows}
 
     @cached_property
     def extended(self) -> Extended:
         """The table of cells with the columns that plugins add to it."""
-        return tables.extended(self.path, "cells")
+        return extended(self.path, "cells")
 
     @cached_property
     def identity(self) -> dict[str, Any]:
@@ -68,7 +68,7 @@ class ComparedRun:
     @cached_property
     def ok_queries(self) -> pd.DataFrame:
         """Rows of the ok queries, by cell and number."""
-        queries = tables.read(self.path, "queries")
+        queries = read_table(self.path, "queries")
         return queries[queries["status"] == Status.OK].set_index(["cell", "query"])
 
     def rounds(self, cell: str) -> Sequence[float]:
@@ -77,7 +77,7 @@ class ComparedRun:
 
     @cached_property
     def _rounds(self) -> Mapping[str, list[float]]:
-        timings = tables.read(self.path, "timings").sort_values(["cell", "round"])
+        timings = read_table(self.path, "timings").sort_values(["cell", "round"])
         return {str(cell): list(rows["total_s"]) for cell, rows in timings.groupby("cell")}
 
     def thresholds_of(self, cells: Collection[str]) -> pd.DataFrame:
@@ -89,7 +89,7 @@ class ComparedRun:
 
     @cached_property
     def _thresholds(self) -> pd.DataFrame:
-        return tables.read(self.path, "thresholds")
+        return read_table(self.path, "thresholds")
 
     def measured_beside(self, other: ComparedRun, unless: Sequence[ComparedRun]) -> list[str]:
         """Cells whose seconds compare with those of the other run, and with those of none of the runs `unless`."""

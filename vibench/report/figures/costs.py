@@ -22,8 +22,8 @@ from vibench.report.figures.data import (
 )
 from vibench.report.figures.looks import HIGH_FIDELITY_LOOK, Looks, Series
 from vibench.report.figures.style import ABREAST, DEEP, SERIES, Layout, Pages, Sheet, plot, scatter
-from vibench.results.costs import ranking
-from vibench.results.costs.break_even import HIGH_FIDELITY, Meaning
+from vibench.results import ranking
+from vibench.results.break_even import HIGH_FIDELITY, Meaning
 from vibench.study.cells import UNCORRECTED
 
 ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}

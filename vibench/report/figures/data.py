@@ -16,9 +16,10 @@ import pandas as pd
 
 from vibench.interfaces.formulations import MIXED
 from vibench.report.figures.looks import Series
-from vibench.results import pictures, tables
-from vibench.results.costs.ranking import too_loose
+from vibench.results import pictures
 from vibench.results.plugin_columns import faults_of
+from vibench.results.ranking import too_loose
+from vibench.results.read import extended_tables, in_order
 from vibench.study.cells import NO_SUCH_AXIS
 from vibench.text import json_object
 
@@ -116,10 +117,10 @@ def problems(
     The training set is named where a problem has several. Tables that are `given` are not read again; `note` is called
     with a line for every column of a plugin that those read here do not have.
     """
-    extended = tables.extended_tables(path, [name for name in TABLES if name not in given])
+    extended = extended_tables(path, [name for name in TABLES if name not in given])
     for line in faults_of(extended.values()):
         note(line)
-    read = {name: tables.in_order(given[name] if name in given else extended.pop(name).frame) for name in TABLES}
+    read = {name: in_order(given[name] if name in given else extended.pop(name).frame) for name in TABLES}
     if read["queries"].empty:
         return
     for axis in ("training", "formulation", "dual", "primal"):

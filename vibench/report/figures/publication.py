@@ -21,7 +21,7 @@ from vibench.report.figures.data import Data, file_names, problems
 from vibench.report.figures.plugins import FigureError, draw_guarded, named
 from vibench.report.figures.style import FORMATS, caption_of, first_sentence, save, styled
 from vibench.results.plugin_columns import loaded
-from vibench.results.sqlite.reading import read_meta, study_of
+from vibench.results.sqlite import read_meta, study_of
 from vibench.text import unbroken
 
 PAGE = "paper-figures.md"

@@ -10,9 +10,10 @@ from typing import Any
 
 import pandas as pd
 
-from vibench.results import formats, tables, views
-from vibench.results.columns import CELLS, STORED, THRESHOLDS, Column
+from vibench.results import formats, show
 from vibench.results.plugin_columns import Extended
+from vibench.results.read import in_order
+from vibench.results.schema import BREAK_EVEN, CELLS, STORED, Column
 from vibench.results.selection import short_keys
 from vibench.text import printable
 
@@ -26,7 +27,7 @@ FEW = 60
 """Texts of a column up to which it can be filtered by a list of them."""
 
 OF_CELLS = (
-    "cell", *views.AXES, "status", "queries_ok", "error_lambda_mean", "error_u_mean", "online_s", "offline_s",
+    "cell", *show.AXES, "status", "queries_ok", "error_lambda_mean", "error_u_mean", "online_s", "offline_s",
     "beta_span_min", "beta_cone_lower_min", "N", "R", "enrichment", "queries_zero_u", "error_u_zero_max",
     "queries_zero_lambda", "error_lambda_zero_max",
 )  # fmt: skip
@@ -74,31 +75,31 @@ class TableGrid:
         return shown, [[formats.cell_text(value) for value in row] for row in rows]
 
 
-RECORDED = [pair for table in (CELLS, THRESHOLDS, *STORED.values()) for pair in table.items()]
+RECORDED = [pair for table in (CELLS, BREAK_EVEN, *STORED.values()) for pair in table.items()]
 """Columns of all tables, those of cells first."""
 
 
 def grid_of_cells(extended: Extended, caption: str) -> TableGrid:
     """The table of all cells, in the order of the rows; columns of plugins without a heading are offered besides."""
     cells, columns, own = extended.frame, {**CELLS, **extended.columns}, tuple(extended.columns)
-    names = [n for n in (*OF_CELLS, *MORE_OF_CELLS, *own) if n in ("cell", *views.AXES) or cells[n].notna().any()]
-    says_nothing = [name for name in names if columns[name].heading and not tables.says_something(cells, name)]
+    names = [n for n in (*OF_CELLS, *MORE_OF_CELLS, *own) if n in ("cell", *show.AXES) or cells[n].notna().any()]
+    says_nothing = [name for name in names if columns[name].heading and not formats.says_something(cells, name)]
     length = short_keys(cells["cell"])
-    frame = tables.under_headings(cells.assign(cell=cells["cell"].str[:length]), names, columns)
+    frame = formats.under_headings(cells.assign(cell=cells["cell"].str[:length]), names, columns)
     offered = (*MORE_OF_CELLS, *(name for name in own if not columns[name].heading))
     hidden = [_heading(columns, name) for name in (*says_nothing, *offered) if name in names]
-    axes = tuple(_heading(CELLS, name) for name in (*views.AXES, "status"))
+    axes = tuple(_heading(CELLS, name) for name in (*show.AXES, "status"))
     disturbed, left_out = _disturbed(cells["cell"], cells), (*hidden, *_constant(frame))
     return TableGrid("summary", "All cells", caption, frame, axes, left_out, disturbed, extended.columns)
 
 
 def grid_of_thresholds(name: str, title: str, caption: str, rows: Extended, cells: pd.DataFrame) -> TableGrid:
     """A table of break-even points; a row is disturbed if one of its cells is."""
-    ordered = tables.in_order(rows.frame)
-    frame = tables.benefits(rows.frame, rows.columns)
-    first = _heading(THRESHOLDS, "primal_b")
+    ordered = in_order(rows.frame)
+    frame = formats.break_even_table(rows.frame, rows.columns)
+    first = _heading(BREAK_EVEN, "primal_b")
     frame = frame[[first, *frame.columns.drop(first)]]
-    results = {_heading(THRESHOLDS, name) for name in ("benefit_threshold", "threshold_high")}
+    results = {_heading(BREAK_EVEN, name) for name in ("benefit_threshold", "threshold_high")}
     texts = [heading for heading in frame.columns if not pd.api.types.is_numeric_dtype(frame[heading])]
     axes = tuple(heading for heading in texts if heading not in results)
     disturbed = {*_disturbed(ordered["cell_a"], cells), *_disturbed(ordered["cell_b"], cells)}

@@ -20,9 +20,9 @@ from vibench.report.figures.costs import ERRORS
 from vibench.report.figures.data import Data, best_solver, label
 from vibench.report.figures.looks import Look, Looks, Series
 from vibench.report.page.grids import short
-from vibench.results.costs import best, ranking
-from vibench.results.costs.break_even import HIGH_FIDELITY, TAIL
-from vibench.results.costs.paired_seconds import PairedSeconds
+from vibench.results import ranking
+from vibench.results.break_even import HIGH_FIDELITY, TAIL
+from vibench.results.paired_timing import PairedTiming
 from vibench.text import printable
 
 MARKERS = {
@@ -111,7 +111,7 @@ QUERIES = np.logspace(0.0, 6.0, 61)
 
 
 def overview(
-    name: str, data: Data, rows: Mapping[str, int], paired: PairedSeconds, certified: pd.Series
+    name: str, data: Data, rows: Mapping[str, int], paired: PairedTiming, certified: pd.Series
 ) -> Iterator[Plot]:
     """Errors, and certified ones, against the seconds of a query, and total costs over the number of queries.
 
@@ -136,11 +136,11 @@ def overview(
 
 
 def _costs(
-    cells: pd.DataFrame, errors: pd.Series, paired: PairedSeconds, rows: Mapping[str, int], looks: Looks
+    cells: pd.DataFrame, errors: pd.Series, paired: PairedTiming, rows: Mapping[str, int], looks: Looks
 ) -> dict[str, Any]:
     """Total costs over the number of queries with their 95 % bands, of the high-fidelity model and of the cheapest."""
     ways = dict(zip(cells["cell"], (Series(*w) for w in zip(cells["primal"], cells["way"], strict=True)), strict=True))
-    every = {one.key: one for one in best.candidates(cells, paired)}
+    every = {one.key: one for one in ranking.candidates(cells, paired)}
     winners: dict[str | None, None] = {None: None}
     for level in ranking.reached_errors(errors):
         allowed = [every[None], *(every[cell] for cell in cells["cell"][errors <= level * (1.0 + 1e-12)])]

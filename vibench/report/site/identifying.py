@@ -13,9 +13,8 @@ from contextlib import closing
 from pathlib import Path
 
 from vibench.errors import RequestError
-from vibench.results.columns import KEYS, STORED, TEXT
-from vibench.results.sqlite.digests import Digests
-from vibench.results.sqlite.reading import open_read_only, read_meta, read_rows, text_reader
+from vibench.results.schema import KEYS, STORED, TEXT
+from vibench.results.sqlite import Digests, open_read_only, read_meta, read_rows, text_reader
 from vibench.text import brief, json_object, unbroken
 
 LEFT_OUT = "…"

@@ -17,11 +17,12 @@ from vibench.report.site import folder
 from vibench.report.site.citation import Citation, requirements
 from vibench.report.site.identifying import cleaned, left
 from vibench.report.site.published_run import FILTERED, SHOWN_CELLS, PublishedRun, folder_names
-from vibench.results import formats, tables
-from vibench.results.costs.paired_seconds import PairedSeconds
-from vibench.results.costs.ranking import Criterion, Standings, leaderboard
+from vibench.results import formats
+from vibench.results.paired_timing import PairedTiming
 from vibench.results.plugin_columns import faults_of
-from vibench.results.sqlite.reading import FILE, open_read_only
+from vibench.results.ranking import Criterion, Standings, leaderboard
+from vibench.results.read import extended_tables, in_order, read_table, whole_numbers
+from vibench.results.sqlite import FILE, open_read_only
 
 TABLES = ("cells", "thresholds", "disagreements")
 """Tables that are published as CSV, too; all of them are in the results file."""
@@ -107,9 +108,9 @@ def _write_run(own: Path, run: PublishedRun, pages: _Pages, figures: bool) -> li
     with open_read_only(run.run.path) as db:
         db.execute("VACUUM INTO ?", (str((own / FILE).absolute()),))
     _write(own / "report.html", html.page(run.run.path, figures=figures))
-    extended = tables.extended_tables(run.run.path, TABLES)
+    extended = extended_tables(run.run.path, TABLES)
     for name, one in extended.items():
-        _write(own / "tables" / f"{name}.csv", formats.to_csv(tables.whole_numbers(tables.in_order(one.frame))))
+        _write(own / "tables" / f"{name}.csv", formats.to_csv(whole_numbers(in_order(one.frame))))
     _write(own / "requirements.txt", requirements(run.run.versions, run.code))
     _write(own / "provenance.json", json.dumps(run.provenance, indent=1, ensure_ascii=True, sort_keys=True) + "\n")
     pages.write(own / "index.html", "run", "../../", run=run, cells=run.cells(), columns=SHOWN_CELLS, tables=TABLES)
@@ -131,8 +132,8 @@ def _comparable(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, list[Publis
 def _boards(runs: Sequence[PublishedRun]) -> Iterator[tuple[PublishedRun, tuple[Standings, ...]]]:
     """The leaderboard of every run: seconds of other runs may have come from a busier machine, or other parameters."""
     for run in runs:
-        cells, timings = (tables.read(run.run.path, name) for name in ("cells", "timings"))
-        yield run, leaderboard(tables.in_order(cells), PairedSeconds(timings.to_dict("records")))
+        cells, timings = (read_table(run.run.path, name) for name in ("cells", "timings"))
+        yield run, leaderboard(in_order(cells), PairedTiming(timings.to_dict("records")))
 
 
 def _section(site: Path, number: int, study: str, comparison: Comparison) -> dict[str, Any]:

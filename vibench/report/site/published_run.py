@@ -17,7 +17,7 @@ from vibench.plugins.registry import registered
 from vibench.report.comparison.runs import ComparedRun
 from vibench.report.figures.data import way
 from vibench.results.formats import asked, cell_text, solver_text
-from vibench.results.sqlite.reading import FILE
+from vibench.results.sqlite import FILE
 
 FILTERED = ("study", "problem", "dual", "primal", "solver", "machine", "vibench")
 """What the list of runs is filtered by."""

@@ -19,7 +19,7 @@ from vibench.offline.formulated import CellSolver, Formulated
 from vibench.plugins.plugin import Plugin
 from vibench.qp.repeats import nearby
 from vibench.qp.status import Status
-from vibench.results.solver_agreement import answer_row
+from vibench.results.consistency import answer_row
 from vibench.stages.base import Row, Stage, Watch
 from vibench.stages.enrichment import spaces_of
 from vibench.stages.formulations.building import FormulationStage

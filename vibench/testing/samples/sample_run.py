@@ -12,10 +12,10 @@ import numpy as np
 
 from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Kind
-from vibench.results.columns import CELLS, HISTORY_KEYS, INTEGER, OUTPUTS, QUERIES, REAL, TEXT, TIMINGS, Column
-from vibench.results.costs.break_even import break_even_rows
+from vibench.results.break_even import break_even_rows
 from vibench.results.database import ResultsDatabase
-from vibench.results.sqlite.reading import FILE
+from vibench.results.schema import CELLS, HISTORY_KEYS, INTEGER, OUTPUTS, QUERIES, REAL, TEXT, TIMINGS, Column
+from vibench.results.sqlite import FILE
 
 QUERIES_PER_CELL, ROUNDS, STEPS = 5, 8, 6
 """Sizes of the run."""

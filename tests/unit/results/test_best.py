@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from samples import cells_of, row_of
 
-from vibench.results import tables
-from vibench.results.costs.ranking import BAND, HEADINGS, fastest
+from vibench.results import formats
+from vibench.results.ranking import BAND, HEADINGS, fastest
 
 
 def test_every_error_that_is_reached_has_its_fastest_cell() -> None:
@@ -38,4 +38,4 @@ def test_cells_that_no_leaderboard_names_take_no_part() -> None:
 def test_problems_are_apart_and_an_error_of_zero_is_one() -> None:
     found = fastest(cells_of(row_of("a", 0.05, 0.1), row_of("b", 0.0, 0.2, problem="zero", error_u_mean=0.0)))
     assert list(found["cell"]) == ["a", "b"]
-    assert "error ≤" in tables.under_headings(found, ["problem", BAND], HEADINGS)
+    assert "error ≤" in formats.under_headings(found, ["problem", BAND], HEADINGS)

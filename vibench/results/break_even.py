@@ -14,8 +14,8 @@ from vibench.arrays import Array
 from vibench.errors import requested
 from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Kind
-from vibench.results.columns import KEYS, THRESHOLDS
-from vibench.results.costs.paired_seconds import CONDITIONS, PairedSeconds
+from vibench.results.paired_timing import CONDITIONS, PairedTiming
+from vibench.results.schema import BREAK_EVEN, KEYS
 from vibench.study.cells import CERTIFIED, NO_SUCH_AXIS
 
 DRAWS = 2000
@@ -140,7 +140,7 @@ about as much, and no threshold that rests on it would be found again."""
 VALIDATION = ("validation", "validation_options")
 """Columns that name the validation set: seconds of a query are means over its queries."""
 
-_SHARED = tuple(name for name in THRESHOLDS if name in KEYS)
+_SHARED = tuple(name for name in BREAK_EVEN if name in KEYS)
 
 FORMULATION = ("formulation", "formulation_options")
 
@@ -171,10 +171,10 @@ def break_even_rows(
     cells: Iterable[Mapping[str, Any]], timings: Iterable[Mapping[str, Any]]
 ) -> Iterator[dict[str, Any]]:
     """Rows of the thresholds table from rows of the tables of cells and timings; see `compared`."""
-    return (_row(one) for one in compared(cells, PairedSeconds(timings)))
+    return (_row(one) for one in compared(cells, PairedTiming(timings)))
 
 
-def compared(cells: Iterable[Mapping[str, Any]], paired: PairedSeconds, tail: float = TAIL) -> Iterator[Comparison]:
+def compared(cells: Iterable[Mapping[str, Any]], paired: PairedTiming, tail: float = TAIL) -> Iterator[Comparison]:
     """Break-even of the models that are compared, undecided where more than `tail` of the draws deny it.
 
     It is "as fast" where it would be undecided, but the seconds of both queries differ by less than `MARGIN`, with the
@@ -232,7 +232,7 @@ def _as_certified(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     return bool((a["assembly"] == CERTIFIED) == (b["assembly"] == CERTIFIED))
 
 
-def _comparison(paired: PairedSeconds, a: Mapping[str, Any] | None, b: Mapping[str, Any], tail: float) -> Comparison:
+def _comparison(paired: PairedTiming, a: Mapping[str, Any] | None, b: Mapping[str, Any], tail: float) -> Comparison:
     """Break-even of b against a; what both have in common, offline phases or the set-up, does not differ."""
     key, offline_a = (None, b["hf_setup_s"]) if a is None else (a["cell"], a["offline_s"])
     ratio, level = paired.ratio(key, b["cell"]), paired.level(key, b["cell"])
@@ -256,7 +256,7 @@ def _comparison(paired: PairedSeconds, a: Mapping[str, Any] | None, b: Mapping[s
     return Comparison(a, b, result, (online_a, online_a * quotient), (math.exp(-high), math.exp(-low)))
 
 
-def _rounds_missing(paired: PairedSeconds, a: str | None, b: str) -> int | None:
+def _rounds_missing(paired: PairedTiming, a: str | None, b: str) -> int | None:
     """How many more rounds would decide between two queries at their present scatter: which is faster, or neither."""
     within, done = paired.ratio_within(a, b), paired.rounds(a, b)
     if within is None:

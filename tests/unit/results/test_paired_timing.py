@@ -14,12 +14,12 @@ import pytest
 from scipy.stats import t as student
 
 from vibench.execution.timing_plan import STOPPING_TAIL
-from vibench.results.costs.break_even import TAIL, compared
-from vibench.results.costs.paired_seconds import (
+from vibench.results.break_even import TAIL, compared
+from vibench.results.paired_timing import (
     CONDITIONS,
     CommonVariance,
     Estimate,
-    PairedSeconds,
+    PairedTiming,
     beside,
     blocks_of,
     paces,
@@ -89,7 +89,7 @@ def test_intervals_of_ratios_contain_the_truth_in_93_to_98_of_100_runs(kind: str
     inside: dict[str, list[bool]] = {"model": [], "group": [], "apart": []}
     for blocks in [2] * 70 + [4] * 30:
         rows, truth = measured(kind, blocks, GROUPS, rng)
-        paired = PairedSeconds(rows)
+        paired = PairedTiming(rows)
         inside["model"] += [covered(paired.ratio(None, cell), true) for cell, true in truth.items()]
         for cell, true in truth.items():
             group, number = map(int, cell.split("-"))
@@ -108,14 +108,14 @@ def test_intervals_of_cells_whose_rounds_end_when_they_are_decided_contain_the_t
         kept = [row for row in rows if row["block"].endswith(("/0", "/1"))]
         going = set(truth)
         for block in range(2, 6):
-            paired = PairedSeconds(kept)
+            paired = PairedTiming(kept)
             for cell in tuple(going):
                 found = paired.ratio(None, cell)
                 assert found is not None
                 low, high = found.interval(STOPPING_TAIL)
                 going -= {cell} if low > 0.0 or high < 0.0 else set()
             kept += [row for row in rows if row["block"].endswith(f"/{block}") and row["cell"] in going]
-        paired = PairedSeconds(kept)
+        paired = PairedTiming(kept)
         inside += [covered(paired.ratio(None, cell), true) for cell, true in truth.items()]
         blocks += [paired.rounds(None, cell) // ROUNDS for cell in truth]
     assert 0.93 <= np.mean(inside) <= 0.98
@@ -143,7 +143,7 @@ def runs_of_break_even(kind: str, offline_noise: float, rng: np.random.Generator
             | {"offline_s": offline, "offline_low_s": offline / factor, "offline_high_s": offline * factor}
             | {"hf_setup_s": 0.0, "hf_s": 1.0, "online_s": 1.0, "enrichment_kind": "fixed"}
         )  # fmt: skip
-    for one in compared(cells, PairedSeconds(rows)):
+    for one in compared(cells, PairedTiming(rows)):
         true = numbers[one.b["cell"]]
         yield one.result.low is not None and one.result.high is not None and one.result.low <= true <= one.result.high
 
@@ -187,7 +187,7 @@ def test_without_other_models_an_interval_is_students() -> None:
         {"cell": "c", "block": str(k), "total_s": np.exp(value), "hf_s": 1.0, "pace": 1.0}
         for k, value in enumerate(values)
     ]
-    found = PairedSeconds(rows).ratio_within(None, "c")
+    found = PairedTiming(rows).ratio_within(None, "c")
     assert found is not None
     expected = student.interval(0.95, 2, loc=0.2, scale=0.1 / np.sqrt(3.0))
     assert found.interval(TAIL) == pytest.approx(expected)

@@ -487,7 +487,7 @@ HISTORIES: Mapping[str, Column] = {
     "value": real("1", "The value; inf-sup constants are in the unit of β, diagnostics in their own units."),
 }
 
-THRESHOLDS: Mapping[str, Column] = {
+BREAK_EVEN: Mapping[str, Column] = {
     **_without("formulation", "formulation_options", "primal", "primal_options", "primal_tol", "assembly"),
     "cell_a": text("Cell of model a; empty for the high-fidelity model."),
     "cell_b": text("Cell of model b."),
@@ -578,7 +578,7 @@ TABLES: Mapping[str, Mapping[str, Column]] = {
     "queries": QUERIES,
     "histories": HISTORIES,
     "timings": TIMINGS,
-    "thresholds": THRESHOLDS,
+    "thresholds": BREAK_EVEN,
     "disagreements": DISAGREEMENTS,
     "outputs": OUTPUTS,
 }

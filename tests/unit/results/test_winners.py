@@ -21,9 +21,8 @@ from samples import cells_of, row_of
 
 import vibench
 from vibench.errors import RequestError
-from vibench.results.costs.best import certified_errors, cheapest
-from vibench.results.costs.paired_seconds import PairedSeconds
-from vibench.results.costs.ranking import BAND, Criterion, leaderboard
+from vibench.results.paired_timing import PairedTiming
+from vibench.results.ranking import BAND, Criterion, certified_errors, cheapest, leaderboard
 
 TOO_MUCH = 0.1
 """Errors, and shares of the solver and of assembly in them, from which a model wins nothing."""
@@ -122,10 +121,10 @@ def test_the_cheapest_models_are_those_of_the_raw_rows(raw: Raw, folder: Path, q
         assert 0.0 < row["probability"] <= 1.0
 
 
-def timed(cells: pd.DataFrame, noise: float = 0.0) -> PairedSeconds:
+def timed(cells: pd.DataFrame, noise: float = 0.0) -> PairedTiming:
     rng = np.random.default_rng(0)
     rows = cells.to_dict("records")
-    return PairedSeconds(
+    return PairedTiming(
         {"cell": row["cell"], "block": str(k // 3), "hf_s": row["hf_s"], "pace": 1.0}
         | {"total_s": row["online_s"] * float(np.exp(noise * rng.standard_normal()))}
         for row in rows

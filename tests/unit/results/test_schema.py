@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import hashlib
 
-from vibench.results.columns import STORED, VERSION
+from vibench.results.schema import STORED, VERSION
 
 WRITTEN = {19: "4d97"}
 """By version, the first four digits of the digest of tables and columns."""

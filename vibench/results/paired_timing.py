@@ -199,7 +199,7 @@ def mean_seconds(blocks: Iterable[Block]) -> tuple[float, float | None]:
     return float(online), float(online / ratio) if len(paired) else None
 
 
-class PairedSeconds:
+class PairedTiming:
     """Seconds of the cells of a run, from rows of its timings table."""
 
     def __init__(self, timings: Iterable[Mapping[str, Any]] = ()) -> None:

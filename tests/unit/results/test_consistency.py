@@ -13,8 +13,8 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.qp import verification
 from vibench.qp.solve import solve_qp
 from vibench.qp.verification import Slack, allowed, slack
-from vibench.results.columns import KEYS
-from vibench.results.solver_agreement import Recorded, compare, disagreement_rows, sentence, solution_row
+from vibench.results.consistency import Recorded, compare, disagreement_rows, sentence, solution_row
+from vibench.results.schema import KEYS
 
 
 def program(seed: int, n: int = 6, m: int = 4) -> VariationalInequality:

@@ -12,9 +12,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from samples import cell_row
 
-from vibench.results.columns import THRESHOLDS
-from vibench.results.costs import paired_seconds
-from vibench.results.costs.break_even import (
+from vibench.results import paired_timing
+from vibench.results.break_even import (
     FEWEST_ROUNDS,
     MARGIN,
     MOST_ROUNDS,
@@ -24,8 +23,9 @@ from vibench.results.costs.break_even import (
     break_even,
     break_even_rows,
 )
+from vibench.results.schema import BREAK_EVEN
 
-OTHER_RUNS = float(np.exp(NORMAL_95 * paired_seconds.CONDITIONS))
+OTHER_RUNS = float(np.exp(NORMAL_95 * paired_timing.CONDITIONS))
 """Half the width of the interval of a ratio that all rounds of a run agree on, as a factor."""
 
 PAPER = {
@@ -275,7 +275,7 @@ def test_cells_without_an_answer_are_left_out() -> None:
 
 def test_rows_fit_the_table() -> None:
     for row in compared(EVERY):
-        assert set(row) == set(THRESHOLDS)
+        assert set(row) == set(BREAK_EVEN)
 
 
 def test_nothing_comes_of_nothing() -> None:
@@ -384,7 +384,7 @@ def test_one_block_decides_nothing(count: int, meaning: str) -> None:
 def test_offline_seconds_are_as_uncertain_as_their_interval(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of those that both share nothing is uncertain."""
     cells = [cell("varying", "per-parameter", online_s=0.2), cell("fixed", "fixed", offline_s=12.0)]
-    monkeypatch.setattr(paired_seconds, "CONDITIONS", 0.0)
+    monkeypatch.setattr(paired_timing, "CONDITIONS", 0.0)
     steady = the_one(cells, rounds(cells))
     assert steady["threshold_low"] == pytest.approx(20.0)
     assert steady["threshold_high"] == pytest.approx(20.0)
@@ -397,7 +397,7 @@ def test_offline_seconds_are_as_uncertain_as_their_interval(monkeypatch: pytest.
 
 
 def test_shared_offline_phases_cancel(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(paired_seconds, "CONDITIONS", 0.0)
+    monkeypatch.setattr(paired_timing, "CONDITIONS", 0.0)
     spread = {"offline_low_s": 7.0, "offline_high_s": 9.0}
     cells = [cell("varying", "per-parameter", online_s=0.2), cell("fixed", "fixed")]
     alone = [{**one, **spread, "offline_s": 8.0} for one in cells]  # nothing but what they share

@@ -15,9 +15,9 @@ from samples import cell_row
 
 from vibench.errors import RequestError, StorageError
 from vibench.execution.run_folder import claimed
-from vibench.results import tables
 from vibench.results.database import ResultsDatabase
-from vibench.results.sqlite.reading import DAMAGED, FILE, DamagedResultsError, open_read_only, read_meta, set_aside
+from vibench.results.read import read_table, results_file
+from vibench.results.sqlite import DAMAGED, FILE, DamagedResultsError, open_read_only, read_meta, set_aside
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4}
 NOBODY = 65534
@@ -64,10 +64,10 @@ def test_a_file_that_is_gone_is_noticed_at_the_next_commit(
         with pytest.raises(StorageError, match=r"run/results.sqlite' was removed or replaced during the run"):
             write()
     database.close()
-    found = {name: tables.read(tmp_path / name / FILE, "cells")["cell"].tolist() for name in ("elsewhere",)}
+    found = {name: read_table(tmp_path / name / FILE, "cells")["cell"].tolist() for name in ("elsewhere",)}
     assert found == {"elsewhere": ["c1"]}
     if replaced:
-        assert tables.read(tmp_path / "run" / FILE, "cells")["cell"].tolist() == ["theirs"]
+        assert read_table(tmp_path / "run" / FILE, "cells")["cell"].tolist() == ["theirs"]
 
 
 @contextlib.contextmanager
@@ -97,8 +97,8 @@ def test_what_a_killed_run_left_is_read_in_a_folder_that_cannot_be_written(
         folder.chmod(0o555)
         Path(parent).chmod(0o755)
         with without_privileges():
-            assert tables.results_file(str(folder)) == folder / FILE
-            assert tables.read(folder / FILE, "cells")["cell"].tolist() == ["c1"]
+            assert results_file(str(folder)) == folder / FILE
+            assert read_table(folder / FILE, "cells")["cell"].tolist() == ["c1"]
             assert sorted(path.name for path in folder.iterdir()) == sorted(FILE + end for end in ends)
         folder.chmod(0o755)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -13,14 +13,24 @@ from typing import NoReturn
 import pandas as pd
 
 from vibench.errors import RequestError, unknown_name
-from vibench.results import plugin_columns, selection, tables
-from vibench.results.columns import CELLS, STORED, THRESHOLDS, Column
-from vibench.results.costs import best, ranking
-from vibench.results.costs.paired_seconds import PairedSeconds
-from vibench.results.costs.ranking import BAND
-from vibench.results.formats import cell_text
+from vibench.files import write_atomically
+from vibench.results import formats, plugin_columns, ranking, selection
+from vibench.results.formats import cell_text, csv_lines, summary, to_csv, to_markdown
+from vibench.results.paired_timing import PairedTiming
 from vibench.results.plugin_columns import Extended
-from vibench.results.sqlite.reading import parameters_of
+from vibench.results.ranking import BAND
+from vibench.results.read import (
+    cells_with_errors,
+    checked,
+    extended,
+    extended_tables,
+    in_order,
+    read_table,
+    terms_in_order,
+    whole_numbers,
+)
+from vibench.results.schema import BREAK_EVEN, CELLS, STORED, TABLES, Column
+from vibench.results.sqlite import parameters_of, read_parts
 from vibench.text import json_object
 
 AXES = (
@@ -60,7 +70,7 @@ class View:
     out."""
     headings: Mapping[str, Column] | None = None
     """Columns with headings and places of their own; empty where names are headings."""
-    rows: Callable[[pd.DataFrame], pd.DataFrame] = tables.in_order
+    rows: Callable[[pd.DataFrame], pd.DataFrame] = in_order
     """Its rows, in their order, from those of the source."""
     empty: str = ""
     """Why it may have no rows where the source has some."""
@@ -72,7 +82,7 @@ VIEWS: Mapping[str, View] = {
         "cells", ("problem", BAND, *OF_CELLS[:14], "ties", *OF_CELLS[14:]), ranking.HEADINGS, ranking.fastest,
         ranking.NO_BEST_CELL,
     ),
-    "benefits": View("thresholds", (*OF_BENEFITS, *(n for n in THRESHOLDS if THRESHOLDS[n].heading)), THRESHOLDS),
+    "benefits": View("thresholds", (*OF_BENEFITS, *(n for n in BREAK_EVEN if BREAK_EVEN[n].heading)), BREAK_EVEN),
     "cells": View("cells", (*OF_CELLS, "reason")),
     "queries": View(
         "queries",
@@ -133,21 +143,21 @@ class Table:
     def exact(self) -> pd.DataFrame:
         """Every value as it is recorded, under the column's name: for programs."""
         if not self.view.headings and not self.chosen:
-            return tables.whole_numbers(self.rows)
+            return whole_numbers(self.rows)
         more = {name: () if self.chosen else TOGETHER.get(name, ()) for name in self.columns}
-        return tables.whole_numbers(self.rows[[part for name in self._placed for part in (name, *more[name])]])
+        return whole_numbers(self.rows[[part for name in self._placed for part in (name, *more[name])]])
 
     @property
     def readable(self) -> pd.DataFrame:
         """The values as people read them, under headings; keys of cells are shortened, and names have their options."""
         told = {axis for axis, _ in self.varying}
-        names = [n for n in self._placed if self.chosen or n in told or tables.says_something(self.rows, n)]
+        names = [n for n in self._placed if self.chosen or n in told or formats.says_something(self.rows, n)]
         rows = self.rows.assign(cell=self.rows["cell"].str[: self.key_length]) if "cell" in self.rows else self.rows
         for axis in told:
             pairs = zip(rows[axis], rows[f"{axis}_options"], strict=True)
             texts = [_with_options(name, text, self.varying.get((axis, name), ())) for name, text in pairs]
             rows = rows.assign(**{axis: texts})
-        return tables.under_headings(rows, names, self.view.headings or {}).rename(columns=dict(self.parameters))
+        return formats.under_headings(rows, names, self.view.headings or {}).rename(columns=dict(self.parameters))
 
     @property
     def described(self) -> tuple[pd.DataFrame, list[str]]:
@@ -210,7 +220,7 @@ def look_up(
     needed = _cells_needed(path, VIEWS[name], cell, where, sort, limit) if not error and largest is None else ()
     view, extended = _measured(path, name, error, largest, needed, queries)
     view, frame = _with_columns(view, extended.columns), extended.frame
-    everything = tables.read(path, "cells") if needed else frame
+    everything = read_table(path, "cells") if needed else frame
     keys = everything.get("cell", [])
     if where:
         made = set(view.headings or {}) - set(frame.columns)
@@ -282,13 +292,13 @@ def _cells_needed(path: Path, view: View, cell: str, where: str, sort: Sequence[
         f'"{name}" IS NULL, "{name}" {"DESC" if key.startswith("-") else "ASC"}'
         for key, name in zip(sort, named, strict=True)
     ]
-    order = [*first, *tables.terms_in_order(STORED[view.source])]
+    order = [*first, *terms_in_order(STORED[view.source])]
     cells = selection.cells_of_first(path, view.source, where, order, limit)
     return cells if len(cells) <= FEW else ()
 
 
 def _key_of(path: Path, cell: str) -> str:
-    return selection.key_of(cell, map(str, tables.read(path, "cells")["cell"]), str(path.parent))
+    return selection.key_of(cell, map(str, read_table(path, "cells")["cell"]), str(path.parent))
 
 
 def _varying_options(frame: pd.DataFrame) -> dict[tuple[str, str], tuple[str, ...]]:
@@ -335,21 +345,21 @@ def _measured(
     path: Path, name: str, error: str, largest: float | None, cells: Sequence[str], queries: float | None
 ) -> tuple[View, Extended]:
     """A table for reading and its rows, or those of some cells, with errors by the measure that is asked for."""
-    view, extended = VIEWS[name], tables.extended(path, VIEWS[name].source, cells)
+    view, table = VIEWS[name], extended(path, VIEWS[name].source, cells)
     if queries is not None and name != "best":
         raise RequestError(f"--queries is for the table best, not for {name}")
     if name == "best":
-        return _best(path, view, error, largest, queries), extended
+        return _best(path, view, error, largest, queries), table
     if not error and largest is None:
-        return view, extended
+        return view, table
     if view.source != "thresholds":
         raise RequestError(f"the table {name} compares no models by an error; expected {', '.join(COMPARING)}")
-    recorded, errors = tables.measured(path, error or ranking.SOLUTION)
-    frame = ranking.with_errors(extended.frame, recorded, errors)
+    recorded, errors = cells_with_errors(path, error or ranking.SOLUTION)
+    frame = ranking.with_errors(table.frame, recorded, errors)
     first = ("problem", "dual", "primal_a", "primal_b", "benefit_threshold", "error_b", "error_a")
-    columns = {**extended.columns, **ranking.ERROR_COLUMNS}
+    columns = {**table.columns, **ranking.ERROR_COLUMNS}
     return replace(view, columns=tuple(dict.fromkeys((*first, *view.columns)))), replace(
-        extended, frame=frame, columns=columns
+        table, frame=frame, columns=columns
     )
 
 
@@ -357,14 +367,14 @@ def _best(path: Path, view: View, error: str, largest: float | None, queries: fl
     """The table of the fastest query at every error, or with a number of queries of the cheapest model."""
     if queries is None and largest is not None:
         raise RequestError("--within is for tables of break-even points, and for the table best with --queries")
-    errors = tables.measured(path, error)[1] if error else None
-    paired = PairedSeconds(tables.read(path, "timings").to_dict("records"))
+    errors = cells_with_errors(path, error)[1] if error else None
+    paired = PairedTiming(read_table(path, "timings").to_dict("records"))
     if queries is None:
         return replace(view, rows=partial(ranking.fastest, errors=errors, paired=paired))
-    certified = best.certified_errors(tables.read(path, "queries"))
+    certified = ranking.certified_errors(read_table(path, "queries"))
     asked = {"queries": queries, "errors": errors, "within": largest, "certified": certified}
-    rows = partial(best.cheapest, paired=paired, **asked)
-    return replace(view, rows=rows, columns=OF_TOTALS, headings=best.COLUMNS)
+    rows = partial(ranking.cheapest, paired=paired, **asked)
+    return replace(view, rows=rows, columns=OF_TOTALS, headings=ranking.COLUMNS)
 
 
 COMPARING = ("best", *(name for name, view in VIEWS.items() if view.source == "thresholds"))
@@ -384,3 +394,39 @@ def _refuse(table: str, column: str, known: Iterable[str], faults: Sequence[str]
         if line.startswith(f"column '{column}' of "):
             raise RequestError(line)
     raise unknown_name(f"column of {table}", column, known)
+
+
+SUMMARY = "summary.md"
+
+
+EXPORTED = (*(f"{table}.csv" for table in TABLES), SUMMARY)
+"""Names of the files that `export` writes."""
+
+
+def export(path: Path, folder: Path, note: Callable[[str], None] = lambda _: None) -> list[Path]:
+    """Write every table as CSV and the summary as Markdown into a folder; returns the files.
+
+    `note` is called with a line for every column of a plugin that could not be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    # The other tables are written as they are read: queries may be more than memory holds.
+    whole = extended_tables(path, [name for name in TABLES if name == "cells" or plugin_columns.is_extended(name)])
+    for line in plugin_columns.faults_of(whole.values()):
+        note(line)
+    texts: dict[str, Iterable[str]] = {
+        f"{name}.csv": [to_csv(whole_numbers(in_order(whole[name].frame)))] if name in whole else _csv_parts(path, name)
+        for name in TABLES
+    }
+    texts[SUMMARY] = [to_markdown(summary(whole["cells"].frame, whole["cells"].columns))]
+    for name, parts in texts.items():
+        write_atomically(folder / name, (part.encode("utf-8") for part in parts))
+    return [folder / name for name in texts]
+
+
+def _csv_parts(path: Path, table: str) -> Iterator[str]:
+    """A table without columns of plugins as CSV, in the order of `in_order`, part by part."""
+    header = True
+    for part in read_parts(path, table, order=terms_in_order(STORED[table])):
+        names, rows = checked(path, table, part)
+        yield csv_lines([names, *rows] if header else rows)
+        header = False

@@ -7,9 +7,9 @@ from pathlib import Path
 from running import execute
 from samples import cell_row
 
-from vibench.results.columns import VERSION
 from vibench.results.database import ResultsDatabase
-from vibench.results.sqlite.reading import FILE, open_read_only, read_meta, read_rows
+from vibench.results.schema import VERSION
+from vibench.results.sqlite import FILE, open_read_only, read_meta, read_rows
 
 
 def test_what_others_have_written_is_printable_when_it_is_read(journal: ResultsDatabase, tmp_path: Path) -> None:

@@ -1,1 +1,0 @@
-"""What models cost: seconds compared within rounds, break-even, who ranks where, and the cheapest."""

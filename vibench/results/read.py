@@ -1,0 +1,170 @@
+"""Tables of a run, read from its results file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from types import NoneType
+
+import pandas as pd
+
+from vibench.errors import RequestError
+from vibench.results import plugin_columns, ranking
+from vibench.results.break_even import Meaning
+from vibench.results.plugin_columns import Extended
+from vibench.results.schema import (
+    BLOB,
+    INTEGER,
+    KEYS,
+    PARAMETER,
+    REAL,
+    STORED,
+    TABLES,
+    TEXT,
+    VERSION,
+    Column,
+)
+from vibench.results.sqlite import FILE, Part, read_meta, read_parts, read_rows
+from vibench.study.cells import UNCORRECTED
+from vibench.text import brief, json_object
+
+ORDER = (
+    *KEYS, "formulation_a", "formulation_b", "primal_a", "primal_b", "primal_tol_a", "primal_tol_b", "assembly_a",
+    "assembly_b", "stage", "quantity", "query", "step",
+)  # fmt: skip
+"""Columns by which rows are sorted, where a table has them."""
+
+
+def results_file(run: str) -> Path:
+    """Results file of a run: a results file, its folder, or the name of a study under `runs/`.
+
+    Raises a `RequestError` if there is no results file, or its schema has another version.
+    """
+    for folder in (Path(run), Path("runs") / run):
+        # os.path, since methods of Path raise OSError for names too long for a file.
+        path = folder if os.path.isfile(folder) else folder / FILE  # noqa: PTH113
+        if os.path.isfile(path):  # noqa: PTH113
+            schema = read_meta(path).get("schema")
+            if schema != str(VERSION):
+                raise RequestError(f"'{path}' has schema {schema}, this vibench reads {VERSION}")
+            return path
+    raise RequestError(f"no results in '{run}': expected a folder with {FILE}, as `vibench run` makes under runs/")
+
+
+def read_table(path: Path, table: str, cells: Sequence[str] = ()) -> pd.DataFrame:
+    """One table of a results file, or its rows of some cells, in the order in which they were written.
+
+    Raises a `RequestError` if they are damaged, or have a value that is none of its column.
+    """
+    return _framed(path, table, read_rows(path, table, cells))
+
+
+def read_in_parts(path: Path, table: str) -> Iterator[pd.DataFrame]:
+    """One table as `read_table` gives it, some thousand rows at a time, since it may be larger than memory.
+
+    Raises a `RequestError` as `read_table`; of damage after the last part.
+    """
+    return (_framed(path, table, part) for part in read_parts(path, table))
+
+
+def _framed(path: Path, table: str, part: Part) -> pd.DataFrame:
+    names, rows = checked(path, table, part)
+    frame = pd.DataFrame.from_records(rows, columns=names, coerce_float=True)
+    for name in names:
+        if not _column(table, name).kind.startswith((TEXT, BLOB)) and not pd.api.types.is_numeric_dtype(frame[name]):
+            frame[name] = frame[name].astype(float)  # every value is NULL
+    return frame
+
+
+def checked(path: Path, table: str, part: Part) -> Part:
+    """Rows as they are; a `RequestError` if one has a value that is none of its column."""
+    names, rows = part
+    for name, values in zip(names, zip(*rows, strict=True), strict=False):  # no values where there are no rows
+        kind = _column(table, name).kind
+        types = set(map(type, values)) - {NoneType}
+        if kind.startswith(BLOB) or (types <= {int, float} and kind.startswith((REAL, INTEGER))):
+            continue
+        is_right, right = A_NUMBER if kind.startswith((REAL, INTEGER)) else RIGHT.get(name, A_TEXT)
+        for value in dict.fromkeys(values):
+            if value is not None and not is_right(value):
+                strange = f"{brief(repr(value), 60)} in the column '{name}' of '{table}'"
+                raise RequestError(f"'{path}' has {strange}, expected {right}")
+    return part
+
+
+def _column(table: str, name: str) -> Column:
+    return STORED[table].get(name, PARAMETER)
+
+
+A_NUMBER = (lambda value: isinstance(value, float | int)), "a number"
+A_TEXT = (lambda value: isinstance(value, str)), "a text"
+RIGHT: Mapping[str, tuple[Callable[[object], bool], str]] = {
+    "meaning": (set(Meaning).__contains__, f"one of {', '.join(Meaning)}"),
+    "versions": (lambda value: json_object(value) is not None, "a JSON object"),
+}
+"""What the values of some columns of texts have to be, and how it is said."""
+
+
+def extended(path: Path, table: str, cells: Sequence[str] = ()) -> Extended:
+    """One table of a results file with the columns that plugins add to it, in the order in which it was written.
+
+    With `cells`, only the rows of these are read: no plugin may add a column to the table, which may depend on others.
+
+    Raises a `RequestError` if it is damaged; what is wrong with a plugin is among the faults instead.
+    """
+    return plugin_columns.extended_tables((table,), partial(read_table, path, cells=cells))[table]
+
+
+def extended_tables(path: Path, names: Collection[str]) -> dict[str, Extended]:
+    """Several tables of a results file, as `extended` reads one; plugins are loaded once for all of them.
+
+    Raises a `RequestError` if one is damaged.
+    """
+    return plugin_columns.extended_tables(names, partial(read_table, path))
+
+
+def cells_with_errors(path: Path, measure: str = ranking.SOLUTION) -> tuple[pd.DataFrame, pd.Series]:
+    """The recorded cells of a results file, and the error of each by a measure.
+
+    Raises a `RequestError` if there is no such measure, or the file cannot be read.
+    """
+    cells = read_table(path, "cells")
+    return cells, ranking.errors_of(cells, read_table(path, "outputs"), measure)
+
+
+def in_order(frame: pd.DataFrame) -> pd.DataFrame:
+    """Rows sorted by the columns that identify them, loose tolerances first, whatever order cells finished in."""
+    by = [name for name in ORDER if name in frame.columns]
+    ascending = [_rises(name) for name in by]
+    return frame.sort_values(
+        by, ascending=ascending, kind="stable", na_position="first", ignore_index=True, key=_without_correction_first
+    )
+
+
+def terms_in_order(names: Collection[str]) -> list[str]:
+    """The order of `in_order` as terms of SQL, for a table with columns of these names."""
+    by = [name for name in ORDER if name in names and name != "correction"]
+    terms = {name: f'"{name}" IS NOT NULL, "{name}" {"ASC" if _rises(name) else "DESC"}' for name in by}
+    terms |= {"correction": f"correction IS NOT '{UNCORRECTED}'"} if "correction" in names else {}
+    return [*(terms[name] for name in ORDER if name in terms), "rowid"]
+
+
+def _rises(name: str) -> bool:
+    """Whether the smallest value of a column comes first."""
+    return "_tol" not in name
+
+
+def _without_correction_first(column: pd.Series) -> pd.Series:
+    return column != UNCORRECTED if column.name == "correction" else column
+
+
+def whole_numbers(frame: pd.DataFrame) -> pd.DataFrame:
+    """A table of the results file with whole numbers where its columns hold them: a missing one makes them floats."""
+    whole = {name: "Int64" for name in frame.columns if name in WHOLE and frame[name].dtype.kind in "if"}
+    return frame.astype(whole)
+
+
+WHOLE = {name for table in TABLES.values() for name, column in table.items() if column.kind == INTEGER}
+"""Columns of whole numbers; no name is a column of whole numbers in one table and of others in another."""
