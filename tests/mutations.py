@@ -445,10 +445,10 @@ FAULTS = (
     ),
     Fault(
         "proof-without-round-off",
-        "vibench/linalg/inertia.py",
-        "if error <= shift:",
-        "if np.isfinite(error):",
-        ("tests/unit/linalg/test_inertia.py",),
+        "vibench/linalg/proofs.py",
+        "if error <= shift:\n            return int",
+        "if np.isfinite(error):\n            return int",
+        ("tests/unit/linalg/test_proofs.py",),
     ),
     Fault(
         "constant-of-the-wrong-side",

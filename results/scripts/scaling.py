@@ -125,7 +125,7 @@ def all_rows() -> Iterator[dict[str, Any]]:
     name, meshes = FACTORISED
     case = CASES[name]
     for one in IMPLEMENTATIONS.values():
-        for nodes in meshes if one.is_direct and one.is_installed else ():
+        for nodes in meshes if one.is_installed else ():
             yield from _in_a_process("factorisation", name, nodes, case.R, case.delta, case.N, one.name)
 
 

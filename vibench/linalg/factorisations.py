@@ -1,16 +1,13 @@
-"""Factorisations of sparse symmetric positive definite matrices: one interface, and who implements it.
+"""Factorisations of sparse symmetric positive definite matrices: one interface and its implementations.
 
-A factor solves; an elimination condenses a matrix on some unknowns. Whether a matrix is positive definite is proved by
-any implementation that factorises: see `is_proved_definite`.
+A factor solves; an elimination condenses a matrix on some unknowns. Every implementation that factorises without
+pivoting proves that a matrix is positive definite, see `vibench.linalg.proofs`.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from importlib import import_module
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
@@ -18,16 +15,10 @@ from scipy.sparse.csgraph import connected_components
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError, RequestError, unknown_name
-from vibench.linalg import UNIT_ROUND_OFF
-from vibench.linalg.banded import is_proved_by_band
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky, elimination_order
 from vibench.linalg.definite import BlockDiagonal
-from vibench.linalg.inertia import ATTEMPTS, first_shift, proved_positive
 from vibench.provenance import distribution_version
 from vibench.text import brief
-
-COLUMNS = 128
-"""Columns of a Schur complement that are solved for at once, where an implementation has no better way to it."""
 
 
 class Factor(ABC):
@@ -38,7 +29,7 @@ class Factor(ABC):
         """X⁻¹ r for right-hand sides (n,) or (n, k)."""
 
     def entries(self, n: int) -> float:
-        """At most how many entries the triangular factor of a matrix (n×n) has."""
+        """Upper bound of the number of entries of the triangular factor of a matrix (n×n)."""
         return n * (n + 1.0) / 2.0
 
 
@@ -64,7 +55,7 @@ class Elimination(ABC):
 
 
 class FactoredElimination(Elimination):
-    """An elimination with a factor F of X = FᵀF that is upper triangular in its order; the last unknowns end that."""
+    """An elimination with a factor F of X = FᵀF, upper triangular in an order that ends with the last unknowns."""
 
     @property
     @abstractmethod
@@ -80,7 +71,7 @@ class FactoredElimination(Elimination):
 
     @abstractmethod
     def solve_factor_transposed(self, right: Array) -> Array:
-        """F⁻ᵀ r, for r (n,) or (n, k); of a functional on the last unknowns only the last entries are not zero."""
+        """F⁻ᵀ r, for r (n,) or (n, k); a functional on the last unknowns has nonzeros only in the last entries."""
 
 
 class _Empty(Factor):
@@ -94,31 +85,22 @@ FactoredElimination.register(PartialCholesky)
 Factor.register(SparseCholesky)
 
 
-@dataclass(frozen=True)
-class Implementation:
-    """Who factorises.
+class Implementation(ABC):
+    """A library that factorises without pivoting.
+
+    All methods raise a `NumericalError` that calls the matrix by `name` if it is not positive definite.
 
     Attributes
     ----------
-    name
-        Its name in studies.
-    summary
-        What it is, in a line.
-    module
-        Defines `factorise(matrix, name)`, and `eliminate(matrix, order, last, name)`, a `FactoredElimination`, if there
-        is a better one than by solutions with X_ii. Both raise a `NumericalError` that calls the matrix by `name` if it
-        is not positive definite.
+    name, summary
+        Name in studies, and one line about it.
     distribution
         The distribution it needs; "" if vibench needs that anyway.
-    is_direct
-        Whether it factorises, without pivoting: then a factorisation proves that a matrix is definite.
     """
 
-    name: str
-    summary: str
-    module: str
-    distribution: str = ""
-    is_direct: bool = True
+    name: ClassVar[str]
+    summary: ClassVar[str]
+    distribution: ClassVar[str] = ""
 
     @property
     def is_installed(self) -> bool:
@@ -126,87 +108,119 @@ class Implementation:
         return not self.distribution or bool(distribution_version(self.distribution))
 
     def factorise(self, matrix: SparseMatrix, name: str) -> Factor:
-        """A factor of a sparse symmetric matrix (n×n), which messages call by `name`.
+        """Return a factor of a sparse symmetric matrix (n×n), all of whose entries have to be finite."""
+        matrix = checked(matrix, name)
+        return self._factor(matrix, name) if matrix.shape[0] else _Empty()
 
-        Raises a `NumericalError` if it is not positive definite, or has an entry that is not finite.
-        """
-        if not self.module:
-            return SparseCholesky(checked(matrix, name), name)  # type: ignore[return-value]
-        return self._own.factorise(checked(matrix, name), name) if matrix.shape[0] else _Empty()
+    @abstractmethod
+    def _factor(self, matrix: SparseMatrix, name: str) -> Factor: ...
 
     def eliminate(self, matrix: SparseMatrix, order: Indices, last: int, name: str) -> Elimination:
-        """`matrix` (n×n) in an `order` (n,) with all unknowns but the last ones eliminated; raises as `factorise`."""
-        if not self.module:
-            return PartialCholesky(matrix, order, last, name)  # type: ignore[return-value]
-        if self._has_factor(len(order), last):
-            return self._own.eliminate(matrix, order, last, name)
+        """Eliminate all unknowns of a `matrix` (n×n) in an `order` (n,) but the last ones."""
         return EliminationBySolutions(self, matrix, order, last, name)
 
     def eliminate_with_factor(self, matrix: SparseMatrix, last: Indices, name: str) -> FactoredElimination:
-        """`matrix` (n×n) with all unknowns but `last` (c,) eliminated; by the default where this one shows no factor.
-
-        Raises as `factorise`.
-        """
-        chosen = self if self._has_factor(matrix.shape[0], len(last)) else IMPLEMENTATIONS[DEFAULT]
-        return chosen.eliminate(matrix, chosen.order(matrix, last), len(last), name)  # type: ignore[return-value]
-
-    def _has_factor(self, n: int, last: int) -> bool:
-        return not self.module or (0 < last < n and hasattr(self._own, "eliminate"))
+        """Eliminate all unknowns of a `matrix` (n×n) but `last` (c,), by the default where this one shows no factor."""
+        return IMPLEMENTATIONS[DEFAULT].eliminate_with_factor(matrix, last, name)
 
     def order(self, matrix: SparseMatrix, last: Indices) -> Indices:
-        """An order (n,) for `eliminate` that ends with the unknowns `last` (c,); of others each has its own."""
-        if self.module:
-            return np.concatenate([np.setdiff1d(np.arange(matrix.shape[0]), last), last])
+        """Return an order (n,) for `eliminate` that ends with the unknowns `last` (c,)."""
+        return np.concatenate([np.setdiff1d(np.arange(matrix.shape[0]), last), last])  # each has its own for the others
+
+
+class _SuperLU(Implementation):
+    name, summary = "superlu", "SuperLU of SciPy"
+
+    def _factor(self, matrix: SparseMatrix, name: str) -> Factor:
+        return SparseCholesky(matrix, name)  # type: ignore[return-value]
+
+    def eliminate(self, matrix: SparseMatrix, order: Indices, last: int, name: str) -> Elimination:
+        return PartialCholesky(matrix, order, last, name)  # type: ignore[return-value]
+
+    def eliminate_with_factor(self, matrix: SparseMatrix, last: Indices, name: str) -> FactoredElimination:
+        return self.eliminate(matrix, self.order(matrix, last), len(last), name)  # type: ignore[return-value]
+
+    def order(self, matrix: SparseMatrix, last: Indices) -> Indices:
         return elimination_order(matrix, last)
 
-    @cached_property
-    def _own(self) -> _Module:
-        return import_module(self.module)  # type: ignore[return-value]
+
+class _Pardiso(Implementation):
+    name, summary, distribution = "pardiso", "PARDISO of the Intel MKL", "pypardiso"
+
+    def _factor(self, matrix: SparseMatrix, name: str) -> Factor:
+        from vibench.linalg.pardiso import PardisoFactor  # noqa: PLC0415  an optional library
+
+        return PardisoFactor(matrix, name)
+
+    def eliminate(self, matrix: SparseMatrix, order: Indices, last: int, name: str) -> Elimination:
+        from vibench.linalg.pardiso import PardisoElimination  # noqa: PLC0415
+
+        # PARDISO has no Schur complement of no unknown or of all.
+        is_some = 0 < last < len(order)
+        return (PardisoElimination if is_some else super().eliminate)(matrix, order, last, name)
+
+    def eliminate_with_factor(self, matrix: SparseMatrix, last: Indices, name: str) -> FactoredElimination:
+        if not 0 < len(last) < matrix.shape[0]:
+            return super().eliminate_with_factor(matrix, last, name)
+        return self.eliminate(matrix, self.order(matrix, last), len(last), name)  # type: ignore[return-value]
 
 
-class _Module:
-    """What a module of an implementation has."""
+class _Cholmod(Implementation):
+    name, summary, distribution = "cholmod", "CHOLMOD, supernodal", "kvxopt"
 
-    factorise: Callable[[SparseMatrix, str], Factor]
-    eliminate: Callable[[SparseMatrix, Indices, int, str], FactoredElimination]
+    def _factor(self, matrix: SparseMatrix, name: str) -> Factor:
+        return CholmodFactor(matrix, name)
 
 
-IMPLEMENTATIONS = {
-    one.name: one
-    for one in (
-        Implementation("superlu", "SuperLU of SciPy", ""),
-        Implementation("pardiso", "PARDISO of the Intel MKL", "vibench.linalg.pardiso", "pypardiso"),
-        Implementation("cholmod", "CHOLMOD, supernodal", "vibench.linalg.cholmod", "kvxopt"),
-        Implementation(
-            "conjugate-gradients",
-            "conjugate gradients with smoothed aggregation, for matrices whose factors do not fit in memory",
-            "vibench.linalg.conjugate_gradients", "pyamg", is_direct=False,
-        ),
-    )
-}  # fmt: skip
-"""All implementations by name, the default first."""
+class CholmodFactor(Factor):
+    """A supernodal Cholesky factor by CHOLMOD of SuiteSparse."""
 
+    def __init__(self, matrix: SparseMatrix, name: str) -> None:
+        from kvxopt import base, cholmod  # noqa: PLC0415  an optional library
+
+        lower, self._library, self._dense = sp.coo_array(sp.tril(matrix)), cholmod, base.matrix
+        rows, columns = lower.coords
+        sparse: Any = base.spmatrix
+        values: Any = [self._dense(part) for part in (lower.data.astype(float), rows.astype(int), columns.astype(int))]
+        entries = sparse(*values, matrix.shape)
+        self._symbolic = cholmod.symbolic(entries)
+        try:
+            cholmod.numeric(entries, self._symbolic)
+            # Only the diagonal raises where the factorisation has stopped before its end.
+            cholmod.diag(self._symbolic)
+        except (ArithmeticError, ValueError):
+            raise NumericalError(f"{name} is not positive definite") from None
+
+    def solve(self, right: Array) -> Array:
+        if not right.size:
+            return np.zeros_like(right, dtype=float)
+        columns: Any = np.asfortranarray(right.reshape(len(right), -1), dtype=float)
+        solution = self._dense(columns)
+        self._library.solve(self._symbolic, solution)
+        return np.ascontiguousarray(np.array(solution).reshape(columns.shape)).reshape(right.shape)
+
+
+IMPLEMENTATIONS: dict[str, Implementation] = {one.name: one for one in (_SuperLU(), _Pardiso(), _Cholmod())}
 DEFAULT: str = next(iter(IMPLEMENTATIONS))
 
 AVAILABLE = "available"
-"""Asks for the first of `PREFERRED` that is installed."""
-
-PREFERRED = ("pardiso", "cholmod", "superlu")
+"""Asks for the first installed one of PARDISO, CHOLMOD and SuperLU."""
 
 
 def implementation(name: str) -> Implementation:
-    """The implementation of a name; raises a `RequestError` if there is none."""
+    """Return the implementation of a name; raises a `RequestError` if there is none."""
     if not isinstance(name, str):
         raise RequestError(f"the factorisation is {brief(repr(name), 80)}, expected the name of one")
     if name == AVAILABLE:
-        return next(IMPLEMENTATIONS[one] for one in PREFERRED if IMPLEMENTATIONS[one].is_installed)
+        fastest_first = (IMPLEMENTATIONS[one] for one in ("pardiso", "cholmod", DEFAULT))
+        return next(one for one in fastest_first if one.is_installed)
     if name not in IMPLEMENTATIONS:
         raise unknown_name("factorisation", name, [*IMPLEMENTATIONS, AVAILABLE])
     return IMPLEMENTATIONS[name]
 
 
 def checked(matrix: SparseMatrix, name: str) -> SparseMatrix:
-    """The matrix (CSC); a `NumericalError` if an entry is not finite, or a pivot at sight not positive."""
+    """Return the matrix (CSC); raises a `NumericalError` if an entry is not finite, or a diagonal one not positive."""
     matrix = sp.csc_array(matrix)
     if not np.all(np.isfinite(matrix.data)):
         raise NumericalError(f"{name} has entries that are not finite")
@@ -227,11 +241,9 @@ class EliminationBySolutions(Elimination):
 
     @property
     def nbytes(self) -> int:
-        """Memory of the matrix; that of the factors is not known."""
         return 12 * int(self._matrix.nnz)
 
     def schur_blocks(self) -> BlockDiagonal:
-        """The Schur complement, body by body."""
         split, bodies = self._split, connected_components(self._matrix, directed=False)[1]
         blocks = []
         for body in np.unique(bodies[split:]):
@@ -245,12 +257,12 @@ class EliminationBySolutions(Elimination):
         schur = matrix[split:, split:].toarray(order="F")
         if split:
             factor, coupling = self._chosen.factorise(matrix[:split, :split], self._name), matrix[:split, split:]
-            for columns in _slices(count):
+            # Columns of a dense right-hand side that are solved for at once: all of them may not fit in memory.
+            for columns in (slice(first, first + 128) for first in range(0, count, 128)):
                 schur[:, columns] -= coupling.T @ factor.solve(coupling[:, columns].toarray())
         return np.asarray(0.5 * (schur + schur.T))
 
     def eliminate(self, right: Array) -> tuple[Array, Array]:
-        """The solution in i and the load on c."""
         first, last = np.asarray(right[self._order[: self._split]], float), right[self._order[self._split :]]
         if self._factor is None or not first.any():
             return np.zeros_like(first), np.asarray(last, float)
@@ -258,47 +270,8 @@ class EliminationBySolutions(Elimination):
         return solved, last - self._coupling @ solved
 
     def extend(self, last: Array) -> Array:
-        """All unknowns from the last ones."""
         u = np.empty((len(self._order), *last.shape[1:]))
         if self._factor is not None:
             u[self._order[: self._split]] = -self._factor.solve(np.asarray(self._coupling.T @ last))
         u[self._order[self._split :]] = last
         return u
-
-
-def _slices(count: int) -> Iterator[slice]:
-    return (slice(first, first + COLUMNS) for first in range(0, count, COLUMNS))
-
-
-def is_proved_definite(parts: Sequence[SparseMatrix], chosen: Implementation, order: Indices | None = None) -> bool:
-    """Whether the sum of symmetric matrices (n×n) is proved to be positive definite, whatever the round-off.
-
-    By default a narrow band is factorised (`vibench.linalg.banded`), or factors of SuperLU, which stands in for what
-    factorises nothing, are looked at (`vibench.linalg.inertia`), in an `order` (n,) if given. Of the others nothing is
-    known but that they compute a Cholesky factorisation. If it ends for the computed D⁻¹XD⁻¹ − cI, D² being the
-    diagonal of X, then X is definite, with c the sum of the round-off of summing and scaling and of the factorisation,
-    Σ_j γ / (1 − γ) with γ_k of k = t_j + 1 and t_j entries in column j of the factor (Rump, "Verification of positive
-    definiteness", BIT Numerical Mathematics 46, 2006, §2): about u times the number of all entries. An LU factorisation
-    has no such bound, since its two factors differ by round-off.
-    """
-    if not chosen.module or not chosen.is_direct:
-        if (found := is_proved_by_band(parts)) is not None:
-            return found
-        diagonal = np.asarray(sum(part.diagonal() for part in parts))
-        return bool(np.all(diagonal > 0.0)) and proved_positive(parts, np.sqrt(diagonal), order) == len(diagonal)
-    try:
-        matrix = checked(sum(sp.csc_array(part) for part in parts), "")
-        scale = sp.diags_array(1.0 / np.sqrt(matrix.diagonal()), format="csc")
-        sizes = scale @ sum(abs(sp.csc_array(part)) for part in parts) @ scale
-        scaled = sp.csc_array(scale @ (0.5 * (matrix + matrix.T)) @ scale)
-        rounded = (8.0 + 2.0 * len(parts)) * UNIT_ROUND_OFF * float(np.max(sizes.sum(axis=0), initial=0.0))
-        shift, identity = first_shift(scaled), sp.eye_array(matrix.shape[0], format="csc")
-        for _ in range(ATTEMPTS):
-            factor = chosen.factorise(sp.csc_array(scaled - shift * identity), "")
-            error = 1.01 * (2.0 * UNIT_ROUND_OFF * (factor.entries(matrix.shape[0]) + matrix.shape[0]) + rounded)
-            if error <= shift:
-                return True
-            shift = 1.01 * error
-    except NumericalError:
-        pass
-    return False

@@ -119,7 +119,7 @@ class InnerProduct:
     @cached_property
     def _solver(self) -> Factor | SparseCholesky:
         chosen = implementation(self.factorisation)
-        return chosen.factorise(self.matrix, self._name) if chosen.module and chosen.is_direct else self._factor
+        return chosen.factorise(self.matrix, self._name) if chosen.name != DEFAULT else self._factor
 
     def _refuse_others(self, u: Array) -> None:
         """Refuse what has not one row for each dimension of the space."""

@@ -68,7 +68,9 @@ def _call(solver: PyPardisoSolver, phase: int, upper: SparseMatrix, right: Array
         raise NumericalError(f"{name} is not positive definite (PARDISO: error {error.value})") from None
 
 
-class _Pardiso(Factor):
+class PardisoFactor(Factor):
+    """A factor; a `NumericalError` says that the matrix is not positive definite."""
+
     def __init__(self, matrix: SparseMatrix, name: str) -> None:
         self._solver, self._upper, self._name = _solver(), _upper(matrix), name
         weakref.finalize(self, self._solver.free_memory, everything=True).atexit = False  # memory that NumPy has not
@@ -84,12 +86,7 @@ class _Pardiso(Factor):
         return _call(self._solver, SOLVE, self._upper, np.asfortranarray(right, dtype=float), self._name)
 
 
-def factorise(matrix: SparseMatrix, name: str) -> Factor:
-    """A factor of a matrix (n×n); raises a `NumericalError` if it is not positive definite."""
-    return _Pardiso(matrix, name)
-
-
-class _Elimination(FactoredElimination):
+class PardisoElimination(FactoredElimination):
     """One factorisation for the Schur complement and for solutions: FORWARD ends with its loads, BACKWARD begins there.
 
     FORWARD solves with L, so that what it makes of functionals has their inner products in X_ii⁻¹.
@@ -157,11 +154,3 @@ class _Elimination(FactoredElimination):
 
     def _forward(self, ordered: Array) -> Array:
         return self._call(FORWARD, ordered) if ordered.size else ordered
-
-
-def eliminate(matrix: SparseMatrix, order: Indices, last: int, name: str) -> FactoredElimination:
-    """A matrix (n×n) in an order (n,) with all unknowns but the last ones eliminated, some and not all.
-
-    Raises as `factorise` of the eliminated block.
-    """
-    return _Elimination(matrix, order, last, name)

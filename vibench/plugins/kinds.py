@@ -20,7 +20,7 @@ class PluginKind(StrEnum):
     """The module that `vibench new` writes it to."""
     _base: str
 
-    def __new__(  # noqa: D102
+    def __new__(
         cls, title: str, plural: str = "", group: str = "", cli_name: str = "", module: str = "", base: str = ""
     ) -> PluginKind:
         kind = str.__new__(cls, title)

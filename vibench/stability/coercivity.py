@@ -10,7 +10,7 @@ of A − aX_V, c ≥ γ_a by those of cX_V − A, and, where A is positive defin
     [ A    Bᵀ     ]
     [ B    b²X_W  ],    whose Schur complement of A is b²X_W − BA⁻¹Bᵀ (Haynsworth),
 
-see `vibench.linalg.inertia` for what proves them in floating-point arithmetic.
+see `vibench.linalg.proofs` for what proves them in floating-point arithmetic.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.linalg.cholesky import SparseCholesky, symmetric_lu
-from vibench.linalg.factorisations import implementation, is_proved_definite
-from vibench.linalg.inertia import proved_positive
+from vibench.linalg.factorisations import implementation
 from vibench.linalg.inner_product import InnerProduct
 from vibench.linalg.lanczos import Lanczos, largest_eigenvalue
+from vibench.linalg.proofs import is_proved_definite, proved_positive
 from vibench.linalg.schur_complement import FEW_PER_UNKNOWN
 from vibench.stability.infsup import InfSup
 

@@ -39,9 +39,10 @@ from scipy.linalg.lapack import dpotrf
 from vibench.arrays import Array, SparseMatrix
 from vibench.linalg import UNIT_ROUND_OFF
 from vibench.linalg.definite import BlockDiagonal
-from vibench.linalg.factorisations import DEFAULT, implementation, is_proved_definite
+from vibench.linalg.factorisations import DEFAULT, implementation
 from vibench.linalg.inner_product import InnerProduct
 from vibench.linalg.lanczos import Lanczos
+from vibench.linalg.proofs import is_proved_definite
 from vibench.stability.coercivity import FEW, Constant, moved, smallest_root
 
 COLUMNS = 128

@@ -212,7 +212,7 @@ class Study(_Model):
         Field(description="Minimal number of timing rounds, after which a cell with decided comparisons ends."),
     ] = 6
     factorisation: Annotated[
-        Literal["superlu", "pardiso", "cholmod", "conjugate-gradients", "available"],
+        Literal["superlu", "pardiso", "cholmod", "available"],
         Field(description="Factorisation of high-fidelity matrices; a problem may have an option of the same name."),
     ] = "superlu"
     problem: Annotated[list[ProblemEntry], MinLen(1), Field(description="Problems.")]

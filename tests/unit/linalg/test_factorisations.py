@@ -1,4 +1,4 @@
-"""Every implementation of factorisations against dense matrices; what it has to refuse; proofs of definiteness."""
+"""Every implementation of factorisations against dense matrices; and what it has to refuse."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import pytest
 import scipy.sparse as sp
 
 from vibench.errors import NumericalError, RequestError
-from vibench.linalg import banded, factorisations
-from vibench.linalg.factorisations import IMPLEMENTATIONS, Implementation, implementation, is_proved_definite
+from vibench.linalg.factorisations import IMPLEMENTATIONS, Implementation, implementation
+from vibench.linalg.proofs import is_proved_definite
 
 EVERY = pytest.mark.parametrize("chosen", [pytest.param(one, id=name) for name, one in IMPLEMENTATIONS.items()])
 
@@ -108,37 +108,6 @@ def test_what_is_not_definite_is_refused_by_name(chosen: Implementation, matrix:
     with pytest.raises(NumericalError, match="the thing"):
         chosen.factorise(sp.csc_array(matrix), "the thing")
     assert not is_proved_definite([sp.csc_array(matrix)], chosen)
-
-
-@EVERY
-@pytest.mark.parametrize("weight", [1.0, 2e11])
-def test_a_definite_matrix_is_proved_to_be_one(chosen: Implementation, weight: float) -> None:
-    """As a sum, too; and what is definite, and factorised, but may be so by round-off, is not."""
-    A = membranes((12,), weight)
-    smallest = float(np.linalg.eigvalsh(A.toarray())[0])
-    assert is_proved_definite([A], chosen)
-    norm = sp.eye_array(144, format="csc")
-    assert is_proved_definite([A, -(1.0 - 1e-7) * smallest * norm], chosen)
-    assert not is_proved_definite([A, -(1.0 + 1e-7) * smallest * norm], chosen)
-    if chosen.is_direct:
-        chosen.factorise(sp.csc_array(A - smallest * (1.0 - 1e-13) * norm), "A")
-    assert not is_proved_definite([A, -(1.0 - 1e-13) * smallest * norm], chosen)
-
-
-@pytest.mark.parametrize("work", [1.5e8, 0.0])
-def test_an_order_serves_bands_that_are_not_narrow(monkeypatch: pytest.MonkeyPatch, work: float) -> None:
-    """Where an order is known, too, a narrow band is factorised; either way decides closely."""
-    A, orders = membranes((12,)), list[object]()
-    smallest, norm = float(np.linalg.eigvalsh(A.toarray())[0]), sp.eye_array(144, format="csc")
-    monkeypatch.setattr(banded, "MOST_WORK", work)
-    plain = factorisations.proved_positive
-    monkeypatch.setattr(factorisations, "proved_positive", lambda *given: orders.append(given[2]) or plain(*given))
-    order = np.random.default_rng(0).permutation(144)
-    for share, proved in ((1.0 - 1e-7, True), (1.0 + 1e-7, False), (1.0 - 1e-13, False)):
-        assert is_proved_definite([A, -share * smallest * norm], implementation("superlu"), order) is proved
-    assert not is_proved_definite([np.nan * A], implementation("superlu"), order)
-    assert bool(orders) == (work == 0.0)
-    assert all(one is order for one in orders)
 
 
 def test_names() -> None:
