@@ -142,6 +142,27 @@ def core_code() -> str:
     return f"{distribution_version('vibench')} {source_hash(Path(__file__).parent)}"
 
 
+LAYERS = (
+    "rounds", "stages", "offline", "results.consistency", "results.pictures", "study.parameter_sets", "packs",
+    "model", "highfidelity", "stability", "reduction", "qp", "fem", "interfaces", "linalg", "timing", "arrays",
+)  # fmt: skip
+"""Packages and modules that determine numbers, from top to bottom as in the contracts of import-linter.
+
+All others only ask for numbers, hand them over, record or show them.
+"""
+
+
+@cache
+def numerical_code(below: str = "") -> str:
+    """Hash of the sources of `LAYERS`, or of those below one of them."""
+    content, core = hashlib.sha256(), Path(__file__).parent
+    for layer in LAYERS[LAYERS.index(below) + 1 if below else 0 :]:
+        folder = core.joinpath(*layer.split("."))
+        source = folder if folder.is_dir() else folder.with_suffix(".py")
+        content.update(f"{layer} {source_hash(source)}\n".encode())
+    return content.hexdigest()[:12]
+
+
 @cache
 def libraries() -> str:
     """Versions of Python and of the libraries that results of stages depend on."""
@@ -150,10 +171,12 @@ def libraries() -> str:
 
 
 def source_hash(source: Path) -> str:
-    """Short hash of a Python source, or of all of them in a folder and below it."""
+    """Short hash of a source, or of all sources and templates in a folder and below it."""
     content = hashlib.sha256()
     folder = source if source.is_dir() else source.parent
-    for path in sorted(source.rglob("*.py")) if source.is_dir() else [source]:
+    for path in (
+        sorted(p for p in source.rglob("*") if p.suffix in (".py", ".template")) if source.is_dir() else [source]
+    ):
         content.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     return content.hexdigest()[:12]
 

@@ -30,8 +30,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from importlib import import_module
-from importlib.metadata import distribution
-from inspect import isabstract
 from pathlib import Path
 from pkgutil import walk_packages
 from typing import Any
@@ -255,7 +253,6 @@ def _load() -> None:
     import_module("unsynced").leave_syncing_to_the_system()
     import_module("vibench.execution.jobs").code_here()
     _hash_stages(import_module("vibench.stages.base").Stage)
-    _hash_plugins()
     typer = import_module("typer.main")
     typer.get_command = cache(typer.get_command)
     typer.get_command(import_module("vibench.cli.main").app)
@@ -265,17 +262,8 @@ def _load() -> None:
 def _hash_stages(kind: Any) -> None:
     """Hash the sources that determine the values of all stages of a kind."""
     for stage in kind.__subclasses__():
-        if not isabstract(stage):
-            import_module("vibench.dependencies").code_used(*stage.code())
+        stage.code()
         _hash_stages(stage)
-
-
-def _hash_plugins() -> None:
-    """Hash what plugins of vibench use of its sources; none is imported, and who is forked looks for plugins itself."""
-    groups = {f"vibench.{kind}" for kind in ("problems", "dual_strategies", "primal_strategies")}
-    for entry in distribution("vibench").entry_points:
-        if entry.group in groups:
-            import_module("vibench.dependencies").code_used(entry.value, whole=True)
 
 
 def _forked(client: socket.socket, own: Sequence[socket.socket]) -> int:

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any
 
-from vibench.dependencies import CELL, Request, code_found, code_used
-from vibench.provenance import libraries
+from vibench.provenance import libraries, numerical_code
 from vibench.stages.base import Failed, ItemwiseStage, Stage
 
 OUT_OF_MEMORY = "out of memory: the limit is memory_gib"
@@ -18,7 +17,7 @@ OUT_OF_MEMORY = "out of memory: the limit is memory_gib"
 
 def code_here() -> str:
     """The code of vibench that determines numbers, and the libraries, in this process."""
-    return f"{code_used(*CELL, whole=True)}; {libraries()}"
+    return f"{numerical_code()}; {libraries()}"
 
 
 @dataclass(frozen=True)
@@ -33,8 +32,6 @@ class Job:
     lost: Mapping[str, Failed] = field(default_factory=dict)
     """Dispensable stages that failed, by key."""
     code: str = field(default_factory=code_here)
-    found: Mapping[Request, tuple[str, str]] = field(default_factory=code_found)
-    """What was looked for in sources: a worker that has the same ones need not do it again."""
 
 
 @dataclass(frozen=True)

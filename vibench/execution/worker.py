@@ -22,7 +22,6 @@ from typing import Any, TypeVar
 from threadpoolctl import threadpool_limits
 
 from vibench import interrupts
-from vibench.dependencies import take_over
 from vibench.errors import NumericalError, StorageError, UnsupportedError, VibenchError, in_a_line, message_of
 from vibench.execution.jobs import (
     OUT_OF_MEMORY,
@@ -151,7 +150,6 @@ def perform(
 
 def _check_code(job: Job, batch: Batch) -> None:
     """Refuse a job that was planned with other code than this process has: its artefact would have the wrong key."""
-    take_over(job.found)
     stage = job.stage
     stages = [stage.stage_of(number) for number in batch.numbers] if isinstance(stage, ItemwiseStage) else [stage]
     # Each once: stages reach the same plugins through many of their inputs.

@@ -13,7 +13,6 @@ from pathlib import Path
 from types import CodeType, FunctionType, GetSetDescriptorType, MemberDescriptorType, ModuleType
 from typing import Any
 
-from vibench.dependencies import code_used
 from vibench.provenance import package_hash
 
 
@@ -21,7 +20,7 @@ def fingerprint_of(value: Any) -> tuple[str, dict[str, str]]:
     """Hash of a value and of the code that it runs, equal in all processes that make it in the same way.
 
     Functions and classes of scripts and notebooks count with their bytecode and the global names that it uses, those of
-    modules with the `module_version` and what they use of vibench. What is computed again when it is asked for
+    modules with the `module_version`. What is computed again when it is asked for
     (`functools.cached_property`) does not count.
 
     Returned with it are the versions of the modules that it names. Raises a `TypeError` if the value holds something
@@ -73,10 +72,7 @@ def _parts(value: Any) -> Iterator[Any]:
     elif isinstance(value, ModuleType):
         yield f"{value.__name__} {module_version(value)}"
     elif isinstance(value, type | FunctionType) and is_importable(value):
-        module = sys.modules[value.__module__]
-        used = _is_ours(module) or module_version(module)
-        yield code_used(f"{module.__name__}:{value.__qualname__}", whole=True) if used else ""
-        yield from (value.__qualname__, module)
+        yield from ("", value.__qualname__, sys.modules[value.__module__])
     elif isinstance(value, FunctionType):
         cells = [cell.cell_contents for cell in value.__closure__ or ()]
         yield from ("", value.__code__, value.__defaults__, value.__kwdefaults__, cells, _globals(value))
@@ -107,18 +103,13 @@ def is_computed_again(cls: type, name: str) -> bool:
 
 
 def _globals(function: FunctionType) -> dict[str, Any]:
-    """The global names that a function uses, with their values; of modules of vibench what is used of them."""
+    """The global names that a function uses, with their values."""
     code = [function.__code__]
     for part in code:
         code += [one for one in part.co_consts if isinstance(one, CodeType)]
     loads = (one for part in code for one in dis.get_instructions(part) if one.opname.startswith("LOAD_"))
     names = {str(one.argval) for one in loads if one.opname.endswith(("GLOBAL", "GLOBALS", "NAME"))}
-    used = {name: function.__globals__[name] for name in names if name in function.__globals__}
-    attributes = sorted({name for part in code for name in part.co_names})
-    for name, one in used.items():
-        if isinstance(one, ModuleType) and _is_ours(one):
-            used[name] = code_used(*(f"{one.__name__}:{attribute}" for attribute in attributes), whole=True)
-    return used
+    return {name: function.__globals__[name] for name in names if name in function.__globals__}
 
 
 def _counts(name: str, member: Any) -> bool:
@@ -142,15 +133,11 @@ def is_importable(value: Any) -> bool:
 def module_version(module: ModuleType) -> str:
     """Version of the package of a module if it is installed and has one, else the hash of its sources.
 
-    It is "" for modules of Python, whose version is recorded anyway, and of vibench, of which what is used counts.
+    It is "" for modules of Python and of vibench, whose versions are recorded anyway.
     """
     source, top = getattr(module, "__file__", None), module.__name__.partition(".")[0]
-    if source is None or _is_ours(module) or top in sys.stdlib_module_names:
+    if source is None or top in ("vibench", *sys.stdlib_module_names):
         return ""
     installed = {"site-packages", "dist-packages"} & {*Path(source).parts}
     released = getattr(sys.modules.get(top), "__version__", "") if installed else ""
     return str(released or package_hash(module.__name__))
-
-
-def _is_ours(module: ModuleType) -> bool:
-    return module.__name__.partition(".")[0] == __name__.partition(".")[0]

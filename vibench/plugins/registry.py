@@ -135,7 +135,7 @@ class RegisteredPlugin:
 
     @cached_property
     def code(self) -> str:
-        """Version with hashes of its outermost package, or its module in none, and of what it uses of vibench.
+        """Version with a hash of its outermost package, or its module in none.
 
         Of a name that several packages use it is their versions: nothing is computed with it.
 
@@ -145,11 +145,8 @@ class RegisteredPlugin:
             return self.origin
         if self.kind is SOLVER and not self.entries:
             return solver_version(self.name)
-        from vibench.dependencies import code_used
-
-        used = code_used(self.reference, whole=True)
         needed = "".join(f" {required} {distribution_version(required)}" for required in self.requirements)
-        return f"{self.origin} {package_hash(self._entry.module)} with {used}{needed}"
+        return f"{self.origin} {package_hash(self._entry.module)}{needed}"
 
     @property
     def requirements(self) -> tuple[str, ...]:

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, fields, is_dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
 
-from vibench.dependencies import code_used
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import Problem
 from vibench.plugins.plugin import Plugin
-from vibench.provenance import libraries
+from vibench.provenance import libraries, numerical_code, source_hash
 from vibench.qp.status import Status
 from vibench.storage.artefacts import History, Store
 from vibench.study.cells import Axes, digest
@@ -105,19 +106,23 @@ class Stage(ABC):
     def key(self) -> str:
         """Name of the artefact: the label, and a hash of everything that determines the value.
 
-        These are the fields of the stage, the keys of its inputs, the libraries, and the modules of vibench that `run`
-        depends on: an edited figure or help text invalidates no artefact. The code of a plugin, and what it uses of
-        vibench, enter through `Plugin.code`.
+        These are the fields of the stage, the keys of its inputs, the libraries, its own module with those of other
+        stages that it imports, and the layers of vibench below the stages that determine numbers. An edited figure or
+        help text invalidates no artefact. The code of a plugin enters through `Plugin.code`.
         """
         own = {name: _described(value) for name, value in self._fields().items()}
-        content = [type(self).__name__, code_used(*self.code()), libraries(), own, [one.key for one in self.inputs()]]
+        content = [type(self).__name__, self.code(), libraries(), own, [one.key for one in self.inputs()]]
         return f"{self.label.lower().replace(' ', '-')}-{digest(content)}"
 
     @classmethod
-    def code(cls) -> tuple[str, ...]:
-        """Where the code begins that determines the value, as for `code_used`: the class, and the method `run`."""
-        owner = next(one for one in cls.__mro__ if "run" in vars(one))
-        return (f"{cls.__module__}:{cls.__qualname__}", f"{owner.__module__}:{owner.__qualname__}.run")
+    @cache
+    def code(cls) -> str:
+        """Hash of the code that determines the value; that of the inputs is in their keys."""
+        # Of its own layer only the modules count that it imports from: an edit of one stage keeps most other artefacts.
+        imported = {str(getattr(one, "__module__", "")) for one in vars(sys.modules[cls.__module__]).values()}
+        own = {name for name in imported if name.startswith(("vibench.stages.", "vibench.rounds."))} - {__name__}
+        sources = [source_hash(Path(str(sys.modules[name].__file__))) for name in sorted({cls.__module__, *own})]
+        return " ".join([*sources, numerical_code(below="stages")])
 
     @property
     def sort(self) -> str:
@@ -226,11 +231,6 @@ class ItemwiseStage(Stage):
     """A stage whose items are kept one by one: if its process dies or hangs, only the current item is lost."""
 
     stored = False
-
-    @classmethod
-    def code(cls) -> tuple[str, ...]:
-        """None: the value is not kept for another run."""
-        return ()
 
     @property
     @abstractmethod

@@ -9,13 +9,13 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
-from vibench.dependencies import CELL, code_used
 from vibench.errors import RequestError, unknown_name
 from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Stop
 from vibench.plugins.kinds import SOLVER
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find
+from vibench.provenance import numerical_code
 from vibench.study.parameter_sets import OWN, OWN_TRAINING, ParameterSet
 
 CERTIFIED = "certified"
@@ -163,10 +163,10 @@ class Cell:
 
     @property
     def code(self) -> str:
-        """Hash of the code that computes the cell: that of all stages, of its plugins and of its solver."""
+        """Hash of the code that computes the cell: that of vibench, of its plugins and of its solver."""
         codes = [plugin.code for plugin in self.plugins]
         codes += [] if self.solver is None else [find(SOLVER, self.solver).code]
-        return digest([code_used(*CELL, whole=True), *codes])
+        return digest([numerical_code(), *codes])
 
     def __str__(self) -> str:
         problem, dual, primal = self.labels

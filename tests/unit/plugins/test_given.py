@@ -19,7 +19,6 @@ from fake_plugins import Wire
 
 import vibench
 from vibench.errors import RequestError
-from vibench.plugins import fingerprint as fingerprint_module
 from vibench.plugins import plugin as module
 from vibench.plugins.fingerprint import fingerprint_of
 from vibench.plugins.kinds import PROBLEM
@@ -140,26 +139,6 @@ def test_an_imported_module_counts_with_its_sources(tmp_path: Path, monkeypatch:
     (tmp_path / "my_shapes.py").write_text(dedent(SOURCE) + "# edited\n")
     after = hashed(source, "Mine"), hashed(source, "my_shapes.Shape")
     assert set(before).isdisjoint(after)
-
-
-def test_what_is_used_of_vibench_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the module only what is named; a class of vibench that another inherits from with all that it uses."""
-    source = """
-        import vibench
-        from vibench import DualStrategy
-        class Mine(DualStrategy):
-            def reduce(self, snapshots, W, stop):
-                return vibench.greedy_cone(snapshots, W, stop)
-    """
-    asked: list[str] = []
-    monkeypatch.setattr(fingerprint_module, "code_used", lambda *roots, whole: asked.extend(roots) or "code")
-    before = hashed(source, "Mine")
-    assert {"vibench:greedy_cone", "vibench.interfaces.strategies:DualStrategy"} <= set(asked)
-    assert "vibench:Problem" not in asked
-    monkeypatch.setattr(
-        fingerprint_module, "code_used", lambda *roots, whole: f"edited {'vibench:greedy_cone' in roots}"
-    )
-    assert hashed(source, "Mine") != before
 
 
 @pytest.fixture(scope="module")

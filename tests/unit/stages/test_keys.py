@@ -5,24 +5,21 @@ from __future__ import annotations
 import inspect
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping, Set
-from itertools import chain
+import tomllib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import CodeType, FrameType
 
 import pytest
 from samples import SampleStore, small_study
 
-from vibench import dependencies
-from vibench.dependencies import CARRIERS, CELL, COUNTED, code_used, modules_used
+from vibench import provenance
 from vibench.offline.assemblies import assemblies
 from vibench.plugins import registry
-from vibench.plugins.kinds import DUAL, PRIMAL, PROBLEM, SAMPLING
-from vibench.plugins.plugin import Plugin
 from vibench.rounds import timing_rounds
 from vibench.rounds.offline_repeats import OfflineRepeat
 from vibench.rounds.timing_rounds import TimingRounds
-from vibench.stages.base import Result, Stage, build_problem
+from vibench.stages.base import ItemwiseStage, Result, Stage, build_problem
 from vibench.stages.cell_queries import cell_queries
 from vibench.stages.formulations.building import FormulationStage
 from vibench.stages.formulations.queries import FormulationQueries
@@ -31,6 +28,8 @@ from vibench.stages.snapshots import fingerprint_here
 from vibench.storage.artefacts import Artefact, Store
 from vibench.study.matrix import expand
 from vibench.study.spec import Study
+
+CORE = Path(provenance.__file__).parent
 
 COMPILED = ["compiled"] if shutil.which("cc") else []
 
@@ -78,8 +77,8 @@ def stages_of(study: Study) -> list[Stage]:
 
 def module_of(code: CodeType) -> str:
     path = Path(code.co_filename)
-    inside = path.is_relative_to(dependencies.CORE) and code.co_name != "<module>"
-    return ".".join(("vibench", *path.relative_to(dependencies.CORE).with_suffix("").parts)) if inside else ""
+    inside = path.is_relative_to(CORE) and code.co_name != "<module>"
+    return ".".join(("vibench", *path.relative_to(CORE).with_suffix("").parts)) if inside else ""
 
 
 def is_for_a_key(frame: FrameType | None) -> bool:
@@ -105,16 +104,17 @@ def traced(stage: Stage, store: Store) -> tuple[Result, set[str]]:
     return result, {module_of(code) for code in codes} - {""}
 
 
-def is_carrier(module: str) -> bool:
-    return module != COUNTED and any(f"{module}.".startswith(f"{one}.") for one in CARRIERS)
+CARRIERS = ("storage", "plugins", "study", "errors", "text", "provenance", "files", "stages.base")
+"""Packages and modules that only hand over what determines numbers."""
 
 
-def modules_behind(stage: Stage) -> Set[str]:
-    """The modules whose code is in the key of a stage, by its own code or by that of its plugins."""
-    roots = stage.code() or CELL
-    plugins = {plugin.registered.reference for plugin in stage.plugins}
-    used = (modules_used(reference, whole=True) for reference in plugins)
-    return modules_used(*roots, whole=roots is CELL).union(*used)
+def counts_for(stage: Stage, module: str) -> bool:
+    """Whether the code of a module is in the key of a stage, or of one of its inputs."""
+    imported = vars(sys.modules[type(stage).__module__]).values()
+    own = {f"{one.__module__}." for one in imported if getattr(one, "__module__", None)}
+    layers = provenance.LAYERS[provenance.LAYERS.index("stages") + (not isinstance(stage, ItemwiseStage)) :]
+    inside = f"{module}.".startswith((*own, *(f"vibench.{layer}." for layer in layers)))
+    return inside or any(counts_for(one, module) for one in stage.inputs())
 
 
 @pytest.mark.parametrize("study", [TRAINED, ADAPTIVE], ids=lambda study: study.name)
@@ -129,7 +129,8 @@ def test_what_runs_in_a_stage_is_what_its_code_is_read_from(
             cache.cache_clear()  # type: ignore[attr-defined]
         result, ran = traced(stage, store)
         store.kept[stage.key] = Artefact(result.value, result.seconds, result.histories, "here")
-        unseen = {module for module in ran - modules_behind(stage) if not is_carrier(module)}
+        carriers = tuple(f"vibench.{name}." for name in CARRIERS)
+        unseen = {module for module in ran if not f"{module}.".startswith(carriers) and not counts_for(stage, module)}
         if unseen:
             missing.setdefault(type(stage).__name__, set()).update(unseen)
         assert ran, stage
@@ -143,14 +144,6 @@ def concrete(kind: type) -> Iterator[type[Stage]]:
         yield from concrete(one)
 
 
-def test_the_key_of_a_formulation_has_the_code_that_makes_its_model() -> None:
-    """The plugin's own code, and what that uses, is in its version."""
-    used = modules_used(*FormulationStage.code())
-    assert {
-        f"vibench.{name}" for name in ("offline.formulated", "offline.reduction", "stages.formulations.building")
-    } <= used
-
-
 @pytest.mark.skipif(not COMPILED, reason="NO C COMPILER (cc): programs are not compiled")
 def test_every_sort_of_stage_is_among_them() -> None:
     """But repeats, which run the code of the stages in their keys, and formulations, which are plugins."""
@@ -158,63 +151,39 @@ def test_every_sort_of_stage_is_among_them() -> None:
     assert {type(stage) for stage in [*stages_of(TRAINED), *stages_of(ADAPTIVE)]} == kinds
 
 
-NUMERICAL = (
-    "linalg", "interfaces", "qp", "reduction", "stability", "highfidelity", "model", "offline", "stages", "rounds",
-    "fem", "arrays", "timing", "packs", "study.parameter_sets",
-    "results.solver_agreement", "results.pictures",  # what is kept of a solution and of a picture
-)  # fmt: skip
-
-
-def test_no_code_counts_that_only_requests_records_or_shows() -> None:
-    used = set(modules_used(*CELL, whole=True))
-    used |= set(chain.from_iterable(modules_used(*kind.code()) for kind in concrete(Stage)))
-    for kind in (PROBLEM, DUAL, PRIMAL, SAMPLING):
-        for plugin in registry.registered(kind).values():
-            used |= modules_used(plugin.reference, whole=True)
-    packages = {f"vibench.{name}" for name in NUMERICAL}
-    strangers = [module for module in used if not any(f"{module}.".startswith(f"{one}.") for one in packages)]
-    assert strangers == []
-    assert not [module for module in used if is_carrier(module)]
-    assert {module.split(".")[1] for module in used} >= {name.split(".")[0] for name in NUMERICAL}
-
-
-SOLUTIONS, MATRICES = "high-fidelity solutions", "constraint matrices"
-CONSTANTS, REFERENCE = "high-fidelity constants", "high-fidelity inf-sup constants"
-SHOWN = (
-    "report.html", "results.schema", "results.break_even", "study.spec", "plugins.registry", "errors", "text",
-    "storage.artefacts", "storage.serialisation", "stages.base", "provenance", "execution.run", "cli.main",
-    "library.runs",
-)  # fmt: skip
-EDITS: Mapping[str, tuple[set[str], set[str]]] = {
-    "highfidelity.active_set": ({SOLUTIONS, "POD", "cone", "assembly"}, {MATRICES, "affine decomposition"}),
-    "reduction.pod": ({"POD", "enrichment", "assembly"}, {SOLUTIONS, "cone", "training constants", "pictures"}),
-    "reduction.cones": ({"cone", "enrichment", "assembly"}, {SOLUTIONS, "POD"}),
-    "stability.infsup": ({"cone", "enrichment", REFERENCE}, {SOLUTIONS, "POD", MATRICES, CONSTANTS}),
-    "stability.conic_infsup": ({REFERENCE}, {SOLUTIONS, "POD", "cone", "enrichment", "assembly", CONSTANTS}),
-    "stability.coercivity": ({CONSTANTS}, {MATRICES, REFERENCE}),
-    "model.hyperreduced": ({"hyper-reduction", "assembly"}, {SOLUTIONS, "POD", "cone", "enrichment"}),
-    "qp.exact": ({"exact reduced solutions", SOLUTIONS, "POD", "cone", "enrichment"}, set()),
-    "study.parameter_sets": ({SOLUTIONS, "affine decomposition", "assembly"}, set()),
-    **dict.fromkeys(SHOWN, (set(), {SOLUTIONS, "POD", "cone", "enrichment", "assembly", "queries", "pictures"})),
-}
-"""Modules, the labels of stages whose keys change with an edit of them, and of some whose keys do not."""
+def test_the_layers_are_those_of_the_import_contract_in_its_order() -> None:
+    """A new package of the core is either a layer that determines numbers or among those that only carry them."""
+    contracts = tomllib.loads((CORE.parent / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    order = [name for row in contracts[0]["layers"] for name in row.split(" | ")]
+    layers = [layer for layer in provenance.LAYERS if "." not in layer]
+    assert layers == sorted(layers, key=order.index)
+    assert set(order) - set(layers) == {
+        "cli", "benchmarks", "testing", "library", "report", "execution", "storage", "results", "study", "plugins",
+        "provenance", "files", "interrupts", "errors", "text",
+    }  # fmt: skip
+    assert [layer for layer in provenance.LAYERS if not [*CORE.glob(f"{layer.replace('.', '/')}*")]] == []
 
 
 @pytest.fixture
 def edit(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], None]]:
     """Function after which a module of vibench seems to have another line."""
-    source = dependencies._source
+    caches = (provenance.numerical_code, Stage.code.__func__)  # type: ignore[attr-defined]
+
+    def forget() -> None:
+        for cached in caches:
+            cached.cache_clear()
+        registry.registered.cache_clear()
 
     def change(module: str) -> None:
-        assert source(module), f"there is no module {module}"
-        monkeypatch.setattr(dependencies, "_source", lambda m: source(m) + b"# edited" * (m == module))
-        code_used.cache_clear()
-        registry.registered.cache_clear()
+        edited = CORE / f"{module.replace('.', '/')}.py"
+        assert edited.is_file()
+        read = Path.read_bytes
+        monkeypatch.setattr(Path, "read_bytes", lambda path: read(path) + b"# edited" * (path == edited))
+        forget()
 
     yield change
     monkeypatch.undo()
-    code_used.cache_clear()
-    registry.registered.cache_clear()
+    forget()
 
 
 def keys() -> dict[str, set[str]]:
@@ -225,18 +194,19 @@ def keys() -> dict[str, set[str]]:
     return found
 
 
-@pytest.mark.parametrize("module", EDITS)
-def test_an_edit_changes_the_keys_of_what_it_determines_and_no_other(module: str, edit: Callable[[str], None]) -> None:
+def test_an_edit_changes_the_keys_of_what_it_may_determine_and_no_other(edit: Callable[[str], None]) -> None:
+    """A stage does not depend on the modules of other stages, unless these are its inputs."""
     before, codes = keys(), {cell.code for cell in expand(TRAINED)}
-    edit(f"vibench.{module}")
-    after, (changed, kept) = keys(), EDITS[module]
-    assert {label for label in changed if before[label] & after[label]} == set()
-    assert {label for label in kept if before[label] != after[label]} == set()
-    assert codes.isdisjoint(cell.code for cell in expand(TRAINED)) == bool(changed)
-
-
-def test_what_a_plugin_uses_of_the_core_is_in_its_code(edit: Callable[[str], None]) -> None:
-    plugins = {name: Plugin(DUAL, name, "{}", "").as_installed() for name in ("mcpg", "pod-dual")}
-    edit("vibench.reduction.cone_parts")
-    assert plugins["mcpg"].as_installed() != plugins["mcpg"]
-    assert plugins["pod-dual"].as_installed() == plugins["pod-dual"]
+    for module in ("report.html", "results.schema", "study.spec", "plugins.registry", "errors", "text", "cli.main"):
+        edit(module)
+        assert (keys(), {cell.code for cell in expand(TRAINED)}) == (before, codes), module
+    edit("stages.base")
+    assert keys() == before
+    edit("stages.enrichment")
+    after = keys()
+    assert {label for label in before if before[label].isdisjoint(after[label])} >= {"enrichment", "assembly"}
+    assert {label for label in before if before[label] == after[label]} >= {"high-fidelity solutions", "POD", "cone"}
+    for module in ("highfidelity.active_set", "study.parameter_sets", "results.consistency", "timing"):
+        edit(module)
+        assert all(before[label].isdisjoint(after) for label, after in keys().items()), module
+        assert codes.isdisjoint(cell.code for cell in expand(TRAINED))

@@ -239,10 +239,10 @@ def test_the_code_changes_with_every_plugin(axis: str) -> None:
     assert code("package 1") != code("package 2")
 
 
-@pytest.mark.parametrize("what", ["code_used", "solver_version"])
+@pytest.mark.parametrize("what", ["numerical_code", "solver_version"])
 def test_the_code_changes_with_the_core_and_the_solver(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
     before = SAMPLE.code
-    monkeypatch.setattr(module if what == "code_used" else registry, what, lambda *_, **__: "another version")
+    monkeypatch.setattr(module if what == "numerical_code" else registry, what, lambda *_, **__: "another version")
     registry.registered.cache_clear()
     assert SAMPLE.code != before
 
