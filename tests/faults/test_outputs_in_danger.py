@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 from forking import forked
 from running import Main, Vibench, rows
+from sample_run import write_sample_run
 from samples import wire_study, write_study
 
 from vibench.library.runs import Run
 from vibench.report.site import folder
 from vibench.results.sqlite import FILE
-from vibench.testing.samples.sample_run import write_sample_run
 
 KILLS = 2
 COARSE = {"name": "radial-obstacle", "options": {"resolution": "coarse"}}

@@ -39,7 +39,7 @@ from vibench.results import formats, schema
 from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
 from vibench.study.matrix import expand, read_study
 from vibench.study.spec import Limits, Study, ToleranceTable
-from vibench.testing import check_figure, check_problem
+from vibench.testing import check
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -117,7 +117,7 @@ def test_what_a_page_looks_at_is_as_it_says(page: Path) -> None:
 def test_the_membrane_of_fenicsx_is_a_problem() -> None:
     pytest.importorskip("dolfinx", reason="FEniCSx is not installed: its example is not run")
     membrane = importlib.import_module("vibench_mine.membrane_dolfinx").Membrane
-    check_problem(partial(membrane, cells=8))
+    check(partial(membrane, cells=8))
 
 
 def test_the_torsion_problem_of_the_pages_takes_some_thirty_lines(package: Path) -> None:
@@ -127,11 +127,6 @@ def test_the_torsion_problem_of_the_pages_takes_some_thirty_lines(package: Path)
 def test_the_package_of_the_pages_has_a_plugin_of_every_kind(package: Path) -> None:
     project = tomllib.loads((package / "pyproject.toml").read_text())["project"]
     assert {*project["entry-points"], STUDY.entry_points} == {kind.entry_points for kind in PluginKind}
-
-
-@pytest.mark.usefixtures("importable")
-def test_the_columns_of_the_pages_pass_their_checks() -> None:
-    check_figure(importlib.import_module("vibench_mine.columns").Savings)
 
 
 def test_the_plugins_of_the_pages_run_through_the_whole_benchmark(

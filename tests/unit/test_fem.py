@@ -21,7 +21,7 @@ from skfem.models.poisson import laplace, unit_load
 
 from vibench import AffineProblem, Array, HighFidelitySolver, InnerProduct, NumericalError, ParameterBox, fem
 from vibench.interfaces.problem import VariationalInequality
-from vibench.testing import check_problem
+from vibench.testing import check
 
 MESH = MeshTri.init_tensor(np.linspace(0.0, 2.0, 7), np.linspace(0.0, 1.0, 4)).with_boundaries(
     {"top": lambda x: x[1] == 1.0, "left": lambda x: x[0] == 0.0}
@@ -168,7 +168,7 @@ def test_dirichlet_data_that_depend_on_the_parameter_are_lifted(mu: list[float],
 
 
 def test_a_lifted_problem_passes_the_conformance_checks() -> None:
-    check_problem(lambda: Patch(depth=0.2))
+    check(partial(Patch, depth=0.2))
 
 
 def test_constants_stay_constant_when_they_are_lifted() -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from typer import Argument, Exit, Option
 
-from vibench.cli.completion import lists, plugin_options, plugins, runs
+from vibench.cli.completion import lists, plugin_options, plugins
 from vibench.cli.console import echo
 from vibench.errors import RequestError, VibenchError, in_a_line, unknown_name
 from vibench.plugins.kinds import CHECKED, FIGURE, PROBLEM, SAMPLING, SOLVER, STUDY, PluginKind
@@ -30,9 +30,6 @@ if TYPE_CHECKING:
     NewKind = str
 else:
     NewKind = Literal[(*CHECKED, "study", "pack")]
-
-SECONDS = 120.0
-"""Default of `--seconds`: that of `vibench.testing`, which is too slow to import for a help text."""
 
 
 def list_plugins(
@@ -82,46 +79,39 @@ def check_plugin(
         list[str] | None,
         Option(metavar="KEY=VALUE", help="Option of the plugin (repeatable).", autocompletion=plugin_options),
     ] = None,
-    seconds: Annotated[float, Option(min=0.0, help="Time limit for all checks; a slow plugin gets fewer.")] = SECONDS,
-    run: Annotated[
-        str | None,
-        Option(metavar="RUN", help="Run that figures are drawn from; a made-up one by default.", autocompletion=runs),
-    ] = None,
+    # The default is that of `vibench.testing`, which is too slow to import for a help text.
+    seconds: Annotated[float, Option(min=0.0, help="Time limit for all checks; a slow plugin gets fewer.")] = 120.0,
 ) -> None:
     """Check a plugin: shapes, signs, tolerances, repetition, time.
 
     One line per requirement of the interface, as soon as it is checked; exit code 1 if one is violated.
     """
-    from vibench.results.read import results_file
-    from vibench.testing import Verdict
-    from vibench.testing.processes import Examination, examine_in_process
+    from functools import partial
+
+    from vibench.testing import Examination, Verdict
+    from vibench.testing.solvers import of_qpsolvers
 
     checked = _find(plugin)
-    if run is not None and checked.kind is not FIGURE:
-        raise RequestError(f"--run is for figure plugins; {checked} is none")
-    given = {} if run is None else {"run": str(results_file(run).resolve())}
     options, remark = _chosen_options(checked, dict(map(key_value, option or [])))
     echo(f"{checked}{remark}")
-    reference = checked.reference if checked.entries else OF_QPSOLVERS
-    examination = Examination(checked.kind.cli_name, reference, options, seconds, given)
-    results = examine_in_process(examination, lambda result: echo(str(result)))
-    counts = {verdict: sum(result.verdict is verdict for result in results) for verdict in Verdict}
+    loaded = checked.load() if checked.entries else partial(of_qpsolvers, solver=checked.name)
+    create = partial(loaded, **options) if options else loaded
+    counts = dict.fromkeys(Verdict, 0)
+    for result in Examination(create, checked.kind.cli_name, seconds).results():
+        echo(str(result))
+        counts[result.verdict] += 1
     told = (f"{count} {verdict}" for verdict, count in counts.items() if count or verdict is not Verdict.WARNING)
     echo(", ".join(told))
     if counts[Verdict.FAILED]:
         raise Exit(1)
 
 
-OF_QPSOLVERS = "vibench.testing.solvers:of_qpsolvers"
-"""What the solvers of qpsolvers are checked as, with the option `solver`."""
-
-
-def _chosen_options(checked: RegisteredPlugin, given: dict[str, Any]) -> tuple[dict[str, Any] | None, str]:
+def _chosen_options(checked: RegisteredPlugin, given: dict[str, Any]) -> tuple[dict[str, Any], str]:
     """Options of a plugin, and what its title says of them: those that `vibench check` chooses where none are given."""
     if checked.kind is SOLVER:
         if given:
             raise RequestError(f"{checked} has no options")
-        return (None if checked.entries else {"solver": checked.name}), ""
+        return {}, ""
     if checked.kind is PROBLEM and "resolution" not in given:
         with suppress(RequestError):  # the problem has no resolution of that name
             options = checked.check_options({"resolution": "coarse", **given})
@@ -129,14 +119,10 @@ def _chosen_options(checked: RegisteredPlugin, given: dict[str, Any]) -> tuple[d
     chosen = {}
     if checked.kind is SAMPLING:
         needed = {name for name, option in checked.options.items() if option.required}
-        chosen = {name: value for name, value in SAMPLE.items() if name in needed and name not in given}
+        chosen = {name: value for name, value in (("size", 16), ("seed", 0)) if name in needed and name not in given}
     told = " and ".join(f"{name} = {value}" for name, value in chosen.items())
     remark = f", with {told} (--option {next(iter(chosen))}=… for another)" if chosen else ""
     return checked.check_options(chosen | given), remark
-
-
-SAMPLE = {"size": 16, "seed": 0}
-"""Options of a sampling strategy that `vibench check` chooses, where it needs them."""
 
 
 def new_plugin(

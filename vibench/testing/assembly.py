@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from functools import partial
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property, partial
 
 import numpy as np
 import scipy.linalg
@@ -15,10 +16,9 @@ from vibench.errors import NumericalError
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.linalg.inner_product import SYMMETRY_RTOL, InnerProduct
 from vibench.model.affine import CONSTANT_RTOL
-from vibench.testing.case import MOST_POINTS, PARTIAL_RTOL, ProblemCase
-from vibench.testing.checks import ConformanceError, Doubt, Note, raised
-from vibench.testing.comparisons import (
+from vibench.testing.case import (
     Arrays,
+    Case,
     array_fault,
     at,
     copies,
@@ -28,18 +28,82 @@ from vibench.testing.comparisons import (
     largest_entry,
     unmutated,
 )
+from vibench.testing.checks import ConformanceError, Doubt, Note, plugin_line, raised
+from vibench.timing import timed
 
-ENTRIES = 40
-"""Number of entries of every member that are sampled."""
+
+@dataclass(eq=False)
+class ProblemCase(Case[Problem, Array, Arrays]):
+    """A problem, parameters, and the arrays it assembles.
+
+    All checks together take `seconds`, about: where an assembly is slow, they are made at fewer parameters.
+    """
+
+    base = Problem
+    # The largest difference between two ways to assemble, relative to the largest entry of the member.
+    round_off = 1e-10
+    _: KW_ONLY
+    seed: int = 0
+
+    @cached_property
+    def one_assembly(self) -> float:
+        """Wall seconds of the first assembly."""
+        box, problem = self.plugin.parameters, self.plugin
+        return timed(lambda: problem.assemble(0.5 * (box.lower + box.upper)))[1].wall
+
+    @cached_property
+    def points(self) -> int:
+        """Number of parameters, such that all checks take about half of the time limit: 7, or 2 at least."""
+        try:
+            seconds = self.one_assembly
+        except Exception:  # noqa: BLE001  the check "assembly" says what a plugin raises
+            return 7
+        # All checks but the search for jumps make about ten assemblies at each parameter.
+        return int(min(max(0.5 * self.seconds / max(10.0 * seconds, 1e-8), 2), 7))
+
+    @property
+    def in_time(self) -> bool:
+        """Whether there is time for all parameters, and for the search for jumps."""
+        return self.points == 7
+
+    @cached_property
+    def mus(self) -> Array:
+        """Parameters (7×d): two corners of the box, its centre, and four random ones; only the first if it is slow."""
+        box = self.plugin.parameters
+        fixed = np.stack([box.lower, box.upper, 0.5 * (box.lower + box.upper)])
+        return np.concatenate([fixed, box.sample(4, self.seed)])[: self.points]
+
+    @cached_property
+    def arguments(self) -> dict[str, Array]:
+        return {at(mu): mu for mu in self.mus}
+
+    def evaluate(self, argument: Array, plugin: Problem | None = None) -> Arrays:
+        """Copies of A, f, B and g at a parameter (d,), and of X_V and X_W."""
+        problem, mu = plugin or self.plugin, argument.copy()
+        vi = self.clocked("an assembly", lambda: problem.assemble(mu))
+        members = {name: getattr(vi, name) for name in MEMBERS}
+        return copies({**members, "X_V": problem.V.matrix, "X_W": problem.W.matrix})
+
+    def arrays(self, result: Arrays) -> Arrays:
+        return result
+
+    def construction(self) -> Iterator[str]:
+        """An instance can be made; a refused Gram matrix is named."""
+        try:
+            yield from super().construction()
+        except NumericalError as error:
+            place = plugin_line(error)
+            names = [f"X_{name}: " for name in "VW" if f"self.{name} =" in place and f"X_{name}" not in str(error)]
+            raise ConformanceError(f"{''.join(names)}{error} ({place})") from error
 
 
 def one_assembly(case: ProblemCase) -> Iterator[str]:
     """The first assembly is timed; at how many parameters the others can be made follows."""
-    points = case.points
+    in_time = case.in_time
     with suppress(Exception):  # the next check says what a plugin raises
         yield Note(f"takes {case.one_assembly:.2g} s")
-    if points < MOST_POINTS:
-        yield Note(f"checks at {points} parameters instead of {MOST_POINTS}, and none for jumps, for lack of time")
+    if not in_time:
+        yield Note(f"checks at {case.points} parameters instead of 7, and none for jumps, for lack of time")
 
 
 def assembly(case: ProblemCase) -> Iterator[str]:
@@ -103,7 +167,7 @@ def independence(case: ProblemCase) -> Iterator[str]:
             if what := difference(arrays[name], reference, CONSTANT_RTOL * largest_entry(reference)):
                 yield f"{name} is declared `constant` but depends on mu: {what} ({where} and {first})"
                 break
-    yield from _without_effect(case) if case.points == MOST_POINTS else ()
+    yield from _without_effect(case) if case.in_time else ()
 
 
 def _without_effect(case: ProblemCase) -> Iterator[str]:
@@ -113,14 +177,14 @@ def _without_effect(case: ProblemCase) -> Iterator[str]:
     for number, name in enumerate(box.names):
         moved = np.where(np.arange(box.dim) == number, box.upper, centre)
         if box.upper[number] > box.lower[number] and not any(
-            differences(case.evaluate(moved), case.evaluate(centre), PARTIAL_RTOL)
+            differences(case.evaluate(moved), case.evaluate(centre), case.round_off)
         ):
             yield Doubt(f"nothing depends on the parameter '{name}'")
 
 
 def continuity(case: ProblemCase) -> Iterator[str]:
     """Members do not jump on lines in the box: a diagonal, one between random points, one along every axis."""
-    if case.points < MOST_POINTS:
+    if not case.in_time:
         yield Note("not looked for, for lack of time")
         return
     largest = {name: max(largest_entry(arrays[name]) for arrays in case.results.values()) for name in MEMBERS}
@@ -165,7 +229,7 @@ def on_contact(case: ProblemCase) -> Iterator[str]:
             if defined:
                 _check_contact(case, dofs, mu, full)
         B, g = problem.constraint(mu.copy())
-        _compare("constraint", mu, {"B": B, "g": g}, full)
+        _compare(case, "constraint", mu, {"B": B, "g": g}, full)
 
 
 def _dofs_fault(dofs: object, n: int) -> str:
@@ -183,7 +247,7 @@ def _check_contact(case: ProblemCase, dofs: Indices, mu: Array, full: Arrays) ->
     contact = unmutated("contact", {"its argument mu": given}, partial(case.plugin.contact, given))
     if not isinstance(contact, Contact):
         raise ConformanceError(f"contact returns a {type(contact).__name__} {at(mu)}; expected a vibench.Contact")
-    _compare("contact", mu, {columns: contact.B, "g": contact.g}, full | {columns: full["B"][:, dofs]})
+    _compare(case, "contact", mu, {columns: contact.B, "g": contact.g}, full | {columns: full["B"][:, dofs]})
     if type(case.plugin).contact_loads is not Problem.contact_loads:
         _check_contact_loads(case, dofs, mu, full)
 
@@ -200,7 +264,7 @@ def _check_contact_loads(case: ProblemCase, dofs: Indices, mu: Array, full: Arra
         B_eta = loads.fixed.copy()
         B_eta[loads.first : loads.first + len(varying)] += varying
         expected = {"Bᵀη": full["B"][:, dofs].T @ chosen, "ηᵀg": chosen.T @ full["g"]}
-        _compare("contact_loads", mu, {"Bᵀη": B_eta, "ηᵀg": bounds}, expected)
+        _compare(case, "contact_loads", mu, {"Bᵀη": B_eta, "ηᵀg": bounds}, expected)
 
 
 def affine(case: ProblemCase) -> Iterator[str]:
@@ -218,7 +282,7 @@ def affine(case: ProblemCase) -> Iterator[str]:
                 summed = each.at(mu.copy())
             except NumericalError as error:
                 raise ConformanceError(f"the affine sum of {name} {where}: {error}") from error
-            _compare("affine", mu, {name: summed}, case.results[where])
+            _compare(case, "affine", mu, {name: summed}, case.results[where])
 
 
 def by_entries(case: ProblemCase) -> Iterator[str]:
@@ -253,7 +317,7 @@ def by_elements(case: ProblemCase) -> Iterator[str]:
         yield f"element_dofs has shape {dofs.shape} and dtype {dofs.dtype}; expected (k, e), whole, from -1 to {n - 1}"
         return
     k, count = dofs.shape
-    some = np.arange(0, count, max(2, count // ENTRIES))
+    some = np.arange(0, count, max(2, count // 40))
     of_all, of_some = problem.element_sampler(np.arange(count)), problem.element_sampler(some)
     for where, mu in case.arguments.items():
         full, parts = of_all(mu.copy()), of_some(mu.copy())
@@ -264,8 +328,8 @@ def by_elements(case: ProblemCase) -> Iterator[str]:
                     raise ConformanceError(f"the element sampler returns no {name}, which `elementwise` names")
                 if fault := array_fault(f"{name} of the element sampler", sampled[name], (number, *shape)):
                     raise ConformanceError(f"{fault} ({at(mu)})")
-            _compare("element_sampler", mu, {name: _summed(name, full[name], dofs, n)}, case.results[where])
-            if what := difference(parts[name], full[name][some], PARTIAL_RTOL * largest_entry(full[name])):
+            _compare(case, "element_sampler", mu, {name: _summed(name, full[name], dofs, n)}, case.results[where])
+            if what := difference(parts[name], full[name][some], case.round_off * largest_entry(full[name])):
                 raise ConformanceError(f"{name} on some elements differs from that on all of them {at(mu)}: {what}")
 
 
@@ -286,7 +350,7 @@ def _places(name: str, values: object, rng: np.random.Generator) -> tuple[Indice
     else:
         pattern = sp.coo_array(sp.triu(values) if name == "A" else values)
         rows, columns = (np.asarray(axis, dtype=np.intp) for axis in pattern.coords)
-    chosen = np.sort(rng.choice(len(rows), min(ENTRIES, len(rows)), replace=False))
+    chosen = np.sort(rng.choice(len(rows), min(40, len(rows)), replace=False))
     return rows[chosen], columns[chosen]
 
 
@@ -303,15 +367,15 @@ def _check_sampler(case: ProblemCase, wanted: dict[str, tuple[Indices, Indices]]
             # A full copy with the sampled entries, so that the message names their place in the member.
             sampled = copies({name: full[name]})
             sampled[name][(rows, columns) if name in "AB" else rows] = samples[name]
-            _compare("sampler", mu, sampled, full)
+            _compare(case, "sampler", mu, sampled, full)
 
 
-def _compare(function: str, mu: Array, arrays: Arrays, full: Arrays) -> None:
+def _compare(case: ProblemCase, function: str, mu: Array, arrays: Arrays, full: Arrays) -> None:
     """Raise a `ConformanceError` for the first array whose type, shape or values are not those of `assemble` at mu."""
     for name, array in arrays.items():
         if fault := array_fault(f"{name} of `{function}`", array, full[name].shape, sparse=sp.issparse(full[name])):
             raise ConformanceError(f"{fault} ({at(mu)})")
-    for name, what in differences(copies(arrays), {name: full[name] for name in arrays}, PARTIAL_RTOL):
+    for name, what in differences(copies(arrays), {name: full[name] for name in arrays}, case.round_off):
         raise ConformanceError(f"{name} of `{function}` differs from that of `assemble` {at(mu)}: {what}")
 
 

@@ -1,4 +1,7 @@
-"""A plugin under examination, and the checks that plugins of several kinds have in common."""
+"""A plugin under examination, checks that plugins of several kinds share, and comparisons that name the entry at fault.
+
+Arrays are dense arrays and sparse matrices by name.
+"""
 
 from __future__ import annotations
 
@@ -9,102 +12,54 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
+import scipy.sparse as sp
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError, in_a_line
-from vibench.interfaces.problem import MEMBERS, Problem
 from vibench.plugins.options import options_of
 from vibench.storage.serialisation import dumps, loads
-from vibench.testing.checks import SECONDS, ConformanceError, Doubt, Note, plugin_line
-from vibench.testing.comparisons import Arrays, at, copies, differences
-from vibench.testing.processes import NotImportableError, call_in_other_process
+from vibench.testing.checks import (
+    SECONDS,
+    ConformanceError,
+    Doubt,
+    Note,
+    NotImportableError,
+    call_in_other_process,
+    kind_of,
+)
 from vibench.timing import timed
-
-MOST_POINTS, LEAST_POINTS = 7, 2
-"""Numbers of parameters at which a problem is assembled: where there is time, and where there is not."""
-
-CALLS_PER_POINT = 10
-"""Assemblies that all checks but the search for jumps make at each of them, about."""
-
-MOST_SENT = 3
-"""Number of arguments at which another process is compared."""
-
-PARTIAL_RTOL = 1e-10
-"""Largest difference of round-off between two ways to assemble, relative to the largest entry of the member."""
-
-LATE = 0.7
-"""Share of the time limit after which no search for faults goes on."""
 
 PluginT = TypeVar("PluginT")
 ArgumentT = TypeVar("ArgumentT")
 ResultT = TypeVar("ResultT")
 T = TypeVar("T")
 
+Arrays = dict[str, Any]
+
 
 @dataclass(eq=False)
-class Examined(Generic[PluginT]):
-    """A plugin of any kind under examination; `seconds` bounds the wall time [s] of the checks."""
+class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
+    """A plugin under examination, the arguments it is called with, and the results.
+
+    Every call receives copies, so that a plugin that writes to its input fails the check "no mutation" alone. The wall
+    time [s] of each call is limited by `seconds`; `round_off` is the largest relative difference that arrays of another
+    process may have.
+    """
 
     base: ClassVar[type]
-    """Class that the plugin derives from."""
+    round_off: ClassVar[float] = 0.0
 
     create: Callable[[], PluginT]
     _: KW_ONLY
     seconds: float = SECONDS
 
     def __post_init__(self) -> None:
+        kind_of(self.create)  # refuses an instance
         self._times: defaultdict[str, list[float]] = defaultdict(list)
-        if not callable(self.create):
-            raise TypeError(
-                f"pass the class {type(self.create).__name__}, or a function that makes an instance, not an instance: "
-                "two instances are compared"
-            )
-
-    @cached_property
-    def plugin(self) -> PluginT:
-        """The instance that most checks use."""
-        return self.clocked("the construction", self.create)
-
-    def clocked(self, what: str, work: Callable[[], T]) -> T:
-        """Result of some work; the check "time" reports its wall time."""
-        result, seconds = timed(work)
-        self._times[what].append(seconds.wall)
-        return result
-
-    def construction(self) -> Iterator[str]:
-        """An instance of the right class can be made."""
-        plugin: object = self.plugin
-        if not isinstance(plugin, self.base):
-            yield f"a {type(plugin).__name__} was made; expected a subclass of vibench.{self.base.__name__}"
-
-    def duration(self) -> Iterator[str]:
-        """The constructor and every call stay below the limit."""
-        for what, seconds in self._times.items():
-            if max(seconds) > self.seconds:
-                excess = f"{what} takes {max(seconds):.3g} s, above the limit of {self.seconds:g} s"
-                yield f"{excess}; is something recomputed that could be stored?"
-        yield from self._spent()
-
-    def _spent(self) -> Iterator[Note]:
-        """What all calls took."""
-        yield from (Note(f"{what} takes {np.median(seconds):.2g} s") for what, seconds in self._times.items())
-
-
-@dataclass(eq=False)
-class Case(Examined[PluginT], ABC, Generic[PluginT, ArgumentT, ResultT]):
-    """A plugin, the arguments it is called with, and the results.
-
-    Every call receives copies, so that a plugin that writes to its input fails the check "no mutation" alone.
-    """
-
-    round_off: ClassVar[float] = 0.0
-    """Largest relative difference that arrays of another process may have."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
         self._began = time.monotonic()
 
     @property
@@ -121,14 +76,31 @@ class Case(Examined[PluginT], ABC, Generic[PluginT, ArgumentT, ResultT]):
         """Arrays of a result that a repeated call has to reproduce to the last bit."""
 
     @cached_property
+    def plugin(self) -> PluginT:
+        """The instance that most checks use."""
+        return self.clocked("the construction", self.create)
+
+    @cached_property
     def results(self) -> dict[str, ResultT]:
         """Results by the names of their arguments."""
         return {name: self.evaluate(argument) for name, argument in self.arguments.items()}
 
     @property
     def late(self) -> bool:
-        """Whether most of the time has passed, so that a search for faults has to end."""
-        return time.monotonic() - self._began > LATE * self.seconds
+        """Whether a search for faults has to end: the checks after it need the rest of the time."""
+        return time.monotonic() - self._began > 0.7 * self.seconds
+
+    def clocked(self, what: str, work: Callable[[], T]) -> T:
+        """Result of some work; the check "time" reports its wall time."""
+        result, seconds = timed(work)
+        self._times[what].append(seconds.wall)
+        return result
+
+    def construction(self) -> Iterator[str]:
+        """An instance of the right class can be made."""
+        plugin: object = self.plugin
+        if not isinstance(plugin, self.base):
+            yield f"a {type(plugin).__name__} was made; expected a subclass of vibench.{self.base.__name__}"
 
     def options(self) -> Iterator[str]:
         """Every option has an annotation that its default conforms to: study files may set no other to anything."""
@@ -138,6 +110,14 @@ class Case(Examined[PluginT], ABC, Generic[PluginT, ArgumentT, ResultT]):
                 if doubt := option.doubt:
                     yield Doubt(f"the option '{option.name}' {doubt}")
 
+    def duration(self) -> Iterator[str]:
+        """The constructor and every call stay below the limit."""
+        for what, seconds in self._times.items():
+            if max(seconds) > self.seconds:
+                excess = f"{what} takes {max(seconds):.3g} s, above the limit of {self.seconds:g} s"
+                yield f"{excess}; is something recomputed that could be stored?"
+            yield Note(f"{what} takes {np.median(seconds):.2g} s")
+
     def determinism(self) -> Iterator[str]:
         """A second call and another instance give the same results to the last bit."""
         again = list(self._deviations("a second call", self._evaluation(self.plugin)))
@@ -145,9 +125,9 @@ class Case(Examined[PluginT], ABC, Generic[PluginT, ArgumentT, ResultT]):
 
     def another_process(self) -> Iterator[str]:
         """Another process, whose sets have another order, gives the same results up to `round_off`."""
-        some = dict([*self.arguments.items()][-MOST_SENT:])
+        some = dict([*self.arguments.items()][-3:])
         try:
-            there = call_in_other_process(evaluated, type(self), self.create, some, seconds=self.seconds)
+            there = call_in_other_process(_evaluated, type(self), self.create, some, seconds=self.seconds)
         except NotImportableError as error:
             yield Note(f"not compared: {error}")
             return
@@ -178,7 +158,6 @@ class Case(Examined[PluginT], ABC, Generic[PluginT, ArgumentT, ResultT]):
         return again
 
     def _evaluation(self, plugin: PluginT) -> Callable[[str], Arrays]:
-        """What an instance gives for an argument, by its name."""
         return lambda name: self.arrays(self.evaluate(self.arguments[name], plugin))
 
     def _deviations(
@@ -194,83 +173,13 @@ class Case(Examined[PluginT], ABC, Generic[PluginT, ArgumentT, ResultT]):
                     yield f"{name}: {source} gives different values of {array}: {what}"
 
 
-def evaluated(
+def _evaluated(
     case: Callable[[Callable[[], PluginT]], Case[PluginT, ArgumentT, Any]],
     create: Callable[[], PluginT],
     arguments: Mapping[str, ArgumentT],
 ) -> dict[str, Arrays]:
-    """What another instance gives for some arguments."""
     other = case(create)
     return {name: other.arrays(other.evaluate(argument)) for name, argument in arguments.items()}
-
-
-@dataclass(eq=False)
-class ProblemCase(Case[Problem, Array, Arrays]):
-    """A problem, parameters, and the arrays it assembles.
-
-    Parameters
-    ----------
-    create
-        Class, or `partial` of it with options; an instance is refused with a `TypeError`. Choose a coarse mesh: some
-        hundred assemblies are made.
-    seconds
-        Wall time [s] that all checks may take, about: where an assembly is slow, they are made at fewer parameters.
-    seed
-        Of the random parameters and entries.
-    """
-
-    base = Problem
-    round_off = PARTIAL_RTOL
-    _: KW_ONLY
-    seed: int = 0
-
-    @cached_property
-    def one_assembly(self) -> float:
-        """Wall seconds of the first assembly."""
-        box, problem = self.plugin.parameters, self.plugin
-        return timed(lambda: problem.assemble(0.5 * (box.lower + box.upper)))[1].wall
-
-    @cached_property
-    def points(self) -> int:
-        """Number of parameters, such that all checks take about half of the time limit: 7, or 2 at least."""
-        try:
-            seconds = self.one_assembly
-        except Exception:  # noqa: BLE001  the check "assembly" says what a plugin raises
-            return MOST_POINTS
-        calls = 0.5 * self.seconds / max(seconds, 1e-9)
-        return int(min(max(calls / CALLS_PER_POINT, LEAST_POINTS), MOST_POINTS))
-
-    @cached_property
-    def mus(self) -> Array:
-        """Parameters (7×d): two corners of the box, its centre, and four random ones; only the first if it is slow."""
-        box = self.plugin.parameters
-        fixed = np.stack([box.lower, box.upper, 0.5 * (box.lower + box.upper)])
-        return np.concatenate([fixed, box.sample(MOST_POINTS - 3, self.seed)])[: self.points]
-
-    @cached_property
-    def arguments(self) -> dict[str, Array]:
-        """The parameters."""
-        return {at(mu): mu for mu in self.mus}
-
-    def evaluate(self, argument: Array, plugin: Problem | None = None) -> Arrays:
-        """Copies of A, f, B and g at a parameter (d,), and of X_V and X_W."""
-        problem, mu = plugin or self.plugin, argument.copy()
-        vi = self.clocked("an assembly", lambda: problem.assemble(mu))
-        members = {name: getattr(vi, name) for name in MEMBERS}
-        return copies({**members, "X_V": problem.V.matrix, "X_W": problem.W.matrix})
-
-    def arrays(self, result: Arrays) -> Arrays:
-        """The members and Gram matrices."""
-        return result
-
-    def construction(self) -> Iterator[str]:
-        """An instance can be made; a refused Gram matrix is named."""
-        try:
-            yield from super().construction()
-        except NumericalError as error:
-            place = plugin_line(error)
-            names = [f"X_{name}: " for name in "VW" if f"self.{name} =" in place and f"X_{name}" not in str(error)]
-            raise ConformanceError(f"{''.join(names)}{error} ({place})") from error
 
 
 def _pickling_error(thing: Any) -> str:
@@ -279,3 +188,131 @@ def _pickling_error(thing: Any) -> str:
     except Exception as error:  # noqa: BLE001  a plugin may raise anything
         return in_a_line(error)
     return ""
+
+
+def copies(arrays: Arrays) -> Arrays:
+    """Copies of dense arrays, and of sparse matrices in CSR format without duplicate entries."""
+    copied: Arrays = {}
+    for name, value in arrays.items():
+        copied[name] = value.copy() if isinstance(value, np.ndarray) else sp.csr_array(value, copy=True)
+        if sp.issparse(copied[name]):
+            copied[name].sum_duplicates()
+    return copied
+
+
+def largest_entry(value: Any) -> float:
+    """Largest modulus of an entry of a dense array or a sparse matrix; 0 without entries."""
+    return float(np.max(np.abs(_entries(value)), initial=0.0))
+
+
+def difference(one: Any, other: Any, limit: float = 0.0) -> str:
+    """Entry in which two arrays differ most, "entry (3, 4) is 1.0 against 2.0"; "" if by no more than the limit."""
+    if one.shape != other.shape:
+        return f"the shape is {one.shape} against {other.shape}"
+    gap = one - other
+    sizes = np.abs(_entries(gap))
+    if not len(sizes) or np.max(sizes) <= limit:
+        return ""
+    place = _place(gap, int(np.argmax(np.where(np.isnan(sizes), np.inf, sizes))))
+    values = float(one[place]), float(other[place])
+    short = [f"{value:.6g}" for value in values]
+    first, second = short if short[0] != short[1] else map(repr, values)
+    return f"entry {place} is {first} against {second}"
+
+
+def differences(one: Arrays, other: Arrays, rtol: float = 0.0) -> Iterator[tuple[str, str]]:
+    """Names of the arrays that differ by more than rtol times the largest entry of the other, and the `difference`."""
+    for name in {**one, **other}:
+        if name not in one or name not in other:
+            yield name, "one of the two has none"
+        elif what := difference(one[name], other[name], rtol * largest_entry(other[name])):
+            yield name, what
+
+
+def unmutated(function: str, arrays: Arrays, call: Callable[[], T]) -> T:
+    """Result of a call; a `ConformanceError` names the arrays that it changed, and an entry of each."""
+    before = copies(arrays)
+    result = call()
+    if changed := [f"{name}: {what} before" for name, what in differences(copies(arrays), before)]:
+        raise ConformanceError(f"{function} changes {'; '.join(changed)}; work on copies and return new arrays")
+    return result
+
+
+def array_fault(name: str, value: Any, shape: tuple[int, ...], *, sparse: bool = False) -> str:
+    """Why a value is not a finite float64 array of a shape, dense or sparse (CSR, CSC); "" if it is."""
+    if not (sp.issparse(value) if sparse else isinstance(value, np.ndarray)):
+        right = f"sparse CSR matrix: scipy.sparse.csr_array({name})" if sparse else f"NumPy array of shape {shape}"
+        return f"{name} is a {type(value).__name__}; expected a {right}"
+    if value.shape != shape:
+        return f"{name} has shape {value.shape}; expected {shape}"
+    if sparse and value.format not in ("csr", "csc"):
+        return f"{name} has the sparse format {value.format}; expected CSR or CSC: scipy.sparse.csr_array({name})"
+    if value.dtype != np.float64:
+        return f"{name} has dtype {value.dtype}; expected float64"
+    wrong = np.flatnonzero(~np.isfinite(_entries(value)))
+    if not len(wrong):
+        return ""
+    return f"{name} is not finite: entry {_place(value, wrong[0])} is {_entries(value)[wrong[0]]}"
+
+
+def at(mu: Array) -> str:
+    """A parameter (d,) in words: "at mu = [4.0, 0.1]"."""
+    return f"at mu = {[float(f'{value:.12g}') for value in mu]}"
+
+
+def _entries(value: Any) -> Array:
+    """Entries of a dense array, or stored entries of a sparse matrix."""
+    return np.asarray(value.data if sp.issparse(value) else np.ravel(value))
+
+
+def _place(value: Any, k: int) -> tuple[int, ...] | int:
+    """Index of the k-th of these entries, in a vector a number."""
+    axes = [axis[k] for axis in sp.coo_array(value).coords] if sp.issparse(value) else np.unravel_index(k, value.shape)
+    return tuple(int(index) for index in axes) if len(axes) > 1 else int(axes[0])
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """A segment of the line, and the arrays at its left end, in its middle and at its right end.
+
+    In the middle the array `name` deviates most from the mean of both ends, relative to its largest entry.
+    """
+
+    left: float
+    right: float
+    values: tuple[Arrays, Arrays, Arrays]
+    name: str
+    deviation: float
+
+
+def find_jump(
+    evaluate: Callable[[float], Arrays], scales: dict[str, float], late: Callable[[], bool] = lambda: False
+) -> Segment | None:
+    """A segment of length 2⁻³⁰ at most on which an array jumps, `None` if no jump is found before it is `late`.
+
+    Jumps below 1e-3 of the largest entry are not found. `evaluate` returns the arrays at t ∈ [0, 1]; `scales` names
+    those that are examined, with their largest modulus.
+    """
+
+    def segment(left: float, right: float, first: Arrays, last: Arrays) -> Segment:
+        middle = evaluate(0.5 * (left + right))
+        off = {name: middle[name] - 0.5 * (first[name] + last[name]) for name in scales}
+        deviations = {name: largest_entry(off[name]) / scales[name] for name in scales}
+        name = max(deviations, key=deviations.__getitem__)
+        return Segment(left, right, (first, middle, last), name, deviations[name])
+
+    knots = [(t, evaluate(t)) for t in (0.0, 0.25, 0.5, 0.75, 1.0)]
+    segments = [segment(left, right, first, last) for (left, first), (right, last) in pairwise(knots)]
+    # Halving a segment divides the deviation of a smooth array by 4 and that at a kink by 2; at a jump it stays half
+    # the jump. A kink takes fewer than 60 halvings; what changes by 1e-3 over 2⁻³⁰ is discontinuous or as steep as 1e6.
+    for _ in range(60):
+        worst = max(segments, key=lambda each: each.deviation)
+        if worst.deviation < 0.5e-3 or late():
+            return None
+        if worst.right - worst.left <= 2.0**-30:
+            return worst
+        segments.remove(worst)
+        middle = 0.5 * (worst.left + worst.right)
+        first, between, last = worst.values
+        segments += [segment(worst.left, middle, first, between), segment(middle, worst.right, between, last)]
+    return None

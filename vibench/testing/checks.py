@@ -1,29 +1,39 @@
-"""Checks of plugins, their results, and the error that lists the failures."""
+"""Conformance checks and their results, and running them in this process, in another one, or as tests of pytest."""
 
 from __future__ import annotations
 
-import inspect
+import atexit
+import os
+import pickle
+import sys
 import sysconfig
+import time
 import traceback
-from collections.abc import Callable, Iterable
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import cached_property
+from functools import cache, lru_cache, partial
+from importlib import import_module
 from pathlib import Path
-from typing import Any, Generic, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+import cloudpickle
 import numpy as np
 import scipy
 
 import vibench
 from vibench.errors import in_a_line
+from vibench.execution.supervisor import Supervisor
+from vibench.execution.watched import WatchedWork, watched
+from vibench.plugins.kinds import CHECKED
+from vibench.qp.status import Status
+from vibench.stages.base import Failed
+
+if TYPE_CHECKING:
+    import pytest
 
 CaseT_contra = TypeVar("CaseT_contra", contravariant=True)
-P = ParamSpec("P")
-T = TypeVar("T")
-
-MOST = 5
-"""Largest number of faults that one check lists."""
 
 SECONDS = 120.0
 """Default wall time [s] that the checks of a plugin may take; no call of it may take longer."""
@@ -61,13 +71,17 @@ class Note(str):
 
 
 class Doubt(str):
-    """A remark on what is probably not intended, although it is allowed; it turns a passed check into a warning."""
+    """A remark on what is allowed but probably unintended; it turns a passed check into a warning."""
 
     __slots__ = ()
 
 
 class ConformanceError(AssertionError):
     """A plugin violates what vibench assumes of it; raised in a check, it is a fault that ends the check."""
+
+
+class ConformanceWarning(UserWarning):
+    """A plugin does what is allowed but probably unintended."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +98,7 @@ class Check(Generic[CaseT_contra]):
     def result(self, case: CaseT_contra, earlier: Iterable[CheckResult]) -> CheckResult:
         """Make the check, unless one that it needs is not among the earlier ones or did not pass."""
         passed = {one.check for one in earlier if one.verdict in (Verdict.PASSED, Verdict.WARNING)}
-        missing = [name for name in self.needs if name not in passed]
-        if missing:
+        if missing := [name for name in self.needs if name not in passed]:
             return CheckResult(self.name, Verdict.SKIPPED, f"it needs '{missing[0]}'")
         lines: list[str] = []
         try:
@@ -94,76 +107,248 @@ class Check(Generic[CaseT_contra]):
         except (Exception, SystemExit) as error:  # noqa: BLE001  a plugin may raise anything
             lines.append(str(error) if isinstance(error, ConformanceError) else raised(error))
         faults = [line for line in lines if not isinstance(line, Note | Doubt)]
-        if len(faults) > MOST:
-            faults[MOST:] = ["and more"]
+        if len(faults) > 5:
+            faults[5:] = ["and more"]
         doubtful = any(isinstance(line, Doubt) for line in lines)
         verdict = Verdict.FAILED if faults else Verdict.WARNING if doubtful else Verdict.PASSED
         return CheckResult(self.name, verdict, "; ".join(faults or lines))
 
 
 @dataclass(frozen=True)
-class Conformance(Generic[P, CaseT_contra]):
-    """The conformance checks of one kind of plugins.
+class Conformance(Generic[CaseT_contra]):
+    """The checks of one kind of plugin, in the order in which they are made.
 
-    `examine` and `check` are the functions `vibench.testing.examine_KIND` and `check_KIND`. Their parameters are those
-    of the case, whose docstring explains them.
+    `case` makes the case that all of them share from a plugin, or from a function that makes an instance of it.
     """
 
-    kind: str
-    """The kind, as `vibench check KIND:NAME` has it."""
-    case: Callable[P, CaseT_contra]
-    """What makes a case of a plugin, or of a function that makes an instance, and of further arguments."""
+    case: Callable[..., CaseT_contra]
     checks: tuple[Check[CaseT_contra], ...]
 
-    @cached_property
-    def examine(self) -> Callable[P, list[CheckResult]]:
-        """The function that makes all checks and returns their results."""
 
-        def examine(*args: P.args, **kwargs: P.kwargs) -> list[CheckResult]:
-            case, results = self.case(*args, **kwargs), list[CheckResult]()
-            for check in self.checks:
-                results.append(check.result(case, results))
-            return results
+def conformance(kind: str) -> Conformance[Any]:
+    """The registered checks of a kind of plugin, by its name in `vibench check KIND:NAME`."""
+    # The modules of the checks import this one.
+    module = "strategies" if kind in ("dual", "primal", "sampling") else f"{kind}s"
+    checks: Conformance[Any] = getattr(import_module(f"vibench.testing.{module}"), kind.upper())
+    return checks
 
-        return self._public(examine, f"Make all checks of a {self.kind} and return their results.", list[CheckResult])
 
-    @cached_property
-    def check(self) -> Callable[P, None]:
-        """The function that makes all checks and raises a `ConformanceError` that lists those that fail."""
+def kind_of(plugin: Any) -> str:
+    """The kind of a class, or of a `partial` of one; a function is a QP solver."""
+    cls = getattr(plugin, "func", plugin)
+    if not callable(cls):
+        raise TypeError(
+            f"pass the class {type(cls).__name__}, or a function that makes an instance, not an instance: "
+            "two instances are compared"
+        )
+    named = (kind for kind, one in CHECKED.items() if one.base and isinstance(cls, type) and issubclass(cls, one.base))
+    return next(named, "solver")
 
-        def check(*args: P.args, **kwargs: P.kwargs) -> None:
-            results = self.examine(*args, **kwargs)
-            failures = [f"{each.check}: {each.message}" for each in results if each.verdict is Verdict.FAILED]
-            if failures:
-                create = inspect.signature(self.case).bind(*args, **kwargs).arguments["create"]
-                plugin = getattr(getattr(create, "func", create), "__name__", create)
-                raise ConformanceError(
-                    "\n".join([f"{plugin} fails {len(failures)} of {len(results)} checks", *failures])
-                )
 
-        return self._public(
-            check, f"Make all checks of a {self.kind}; raise a `ConformanceError` that lists the failures."
+def examine(plugin: Any, *, kind: str | None = None, **given: Any) -> list[CheckResult]:
+    """Make all checks of a plugin in this process and return their results; the parameters are those of `check`."""
+    checks = conformance(kind or kind_of(plugin))
+    case, results = checks.case(plugin, **given), list[CheckResult]()
+    for one in checks.checks:
+        results.append(one.result(case, results))
+    return results
+
+
+def check(plugin: Any, *, kind: str | None = None, **given: Any) -> None:
+    """Make all checks of a plugin in this process.
+
+    Parameters
+    ----------
+    plugin
+        Class, or `partial` of it with options; an instance is refused with a `TypeError`. A QP solver is the function
+        itself. Choose a coarse mesh of a problem: some hundred assemblies are made.
+    kind
+        What `plugin` makes, "problem" for instance, where it is a function that makes an instance.
+    **given
+        `seconds`: longest wall time [s] of one call, for a problem of all checks. Problems and formulations: `seed` of
+        the random parameters. Dual strategies: multiplier snapshots `snapshots` (m×P), nonnegative coefficients, with
+        their space `W`, and `tolerances` and `sizes` at which the cones stop. Primal strategies: `offline`, the
+        reduced model to enrich, and `tolerances`. Formulations: `offline`, a `Reduction`. Sampling strategies: `boxes`,
+        by what they are called in messages. What is not given is that of a sample problem.
+
+    Raises
+    ------
+    ConformanceError
+        If a check fails; it lists all failures.
+    """
+    results = examine(plugin, kind=kind, **given)
+    if failures := [f"{each.check}: {each.message}" for each in results if each.verdict is Verdict.FAILED]:
+        raise ConformanceError(
+            "\n".join([f"{_title(plugin)} fails {len(failures)} of {len(results)} checks", *failures])
         )
 
-    def _public(self, function: Callable[P, T], summary: str, returned: Any = None) -> Callable[P, T]:
-        """The function under its public name, with the parameters of the case and what is said of them."""
-        name = f"{function.__name__}_{self.kind}"
-        explained = "\n\n".join([summary, *str(inspect.getdoc(self.case)).split("\n\n")[1:]])
-        signature = inspect.signature(self.case).replace(return_annotation=returned)
-        vars(function).update(__signature__=signature)
-        function.__name__, function.__qualname__, function.__module__ = name, name, "vibench.testing"
-        function.__doc__ = explained
-        return function
+
+def parametrize_with_checks(*plugins: Any, kind: str | None = None, **given: Any) -> pytest.MarkDecorator:
+    """Make a test of pytest one test for every check of every plugin.
+
+    The test has one argument, `check`, and calls it. A check runs in another process, so that a plugin that hangs,
+    exits or crashes fails this check alone. A check is skipped if one that it needs fails; what is doubtful is a
+    `ConformanceWarning`. The parameters are those of `vibench.testing.check`.
+
+        @parametrize_with_checks(Cable, partial(Cable, nodes=20))
+        def test_the_cable_conforms(check):
+            check()
+    """
+    import pytest  # noqa: PLC0415  it is not installed wherever this module is imported
+
+    examinations = [Examination(plugin, kind, **given) for plugin in plugins]
+    cases = [(one, name) for one in examinations for name in one.checks]
+    return pytest.mark.parametrize(
+        "check", [pytest.param(partial(_report, *case), id=f"{case[0].title}-{case[1]}") for case in cases]
+    )
+
+
+def _report(examination: Examination, name: str) -> None:
+    """Report the result of a check to pytest."""
+    import pytest  # noqa: PLC0415  see above
+
+    result = examination.result(name)
+    if result.verdict is Verdict.FAILED:
+        raise ConformanceError(result.message)
+    if result.verdict is Verdict.SKIPPED:
+        pytest.skip(result.message)
+    if result.verdict is Verdict.WARNING:
+        warnings.warn(f"{examination.title}, {name}: {result.message}", ConformanceWarning, stacklevel=2)
+
+
+class Examination:
+    """The checks of a plugin in another process: one that ends the process or exceeds the time fails alone.
+
+    `seconds` limits the wall time of all of them; the other parameters are those of `check`.
+    """
+
+    def __init__(self, plugin: Any, kind: str | None = None, seconds: float = SECONDS, **given: Any) -> None:
+        self.kind, self.title, self.seconds = kind or kind_of(plugin), _title(plugin), seconds
+        self.checks = {one.name: one for one in conformance(self.kind).checks}
+        self._pickled = cloudpickle.dumps((plugin, given | {"seconds": seconds}))
+        self._results = dict[str, CheckResult]()
+        self._left = seconds
+
+    def result(self, name: str) -> CheckResult:
+        """Result of one check, made when it is first asked for, after those that it needs."""
+        if name not in self._results:
+            earlier = [self.result(needed) for needed in self.checks[name].needs]
+            self._results[name] = self._make(name, earlier)
+        return self._results[name]
+
+    def results(self) -> Iterator[CheckResult]:
+        """Results of all checks as soon as they are made; those that no time is left for are one result."""
+        late = []
+        for result in map(self.result, self.checks):
+            if result.message == NO_TIME:
+                late.append(result.check)
+            else:
+                yield result
+        if late:
+            yield CheckResult(", ".join(late), Verdict.SKIPPED, NO_TIME)
+
+    def _make(self, name: str, earlier: list[CheckResult]) -> CheckResult:
+        if self._left <= 0.0:
+            return CheckResult(name, Verdict.SKIPPED, NO_TIME)
+        answer = _call(_check_here, self.kind, self._pickled, name, earlier, seconds=self._left, process=_process())
+        if not isinstance(answer, Failed):
+            result: CheckResult = answer[0]
+            self._left -= answer[1]
+            return result
+        if answer.status is Status.TIMEOUT:
+            self._left = 0.0
+            return CheckResult(name, Verdict.FAILED, f"stopped: the checks take longer than {self.seconds:g} s")
+        return CheckResult(name, Verdict.FAILED, answer.reason)
+
+
+NO_TIME = "no time is left"
+
+
+def _check_here(kind: str, pickled: bytes, name: str, earlier: list[CheckResult]) -> tuple[CheckResult, float]:
+    """Result of a check in this process, and the wall seconds that it took."""
+    begin = time.monotonic()
+    (own,) = (one for one in conformance(kind).checks if one.name == name)
+    result = own.result(_case(kind, pickled), earlier)
+    return result, time.monotonic() - begin
+
+
+@lru_cache(maxsize=1)
+def _case(kind: str, pickled: bytes) -> Any:
+    """The case of a plugin, cached: its checks share what it has computed."""
+    plugin, given = pickle.loads(pickled)
+    return conformance(kind).case(plugin, **given)
+
+
+def _title(plugin: Any) -> str:
+    return str(getattr(getattr(plugin, "func", plugin), "__name__", plugin))
+
+
+@dataclass(frozen=True)
+class Call(WatchedWork):
+    """One call of a pickled function with its arguments; `path` is searched for modules, too."""
+
+    label = "call"
+    items = 1
+
+    pickled: bytes
+    path: tuple[str, ...]
+
+    def do(self, number: int, done: Mapping[int, Any]) -> Any:  # noqa: ARG002
+        """Return the value of the function; a `NotImportableError` if this process cannot import what was pickled."""
+        sys.path += [folder for folder in self.path if folder not in sys.path]
+        try:
+            function, arguments = pickle.loads(self.pickled)
+        except (ImportError, AttributeError) as error:
+            return NotImportableError(in_a_line(error))
+        return function(*arguments)
+
+
+class NotImportableError(Exception):
+    """Another process cannot import a plugin: a class that is local to a function, a module that is not on the path."""
+
+
+def _call(function: Callable[..., Any], *arguments: Any, seconds: float, process: Supervisor) -> Any:
+    """Value of a function in another process, or why it has none."""
+    call = Call(pickle.dumps((function, arguments)), tuple(folder for folder in sys.path if folder))
+    answer = watched(call, seconds, supervisor=process)
+    return answer if isinstance(answer, Failed) else answer[0]
+
+
+def call_in_other_process(function: Callable[..., Any], *arguments: Any, seconds: float) -> Any:
+    """Value of a function in another process, whose hashes have another seed than those here.
+
+    Raises a `NotImportableError` if function or arguments cannot be sent there, and a `ConformanceError` if the call
+    fails there, or takes longer than so many seconds.
+    """
+    # The seed orders sets of texts.
+    seed = "1" if os.environ.get("PYTHONHASHSEED") != "1" else "2"
+    try:
+        value = _call(function, *arguments, seconds=seconds, process=_process(PYTHONHASHSEED=seed))
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise NotImportableError(in_a_line(error)) from None
+    if isinstance(value, NotImportableError):
+        raise value
+    if isinstance(value, Failed):
+        raise ConformanceError(f"in another process it fails: {value.reason}")
+    return value
+
+
+@cache
+def _process(**environment: str) -> Supervisor:
+    """Another process with these variables in its environment, which serves all checks of this one."""
+    supervisor = Supervisor(environment=environment)
+    atexit.register(supervisor.close)
+    return supervisor
 
 
 def raised(error: BaseException) -> str:
-    """An exception in one line, with the last line of the plugin's own code that it passed through."""
+    """Describe an exception in one line, with the last line of the plugin's own code that it passed through."""
     place = plugin_line(error)
     return in_a_line(error) + (f" ({place})" if place else "")
 
 
 def plugin_line(error: BaseException) -> str:
-    """Where an exception left the plugin, "cable.py, line 12: self.V = …"; "" if it did not pass through it."""
+    """Return where an exception left the plugin, "cable.py, line 12: self.V = …"; "" if it did not pass through it."""
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not _is_library(frame.filename)]
     return f"{Path(frames[-1].filename).name}, line {frames[-1].lineno}: {frames[-1].line}" if frames else ""
 

@@ -26,25 +26,9 @@ from vibench.offline.formulated import ACCURACY, CellSolver, Formulated, check_b
 from vibench.offline.reduction import Reduction
 from vibench.qp.status import Status
 from vibench.storage.serialisation import dumps, loads
-from vibench.testing.case import Case
+from vibench.testing.case import Arrays, Case, at, difference, differences, largest_entry, unmutated
 from vibench.testing.checks import Check, Conformance, ConformanceError, Note
-from vibench.testing.comparisons import Arrays, at, difference, differences, largest_entry, unmutated
-from vibench.testing.samples.sample_problem import sample_reduction
-
-SOLVER = "piqp"
-"""The QP solver of the queries."""
-
-POINTS = 4
-"""Random parameters beside the centre of the box and a training parameter."""
-
-AGREEMENT = 1e-3
-"""Largest difference of u, relative to its largest entry, of an answer that started from another one."""
-
-STEPS = {
-    "pod": ("pod", "modes"), "dual": ("cone", "multipliers", "dual", "generators"), "primal": ("enrichment", "primal"),
-    "assembly": ("assembled", "operators", "members", "assembly"),
-}  # fmt: skip
-"""Attributes of an offline phase whose use shows that a formulation has an axis."""
+from vibench.testing.sample_problem import sample_reduction
 
 
 @dataclass(frozen=True)
@@ -58,17 +42,7 @@ class Answered:
 
 @dataclass(eq=False)
 class FormulationCase(Case[Formulation, Array, Answered]):
-    """A formulation, parameters, and what it answers there on an offline phase.
-
-    Parameters
-    ----------
-    create
-        Class, or `partial` of it with options; an instance is refused with a `TypeError`.
-    offline
-        The offline phase; by default one of a sample problem.
-    seconds
-        Longest wall time [s] of one call.
-    """
+    """A formulation, parameters, and its answers there on an offline phase."""
 
     base = Formulation
     offline: Reduction | None = None
@@ -109,7 +83,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         """A training parameter, the centre of the box, and random parameters."""
         box = self.whole.problem.parameters
         fixed = np.stack([self.whole.snapshots.mu[0], 0.5 * (box.lower + box.upper)])
-        return {at(mu): mu for mu in np.concatenate([fixed, box.sample(POINTS, self.seed)])}
+        return {at(mu): mu for mu in np.concatenate([fixed, box.sample(4, self.seed)])}
 
     def formulated(self, plugin: Formulation) -> Formulated:
         """The model of an instance, from what it has built once that was stored."""
@@ -122,7 +96,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
     @staticmethod
     def _of(plugin: Formulation, offline: Reduction, built: Mapping[str, Any]) -> Formulated:
         uses = axes_of(plugin, type(plugin).__name__)
-        return Formulated(plugin, offline, built, SOLVER if "solvers" in uses else None, ACCURACY)
+        return Formulated(plugin, offline, built, "piqp" if "solvers" in uses else None, ACCURACY)
 
     def evaluate(self, argument: Array, plugin: Formulation | None = None) -> Answered:
         """The answer at a parameter (d,), and its pair."""
@@ -237,11 +211,18 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         self.results  # noqa: B018  the first use builds and asks
         of = self.formulated(self.plugin)
         assert isinstance(of.offline, _Seen)
+        # The attributes of an offline phase whose use shows that a formulation has an axis.
+        steps = {
+            "pod": ("pod", "modes"),
+            "dual": ("cone", "multipliers", "dual", "generators"),
+            "primal": ("enrichment", "primal"),
+            "assembly": ("assembled", "operators", "members", "assembly"),
+        }
         for axis in axes_of(self.plugin, type(self.plugin).__name__):
             if axis == "solvers" and all(result.solver.last is None for result in self.results.values()):
                 yield "uses declares 'solvers', but no query calls `asked.solve_qp`"
-            elif axis in STEPS and of.offline.seen.isdisjoint(STEPS[axis]):
-                yield f"uses declares '{axis}', but nothing is made of offline.{STEPS[axis][0]}"
+            elif axis in steps and of.offline.seen.isdisjoint(steps[axis]):
+                yield f"uses declares '{axis}', but nothing is made of offline.{steps[axis][0]}"
 
     def starts(self) -> Iterator[str]:
         """An answer that starts from another one is the same up to the accuracy."""
@@ -252,7 +233,8 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         for name, result in others:
             warm = of.model.solve(self.arguments[name].copy(), of.asked(first[1].answer)[0])
             u = of.model.reconstruct(self.arguments[name].copy(), warm)[0]
-            if what := difference(u, result.pair[0], AGREEMENT * largest_entry(result.pair[0])):
+            # Both are accurate to the accuracy of the solver; a thousandth tells another solution.
+            if what := difference(u, result.pair[0], 1e-3 * largest_entry(result.pair[0])):
                 yield f"{name}: started from the answer {first[0]}, u differs: {what}"
 
     def no_mutation(self) -> None:
@@ -319,7 +301,7 @@ def _faults_of(answer: FormulationAnswer, model: FormulationModel) -> Iterator[s
             yield f"{name} is not finite: entry {int(np.argmin(np.isfinite(vector)))}"
 
 
-FORMULATION = Conformance("formulation", FormulationCase, (
+FORMULATION = Conformance(FormulationCase, (
     Check("construction", FormulationCase.construction),
     Check("options", FormulationCase.options, ("construction",)),
     Check("axes", FormulationCase.axes, ("construction",)),

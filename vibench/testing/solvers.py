@@ -9,6 +9,7 @@ from copy import deepcopy
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property, partial
 from types import FrameType
+from typing import ClassVar
 
 import numpy as np
 
@@ -19,27 +20,12 @@ from vibench.qp.scaling import units_of
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, QPSolver, kkt_residuals, verify
+from vibench.testing.case import copies, differences, unmutated
 from vibench.testing.checks import SECONDS, Check, Conformance, ConformanceError, Doubt, Note, raised
-from vibench.testing.comparisons import copies, differences, unmutated
 from vibench.timing import timed
 
 ACCURACY = 1e-7
 """Relative accuracy of the solutions: the default of studies."""
-
-ACCURACIES = (1e-3, 1e-5, ACCURACY)
-"""Accuracies that the residuals are compared with."""
-
-SOLUTION_RTOL = 1e-3
-"""Largest error of a solution whose residuals are below `ACCURACY`; the conditions of the programs are below 1e3."""
-
-SLOW = 1.0
-"""Wall seconds of a solution of a few unknowns above which a solver is said to be slow."""
-
-REPEATS = 9
-"""Number of calls with the same program, and of calls with one that is new."""
-
-KEPT_RATIO = 5.0
-"""A program solved before that takes so many times less than a new one was not solved again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +47,7 @@ def known_program(
 
 
 def known_programs() -> dict[str, KnownProgram]:
-    """Programs by what is special about them."""
+    """Programs with known solutions, by what is special about them."""
     rng = np.random.default_rng(1)
     n, m = 6, 9
     x, B, size = rng.standard_normal(n), rng.standard_normal((m, n)), 0.5 + rng.random(m)
@@ -93,29 +79,18 @@ def known_programs() -> dict[str, KnownProgram]:
     }  # fmt: skip
 
 
-IMPOSSIBLE = VariationalInequality(np.eye(1), np.ones(1), np.array([[1.0], [-1.0]]), np.array([-1.0, -1.0]))
-"""x ≤ −1 and x ≥ 1."""
-
-
 @dataclass(eq=False)
 class SolverCase:
-    """A QP solver, and the programs it solves.
-
-    Parameters
-    ----------
-    create
-        The function that is registered under `vibench.qp_solvers`.
-    seconds
-        Longest wall time [s] of one solution.
-    """
+    """A QP solver, which is the function that is registered under `vibench.qp_solvers`, and the programs it solves."""
 
     create: QPSolver
     _: KW_ONLY
     seconds: float = SECONDS
+    # Largest error of a solution whose residuals are below the accuracy: the conditions of the programs are below 1e3.
+    rtol: ClassVar[float] = 1e-3
 
     @cached_property
     def programs(self) -> dict[str, KnownProgram]:
-        """The programs with known solutions."""
         return known_programs()
 
     @cached_property
@@ -149,7 +124,7 @@ class SolverCase:
         ]
         if off[0] > 1e-3 > off[1]:
             yield f"multipliers have the other sign: ‖A x + Bᵀα − f‖ is {off[0]:.1g}, with −α {off[1]:.1g}"
-        elif np.min(answer.alpha) < -SOLUTION_RTOL * np.max(np.abs(answer.alpha)):
+        elif np.min(answer.alpha) < -self.rtol * np.max(np.abs(answer.alpha)):
             yield f"a multiplier is negative: entry {np.argmin(answer.alpha)} is {np.min(answer.alpha):.2g}"
 
     def solutions(self) -> Iterator[str]:
@@ -165,7 +140,7 @@ class SolverCase:
             for symbol, value, right in (("x", answer.x, posed.x), ("α", answer.alpha, posed.alpha)):
                 if right is not None and value is not None and len(right):
                     gap, scale = np.abs(value - right), max(1e-3, float(np.max(np.abs(right))))
-                    if np.max(gap) > SOLUTION_RTOL * scale:
+                    if np.max(gap) > self.rtol * scale:
                         k = int(np.argmax(gap))
                         yield f"{name}: {symbol}[{k}] is {value[k]:.6g} against {right[k]:.6g}"
         yield Note(f"{len(self.programs)} programs, residuals up to {worst:.0e}")
@@ -173,7 +148,7 @@ class SolverCase:
     def accuracies(self) -> Iterator[str]:
         """Residuals are below the accuracy that is asked for."""
         program = next(iter(self.programs.values())).program
-        for accuracy in ACCURACIES:
+        for accuracy in (1e-3, 1e-5, ACCURACY):
             answer = self.solve(program, accuracy)
             status, reason, residuals = verify(program, answer, accuracy)
             if status is not Status.OK or residuals is None:
@@ -183,12 +158,14 @@ class SolverCase:
 
     def infeasible(self) -> Iterator[str]:
         """A program without admissible points is answered, with whatever status, and not by an exception."""
+        # x ≤ −1 and x ≥ 1
+        impossible = VariationalInequality(np.eye(1), np.ones(1), np.array([[1.0], [-1.0]]), np.array([-1.0, -1.0]))
         try:
-            answer = self.solve(IMPOSSIBLE)
+            answer = self.solve(impossible)
         except Exception as error:  # a plugin may raise anything
             advice = "return QPSolution(None, None, status) where there is no solution"
             raise ConformanceError(f"it raises {raised(error)}; {advice}") from error
-        status, _, _ = verify(IMPOSSIBLE, answer, ACCURACY)
+        status, _, _ = verify(impossible, answer, ACCURACY)
         if status is Status.NONFINITE:
             yield "x or α is not finite; return QPSolution(None, None, status) where there is no solution"
         yield Note(answer.solver_status)
@@ -217,7 +194,7 @@ class SolverCase:
         if later.x is None or later.alpha is None or earlier.x is None:
             yield "a program with a solution gets none at a second call"
             return
-        if kkt_residuals(program, later.x, np.maximum(later.alpha, 0.0)).worst > SOLUTION_RTOL:
+        if kkt_residuals(program, later.x, np.maximum(later.alpha, 0.0)).worst > self.rtol:
             yield "where the entries of a program were changed, the solution is that of the program before"
         for name, what in differences(copies(_vectors(earlier)), kept):
             yield f"a later call overwrites {name} of an earlier solution: {what} before"
@@ -228,14 +205,14 @@ class SolverCase:
         Seconds alone depend on what else the machine does, calls alone on the number of iterations.
         """
         program = _scaled(self.programs["many constraints"].program)
-        new = [replace(program, f=program.f * (1.0 + 1e-6 * (k + 1))) for k in range(2 * REPEATS)]
+        new = [replace(program, f=program.f * (1.0 + 1e-6 * (k + 1))) for k in range(18)]
         again = [deepcopy(program) for _ in new]
         self.create(program, ACCURACY)
-        kept, solved = (max(map(self._calls, again[:REPEATS])), min(map(self._calls, new[:REPEATS])))
-        pairs = zip(again[REPEATS:], new[REPEATS:], strict=True)
+        kept, solved = (max(map(self._calls, again[:9])), min(map(self._calls, new[:9])))
+        pairs = zip(again[9:], new[9:], strict=True)
         seconds = [[timed(partial(self.create, each, ACCURACY))[1].cpu for each in pair] for pair in pairs]
         fast, slow = map(min, zip(*seconds, strict=True))
-        if kept < solved and slow > KEPT_RATIO * fast:
+        if kept < solved and slow > 5.0 * fast:
             yield (
                 f"a program solved before takes {fast:.1g} s of CPU, a new one {slow:.1g} s: solutions are kept, and "
                 "their times say nothing"
@@ -261,14 +238,13 @@ class SolverCase:
         seconds = self._solution_seconds()
         if seconds > self.seconds:
             yield f"a solution takes {seconds:.3g} s, above the limit of {self.seconds:g} s"
-        elif seconds > SLOW:
+        elif seconds > 1.0:
             seconds = min(seconds, self._solution_seconds())  # the machine may have been busy with something else
-            if seconds > SLOW:
+            if seconds > 1.0:
                 yield Doubt(f"a solution of a program of 6 unknowns takes {seconds:.3g} s")
         yield Note(f"a solution takes {seconds:.2g} s")
 
     def _solution_seconds(self) -> float:
-        """Wall seconds of a solution."""
         begin = time.perf_counter()
         self.create(self.typical, ACCURACY)
         return time.perf_counter() - begin
@@ -287,7 +263,7 @@ def of_qpsolvers(program: VariationalInequality, accuracy: float, *, solver: str
     return solve_qp(program, solver, accuracy)
 
 
-SOLVER = Conformance("solver", SolverCase, (
+SOLVER = Conformance(SolverCase, (
     Check("answer", SolverCase.answer),
     Check("signs of multipliers", SolverCase.signs, ("answer",)),
     Check("known solutions", SolverCase.solutions, ("signs of multipliers",)),

@@ -18,7 +18,7 @@ from vibench.interfaces.validation import check_cone
 from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction import part_in_cone
 from vibench.reduction.cones import project_on_cone
-from vibench.testing import check_dual
+from vibench.testing import check
 from vibench_strategies import enlarged_cpg
 from vibench_strategies.angle_greedy import AngleGreedy
 from vibench_strategies.cpg import CPG
@@ -52,7 +52,7 @@ def errors_one_by_one(cone: Cone, theta: Array, X: InnerProduct) -> Array:
 
 @ALL
 def test_they_conform(create: type[DualStrategy]) -> None:
-    check_dual(create)
+    check(create)
 
 
 @ALL

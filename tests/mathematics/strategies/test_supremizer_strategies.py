@@ -24,7 +24,7 @@ from vibench.reduction.nested import NestedStrategy, grow_through
 from vibench.reduction.pod import pod
 from vibench.reduction.supremizers import supremizers
 from vibench.stability.infsup import inf_sup_full, inf_sup_on, multipliers
-from vibench.testing import check_primal
+from vibench.testing import check
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies import infsup_greedy, offline_pga
@@ -203,7 +203,7 @@ def test_tolerances_in_any_order_cut_one_growth(varying: Offline, strategy: Nest
     ids=["inf-sup", "β", "σ", "POD"],
 )
 def test_they_conform(create: Callable[[], NestedStrategy]) -> None:
-    check_primal(create)
+    check(create)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from vibench.plugins.registry import registered
 
 NAMES = {
     "problem": "my-rope", "primal": "tied", "dual": "cone", "solver": "for-rope", "sampling": "strata",
-    "figure": "faster", "formulation": "program",
+    "formulation": "program",
 }  # fmt: skip
 
 

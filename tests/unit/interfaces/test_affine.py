@@ -23,7 +23,7 @@ from vibench import (
     RequestError,
 )
 from vibench.model.affine import Evaluation, affine_decomposition
-from vibench.testing import ConformanceError, check_problem
+from vibench.testing import ConformanceError, check
 
 
 def squared(mu: Array) -> float:
@@ -56,7 +56,7 @@ class Strings(AffineProblem):
 
 
 def test_a_declared_problem_passes_the_conformance_checks() -> None:
-    check_problem(Strings)
+    check(Strings)
 
 
 class Wrong(Strings):
@@ -69,7 +69,7 @@ class Wrong(Strings):
 
 def test_the_conformance_checks_name_a_sum_that_is_not_the_member() -> None:
     with pytest.raises(ConformanceError, match="affine sums: f of `affine` differs from that of `assemble`"):
-        check_problem(Wrong)
+        check(Wrong)
 
 
 def test_members_are_the_sums_that_were_declared() -> None:

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from packs import write_cable
+from sample_run import write_sample_run
 
 import vibench
 from vibench import NumericalError, RequestError, Stop
 from vibench.library import runs
-from vibench.testing.samples.sample_run import write_sample_run
 
 VALUES = [
     None, float("nan"), float("inf"), -1, 0, 1.5, 2**70, True, 1j, "", "x", "\0", "x" * 5000, b"x", [], ["x"],

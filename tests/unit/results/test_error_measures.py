@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from running import Main, refused
+from sample_run import write_sample_run
 from samples import cell_row
 
 import vibench
@@ -22,7 +23,6 @@ from vibench.results.break_even import break_even_rows
 from vibench.results.database import FILE, ResultsDatabase
 from vibench.results.ranking import BAND, errors_of, fastest, measures, with_errors, within
 from vibench.results.schema import CELLS, KEYS, OUTPUTS
-from vibench.testing.samples.sample_run import write_sample_run
 
 MODELS = {
     # offline seconds, seconds of a query, errors of u, of λ, of the force, and of the area

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from running import Main, Register, refused
+from sample_run import write_sample_run
 from samples import cell_row, query_rows
 
 import vibench
@@ -24,7 +25,6 @@ from vibench.results.plugin_columns import extended_tables
 from vibench.results.ranking import fastest
 from vibench.results.read import extended, read_table
 from vibench.results.sqlite import FILE
-from vibench.testing.samples.sample_run import write_sample_run
 
 GROUP, HERE = "vibench.figures", __name__
 

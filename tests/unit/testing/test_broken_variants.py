@@ -72,14 +72,14 @@ def messages(findings: list[testing.CheckResult]) -> dict[str, str]:
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_a_mistake_in_a_problem_is_named(name: str) -> None:
     check, words = PROBLEMS[name]
-    found = messages(testing.examine_problem(getattr(broken_variants, name)))
+    found = messages(testing.examine(getattr(broken_variants, name)))
     assert words in found.get(check, ""), found
 
 
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_mistake_in_a_solver_is_named(name: str) -> None:
     check, words = SOLVERS[name]
-    found = messages(testing.examine_solver(getattr(broken_variants, name)))
+    found = messages(testing.examine(getattr(broken_variants, name)))
     assert words in found.get(check, ""), found
 
 
@@ -97,7 +97,7 @@ def test_every_broken_variant_is_tried() -> None:
     "create", [partial(Torsion, 6), partial(Put, 24), partial(Block, 2), partial(Block, 2, 2e11, 1e-3)]
 )
 def test_what_is_right_passes_without_a_warning(create) -> None:
-    findings = testing.examine_problem(create)
+    findings = testing.examine(create)
     assert messages(findings) == {}
     constants = next(found.message for found in findings if found.check == "coercivity and inf-sup")
     assert [symbol for symbol in ("α = ", "γ_a = ", "β_HF = ") if symbol not in constants] == []
@@ -105,4 +105,4 @@ def test_what_is_right_passes_without_a_warning(create) -> None:
 
 @pytest.mark.parametrize("solver", SOLVERS_OF_TESTS)
 def test_the_solvers_of_the_dependencies_pass(solver: str) -> None:
-    assert messages(testing.examine_solver(partial(of_qpsolvers, solver=solver))) == {}
+    assert messages(testing.examine(partial(of_qpsolvers, solver=solver))) == {}

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from numerics import Varying
 from packs import manifest, write_cable, write_manifest
 from running import Main, failures, refused
+from vibench.testing.comparisons import JUMP, WIDTH, difference, find_jump
 
 from vibench import testing
 from vibench.interfaces.strategies import DualStrategy
@@ -26,7 +27,6 @@ from vibench.plugins.kinds import CHECKED
 from vibench.plugins.registry import create, find
 from vibench.testing import solvers
 from vibench.testing.checks import Check, Conformance, Doubt, Note, Verdict
-from vibench.testing.comparisons import JUMP, WIDTH, difference, find_jump
 
 Case = tuple[str, list[str]]
 """The one check that fails, and parts of its message."""
@@ -140,7 +140,7 @@ def assert_found(found: Mapping[str, str], case: Case) -> None:
 def test_a_fault_is_found_by_its_check_alone(plugin: str) -> None:
     module, _, name = plugin.partition(":")
     cls = getattr({"broken_problems": broken_problems, "broken_strategies": broken_strategies}[module], name)
-    examine = testing.examine_dual if issubclass(cls, DualStrategy) else testing.examine_problem
+    examine = testing.examine if issubclass(cls, DualStrategy) else testing.examine
     assert_found(failures(examine(cls)), THE_TWELVE[plugin])
 
 
@@ -158,13 +158,13 @@ def test_the_command_catches_a_fault_and_names_it(plugin: str, main: Main) -> No
 
 @pytest.mark.parametrize("name", MORE_PROBLEMS)
 def test_a_fault_of_a_problem_is_found_by_its_check_alone(name: str) -> None:
-    assert_found(failures(testing.examine_problem(getattr(broken_problems, name))), MORE_PROBLEMS[name])
+    assert_found(failures(testing.examine(getattr(broken_problems, name))), MORE_PROBLEMS[name])
 
 
 @pytest.mark.parametrize("name", MORE_STRATEGIES)
 def test_a_fault_of_a_strategy_is_found_by_its_check_alone(name: str) -> None:
     plugin = getattr(broken_strategies, name)
-    check = testing.examine_dual if issubclass(plugin, DualStrategy) else testing.examine_primal
+    check = testing.examine if issubclass(plugin, DualStrategy) else testing.examine
     assert_found(failures(check(plugin)), MORE_STRATEGIES[name])
 
 
@@ -240,15 +240,15 @@ def test_a_warning_does_not_fail_the_command(main: Main) -> None:
 
 def test_the_plugins_that_are_broken_elsewhere_are_correct() -> None:
     for problem in (broken_problems.Declared, testing.MovingSupport, Varying):
-        testing.check_problem(problem)
+        testing.check(problem)
     for dual in (broken_strategies.Greedy, broken_strategies.LastErrorAlone):
-        testing.check_dual(dual)
-    testing.check_primal(broken_strategies.Supremizing)
+        testing.check(dual)
+    testing.check(broken_strategies.Supremizing)
 
 
 def test_one_error_lists_all_failures() -> None:
     with pytest.raises(testing.ConformanceError) as caught:
-        testing.check_problem(broken_problems.Worse)
+        testing.check(broken_problems.Worse)
     lines = str(caught.value).splitlines()
     assert lines[0] == "Worse fails 2 of 26 checks"
     assert [line.split(":")[0] for line in lines[1:]] == ["training set", "pickling"]
@@ -264,9 +264,9 @@ def test_check_and_examine_have_the_same_parameters(kind: str) -> None:
 
 def test_an_instance_is_refused_because_two_are_compared() -> None:
     for check, instance in (
-        (testing.check_problem, broken_problems.Declared()),
-        (testing.check_dual, broken_strategies.Greedy()),
-        (testing.check_primal, broken_strategies.Supremizing()),
+        (testing.check, broken_problems.Declared()),
+        (testing.check, broken_strategies.Greedy()),
+        (testing.check, broken_strategies.Supremizing()),
     ):
         with pytest.raises(TypeError, match=f"pass the class {type(instance).__name__}"):
             check(instance)  # type: ignore[operator]
@@ -274,22 +274,22 @@ def test_an_instance_is_refused_because_two_are_compared() -> None:
 
 def test_snapshots_and_a_model_of_one_s_own_are_used() -> None:
     snapshots, W = testing.sample_snapshots()
-    misses = testing.examine_dual(broken_strategies.Misses, snapshots[:, :2], W, tolerances=[1e-9], sizes=[1])
+    misses = testing.examine(broken_strategies.Misses, snapshots[:, :2], W, tolerances=[1e-9], sizes=[1])
     assert failures(misses) == {}  # two generators are all there is
     offline = testing.sample_offline(modes=3, generators=2)
-    findings = testing.examine_primal(broken_strategies.Supremizing, offline, tolerances=[0.2, 0.8])
+    findings = testing.examine(broken_strategies.Supremizing, offline, tolerances=[0.2, 0.8])
     counts = next(finding.message for finding in findings if finding.check == "enrichment")
     assert counts == "tolerance 0.8: fixed, 2 vectors; tolerance 0.2: fixed, 2 vectors"
     with pytest.raises(TypeError, match="both snapshots and W"):
-        testing.check_dual(broken_strategies.Greedy, snapshots)
+        testing.check(broken_strategies.Greedy, snapshots)
 
 
-@pytest.mark.parametrize("check", [testing.examine_dual, testing.examine_problem, testing.examine_primal])
+@pytest.mark.parametrize("check", [testing.examine, testing.examine, testing.examine])
 def test_a_call_that_takes_longer_than_the_limit_fails(check, monkeypatch: pytest.MonkeyPatch) -> None:
     plugin = {
-        testing.examine_dual: broken_strategies.Greedy,
-        testing.examine_problem: broken_problems.Declared,
-        testing.examine_primal: broken_strategies.Supremizing,
+        testing.examine: broken_strategies.Greedy,
+        testing.examine: broken_problems.Declared,
+        testing.examine: broken_strategies.Supremizing,
     }[check]
     assert "above the limit of 0 s" in failures(check(plugin, seconds=0.0))["time"]
 

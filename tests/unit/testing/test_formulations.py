@@ -42,13 +42,13 @@ FAULTS: Mapping[str, tuple[str, list[str]]] = {
 
 @pytest.mark.parametrize("formulation", [Program, Nearest])
 def test_a_formulation_that_is_right_passes(formulation: type[Formulation]) -> None:
-    assert failures(testing.examine_formulation(formulation)) == {}
+    assert failures(testing.examine(formulation)) == {}
 
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_is_found_by_its_check_alone(name: str) -> None:
     check, words = FAULTS[name]
-    found = failures(testing.examine_formulation(getattr(broken_formulations, name)))
+    found = failures(testing.examine(getattr(broken_formulations, name)))
     assert list(found) == [check], found
     assert [word for word in words if word not in found[check]] == [], found[check]
 

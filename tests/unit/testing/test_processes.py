@@ -10,12 +10,12 @@ import pytest
 from broken_variants import Bar
 from fake_plugins import Wire
 from running import PATIENCE, Main
+from vibench.testing.processes import Examination, NotImportableError, call_in_other_process, examine_in_process
 
 from vibench import testing
 from vibench.testing.case import LEAST_POINTS, MOST_POINTS, ProblemCase
 from vibench.testing.checks import CheckResult, ConformanceError, Verdict
 from vibench.testing.problems import PROBLEM
-from vibench.testing.processes import Examination, NotImportableError, call_in_other_process, examine_in_process
 
 
 def found(plugin: str, seconds: float = 60.0) -> list[CheckResult]:
@@ -28,7 +28,7 @@ def found(plugin: str, seconds: float = 60.0) -> list[CheckResult]:
 
 def test_findings_are_those_of_this_process() -> None:
     elsewhere = [(each.check, each.verdict) for each in found("fake_plugins:Wire")]
-    assert elsewhere == [(each.check, each.verdict) for each in testing.examine_problem(Wire)]
+    assert elsewhere == [(each.check, each.verdict) for each in testing.examine(Wire)]
 
 
 def test_a_call_that_hangs_ends_the_checks_with_one_line(main: Main) -> None:
@@ -115,7 +115,7 @@ def test_what_fails_there_is_told_from_what_cannot_be_sent() -> None:
     class Local(Wire):
         pass
 
-    findings = {each.check: each for each in testing.examine_problem(partial(Local, nodes=6))}
+    findings = {each.check: each for each in testing.examine(partial(Local, nodes=6))}
     assert findings["another process"].verdict is Verdict.PASSED
     assert findings["another process"].message.startswith("not compared: ")
 

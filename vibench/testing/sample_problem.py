@@ -19,10 +19,7 @@ from vibench.offline.reduction import Reduction
 from vibench.offline.sweep import Snapshots, high_fidelity_sweep
 from vibench.reduction.cones import greedy_cone
 from vibench.reduction.supremizers import supremizers
-from vibench.testing.comparisons import Arrays
-
-NODES, CONSTRAINTS = 40, 14
-"""Free nodes of the string, and constraints on it."""
+from vibench.testing.case import Arrays
 
 
 class MovingSupport(Problem):
@@ -36,13 +33,14 @@ class MovingSupport(Problem):
     parameters = ParameterBox(("position", "height"), np.array([-0.1, 0.0]), np.array([0.1, 0.04]), ("m", "m"))
 
     def __init__(self) -> None:
-        h = 1.0 / (NODES + 1)
-        self._x = h * np.arange(1, NODES + 1)
-        self._stiffness = _tridiagonal(-1.0, 2.0, NODES) / h
-        self._load = np.full(NODES, -4.0 * h)
-        self._width = 0.5 / (CONSTRAINTS - 1)
-        self.V = InnerProduct(self._stiffness + h * sp.eye_array(NODES), "X_V")
-        self.W = InnerProduct(_tridiagonal(self._width / 6.0, self._width * 2.0 / 3.0, CONSTRAINTS), "X_W")
+        n, m = 40, 14
+        self._h = h = 1.0 / (n + 1)
+        self._x = h * np.arange(1, n + 1)
+        self._stiffness = _tridiagonal(-1.0, 2.0, n) / h
+        self._load = np.full(n, -4.0 * h)
+        self._width = 0.5 / (m - 1)
+        self.V = InnerProduct(self._stiffness + h * sp.eye_array(n), "X_V")
+        self.W = InnerProduct(_tridiagonal(self._width / 6.0, self._width * 2.0 / 3.0, m), "X_W")
 
     def training_set(self) -> Array:
         """The 5×5 grid."""
@@ -50,21 +48,21 @@ class MovingSupport(Problem):
 
     def assemble(self, mu: Array) -> VariationalInequality:
         """Weighted means of −u around 14 points are at most those of −ψ, where ψ is the support."""
-        centres = np.linspace(0.25, 0.75, CONSTRAINTS) + mu[0]
+        centres = np.linspace(0.25, 0.75, self.W.dim) + mu[0]
         hats = np.maximum(0.0, 1.0 - np.abs(self._x[None, :] - centres[:, None]) / self._width)
-        weights = hats / NODES
+        weights = hats / self.V.dim
         support = -0.2 + mu[1] - 0.8 * (self._x - 0.5 - mu[0]) ** 2
         return VariationalInequality(self._stiffness, self._load, sp.csr_array(-weights), -weights @ support)
 
     @property
     def element_dofs(self) -> Indices:
         """The nodes at both ends of the intervals."""
-        left = np.arange(-1, NODES)
-        return np.stack([left, np.where(left + 1 < NODES, left + 1, -1)])
+        left = np.arange(-1, self.V.dim)
+        return np.stack([left, np.where(left + 1 < self.V.dim, left + 1, -1)])
 
     def element_sampler(self, elements: Indices) -> Sampler:
         """The same on every interval."""
-        h = 1.0 / (NODES + 1)
+        h = self._h
         stiffness = np.tile(np.array([[1.0, -1.0], [-1.0, 1.0]]) / h, (len(elements), 1, 1))
         return lambda _: {"A": stiffness, "f": np.full((len(elements), 2), -2.0 * h)}
 

@@ -1,1 +1,0 @@
-"""What plugins are checked on: a sample problem with its offline phase, and a made-up run."""

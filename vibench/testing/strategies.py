@@ -1,0 +1,522 @@
+"""The conformance checks of dual, primal and sampling strategies."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import KW_ONLY, dataclass, field, replace
+from functools import cached_property, partial
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.errors import NumericalError, RequestError, VibenchError
+from vibench.interfaces.parameters import ParameterBox
+from vibench.interfaces.strategies import (
+    AdaptiveSampling,
+    Cone,
+    DualStrategy,
+    Enrichment,
+    Kind,
+    Offline,
+    PrimalStrategy,
+    Sampling,
+    Stop,
+    Trainer,
+    check_sample,
+    no_free,
+    rays,
+)
+from vibench.interfaces.validation import check_cone, check_enrichment
+from vibench.linalg.inner_product import InnerProduct
+from vibench.reduction.cones import project_on_cone
+from vibench.reduction.nested import NestedStrategy, grow_through
+from vibench.stages.enrichment import BuiltEnrichment
+from vibench.storage.serialisation import dumps, loads
+from vibench.testing.case import Arrays, Case, array_fault, at, difference, unmutated
+from vibench.testing.checks import Check, Conformance, ConformanceError, Doubt, Note, raised
+from vibench.testing.sample_problem import arrays_of, copy_of, sample_offline, sample_snapshots
+
+
+@dataclass(eq=False)
+class DualCase(Case[DualStrategy, Stop, Cone]):
+    """A dual strategy, tolerances and sizes, and the cones it makes of snapshots (m×P).
+
+    A cone with R + 1 errors claims that its generators are nested, and every error is computed again; a construction
+    that is not nested returns its last error alone.
+    """
+
+    base = DualStrategy
+    snapshots: Array | None = None
+    W: InnerProduct | None = None
+    _: KW_ONLY
+    tolerances: Sequence[float] = (0.3, 0.1, 0.01)
+    sizes: Sequence[int] = (1, 3)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.snapshots is not None and self.W is not None:
+            self.lam, self.space = self.snapshots, self.W
+        elif self.snapshots is None and self.W is None:
+            self.lam, self.space = sample_snapshots()
+        else:
+            raise TypeError("pass both snapshots and W, or neither")
+
+    @cached_property
+    def arguments(self) -> dict[str, Stop]:
+        stops = {f"tolerance {value}": Stop(tolerance=value) for value in self.tolerances}
+        return stops | {f"size {value}": Stop(size=value) for value in self.sizes}
+
+    def evaluate(self, argument: Stop, plugin: DualStrategy | None = None, snapshots: Array | None = None) -> Cone:
+        """Cone of all snapshots, or of others."""
+        given = (self.lam if snapshots is None else snapshots).copy()
+        return self.clocked("a cone", lambda: (plugin or self.plugin).reduce(given, self.space, argument))
+
+    def arrays(self, result: Cone) -> Arrays:
+        return {"generators": result.generators, "errors": result.errors, "free": result.free.astype(float)}
+
+    def cone(self) -> Iterator[str]:
+        """Generators lie in W⁺ and have unit norm; errors have the right shape."""
+        for stop, cone in self.results.items():
+            fault = _cone_fault(cone, self.space)
+            yield f"{stop}: {fault}" if fault else Note(f"{stop}: R = {cone.size}")
+
+    def tolerance(self) -> Iterator[str]:
+        """The projection error of every snapshot is below the tolerance."""
+        for name, stop in self.arguments.items():
+            if stop.tolerance is not None:
+                yield from self._missed(stop.tolerance, self.results[name], self.lam)
+
+    def _missed(self, tolerance: float, cone: Cone, snapshots: Array) -> Iterator[str]:
+        errors = self._errors(cone, cone.size, snapshots)
+        if errors.max(initial=0.0) > tolerance + _round_off(tolerance):
+            yield (
+                f"tolerance {tolerance:g} is missed: with {cone.size} generators the projection error of snapshot "
+                f"{errors.argmax()} is {errors.max():.3g}, relative to the largest norm of a snapshot; "
+                f"the claimed error is {cone.errors[-1]:.3g}"
+            )
+
+    def size(self) -> Iterator[str]:
+        """The cone has the prescribed number of generators, fewer only if it contains all snapshots."""
+        for name, stop in self.arguments.items():
+            cone = self.results[name]
+            if stop.size is None or cone.size == stop.size:
+                continue
+            error = self._errors(cone, cone.size, self.lam).max(initial=0.0)
+            if cone.size > stop.size or error > _round_off(0.0):
+                yield f"{name} was prescribed; the cone has {cone.size} generators and the projection error {error:.1e}"
+
+    def errors(self) -> Iterator[str]:
+        """Claimed errors are the projection errors of the first r generators."""
+        for stop, cone in self.results.items():
+            first = 0 if len(cone.errors) == cone.size + 1 else cone.size
+            for r, claimed in enumerate(cone.errors, first):
+                error = self._errors(cone, r, self.lam).max(initial=0.0)
+                if abs(error - claimed) > _round_off(error):
+                    yield (
+                        f"{stop}: the claimed error e({r}) is {claimed:.6g}; the projection error of the snapshots is "
+                        f"{error:.6g} for r = {r} (a construction that is not nested returns its last error alone)"
+                    )
+                    break
+
+    def no_mutation(self) -> None:
+        """`reduce` changes neither the snapshots nor the space."""
+        for name, stop in self.arguments.items():
+            given = self.lam.copy()
+            arrays = {"the snapshots": given, "X_W": self.space.matrix}
+            unmutated(f"{name}: reduce", arrays, partial(self.plugin.reduce, given, self.space, stop))
+
+    def without_contact(self) -> Iterator[str]:
+        """Zero, repeated and single snapshots are reduced; snapshots that all vanish are reduced or refused."""
+        tolerance = next(iter(self.tolerances), 0.3)
+        some, stop = self.lam, Stop(tolerance=tolerance)
+        largest = some[:, [np.linalg.norm(some, axis=0).argmax()]]
+        for name, snapshots in {
+            "with a zero snapshot": np.hstack([np.zeros((len(some), 1)), some]),
+            "with a repeated snapshot": np.hstack([some, largest]),
+            "with one snapshot": largest,
+        }.items():
+            cone = self.evaluate(stop, snapshots=snapshots)
+            if fault := _cone_fault(cone, self.space) or "".join(self._missed(tolerance, cone, snapshots)):
+                yield f"{name}: {fault}"
+        try:
+            cone = self.evaluate(stop, snapshots=np.zeros_like(some))
+        except VibenchError:  # a strategy may refuse them in one line
+            return
+        if fault := _cone_fault(cone, self.space):
+            yield f"with zero snapshots alone: {fault}; expected a cone without generators"
+
+    def _errors(self, cone: Cone, r: int, snapshots: Array) -> Array:
+        """Projection errors (P,) on the cone of the first r generators, relative to the largest norm of a snapshot."""
+        largest = float(np.max(self.space.norm(snapshots), initial=0.0)) or 1.0
+        chi = rays(cone.generators[:, :r], cone.free[:r])
+        return np.array([project_on_cone(chi, theta, self.space).distance for theta in snapshots.T]) / largest
+
+
+DUAL = Conformance(DualCase, (
+    Check("construction", DualCase.construction),
+    Check("options", DualCase.options, ("construction",)),
+    Check("cone", DualCase.cone, ("construction",)),
+    Check("tolerance", DualCase.tolerance, ("cone",)),
+    Check("size", DualCase.size, ("cone",)),
+    Check("errors", DualCase.errors, ("cone",)),
+    Check("determinism", DualCase.determinism, ("cone",)),
+    Check("no mutation", DualCase.no_mutation, ("cone",)),
+    Check("snapshots without contact", DualCase.without_contact, ("cone", "tolerance")),
+    Check("pickling", DualCase.pickling, ("determinism",)),
+    Check("time", DualCase.duration, ("cone",)),
+))  # fmt: skip
+
+
+def _round_off(error: float) -> float:
+    """Largest difference of a projection error of a strategy from that of nonnegative least squares."""
+    return 1e-8 + 1e-6 * error
+
+
+def _cone_fault(cone: object, W: InnerProduct) -> str:
+    """What is wrong with a cone, and where; "" if nothing is."""
+    try:
+        checked = check_cone(cone, W)
+    except NumericalError as error:
+        return str(error)
+    errors, R = checked.errors, checked.size
+    fault = array_fault("errors", errors, np.shape(errors))
+    if not fault and (errors.ndim != 1 or len(errors) not in (1, R + 1) or errors.min() < 0.0):
+        return f"errors has shape {errors.shape}; expected e(0) … e({R}), or e({R}) alone, none negative"
+    return fault
+
+
+@dataclass(eq=False)
+class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
+    """A primal strategy, tolerances or `None`, and the enrichments it makes of a reduced model."""
+
+    base = PrimalStrategy
+    offline: Offline | None = None
+    _: KW_ONLY
+    tolerances: Sequence[float] = (0.9, 0.5, 0.1)
+
+    @cached_property
+    def model(self) -> Offline:
+        return self.offline or sample_offline()
+
+    @cached_property
+    def arguments(self) -> dict[str, float | None]:
+        """Tolerances from loose to tight, or `None` alone."""
+        if not self.plugin.takes_tolerance:
+            return {"without tolerance": None}
+        ordered = sorted(self.tolerances, reverse=not self.plugin.larger_is_tighter)
+        return {f"tolerance {tolerance}": tolerance for tolerance in ordered}
+
+    def evaluate(self, argument: float | None, plugin: PrimalStrategy | None = None) -> Enrichment:
+        given = copy_of(self.model)
+        return self.clocked("an enrichment", lambda: (plugin or self.plugin).build(given, argument))
+
+    def arrays(self, result: Enrichment, offline: Offline | None = None) -> Arrays:
+        """Vectors (n×S), eta (m×k), or the vectors (n×k) supplied at the first training parameter."""
+        reduced = offline or self.model
+        problem, mu = reduced.problem, reduced.training[0]
+        named = {"vectors": result.vectors, "eta": result.eta}
+        if result.supply is not None:
+            named[f"the supply {at(mu)}"] = result.supply(problem.V, problem.assemble(mu.copy()), reduced.span.copy())
+        return {name: value for name, value in named.items() if value is not None}
+
+    def stored(self, result: Enrichment) -> Enrichment:
+        built: BuiltEnrichment = loads(dumps(BuiltEnrichment.of(result, self.plugin)))
+        return built.restored(lambda: self.plugin)
+
+    def tolerance(self) -> Iterator[str]:
+        """`build` accepts a tolerance exactly if `takes_tolerance` says so."""
+        takes: object = self.plugin.takes_tolerance
+        if not isinstance(takes, bool):
+            raise ConformanceError(f"takes_tolerance is {takes!r}; expected True or False")
+        try:
+            self.results  # noqa: B018  the first use builds them
+        except Exception as error:  # a plugin may raise anything
+            how = "with a tolerance" if takes else "without a tolerance, although takes_tolerance is False"
+            advice = "" if takes else "; set takes_tolerance = True if the strategy needs one"
+            raise ConformanceError(f"build fails {how}: {raised(error)}{advice}") from error
+        with suppress(Exception):  # every refusal is right
+            if takes:
+                self.evaluate(None)
+                advice = "refuse None, or set takes_tolerance = False"
+                yield f"takes_tolerance is True, but build(offline, None) returns an enrichment; {advice}"
+
+    def enrichment(self) -> Iterator[str]:
+        """Enrichments have the right types and shapes; fixed vectors are orthonormal and orthogonal to V_N."""
+        for name, built in self.results.items():
+            if fault := self._fault(built, self.model):
+                raise ConformanceError(f"{name}: {fault}")
+            vectors = built.vectors if built.vectors is not None else built.eta
+            yield Note(f"{name}: {built.kind}" + ("" if vectors is None else f", {vectors.shape[1]} vectors"))
+
+    def _fault(self, built: Enrichment, offline: Offline) -> str:
+        V, W = offline.problem.V, offline.problem.W
+        try:
+            check_enrichment(built, V, offline.basis)
+        except NumericalError as error:
+            return str(error)
+        if not isinstance(built.kind, Kind):
+            return f"the kind is {built.kind!r}; expected a vibench.Kind"
+        for name, value in self.arrays(built, offline).items():
+            rows = W.dim if name == "eta" else V.dim
+            if fault := array_fault(name, value, (rows, *np.shape(value)[-1:])):
+                return fault
+        for quantity, values in built.history.items():
+            if np.ndim(values) != 1 or not np.all(np.isfinite(values)):
+                return f"the history of '{quantity}' is not a vector of finite numbers, one for each step"
+        return ""
+
+    def kind(self) -> Iterator[str]:
+        """The kind does not depend on the tolerance."""
+        kinds = {built.kind: name for name, built in self.results.items()}
+        if len(kinds) > 1:
+            yield "the kind depends on the tolerance: " + ", ".join(f"{kind} at {name}" for kind, name in kinds.items())
+
+    def tighter(self) -> None:
+        """A fixed enrichment of a tighter tolerance has at least as many vectors."""
+        for (loose, before), (tight, after) in pairwise(self._fixed().items()):
+            if (fewer := after.shape[1]) < (more := before.shape[1]):
+                raise ConformanceError(f"{tight} gives {fewer} vectors, fewer than the {more} of {loose}")
+
+    def nested(self) -> Iterator[str]:
+        """The vectors of a `NestedStrategy` at a loose tolerance are the first ones at a tight tolerance."""
+        if not isinstance(self.plugin, NestedStrategy):
+            yield Note("not declared")
+            return
+        tolerances = {name: tolerance for name, tolerance in self.arguments.items() if tolerance is not None}
+        grown = grow_through(self.plugin, copy_of(self.model), tolerances.values())
+        fixed = self._fixed()
+        tightest, longest = list(fixed.items())[-1]
+        # The growth may be orthonormalised in another order: the difference is round-off.
+        limit = 1e-10 * float(np.max(np.abs(longest), initial=0.0))
+        for name, vectors in fixed.items():
+            if what := difference(vectors, longest[:, : vectors.shape[1]], limit):
+                yield f"the vectors of {name} are not the first ones of {tightest}: {what}"
+            if what := difference(grown.at(grown.milestone(tolerances[name])).vectors, vectors, limit):
+                yield f"the vectors of {name} differ if one growth serves all tolerances: {what}"
+
+    def _fixed(self) -> dict[str, Array]:
+        """Vectors of fixed enrichments, from loose to tight."""
+        return {name: built.vectors for name, built in self.results.items() if built.vectors is not None}
+
+    def no_mutation(self) -> None:
+        """`build` changes nothing of the reduced model."""
+        for name, tolerance in self.arguments.items():
+            given = copy_of(self.model)
+            unmutated(f"{name}: build", arrays_of(given), partial(self.plugin.build, given, tolerance))
+
+    def without_contact(self) -> Iterator[str]:
+        """A cone without generators, as of snapshots without contact, is accepted or refused."""
+        none = np.zeros((self.model.problem.W.dim, 0))
+        offline = replace(copy_of(self.model), cone=Cone(none, np.zeros(1), no_free(0)), span=none)
+        try:
+            built = self.plugin.build(offline, next(iter(self.arguments.values())))
+        except VibenchError:  # a strategy may refuse it in one line
+            return
+        if fault := self._fault(built, offline):
+            yield f"with a cone without generators: {fault}"
+
+
+PRIMAL = Conformance(PrimalCase, (
+    Check("construction", PrimalCase.construction),
+    Check("options", PrimalCase.options, ("construction",)),
+    Check("tolerance", PrimalCase.tolerance, ("construction",)),
+    Check("enrichment", PrimalCase.enrichment, ("tolerance",)),
+    Check("kind", PrimalCase.kind, ("enrichment",)),
+    Check("determinism", PrimalCase.determinism, ("enrichment",)),
+    Check("tighter tolerances", PrimalCase.tighter, ("kind", "determinism")),
+    Check("nested growth", PrimalCase.nested, ("tighter tolerances",)),
+    Check("no mutation", PrimalCase.no_mutation, ("enrichment",)),
+    Check("model without contact", PrimalCase.without_contact, ("enrichment",)),
+    Check("pickling", PrimalCase.pickling, ("determinism",)),
+    Check("time", PrimalCase.duration, ("enrichment",)),
+))  # fmt: skip
+
+
+def sample_boxes() -> Mapping[str, ParameterBox]:
+    """Boxes by what they are called in messages: a negative lower bound, six orders of magnitude, and a thin one."""
+    names, lower, upper = ("position", "height", "stiffness"), np.array([-1.0, 1e-3, 5.0]), np.array([2.0, 1e3, 5.5])
+    return {
+        f"{d} parameter{'s' * (d > 1)}": ParameterBox(names[:d], lower[:d], upper[:d], ("m", "m", "N/m")[:d])
+        for d in (1, 2, 3)
+    }
+
+
+@dataclass(eq=False)
+class SamplingCase(Case[Sampling, ParameterBox, Array]):
+    """A sampling strategy, boxes, and its points (P×d) in those that its options fit.
+
+    An option called `size` is the number of points, one called `seed` determines whatever is random; both are tried
+    with other values. A strategy may refuse some boxes by a `RequestError`, where its options do not fit.
+    """
+
+    base = Sampling
+    boxes: Mapping[str, ParameterBox] = field(default_factory=sample_boxes)
+
+    @cached_property
+    def tried(self) -> dict[str, Array | RequestError]:
+        """Points in every box, or why the strategy refuses it."""
+        tried: dict[str, Array | RequestError] = {}
+        for name, box in self.boxes.items():
+            try:
+                tried[name] = self.evaluate(box)
+            except RequestError as error:
+                tried[name] = error
+        return tried
+
+    @property
+    def arguments(self) -> dict[str, ParameterBox]:
+        return {name: self.boxes[name] for name, points in self.tried.items() if not isinstance(points, RequestError)}
+
+    @cached_property
+    def results(self) -> dict[str, Array]:
+        return {name: points for name, points in self.tried.items() if not isinstance(points, RequestError)}
+
+    def evaluate(self, argument: ParameterBox, plugin: Sampling | None = None) -> Array:
+        return self.clocked("a sample", partial(_points, plugin or self.plugin, argument))
+
+    def arrays(self, result: Array) -> Arrays:
+        return {"the points": result}
+
+    def parameters(self) -> Iterator[str]:
+        """Points have the right shape, are finite, different, and in the box; some box is not refused."""
+        for name, points in self.tried.items():
+            if isinstance(points, RequestError):
+                yield Note(f"{name}: refused, {points}")
+                continue
+            try:
+                yield Note(f"{name}: P = {len(check_sample(self.boxes[name], points))}")
+            except RequestError as error:
+                yield f"{name}: {error}"
+        if not self.results:
+            reasons = dict.fromkeys(str(points) for points in self.tried.values())
+            names = max((box.names for box in self.boxes.values()), key=len)
+            yield f"no box of one to three parameters ({', '.join(names)}) is accepted: {'; '.join(reasons)}"
+
+    def size(self) -> Iterator[str]:
+        """There are as many points as an option `size` says."""
+        if not self._takes("size"):
+            yield Note("no option is called 'size'")
+            return
+        for size in dict.fromkeys([1, 5, 16, *([self._given["size"]] if "size" in self._given else [])]):
+            for name, box in self.arguments.items():
+                try:
+                    points = self.evaluate(box, self._variant(size=size))
+                except RequestError as error:
+                    yield Note(f"{name}: size {size} is refused, {error}")
+                    continue
+                if len(points) != size:
+                    yield f"{name}: size = {size} was asked for; there are {len(points)} points"
+
+    def seed(self) -> Iterator[str]:
+        """Another value of an option `seed` gives other points; without one nothing is random."""
+        if not self._takes("seed"):
+            yield Note("no option is called 'seed'")
+            return
+        seeds = [self._variant(seed=seed) for seed in range(4)]
+        for name, box in self.arguments.items():
+            samples = [self.evaluate(box, plugin) for plugin in seeds]
+            if len(samples[0]) > 1 and all(np.array_equal(samples[0], other) for other in samples[1:]):
+                yield Doubt(f"{name}: seeds 0 to 3 give the same points, so that the option 'seed' changes nothing")
+
+    def no_mutation(self) -> Iterator[str]:
+        """Neither the box nor NumPy's global random numbers are changed."""
+        for name, box in self.arguments.items():
+            given, state = _copy(box), np.random.get_state()  # noqa: NPY002  the state that others share
+            self.plugin.parameters(given)
+            for what in ("lower", "upper"):
+                if not np.array_equal(getattr(given, what), getattr(box, what)):
+                    yield f"{name}: parameters changes box.{what}; work on copies"
+            if not all(map(np.array_equal, state, np.random.get_state())):  # noqa: NPY002
+                yield f"{name}: parameters changes NumPy's global random numbers: use np.random.default_rng(seed)"
+
+    def training(self) -> Iterator[str]:
+        """An adaptive strategy solves at points of the box, the same ones in every call, and ends."""
+        if not isinstance(self.plugin, AdaptiveSampling):
+            yield Note("the strategy is not adaptive")
+            return
+        for name, box in self.arguments.items():
+            first, again = (_train(plugin, box) for plugin in (self.plugin, self.create()))
+            if not first:
+                yield f"{name}: train solves nowhere; expected a training parameter at least"
+                continue
+            try:
+                check_sample(box, np.array(first))
+            except (RequestError, ValueError) as error:
+                yield f"{name}: train: {error}"
+                continue
+            same = len(first) == len(again) and all(map(np.array_equal, first, again))
+            yield (
+                Note(f"{name}: {len(first)} solutions") if same else f"{name}: a second call solves at other parameters"
+            )
+
+    @property
+    def _given(self) -> dict[str, Any]:
+        """Options that are given."""
+        return dict(getattr(self.create, "keywords", {}))
+
+    def _takes(self, option: str) -> bool:
+        constructor = getattr(self.create, "func", self.create)
+        return isinstance(constructor, type) and option in inspect.signature(constructor).parameters
+
+    def _variant(self, **options: Any) -> Sampling:
+        """The strategy with other options."""
+        constructor: Callable[..., Sampling] = getattr(self.create, "func", self.create)
+        return constructor(**self._given | options)
+
+
+class DistanceTrainer(Trainer):
+    """A model whose error at a parameter is bounded by the distance to the nearest solution, in widths of the box."""
+
+    def __init__(self, box: ParameterBox) -> None:
+        self._box, self.solved = box, list[Array]()
+
+    def solve(self, mu: Array, bound: float = float("nan")) -> None:  # noqa: ARG002
+        """Note the parameter."""
+        if len(self.solved) >= 5000:
+            raise ConformanceError("train does not end after 5000 solutions, with bounds that decrease")
+        self.solved.append(np.array(mu, float))
+
+    def bound(self, mu: Array) -> float:
+        """The distance, infinite without a solution."""
+        gaps = [np.abs((mu - other) / (self._box.upper - self._box.lower)).max() for other in self.solved]
+        return float(min(gaps, default=np.inf))
+
+
+def _points(plugin: Sampling, box: ParameterBox) -> Array:
+    return np.array(plugin.parameters(_copy(box)), float)
+
+
+def _copy(box: ParameterBox) -> ParameterBox:
+    return replace(box, lower=box.lower.copy(), upper=box.upper.copy())
+
+
+def _train(plugin: Sampling, box: ParameterBox) -> list[Array]:
+    """The parameters at which a strategy solves."""
+    assert isinstance(plugin, AdaptiveSampling)  # its caller asks for no other
+    trainer = DistanceTrainer(box)
+    try:
+        plugin.train(_copy(box), trainer)
+    except ConformanceError:
+        raise
+    except Exception as error:
+        raise ConformanceError(f"train fails after {len(trainer.solved)} solutions: {raised(error)}") from error
+    return trainer.solved
+
+
+SAMPLING = Conformance(SamplingCase, (
+    Check("construction", SamplingCase.construction),
+    Check("options", SamplingCase.options, ("construction",)),
+    Check("parameters", SamplingCase.parameters, ("construction",)),
+    Check("size", SamplingCase.size, ("parameters",)),
+    Check("determinism", SamplingCase.determinism, ("parameters",)),
+    Check("seed", SamplingCase.seed, ("determinism",)),
+    Check("another process", SamplingCase.another_process, ("determinism",)),
+    Check("no mutation", SamplingCase.no_mutation, ("parameters",)),
+    Check("training", SamplingCase.training, ("determinism",)),
+    Check("pickling", SamplingCase.pickling, ("determinism",)),
+    Check("time", SamplingCase.duration, ("parameters",)),
+))  # fmt: skip
