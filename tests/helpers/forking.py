@@ -73,7 +73,9 @@ class Forked:
 
     def _number(self) -> int:
         """A number from the template: the process id, and the exit code once there is one."""
-        return int(struct.unpack("q", self._socket.recv(8, socket.MSG_WAITALL))[0])
+        content = self._socket.recv(8, socket.MSG_WAITALL)
+        # At the end of the tests the template ends before the supervisors that are closed at exit.
+        return int(struct.unpack("q", content)[0]) if content else -signal.SIGKILL
 
     def poll(self) -> int | None:
         """The exit code, if the process has ended."""

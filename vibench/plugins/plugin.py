@@ -98,7 +98,7 @@ class Plugin:
     def check(self) -> str:
         """What checks the plugin with these options: a command, or a function for what was given."""
         if self.code.startswith(GIVEN):
-            return f"vibench.testing.check_{self.kind.cli_name}"
+            return "vibench.testing.check"
         options = (f"{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in self.arguments.items())
         check = ["vibench", "check", f"{self.kind.cli_name}:{self.name}", *(f"--option={text}" for text in options)]
         return shlex.join(check)

@@ -14,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import Varying
 from running import Register
-from vibench.testing.processes import call_in_other_process
 
 from vibench import NumericalError, Problem, VariationalInequality
 from vibench.interfaces.validation import AGREEMENT_RTOL, Fingerprint, ReferenceAssembly, fingerprint
@@ -24,6 +23,7 @@ from vibench.stages.base import build_problem
 from vibench.stages.snapshots import fingerprint_here, gather, solution_stages
 from vibench.storage.artefacts import Store
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
+from vibench.testing.checks import call_in_other_process
 
 REASONS: Mapping[str, str] = {
     "SkewStiffness": "A at mu = [0.25, 0.05] is not symmetric",

@@ -1,34 +1,40 @@
-"""Checks in processes of their own: those that hang or die are told; another process has other hashes."""
+"""Checks in other processes: those that hang or die are told; another process has other hashes; tests of pytest."""
 
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from functools import partial
+from pathlib import Path
 from typing import Any
 
+import broken_variants
+import fake_plugins
 import pytest
 from broken_variants import Bar
 from fake_plugins import Wire
 from running import PATIENCE, Main
-from vibench.testing.processes import Examination, NotImportableError, call_in_other_process, examine_in_process
 
 from vibench import testing
-from vibench.testing.case import LEAST_POINTS, MOST_POINTS, ProblemCase
-from vibench.testing.checks import CheckResult, ConformanceError, Verdict
+from vibench.testing.assembly import ProblemCase
+from vibench.testing.checks import (
+    CheckResult,
+    ConformanceError,
+    NotImportableError,
+    Verdict,
+    call_in_other_process,
+)
 from vibench.testing.problems import PROBLEM
 
 
-def found(plugin: str, seconds: float = 60.0) -> list[CheckResult]:
-    """Findings of a problem; every one is told, once."""
-    told: list[CheckResult] = []
-    findings = examine_in_process(Examination("problem", plugin, {}, seconds), told.append)
-    assert sorted(told, key=findings.index) == findings
-    return findings
+def examined(plugin: type) -> dict[str, CheckResult]:
+    return {each.check: each for each in testing.Examination(plugin, seconds=60.0).results()}
 
 
-def test_findings_are_those_of_this_process() -> None:
-    elsewhere = [(each.check, each.verdict) for each in found("fake_plugins:Wire")]
-    assert elsewhere == [(each.check, each.verdict) for each in testing.examine(Wire)]
+def test_results_are_those_of_this_process() -> None:
+    here = [(each.check, each.verdict) for each in testing.examine(Wire)]
+    assert [(name, each.verdict) for name, each in examined(Wire).items()] == here
 
 
 def test_a_call_that_hangs_ends_the_checks_with_one_line(main: Main) -> None:
@@ -43,7 +49,7 @@ def test_a_call_that_hangs_ends_the_checks_with_one_line(main: Main) -> None:
 
 @pytest.mark.parametrize(("plugin", "cause"), [("Segfaults", "SIGSEGV"), ("Exits", "exit code 3")])
 def test_a_check_that_ends_its_process_costs_those_that_need_it(plugin: str, cause: str) -> None:
-    findings = {each.check: each for each in found(f"fake_plugins:{plugin}")}
+    findings = examined(getattr(fake_plugins, plugin))
     (failed,) = (each for each in findings.values() if each.verdict is Verdict.FAILED)
     assert failed.check == "one assembly"
     assert cause in failed.message
@@ -53,7 +59,7 @@ def test_a_check_that_ends_its_process_costs_those_that_need_it(plugin: str, cau
 
 
 def test_what_passed_in_a_process_that_died_later_is_remembered() -> None:
-    findings = {each.check: each for each in found("broken_variants:PaintsTheEnd")}
+    findings = examined(broken_variants.PaintsTheEnd)
     assert findings["picture and diagnostics"].message == "the worker process died with exit code 5"
     assert [name for name, each in findings.items() if each.verdict is not Verdict.PASSED] == [
         "picture and diagnostics"
@@ -62,23 +68,51 @@ def test_what_passed_in_a_process_that_died_later_is_remembered() -> None:
 
 
 def test_a_plugin_that_raises_what_ctrl_c_does_fails_its_check() -> None:
-    told: list[CheckResult] = []
-    findings = examine_in_process(Examination("dual", "fake_plugins:InterruptingCone", {}, 60.0), told.append)
-    (failed,) = (each for each in findings if each.verdict is Verdict.FAILED)
+    (failed,) = (each for each in examined(fake_plugins.InterruptingCone).values() if each.verdict is Verdict.FAILED)
     assert failed.check == "cone"
     assert failed.message.startswith("KeyboardInterrupt")
-    assert sorted(told, key=findings.index) == findings
 
 
-def test_a_plugin_that_is_not_there_is_one_finding() -> None:
-    (failed,) = found("fake_plugins:Wier")
-    assert failed.verdict is Verdict.FAILED
-    assert "has no attribute 'Wier'" in failed.message
+TESTS = """
+from functools import partial
+from fake_plugins import BadCone, Exits, Wire
+from broken_variants import Unannotated
+from vibench.testing import parametrize_with_checks
+
+@parametrize_with_checks(Exits, Unannotated, partial(Wire, nodes=6), partial(BadCone, how="negative"))
+def test_conforms(check):
+    check()
+"""
 
 
-@pytest.mark.parametrize(
-    ("seconds", "points"), [(1e-3, MOST_POINTS), (0.8, MOST_POINTS), (1.5, 4), (3.0, LEAST_POINTS)]
-)
+def test_checks_are_tests_of_pytest(tmp_path: Path) -> None:
+    (tmp_path / "test_mine.py").write_text(TESTS)
+    (tmp_path / "pytest.ini").write_text("[pytest]\n")
+    chosen = [
+        "Exits-one assembly", "Wire-assembly by entries", "Unannotated-options", "BadCone-cone", "BadCone-errors",
+    ]  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", "-rA"]
+        + [f"test_mine.py::test_conforms[{name}]" for name in chosen],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(folder for folder in sys.path if folder)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    lines = done.stdout.splitlines()
+    assert done.returncode == 1
+    for words in (
+        "FAILED test_mine.py::test_conforms[Exits-one assembly] - ", "the worker process died with exit code 3",
+        "PASSED test_mine.py::test_conforms[Wire-assembly by entries]",
+        "PASSED test_mine.py::test_conforms[Unannotated-options]",
+        "ConformanceWarning: Unannotated, options: the option 'depth' has no annotation",
+        "FAILED test_mine.py::test_conforms[BadCone-cone] - ", "negative coefficient", "it needs 'cone'",
+    ):  # fmt: skip
+        assert any(words in line for line in lines), (words, done.stdout)
+
+
+@pytest.mark.parametrize(("seconds", "points"), [(1e-3, 7), (0.8, 7), (1.5, 4), (3.0, 2)])
 def test_a_slow_assembly_is_made_at_fewer_parameters(seconds: float, points: int) -> None:
     case = ProblemCase(Bar)
     case.__dict__["one_assembly"] = seconds
@@ -87,8 +121,8 @@ def test_a_slow_assembly_is_made_at_fewer_parameters(seconds: float, points: int
     findings = {check.name: list(check.faults(case) or ()) for check in here}
     assert findings["one assembly"][0] == f"takes {seconds:.2g} s"
     fewer = f"checks at {points} parameters instead of 7, and none for jumps, for lack of time"
-    assert findings["one assembly"][1:] == ([fewer] if points < MOST_POINTS else [])
-    assert findings["continuity in mu"] == (["not looked for, for lack of time"] if points < MOST_POINTS else [])
+    assert findings["one assembly"][1:] == ([fewer] if points < 7 else [])
+    assert findings["continuity in mu"] == (["not looked for, for lack of time"] if points < 7 else [])
 
 
 def process() -> tuple[int, int]:

@@ -201,7 +201,3 @@ def test_the_command_names_what_hangs(main: Main) -> None:
     code, out, _ = main("check", "hanging_points:Hangs", "--seconds", "3")
     assert code == 1
     assert "failed   parameters: stopped: the checks take longer than 3 s" in out
-
-
-def test_a_run_is_for_figures(main: Main) -> None:
-    refused(main("check", "sampling:grid", "--run", "quick"), "--run is for figure plugins", "'grid' is none")
