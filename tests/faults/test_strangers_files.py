@@ -19,7 +19,7 @@ from running import PATIENCE, seal
 from vibench.cli.output_commands import export_qps, write_report
 from vibench.cli.result_commands import replay_query, show
 from vibench.errors import NumericalError, RequestError
-from vibench.execution.run_folder import LOCK, REPORT, claimed
+from vibench.execution.recording import LOCK, REPORT, claimed
 from vibench.files import locked, write_atomically
 from vibench.report import figures
 from vibench.results.read import read_table, results_file

@@ -28,7 +28,7 @@ from vibench.benchmarks.measure import PASSES, PassTimes, Timing, measure
 from vibench.benchmarks.offline import OFFLINE
 from vibench.benchmarks.online import ONLINE, LeftOutError
 from vibench.errors import VibenchError
-from vibench.execution.watched import WatchedWork, watched
+from vibench.execution.isolated import IsolatedWork, run_isolated
 from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SOLVER
 from vibench.plugins.registry import registered
 from vibench.qp.solve import installed_solvers
@@ -103,7 +103,7 @@ class Turn:
 
 
 @dataclass(frozen=True)
-class TimedBenchmarks(WatchedWork):
+class TimedBenchmarks(IsolatedWork):
     """All benchmarks once, then all once more, and so on; `seconds` are for each of them, about."""
 
     label = "benchmarks"
@@ -192,7 +192,7 @@ def run_benchmarks(
     Raises a `VibenchError` if no benchmark can be begun.
     """
     work, results = TimedBenchmarks(tuple(benchmarks), setting, seconds), BenchmarkResults(len(benchmarks), show)
-    turns = watched(work, setting.seconds, results.take, in_all=setting.seconds * work.items)
+    turns = run_isolated(work, setting.seconds, results.take, in_all=setting.seconds * work.items)
     if isinstance(turns, Failed):
         raise VibenchError(f"the process of the benchmarks failed: {turns.reason}")
     return results

@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from vibench import provenance
 from vibench.cli.console import echo, shown
 from vibench.errors import RequestError, in_a_line
-from vibench.execution.solver_trials import solver_trials
+from vibench.execution.isolated import solver_trials
 from vibench.files import locked
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.factorisations import IMPLEMENTATIONS

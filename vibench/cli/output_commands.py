@@ -37,7 +37,7 @@ def write_report(
 ) -> None:
     """Write the report of a run as one HTML page."""
     from vibench import provenance
-    from vibench.execution.run_folder import REPORT
+    from vibench.execution.recording import REPORT
     from vibench.report import html
     from vibench.results.read import results_file
 

@@ -14,10 +14,16 @@ from vibench.errors import ExecutorError, RequestError, StorageError, VibenchErr
 from vibench.execution.executors import Dask, Executor, Local
 from vibench.execution.graph import Graph
 from vibench.execution.jobs import Job
-from vibench.execution.offline_plan import OfflinePlan
-from vibench.execution.result_writer import ResultWriter, labels_of
-from vibench.execution.run_folder import LOG, claimed, clear, ended_by_smaller_limits, keep_limits
-from vibench.execution.timing_plan import TimingPlan
+from vibench.execution.recording import (
+    LOG,
+    ResultWriter,
+    claimed,
+    clear,
+    ended_by_smaller_limits,
+    keep_limits,
+    labels_of,
+)
+from vibench.execution.timing_plan import OfflinePlan, TimingPlan
 from vibench.linalg.factorisations import DEFAULT, implementation
 from vibench.plugins.kinds import SAMPLING, SOLVER
 from vibench.plugins.plugin import Plugin
@@ -280,7 +286,7 @@ class _Run:
         artefact = self.store.get(stage.key)
         if artefact is None or artefact.machine not in self.machines:
             return False
-        self.offline.note(stage, artefact.seconds)
+        self.offline.note(stage, artefact.seconds, 0.0)
         self.writer.stage(stage, artefact.histories, self.store)
         return True
 

@@ -1,76 +1,141 @@
-"""Which cells are timed together, when, and for how long: until their comparisons are decided."""
+"""Which offline stages are repeated, and which cells are timed together until their comparisons are decided."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 
-from vibench.execution.result_writer import ResultWriter
+from vibench.execution.recording import ResultWriter
 from vibench.results.break_even import FEWEST_ROUNDS, Comparison, Meaning, compared
 from vibench.results.paired_timing import FEWEST_BLOCKS, PairedTiming
+from vibench.rounds.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
 from vibench.rounds.timed_seconds import TimedCell, TimedRound
 from vibench.rounds.timing_rounds import SHARE, TimingRounds, block_rows
 from vibench.stages.base import Failed, Row, Stage
 from vibench.stages.judging.cell_goal import CellGoal
+from vibench.storage.artefacts import Store
 from vibench.study.cells import Cell
-
-STOPPING_TAIL = 0.005
-"""Probability on each side at which a comparison is decided while rounds go on: those that are looked at several times
-are decided at 5 % only if each look is stricter (Pocock 1977)."""
-
-HOPELESS = 2.0
-"""Rounds end where a decision would take this multiple of those that are allowed."""
+from vibench.timing import Seconds
 
 
-@dataclass
+class OfflinePlan:
+    """Repeats of the offline stages of a run: of short ones within a budget, or of all as often as requested.
+
+    Parameters
+    ----------
+    store
+        The store with their artefacts.
+    writer
+        Writes the offline columns of cells that have rows.
+    requested
+        Repeats of every stage at any cost; 0 for two repeats of short stages, within the budget.
+    """
+
+    def __init__(self, store: Store, writer: ResultWriter, requested: int) -> None:
+        self._store, self._writer, self._requested = store, writer, requested
+        self._numbers = range(1, (requested or 2) + 1)
+        self._seconds: dict[str, Seconds] = {}  # of the first run of a stage, by its key
+        self._costs: dict[str, float] = {}  # of a repeat of a stage, by its key
+        # Only offline stages pay for repeats: the assessment of queries takes many times their seconds.
+        self._sources: set[str] = set()
+        self._planned: set[str] = set()
+        self._spent = 0.0
+        self._cells: dict[Cell, CellGoal] = {}
+
+    def note(self, stage: Stage, seconds: Seconds, wall: float) -> None:
+        """Register a stage that has run, with its wall seconds, or whose artefact was reused."""
+        self._seconds[stage.key] = seconds
+        self._costs[stage.key] = seconds.cpu or wall
+
+    def repeats(self, cells: Iterable[tuple[Cell, CellGoal]]) -> list[OfflineRepeat]:
+        """The repeats to run for some cells that have their rows, the cheapest first."""
+        mine = dict(cells)
+        self._cells |= mine
+        stages = {stage.key: stage for goal in mine.values() for stage in sources(goal)}
+        self._sources |= stages.keys() & self._costs.keys()
+        known = sorted((key for key in stages if key in self._costs), key=self._costs.__getitem__)
+        planned = []
+        for number in self._numbers:
+            for key in known:
+                repeat = OfflineRepeat(stages[key], number)
+                if repeat.key not in self._planned and self._afford(self._costs[key]):
+                    self._planned.add(repeat.key)
+                    planned.append(repeat)
+        return planned
+
+    def _afford(self, cost: float) -> bool:
+        # Repeats may take 30 % of the offline seconds of a run. The scatter of a stage above 3 s is that of the others.
+        budget = 0.3 * sum(self._costs[key] for key in self._sources)
+        if not self._requested and (cost > 3.0 or self._spent + cost > budget):
+            return False
+        self._spent += cost
+        return True
+
+    def finish(self) -> None:
+        """Write the offline columns of the cells whose repeats were planned."""
+        stages = {one.key: one for goal in self._cells.values() for some in goal.offline.values() for one in some}
+        runs = {key: self._runs(stage) for key, stage in stages.items()}
+        known = {key: some for key, some in runs.items() if some}
+        deviation = scatter(known.values())
+        for cell, goal in self._cells.items():
+            row = self._writer.database.cell(cell.key)
+            if row is not None and all(one.key in known for some in goal.offline.values() for one in some):
+                self._writer.offline(cell, offline_columns(goal, row["hf_setup_s"], known, deviation))
+
+    def _runs(self, stage: Stage) -> list[Seconds]:
+        """The seconds of the first run of a stage and of its repeats; none where its artefact is gone."""
+        if stage.key not in self._seconds:
+            artefact = self._store.get(stage.key)
+            if artefact is None:
+                return []
+            self._seconds[stage.key] = artefact.seconds
+        source, name = stage.measured_by
+        repeated = (OfflineRepeat(source, number).seconds(self._store, name) for number in self._numbers)
+        return [self._seconds[stage.key], *(seconds for seconds in repeated if seconds is not None)]
+
+
 class _Group:
-    """Cells that are timed together, and what was measured so far, by the key of a goal."""
+    """Cells that are timed together, and their measurements so far, by the key of a goal."""
 
-    members: dict[Cell, CellGoal]
-    queries: dict[str, tuple[int, ...]]
-    rows: dict[str, list[Row]] = field(default_factory=dict)
-    rounds: dict[str, list[TimedRound]] = field(default_factory=dict)
-    machines: dict[str, set[str]] = field(default_factory=dict)
-    lost: dict[str, tuple[int, str]] = field(default_factory=dict)
-    """How many rounds of a goal are missing, and why the first one is."""
-    blocks: int = 0
-    first: int = 0
-    """Number of the rounds so far."""
+    def __init__(self, members: dict[Cell, CellGoal], queries: dict[str, tuple[int, ...]]) -> None:
+        self.members, self.queries = members, queries
+        self.rows: dict[str, list[Row]] = defaultdict(list)
+        self.rounds: dict[str, list[TimedRound]] = defaultdict(list)
+        self.machines: dict[str, set[str]] = defaultdict(set)
+        self.lost: dict[str, tuple[int, str]] = defaultdict(lambda: (0, ""))  # rounds, and the reason of the first
+        self.blocks = self.first = 0  # numbers of the next block and of the next round
 
 
-@dataclass
 class TimingPlan:
-    """The groups of a run, each of the cells that break-even compares: of one problem, cone and pair of tolerances.
+    """The groups of a run: the cells that break-even compares, of one problem, cone and pair of tolerances.
 
-    A group is timed whole, even where only some of its cells are new: seconds of different runs are not compared. It is
-    timed in blocks of rounds, of which the next one is planned when the one before has ended; a cell whose comparisons
-    are decided takes no part any more.
+    A group is timed whole, even where only some of its cells are new: seconds of different runs are not comparable. It
+    is timed in blocks of rounds; each block is planned when the previous one has ended. A cell whose comparisons are
+    decided takes no part any more.
 
-    Attributes
+    Parameters
     ----------
     goals
         The last stages of the cells that can be timed here, by cell.
     rounds
-        Most rounds.
+        Upper limit of rounds.
     writer
-        Knows which cells have rows and seconds already.
+        Knows which cells have rows and seconds.
     fewest
-        Rounds that every cell gets, if so many are allowed.
+        Rounds of every cell, if the limit allows them.
     """
 
-    goals: Mapping[Cell, CellGoal]
-    rounds: int
-    writer: ResultWriter
-    fewest: int = 0
-    paired: PairedTiming = field(default_factory=PairedTiming)
-    """All that was measured so far: the scatter of a cell's few blocks is judged together with that of others."""
-    _groups: dict[tuple[object, ...], list[Cell]] = field(default_factory=dict)
-    _open: dict[tuple[object, ...], set[Cell]] = field(default_factory=dict)
-    _planned: dict[str, _Group] = field(default_factory=dict)
-    _session: int = 0
+    def __init__(self, goals: Mapping[Cell, CellGoal], rounds: int, writer: ResultWriter, fewest: int) -> None:
+        self._goals, self._rounds, self._writer, self._fewest = goals, rounds, writer, fewest
+        # All measurements so far: the scatter of the few blocks of a cell is pooled with that of other cells.
+        self._paired = PairedTiming()
+        self._groups: dict[tuple[object, ...], list[Cell]] = {}
+        self._open: dict[tuple[object, ...], set[Cell]] = {}
+        self._planned: dict[str, _Group] = {}
+        self._session = 0
 
     def start(self, todo: Iterable[Cell]) -> list[TimingRounds]:
-        """Note which cells will get new rows.
+        """Register the cells that will get new rows.
 
         Returns
         -------
@@ -78,14 +143,14 @@ class TimingPlan:
             The stages of the groups that wait for none of them, and have cells without seconds.
         """
         waiting = set(todo)
-        for cell in self.goals:
+        for cell in self._goals:
             self._groups.setdefault(_group(cell), []).append(cell)
         self._open = {group: waiting.intersection(cells) for group, cells in self._groups.items()}
         complete = [group for group, left in self._open.items() if not left]
         return [stage for group in complete if (stage := self._begin(group)) is not None]
 
     def ended(self, cell: Cell) -> TimingRounds | None:
-        """Note that a cell has its row; the stage of its group if it was the last one."""
+        """The stage of the group of a cell that has got its row, if the group waited for this cell alone."""
         group = _group(cell)
         self._open[group].discard(cell)
         return None if self._open[group] else self._begin(group)
@@ -95,25 +160,25 @@ class TimingPlan:
         return self._planned[stage.key].members.items()
 
     def _begin(self, group: tuple[object, ...]) -> TimingRounds | None:
-        rows = {cell: self.writer.database.cell(cell.key) for cell in self._groups[group]}
-        members = {cell: self.goals[cell] for cell, row in rows.items() if row is not None and row["queries_ok"]}
-        if all(row["timing_rounds"] == self.rounds for cell in members if (row := rows[cell]) is not None):
+        rows = {cell: self._writer.database.cell(cell.key) for cell in self._groups[group]}
+        members = {cell: self._goals[cell] for cell, row in rows.items() if row is not None and row["queries_ok"]}
+        if all(row["timing_rounds"] == self._rounds for cell in members if (row := rows[cell]) is not None):
             return None
-        fine = {goal.key: self.writer.database.fine_queries(cell.key) for cell, goal in members.items()}
+        fine = {goal.key: self._writer.database.fine_queries(cell.key) for cell, goal in members.items()}
         return self._block(_Group(members, fine), self._session, members.values())
 
     def _block(self, group: _Group, session: int, goals: Iterable[CellGoal]) -> TimingRounds:
         """The next block of a group, of some of its goals."""
-        # Cells that differ in their labels alone have one goal.
+        # Cells that differ only in their labels share one goal.
         mine = tuple({goal.key: goal for goal in goals}.values())
-        rounds = block_sizes(self.rounds)[group.blocks]
+        rounds = block_sizes(self._rounds)[group.blocks]
         stage = TimingRounds(mine, tuple(group.queries[goal.key] for goal in mine), rounds, group.first, session)
         self._planned[stage.key] = group
         self._session = max(self._session, session)
         return stage
 
     def record(self, stage: Stage, outcome: tuple[TimedCell, ...] | Failed) -> TimingRounds | None:
-        """Write the seconds of a block, or why there are none; returns the next one of its group, if there is any.
+        """Write the seconds of a block, or why there are none; returns the next block of its group, if any.
 
         A stage that is not of this plan is ignored.
         """
@@ -121,60 +186,58 @@ class TimingPlan:
             return None
         group = self._planned.pop(stage.key)
         if isinstance(outcome, Failed):
-            lost = TimedCell({}, "", stage.rounds, outcome.reason)
-            outcome = (lost,) * len(stage.cells)
+            outcome = (TimedCell({}, "", stage.rounds, outcome.reason),) * len(stage.cells)
         for goal, rows, timed in zip(stage.cells, block_rows(stage, outcome), outcome, strict=True):
-            self._note(group, goal.key, rows, timed)
+            group.rows[goal.key] += rows
+            group.rounds[goal.key] += timed.rounds.values()
+            group.machines[goal.key] |= {timed.machine} if timed.rounds else set()
+            count, reason = group.lost[goal.key]
+            group.lost[goal.key] = count + timed.lost, reason or timed.reason
         group.blocks += 1
         group.first += stage.rounds
         timed_here = {goal.key for goal in stage.cells}
         for cell, goal in group.members.items():
-            if goal.key in timed_here:  # nothing is new of others
+            if goal.key in timed_here:  # other cells have no new seconds
                 self._write(group, cell, goal)
-                self.paired.add(cell.key, group.rows[goal.key])
+                self._paired.add(cell.key, group.rows[goal.key])
+        # A goal without a single round in this block would fail again.
         timed_now = {goal.key for goal, timed in zip(stage.cells, outcome, strict=True) if timed.rounds}
         following = [goal for goal in self._undecided(group) if goal.key in timed_now]
-        if following and group.blocks < len(block_sizes(self.rounds)):
+        if following and group.blocks < len(block_sizes(self._rounds)):
             return self._block(group, stage.session + 1, following)
         for cell in group.members:
-            self.writer.timed(cell, self.rounds)
+            self._writer.timed(cell, self._rounds)
         return None
-
-    def _note(self, group: _Group, goal: str, rows: list[Row], timed: TimedCell) -> None:
-        group.rows.setdefault(goal, []).extend(rows)
-        group.rounds.setdefault(goal, []).extend(timed.rounds.values())
-        group.machines.setdefault(goal, set()).update({timed.machine} if timed.rounds else ())
-        count, reason = group.lost.get(goal, (0, ""))
-        group.lost[goal] = count + timed.lost, reason or timed.reason
 
     def _write(self, group: _Group, cell: Cell, goal: CellGoal) -> None:
         count, reason = group.lost[goal.key]
         rows, rounds = group.rows[goal.key], group.rounds[goal.key]
         everything = len(rows) + count
         lost = f"{'all' if count == everything else f'{count} of {everything}'} rounds: {reason}" if count else ""
-        self.writer.seconds(cell, rows, rounds, group.machines[goal.key], lost)
+        self._writer.seconds(cell, rows, rounds, group.machines[goal.key], lost)
 
     def _undecided(self, group: _Group) -> list[CellGoal]:
-        """The goals that further rounds may decide a comparison of."""
-        if group.first < min(max(self.fewest, FEWEST_ROUNDS), self.rounds) or group.blocks < FEWEST_BLOCKS:
+        """The goals with a comparison that further rounds may decide."""
+        if group.first < min(max(self._fewest, FEWEST_ROUNDS), self._rounds) or group.blocks < FEWEST_BLOCKS:
             return list(group.members.values())
         cells = {cell.key: goal for cell, goal in group.members.items()}
-        rows = [row for key in cells if (row := self.writer.database.cell(key)) is not None]
+        rows = [row for key in cells if (row := self._writer.database.cell(key)) is not None]
         undecided: dict[str, CellGoal] = {}
-        for one in compared(rows, self.paired, STOPPING_TAIL):
+        # A comparison that is tested after every block reaches 5 % only if each test is stricter (Pocock 1977).
+        for one in compared(rows, self._paired, tail=0.005):
             if one.result.meaning is Meaning.UNDECIDED and self._would_help(one, group.first):
                 both = [one.b["cell"]] if one.a is None else [one.a["cell"], one.b["cell"]]
                 undecided |= {key: cells[key] for key in both}
         return list(undecided.values())
 
     def _would_help(self, one: Comparison, done: int) -> bool:
-        """Whether it is seconds of queries that leave a comparison undecided, and rounds may still decide it."""
-        more = one.result.rounds
-        return one.gain is None or (more is not None and done + more <= HOPELESS * self.rounds)
+        """Whether more rounds may decide a comparison, since it is the seconds of queries that leave it undecided."""
+        more = one.result.rounds  # an estimate, which twice the limit allows for
+        return one.gain is None or (more is not None and done + more <= 2.0 * self._rounds)
 
 
 def block_sizes(rounds: int) -> list[int]:
-    """Numbers of rounds of the blocks of so many: a pass over all queries, or less where rounds are few."""
+    """Numbers of rounds of the blocks of `rounds`: a pass over all queries, or less where rounds are few."""
     blocks = 1 if rounds < FEWEST_ROUNDS else max(FEWEST_BLOCKS, rounds // SHARE)
     return [rounds // blocks + (k < rounds % blocks) for k in range(blocks)]
 

@@ -15,8 +15,8 @@ import pandas as pd
 from vibench import interrupts
 from vibench.errors import requested, unknown_name
 from vibench.execution.recorded_cell import recorded_cell
+from vibench.execution.recording import REPORT
 from vibench.execution.run import Observer, Options, run_study
-from vibench.execution.run_folder import REPORT
 from vibench.files import writing
 from vibench.model.bound_terms import CorrectionMode
 from vibench.offline.formulated import Formulated

@@ -17,8 +17,8 @@ import qpsolvers
 
 from vibench.arrays import Array
 from vibench.errors import RequestError
+from vibench.execution.isolated import Trial, solver_trials
 from vibench.execution.recorded_cell import RecordedCell, recorded_cells
-from vibench.execution.solver_trials import Trial, solver_trials
 from vibench.files import PART, TEMPORARY, write_atomically, writing
 from vibench.interfaces.problem import VariationalInequality
 from vibench.plugins.kinds import SOLVER

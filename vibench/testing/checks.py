@@ -24,8 +24,8 @@ import scipy
 
 import vibench
 from vibench.errors import in_a_line
+from vibench.execution.isolated import IsolatedWork, run_isolated
 from vibench.execution.supervisor import Supervisor
-from vibench.execution.watched import WatchedWork, watched
 from vibench.plugins.kinds import CHECKED
 from vibench.qp.status import Status
 from vibench.stages.base import Failed
@@ -284,7 +284,7 @@ def _title(plugin: Any) -> str:
 
 
 @dataclass(frozen=True)
-class Call(WatchedWork):
+class Call(IsolatedWork):
     """One call of a pickled function with its arguments; `path` is searched for modules, too."""
 
     label = "call"
@@ -310,7 +310,7 @@ class NotImportableError(Exception):
 def _call(function: Callable[..., Any], *arguments: Any, seconds: float, process: Supervisor) -> Any:
     """Value of a function in another process, or why it has none."""
     call = Call(pickle.dumps((function, arguments)), tuple(folder for folder in sys.path if folder))
-    answer = watched(call, seconds, supervisor=process)
+    answer = run_isolated(call, seconds, supervisor=process)
     return answer if isinstance(answer, Failed) else answer[0]
 
 

@@ -14,7 +14,7 @@ from vibench import provenance
 from vibench.cli import doctor
 from vibench.cli.doctor import Diagnosis, Health
 from vibench.errors import RequestError
-from vibench.execution.solver_trials import Trial
+from vibench.execution.isolated import Trial
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from samples import SampleStore, carry_out
 
-from vibench.execution import offline_plan
-from vibench.execution.offline_plan import OfflinePlan
+from vibench.execution.timing_plan import OfflinePlan
 from vibench.results.break_even import SCATTER
 from vibench.rounds.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
 from vibench.stages.assembly import ExactSolutions
@@ -31,8 +30,10 @@ def spent(seconds: float) -> Seconds:
     return Seconds(seconds, seconds)
 
 
-def plan_of(seconds: Mapping[str, float], asked: int = 0, store: Any = None) -> tuple[OfflinePlan, list[OfflineRepeat]]:
-    plan = OfflinePlan(store, SimpleNamespace(), asked)  # type: ignore[arg-type]
+def plan_of(
+    seconds: Mapping[str, float], requested: int = 0, store: Any = None
+) -> tuple[OfflinePlan, list[OfflineRepeat]]:
+    plan = OfflinePlan(None, SimpleNamespace(), requested)  # type: ignore[arg-type]
     for key, cpu in seconds.items():
         plan.note(next(stage for stage in STAGES if stage.key == key), spent(cpu), 1.5 * cpu)
     return plan, plan.repeats([(CELL, GOAL)])
@@ -42,17 +43,17 @@ def test_short_stages_are_repeated_the_cheapest_first_within_the_budget() -> Non
     costs = dict(zip((stage.key for stage in STAGES), (0.5, 0.1, 2.0, 0.2, 0.3, 9.0, 0.1), strict=False))
     plan, repeats = plan_of(costs)
     paid = [costs[one.stage.key] for one in repeats]
-    assert sum(paid) <= offline_plan.BUDGET * sum(costs.values())
-    assert max(paid) <= offline_plan.SHORT
+    assert sum(paid) <= 0.3 * sum(costs.values())
+    assert max(paid) <= 3.0
     firsts = [costs[one.stage.key] for one in repeats if one.number == 1]
-    assert firsts == sorted(cost for cost in costs.values() if cost <= offline_plan.SHORT)
+    assert firsts == sorted(cost for cost in costs.values() if cost <= 3.0)
     assert plan.repeats([(CELL, GOAL)]) == []  # once is enough
 
 
 def test_what_is_not_offline_pays_for_no_repeats() -> None:
     costs = {stage.key: 1.0 for stage in STAGES}
     _, repeats = plan_of(costs)
-    plan = OfflinePlan(None, SimpleNamespace())  # type: ignore[arg-type]
+    plan = OfflinePlan(None, SimpleNamespace(), 0)  # type: ignore[arg-type]
     plan.note(ExactSolutions(GOAL.assembly), spent(100.0), 100.0)
     for stage in STAGES:
         plan.note(stage, spent(1.0), 1.0)
@@ -62,7 +63,7 @@ def test_what_is_not_offline_pays_for_no_repeats() -> None:
 
 def test_repeats_that_are_asked_for_are_all_run() -> None:
     costs = dict.fromkeys((stage.key for stage in STAGES), 100.0)
-    _, repeats = plan_of(costs, asked=3)
+    _, repeats = plan_of(costs, requested=3)
     assert sorted(one.number for one in repeats) == sorted([1, 2, 3] * len(STAGES))
 
 
@@ -119,7 +120,7 @@ def test_seconds_of_cells_whose_artefacts_are_gone_stay_as_they_are() -> None:
     writer = SimpleNamespace(database=database, offline=lambda cell, _: written.append(cell))
     for there in (False, True):
         artefact = SimpleNamespace(seconds=spent(1.0), value={"": [1.0, 1.0]}) if there else None
-        plan = OfflinePlan(SimpleNamespace(get=lambda _, found=artefact: found), writer)  # type: ignore[arg-type]
+        plan = OfflinePlan(SimpleNamespace(get=lambda _, found=artefact: found), writer, 0)  # type: ignore[arg-type]
         plan.repeats([(CELL, GOAL)])
         plan._seconds = {}
         if there:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from samples import STUDY, changed, write_study
 
-from vibench.execution.result_writer import axis_columns, cell_columns, labels_of
+from vibench.execution.recording import axis_columns, cell_columns, labels_of
 from vibench.interfaces.strategies import Stop
 from vibench.results.schema import HISTORY_KEYS, KEYS
 from vibench.stages.base import Stage

@@ -12,7 +12,7 @@ import pytest
 from counting import growth
 from samples import cell_row, query_rows
 
-from vibench.execution.result_writer import ResultWriter, labels_of
+from vibench.execution.recording import ResultWriter, labels_of
 from vibench.execution.timing_plan import TimingPlan, block_sizes
 from vibench.qp.status import Status
 from vibench.results.database import ResultsDatabase
@@ -36,7 +36,7 @@ def writer(tmp_path: Path) -> ResultWriter:
 
 
 def plan_of(writer: ResultWriter, rounds: int = 12) -> TimingPlan:
-    return TimingPlan({cell: cell_queries(cell, 20.0) for cell in CELLS}, rounds, writer)
+    return TimingPlan({cell: cell_queries(cell, 20.0) for cell in CELLS}, rounds, writer, 0)
 
 
 def write(writer: ResultWriter, cell: Cell, *failed: int, **columns: object) -> None:
@@ -246,7 +246,7 @@ def test_a_group_costs_the_same_however_many_there_are() -> None:
         writer: Any = SimpleNamespace(database=database, seconds=lambda *_: None, timed=lambda *_: None)
 
         def work() -> None:
-            plan = TimingPlan(goals, 1, writer)
+            plan = TimingPlan(goals, 1, writer, 0)
             plan.start(cells)
             for cell in cells:
                 if (stage := plan.ended(cell)) is not None:

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from vibench.execution.timing_plan import STOPPING_TAIL
 from vibench.results.break_even import TAIL, compared
 from vibench.results.paired_timing import (
     CONDITIONS,
@@ -112,7 +111,7 @@ def test_intervals_of_cells_whose_rounds_end_when_they_are_decided_contain_the_t
             for cell in tuple(going):
                 found = paired.ratio(None, cell)
                 assert found is not None
-                low, high = found.interval(STOPPING_TAIL)
+                low, high = found.interval(0.005)
                 going -= {cell} if low > 0.0 or high < 0.0 else set()
             kept += [row for row in rows if row["block"].endswith(f"/{block}") and row["cell"] in going]
         paired = PairedTiming(kept)

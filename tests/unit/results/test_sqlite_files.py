@@ -14,7 +14,7 @@ import pytest
 from samples import cell_row
 
 from vibench.errors import RequestError, StorageError
-from vibench.execution.run_folder import claimed
+from vibench.execution.recording import claimed
 from vibench.results.database import ResultsDatabase
 from vibench.results.read import read_table, results_file
 from vibench.results.sqlite import DAMAGED, FILE, DamagedResultsError, open_read_only, read_meta, set_aside

@@ -10,13 +10,13 @@ import pytest
 from samples import SOLVERS_OF_TESTS
 
 from vibench.cli.doctor import ACCURACY, UNKNOWNS, wire
-from vibench.execution.solver_trials import SECONDS, Trial, solver_trials
+from vibench.execution.isolated import Trial, solver_trials
 from vibench.plugins import registry
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 
 
-def attempts(solvers: Sequence[str], seconds: float = SECONDS) -> dict[str, Trial]:
+def attempts(solvers: Sequence[str], seconds: float = 60.0) -> dict[str, Trial]:
     return solver_trials(wire(), ACCURACY, solvers, seconds)
 
 

@@ -1,29 +1,118 @@
-"""What a run writes into its results file: rows of cells, histories and pictures, with keys and provenance."""
+"""The folder of a run, which one run at a time writes into, and what it writes into the results file there."""
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 from vibench import provenance
+from vibench.errors import RequestError
+from vibench.execution.jobs import OUT_OF_MEMORY
+from vibench.files import locked
 from vibench.plugins.plugin import Plugin
+from vibench.qp.status import Status
 from vibench.results.database import ResultsDatabase
 from vibench.results.schema import KEYS
+from vibench.results.show import EXPORTED
+from vibench.results.sqlite import (
+    DAMAGED,
+    FILE,
+    WRITE_AHEAD_LOG,
+    DamagedResultsError,
+    read_meta,
+    set_aside,
+    study_of,
+)
 from vibench.rounds.timed_seconds import TimedRound, seconds_of_cell, seconds_of_queries
 from vibench.stages.base import Row, Stage, value_of
 from vibench.stages.judging.cell_goal import CellRows
 from vibench.storage.artefacts import History, Store
 from vibench.study.cells import NO_SUCH_AXIS, Axes, Cell, digest
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.spec import Study
+from vibench.study.spec import Limits, Study
+
+LOCK, LOG, REPORT = ".lock", "workers.log", "report.html"
+"""Files of a run folder: held during a run, output of plugins and solvers, and what `vibench report` writes."""
+
+LIMITS = "limits of "
+"""Prefix of the keys of `meta` under which the limits of studies are stored, by the hash of the study."""
+
+
+@contextlib.contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Lock a run folder, which is created if it does not exist.
+
+    Raises
+    ------
+    RequestError
+        If the folder is a file, holds files but no results file, cannot be written, or is locked by another run.
+    """
+    try:
+        if folder.exists() and not folder.is_dir():
+            raise RequestError(f"output folder '{folder}' is a file")
+        ours = {LOCK, FILE + DAMAGED, FILE + DAMAGED + WRITE_AHEAD_LOG}
+        if folder.is_dir() and not (folder / FILE).exists() and {path.name for path in folder.iterdir()} - ours:
+            raise RequestError(f"output folder '{folder}' is not empty and holds no {FILE}; choose another with --out")
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RequestError(f"output folder '{folder}' cannot be written: {error.strerror}") from None
+    with locked(folder / LOCK, busy=f"another run writes into '{folder}'"):
+        yield
+
+
+def clear(folder: Path, study: str, note: Callable[[str], None]) -> None:
+    """Remove the tables, log and report of an earlier run of a study; refuse the folder of another study.
+
+    Other files stay: a user may keep notes there, and figures are removed when they are drawn anew. A results file that
+    cannot be read is kept under another name, which is passed to `note`.
+
+    Raises
+    ------
+    RequestError
+        If the folder holds results of another study.
+    """
+    path = folder / FILE
+    try:
+        meta = read_meta(path) if path.is_file() else {}
+    except DamagedResultsError as error:
+        set_aside(path)
+        note(f"{error}; it is kept as '{path}{DAMAGED}'")
+        meta = {}
+    there = study_of(path, meta).get("name") if meta else study
+    if there != study:
+        raise RequestError(f"'{folder}' holds results of the study '{there}'; --fresh removes only '{study}'")
+    for name in (LOG, REPORT, *(f"tables/{file}" for file in EXPORTED)):
+        (folder / name).unlink(missing_ok=True)
+
+
+def ended_by_smaller_limits(database: ResultsDatabase, limits: Limits) -> set[str]:
+    """Keys of the cells that ended, or had a query that ended, at a limit that is larger now.
+
+    Rows name their study by its hash; limits of an unknown hash count as unchanged.
+    """
+    known = {study: json.loads(text) for study, text in database.kept(LIMITS).items()}
+    ended = set()
+    for cell, study, status, reason in database.ends():
+        raised = {name for name, value in limits.model_dump().items() if value > known.get(study, {}).get(name, value)}
+        late = status == Status.TIMEOUT and raised & {"query_seconds", "cell_seconds"}
+        if late or (OUT_OF_MEMORY in reason and "memory_gib" in raised):
+            ended.add(cell)
+    return ended
+
+
+def keep_limits(database: ResultsDatabase, study: str, limits: Limits) -> None:
+    """Store the limits of the study with this hash in its results file."""
+    database.keep(LIMITS + study, limits.model_dump_json())
 
 
 @dataclass(frozen=True)
 class ResultWriter:
-    """Writes the results of the stages of a study; `labels` are the names of its plugins in the results."""
+    """Writes the results of the stages of a study, where plugins go by their `labels`."""
 
     study: Study
     database: ResultsDatabase
@@ -31,11 +120,11 @@ class ResultWriter:
 
     @cached_property
     def study_hash(self) -> str:
-        """What the rows name the study by."""
+        """Name of the study in its rows."""
         return digest(self.study.model_dump(mode="json"))
 
     def cell(self, cell: Cell, rows: CellRows) -> Row:
-        """Write the rows of a cell; returns its own as it is stored."""
+        """Write the rows of a cell; returns its row of the cells table as stored."""
         keys = cell_columns(cell)
         row = {"cell": cell.key, **keys, "machine": provenance.machine(), **rows.cell}
         row |= {
@@ -60,7 +149,7 @@ class ResultWriter:
         machines: Set[str],
         lost: str,
     ) -> None:
-        """Write the seconds of a cell that has its rows, of which there may be more; see `timed`."""
+        """Write the seconds of a cell that has its rows; more may follow until `timed` is called."""
         row = self.database.cell(cell.key)
         assert row is not None  # cells are timed when they have their rows
         own = seconds_of_cell(rows) | {"timing_rounds": None, "timed_rounds": len(rows), "timing_reason": lost}
@@ -69,12 +158,11 @@ class ResultWriter:
         keys = {"cell": cell.key, **cell_columns(cell)}
         self.database.write_seconds(cell.key, own, seconds_of_queries(rounds), [keys | row for row in rows])
 
-    def timed(self, cell: Cell, asked: int) -> None:
-        """Note that a cell has all of its seconds, of at most so many rounds."""
-        self.database.write_columns(cell.key, {"timing_rounds": asked})
+    def timed(self, cell: Cell, limit: int) -> None:
+        """Mark the seconds of a cell as complete; `limit` is the upper limit of its rounds."""
+        self.database.write_columns(cell.key, {"timing_rounds": limit})
 
     def offline(self, cell: Cell, columns: Row) -> None:
-        """Write the offline columns of a cell that has its rows."""
         self.database.write_columns(cell.key, columns)
 
     def stage(self, stage: Stage, histories: Iterable[History], store: Store) -> None:
@@ -89,7 +177,7 @@ class ResultWriter:
             self._tables(stage, stage.rows(value_of(store, stage)))
 
     def failure(self, stage: Stage, reason: str) -> None:
-        """Write the rows of a stage that failed; those of the cells that need it are written separately."""
+        """Write the rows of a stage that failed, except for those of the cells that need it."""
         self._tables(stage, stage.failure_rows(reason))
 
     def _tables(self, stage: Stage, tables: Mapping[str, Sequence[Row]]) -> None:
@@ -112,7 +200,7 @@ def cell_columns(cell: Cell) -> dict[str, Any]:
 
 
 def labels_of(cells: Iterable[Cell]) -> dict[Plugin, str]:
-    """The names of a study's plugins in its results: their labels in the first cell that has them."""
+    """Labels of the plugins of a study: those of the first cell with a plugin."""
     labels: dict[Plugin, str] = {}
     for cell in cells:
         for plugin, label in zip((cell.problem, cell.dual, cell.primal), cell.labels, strict=True):
@@ -122,7 +210,6 @@ def labels_of(cells: Iterable[Cell]) -> dict[Plugin, str]:
 
 
 def _set_columns(parameters: ParameterSet) -> dict[str, Any]:
-    """Label and options of a parameter set."""
     return {parameters.role: parameters.label, f"{parameters.role}_options": parameters.options}
 
 
