@@ -22,10 +22,6 @@ from .highfidelity.active_set import HighFidelitySolution as HighFidelitySolutio
 from .highfidelity.active_set import HighFidelitySolver as HighFidelitySolver
 from .interfaces.affine import AffineSum as AffineSum
 from .interfaces.affine_problem import AffineProblem as AffineProblem
-from .interfaces.figures import DerivedColumn as DerivedColumn
-from .interfaces.figures import FigurePlugin as FigurePlugin
-from .interfaces.figures import ProblemTables as ProblemTables
-from .interfaces.figures import RunTables as RunTables
 from .interfaces.formulations import Asked as Asked
 from .interfaces.formulations import Formulation as Formulation
 from .interfaces.formulations import FormulationAnswer as FormulationAnswer

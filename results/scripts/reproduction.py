@@ -16,7 +16,7 @@ from pathlib import Path
 import pandas as pd
 from page import start
 
-from vibench.report.figures.data import Data, problems
+from vibench.report.figures.data import ProblemTables, problem_tables
 from vibench.results.read import results_file
 from vibench_problems.paper.claims import DIMENSION, MESH, ORDER, RATIO, WIDEST, Agreement, Claim, typeset
 from vibench_problems.paper.evidence import Evidence
@@ -39,7 +39,7 @@ python results/scripts/reproduction.py runs/paper-obstacle runs/paper-hertz runs
 
 Seconds were measured on {machine}.{disturbed} Equations, sections and figures are those of the paper. *On* and *off* are its online and offline enrichment; our numbers are those of the cone of mCPG, PIQP and assembly in full, unless a row says otherwise. Curves are not read off the figures; of a figure, the page compares the statements of text and caption.
 
-The verdict is computed from the numbers. Dimensions agree within {dimension:.0f} %, sizes of meshes within {mesh:.0f} %, ratios of seconds within {ratio:.0f} %, orders of magnitude within a factor {order:.2g}. A benefit threshold n\\* agrees if the value of the paper lies in our [95 % interval](measurement.md#seconds) and the ends of this are at most a factor {widest:g} apart; a wider interval that contains it is inconclusive. An inequality agrees if it holds at every step and parameter. Observations of the paper on a figure are judged at the parameters and tolerances of that figure, and constants over the cone by the bound from which a conclusion follows. Seconds on different machines cannot be compared, nor can quantities that the paper does not give or gives only in a figure, nor those that a run does not reach. Agreement *by construction* is not a result: inputs copied from the paper, sizes that a study prescribes, arithmetic on numbers that the paper prints. `vibench figures --paper` judges by the same rules below each figure.
+The verdict is computed from the numbers. Dimensions agree within {dimension:.0f} %, sizes of meshes within {mesh:.0f} %, ratios of seconds within {ratio:.0f} %, orders of magnitude within a factor {order:.2g}. A benefit threshold n\\* agrees if the value of the paper lies in our [95 % interval](measurement.md#seconds) and the ends of this are at most a factor {widest:g} apart; a wider interval that contains it is inconclusive. An inequality agrees if it holds at every step and parameter. Observations of the paper on a figure are judged at the parameters and tolerances of that figure, and constants over the cone by the bound from which a conclusion follows. Seconds on different machines cannot be compared, nor can quantities that the paper does not give or gives only in a figure, nor those that a run does not reach. Agreement *by construction* is not a result: inputs copied from the paper, sizes that a study prescribes, arithmetic on numbers that the paper prints. `python -m vibench_problems.paper` judges by the same rules below each figure.
 """  # noqa: E501
 
 CAUSES = """## Causes of differences
@@ -95,9 +95,9 @@ def variants() -> dict[str, int]:
     }
 
 
-def the_problem_of(run: str) -> Data:
+def the_problem_of(run: str) -> ProblemTables:
     """The tables of the only problem of a run."""
-    ((_, data),) = problems(results_file(run))
+    ((_, data),) = problem_tables(results_file(run))
     return data
 
 

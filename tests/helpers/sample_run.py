@@ -1,4 +1,4 @@
-"""A made-up run on which figure plugins are checked: columns are filled, a cell failed, and values are missing."""
+"""A made-up run: columns are filled, a cell failed, and values are missing."""
 
 from __future__ import annotations
 

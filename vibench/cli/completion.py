@@ -65,7 +65,6 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench check my_package.cable:Cable",
         "vibench check solver:piqp",
         "vibench check sampling:my-points --option size=32 --option seed=1",
-        "vibench check figure:my-figures --run runs/mine",
     ),
     "bench": (
         "vibench bench my-problem",

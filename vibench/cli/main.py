@@ -146,7 +146,7 @@ def _conclude(name: str, outcome: Outcome, folder: Path, *, draw: int | None, fr
     from vibench.results.read import results_file
 
     path = results_file(str(folder))
-    show.export(path, folder / "tables", warn)
+    show.export(path, folder / "tables")
     if outcome.damaged:
         echo(f"computed again, as their rows were damaged: {', '.join(outcome.damaged)}")
     if outcome.interrupted:

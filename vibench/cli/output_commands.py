@@ -12,7 +12,7 @@ import typer
 from typer import Argument, Exit, Option
 
 from vibench.cli.completion import cells, runs
-from vibench.cli.console import echo, run_argument, warn
+from vibench.cli.console import echo, run_argument
 from vibench.cli.result_commands import At, RunArgument, places_of
 from vibench.errors import RequestError
 
@@ -50,12 +50,7 @@ def draw_figures(
     names: Annotated[
         list[str], Argument(metavar="RUN", help="A run folder, or its name in runs/ (several).", autocompletion=runs)
     ],
-    out: Annotated[
-        Path | None, Option(metavar="DIR", help="Folder; RUN/figures, or paper-figures with --paper, by default.")
-    ] = None,
-    paper: Annotated[
-        bool, Option("--paper", help="Draw the figures of a publication again, on one page with what it says.")
-    ] = False,
+    out: Annotated[Path | None, Option(metavar="DIR", help="Folder; RUN/figures by default.")] = None,
     formats: Annotated[
         list[FigureFormat] | None, Option("--format", help="Format (repeatable); PNG and SVG by default.")
     ] = None,
@@ -67,24 +62,10 @@ def draw_figures(
 
     paths = list({results_file(name).resolve(): results_file(name) for name in names}.values())
     forms = tuple(dict.fromkeys(map(str, formats or FORMATS)))
-    if paper:
-        draw_paper(paths, out or Path("paper-figures"), forms)
-        return
     if out is not None and len(paths) > 1:
-        raise RequestError("--out is for the figures of one run, and --paper; those of several go into their folders")
+        raise RequestError("--out is for the figures of one run; those of several go into their folders")
     for path in paths:
         draw_run(path, out or path.parent / "figures", jobs, forms)
-
-
-def draw_paper(paths: list[Path], folder: Path, formats: tuple[str, ...]) -> None:
-    """Draw the figures of publications again, and say where their page is."""
-    from vibench.library.progress import DrawingDisplay
-    from vibench.report.figures.publication import PAGE, draw_published
-
-    notes: list[str] = []
-    with DrawingDisplay() as display:
-        drawn = draw_published(paths, folder, formats, display.show, notes.append)
-    echo(*dict.fromkeys(notes), f"{len(drawn)} figures: {folder}", f"page: {folder / PAGE}")
 
 
 def draw_run(path: Path, folder: Path, jobs: int, formats: tuple[str, ...] = ("png", "svg")) -> None:
@@ -93,17 +74,17 @@ def draw_run(path: Path, folder: Path, jobs: int, formats: tuple[str, ...] = ("p
     from vibench.library.progress import DrawingDisplay
     from vibench.report import figures
 
-    cores, failures = provenance.cores(), list[str]()
+    cores = provenance.cores()
     try:
         with DrawingDisplay() as display:
-            drawn = figures.draw_all(path, folder, formats, min(jobs or cores, cores), display.show, failures.append)
+            drawn = figures.draw_all(path, folder, formats, min(jobs or cores, cores), display.show)
     except KeyboardInterrupt:
         echo(
             "interrupted while drawing: results and tables are complete, some figures are missing; "
             f"`vibench figures {run_argument(path.parent)}` draws them"
         )
         raise Exit(130) from None
-    echo(*failures, f"{len(drawn)} figures: {folder}")
+    echo(f"{len(drawn)} figures: {folder}")
 
 
 def publish_runs(
@@ -141,7 +122,7 @@ def publish_runs(
             typer.confirm("Publish it?", abort=True)
 
     citation = Citation(title, tuple(author or ()), doi, url, date)
-    page = publish([results_file(one) for one in run], site, citation, warn=warn, figures=figures, ask=ask)
+    page = publish([results_file(one) for one in run], site, citation, figures=figures, ask=ask)
     echo(f"site of {len(run)} run{'s' * (len(run) > 1)}: {page}")
 
 

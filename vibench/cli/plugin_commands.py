@@ -14,7 +14,7 @@ from typer import Argument, Exit, Option
 from vibench.cli.completion import lists, plugin_options, plugins
 from vibench.cli.console import echo
 from vibench.errors import RequestError, VibenchError, in_a_line, unknown_name
-from vibench.plugins.kinds import CHECKED, FIGURE, PROBLEM, SAMPLING, SOLVER, STUDY, PluginKind
+from vibench.plugins.kinds import CHECKED, PROBLEM, SAMPLING, SOLVER, STUDY, PluginKind
 from vibench.text import parsed_json
 
 LISTS = {kind.plural: kind for kind in PluginKind}
@@ -44,7 +44,7 @@ def list_plugins(
         bool, Option("--sizes", help="Build every problem with its default options, and say how large it is.")
     ] = False,
 ) -> None:
-    """List problems, strategies, figures, studies and QP solvers.
+    """List problems, strategies, studies and QP solvers.
 
     Plugins are listed with their options; a list of one kind has the values of the options, too.
     """
@@ -182,8 +182,6 @@ def _loaded_rows(kind: PluginKind, sizes: bool = False) -> Iterator[Row]:
             if kind is PROBLEM:
                 lines += _parameters(plugin.load())
                 lines += [_size(plugin)] if sizes else []
-            if kind is FIGURE:
-                lines += _columns(name)
         except VibenchError as error:
             description = str(error)
         except Exception as error:  # noqa: BLE001  annotations of plugins are evaluated
@@ -214,15 +212,6 @@ def _size(plugin: RegisteredPlugin) -> str:
         return f"its size depends on {', '.join(needed)}"
     problem = plugin.load()()
     return f"n = {problem.V.dim} unknowns, m = {problem.W.dim} constraints"
-
-
-def _columns(plugin: str) -> Iterator[str]:
-    """The columns that a figure plugin adds to tables, each in a line."""
-    from vibench.results.plugin_columns import declared, loaded
-
-    for column in declared(plugin, loaded(plugin)):
-        unit = f" [{column.unit}]" * bool(column.unit)
-        yield f"column {column.name} of {column.table}{unit}: {column.meaning}"
 
 
 def _solvers_by_version() -> list[Row]:

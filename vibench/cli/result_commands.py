@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from typer import Argument, Exit, Option
 
 from vibench.cli.completion import SHOWN, cell_columns, cells, column_names, error_measures, runs, table_names
-from vibench.cli.console import echo, run_argument, warn
+from vibench.cli.console import echo, run_argument
 from vibench.errors import RequestError
 
 EXAMPLE = "solver = 'piqp' and beta_span_min < 1e-3"
@@ -89,7 +89,6 @@ def show(
     path = results_file(run)
     measured = partial(show.look_up, path, table, cell=cell, error=error, largest=within, queries=queries)
     view = measured(columns=parts(columns), where=where, sort=parts(sort), limit=limit)
-    warn(*view.faults)
     if form == "terminal" and cell and table == "summary" and not columns and len(view.rows):
         (key,) = view.rows["cell"]
         described, empty = view.described

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from functools import cached_property, partial
+from functools import cached_property
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -22,8 +21,7 @@ from vibench.model.bound_terms import CorrectionMode
 from vibench.offline.formulated import Formulated
 from vibench.offline.models import Model
 from vibench.results import formats, ranking, show
-from vibench.results.plugin_columns import Extended
-from vibench.results.read import cells_with_errors, extended, in_order, results_file
+from vibench.results.read import cells_with_errors, in_order, read_table, results_file
 from vibench.results.schema import TABLES
 from vibench.results.sqlite import read_meta, study_of
 from vibench.study.cells import NOT_MOVED
@@ -63,8 +61,6 @@ class Run:
     def table(self, name: str) -> pd.DataFrame:
         """A table of the results file, its rows in the order of the axes; the documentation lists the columns.
 
-        Columns that plugins add come last; one that cannot be computed is missing, with a warning.
-
         Raises
         ------
         RequestError
@@ -72,14 +68,7 @@ class Run:
         """
         if name not in TABLES:
             raise unknown_name("table", name, TABLES)
-        return in_order(self._extended(name).frame)
-
-    def _extended(self, name: str) -> Extended:
-        """A table with the columns of plugins; what cannot be used is a warning."""
-        table = extended(self.path, name)
-        for line in table.faults:
-            warnings.warn(line, stacklevel=4)
-        return table
+        return in_order(read_table(self.path, name))
 
     @property
     def cells(self) -> pd.DataFrame:
@@ -149,8 +138,7 @@ class Run:
     @property
     def summary(self) -> pd.DataFrame:
         """The table that `vibench show` prints."""
-        extended = self._extended("cells")
-        return formats.summary(extended.frame, extended.columns)
+        return formats.summary(read_table(self.path, "cells"))
 
     @property
     def findings(self) -> dict[str, list[str]]:
@@ -161,7 +149,7 @@ class Run:
 
     @requested
     def figure(self, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
-        """One figure of the run, to be shown or saved; a column of a plugin that cannot be computed is a warning.
+        """One figure of the run, to be shown or saved.
 
         Parameters
         ----------
@@ -177,28 +165,25 @@ class Run:
         """
         from vibench.report.figures import draw  # noqa: PLC0415  loads matplotlib
 
-        return draw(self.path, kind, problem, dual, partial(warnings.warn, stacklevel=4))
+        return draw(self.path, kind, problem, dual)
 
     @requested
     def write_tables(self, folder: Path | str | None = None) -> list[Path]:
         """Write every table as CSV, and the summary as Markdown; into `tables` beside the results file by default."""
         target = self.path.parent / "tables" if folder is None else Path(folder)
         with writing(target):
-            return show.export(self.path, target, partial(warnings.warn, stacklevel=4))
+            return show.export(self.path, target)
 
     @requested
     def write_figures(
         self, folder: Path | str | None = None, formats: Sequence[Literal["png", "svg", "pdf"]] = ("png", "svg")
     ) -> list[Path]:
-        """Write every figure, and their captions; into `figures` beside the results file by default.
-
-        A figure of a plugin that cannot be drawn, and a column of one that cannot be computed, is a warning.
-        """
+        """Write every figure, and their captions; into `figures` beside the results file by default."""
         from vibench.report.figures import draw_all  # noqa: PLC0415  loads matplotlib
 
         target = self.path.parent / "figures" if folder is None else Path(folder)
         with writing(target):
-            return draw_all(self.path, target, tuple(formats), note=partial(warnings.warn, stacklevel=3))
+            return draw_all(self.path, target, tuple(formats))
 
     @requested
     def report(self, path: Path | str | None = None, *, figures: bool = True) -> Path:

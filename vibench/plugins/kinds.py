@@ -43,7 +43,6 @@ class PluginKind(StrEnum):
         "formulation", "formulations", "formulations", "formulation", "formulation",
         "vibench.interfaces.formulations:Formulation",
     )  # fmt: skip
-    FIGURE = "figure plugin", "figures", "figures", "figure", "figures", "vibench.interfaces.figures:FigurePlugin"
     STUDY = "study", "studies", "studies"
     SOLVER = "QP solver", "solvers", "qp_solvers", "solver", "solver"
 
@@ -53,7 +52,7 @@ class PluginKind(StrEnum):
         return resolve_name(self._base) if self._base else None
 
 
-PROBLEM, SAMPLING, PRIMAL, DUAL, FORMULATION, FIGURE, STUDY, SOLVER = PluginKind
+PROBLEM, SAMPLING, PRIMAL, DUAL, FORMULATION, STUDY, SOLVER = PluginKind
 
 CHECKED = {kind.cli_name: kind for kind in PluginKind if kind.cli_name}
 """The kinds whose plugins `vibench check` examines and `vibench new` writes, by their names on the command line."""

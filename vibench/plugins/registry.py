@@ -270,7 +270,7 @@ def create(kind: str, name: str, options: Mapping[str, Any] | None = None) -> An
     Parameters
     ----------
     kind
-        "problem", "dual strategy", "primal strategy", "formulation", "sampling strategy" or "figure plugin".
+        "problem", "dual strategy", "primal strategy", "formulation" or "sampling strategy".
     name
         Name under which the plugin is registered.
     options

@@ -1,5 +1,7 @@
 """The public names of `vibench.report`: drawing of figures."""
 
+from .figures.data import ProblemTables as ProblemTables
+from .figures.data import problem_tables as problem_tables
 from .figures.looks import HIGH_FIDELITY_LOOK as HIGH_FIDELITY_LOOK
 from .figures.looks import Look as Look
 from .figures.looks import Looks as Looks
@@ -11,4 +13,6 @@ from .figures.style import CaptionedFigure as CaptionedFigure
 from .figures.style import Layout as Layout
 from .figures.style import Sheet as Sheet
 from .figures.style import plot as plot
+from .figures.style import save as save
 from .figures.style import scatter as scatter
+from .figures.style import styled as styled

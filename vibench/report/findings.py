@@ -19,12 +19,12 @@ from vibench.report.common_queries import FEWEST, MEANS, WAY, Comparable, common
 from vibench.report.figures.data import (
     PRIMAL,
     TABLES,
-    Data,
+    ProblemTables,
     best_solver,
     by_dimensions,
     label,
     label_of,
-    problems,
+    problem_tables,
     whole,
 )
 from vibench.results import consistency, formats
@@ -72,7 +72,7 @@ def findings(path: Path) -> dict[str, list[str]]:
     by_subject = defaultdict[str, list[str]](list)
     # as recorded: no finding is on a column of a plugin
     read = {name: read_table(path, name) for name in dict.fromkeys((*READ, *TABLES))}
-    for one in all_findings(read, problems(path, read)):
+    for one in all_findings(read, problem_tables(path, read)):
         by_subject[one.subject].append(one.text)
     return dict(by_subject)
 
@@ -81,10 +81,12 @@ READ = ("cells", "queries", "disagreements", "timings")
 """Tables that findings on the whole run are made from."""
 
 
-def all_findings(read: Mapping[str, pd.DataFrame], by_problem: Iterable[tuple[str, Data]]) -> Iterator[Finding]:
+def all_findings(
+    read: Mapping[str, pd.DataFrame], by_problem: Iterable[tuple[str, ProblemTables]]
+) -> Iterator[Finding]:
     """Every finding of a run, by subject: the whole run, then problem by problem.
 
-    They are made from the tables `READ` of the run, and from what `problems` gives: names and data of its problems.
+    They are made from the tables `READ` of the run and from its `problem_tables`.
     """
     paired = PairedTiming(read["timings"].to_dict("records"))
     for weight, text in _whole_run(read):
@@ -183,7 +185,7 @@ def _are(items: pd.DataFrame | list[Any]) -> str:
     return "is" if len(items) == 1 else "are"
 
 
-def _answer(data: Data, paired: PairedTiming) -> Iterator[str]:
+def _answer(data: ProblemTables, paired: PairedTiming) -> Iterator[str]:
     """The fastest query of a problem in the widest and in the narrowest band of the leaderboard."""
     for standings in leaderboard(data.cells, paired):
         if not standings.bands:
@@ -255,7 +257,7 @@ def _stability(cells: pd.DataFrame, compared: Comparable) -> Iterator[str]:
         )
 
 
-def _corrections(data: Data) -> Iterator[str]:
+def _corrections(data: ProblemTables) -> Iterator[str]:
     """What the correction of all solutions changes: errors and seconds against those of the same models without."""
     model = [name for name in KEYS if name != "correction"]
     both = data.cells.merge(data.cells[data.cells["correction"] == UNCORRECTED], on=model, suffixes=("", "_without"))
@@ -292,7 +294,7 @@ def _mean_error(error: float | None, over: str) -> str:
     return "" if error is None or pd.isna(error) else f"; the mean error of λ is {error:.3g}{over}"
 
 
-def _off_training(data: Data) -> Iterator[str]:
+def _off_training(data: ProblemTables) -> Iterator[str]:
     """Whether the share of the inf-sup constant that holds on the training set holds off it."""
     fixed = data.cells[data.cells["share_training"].notna()].drop_duplicates([*PRIMAL, "dual", "pair"])
     lost = fixed["share_training"] - fixed["share_validation"]
@@ -313,7 +315,7 @@ def _off_training(data: Data) -> Iterator[str]:
         )
 
 
-def _zero_solutions(data: Data) -> Iterator[str]:
+def _zero_solutions(data: ProblemTables) -> Iterator[str]:
     """Queries that have no relative error since the high-fidelity u or λ is zero, and how large the reduced one is."""
     for name, symbol in (("u", "u"), ("lambda", "λ")):
         zero = data.queries[data.queries[f"zero_{name}"] == 1]
@@ -357,7 +359,7 @@ def _costs(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Iterator[str]:
         yield f"Break-even of {name} against high-fidelity solutions: {break_even}."
 
 
-def _solvers(data: Data) -> Iterator[str]:
+def _solvers(data: ProblemTables) -> Iterator[str]:
     """Number of the programs that each solver solved, at each accuracy; median time and mean errors on common ones."""
     several = data.cells["accuracy"].nunique() > 1
     solved = data.queries[data.queries["status"] == Status.OK].groupby(WAY).size()

@@ -21,16 +21,15 @@ from vibench.files import write_atomically
 from vibench.qp.status import Status
 from vibench.report import findings
 from vibench.report.figures import FigureTask, figures_of, processes, render
-from vibench.report.figures.data import TABLES, Data, Extent, label_of, problems, whole
+from vibench.report.figures.data import TABLES, Extent, ProblemTables, label_of, problem_tables, whole
 from vibench.report.page import plots
 from vibench.report.page.grids import TableGrid, grid_of, grid_of_cells, grid_of_thresholds, script_safe, to_json
 from vibench.report.page.images import image_of
 from vibench.results import formats, pictures, ranking
 from vibench.results.break_even import MARGIN
 from vibench.results.paired_timing import PairedTiming
-from vibench.results.plugin_columns import Extended, faults_of
 from vibench.results.ranking import LARGEST_BAND, Criterion, Winner, leaderboard
-from vibench.results.read import extended_tables, in_order
+from vibench.results.read import in_order, read_table
 from vibench.results.selection import short_keys
 from vibench.results.sqlite import read_meta, study_of
 from vibench.stability.infsup import VANISHES
@@ -88,11 +87,10 @@ def page(path: Path, jobs: int = 1, *, figures: bool = True) -> str:
 
 
 def _page(path: Path, pool: ProcessPoolExecutor | None, *, figures: bool) -> str:
-    study, extended = study_of(path, read_meta(path)), extended_tables(path, READ)
-    faults, read = faults_of(extended.values()), {name: one.frame for name, one in extended.items()}
-    cells, data_of = in_order(read["cells"]), dict(problems(path, read))
-    del extended["histories"], read["histories"]  # of a large study millions of rows, which `data_of` has in order
-    grids = list(_grids({**extended, "cells": extended["cells"].of(cells)}))
+    study, read = study_of(path, read_meta(path)), {name: read_table(path, name) for name in READ}
+    cells, data_of = in_order(read["cells"]), dict(problem_tables(path, read))
+    del read["histories"]  # of a large study millions of rows, which `data_of` has in order
+    grids = list(_grids({**read, "cells": cells}))
     everything = list(findings.all_findings(read, data_of.items()))
     first, kept = findings.leading(everything), set(findings.leading(everything, findings.MOST + FOLDED))
     rest = [one for one in everything if one in kept and one not in first]
@@ -104,7 +102,7 @@ def _page(path: Path, pool: ProcessPoolExecutor | None, *, figures: bool) -> str
     first_plots = [p for name, data in data_of.items() for p in plots.overview(name, data, rows, paired, certified)]
     tasks = [task for name, data in data_of.items() for task in tasks_of(name, data)] if figures else []
     rendered = render(tasks, image_of, pool)
-    images = [image for figure in rendered for image in figure.pages]
+    images = [image for pages in rendered for image in pages]
     template = environment("templates", trim_blocks=True, lstrip_blocks=True).get_template("report.html.j2")
     return template.render(
         study=study.get("name", path.parent.name),
@@ -120,10 +118,7 @@ def _page(path: Path, pool: ProcessPoolExecutor | None, *, figures: bool) -> str
         more_findings=[(subject, list(group)) for subject, group in groupby(rest, key=lambda one: one.subject)],
         cells=len(cells),
         failed=int((cells["status"] != Status.OK).sum()),
-        missing=[
-            *(f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason),
-            *dict.fromkeys([*faults, *(figure.failure for figure in rendered if figure.failure)]),
-        ],
+        missing=[f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason],
         grids=grids,
         drawn=figures,
         images=images,
@@ -163,7 +158,7 @@ MOST_DUALS = 1
 """Dual strategies of a problem that have pictures of their own: those of the leaderboard first, then the others."""
 
 
-def tasks_of(name: str, data: Data) -> Iterator[FigureTask]:
+def tasks_of(name: str, data: ProblemTables) -> Iterator[FigureTask]:
     """The figures of a problem of which the page has pictures: of long ones the beginning."""
     winners = (winner for one in leaderboard(data.cells) for band in one.bands for winner in band.winners)
     ranked = dict.fromkeys([*filter(None, (str(winner.cell["dual"]) for winner in winners)), *data.duals])
@@ -193,34 +188,34 @@ def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, st
     yield "seconds", f"{seconds}; {disturbed} of {timed} timed cells were timed on a disturbed machine"
 
 
-def _grids(read: Mapping[str, Extended]) -> Iterator[TableGrid]:
+def _grids(read: Mapping[str, pd.DataFrame]) -> Iterator[TableGrid]:
     """The tables of the page, those of failures first; a table without rows is none."""
-    cells, thresholds = read["cells"].frame, read["thresholds"]
+    cells, thresholds = read["cells"], read["thresholds"]
     keys = short_keys(cells["cell"])
     failed = cells[cells["status"] != Status.OK][["cell", *IDENTITY, "queries_ok", "queries", "reason"]]
-    queries = read["queries"].frame
+    queries = read["queries"]
     failed_queries = queries[queries["status"] != Status.OK][["cell", "query", *IDENTITY, "reason"]]
     grids = [
         grid_of("failed", "Cells that are not ok", "", failed, IDENTITY, keys),
         grid_of("failed-queries", "Queries that are not ok", "", failed_queries, IDENTITY, keys),
-        grid_of_cells(read["cells"], ERRORS),
+        grid_of_cells(cells, ERRORS),
     ]
-    model = thresholds.frame["cell_a"].isna()
-    formulations = formats.between_formulations(thresholds.frame)
+    model = thresholds["cell_a"].isna()
+    formulations = formats.between_formulations(thresholds)
     caption = (
         "When b is cheaper than a, offline and online together, by the number of queries, with its 95 % interval; "
         f"as fast where the seconds of queries differ by less than a factor of {MARGIN:g}; undecided where the rounds "
         "do not tell."
     )
     for name, title, rows in (
-        ("enrichments", "Break-even between enrichments", thresholds.frame[~model & ~formulations]),
-        ("formulations", "Break-even between formulations", thresholds.frame[formulations]),
-        ("model", "Break-even against the high-fidelity model", thresholds.frame[model]),
+        ("enrichments", "Break-even between enrichments", thresholds[~model & ~formulations]),
+        ("formulations", "Break-even between formulations", thresholds[formulations]),
+        ("model", "Break-even against the high-fidelity model", thresholds[model]),
     ):
         if len(rows):
-            grids.append(grid_of_thresholds(name, title, caption, thresholds.of(rows), cells))
+            grids.append(grid_of_thresholds(name, title, caption, rows, cells))
     caption = "Any two solvers on one reduced model: relative differences of u in V, and the differences allowed."
-    disagreements = in_order(read["disagreements"].frame)
+    disagreements = in_order(read["disagreements"])
     disagreements = disagreements[["solver_a", *disagreements.columns.drop(["solver_a", "problem_options"])]]
     axes = ["problem", "dual", "primal", "primal_tol", "accuracy", "assembly", "solver_a", "solver_b"]
     grids.append(grid_of("disagreements", "Agreement of the solvers", caption, disagreements, axes, keys))

@@ -9,7 +9,6 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
-from types import MappingProxyType
 from typing import Any
 
 import pandas as pd
@@ -178,16 +177,14 @@ FORMS = {"markdown": to_markdown, "csv": to_csv, "latex": to_latex, "json": to_j
 """Formats in which a table is printed when the output is not a terminal."""
 
 
-def summary(cells: pd.DataFrame, plugins: Mapping[str, Column] = MappingProxyType({})) -> pd.DataFrame:
-    """The summary of a run: one row per cell, the columns with a heading in `CELLS`, and those of plugins with one."""
-    return _for_reading(in_order(cells), {**CELLS, **plugins})
+def summary(cells: pd.DataFrame) -> pd.DataFrame:
+    """The summary of a run: one row per cell, the columns with a heading in `CELLS`."""
+    return _for_reading(in_order(cells), CELLS)
 
 
-def break_even_table(
-    break_even_rows: pd.DataFrame, plugins: Mapping[str, Column] = MappingProxyType({})
-) -> pd.DataFrame:
+def break_even_table(break_even_rows: pd.DataFrame) -> pd.DataFrame:
     """The break-even table: the number of queries from which, or until which, b is cheaper than a."""
-    return _for_reading(in_order(break_even_rows), {**BREAK_EVEN, **plugins})
+    return _for_reading(in_order(break_even_rows), BREAK_EVEN)
 
 
 def between_formulations(break_even_rows: pd.DataFrame) -> pd.Series:

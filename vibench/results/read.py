@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from types import NoneType
 
 import pandas as pd
 
 from vibench.errors import RequestError
-from vibench.results import plugin_columns, ranking
+from vibench.results import ranking
 from vibench.results.break_even import Meaning
-from vibench.results.plugin_columns import Extended
 from vibench.results.schema import (
     BLOB,
     INTEGER,
@@ -105,24 +103,6 @@ RIGHT: Mapping[str, tuple[Callable[[object], bool], str]] = {
     "versions": (lambda value: json_object(value) is not None, "a JSON object"),
 }
 """What the values of some columns of texts have to be, and how it is said."""
-
-
-def extended(path: Path, table: str, cells: Sequence[str] = ()) -> Extended:
-    """One table of a results file with the columns that plugins add to it, in the order in which it was written.
-
-    With `cells`, only the rows of these are read: no plugin may add a column to the table, which may depend on others.
-
-    Raises a `RequestError` if it is damaged; what is wrong with a plugin is among the faults instead.
-    """
-    return plugin_columns.extended_tables((table,), partial(read_table, path, cells=cells))[table]
-
-
-def extended_tables(path: Path, names: Collection[str]) -> dict[str, Extended]:
-    """Several tables of a results file, as `extended` reads one; plugins are loaded once for all of them.
-
-    Raises a `RequestError` if one is damaged.
-    """
-    return plugin_columns.extended_tables(names, partial(read_table, path))
 
 
 def cells_with_errors(path: Path, measure: str = ranking.SOLUTION) -> tuple[pd.DataFrame, pd.Series]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import re
 import sqlite3
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,7 @@ import pandas as pd
 
 from vibench.arrays import Array
 from vibench.errors import RequestError, unknown_name
-from vibench.results.plugin_columns import Extended
-from vibench.results.schema import PARAMETER, STORED
+from vibench.results.schema import PARAMETER, STORED, Column
 from vibench.results.sqlite import of_cells, open_read_only
 from vibench.text import printable
 
@@ -34,26 +34,25 @@ def matching(
     path: Path,
     table: str,
     expression: str,
-    columns: Iterable[str],
-    plugins: Extended | None = None,
+    frame: pd.DataFrame,
+    added: Mapping[str, Column] = MappingProxyType({}),
     made: Collection[str] = (),
     cells: Sequence[str] = (),
 ) -> Array:
     """Which rows of a table satisfy an expression of SQLite over its columns, in the order they are read in.
 
     The expression may use columns, numbers, texts in single quotes and operators. It runs on a connection that cannot
-    write, under an authoriser that refuses functions, subqueries and other tables. One that names a column of a plugin
-    runs on a copy in memory.
+    write, under an authoriser that refuses functions, subqueries and other tables.
 
-    Of the columns that the table has one is suggested for a name that is none. `plugins` is the table with its columns
-    of plugins, if it has any; `made` are columns of what is made of the rows, which they do not have themselves. With
-    `cells`, only the rows of these are judged.
+    `frame` has the rows and the columns of the table, and those `added` to it, which are in no results file: an
+    expression that names one of these runs on a copy in memory. `made` are columns of what is made of the rows, which
+    they do not have themselves. With `cells`, only the rows of these are judged.
 
     Raises a `RequestError` if it is no such expression, or names a column that the table does not have.
     """
     query = f'SELECT ({expression}) IS TRUE FROM "{table}" NOT INDEXED WHERE {of_cells(cells)} ORDER BY rowid'
-    with _opened(path, table, expression, plugins) as db:
-        found = _answers(db, table, expression, (query, cells), columns, made)
+    with _opened(path, table, expression, frame, added) as db:
+        found = _answers(db, table, expression, (query, cells), frame.columns, made)
     return np.array([matches for (matches,) in found], dtype=bool)
 
 
@@ -116,13 +115,15 @@ def _text_free(expression: str) -> str:
 
 
 @contextlib.contextmanager
-def _opened(path: Path, table: str, expression: str, plugins: Extended | None) -> Iterator[sqlite3.Connection]:
-    """Context with the results file, or with a table in memory for an expression that names a column of a plugin."""
-    if plugins is None or not any(re.search(rf"(?i)\b{name}\b", _text_free(expression)) for name in plugins.columns):
+def _opened(
+    path: Path, table: str, expression: str, frame: pd.DataFrame, added: Mapping[str, Column]
+) -> Iterator[sqlite3.Connection]:
+    """Context with the results file, or with a table in memory for an expression that names an added column."""
+    if not any(re.search(rf"(?i)\b{name}\b", _text_free(expression)) for name in added):
         with open_read_only(path) as db:
             yield db
         return
-    frame, columns = plugins.frame, {**STORED[table], **plugins.columns}
+    columns = {**STORED[table], **added}
     kinds = ", ".join(f'"{name}" {columns.get(name, PARAMETER).kind.split()[0]}' for name in frame.columns)
     values = frame.astype(object).where(frame.notna(), None)
     with contextlib.closing(sqlite3.connect(":memory:")) as db:

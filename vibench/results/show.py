@@ -8,22 +8,18 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import NoReturn
 
 import pandas as pd
 
 from vibench.errors import RequestError, unknown_name
 from vibench.files import write_atomically
-from vibench.results import formats, plugin_columns, ranking, selection
-from vibench.results.formats import cell_text, csv_lines, summary, to_csv, to_markdown
+from vibench.results import formats, ranking, selection
+from vibench.results.formats import cell_text, csv_lines, summary, to_markdown
 from vibench.results.paired_timing import PairedTiming
-from vibench.results.plugin_columns import Extended
 from vibench.results.ranking import BAND
 from vibench.results.read import (
     cells_with_errors,
     checked,
-    extended,
-    extended_tables,
     in_order,
     read_table,
     terms_in_order,
@@ -136,8 +132,6 @@ class Table:
     """Options that tell plugins of one name apart, by the column of the name and the name."""
     parameters: Mapping[str, str] = field(default_factory=dict)
     """Names of the parameters of the problems by their columns, mu_1, mu_2, …"""
-    faults: tuple[str, ...] = ()
-    """A line for every column of a plugin that is missing, or every plugin that cannot be loaded."""
 
     @property
     def exact(self) -> pd.DataFrame:
@@ -218,13 +212,13 @@ def look_up(
     if name not in VIEWS:
         raise unknown_name("table", name, VIEWS)
     needed = _cells_needed(path, VIEWS[name], cell, where, sort, limit) if not error and largest is None else ()
-    view, extended = _measured(path, name, error, largest, needed, queries)
-    view, frame = _with_columns(view, extended.columns), extended.frame
+    view, frame = _measured(path, name, error, largest, needed, queries)
     everything = read_table(path, "cells") if needed else frame
     keys = everything.get("cell", [])
     if where:
+        added = {name: ranking.ERROR_COLUMNS[name] for name in ranking.ERROR_COLUMNS if name in frame}
         made = set(view.headings or {}) - set(frame.columns)
-        frame = frame[selection.matching(path, view.source, where, frame.columns, extended, made, needed)]
+        frame = frame[selection.matching(path, view.source, where, frame, added, made, needed)]
         if frame.empty:  # what keeps rows out of the table is not why there are none
             view = replace(view, empty="")
     if cell:
@@ -243,11 +237,11 @@ def look_up(
         asked = list(rows.columns)
     for column in asked:
         if column not in rows:
-            _refuse(name, column, [*rows, *by_heading], extended.faults)
+            raise unknown_name(f"column of {name}", column, [*rows, *by_heading])
     default = [column for column in dict.fromkeys(view.columns) if column in rows]
     shown = rows.head(limit) if limit else rows
     listed, length = tuple(dict.fromkeys(asked or default)), selection.short_keys(keys)
-    return Table(shown, listed, view, bool(asked), length, _varying_options(everything), named, extended.faults)
+    return Table(shown, listed, view, bool(asked), length, _varying_options(everything), named)
 
 
 def _parameters(path: Path, rows: pd.DataFrame) -> dict[str, str]:
@@ -282,7 +276,7 @@ FEW = 100
 def _cells_needed(path: Path, view: View, cell: str, where: str, sort: Sequence[str], limit: int) -> Sequence[str]:
     """Cells of all rows of a large table that are asked for, where they are few; none where all rows are read."""
     named = [key.removeprefix("-") for key in sort]
-    if view.source not in LARGE or not (cell or limit) or plugin_columns.is_extended(view.source):
+    if view.source not in LARGE or not (cell or limit):
         return ()
     if cell:
         return (_key_of(path, cell),)
@@ -343,24 +337,22 @@ def _with_options(name: str, text: str | None, keys: Sequence[str]) -> str:
 
 def _measured(
     path: Path, name: str, error: str, largest: float | None, cells: Sequence[str], queries: float | None
-) -> tuple[View, Extended]:
+) -> tuple[View, pd.DataFrame]:
     """A table for reading and its rows, or those of some cells, with errors by the measure that is asked for."""
-    view, table = VIEWS[name], extended(path, VIEWS[name].source, cells)
+    view, frame = VIEWS[name], read_table(path, VIEWS[name].source, cells)
     if queries is not None and name != "best":
         raise RequestError(f"--queries is for the table best, not for {name}")
     if name == "best":
-        return _best(path, view, error, largest, queries), table
+        return _best(path, view, error, largest, queries), frame
     if not error and largest is None:
-        return view, table
+        return view, frame
     if view.source != "thresholds":
         raise RequestError(f"the table {name} compares no models by an error; expected {', '.join(COMPARING)}")
     recorded, errors = cells_with_errors(path, error or ranking.SOLUTION)
-    frame = ranking.with_errors(table.frame, recorded, errors)
     first = ("problem", "dual", "primal_a", "primal_b", "benefit_threshold", "error_b", "error_a")
-    columns = {**table.columns, **ranking.ERROR_COLUMNS}
-    return replace(view, columns=tuple(dict.fromkeys((*first, *view.columns)))), replace(
-        table, frame=frame, columns=columns
-    )
+    columns = tuple(dict.fromkeys((*first, *view.columns, *ranking.ERROR_COLUMNS)))
+    headings = None if view.headings is None else {**view.headings, **ranking.ERROR_COLUMNS}
+    return replace(view, columns=columns, headings=headings), ranking.with_errors(frame, recorded, errors)
 
 
 def _best(path: Path, view: View, error: str, largest: float | None, queries: float | None) -> View:
@@ -381,21 +373,6 @@ COMPARING = ("best", *(name for name, view in VIEWS.items() if view.source == "t
 """Tables that compare models, for which an error measure can be asked."""
 
 
-def _with_columns(view: View, columns: Mapping[str, Column]) -> View:
-    """A table for reading with columns of plugins as the least important ones: all, or those with a heading."""
-    shown = [name for name, column in columns.items() if column.heading or view.headings is None]
-    headings = None if view.headings is None else {**view.headings, **columns}
-    return replace(view, columns=tuple(dict.fromkeys((*view.columns, *shown))), headings=headings)
-
-
-def _refuse(table: str, column: str, known: Iterable[str], faults: Sequence[str]) -> NoReturn:
-    """Refuse a column that the table does not have: a plugin may have failed to give it."""
-    for line in faults:
-        if line.startswith(f"column '{column}' of "):
-            raise RequestError(line)
-    raise unknown_name(f"column of {table}", column, known)
-
-
 SUMMARY = "summary.md"
 
 
@@ -403,28 +380,19 @@ EXPORTED = (*(f"{table}.csv" for table in TABLES), SUMMARY)
 """Names of the files that `export` writes."""
 
 
-def export(path: Path, folder: Path, note: Callable[[str], None] = lambda _: None) -> list[Path]:
-    """Write every table as CSV and the summary as Markdown into a folder; returns the files.
-
-    `note` is called with a line for every column of a plugin that could not be written.
-    """
+def export(path: Path, folder: Path) -> list[Path]:
+    """Write every table as CSV and the summary as Markdown into a folder; returns the files."""
     folder.mkdir(parents=True, exist_ok=True)
-    # The other tables are written as they are read: queries may be more than memory holds.
-    whole = extended_tables(path, [name for name in TABLES if name == "cells" or plugin_columns.is_extended(name)])
-    for line in plugin_columns.faults_of(whole.values()):
-        note(line)
-    texts: dict[str, Iterable[str]] = {
-        f"{name}.csv": [to_csv(whole_numbers(in_order(whole[name].frame)))] if name in whole else _csv_parts(path, name)
-        for name in TABLES
-    }
-    texts[SUMMARY] = [to_markdown(summary(whole["cells"].frame, whole["cells"].columns))]
+    # Tables are written as they are read: queries may be more than memory holds.
+    texts: dict[str, Iterable[str]] = {f"{name}.csv": _csv_parts(path, name) for name in TABLES}
+    texts[SUMMARY] = [to_markdown(summary(read_table(path, "cells")))]
     for name, parts in texts.items():
         write_atomically(folder / name, (part.encode("utf-8") for part in parts))
     return [folder / name for name in texts]
 
 
 def _csv_parts(path: Path, table: str) -> Iterator[str]:
-    """A table without columns of plugins as CSV, in the order of `in_order`, part by part."""
+    """A table as CSV, in the order of `in_order`, part by part."""
     header = True
     for part in read_parts(path, table, order=terms_in_order(STORED[table])):
         names, rows = checked(path, table, part)

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from vibench import Array, Cone, Problem, ProblemTables, Reduction, Stop, create
+from vibench import Array, Cone, Problem, Reduction, Stop, create
+from vibench.report import ProblemTables
 from vibench_problems.paper.published import PROBLEMS, Pair, Published
 
 PLAIN, MODIFIED = "cpg", "mcpg"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
-from vibench import ProblemTables
+from vibench.report import ProblemTables
 from vibench_problems.paper import constants, discs, membrane, method, offline, tables
 from vibench_problems.paper.claims import Claim
 from vibench_problems.paper.evidence import Evidence

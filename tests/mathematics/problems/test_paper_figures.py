@@ -13,15 +13,16 @@ from matplotlib.axes import Axes
 from running import Changed
 
 from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.report.figures.data import Data, problems
+from vibench.report.figures.data import ProblemTables, problem_tables
 from vibench.results.read import read_table
 from vibench_problems.hertz import Hertz
 from vibench_problems.line_contact import theory
 from vibench_problems.obstacle import RADIUS, Obstacle
 from vibench_problems.paper import published
+from vibench_problems.paper.__main__ import main
 from vibench_problems.paper.claims import Agreement, Claim, compared, exceptions, holds, typeset
 from vibench_problems.paper.evidence import Evidence, reached
-from vibench_problems.paper.figures import PaperFigures
+from vibench_problems.paper.figures import PAGE, drawings
 from vibench_problems.paper.sections import figure_claims, sections
 
 FIXED = "primal = 'offline-pga'"
@@ -49,13 +50,13 @@ HERTZ = as_published("hertz", "pod_tol = NULL, pod_size = 46, dual_tol = NULL, d
 OBSTACLE = as_published("obstacle", "pod_tol = 0.001", 0.5, 0.001)
 
 
-def tables_of(path: Path, problem: str) -> Data:
-    (data,) = [one for _, one in problems(path) if one.problem == problem]
+def tables_of(path: Path, problem: str) -> ProblemTables:
+    (data,) = [one for _, one in problem_tables(path) if one.problem == problem]
     return data
 
 
 def twins(path: Path, problem: str) -> dict[str, Callable[[], Any]]:
-    return dict(PaperFigures().drawings(tables_of(path, problem)))
+    return {f"figure-{number}": draw for number, draw in drawings(tables_of(path, problem)).items()}
 
 
 def the_claim(path: Path, problem: str, statement: str) -> Claim:
@@ -228,3 +229,31 @@ def test_claims_are_sorted_by_their_verdicts() -> None:
     assert reached({0: 1.0, 3: 0.1, 4: 0.05}, 0.1) == 3
     assert np.isnan(reached({0: 1.0}, 0.1))
     assert exceptions({1: 1.0, 2: 3.0, 9: 1.0}, {1: 1.0, 2: 2.0}) == [2]
+
+
+def test_the_command_draws_the_figures_of_runs_and_a_page(
+    quick_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    again = tmp_path / "again" / "results.sqlite"
+    again.parent.mkdir()
+    again.write_bytes((quick_run / "results.sqlite").read_bytes())
+    for problem in ("membrane", "discs"):
+        monkeypatch.setattr(f"vibench_problems.paper.figures.{problem}.solution", lambda _: None)
+    assert main([str(quick_run), str(again.parent), "--out", str(tmp_path / "drawn"), "--format", "svg"]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert f"page: {tmp_path / 'drawn' / PAGE}" in printed
+    assert "figure-4-again: again has no data for it" in printed
+    page = (tmp_path / "drawn" / PAGE).read_text(encoding="utf-8")
+    assert page.index("## Figure 5\n") < page.index("## Figure 5 again") < page.index("## Figure 11\n")
+    assert "Run quick, problem obstacle: resolution = coarse.\n\n**Published.** N for δ\\_POD = 0.001: 19; " in page
+    assert {file.stem for file in (tmp_path / "drawn").glob("*.svg")} >= {"figure-5", "figure-5-again", "figure-9"}
+
+
+def test_a_run_of_no_problem_of_the_paper_is_refused(
+    tmp_path: Path, changed: Changed, capsys: pytest.CaptureFixture[str]
+) -> None:
+    remaining = (f"DELETE FROM {table} WHERE problem = 'hertz'" for table in TABLES)
+    others = (f"UPDATE {table} SET problem_options = '{{\"bulge\": true}}'" for table in TABLES)
+    assert main([str(changed(*remaining, *others)), "--out", str(tmp_path / "drawn")]) == 2
+    assert "error: no problem of the paper in changed" in capsys.readouterr().err
+    assert not (tmp_path / "drawn").exists()

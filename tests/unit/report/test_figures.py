@@ -22,7 +22,7 @@ from running import DECIDED, Changed, execute
 
 from vibench.report import figures
 from vibench.report.figures import FORMATS, OF_DUAL, OF_HISTORIES, OF_PROBLEM, constants, convergence, costs, draw_all
-from vibench.report.figures import problems as of_file
+from vibench.report.figures import problem_tables as of_file
 from vibench.report.figures.data import Extent, _per_combination
 from vibench.report.figures.style import save, styled
 from vibench.results.read import read_table
@@ -576,7 +576,7 @@ def test_a_long_figure_is_drawn_in_parts(results: Path) -> None:
     pairs = pd.concat([data.queries.assign(pair=f"pair {k}") for k in range(8)])
     task = ("name", figures.inf_sup, replace(data, queries=pairs, extent=Extent.PAGES))
     (rendered,) = figures.render([task], lambda name, figure: (name, figure))
-    drawn = dict(rendered.pages)
+    drawn = dict(rendered)
     assert list(drawn) == ["name", "name-2"]
     assert [len([axes for axes in figure.axes if axes.get_title()]) for figure in drawn.values()] == [6, 2]
     assert [figure.caption[-12:] for figure in drawn.values()] == ["Part 1 of 2.", "Part 2 of 2."]

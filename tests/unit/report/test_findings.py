@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from running import DECIDED, Changed
 
-from vibench.report.figures.data import problems
+from vibench.report.figures.data import problem_tables
 from vibench.report.findings import MOST, READ, Finding, Weight, all_findings, findings, leading
 from vibench.results import formats
 from vibench.results.read import read_table
@@ -242,7 +242,7 @@ def test_the_fastest_of_a_problem_is_named_with_its_errors(said: Said, quick_run
 
 def test_findings_that_say_most_come_first_and_every_subject_has_a_turn(quick_run: Path) -> None:
     read = {name: read_table(quick_run / FILE, name) for name in READ}
-    found = list(all_findings(read, problems(quick_run / FILE, read)))
+    found = list(all_findings(read, problem_tables(quick_run / FILE, read)))
     first = leading(found)
     assert len(first) == MOST < len(found)
     assert [one.weight for one in first] == sorted(one.weight for one in first)

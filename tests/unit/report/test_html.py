@@ -13,11 +13,11 @@ from outputs import Links, clean, elements
 from running import Changed, Main
 
 from vibench.report import html
-from vibench.report.figures.data import problems
+from vibench.report.figures.data import problem_tables
 from vibench.report.findings import MOST, findings
 from vibench.report.page.grids import FIRST
 from vibench.results.ranking import leaderboard
-from vibench.results.read import extended_tables, in_order, read_table
+from vibench.results.read import in_order, read_table
 from vibench.results.schema import CELLS, TABLES
 from vibench.results.sqlite import FILE
 from vibench.text import brief
@@ -170,8 +170,8 @@ def test_a_run_without_any_query_has_a_report(changed: Changed) -> None:
 
 def test_a_strategy_that_is_labelled_high_fidelity_is_no_high_fidelity_model(changed: Changed) -> None:
     path = changed("UPDATE thresholds SET primal_a = 'high-fidelity'")
-    read = extended_tables(path, html.READ)
-    thresholds = read["thresholds"].frame
+    read = {name: read_table(path, name) for name in html.READ}
+    thresholds = read["thresholds"]
     found = {grid.name: len(grid.frame) for grid in html._grids(read)}
     assert found["enrichments"] == thresholds["cell_a"].notna().sum() > 0
     assert found["model"] == thresholds["cell_a"].isna().sum() > 0
@@ -182,7 +182,7 @@ def test_a_large_study_has_pictures_of_the_cones_that_win(changed: Changed, monk
     path = changed("UPDATE cells SET error_lambda_mean = 0.05, error_u_mean = 0.01")
     (hertz, _) = leaderboard(in_order(read_table(path, "cells")))
     (winner, *_) = hertz.bands[0].winners
-    ((name, data), _) = problems(path)
+    ((name, data), _) = problem_tables(path)
     names = [task[0] for task in html.tasks_of(name, data)]
     assert [one for one in names if one.endswith("inf-sup")] == [f"hertz-{winner.cell['dual']}-inf-sup"]
     assert {"hertz-errors", "hertz-total-cost"} <= {*names}

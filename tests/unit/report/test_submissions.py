@@ -17,6 +17,7 @@ import pytest
 from vibench.provenance import PROTOCOL
 from vibench.report.site.citation import Citation
 from vibench.report.site.publish import publish
+from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
 
 SCRIPTS = Path(__file__).parents[3] / "results" / "scripts"
@@ -92,7 +93,7 @@ def test_what_is_wrong_is_named(
 
 
 def test_another_protocol_and_residuals_above_the_accuracy_are_named(script: ModuleType, quick_run: Path) -> None:
-    cells, queries = (script.tables.read(quick_run / FILE, name) for name in ("cells", "queries"))
+    cells, queries = (read_table(quick_run / FILE, name) for name in ("cells", "queries"))
     earlier = cells.assign(versions=cells["versions"].str.replace(f'"protocol": "{PROTOCOL}"', '"protocol": "0"'))
     assert any(f"protocol 0, expected {PROTOCOL}" in line for line in script.of_cells(earlier))
     assert any("never timed" in line for line in script.of_cells(cells.assign(timing_rounds=0)))

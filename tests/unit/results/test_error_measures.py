@@ -18,7 +18,7 @@ from vibench.interfaces.strategies import Kind
 from vibench.report.figures import caption_of
 from vibench.report.figures.costs import break_even
 from vibench.report.figures.costs import outputs as figure_of_outputs
-from vibench.report.figures.data import problems
+from vibench.report.figures.data import problem_tables
 from vibench.results.break_even import break_even_rows
 from vibench.results.database import FILE, ResultsDatabase
 from vibench.results.ranking import BAND, errors_of, fastest, measures, with_errors, within
@@ -171,7 +171,7 @@ def test_a_pair_without_an_error_has_none() -> None:
 @pytest.mark.parametrize("count", [1, 2, 4, 5])
 def test_figures_of_any_number_of_outputs_are_drawn(count: int, tmp_path: Path) -> None:
     """Their panels need not fill a row."""
-    data = next(data for _, data in problems(write_sample_run(tmp_path / "run")))
+    data = next(data for _, data in problem_tables(write_sample_run(tmp_path / "run")))
     outputs = pd.concat([data.outputs.assign(output=f"force {k}") for k in range(count)], ignore_index=True)
     thresholds = data.thresholds.assign(benefit_threshold=9.0, threshold_low=8.0, threshold_high=10.0, meaning="from")
     known = type(data)(**{**vars(data), "outputs": outputs, "thresholds": thresholds})
@@ -188,7 +188,7 @@ DUALS = ("narrow", "wide")
 
 
 def test_the_figure_has_a_panel_for_every_measure_and_says_what_has_no_point(tmp_path: Path) -> None:
-    data = next(data for _, data in problems(write_sample_run(tmp_path / "run")))
+    data = next(data for _, data in problem_tables(write_sample_run(tmp_path / "run")))
     thresholds = data.thresholds.copy()
     mine = thresholds["cell_a"].isna()
     numbers = {"benefit_threshold": 50.0, "threshold_low": 40.0, "threshold_high": 60.0, "meaning": "from"}
@@ -209,7 +209,7 @@ def test_the_figure_has_a_panel_for_every_measure_and_says_what_has_no_point(tmp
 
 
 def test_the_figure_names_the_models_that_no_other_beats_in_both(tmp_path: Path) -> None:
-    data = next(data for _, data in problems(write_sample_run(tmp_path / "run")))
+    data = next(data for _, data in problem_tables(write_sample_run(tmp_path / "run")))
     rng, mine = np.random.default_rng(3), data.thresholds["cell_a"].isna()
     queries = pd.Series(rng.permutation(int(mine.sum())) * 10.0 + 10.0, index=data.thresholds.index[mine])
     thresholds = data.thresholds.assign(meaning="from", benefit_threshold=queries, threshold_low=9.0, threshold_high=70)

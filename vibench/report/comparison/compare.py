@@ -23,7 +23,6 @@ from vibench.report.comparison.differences import (
     Difference,
     agreement,
     of_numbers,
-    of_plugins,
     of_seconds,
 )
 from vibench.report.comparison.runs import AXES, ComparedRun, compared_runs
@@ -134,9 +133,8 @@ class Comparison:
 
         Raises a `RequestError` if there is no such column.
         """
-        columns = {**CELLS, **{name: one for run in self.runs for name, one in run.extended.columns.items()}}
-        if column not in columns:
-            raise unknown_name("column of cells", column, columns)
+        if column not in CELLS:
+            raise unknown_name("column of cells", column, CELLS)
         counts = range(2, len(self.runs) + 1)
         return self._across(counts, lambda run, key: run.cells.get(key, {}).get(column))
 
@@ -185,12 +183,9 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
         differences += [Difference(cell, "cell", "present", "gone", ChangeKind.WORSE) for cell in gone]
         differences += [Difference(cell, "cell", "", "new", ChangeKind.CHANGED) for cell in new]
         means = _on_common_queries(first, run, shared)
-        # a column that fails for one of the runs is no difference between their cells
-        judged = {name: better for name, better in first.extended.better.items() if name in run.extended.columns}
         for key in shared:
             one, two = first.cells[key] | means[0].get(key, {}), run.cells[key] | means[1].get(key, {})
             differences += of_numbers(one, two, limit)
-            differences += of_plugins(one, two, judged, limit)
         notes.append(f"{of_run}{len(shared)} cells are in both runs")
         if means[0]:
             notes.append(f"{of_run}errors of {len(means[0])} of them are compared on the queries that are ok in both")
@@ -203,7 +198,6 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
         if compared < len([key for key in run.cells if any(key in earlier.cells for earlier in runs[:k])]):
             notes.append(f"{of_run}times and break-even of different machines or protocols are not compared")
     notes += _agreements(runs)
-    notes += dict.fromkeys(line for run in runs for line in run.extended.faults)
     pairs = tuple(RunPair(*names, differences) for names, differences in by_pair.items())
     return Comparison(tuple(runs), pairs, tuple(notes))
 

@@ -94,22 +94,6 @@ def of_numbers(one: Mapping[str, Any], two: Mapping[str, Any], limit: float) -> 
             yield Difference(one, name, one[name], two[name], verdict)
 
 
-def of_plugins(
-    one: Mapping[str, Any], two: Mapping[str, Any], better: Mapping[str, str], limit: float
-) -> Iterator[Difference]:
-    """Differences of a cell in positive numbers that plugins derive, by whether "smaller" or "larger" ones are better.
-
-    Nobody knows which of them depend on seconds: they are undecided between machines, and where a row is disturbed.
-    """
-    comparable = one["machine"] == two["machine"] and not (one["disturbed"] == 1 or two["disturbed"] == 1)
-    for name, direction in better.items():
-        verdict = _verdict(one.get(name), two.get(name), limit, more_is_better=direction == "larger")
-        if verdict in (ChangeKind.WORSE, ChangeKind.BETTER) and not comparable:
-            verdict = ChangeKind.UNDECIDED
-        if verdict is not None:
-            yield Difference(one, name, one.get(name), two.get(name), verdict)
-
-
 def _solvers_part(cell: Mapping[str, Any], error: str) -> float:
     """What the QP solver contributed to an error at most: by the triangle inequality a mean moves by no more."""
     largest = cell.get(f"solver_{error.rpartition('_')[0]}_max") if error in ERRORS else None

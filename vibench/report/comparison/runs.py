@@ -12,8 +12,7 @@ from typing import Any
 import pandas as pd
 
 from vibench.qp.status import Status
-from vibench.results.plugin_columns import Extended
-from vibench.results.read import extended, in_order, read_table
+from vibench.results.read import in_order, read_table
 from vibench.results.sqlite import FILE, read_meta, study_of
 
 AXES = ("problem", "formulation", "dual", "primal", "asked", "solver", "accuracy", "assembly", "correction")
@@ -30,13 +29,8 @@ class ComparedRun:
     @cached_property
     def cells(self) -> dict[str, dict[str, Any]]:
         """Rows of the table of cells in the order of the axes, by key."""
-        rows = in_order(self.extended.frame).to_dict("records")
+        rows = in_order(read_table(self.path, "cells")).to_dict("records")
         return {str(row["cell"]): {str(name): value for name, value in row.items()} for row in rows}
-
-    @cached_property
-    def extended(self) -> Extended:
-        """The table of cells with the columns that plugins add to it."""
-        return extended(self.path, "cells")
 
     @cached_property
     def identity(self) -> dict[str, Any]:

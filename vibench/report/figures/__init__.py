@@ -9,11 +9,11 @@ import re
 import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Generic, TypeVar, cast
+from typing import TypeVar, cast
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -24,12 +24,14 @@ from vibench.files import TEMPORARY, read_regular, write_atomically
 from vibench.report.figures.constants import inf_sup, shares
 from vibench.report.figures.convergence import diagnostics, enrichment, orthogonality, projection_errors
 from vibench.report.figures.costs import break_even, dimension, outputs, total_cost, work_precision
-from vibench.report.figures.data import Data, Extent, file_names, problems
-from vibench.report.figures.plugins import DrawPages, FigureError, of_plugins
+from vibench.report.figures.data import Extent, ProblemTables, file_names, problem_tables
 from vibench.report.figures.solutions import solutions
 from vibench.report.figures.solvers import precision, solvers
-from vibench.report.figures.style import FORMATS, WRITTEN, caption_of, save, styled
+from vibench.report.figures.style import FORMATS, WRITTEN, Pages, caption_of, save, styled
 from vibench.text import json_object
+
+DrawPages = Callable[[ProblemTables], Pages]
+"""Draws the pages of a figure: none where there is nothing to draw."""
 
 OF_PROBLEM: dict[str, DrawPages] = {
     "solutions": solutions,
@@ -57,68 +59,50 @@ CAPTIONS = "captions.json"
 """File beside the figures: the caption of every figure, by the name of its files."""
 
 
-FigureTask = tuple[str, DrawPages, Data]
+FigureTask = tuple[str, DrawPages, ProblemTables]
 """A figure to be drawn: the name of its file, or of the first one, the function that draws its pages, and the data."""
 
 Made = TypeVar("Made")
 """What is made of a page."""
 
 
-def drawings(path: Path, note: Callable[[str], None] = lambda _: None) -> Iterator[FigureTask]:
-    """Every figure a results file may have, in files of a size that a page takes.
-
-    The functions of plugins raise `FigureError`; those of this package do not. `note` is called with a line for every
-    column of a plugin that the data do not have.
-    """
-    for name, data in problems(path, note=note):
+def drawings(path: Path) -> Iterator[FigureTask]:
+    """Every figure a results file may have, in files of a size that a page takes."""
+    for name, data in problem_tables(path):
         yield from figures_of(name, replace(data, extent=Extent.PAGES), data.duals)
 
 
-def figures_of(name: str, data: Data, duals: Collection[str]) -> Iterator[FigureTask]:
+def figures_of(name: str, data: ProblemTables, duals: Collection[str]) -> Iterator[FigureTask]:
     """The figures of a problem, whose names begin with its name, and of some of its dual strategies."""
     yield from ((f"{name}-{kind}", draw, data) for kind, draw in OF_PROBLEM.items())
     for dual, file in zip(data.duals, file_names(data.duals), strict=True):
         if dual in duals:
             of_dual = data.of_dual(dual)
             yield from ((f"{name}-{file}-{kind}", draw, of_dual) for kind, draw in OF_DUAL.items())
-    yield from ((f"{name}-{kind}", draw, data) for kind, draw in of_plugins(data, {*OF_PROBLEM, *OF_DUAL}).items())
 
 
-def draw(
-    path: Path,
-    kind: str,
-    problem: str | None = None,
-    dual: str | None = None,
-    note: Callable[[str], None] = lambda _: None,
-) -> Figure:
+def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
     """One figure of a results file.
 
-    Its kind is a key of `OF_PROBLEM` or `OF_DUAL`, or a figure of a plugin. The problem is given by its label ("LABEL,
-    TRAINING" where it has several training sets), the dual strategy for a kind of `OF_DUAL` by its own; `None` is for
-    the only one. `note` is called with a line for every column of a plugin that the data do not have.
+    Its kind is a key of `OF_PROBLEM` or `OF_DUAL`. The problem is given by its label ("LABEL, TRAINING" where it has
+    several training sets), the dual strategy for a kind of `OF_DUAL` by its own; `None` is for the only one.
 
-    Raises a `RequestError` if there is no such figure, or nothing to draw in it, and a `FigureError` if it is a
-    plugin's figure, which cannot be drawn.
+    Raises a `RequestError` if there is no such figure, or nothing to draw in it.
     """
-    faults: list[str] = []
-    by_problem = {data.problem: data for _, data in problems(path, note=faults.append)}
-    for line in faults:  # called here, so that a warning can name the line of the caller
-        note(line)
-    others = {name for data in by_problem.values() for name in of_plugins(data, {*OF_PROBLEM, *OF_DUAL})}
-    if kind not in {*OF_PROBLEM, *OF_DUAL, *others}:
-        raise unknown_name("figure", kind, (*OF_PROBLEM, *OF_DUAL, *sorted(others)))
+    by_problem = {data.problem: data for _, data in problem_tables(path)}
+    if kind not in OF_PROBLEM | OF_DUAL:
+        raise unknown_name("figure", kind, (*OF_PROBLEM, *OF_DUAL))
     data = _only("problem", by_problem, problem)
     if kind in OF_DUAL:
         data = _only("dual strategy", {name: data.of_dual(name) for name in data.duals}, dual)
-    draw_pages = (OF_PROBLEM | OF_DUAL | of_plugins(data, {*OF_PROBLEM, *OF_DUAL})).get(kind)
     with styled():
-        figure = None if draw_pages is None else next(iter(draw_pages(data)), None)
+        figure = next((OF_PROBLEM | OF_DUAL)[kind](data), None)
     if figure is None:
         raise RequestError(f"the run has no data for the figure '{kind}' of {data.problem}")
     return figure
 
 
-def _only(noun: str, by_label: Mapping[str, Data], label: str | None) -> Data:
+def _only(noun: str, by_label: Mapping[str, ProblemTables], label: str | None) -> ProblemTables:
     """The data under a label, or the only ones."""
     if label is None:
         if len(by_label) != 1:
@@ -149,36 +133,23 @@ def read_captions(folder: Path) -> dict[str, str]:
     return {name: str(text) for name, text in (captions or {}).items()}
 
 
-@dataclass(frozen=True)
-class Rendered(Generic[Made]):
-    """What became of a figure: what is made of its pages, and why a plugin could not draw it, "" if it could."""
-
-    pages: tuple[Made, ...]
-    failure: str = ""
-
-
 def draw_all(
     path: Path,
     folder: Path,
     formats: tuple[str, ...] = FORMATS,
     jobs: int = 1,
     progress: Callable[[str, int, int], None] = lambda *_: None,
-    note: Callable[[str], None] = lambda _: None,
 ) -> list[Path]:
     """Draw every figure that a results file has data for, in every format; returns the files written to the folder.
 
     Beside them is `CAPTIONS`, with the caption of every figure.
 
     Formats are keys of `style.WRITTEN`; `jobs` processes draw, this one included. `progress` is called before a figure
-    is drawn here, with its name, the number of those done, and that of all there may be, `note` with a line for every
-    column of a plugin that the data do not have, and for every figure of a plugin that could not be drawn.
+    is drawn here, with its name, the number of those done, and that of all there may be.
     """
-    faults: list[str] = []
     with processes(jobs) as pool:
-        figures = render(list(drawings(path, faults.append)), partial(_save, folder, formats), pool, progress)
-    for line in dict.fromkeys([*faults, *(figure.failure for figure in figures if figure.failure)]):
-        note(line)
-    pages = [page for figure in figures for page in figure.pages]
+        figures = render(list(drawings(path)), partial(_save, folder, formats), pool, progress)
+    pages = [page for figure in figures for page in figure]
     if pages:
         captions = read_captions(folder) | {name: caption for name, caption, _ in pages}
         text = json.dumps(captions, ensure_ascii=False, indent=1) + "\n"
@@ -213,9 +184,9 @@ def render(
     finish: Callable[[str, Figure], Made],
     pool: ProcessPoolExecutor | None = None,
     progress: Callable[[str, int, int], None] = lambda *_: None,
-) -> list[Rendered[Made]]:
+) -> list[list[Made]]:
     """Draw figures here and in the processes of a pool; `finish` makes something of every page and its name."""
-    rendered: dict[int, Rendered[Made]] = {}
+    rendered: dict[int, list[Made]] = {}
     with contextlib.ExitStack() as stack:
         awaited = {} if pool is None else stack.enter_context(_submitted(tasks, finish, pool))
         # the others draw from the last figure on, this process what only it can and then what they have not begun
@@ -234,14 +205,13 @@ def render(
 @contextlib.contextmanager
 def _submitted(
     tasks: Sequence[FigureTask], finish: Callable[[str, Figure], Made], pool: ProcessPoolExecutor
-) -> Iterator[dict[int, Future[Rendered[Made]]]]:
+) -> Iterator[dict[int, Future[list[Made]]]]:
     """Context with the figures that other processes may draw, by their places.
 
-    Those of plugins are not among them, since their functions need not go to other processes, and neither are those of
-    histories: of a large study these are millions of rows, which take longer to send than their few lines to draw.
+    Those of histories are not among them: of a large study these are millions of rows, which take longer to send than
+    their few lines to draw.
     """
-    shared = {*OF_PROBLEM.values(), *OF_DUAL.values()} - OF_HISTORIES
-    places = [k for k, (_, draw, _) in enumerate(tasks) if draw in shared]
+    places = [k for k, (_, draw, _) in enumerate(tasks) if draw not in OF_HISTORIES]
     # None, for a figure that reads histories without being one of OF_HISTORIES would not notice empty ones
     none = cast("pd.DataFrame", None)
     sent = [(name, draw, replace(data, histories=none)) for name, draw, data in (tasks[k] for k in places)]
@@ -263,16 +233,13 @@ def pages_of(task: FigureTask) -> Iterator[tuple[str, Figure]]:
         yield name + f"-{k}" * (k > 1), page
 
 
-def _render(task: FigureTask, finish: Callable[[str, Figure], Made]) -> Rendered[Made]:
+def _render(task: FigureTask, finish: Callable[[str, Figure], Made]) -> list[Made]:
     """Draw a figure, and make something of its pages."""
     with styled():
-        try:
-            return Rendered(tuple(finish(name, page) for name, page in pages_of(task)))
-        except FigureError as error:
-            return Rendered((), str(error))
+        return [finish(name, page) for name, page in pages_of(task)]
 
 
-def _render_sent(file: Path, number: int, finish: Callable[[str, Figure], Made]) -> Rendered[Made]:
+def _render_sent(file: Path, number: int, finish: Callable[[str, Figure], Made]) -> list[Made]:
     """Draw a figure of those that another process has written to a file."""
     return _render(_tasks_in(file)[number], finish)
 

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from vibench.interfaces.strategies import Kind
 from vibench.report.figures.data import (
     PRIMAL,
-    Data,
+    ProblemTables,
     at_best_tolerance,
     by_strategy,
     common_tolerances,
@@ -58,7 +58,7 @@ class _Panel(NamedTuple):
         return rows.set_index("query").reindex(self.order)
 
 
-def inf_sup(data: Data) -> Pages:
+def inf_sup(data: ProblemTables) -> Pages:
     """Inf-sup constants β of every primal strategy and of the high-fidelity pair over the validation set.
 
     First row: over the span; second row: over the cone, with the certified interval as a band. Fixed enrichments are
@@ -98,7 +98,7 @@ def loosest(constants: pd.DataFrame) -> pd.DataFrame:
     return constants.loc[~fixed | constants.index.isin(at_best_tolerance(compared, score).index)]
 
 
-def _panels(data: Data, shown: pd.DataFrame) -> list[_Panel]:
+def _panels(data: ProblemTables, shown: pd.DataFrame) -> list[_Panel]:
     """A panel for each pair, and several where there are more strategies than a panel takes."""
     panels, by_pair = [], dict(iter(shown.groupby("pair", sort=False)))
     for pair, sizes in data.queries[["pair", "N", "R"]].groupby("pair", sort=False):
@@ -139,7 +139,7 @@ def _name_zeros(panels: list[Axes], zeros: list[list[str]]) -> None:
             panel.text(0.02, 0.03, text, transform=panel.transAxes, fontsize=7)
 
 
-def _caption(data: Data, constants: pd.DataFrame, shown: pd.DataFrame, along: bool) -> str:
+def _caption(data: ProblemTables, constants: pd.DataFrame, shown: pd.DataFrame, along: bool) -> str:
     """What is shown, and which tolerances are not."""
     text = [
         f"Inf-sup constants β of {data.problem} with the cones of {data.duals[0]} at the validation parameters, "
@@ -155,7 +155,7 @@ def _caption(data: Data, constants: pd.DataFrame, shown: pd.DataFrame, along: bo
     return " ".join(text)
 
 
-def shares(data: Data) -> Pages:
+def shares(data: ProblemTables) -> Pages:
     """Smallest shares of β over the span in that of the whole of V: over the validation against the training set.
 
     One point per fixed enrichment. Below the diagonal, validation parameters are less stable than the training set; the

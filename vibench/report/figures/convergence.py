@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from vibench.arrays import Array
 from vibench.interfaces.strategies import Kind
 from vibench.report.figures.data import (
-    Data,
+    ProblemTables,
     at_best_tolerance,
     by_strategy,
     dimensions,
@@ -38,7 +38,7 @@ GROWTH = {"sigma": "largest σ, training set", "beta_span_min": "min β over spa
 POD = Series("POD")
 
 
-def diagnostics(data: Data) -> Pages:
+def diagnostics(data: ProblemTables) -> Pages:
     """Quantities that the problem reports at every parameter, such as the largest aspect ratio (paper, Figure 3)."""
     reported = data.histories[data.histories["stage"].isin(DIAGNOSED)]
     if reported.empty:
@@ -61,7 +61,7 @@ def diagnostics(data: Data) -> Pages:
     )
 
 
-def projection_errors(data: Data) -> Pages:
+def projection_errors(data: ProblemTables) -> Pages:
     """Relative projection errors of the POD and of the cones against their size (paper, Figures 5 and 11)."""
     errors = data.histories[data.histories["quantity"] == "error"]
     cones = _in_panels(errors[errors["stage"] == "cone"])
@@ -82,7 +82,7 @@ def projection_errors(data: Data) -> Pages:
     )
 
 
-def orthogonality(data: Data) -> Pages:
+def orthogonality(data: ProblemTables) -> Pages:
     """Relative distance of every generator from the cone of the preceding ones (paper, Figures 6 and 12)."""
     steps = data.histories[(data.histories["stage"] == "cone") & (data.histories["quantity"] == "e_orth")]
     if steps.empty:
@@ -128,7 +128,7 @@ def _cones(axes: Axes, cones: Mapping[str, pd.DataFrame], xlabel: str, ylabel: s
     counted(axes)
 
 
-def enrichment(data: Data) -> Pages:
+def enrichment(data: ProblemTables) -> Pages:
     """Fixed enrichments: σ and min β against the vectors added, β over the validation set (paper, Figures 7 and 14).
 
     One row of panels for every pair; the histories are those of the tolerance that went farthest, which contain the
@@ -158,7 +158,7 @@ def enrichment(data: Data) -> Pages:
         yield sheet.finish(_enrichment_caption(data, fixed), part)
 
 
-def _enrichment_caption(data: Data, fixed: pd.DataFrame) -> str:
+def _enrichment_caption(data: ProblemTables, fixed: pd.DataFrame) -> str:
     tolerances = ", ".join(
         f"{primal} at δ = {some(mine['primal_tol'].dropna())}"
         for primal, mine in fixed.groupby("primal", sort=False)
@@ -183,7 +183,9 @@ def _enrichment_rows(fixed: pd.DataFrame) -> list[tuple[str, str, list[tuple[str
     return rows
 
 
-def _validation(panel: Axes, data: Data, queries: pd.DataFrame, names: list[tuple[str, float]], looks: Looks) -> None:
+def _validation(
+    panel: Axes, data: ProblemTables, queries: pd.DataFrame, names: list[tuple[str, float]], looks: Looks
+) -> None:
     """β at the validation parameters: over the only parameter, or each curve sorted for itself."""
     wanted = {str(series(*name)) for name in names}
     for name, one in by_strategy(one_solver(queries)):

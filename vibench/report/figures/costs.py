@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from vibench.report.common_queries import on_common_queries
 from vibench.report.figures.data import (
     CORRECTED,
-    Data,
+    ProblemTables,
     best_solver,
     by_dimensions,
     label,
@@ -37,14 +37,14 @@ MODEL = ["primal", "primal_options", "way"]
 MARKS = {Meaning.FROM: ">", Meaning.UNTIL: "<"}
 
 
-def dimension(data: Data) -> Pages:
+def dimension(data: ProblemTables) -> Pages:
     """Errors against the dimension of the reduced problem, N + S + R; means over the queries that all cells solved."""
     cells = _of_one_assembly(best_solver(data.cells))
     size = cells["N"] + cells["enrichment"].fillna(0) + cells["R"]
     return _errors_against(data, cells, size, "dimension N + S + R", "errors against dimension")
 
 
-def work_precision(data: Data) -> Pages:
+def work_precision(data: ProblemTables) -> Pages:
     """Errors against the time of a query; no cell is both faster and more accurate than those on the line.
 
     Errors are means over the queries that all of these cells solved; a cell that solved fewer than half has no point.
@@ -55,7 +55,7 @@ def work_precision(data: Data) -> Pages:
 
 
 def _errors_against(
-    data: Data, cells: pd.DataFrame, x: pd.Series, xlabel: str, title: str, *, front: bool = False
+    data: ProblemTables, cells: pd.DataFrame, x: pd.Series, xlabel: str, title: str, *, front: bool = False
 ) -> Pages:
     """One point per cell with its (N, R) and δ; a row of panels for every dual strategy, assembly and correction."""
     compared = on_common_queries(cells[x.notna()], data.queries)
@@ -113,7 +113,7 @@ def _ways(cells: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
             yield part, mine, names
 
 
-def outputs(data: Data) -> Pages:
+def outputs(data: ProblemTables) -> Pages:
     """Errors of every quantity of interest, over its largest value of the training set, against the time of a query."""
     of_outputs = data.outputs.loc[data.outputs["error_scaled_mean"].notna(), ["cell", "output", "error_scaled_mean"]]
     models = best_solver(data.cells).merge(of_outputs, "inner", "cell")
@@ -141,7 +141,7 @@ def outputs(data: Data) -> Pages:
         )
 
 
-def break_even(data: Data) -> Pages:
+def break_even(data: ProblemTables) -> Pages:
     """Queries from which a reduced model is cheaper than the high-fidelity one, against its errors, also of outputs."""
     cells, numbers = best_solver(data.cells), ["benefit_threshold", "threshold_low", "threshold_high", "meaning"]
     against = data.thresholds[data.thresholds["cell_a"].isna()].set_index("cell_b")[numbers]
@@ -189,7 +189,7 @@ def _front(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return kept
 
 
-def total_cost(data: Data) -> Pages:
+def total_cost(data: ProblemTables) -> Pages:
     """Offline and online seconds against the number of queries; triangles mark where two models break even."""
     cells = best_solver(data.cells)
     panels = [

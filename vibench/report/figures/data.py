@@ -17,9 +17,8 @@ import pandas as pd
 from vibench.interfaces.formulations import MIXED
 from vibench.report.figures.looks import Series
 from vibench.results import pictures
-from vibench.results.plugin_columns import faults_of
 from vibench.results.ranking import too_loose
-from vibench.results.read import extended_tables, in_order
+from vibench.results.read import in_order, read_table
 from vibench.study.cells import NO_SUCH_AXIS
 from vibench.text import json_object
 
@@ -47,10 +46,10 @@ class Extent(Enum):
 
 
 @dataclass(frozen=True)
-class Data:
+class ProblemTables:
     """The tables of one problem of a run, and of one training set where it has several.
 
-    They are what figures and findings are made from (`vibench.ProblemTables`).
+    Figures and findings are made from them.
 
     Each has a column `pair`, a text of the values of `PAIR`; queries also have the columns `enrichment_kind`, `N` and
     `R` of their cells.
@@ -80,7 +79,7 @@ class Data:
         for k in range(count)[: 1 if self.extent is Extent.BEGINNING else count]:
             yield panels[k * most : (k + 1) * most], f"Part {k + 1} of {count}." * (count > 1)
 
-    def of_dual(self, dual: str) -> Data:
+    def of_dual(self, dual: str) -> ProblemTables:
         """The rows of one dual strategy."""
         frames = {name: getattr(self, name) for name in TABLES}
         return replace(self, **{name: frame[frame["dual"] == dual] for name, frame in frames.items()})
@@ -107,20 +106,14 @@ class Data:
         return [str(dual) for dual in self.queries["dual"].unique()]
 
 
-def problems(
-    path: Path,
-    given: Mapping[str, pd.DataFrame] = MappingProxyType({}),
-    note: Callable[[str], None] = lambda _: None,
-) -> Iterator[tuple[str, Data]]:
+def problem_tables(
+    path: Path, known: Mapping[str, pd.DataFrame] = MappingProxyType({})
+) -> Iterator[tuple[str, ProblemTables]]:
     """Every problem and training set of a results file that has queries, with the name its files begin with.
 
-    The training set is named where a problem has several. Tables that are `given` are not read again; `note` is called
-    with a line for every column of a plugin that those read here do not have.
+    The training set is named where a problem has several. Tables that are `known` are not read again.
     """
-    extended = extended_tables(path, [name for name in TABLES if name not in given])
-    for line in faults_of(extended.values()):
-        note(line)
-    read = {name: in_order(given[name] if name in given else extended.pop(name).frame) for name in TABLES}
+    read = {name: in_order(known[name] if name in known else read_table(path, name)) for name in TABLES}
     if read["queries"].empty:
         return
     for axis in ("training", "formulation", "dual", "primal"):
@@ -144,7 +137,7 @@ def problems(
         }
         drawn = tuple(one for one in shown if one.key == tuple(problem))
         options = json_object(problem[1]) or {}
-        yield name, Data(label, _plugin_name(mine["cells"], "problem"), options, **mine, pictures=drawn)
+        yield name, ProblemTables(label, _plugin_name(mine["cells"], "problem"), options, **mine, pictures=drawn)
 
 
 def _tell_apart(axis: str, cells: pd.DataFrame, frames: list[pd.DataFrame]) -> None:

@@ -12,7 +12,7 @@ from matplotlib.tri import Triangulation
 
 from vibench.arrays import Array
 from vibench.interfaces.pictures import Picture
-from vibench.report.figures.data import Data
+from vibench.report.figures.data import ProblemTables
 from vibench.report.figures.looks import BLACK, COLOURS
 from vibench.report.figures.style import ABREAST, CaptionedFigure, Layout, Pages, Sheet
 
@@ -26,7 +26,7 @@ EDGE = "#D55E00"
 """Colour of the boundary of the contact."""
 
 
-def solutions(data: Data) -> Pages:
+def solutions(data: ProblemTables) -> Pages:
     """High-fidelity solution above and multiplier below, at some training parameters; one range of values for all."""
     shown = [(one.title, one.picture) for one in data.pictures if one.picture is not None][:ABREAST]
     if shown:

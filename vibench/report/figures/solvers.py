@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from vibench.qp.status import Status
 from vibench.report.common_queries import PROGRAM, WAY, common_programs, of_solvers
-from vibench.report.figures.data import Data, parts
+from vibench.report.figures.data import ProblemTables, parts
 from vibench.report.figures.looks import Looks, Series
 from vibench.report.figures.style import SERIES, Pages, Sheet, plot, scatter
 
@@ -18,7 +18,7 @@ EXACT = 1e-16
 """Residuals and errors are drawn no lower than this."""
 
 
-def solvers(data: Data) -> Pages:
+def solvers(data: ProblemTables) -> Pages:
     """Time of every solver against the accuracy it achieves, and its performance profile (Dolan and Moré, 2002).
 
     A profile is the share of programs solved to the prescribed accuracy within a factor of the time of the fastest
@@ -51,7 +51,7 @@ def solvers(data: Data) -> Pages:
     )
 
 
-def precision(data: Data) -> Pages:
+def precision(data: ProblemTables) -> Pages:
     """Median time of a program against the part of the error of u and of λ that the solver makes, over the accuracy.
 
     Each point is one accuracy of one solver: median over the programs that are ok in all of these ways. A solver that

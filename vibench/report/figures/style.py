@@ -111,6 +111,11 @@ class CaptionedFigure(Figure):
     published: str = ""
     compared: str = ""
 
+    @property
+    def alternative(self) -> str:
+        """Alternative text for a page: the first sentence of the caption."""
+        return first_sentence(self.caption)
+
 
 Pages = Iterator[CaptionedFigure]
 """A figure: one page, several where it has too many panels for one, none where there is nothing to draw."""
@@ -125,12 +130,6 @@ def first_sentence(text: str) -> str:
     """The first sentence of a text; a point after a digit or a single letter ends none."""
     found = re.match(r".+?[^\W\d_]{2}[)’”]?\.(?= |$)", text)
     return found[0] if found else text
-
-
-def set_caption(figure: Figure, text: str) -> None:
-    """Give a figure a caption, unless it has one."""
-    if not caption_of(figure):
-        setattr(figure, "caption", text)  # noqa: B010  a figure of Matplotlib has no such attribute
 
 
 class Sheet:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
 
 from vibench.results import formats, show
-from vibench.results.plugin_columns import Extended
 from vibench.results.read import in_order
 from vibench.results.schema import BREAK_EVEN, CELLS, STORED, Column
 from vibench.results.selection import short_keys
@@ -57,12 +56,10 @@ class TableGrid:
     """Headings that are not shown at first."""
     disturbed: tuple[int, ...] = ()
     """Numbers of the rows whose seconds were measured on a disturbed machine."""
-    own: Mapping[str, Column] = field(default_factory=dict)
-    """Columns of plugins."""
 
     def meaning(self, heading: str) -> str:
         """What stands under a heading, and its unit; "" where nobody says."""
-        for name, column in [*self.own.items(), *RECORDED]:
+        for name, column in RECORDED:
             if heading in (name, column.heading):
                 return printable(f"{column.meaning} [{column.unit}]" if column.unit else column.meaning)
         return ""
@@ -79,24 +76,22 @@ RECORDED = [pair for table in (CELLS, BREAK_EVEN, *STORED.values()) for pair in 
 """Columns of all tables, those of cells first."""
 
 
-def grid_of_cells(extended: Extended, caption: str) -> TableGrid:
-    """The table of all cells, in the order of the rows; columns of plugins without a heading are offered besides."""
-    cells, columns, own = extended.frame, {**CELLS, **extended.columns}, tuple(extended.columns)
-    names = [n for n in (*OF_CELLS, *MORE_OF_CELLS, *own) if n in ("cell", *show.AXES) or cells[n].notna().any()]
-    says_nothing = [name for name in names if columns[name].heading and not formats.says_something(cells, name)]
+def grid_of_cells(cells: pd.DataFrame, caption: str) -> TableGrid:
+    """The table of all cells, in the order of the rows."""
+    names = [n for n in (*OF_CELLS, *MORE_OF_CELLS) if n in ("cell", *show.AXES) or cells[n].notna().any()]
+    says_nothing = [name for name in names if CELLS[name].heading and not formats.says_something(cells, name)]
     length = short_keys(cells["cell"])
-    frame = formats.under_headings(cells.assign(cell=cells["cell"].str[:length]), names, columns)
-    offered = (*MORE_OF_CELLS, *(name for name in own if not columns[name].heading))
-    hidden = [_heading(columns, name) for name in (*says_nothing, *offered) if name in names]
+    frame = formats.under_headings(cells.assign(cell=cells["cell"].str[:length]), names, CELLS)
+    hidden = [_heading(CELLS, name) for name in (*says_nothing, *MORE_OF_CELLS) if name in names]
     axes = tuple(_heading(CELLS, name) for name in (*show.AXES, "status"))
     disturbed, left_out = _disturbed(cells["cell"], cells), (*hidden, *_constant(frame))
-    return TableGrid("summary", "All cells", caption, frame, axes, left_out, disturbed, extended.columns)
+    return TableGrid("summary", "All cells", caption, frame, axes, left_out, disturbed)
 
 
-def grid_of_thresholds(name: str, title: str, caption: str, rows: Extended, cells: pd.DataFrame) -> TableGrid:
+def grid_of_thresholds(name: str, title: str, caption: str, rows: pd.DataFrame, cells: pd.DataFrame) -> TableGrid:
     """A table of break-even points; a row is disturbed if one of its cells is."""
-    ordered = in_order(rows.frame)
-    frame = formats.break_even_table(rows.frame, rows.columns)
+    ordered = in_order(rows)
+    frame = formats.break_even_table(rows)
     first = _heading(BREAK_EVEN, "primal_b")
     frame = frame[[first, *frame.columns.drop(first)]]
     results = {_heading(BREAK_EVEN, name) for name in ("benefit_threshold", "threshold_high")}
@@ -105,7 +100,7 @@ def grid_of_thresholds(name: str, title: str, caption: str, rows: Extended, cell
     disturbed = {*_disturbed(ordered["cell_a"], cells), *_disturbed(ordered["cell_b"], cells)}
     # Where all answers are undecided that is said: an interval alone would read like a result.
     hidden = tuple(heading for heading in _constant(frame) if heading not in results)
-    return TableGrid(name, title, caption, frame, axes, hidden, tuple(sorted(disturbed)), rows.columns)
+    return TableGrid(name, title, caption, frame, axes, hidden, tuple(sorted(disturbed)))
 
 
 def grid_of(name: str, title: str, caption: str, frame: pd.DataFrame, axes: Sequence[str], keys: int) -> TableGrid:

@@ -17,7 +17,7 @@ import pandas as pd
 
 from vibench.report.common_queries import on_common_queries
 from vibench.report.figures.costs import ERRORS
-from vibench.report.figures.data import Data, best_solver, label
+from vibench.report.figures.data import ProblemTables, best_solver, label
 from vibench.report.figures.looks import Look, Looks, Series
 from vibench.report.page.grids import short
 from vibench.results import ranking
@@ -74,7 +74,7 @@ class Plot:
     data: dict[str, Any]
 
 
-def plots(name: str, data: Data, rows: Mapping[str, int]) -> Iterator[Plot]:
+def plots(name: str, data: ProblemTables, rows: Mapping[str, int]) -> Iterator[Plot]:
     """The plots of one problem.
 
     The names of its pictures begin with `name`; `rows` has the row of every cell in the table of cells, from which the
@@ -111,7 +111,7 @@ QUERIES = np.logspace(0.0, 6.0, 61)
 
 
 def overview(
-    name: str, data: Data, rows: Mapping[str, int], paired: PairedTiming, certified: pd.Series
+    name: str, data: ProblemTables, rows: Mapping[str, int], paired: PairedTiming, certified: pd.Series
 ) -> Iterator[Plot]:
     """Errors, and certified ones, against the seconds of a query, and total costs over the number of queries.
 

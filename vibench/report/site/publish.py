@@ -19,9 +19,8 @@ from vibench.report.site.identifying import cleaned, left
 from vibench.report.site.published_run import FILTERED, SHOWN_CELLS, PublishedRun, folder_names
 from vibench.results import formats
 from vibench.results.paired_timing import PairedTiming
-from vibench.results.plugin_columns import faults_of
 from vibench.results.ranking import Criterion, Standings, leaderboard
-from vibench.results.read import extended_tables, in_order, read_table, whole_numbers
+from vibench.results.read import in_order, read_table, whole_numbers
 from vibench.results.sqlite import FILE, open_read_only
 
 TABLES = ("cells", "thresholds", "disagreements")
@@ -39,7 +38,6 @@ def publish(
     site: Path,
     citation: Citation,
     notes: Mapping[Path, str] | None = None,
-    warn: Callable[[str], None] = lambda _: None,
     *,
     figures: bool = True,
     ask: Callable[[Iterator[str]], None] = lambda _: None,
@@ -47,15 +45,14 @@ def publish(
     """Write the site of some results files; the same files give the same site.
 
     The folder is new, empty, or one that was written by this function, whose files are replaced. Notes are remarks on
-    results files, which stand on the pages of their runs; `warn` is called with a line for every column of a plugin
-    that a published table does not have; with `figures` reports have pictures. Paths, the user's name and that of the
-    host are taken out; `ask` gets lines on what could still identify somebody, before anything is written.
+    results files, which stand on the pages of their runs; with `figures` reports have pictures. Paths, the user's name
+    and that of the host are taken out; `ask` gets lines on what could still identify somebody, before anything is
+    written.
 
     Returns the first page. Raises a `RequestError` if a results file cannot be read, or the folder holds files of
     others or cannot be written.
     """
     folder.check(site)
-    faults: list[str] = []
     with tempfile.TemporaryDirectory(prefix=TEMPORARY) as scratch:
         copies = [Path(scratch, name, FILE) for name in _names(paths)]
         for path, copy in zip(paths, copies, strict=True):
@@ -67,9 +64,7 @@ def publish(
             PublishedRun(run, own, (notes or {}).get(path, ""))
             for run, path, own in zip(runs, paths, folder_names(names), strict=True)
         ]
-        folder.write(site, lambda new: faults.extend(_fill(new, published, citation, figures=figures)))
-    for line in dict.fromkeys(faults):
-        warn(line)
+        folder.write(site, lambda new: _fill(new, published, citation, figures=figures))
     return site / folder.FIRST_PAGE
 
 
@@ -83,11 +78,12 @@ def _names(paths: Sequence[Path]) -> list[str]:
     return names
 
 
-def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation, *, figures: bool) -> list[str]:
-    """Write all files of the site; returns lines on columns of plugins that tables do not have."""
+def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation, *, figures: bool) -> None:
+    """Write all files of the site."""
     pages = _Pages(citation)
     comparisons = {study: compare([run.run.path for run in group], LIMIT) for study, group in _comparable(runs)}
-    faults = [line for run in runs for line in _write_run(site / "runs" / run.folder, run, pages, figures)]
+    for run in runs:
+        _write_run(site / "runs" / run.folder, run, pages, figures)
     links = {run.run.name: f"runs/{run.folder}/index.html" for run in runs}
     pages.write(site / "leaderboard.html", "leaderboard", "", boards=list(_boards(runs)), links=links, way=html.way)
     sections = [_section(site, number, *item) for number, item in enumerate(comparisons.items(), start=1)]
@@ -96,25 +92,20 @@ def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation, *, figur
     pages.write(site / folder.FIRST_PAGE, "index", "", runs=runs, filters=filters)
     _write(site / "CITATION.cff", citation.cff())
     _write(site / "citation.bib", citation.bibtex())
-    return faults
 
 
-def _write_run(own: Path, run: PublishedRun, pages: _Pages, figures: bool) -> list[str]:
-    """Write the folder of one run: its page and report, its data, and what installs its versions.
-
-    Returns lines on columns of plugins that its tables do not have.
-    """
+def _write_run(own: Path, run: PublishedRun, pages: _Pages, figures: bool) -> None:
+    """Write the folder of one run: its page and report, its data, and what installs its versions."""
     (own / "tables").mkdir(parents=True)
     with open_read_only(run.run.path) as db:
         db.execute("VACUUM INTO ?", (str((own / FILE).absolute()),))
     _write(own / "report.html", html.page(run.run.path, figures=figures))
-    extended = extended_tables(run.run.path, TABLES)
-    for name, one in extended.items():
-        _write(own / "tables" / f"{name}.csv", formats.to_csv(whole_numbers(in_order(one.frame))))
+    for name in TABLES:
+        rows = whole_numbers(in_order(read_table(run.run.path, name)))
+        _write(own / "tables" / f"{name}.csv", formats.to_csv(rows))
     _write(own / "requirements.txt", requirements(run.run.versions, run.code))
     _write(own / "provenance.json", json.dumps(run.provenance, indent=1, ensure_ascii=True, sort_keys=True) + "\n")
     pages.write(own / "index.html", "run", "../../", run=run, cells=run.cells(), columns=SHOWN_CELLS, tables=TABLES)
-    return faults_of(extended.values())
 
 
 def _comparable(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, list[PublishedRun]]]:
