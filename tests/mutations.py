@@ -115,7 +115,7 @@ FAULTS = (
     ),
     Fault(
         "coefficientwise-constraint-dropped",
-        "vibench/reduction/cone_parts.py",
+        "vibench/reduction/cone_subtraction.py",
         "B=np.vstack([-np.eye(count), units[:, None] * generators[support]]),\n"
         "        g=np.concatenate([np.zeros(count), units * theta[support]]),",
         "B=-np.eye(count),\n        g=np.zeros(count),",
@@ -221,7 +221,7 @@ FAULTS = (
     ),
     Fault(
         "cone-interval-too-narrow",
-        "vibench/stability/conic_infsup.py",
+        "vibench/stability/infsup.py",
         "return max(0.0, float(np.min(M[positive] / G[positive])) - len(G) * negative)",
         "return max(0.0, float(np.min(M[positive] / G[positive])))",
         ("tests/unit/stability/test_conic_infsup.py",),
@@ -291,7 +291,7 @@ FAULTS = (
     ),
     Fault(
         "equality-with-one-side-alone",
-        "vibench/qp/rows.py",
+        "vibench/qp/exact.py",
         "np.maximum(-forces, 0.0)",
         "0.0 * forces",
         ("tests/unit/qp/test_rows.py", "tests/unit/model/test_hard_rows.py"),

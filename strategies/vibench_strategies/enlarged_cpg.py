@@ -8,7 +8,7 @@ import numpy as np
 from annotated_types import Ge
 
 from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, greedy_cone, no_free, project_on_cone
-from vibench.reduction import part_in_cone
+from vibench.reduction import subtract_cone_component
 from vibench_strategies.snapshot_cones import projection_errors
 
 ROUND_OFF = 1e-9
@@ -35,10 +35,9 @@ class EnlargedCPG(DualStrategy):
                 if project_on_cone(others, chi[:, i], W).distance <= ROUND_OFF:
                     changed, chi = True, others  # i stays: it is now the index of the next generator
                     continue
-                part, note = part_in_cone(chi[:, i], others, W)
+                rest, note = subtract_cone_component(chi[:, i], others, W)
                 notes += [f"sweep {sweep}, generator {i + 1}: {note}"] if note else []
-                if W.norm(part) > ROUND_OFF:
-                    rest = chi[:, i] - part
+                if W.norm(chi[:, i] - rest) > ROUND_OFF:
                     changed, chi = True, np.insert(others, i, rest / W.norm(rest), axis=1)
                 i += 1
             if not changed:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vibench import Array, Cone, DualStrategy, InnerProduct, Stop
-from vibench.reduction import GrowingCone, part_in_cone
+from vibench.reduction import GrowingCone, subtract_cone_component
 
 
 class ModifiedCPG(DualStrategy):
@@ -14,8 +14,8 @@ class ModifiedCPG(DualStrategy):
         cone = GrowingCone(snapshots, W)
         while not cone.reached(stop):
             theta = snapshots[:, cone.farthest]  # lines 5 to 8: the snapshot with the largest projection error
-            upsilon, note = part_in_cone(theta, cone.generators, W)  # line 9
+            rest, note = subtract_cone_component(theta, cone.generators, W)  # line 9
             # Lines 10 and 11. Where θ − Υ vanishes the algorithm ends (Remark 4.2).
-            if not cone.add(theta - upsilon, note):
+            if not cone.add(rest, note):
                 break
         return cone.result()

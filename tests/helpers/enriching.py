@@ -10,7 +10,7 @@ from vibench import Cone, Kind, Offline, Problem, Reduction, Stop, no_free
 from vibench.model.galerkin import ReducedModel
 from vibench.offline.sweep import high_fidelity_sweep
 from vibench.reduction import LazyMaximum
-from vibench.stability.infsup import multipliers
+from vibench.stability.infsup import cone_basis
 from vibench_strategies.cpg import CPG
 from vibench_strategies.online_supremizers import OnlineSupremizers
 
@@ -22,7 +22,7 @@ def offline(problem: Problem, count: int, modes: int, generators: int) -> Offlin
     basis = problem.V.orthonormalise(solved.u)[:, :modes]
     chi = solved.lam[:, :generators] / problem.W.norm(solved.lam[:, :generators])
     cone = Cone(chi, np.ones(1), no_free(generators))
-    return Offline(problem, basis, cone, multipliers(chi, problem.W).span, training)
+    return Offline(problem, basis, cone, cone_basis(chi, problem.W).span, training)
 
 
 def reduced_from(problem: Problem, kind: Kind, modes: int, generators: int) -> ReducedModel:

@@ -23,7 +23,7 @@ from vibench.qp.status import Status
 from vibench.qp.verification import kkt_residuals, verify
 from vibench.reduction.cones import orthogonality, project_on_cone
 from vibench.results.consistency import EFFECTIVITIES, violations
-from vibench.stability.infsup import inf_sup, multipliers
+from vibench.stability.infsup import cone_basis, inf_sup
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
@@ -42,7 +42,7 @@ def model(free: list[bool]) -> tuple[ReducedModel, Cone]:
     chi = np.column_stack([s.lam for s in solved])
     cone = Cone(chi / problem.W.norm(chi), np.ones(5), np.array(free))
     basis = problem.V.orthonormalise(np.column_stack([s.u for s in solved]))
-    span = multipliers(cone.generators, problem.W, cone.free).span
+    span = cone_basis(cone.generators, problem.W, cone.free).span
     return ReducedModel(problem, basis, Enrichment(Kind.PER_PARAMETER, eta=span), cone.rays, span), cone
 
 
@@ -97,7 +97,7 @@ def test_the_constant_of_a_cone_with_free_generators_is_between_span_and_ordinar
     W, chi = space(6, seed), rng.random((6, 4))
     chi /= W.norm(chi)
     images, free = rng.standard_normal((7, 6)) @ chi, np.array([True, False, True, False])
-    ordinary, mixed, unsigned = (multipliers(chi, W, mask) for mask in (None, free, np.ones(4, dtype=bool)))
+    ordinary, mixed, unsigned = (cone_basis(chi, W, mask) for mask in (None, free, np.ones(4, dtype=bool)))
     on_span = images @ np.linalg.lstsq(chi, mixed.span, rcond=None)[0]
     plain, some, every = (inf_sup(on_span, images, cone) for cone in (ordinary, mixed, unsigned))
     assert every.cone_lower == every.cone_upper == every.span == plain.span

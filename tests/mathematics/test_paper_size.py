@@ -12,7 +12,7 @@ from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.strategies import Cone, DualStrategy, Offline, Stop
 from vibench.reduction.cones import orthogonality
 from vibench.reduction.pod import pod
-from vibench.stability.infsup import inf_sup_full, inf_sup_on, multipliers, nodal_multipliers
+from vibench.stability.infsup import cone_basis, inf_sup_full, inf_sup_on, nodal_cone
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies.cpg import CPG
 from vibench_strategies.mcpg import ModifiedCPG
@@ -75,10 +75,10 @@ def test_stability_of_the_pair_where_span_and_cone_differ(training, cone) -> Non
     problem, u, _ = training
     basis = pod(u, problem.V, Stop(tolerance=1e-3)).basis
     chi = cone(ModifiedCPG, 1e-2)
-    prepared = multipliers(chi.generators, problem.W)
+    prepared = cone_basis(chi.generators, problem.W)
     B = problem.assemble(np.array([1.0, 0.0, 0.0])).B
     plain, full = inf_sup_on(basis, B, prepared), inf_sup_full(problem.V, B, prepared)
-    hf = inf_sup_full(problem.V, B, nodal_multipliers(problem.W))
+    hf = inf_sup_full(problem.V, B, nodal_cone(problem.W))
     assert plain.span == 0.0
     assert 0.01 < plain.cone_lower <= plain.cone_upper < 0.03
     assert plain.cone_upper - plain.cone_lower < 0.01 * plain.cone_upper
@@ -94,7 +94,7 @@ def test_nearly_parallel_generators_of_the_plain_greedy_keep_the_online_constant
     """Supremizers of the generators themselves lost directions here: β_on came out at 1e-7 instead of 1e-3."""
     problem, u, _ = training
     basis = pod(u, problem.V, Stop(tolerance=1e-4)).basis
-    prepared = multipliers(cone(CPG, 1e-3).generators, problem.W)
+    prepared = cone_basis(cone(CPG, 1e-3).generators, problem.W)
     assert prepared.rank < prepared.chi.shape[1]
     B = problem.assemble(np.array([1.0, 0.0, 0.0])).B
     V = problem.V

@@ -17,8 +17,7 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import check_symmetric
 from vibench.linalg.schur_complement import FEW_PER_UNKNOWN, EliminationPattern
 from vibench.qp import verification
-from vibench.qp.exact import least_distance_solution
-from vibench.qp.rows import rows_that_matter
+from vibench.qp.exact import least_distance_solution, rows_that_matter
 from vibench.qp.scaling import peak, ratio, row_norms
 from vibench.qp.solve import solve_qp
 

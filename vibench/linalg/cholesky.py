@@ -17,7 +17,7 @@ from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.linalg import UNIT_ROUND_OFF
-from vibench.linalg.definite import BlockDiagonal, dense_cholesky, mirrored
+from vibench.linalg.definite import BlockDiagonal, Factor, FactoredElimination, dense_cholesky, mirrored
 
 SPACE, PANEL = 32, 20
 """Entries of a row from which on factors are so full that SuperLU is the fastest with panels of so many columns, as
@@ -60,7 +60,7 @@ def few_at_once(solve: Callable[[Array], Array], right: Array) -> Array:
     return solved
 
 
-class SparseCholesky:
+class SparseCholesky(Factor):
     """X = FᵀF for a sparse symmetric positive definite X (n×n), in minimum degree order, without pivoting.
 
     Parameters
@@ -131,7 +131,7 @@ class SparseCholesky:
         return _scale_rows(1.0 / self._root, _triangular_solutions(self._lower, permuted, lower=True))
 
 
-class PartialCholesky:
+class PartialCholesky(FactoredElimination):
     """A sparse symmetric positive definite X (n×n) of which all unknowns but a few are eliminated.
 
     With the eliminated unknowns i and the last ones c, the factors of [X_ii 0; X_ci I] without pivoting are those of

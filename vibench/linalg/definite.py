@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -157,3 +158,66 @@ def _inverse(block: Array, overwrite: bool) -> Array:
     """The inverse, row by row in memory: sparse products copy LAPACK's columns."""
     factor = scipy.linalg.cholesky(block.T, lower=True, overwrite_a=overwrite)  # the transpose is the columns of rows
     return mirrored(np.asarray(dpotri(factor, lower=True, overwrite_c=True)[0])).T
+
+
+class Factor(ABC):
+    """A factor of a sparse symmetric positive definite X (n×n)."""
+
+    @abstractmethod
+    def solve(self, right: Array) -> Array:
+        """X⁻¹ r for right-hand sides (n,) or (n, k)."""
+
+    def entries(self, n: int) -> float:
+        """Upper bound of the number of entries of the triangular factor of a matrix (n×n)."""
+        return n * (n + 1.0) / 2.0
+
+
+class Elimination(ABC):
+    """A sparse symmetric positive definite X (n×n) of which all unknowns i but the last ones c are eliminated."""
+
+    @property
+    @abstractmethod
+    def nbytes(self) -> int:
+        """Memory of the factors."""
+
+    @abstractmethod
+    def schur_blocks(self) -> BlockDiagonal:
+        """The Schur complement S = X_cc − X_ci X_ii⁻¹ X_ic (c×c), body by body."""
+
+    @abstractmethod
+    def eliminate(self, right: Array) -> tuple[Array, Array]:
+        """For r (n,) or (n, k), X_ii⁻¹ r_i and the load of the Schur complement, r_c − X_ci X_ii⁻¹ r_i."""
+
+    @abstractmethod
+    def extend(self, last: Array) -> Array:
+        """Solution (n,) or (n, k) of X u = 0 in the rows of i, with u (c,) or (c, k) given on the last unknowns."""
+
+
+class FactoredElimination(Elimination):
+    """An elimination with a factor F of X = FᵀF, upper triangular in an order that ends with the last unknowns."""
+
+    @property
+    @abstractmethod
+    def trailing_factor(self) -> Array:
+        """The trailing block F_cc (c×c) of F, upper triangular, with F_ccᵀF_cc = S.
+
+        Raises a `NumericalError` if S, and with it X, is not positive definite.
+        """
+
+    @abstractmethod
+    def apply_factor(self, u: Array) -> Array:
+        """F u, for u (n,) or (n, k): first the entries of i."""
+
+    @abstractmethod
+    def solve_factor_transposed(self, right: Array) -> Array:
+        """F⁻ᵀ r, for r (n,) or (n, k); a functional on the last unknowns has nonzeros only in the last entries."""
+
+
+def checked(matrix: SparseMatrix, name: str) -> SparseMatrix:
+    """Return the matrix (CSC); raises a `NumericalError` if an entry is not finite, or a diagonal one not positive."""
+    matrix = sp.csc_array(matrix)
+    if not np.all(np.isfinite(matrix.data)):
+        raise NumericalError(f"{name} has entries that are not finite")
+    if not np.all(matrix.diagonal() > 0.0):
+        raise NumericalError(f"{name} is not positive definite")
+    return matrix

@@ -16,62 +16,9 @@ from scipy.sparse.csgraph import connected_components
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError, RequestError, unknown_name
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky, elimination_order
-from vibench.linalg.definite import BlockDiagonal
+from vibench.linalg.definite import BlockDiagonal, Elimination, Factor, FactoredElimination, checked
 from vibench.provenance import distribution_version
 from vibench.text import brief
-
-
-class Factor(ABC):
-    """A factor of a sparse symmetric positive definite X (n×n)."""
-
-    @abstractmethod
-    def solve(self, right: Array) -> Array:
-        """X⁻¹ r for right-hand sides (n,) or (n, k)."""
-
-    def entries(self, n: int) -> float:
-        """Upper bound of the number of entries of the triangular factor of a matrix (n×n)."""
-        return n * (n + 1.0) / 2.0
-
-
-class Elimination(ABC):
-    """A sparse symmetric positive definite X (n×n) of which all unknowns i but the last ones c are eliminated."""
-
-    @property
-    @abstractmethod
-    def nbytes(self) -> int:
-        """Memory of the factors."""
-
-    @abstractmethod
-    def schur_blocks(self) -> BlockDiagonal:
-        """The Schur complement S = X_cc − X_ci X_ii⁻¹ X_ic (c×c), body by body."""
-
-    @abstractmethod
-    def eliminate(self, right: Array) -> tuple[Array, Array]:
-        """For r (n,) or (n, k), X_ii⁻¹ r_i and the load of the Schur complement, r_c − X_ci X_ii⁻¹ r_i."""
-
-    @abstractmethod
-    def extend(self, last: Array) -> Array:
-        """Solution (n,) or (n, k) of X u = 0 in the rows of i, with u (c,) or (c, k) given on the last unknowns."""
-
-
-class FactoredElimination(Elimination):
-    """An elimination with a factor F of X = FᵀF, upper triangular in an order that ends with the last unknowns."""
-
-    @property
-    @abstractmethod
-    def trailing_factor(self) -> Array:
-        """The trailing block F_cc (c×c) of F, upper triangular, with F_ccᵀF_cc = S.
-
-        Raises a `NumericalError` if S, and with it X, is not positive definite.
-        """
-
-    @abstractmethod
-    def apply_factor(self, u: Array) -> Array:
-        """F u, for u (n,) or (n, k): first the entries of i."""
-
-    @abstractmethod
-    def solve_factor_transposed(self, right: Array) -> Array:
-        """F⁻ᵀ r, for r (n,) or (n, k); a functional on the last unknowns has nonzeros only in the last entries."""
 
 
 class _Empty(Factor):
@@ -79,10 +26,6 @@ class _Empty(Factor):
 
     def solve(self, right: Array) -> Array:
         return np.zeros_like(right, dtype=float)
-
-
-FactoredElimination.register(PartialCholesky)
-Factor.register(SparseCholesky)
 
 
 class Implementation(ABC):
@@ -132,13 +75,13 @@ class _SuperLU(Implementation):
     name, summary = "superlu", "SuperLU of SciPy"
 
     def _factor(self, matrix: SparseMatrix, name: str) -> Factor:
-        return SparseCholesky(matrix, name)  # type: ignore[return-value]
+        return SparseCholesky(matrix, name)
 
-    def eliminate(self, matrix: SparseMatrix, order: Indices, last: int, name: str) -> Elimination:
-        return PartialCholesky(matrix, order, last, name)  # type: ignore[return-value]
+    def eliminate(self, matrix: SparseMatrix, order: Indices, last: int, name: str) -> FactoredElimination:
+        return PartialCholesky(matrix, order, last, name)
 
     def eliminate_with_factor(self, matrix: SparseMatrix, last: Indices, name: str) -> FactoredElimination:
-        return self.eliminate(matrix, self.order(matrix, last), len(last), name)  # type: ignore[return-value]
+        return self.eliminate(matrix, self.order(matrix, last), len(last), name)
 
     def order(self, matrix: SparseMatrix, last: Indices) -> Indices:
         return elimination_order(matrix, last)
@@ -153,16 +96,18 @@ class _Pardiso(Implementation):
         return PardisoFactor(matrix, name)
 
     def eliminate(self, matrix: SparseMatrix, order: Indices, last: int, name: str) -> Elimination:
+        if not 0 < last < len(order):  # PARDISO has no Schur complement of no unknown or of all
+            return super().eliminate(matrix, order, last, name)
         from vibench.linalg.pardiso import PardisoElimination  # noqa: PLC0415
 
-        # PARDISO has no Schur complement of no unknown or of all.
-        is_some = 0 < last < len(order)
-        return (PardisoElimination if is_some else super().eliminate)(matrix, order, last, name)
+        return PardisoElimination(matrix, order, last, name)
 
     def eliminate_with_factor(self, matrix: SparseMatrix, last: Indices, name: str) -> FactoredElimination:
         if not 0 < len(last) < matrix.shape[0]:
             return super().eliminate_with_factor(matrix, last, name)
-        return self.eliminate(matrix, self.order(matrix, last), len(last), name)  # type: ignore[return-value]
+        from vibench.linalg.pardiso import PardisoElimination  # noqa: PLC0415
+
+        return PardisoElimination(matrix, self.order(matrix, last), len(last), name)
 
 
 class _Cholmod(Implementation):
@@ -217,16 +162,6 @@ def implementation(name: str) -> Implementation:
     if name not in IMPLEMENTATIONS:
         raise unknown_name("factorisation", name, [*IMPLEMENTATIONS, AVAILABLE])
     return IMPLEMENTATIONS[name]
-
-
-def checked(matrix: SparseMatrix, name: str) -> SparseMatrix:
-    """Return the matrix (CSC); raises a `NumericalError` if an entry is not finite, or a diagonal one not positive."""
-    matrix = sp.csc_array(matrix)
-    if not np.all(np.isfinite(matrix.data)):
-        raise NumericalError(f"{name} has entries that are not finite")
-    if not np.all(matrix.diagonal() > 0.0):
-        raise NumericalError(f"{name} is not positive definite")
-    return matrix
 
 
 class EliminationBySolutions(Elimination):

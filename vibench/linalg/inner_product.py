@@ -17,7 +17,8 @@ import scipy.sparse as sp
 from vibench.arrays import Array, SparseMatrix
 from vibench.errors import NumericalError, RequestError
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.linalg.factorisations import DEFAULT, Factor, implementation
+from vibench.linalg.definite import Factor
+from vibench.linalg.factorisations import DEFAULT, implementation
 from vibench.text import brief
 
 SYMMETRY_RTOL = 1e-12

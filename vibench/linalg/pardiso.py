@@ -14,8 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
-from vibench.linalg.definite import BlockDiagonal, dense_cholesky
-from vibench.linalg.factorisations import Factor, FactoredElimination, checked
+from vibench.linalg.definite import BlockDiagonal, Factor, FactoredElimination, checked, dense_cholesky
 
 
 def _library() -> str:

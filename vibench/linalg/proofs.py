@@ -32,7 +32,8 @@ from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.linalg import UNIT_ROUND_OFF
 from vibench.linalg.cholesky import have_one_pattern, round_off_of_factors, symmetric_lu
-from vibench.linalg.factorisations import DEFAULT, Implementation, checked
+from vibench.linalg.definite import checked
+from vibench.linalg.factorisations import DEFAULT, Implementation
 
 
 def is_proved_definite(parts: Sequence[SparseMatrix], chosen: Implementation, order: Indices | None = None) -> bool:

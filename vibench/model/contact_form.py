@@ -23,7 +23,7 @@ from cachetools import LRUCache
 from vibench.arrays import Array, Indices, Mask, SparseMatrix, times_dense
 from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality, is_absent
-from vibench.qp.rows import Directions
+from vibench.qp.exact import Directions
 from vibench.qp.scaling import near_rows
 
 SMALL = 2**18

@@ -74,8 +74,7 @@ from vibench.model.bound_terms import (
 )
 from vibench.model.contact_form import ContactForm, Representer
 from vibench.model.errors import EnergyNorm, riesz_representatives
-from vibench.qp.exact import least_distance_solution
-from vibench.qp.rows import Rows, rows_that_matter
+from vibench.qp.exact import Rows, least_distance_solution, rows_that_matter
 from vibench.qp.scaling import ratio
 from vibench.stability.coercivity import Constant, Stability
 

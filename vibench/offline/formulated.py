@@ -24,10 +24,9 @@ from vibench.model.errors import high_fidelity_residuals, residual_multiplier
 from vibench.offline.assemblies import assemblies
 from vibench.offline.models import Parameters, parameter_in
 from vibench.plugins import registry
-from vibench.qp.repeats import RECOGNISED
 from vibench.qp.solve import solve_qp, takes_start
 from vibench.qp.status import Status
-from vibench.qp.verification import QPSolution, Residuals, verify
+from vibench.qp.verification import RECOGNISED, QPSolution, Residuals, verify
 from vibench.reduction.pod import POD
 from vibench.storage.serialisation import storable
 from vibench.text import brief

@@ -36,7 +36,7 @@ from vibench.offline.formulated import Formulated, check_built
 from vibench.offline.models import AnyReducedModel, Model
 from vibench.offline.sweep import Snapshots, high_fidelity_sweep
 from vibench.reduction.pod import POD, pod
-from vibench.stability.infsup import Multipliers, multipliers
+from vibench.stability.infsup import ConeBasis, cone_basis
 from vibench.text import brief
 
 Assembly: TypeAlias = Literal["full", "reduced", "certified"]
@@ -163,9 +163,9 @@ class Reduction:
         return check_cone(self.dual.reduce(self.snapshots.lam, W, self.generators), W)
 
     @cached_property
-    def multipliers(self) -> Multipliers:
+    def multipliers(self) -> ConeBasis:
         """The generators of the cone with their span and Gram matrix, for inf-sup constants."""
-        return multipliers(self.cone.generators, self.problem.W, self.cone.free)
+        return cone_basis(self.cone.generators, self.problem.W, self.cone.free)
 
     @cached_property
     def offline(self) -> Offline:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Mask, SparseMatrix
+from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import VariationalInequality
 
 NO_LOAD = 1e-10
@@ -113,6 +114,37 @@ def stiffness(A: SparseMatrix | Array) -> float:
     diagonal = A.diagonal()
     mean = float(diagonal.sum()) / max(len(diagonal), 1)
     return mean if mean > 0.0 else 1.0
+
+
+def random_units(count: int, accuracy: float, *seed: int) -> Array:
+    """Units (count,) of the unknowns, all close to 1; the same for the same seed.
+
+    Timed repetitions solve the program in other units, so that a solver that caches answers is not timed on a hit.
+    """
+    # The answer in other units must be wrong by far more than the accuracy; the program stays as difficult as before.
+    spread = min(max(1e3 * accuracy, 1e-12), 1e-2)
+    return np.asarray(1.0 + spread * (2.0 * _uniform(count, seed) - 1.0))
+
+
+def in_units(program: VariationalInequality, d: Array) -> VariationalInequality:
+    """The dense program of y, where x = D y with units d (n,) of the unknowns: D A D, D f, B D, g.
+
+    It is the same program: as definite and as feasible, with the same multipliers, and its solution is D⁻¹x. Zeros,
+    symmetry, and pairs of opposite constraints are preserved to the last bit.
+    """
+    return replace(program, A=program.A * np.outer(d, d), f=d * program.f, B=program.B * d, g=program.g.copy())
+
+
+def nearby(box: ParameterBox, mu: Array, *seed: int) -> Array:
+    """A parameter (d,) of the box next to mu (d,), for problems that cache; the same for the same seed."""
+    elsewhere = box.lower + _uniform(box.dim, seed) * (box.upper - box.lower)
+    return np.asarray(mu + 1e-10 * (elsewhere - mu))
+
+
+def _uniform(count: int, seed: tuple[int, ...]) -> Array:
+    """Random numbers (count,) between 0 and 1."""
+    # NumPy takes (s, 0) for s, the seed of the validation set: the parameter elsewhere would be the one to be moved.
+    return np.random.default_rng((*seed, 1)).random(count)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -20,11 +20,60 @@ from vibench.arrays import Array, Mask
 from vibench.errors import NumericalError, message_of
 from vibench.interfaces.problem import VariationalInequality
 from vibench.provenance import solver_version
-from vibench.qp.direct import DIRECT, DirectSolution
 from vibench.qp.scaling import Units, drive, near, row_norms, units_driven, units_of_dual
 from vibench.qp.settings import SETTINGS
 from vibench.qp.verification import QPSolution, QPSolver
 from vibench.text import one_line
+
+FAR_BOUND = 1e30
+"""DAQP's bound of what has none on this side."""
+
+
+class DirectSolution(NamedTuple):
+    """What a solver returns, as `qpsolvers.Solution` names it; x (n,) and z (m,) are `None` where it found nothing."""
+
+    x: Array | None
+    z: Array | None
+    found: bool
+    extras: Mapping[str, Any]
+
+
+def _piqp(program: VariationalInequality, bounds: bool = False, **settings: Any) -> DirectSolution:
+    import piqp  # noqa: PLC0415  an optional solver
+
+    solver = piqp.DenseSolver()
+    for name, value in settings.items():
+        setattr(solver.settings, name, value)
+    if bounds:
+        solver.setup(np.asfortranarray(program.A), -program.f, x_l=-program.g)
+    else:
+        solver.setup(np.asfortranarray(program.A), -program.f, G=np.asfortranarray(program.B), h_u=program.g)
+    status, result = solver.solve(), solver.result
+    z = np.array(result.z_bl if bounds else result.z_u)
+    return DirectSolution(np.array(result.x), z, status == piqp.PIQP_SOLVED, {"info": result.info})
+
+
+def _daqp(
+    program: VariationalInequality, bounds: bool = False, initvals: Array | None = None, **settings: Any
+) -> DirectSolution:
+    import daqp  # noqa: PLC0415  an optional solver
+
+    B, lower, upper = program.B, np.full(len(program.g), -FAR_BOUND), program.g
+    if bounds:  # of a program without other constraints
+        B, lower, upper = np.zeros((0, len(program.g))), -program.g, np.full(len(program.g), FAR_BOUND)
+    kinds = np.zeros(len(program.g), dtype=np.int32)
+    x, _, outcome, info = daqp.solve(program.A, -program.f, B, upper, lower, kinds, primal_start=initvals, **settings)
+    if outcome <= 0:
+        return DirectSolution(None, None, found=False, extras={})
+    return DirectSolution(x, -info["lam"] if bounds else info["lam"], found=True, extras={})
+
+
+DIRECT: Mapping[str, Callable[..., DirectSolution]] = {"piqp": _piqp, "daqp": _daqp}
+"""What solves min ½ xᵀA x − fᵀx, B x ≤ g with these solvers; their settings and a start are keywords.
+
+Where `bounds` is said B is minus the identity: bounds take these solvers less time than rows.
+"""
+
 
 if TYPE_CHECKING:
     import qpsolvers

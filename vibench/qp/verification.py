@@ -223,6 +223,23 @@ def verify(program: VariationalInequality, answer: QPSolution, accuracy: float) 
     return Status.INACCURATE, reason, residuals
 
 
+RECOGNISED = 30.0
+"""A timed answer with residuals above this multiple of the accuracy does not solve the program that was posed."""
+
+
+def check_answer(program: VariationalInequality, answer: QPSolution, accuracy: float) -> None:
+    """Refuse the answer of a timed repetition that does not solve its program to `RECOGNISED` times the accuracy.
+
+    Raises
+    ------
+    NumericalError
+        Naming the residual.
+    """
+    status, reason, _ = verify(program, answer, RECOGNISED * accuracy)
+    if status is not Status.OK:
+        raise NumericalError(f"timed in other units of the unknowns, {reason}; does the solver remember answers?")
+
+
 def infeasibility_certificate(program: VariationalInequality, tolerance: float = 1e-10) -> Array | None:
     """α ≥ 0 with Bᵀα = 0 and gᵀα = −1 (Farkas), or `None` if no such α is found; dense programs only."""
     if not isinstance(program.B, np.ndarray):

@@ -1,6 +1,6 @@
 """The public names of `vibench.reduction`: building blocks of cones and enrichments."""
 
-from .cone_parts import part_in_cone as part_in_cone
+from .cone_subtraction import subtract_cone_component as subtract_cone_component
 from .cones import REPRODUCED as REPRODUCED
 from .cones import TIE as TIE
 from .cones import GrowingCone as GrowingCone

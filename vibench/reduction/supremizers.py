@@ -12,8 +12,8 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import ContactLoads
-from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal
-from vibench.linalg.factorisations import Elimination, implementation
+from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal, Elimination
+from vibench.linalg.factorisations import implementation
 from vibench.linalg.inner_product import InnerProduct, orthogonal_factorisation
 
 PROPORTIONAL_RTOL = 1e-12
@@ -62,8 +62,8 @@ class ConstraintClasses:
         """Index p of the representative of every class."""
         return np.unique(self.members, return_index=True)[1]
 
-    def everywhere(self, constants: Sequence[float]) -> Array:
-        """An inf-sup constant at every p (P,), from those of the representatives."""
+    def expand_classes(self, constants: Sequence[float]) -> Array:
+        """Expand inf-sup constants of the representatives to every p (P,)."""
         return np.array(constants)[self.members] * np.abs(self.factors)
 
 

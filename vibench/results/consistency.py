@@ -23,8 +23,7 @@ from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Kind
 from vibench.qp.verification import Slack, allowed
 from vibench.results.schema import BOUNDS, CONSTANTS, DISAGREEMENTS, KEYS
-from vibench.stability.conic_infsup import ABSOLUTE, RELATIVE
-from vibench.stability.infsup import UNSIGNED
+from vibench.stability.infsup import ABSOLUTE, RELATIVE, UNSIGNED
 from vibench.study.cells import COMPILED
 
 if TYPE_CHECKING:  # worker processes, which start often, have no use for pandas

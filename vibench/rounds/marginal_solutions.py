@@ -18,7 +18,7 @@ from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolver, solve_unverified
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
-from vibench.qp.repeats import nearby
+from vibench.qp.scaling import nearby
 from vibench.stages.snapshots import TimedSnapshots
 from vibench.study.parameter_sets import chunk_edges
 from vibench.timing import Seconds, timed

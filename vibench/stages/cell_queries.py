@@ -16,7 +16,7 @@ from vibench.offline.correction import Corrector
 from vibench.plugins.plugin import Plugin
 from vibench.qp.exact import ExactSolution
 from vibench.results.consistency import vectors
-from vibench.stability.infsup import share
+from vibench.stability.infsup import stability_ratio
 from vibench.stages.assembly import AssemblyStage, ExactSolutions, assembly_stage
 from vibench.stages.base import Row, Stage, Watch, value_of
 from vibench.stages.certification import CertificateStage
@@ -214,7 +214,7 @@ class _Queries(CellItems):
     def _shares(self) -> Row:
         """The smallest shares of β_span in that of V, and the share that the last σ of the enrichment guarantees."""
         histories = {h.quantity: h.values for h in self._artefact(self._stage.assembly.enrichment).histories}
-        validation = [share(own.span, full.span) for own, full in zip(self._own, self._full, strict=True)]
+        validation = [stability_ratio(own.span, full.span) for own, full in zip(self._own, self._full, strict=True)]
         row: Row = {"share_validation": min(validation)}
         if "share_min" in histories:
             row["share_training"] = histories["share_min"][-1]

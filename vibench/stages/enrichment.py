@@ -103,7 +103,7 @@ class GrowthStage(Stage):
         projected = _projected(offline, grown.vectors, value_of(store, self.cone.constraints))
         size = offline.basis.shape[1]
         training = {tolerance: projected.first(size + m.count).beta_span() for tolerance, m in grown.milestones.items()}
-        shares = projected.shares_over_steps(size, value_of(store, TrainingConstants(self.cone)))
+        shares = projected.stability_ratios(size, value_of(store, TrainingConstants(self.cone)))
         return Result(AssessedGrowth(grown, projected.over_steps(size), shares, training))
 
     def measure(self, store: Store) -> Mapping[str, Seconds]:
@@ -178,7 +178,7 @@ class SingleEnrichment(EnrichmentStage):
             projected = _projected(offline, enrichment.vectors, value_of(store, self.cone.constraints))
             size, reachable = offline.basis.shape[1], value_of(store, self.reachable)
             quantities |= {"beta_span_min": projected.over_steps(size)}
-            quantities |= {"share_min": projected.shares_over_steps(size, reachable)}
+            quantities |= {"share_min": projected.stability_ratios(size, reachable)}
             quantities |= {"beta_span_training": projected.beta_span(), "beta_full_span_training": reachable}
         return Result(BuiltEnrichment.of(enrichment, strategy), seconds, _histories(quantities))
 

@@ -15,13 +15,13 @@ from vibench.plugins.plugin import Plugin
 from vibench.reduction.supremizers import ConstraintClasses
 from vibench.stability.coercivity import Constant, Stability
 from vibench.stability.infsup import (
+    ConeBasis,
     InfSup,
-    Multipliers,
     constants_full,
     constants_on,
-    everywhere,
+    expand_classes,
     inf_sup,
-    nodal_multipliers,
+    nodal_cone,
 )
 from vibench.stages.base import LOST, SHARE, Failed, Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage
@@ -49,7 +49,7 @@ class ReferenceInfSup(Stage):
     def run(self, store: Store) -> Result:
         """Compute the constants."""
         problem = build_problem(self.constraints.problem)
-        return Result(constants_full(problem.V, value_of(store, self.constraints), nodal_multipliers(problem.W)))
+        return Result(constants_full(problem.V, value_of(store, self.constraints), nodal_cone(problem.W)))
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class InfSupConstants(Stage):
     def run(self, store: Store) -> Result:
         """Compute the constants."""
         classes: ConstraintClasses = value_of(store, self.constraints)
-        cone: Multipliers = value_of(store, self.cone).prepared
+        cone: ConeBasis = value_of(store, self.cone).prepared
         if self.space is None:
             return Result(constants_full(build_problem(self.cone.problem).V, classes, cone))
         if isinstance(self.space, PODStage):
@@ -153,9 +153,9 @@ class InfSupConstants(Stage):
         if model.enrichment.eta is None:
             return Result([_constants_at(model, kept.at(mu), cone) for mu in mus])
         at_firsts = (kept.at(mu) for mu in mus[classes.firsts])  # a class shares one space
-        return Result(everywhere(classes, [_constants_at(model, vi, cone) for vi in at_firsts]))
+        return Result(expand_classes(classes, [_constants_at(model, vi, cone) for vi in at_firsts]))
 
 
-def _constants_at(model: ReducedModel, vi: VariationalInequality, cone: Multipliers) -> InfSup:
+def _constants_at(model: ReducedModel, vi: VariationalInequality, cone: ConeBasis) -> InfSup:
     projected = model.project_supremizers(vi, np.hstack([cone.span, cone.chi]))
     return inf_sup(projected[:, : cone.rank], projected[:, cone.rank :], cone)

@@ -10,7 +10,7 @@ from vibench.plugins.plugin import Plugin
 from vibench.reduction.cones import orthogonality
 from vibench.reduction.pod import POD, pod
 from vibench.reduction.supremizers import ConstraintClasses, constraint_classes, isometric_supremizers
-from vibench.stability.infsup import Multipliers, beta_span, multipliers
+from vibench.stability.infsup import ConeBasis, beta_span, cone_basis
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.stages.snapshots import choosing_stages, gather, parameters_in, solution_stages
 from vibench.storage.artefacts import History, Store
@@ -19,7 +19,7 @@ from vibench.study.cells import Axes
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.timing import timed
 
-for _kind in (POD, Cone, Multipliers, ConstraintClasses):
+for _kind in (POD, Cone, ConeBasis, ConstraintClasses):
     storable(_kind)
 
 
@@ -55,7 +55,7 @@ class ReducedCone:
     """A cone, and its multipliers prepared for constants and enrichments."""
 
     cone: Cone
-    prepared: Multipliers
+    prepared: ConeBasis
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class ConeStage(Stage):
         cone, reducing = timed(lambda: strategy.reduce(snapshots, W, self.stop))
         with faults_of(self.dual):  # verification, which is not part of the offline time
             check_cone(cone, W)
-        prepared, preparing = timed(lambda: multipliers(cone.generators, W, cone.free))
+        prepared, preparing = timed(lambda: cone_basis(cone.generators, W, cone.free))
         orthogonal = orthogonality(cone.generators, W, cone.free)
         histories = History.of("cone", "error", cone.errors), History.of("cone", "e_orth", orthogonal)
         return Result(ReducedCone(cone, prepared), reducing + preparing, histories)
@@ -131,4 +131,4 @@ class TrainingConstants(Stage):
         """β_span of the whole of V with the cone at every parameter (P,)."""
         span, classes = value_of(store, self.cone).prepared.span, value_of(store, self.cone.constraints)
         image = isometric_supremizers(build_problem(self.cone.problem).V, classes.representatives, span.shape[1])
-        return Result(classes.everywhere([beta_span(image(B, span)) for B in classes.representatives]))
+        return Result(classes.expand_classes([beta_span(image(B, span)) for B in classes.representatives]))

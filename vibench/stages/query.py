@@ -21,11 +21,10 @@ from vibench.offline.correction import Answer, Corrector
 from vibench.offline.models import AnyReducedModel
 from vibench.plugins import registry
 from vibench.qp.exact import ExactSolution
-from vibench.qp.repeats import check_answer, in_units, nearby, units
-from vibench.qp.scaling import ratio
+from vibench.qp.scaling import in_units, nearby, random_units, ratio
 from vibench.qp.solve import solve_qp, takes_start
 from vibench.qp.status import Status
-from vibench.qp.verification import QPSolution, slack, verify
+from vibench.qp.verification import QPSolution, check_answer, slack, verify
 from vibench.results.consistency import solution_row
 from vibench.stability.coercivity import Stability
 from vibench.stages.assembly import AssemblyStage, ReducedPrograms
@@ -61,8 +60,8 @@ class Query:
         return x if self.units is None else self.units * x
 
     def repeated(self, *seed: int) -> Query:
-        """The same query in other units of the unknowns, which depend on the seed; see `vibench.qp.repeats`."""
-        d = units(len(self.program.f), self.accuracy, *seed)
+        """The same query in other units of the unknowns, which depend on the seed; see `vibench.qp.scaling`."""
+        d = random_units(len(self.program.f), self.accuracy, *seed)
         return replace(
             self,
             program=in_units(self.program, d),

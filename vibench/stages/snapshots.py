@@ -23,7 +23,7 @@ from vibench.offline.assemblies import assemblies
 from vibench.offline.sweep import Snapshots
 from vibench.plugins.kinds import PROBLEM
 from vibench.plugins.plugin import Plugin
-from vibench.qp.repeats import nearby
+from vibench.qp.scaling import nearby
 from vibench.stages.base import SHARE, Result, Stage, build_problem, faults_of, value_of
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable

@@ -16,7 +16,7 @@ from vibench.errors import NumericalError
 from vibench.interfaces.strategies import Cone, DualStrategy, Stop, rays
 from vibench.interfaces.validation import check_cone
 from vibench.linalg.inner_product import InnerProduct
-from vibench.reduction import part_in_cone
+from vibench.reduction import subtract_cone_component
 from vibench.reduction.cones import project_on_cone
 from vibench.testing import check
 from vibench_strategies import enlarged_cpg
@@ -173,8 +173,8 @@ def test_the_enlarged_cone_contains_that_of_cpg_and_nothing_moves_any_more(theta
         assert project_on_cone(cone.generators, generator, W).distance <= 1e-8
     if not cone.fallbacks:
         for i in range(cone.size):
-            part, _ = part_in_cone(cone.generators[:, i], np.delete(cone.generators, i, axis=1), W)
-            assert W.norm(part) <= 1e-8
+            rest, _ = subtract_cone_component(cone.generators[:, i], np.delete(cone.generators, i, axis=1), W)
+            assert W.norm(cone.generators[:, i] - rest) <= 1e-8
 
 
 def test_enlarged_generators_are_better_conditioned_and_leave_less_of_the_snapshots() -> None:
@@ -192,8 +192,8 @@ def test_a_sweep_that_is_not_enough_is_recorded() -> None:
 
 
 def test_a_step_that_is_only_feasible_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole: Callable[..., tuple[Array, str]] = enlarged_cpg.part_in_cone
-    monkeypatch.setattr(enlarged_cpg, "part_in_cone", lambda *data: (whole(*data)[0], "not optimal"))
+    whole: Callable[..., tuple[Array, str]] = enlarged_cpg.subtract_cone_component
+    monkeypatch.setattr(enlarged_cpg, "subtract_cone_component", lambda *data: (whole(*data)[0], "not optimal"))
     theta, X = bumps(5)
     notes = EnlargedCPG().reduce(theta, X, Stop(size=3)).fallbacks
     assert notes[0] == "sweep 1, generator 1: not optimal"

@@ -12,7 +12,7 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Stop
 from vibench.linalg.inner_product import InnerProduct
 from vibench.qp.verification import QPSolution
-from vibench.reduction import cone_parts, part_in_cone
+from vibench.reduction import cone_subtraction, subtract_cone_component
 from vibench.reduction.cones import project_on_cone
 from vibench_strategies.cpg import CPG
 from vibench_strategies.mcpg import ModifiedCPG
@@ -23,8 +23,8 @@ EUCLID = InnerProduct(sp.eye_array(3))
 
 def test_the_second_generator_of_the_example_that_corrects_remark_4_3() -> None:
     theta = np.array([[1.0, 1.0], [1.0, 2.0], [0.0, 1.0]])
-    part, note = part_in_cone(theta[:, 1], theta[:, :1], EUCLID)
-    assert np.allclose(part, [1.0, 1.0, 0.0], atol=1e-10)
+    rest, note = subtract_cone_component(theta[:, 1], theta[:, :1], EUCLID)
+    assert np.allclose(rest, [0.0, 1.0, 1.0], atol=1e-10)
     assert note == ""
     cone = ModifiedCPG().reduce(theta[:, ::-1], EUCLID, Stop(size=2))  # the larger snapshot comes first
     assert np.allclose(cone.generators[:, 0], np.array([1.0, 2.0, 1.0]) / np.sqrt(6.0))
@@ -33,9 +33,9 @@ def test_the_second_generator_of_the_example_that_corrects_remark_4_3() -> None:
 def test_generators_positive_where_theta_is_zero_take_no_part() -> None:
     theta = np.array([1.0, 1.0, 0.0])
     wide = np.array([[1.0], [1.0], [1.0]])
-    assert np.all(part_in_cone(theta, wide, EUCLID)[0] == 0.0)
-    part, _ = part_in_cone(theta, np.hstack([wide, [[1.0], [0.0], [0.0]]]), EUCLID)
-    assert np.allclose(part, [1.0, 0.0, 0.0], atol=1e-10)
+    assert np.array_equal(subtract_cone_component(theta, wide, EUCLID)[0], theta)
+    rest, _ = subtract_cone_component(theta, np.hstack([wide, [[1.0], [0.0], [0.0]]]), EUCLID)
+    assert np.allclose(rest, [0.0, 1.0, 0.0], atol=1e-6)
 
 
 @given(seeds)
@@ -43,11 +43,11 @@ def test_the_removed_part_is_feasible_and_optimal(seed: int) -> None:
     rng = np.random.default_rng(seed)
     W = space(6, seed)
     chi, theta = rng.random((6, 3)), rng.random(6) + 0.1
-    part, note = part_in_cone(theta, chi, W)
+    rest, note = subtract_cone_component(theta, chi, W)
     assert note == ""
-    assert np.all(theta - part >= 0.0)
-    assert project_on_cone(chi, part, W).distance < 1e-9
-    best = float(W.norm(theta - part))
+    assert np.all(rest >= 0.0)
+    assert project_on_cone(chi, theta - rest, W).distance < 1e-9
+    best = float(W.norm(rest))
     for alpha in rng.random((300, 3)) * rng.choice([0.01, 0.1, 1.0], (300, 1)):
         if np.all(chi @ alpha <= theta):
             assert best <= float(W.norm(theta - chi @ alpha)) + 1e-9
@@ -92,10 +92,10 @@ def test_a_solver_that_fails_leaves_a_feasible_generator_and_a_note(monkeypatch,
         return QPSolution(np.full(count, value), np.zeros(rows), "solved")
 
     theta, W = bumps()
-    monkeypatch.setattr(cone_parts, "solve_qp", fails)
-    part, note = part_in_cone(theta[:, 3], theta[:, 2:3] * (theta[:, 3:4] > 0.0), W)
+    monkeypatch.setattr(cone_subtraction, "solve_qp", fails)
+    rest, note = subtract_cone_component(theta[:, 3], theta[:, 2:3] * (theta[:, 3:4] > 0.0), W)
     assert "line 9" in note
-    assert np.all(theta[:, 3] - part >= 0.0)
+    assert np.all(rest >= 0.0)
     cone = ModifiedCPG().reduce(theta, W, Stop(size=12))
     assert any(line.startswith("generator ") for line in cone.fallbacks)
     for snapshot in theta.T:

@@ -17,7 +17,7 @@ from vibench.linalg.inner_product import orthonormal_range, project_out, singula
 from vibench.reduction.cones import LazyMaximum
 from vibench.reduction.pod import pod
 from vibench.reduction.supremizers import supremizers
-from vibench.stability.infsup import inf_sup_full, inf_sup_on, multipliers
+from vibench.stability.infsup import cone_basis, inf_sup_full, inf_sup_on
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies import offline_pga
@@ -44,7 +44,7 @@ def test_decorrelated_adds_nothing(varying: Offline) -> None:
 def test_online_supremizers_reach_the_whole_space_at_every_parameter(varying: Offline) -> None:
     enrichment = pickle.loads(pickle.dumps(OnlineSupremizers().build(varying, None)))
     assert enrichment.kind is Kind.PER_PARAMETER
-    problem, cone = varying.problem, multipliers(varying.cone.generators, varying.problem.W)
+    problem, cone = varying.problem, cone_basis(varying.cone.generators, varying.problem.W)
     for mu in (np.array([0.05]), np.array([0.61])):
         vi = problem.assemble(mu)
         added = supremizers(problem.V, vi.B, enrichment.eta)
@@ -63,7 +63,7 @@ def test_pga_keeps_its_promise_at_every_training_parameter(request, setting: str
     assert sigma[-1] <= delta < (sigma[-2] if len(sigma) > 1 else 1.0)
     Z = np.hstack([data.basis, enrichment.vectors])
     assert np.allclose(V.gram(Z, Z), np.eye(Z.shape[1]), atol=1e-11)
-    cone = multipliers(data.cone.generators, problem.W)
+    cone = cone_basis(data.cone.generators, problem.W)
     for mu in data.training[:: max(1, len(data.training) // 9)]:
         B = problem.assemble(mu).B
         target = V.whiten(V.orthonormalise(supremizers(V, B, data.span)))
@@ -92,7 +92,7 @@ def test_pga_on_any_small_problem(n: int, m: int, count: int, modes: int, genera
     assert np.all(np.diff(sigma) <= 1e-9)
     assert len(sigma) == enrichment.vectors.shape[1] + 1
     Z = np.hstack([data.basis, enrichment.vectors])
-    cone = multipliers(data.cone.generators, problem.W)
+    cone = cone_basis(data.cone.generators, problem.W)
     worst = 0.0
     for mu in data.training:
         B = problem.assemble(mu).B
@@ -138,7 +138,7 @@ def test_with_a_tiny_tolerance_offline_and_online_spaces_coincide(obstacle: Offl
 def test_the_tolerance_between_offline_and_online_constants(obstacle: Offline) -> None:
     """0 ≤ 1 − β_off/β_on ≤ 1 − √(1 − δ²) where all parameters share one supremizer space."""
     problem = obstacle.problem
-    cone = multipliers(obstacle.cone.generators, problem.W)
+    cone = cone_basis(obstacle.cone.generators, problem.W)
     for delta in (0.3, 0.9):
         Z = np.hstack([obstacle.basis, OfflinePGA().build(obstacle, delta).vectors])
         for mu in problem.validation_set(4, 1):
@@ -161,7 +161,7 @@ def test_less_than_half_of_the_evaluations_of_sigma_are_enough_where_b_varies(mo
     solved = [solver.solve(mu) for mu in training]
     basis = pod(np.column_stack([s.u for s in solved]), problem.V, Stop(size=10)).basis
     cone = ModifiedCPG().reduce(np.column_stack([s.lam for s in solved]), problem.W, Stop(size=12))
-    data = Offline(problem, basis, cone, multipliers(cone.generators, problem.W).span, training)
+    data = Offline(problem, basis, cone, cone_basis(cone.generators, problem.W).span, training)
 
     class Kept(LazyMaximum):
         def __init__(self, first: np.ndarray) -> None:

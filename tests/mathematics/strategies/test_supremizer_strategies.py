@@ -23,7 +23,7 @@ from vibench.reduction.cones import LazyMaximum
 from vibench.reduction.nested import NestedStrategy, grow_through
 from vibench.reduction.pod import pod
 from vibench.reduction.supremizers import supremizers
-from vibench.stability.infsup import inf_sup_full, inf_sup_on, multipliers
+from vibench.stability.infsup import cone_basis, inf_sup_full, inf_sup_on
 from vibench.testing import check
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
@@ -53,12 +53,12 @@ def hertz() -> Offline:
     solved = [solver.solve(mu) for mu in training]
     basis = pod(np.column_stack([s.u for s in solved]), problem.V, Stop(size=10)).basis
     cone = ModifiedCPG().reduce(np.column_stack([s.lam for s in solved]), problem.W, Stop(size=12))
-    return Offline(problem, basis, cone, multipliers(cone.generators, problem.W).span, training)
+    return Offline(problem, basis, cone, cone_basis(cone.generators, problem.W).span, training)
 
 
 def shares(data: Offline, added: Array) -> Array:
     """β_S/β_on over the span at every training parameter, from bases of mesh size; 1 where β_on is round-off."""
-    V, cone = data.problem.V, multipliers(data.cone.generators, data.problem.W)
+    V, cone = data.problem.V, cone_basis(data.cone.generators, data.problem.W)
     Z = np.hstack([data.basis, added])
     forms = [data.problem.assemble(mu).B for mu in data.training]
     online = np.array([inf_sup_full(V, B, cone).span for B in forms])

@@ -11,8 +11,7 @@ import scipy.sparse as sp
 from vibench import create
 from vibench.highfidelity import kkt_systems
 from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.highfidelity.contact_zone import watched, zone_of
-from vibench.highfidelity.kkt_systems import ZoneStiffness
+from vibench.highfidelity.kkt_systems import ZoneStiffness, watched, zone_of
 from vibench.interfaces.problem import Problem
 
 MUS = np.array([[0.7], [1.3], [0.9]])

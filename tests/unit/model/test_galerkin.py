@@ -16,7 +16,7 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.model.galerkin import ReducedModel, project, projected_members
 from vibench.qp.solve import solve_qp
 from vibench.reduction.supremizers import supremizers
-from vibench.stability.infsup import multipliers
+from vibench.stability.infsup import cone_basis
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
 
@@ -31,7 +31,7 @@ def solved():
 
 def model(problem, solutions, enrichment: Enrichment) -> ReducedModel:
     chi = np.column_stack([s.lam for s in solutions])
-    cone = multipliers(chi / problem.W.norm(chi), problem.W)
+    cone = cone_basis(chi / problem.W.norm(chi), problem.W)
     basis = problem.V.orthonormalise(np.column_stack([s.u for s in solutions]))
     return ReducedModel(problem, basis, enrichment, cone.chi, cone.span)
 
@@ -102,7 +102,7 @@ def test_any_training_snapshot_in_the_spaces_is_reproduced(n: int, m: int, count
         return
     online = Enrichment(Kind.PER_PARAMETER, supply=lambda V, vi, span: supremizers(V, vi.B, span))
     chi = np.column_stack([s.lam for s in contact])
-    cone = multipliers(chi / problem.W.norm(chi), problem.W)
+    cone = cone_basis(chi / problem.W.norm(chi), problem.W)
     basis = problem.V.orthonormalise(np.column_stack([s.u for s in solutions]))
     reduced = ReducedModel(problem, basis, online, cone.chi, cone.span)
     exact = solutions[which % count]
@@ -148,7 +148,7 @@ def test_bases_at_many_parameters_are_those_of_each(resolution: int, monkeypatch
         vis = [problem.assemble(mu).copy() for mu in mus]
         rng, V, W = np.random.default_rng(0), problem.V, problem.W
         chi = rng.random((W.dim, 12))
-        cone = multipliers(chi / W.norm(chi), W)
+        cone = cone_basis(chi / W.norm(chi), W)
         online = Enrichment(Kind.PER_PARAMETER, eta=cone.span)
         reduced = ReducedModel(problem, V.orthonormalise(rng.standard_normal((V.dim, 3))), online, cone.chi, cone.span)
         computed.clear()

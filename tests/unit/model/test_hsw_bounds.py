@@ -13,7 +13,7 @@ from vibench.highfidelity import active_set
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
 from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity
-from vibench.stability.infsup import InfSup, inf_sup_full, nodal_multipliers
+from vibench.stability.infsup import InfSup, inf_sup_full, nodal_cone
 
 PROBLEM = Varying()
 
@@ -28,7 +28,7 @@ def bound(
 
 def stability(mu: np.ndarray) -> Stability:
     vi = PROBLEM.assemble(mu)
-    inf_sup = inf_sup_full(PROBLEM.V, vi.B, nodal_multipliers(PROBLEM.W))
+    inf_sup = inf_sup_full(PROBLEM.V, vi.B, nodal_cone(PROBLEM.W))
     return Stability(inf_sup, *coercivity_and_continuity(vi.A, PROBLEM.V), Constant(0.0, True))
 
 

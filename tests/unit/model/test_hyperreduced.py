@@ -31,7 +31,7 @@ from vibench.qp import verification
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.reduction.supremizers import supremizers
-from vibench.stability.infsup import multipliers
+from vibench.stability.infsup import cone_basis
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
 
@@ -123,7 +123,7 @@ def reduced_model(problem: Problem, kind: str, modes: int, generators: int, mus:
     """A reduced model from some solutions; the fixed enrichment is the supremizers at the first parameter."""
     u, lam = solutions(problem, tuple(map(tuple, mus.tolist())))
     lam = lam[:, lam.any(axis=0)][:, :generators]
-    cone = multipliers(lam / problem.W.norm(lam), problem.W)
+    cone = cone_basis(lam / problem.W.norm(lam), problem.W)
     basis = problem.V.orthonormalise(u)[:, :modes]
     if kind == "none":
         enrichment = Enrichment(Kind.NONE)

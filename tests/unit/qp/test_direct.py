@@ -10,8 +10,8 @@ from numerics import spd
 
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp import solve
-from vibench.qp.direct import DIRECT, DirectSolution
 from vibench.qp.settings import SETTINGS
+from vibench.qp.solve import DIRECT, DirectSolution
 from vibench.qp.verification import QPSolution
 
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vibench.interfaces.problem import VariationalInequality
-from vibench.qp.rows import rows_that_matter
+from vibench.qp.exact import rows_that_matter
 
 
 def test_of_parallel_rows_the_tightest_is_kept_and_opposite_ones_without_room_are_an_equality() -> None:

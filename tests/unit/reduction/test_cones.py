@@ -14,7 +14,7 @@ from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.strategies import DualStrategy, Stop
 from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction import cones as cone_module
-from vibench.reduction import part_in_cone
+from vibench.reduction import subtract_cone_component
 from vibench.reduction.cones import greedy_cone, orthogonality, project_on_cone, project_on_orthant
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies.cpg import CPG
@@ -40,10 +40,6 @@ def test_projection_on_the_orthant_meets_its_optimality_conditions(kind: str, mo
     assert np.all(found >= 0.0)
     assert np.all(slope >= -1e-13)
     assert np.all(np.abs(found * slope) <= 1e-13)
-
-
-def nothing(theta: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, str]:
-    return np.zeros_like(theta), ""
 
 
 def snapshots(seed: int, m: int = 8, count: int = 7) -> np.ndarray:
@@ -148,13 +144,13 @@ def test_few_projections_find_the_generators_that_a_plain_greedy_finds(
 ) -> None:
     """What a plain greedy projects is every snapshot not yet taken, at every step."""
     theta, W = solved
-    subtract = nothing if isinstance(strategy, CPG) else lambda chosen, chi: part_in_cone(chosen, chi, W)
     largest, left = float(W.norm(theta).max()), list(range(theta.shape[1]))
     plain, projected, distances = np.zeros((W.dim, 0)), 0, W.norm(theta)
     for _ in range(20):
         pick = left[int(np.argmax(distances >= distances.max() - 1e-9 * largest))]
         left.remove(pick)
-        direction = theta[:, pick] - subtract(theta[:, pick], plain)[0]
+        is_plain = isinstance(strategy, CPG)
+        direction = theta[:, pick] if is_plain else subtract_cone_component(theta[:, pick], plain, W)[0]
         plain = np.column_stack([plain, direction / W.norm(direction)])
         distances = np.array([project_on_cone(plain, theta[:, q], W).distance for q in left])
         projected += len(left)

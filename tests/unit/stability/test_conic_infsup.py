@@ -8,7 +8,7 @@ import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vibench.stability.conic_infsup import GAP, cone_interval, entrywise_bound, semidefinite_bounds, simplex_minimiser
+from vibench.stability.infsup import GAP, cone_interval, entrywise_bound, semidefinite_bounds, simplex_minimiser
 
 seeds = st.integers(0, 10_000)
 
@@ -92,7 +92,7 @@ def test_certificates_hold_whatever_the_iterations_reached(seed: int, count: int
     C, G = random_pair(seed, count, count, 0.2)
     M, exact = C.T @ C, minimum_by_faces(C.T @ C, G) ** 2
     assert entrywise_bound(M, G) <= exact * (1.0 + 1e-9) + 1e-12
-    lower, upper = semidefinite_bounds(M, G, upper=np.inf, share=1.0)
+    lower, upper = semidefinite_bounds(M, G, upper=np.inf, fraction=1.0)
     assert lower <= exact * (1.0 + 1e-9) + 1e-12
     assert exact <= upper * (1.0 + 1e-9) + 1e-12
 

@@ -30,7 +30,7 @@ def test_steps_are_the_smallest_constants_of_leading_parts(seed: int, first: int
     assert found.beta_span() == pytest.approx(direct[-1], rel=1e-12)
     reachable = np.abs(classes.factors) * (1.0 + rng.random(2)[classes.members]) * (1.0 + direct.max())
     shares = (direct / reachable).min(axis=1)  # parameter by parameter: a ratio of minima would be another number
-    assert found.shares_over_steps(first, reachable) == pytest.approx(shares, rel=1e-12, abs=1e-14)
+    assert found.stability_ratios(first, reachable) == pytest.approx(shares, rel=1e-12, abs=1e-14)
     assert found.first(first + 2).beta_span() == pytest.approx(direct[2], rel=1e-12)
 
 
@@ -38,4 +38,4 @@ def test_without_multipliers_nothing_is_unstable() -> None:
     classes = constraint_classes([sp.csr_array(np.ones((2, 3)))])
     assert ProjectedSupremizers([np.zeros((4, 0))], classes).over_steps(2).tolist() == [np.inf] * 3
     none = ProjectedSupremizers([np.zeros((4, 0))], classes)
-    assert none.shares_over_steps(2, np.array([np.inf])).tolist() == [1.0] * 3
+    assert none.stability_ratios(2, np.array([np.inf])).tolist() == [1.0] * 3

@@ -18,12 +18,12 @@ from vibench.model.hsw_bounds import hsw_bounds
 from vibench.reduction.supremizers import constraint_classes
 from vibench.stability.coercivity import Stability, coercivity_and_continuity, energy_inf_sup
 from vibench.stability.infsup import (
+    cone_basis,
     constants_full,
     constants_on,
     inf_sup_full,
     inf_sup_on,
-    multipliers,
-    nodal_multipliers,
+    nodal_cone,
 )
 
 
@@ -99,7 +99,7 @@ def test_errors_and_bounds_of_many_queries_are_those_of_each() -> None:
     )
     u = reference.u + 1e-3 * rng.standard_normal(reference.u.shape)
     lam = reference.lam + 1e-2 * rng.random(reference.lam.shape)
-    cone = nodal_multipliers(problem.W)
+    cone = nodal_cone(problem.W)
     known = [
         Stability(
             inf_sup_full(problem.V, vi.B, cone),
@@ -132,7 +132,7 @@ def test_constants_shared_by_proportional_matrices_are_those_of_each() -> None:
     problem = Varying()
     B = problem.assemble(np.array([0.2])).B
     chi = np.random.default_rng(0).random((8, 3))
-    cone = multipliers(chi / problem.W.norm(chi), problem.W)
+    cone = cone_basis(chi / problem.W.norm(chi), problem.W)
     Z = problem.V.orthonormalise(np.random.default_rng(1).standard_normal((30, 5)))
     matrices = [B, sp.csr_array(-3.0 * B), problem.assemble(np.array([0.9])).B]
     classes = constraint_classes(matrices)

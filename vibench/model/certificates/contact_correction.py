@@ -70,8 +70,7 @@ from vibench.interfaces.problem import Contact
 from vibench.linalg import EPS
 from vibench.linalg.definite import BlockDiagonal
 from vibench.model.bound_terms import ATTEMPTS, MARGIN, NO_ROOM, Equalities
-from vibench.qp.exact import least_distance
-from vibench.qp.rows import rows_that_matter
+from vibench.qp.exact import least_distance, rows_that_matter
 from vibench.qp.scaling import row_norms
 
 STEPS = 30

@@ -47,7 +47,7 @@ from vibench.qp.exact import ExactSolution, exact_solution
 from vibench.qp.scaling import ratio
 from vibench.qp.solve import solve_qp
 from vibench.qp.verification import QPSolution
-from vibench.reduction.cone_parts import part_in_cone
+from vibench.reduction.cone_subtraction import subtract_cone_component
 from vibench.reduction.supremizers import supremizers
 from vibench.timing import NO_TIME, Seconds, timed
 
@@ -280,8 +280,8 @@ class IncrementalModel:
     def add(self, vi: VariationalInequality, solution: HighFidelitySolution) -> str:
         """Add the solution of `vi`; returns what was less accurate than usual, "" if nothing."""
         V, W, size = self._problem.V, self._problem.W, self._whitened.shape[1]
-        part, note = part_in_cone(solution.lam, self.generators, W)
-        new, rest = [solution.u[:, None]], solution.lam - part
+        rest, note = subtract_cone_component(solution.lam, self.generators, W)
+        new = [solution.u[:, None]]
         norm = float(W.norm(rest))
         if norm > IN_CONE * float(W.norm(solution.lam)):
             new.append(supremizers(V, vi.B, rest[:, None]))

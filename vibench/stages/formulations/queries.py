@@ -17,7 +17,7 @@ from vibench.model.certificates.base import Guarantee
 from vibench.offline.assemblies import assemblies
 from vibench.offline.formulated import CellSolver, Formulated
 from vibench.plugins.plugin import Plugin
-from vibench.qp.repeats import nearby
+from vibench.qp.scaling import nearby
 from vibench.qp.status import Status
 from vibench.results.consistency import answer_row
 from vibench.stages.base import Row, Stage, Watch

@@ -1,4 +1,4 @@
-"""The part of a multiplier that a cone already has: line 9 of Algorithm 2 of Niakh et al. (2022)."""
+"""Subtraction of the component of a multiplier in a cone: line 9 of Algorithm 2 of Niakh et al. (2022)."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ Entries are compared in units of the norms of their basis functions, so that the
 """
 
 
-def part_in_cone(theta: Array, generators: Array, W: InnerProduct) -> tuple[Array, str]:
-    """Line 9 of Algorithm 2: the Υ of the cone closest to θ with θ − Υ ≥ 0 coefficientwise.
+def subtract_cone_component(theta: Array, generators: Array, W: InnerProduct) -> tuple[Array, str]:
+    """Subtract from θ the closest Υ of the cone with θ − Υ ≥ 0 coefficientwise: line 9 of Algorithm 2 of Niakh et al.
 
     Parameters
     ----------
@@ -41,15 +41,15 @@ def part_in_cone(theta: Array, generators: Array, W: InnerProduct) -> tuple[Arra
     Returns
     -------
     tuple
-        Υ (m,) such that θ − Υ has no negative entry, and exact zeros where round-off would leave less than `ZERO` of
-        the largest entry of θ; and a note, empty where Υ is optimal to `ACCEPTED`.
+        θ − Υ (m,), without negative entries, and with exact zeros where round-off would leave less than `ZERO` of the
+        largest entry of θ; and a note, empty where Υ is optimal to `ACCEPTED`.
     """
     # A generator that is positive where θ is zero must have the coefficient 0. Without such generators, and restricted
     # to the support of θ, the problem has strictly feasible points; otherwise it has none, and QP solvers break down.
     support = theta > 0.0
     usable = generators[:, ~np.any(generators[~support] > 0.0, axis=0)]
     if not usable.shape[1]:
-        return np.zeros_like(theta), ""
+        return theta.copy(), ""
     coefficients, residual = _least_squares(theta, usable, support, W)
     part = usable @ coefficients
     over = part > theta
@@ -62,7 +62,7 @@ def part_in_cone(theta: Array, generators: Array, W: InnerProduct) -> tuple[Arra
     units = np.sqrt(W.matrix.diagonal())
     rest[units * rest < ZERO * (units * theta).max()] = 0.0
     note = "" if residual <= ACCEPTED else f"line 9 solved only to {residual:.0e}, made feasible"
-    return theta - rest, note
+    return rest, note
 
 
 def _least_squares(theta: Array, generators: Array, support: Mask, W: InnerProduct) -> tuple[Array, float]:
