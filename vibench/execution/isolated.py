@@ -15,7 +15,7 @@ from vibench.execution.supervisor import Supervisor
 from vibench.interfaces.problem import VariationalInequality
 from vibench.plugins import registry
 from vibench.plugins.kinds import SOLVER
-from vibench.qp.repeats import in_units, units
+from vibench.qp.scaling import in_units, random_units
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, verify
@@ -155,7 +155,7 @@ class SolverTrials(IsolatedWork):
         name, program, accuracy = self.solvers[number], loads(self.program), self.accuracy
         solve = partial(solve_qp, solver=name, accuracy=accuracy, extra=registry.qp_solver(name))
         # Repeats are in other units, so that a solver that caches solutions cannot be timed on a cache hit.
-        repeats = (in_units(program, units(len(program.f), accuracy, repeat)) for repeat in count())
+        repeats = (in_units(program, random_units(len(program.f), accuracy, repeat)) for repeat in count())
         solution, seconds = median_seconds(solve, chain([program], repeats))
         status, reason, residuals = verify(program, solution, accuracy)
         return Trial(status, reason, solution, residuals, seconds)
