@@ -70,7 +70,7 @@ def test_a_stage_says_which_share_of_it_is_done(run: Run, shared: Supervisor) ->
     for how, share in (("third", 1.0 / 3.0), ("fine", 0.0)):
         stage = Whole(how)
         assert isinstance(run(stage), Done)
-        assert shared.share == (stage.key, share)
+        assert shared.fraction_done == (stage.key, share)
 
 
 def test_processes_of_tests_are_forked_whatever_seed_dask_leaves_in_the_environment(
@@ -90,7 +90,7 @@ def test_the_process_is_kept_from_one_stage_to_the_next(run: Run) -> None:
 
 @pytest.mark.parametrize("how", ["sleep", "hang"])
 def test_an_item_beyond_its_limit_costs_itself(run: Run, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(supervisor, "GRACE", 0.1)
+    monkeypatch.setattr(supervisor._JobState, "grace", 0.1)
     found = run(InItems(("fine", how, "fine", "fine")), query=3.0)
     assert isinstance(found, Done)
     assert [number for number, _ in found.value] == [0, 1, 2, 3]
@@ -240,7 +240,7 @@ def test_limits_begin_when_the_work_begins(monkeypatch: pytest.MonkeyPatch, tmp_
 def test_a_process_that_never_begins_is_given_up(
     watcher: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(supervisor, "START_SECONDS", 0.1)
+    monkeypatch.setattr(supervisor._JobState, "start_seconds", 0.1)
     found = watcher.run(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0), lambda _: None)
     assert found == Failed(Status.CRASHED, "no worker process began within 0.1 s")
 
@@ -338,7 +338,7 @@ def test_a_worker_does_not_outlive_its_supervisor(tmp_path: Path) -> None:
 def test_an_operation_that_raised_has_no_limit_afterwards(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(supervisor, "GRACE", 0.1)
+    monkeypatch.setattr(supervisor._JobState, "grace", 0.1)
     found = run(InItems(("fine", "interrupt"), at_end=f"linger {tmp_path / 'diary'}"), query=1.0)
     assert isinstance(found, Done)
     assert found.value[1][1].status is Status.ERROR
@@ -347,12 +347,12 @@ def test_an_operation_that_raised_has_no_limit_afterwards(
 
 def test_the_current_item_is_what_the_worker_noted_last(tmp_path: Path) -> None:
     with (tmp_path / "shared").open("w+b") as file:
-        file.truncate(CurrentItem.SIZE)
+        file.truncate(8)
         worker, watcher = CurrentItem(file.fileno()), CurrentItem(file.fileno())
     assert watcher.read() == (0, None, False)
     noted = [(0, False), (0, True), (2**31 - 1, True), (7, False)]
-    for changes, (number, watched) in enumerate(noted, 1):
-        worker.enter(number, watched=watched)
-        assert watcher.read() == (changes, number, watched)
+    for changes, (number, limited) in enumerate(noted, 1):
+        worker.enter(number, limited=limited)
+        assert watcher.read() == (changes, number, limited)
     worker.leave()
     assert watcher.read() == (0, None, False)

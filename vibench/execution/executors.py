@@ -22,33 +22,21 @@ from vibench.provenance import machine
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, Unstored
 
-OPEN_FILES, OPEN_FILES_OF_A_WORKER = 64, 16
-"""Files and sockets that a cluster keeps open, and for each worker; about 30 and 11 were counted in /proc."""
-
-ANSWER_SECONDS = 10.0
-"""Seconds within which a scheduler answers."""
-
-ASKED_AGAIN = 5.0
-"""Seconds after which a result that has not come is asked for again, if the client is still there."""
-
 StageOutcome: TypeAlias = Done | Failed | Unstored
-"""How a stage ended."""
 
 
 class Executor(ABC):
-    """Runs jobs, `slots` of them at a time."""
+    """Runs jobs, at most `slots` at a time, on some `machines`."""
 
     slots: int
-    """How many jobs run at a time."""
     machines: frozenset[str]
-    """The machines they run on."""
 
     @abstractmethod
     def submit(self, job: Job) -> Future[StageOutcome]:
         """Begin a job."""
 
-    def shares(self) -> Mapping[str, float]:
-        """Which share of running stages is done, by their keys, where that is known."""
+    def fractions_done(self) -> Mapping[str, float]:
+        """Fractions of running stages that are done, by their keys, where they are known."""
         return {}
 
     def check(self) -> None:  # noqa: B027  nothing to check where jobs run in our own threads
@@ -86,7 +74,6 @@ class Local(Executor):
         self._threads = ThreadPoolExecutor(slots)
 
     def submit(self, job: Job) -> Future[StageOutcome]:
-        """Begin a job in a worker process that is free."""
         return self._threads.submit(self._run, job)
 
     def _run(self, job: Job) -> StageOutcome:
@@ -96,13 +83,12 @@ class Local(Executor):
         finally:
             self._free.put(supervisor)
 
-    def shares(self) -> Mapping[str, float]:
-        """Those that the worker processes have told."""
-        return dict(supervisor.share for supervisor in self._supervisors)
+    def fractions_done(self) -> Mapping[str, float]:
+        return dict(supervisor.fraction_done for supervisor in self._supervisors)
 
     def close(self) -> None:
-        """End the worker processes."""
-        for supervisor in self._supervisors:  # stopped first, because `shutdown` waits for running jobs
+        # Stop them first: `shutdown` waits for running jobs.
+        for supervisor in self._supervisors:
             supervisor.stop()
         self._threads.shutdown(cancel_futures=True)
         for supervisor in self._supervisors:
@@ -114,14 +100,14 @@ class Local(Executor):
 class Dask(Executor):
     """The workers of a dask cluster, one job at a time on each.
 
-    They must have the same vibench installed and see the folder of the artefacts under the same path. The job of a
-    worker that dies is repeated by another one, which is safe because stages are pure functions.
+    They must have the same vibench installed and see the folder of the artefacts under the same path. Another worker
+    repeats the job of a worker that dies, which is safe because stages are pure functions.
 
     Parameters
     ----------
     scheduler
-        Address of the scheduler; `None` for a cluster of processes on this machine, which speak TLS with credentials
-        made for it. Those of a scheduler tls://… come from dask's configuration.
+        Address of the scheduler; `None` for a cluster of processes on this machine, which use TLS with temporary
+        credentials. The credentials for a scheduler tls://… come from the configuration of dask.
     slots
         Number of workers of a cluster on this machine.
     store
@@ -139,7 +125,7 @@ class Dask(Executor):
             from distributed import Client, LocalCluster  # noqa: PLC0415  an optional dependency
             from distributed.security import Security  # noqa: PLC0415
 
-            # Whoever reaches a scheduler can run code on its workers: others on this machine are kept out, too.
+            # Anybody who can connect to a scheduler can run code on its workers: keep out other users of this machine.
             own = Security.temporary() if scheduler is None else None
         except ImportError:
             raise RequestError(
@@ -149,7 +135,7 @@ class Dask(Executor):
             raise RequestError(f"the scheduler '{scheduler}' asks for credentials: set distributed.comm.tls of dask")
         _allow_open_files(slots if scheduler is None else 0)
         if scheduler is not None:
-            _greet(scheduler)
+            _greet(scheduler, 10.0)
         self._token = secrets.token_hex(8)
         self._cluster: Any = None
         if scheduler is None:
@@ -191,14 +177,12 @@ class Dask(Executor):
         return len(workers), frozenset(where for _, _, where in workers.values())
 
     def submit(self, job: Job) -> Future[StageOutcome]:
-        """Begin a job on a worker."""
         result: Future[StageOutcome] = Future()
         theirs = self._client.submit(_run_for, self._token, job, pure=False)
         theirs.add_done_callback(lambda done: _hand_over(done, result))
         return result
 
     def check(self) -> None:
-        """Check that the scheduler is connected."""
         if self._client.status != "running":
             raise ExecutorError("the dask scheduler is not connected any more; run the same command again to continue")
 
@@ -212,30 +196,31 @@ class Dask(Executor):
             self._cluster.close()
 
 
-def _greet(scheduler: str) -> None:
-    """Shake hands with a scheduler: a client waits for ever for one that says nothing, and trusts sizes it is told.
+def _greet(scheduler: str, seconds: float) -> None:
+    """Shake hands with a scheduler, since a client would wait for ever for an answer, and trust any size it receives.
 
-    Raises a `RequestError` if no scheduler answers.
+    Raises a `RequestError` if no scheduler answers within so many seconds.
     """
     from distributed.comm.core import connect  # noqa: PLC0415
     from distributed.security import Security  # noqa: PLC0415
 
     async def greet() -> None:
         credentials = Security().get_connection_args("client")
-        comm = await asyncio.wait_for(connect(scheduler, timeout=ANSWER_SECONDS, **credentials), ANSWER_SECONDS)
+        comm = await asyncio.wait_for(connect(scheduler, timeout=seconds, **credentials), seconds)
         comm.abort()
 
-    with ThreadPoolExecutor(1) as other:  # where a notebook has a loop of its own
+    with ThreadPoolExecutor(1) as other:  # a notebook has an event loop in this thread
         try:
             other.submit(lambda: asyncio.run(greet())).result()
         except Exception as error:  # noqa: BLE001  whatever answers may say anything
-            why = f"nothing within {ANSWER_SECONDS:g} s" if isinstance(error, TimeoutError) else in_a_line(error)
+            why = f"nothing within {seconds:g} s" if isinstance(error, TimeoutError) else in_a_line(error)
             raise RequestError(f"no dask scheduler answers at '{scheduler}': {why}") from None
 
 
 def _allow_open_files(workers: int) -> None:
-    """Raise the soft limit of open files as far as a cluster needs it: below that, dask does not stop trying."""
-    needed = OPEN_FILES + workers * OPEN_FILES_OF_A_WORKER
+    """Raise the soft limit of open files as far as a cluster needs it: below that, dask retries for ever."""
+    # /proc shows about 30 files and sockets of a cluster, and 11 for each worker.
+    needed = 64 + workers * 16
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY or soft >= needed:
         return
@@ -248,22 +233,21 @@ def _allow_open_files(workers: int) -> None:
 
 
 def is_authenticated(scheduler: str) -> bool:
-    """Whether both sides of a connection to the address of a scheduler prove who they are."""
+    """Whether both sides of a connection to the address of a scheduler are authenticated."""
     return scheduler.startswith(("tls://", "wss://"))
 
 
 def _has_credentials() -> bool:
-    """Whether dask's configuration has credentials of a client."""
     from distributed.security import Security  # noqa: PLC0415
 
     return Security().get_connection_args("client")["ssl_context"] is not None
 
 
 def _hand_over(theirs: Any, ours: Future[StageOutcome]) -> None:
-    """Pass the result of a dask future to a standard one, because `concurrent.futures.wait` works only on these."""
+    """Pass the result of a dask future to a standard one, which `concurrent.futures.wait` needs."""
     try:
         ours.set_result(_result(theirs))
-    except BaseException as error:  # noqa: BLE001  in a thread of dask: passed to the waiting thread
+    except BaseException as error:  # noqa: BLE001  this thread is dask's: pass it to the waiting thread
         line = in_a_line(error)
         if type(error).__name__ == "KilledWorker":
             ours.set_result(Failed(Status.CRASHED, f"dask does not repeat the job again: {line}"))
@@ -274,26 +258,27 @@ def _hand_over(theirs: Any, ours: Future[StageOutcome]) -> None:
 
 
 def _result(theirs: Any) -> StageOutcome:
-    """The result of a dask future that is done, for as long as its client can fetch it.
+    """The result of a dask future that is done, unless its client closes.
 
-    A client that closes meanwhile never answers, and the thread that asks is that of the callbacks of all clients.
+    A client that closes meanwhile never answers, and would block the thread that runs the callbacks of all clients.
     """
     while True:
         try:
-            outcome: StageOutcome = theirs.result(timeout=ASKED_AGAIN)
+            outcome: StageOutcome = theirs.result(timeout=5.0)
         except TimeoutError:
-            if theirs.status == "error" or theirs.client.status != "running":  # the error may be the job's own
+            # The error may be the job's own.
+            if theirs.status == "error" or theirs.client.status != "running":
                 raise
         else:
             return outcome
 
 
 _supervisors: dict[tuple[str, int], Supervisor] = {}
-"""In a dask worker: the supervisors of every run, one per thread."""
+"""Supervisors of a dask worker, by the token of a run and the thread."""
 
 
 def _run_for(token: str, job: Job) -> StageOutcome:
-    """Run a job of a run with the supervisor that this thread of a dask worker has for it."""
+    """Run a job in a dask worker, with the supervisor of its run in this thread."""
     return _supervisors.setdefault((token, threading.get_ident()), Supervisor()).run(job)
 
 

@@ -13,7 +13,7 @@ from vibench.stages.base import Stage
 class Graph:
     """The stages of a run, by key: the goals, and the stages that they need.
 
-    What begins, ends or is lost costs as many steps as it has neighbours, however many others wait.
+    A stage that begins, ends or is lost costs as many steps as it has neighbours, however many others wait.
 
     Attributes
     ----------
@@ -25,28 +25,28 @@ class Graph:
 
     stages: dict[str, Stage] = field(default_factory=dict)
     waiting: dict[str, set[str]] = field(default_factory=dict)
+    # For each stage, those that need it and have not begun, in the order of the plan: an ordered set.
     _needed: dict[str, dict[str, None]] = field(default_factory=dict)
-    """For each stage, those that need it and have not begun, in the order in which they were planned."""
+    # A heap of the stages whose inputs are done, by their number; some may have been dropped since.
     _ready: list[tuple[int, str]] = field(default_factory=list)
-    """A heap of the stages whose inputs are done, by their number; some may have been dropped since."""
     _numbers: dict[str, int] = field(default_factory=dict)
     _goals: set[str] = field(default_factory=set)
-    _there: set[str] = field(default_factory=set)
+    _available: set[str] = field(default_factory=set)
 
-    def add_goal(self, stage: Stage, is_there: Callable[[Stage], bool]) -> None:
-        """Plan a stage and the inputs that are not available; `is_there` is called once per stage."""
+    def add_goal(self, stage: Stage, is_available: Callable[[Stage], bool]) -> None:
+        """Plan a stage and its inputs without those that are available; `is_available` is called once per stage."""
         self._goals.add(stage.key)
-        self._add(stage, is_there)
+        self._add(stage, is_available)
 
-    def _add(self, stage: Stage, is_there: Callable[[Stage], bool]) -> bool:
-        if stage.key in self._there:
+    def _add(self, stage: Stage, is_available: Callable[[Stage], bool]) -> bool:
+        if stage.key in self._available:
             return False
         if stage.key in self.stages:
             return True
-        if is_there(stage):
-            self._there.add(stage.key)
+        if is_available(stage):
+            self._available.add(stage.key)
             return False
-        inputs = {needed.key for needed in stage.inputs() if self._add(needed, is_there)}
+        inputs = {needed.key for needed in stage.inputs() if self._add(needed, is_available)}
         self._numbers[stage.key] = len(self.stages)
         self.stages[stage.key] = stage
         self.waiting[stage.key] = inputs
@@ -65,8 +65,8 @@ class Graph:
                 yield self.stages[key]
 
     def done(self, stage: Stage) -> None:
-        """Note that a stage succeeded; what is planned later does not wait for it."""
-        self._there.add(stage.key)
+        """Mark a stage as done; stages that are planned later do not wait for it."""
+        self._available.add(stage.key)
         for key in self._needed.pop(stage.key, ()):
             self.waiting[key].discard(stage.key)
             if not self.waiting[key]:
@@ -82,7 +82,7 @@ class Graph:
         """
         gone, ahead = {stage.key}, [stage.key]
         while ahead:
-            # What needs a dropped stage was dropped with it, and is not listed any more.
+            # The stages that need a dropped one were dropped with it, and are not listed any more.
             more = self._needed.pop(ahead.pop(), {}).keys() - gone
             gone |= more
             ahead += more

@@ -1,4 +1,4 @@
-"""What a supervisor and its worker processes say to each other: jobs, the batches they are done in, and reports."""
+"""Messages between a supervisor and its worker processes: jobs, the batches they are done in, and reports."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vibench.provenance import libraries, numerical_code
 from vibench.stages.base import Failed, ItemwiseStage, Stage
 
 OUT_OF_MEMORY = "out of memory: the limit is memory_gib"
-"""Beginning of the reason of what a worker has no memory for; the limit follows."""
+"""Prefix of the reason of a job that exceeds the memory limit; the limit follows."""
 
 
 def code_here() -> str:
@@ -22,7 +22,13 @@ def code_here() -> str:
 
 @dataclass(frozen=True)
 class Job:
-    """A stage to be run: where artefacts are, the limits of a query and of the stage, and with what code."""
+    """A stage to be run: the folder of artefacts, the limits of a query and of the stage, and the code expected.
+
+    Attributes
+    ----------
+    lost
+        Dispensable stages that failed, by key.
+    """
 
     store: str
     stage: Stage
@@ -30,13 +36,12 @@ class Job:
     cell_seconds: float
     memory_gib: float
     lost: Mapping[str, Failed] = field(default_factory=dict)
-    """Dispensable stages that failed, by key."""
     code: str = field(default_factory=code_here)
 
 
 @dataclass(frozen=True)
 class Batch:
-    """What one process does in succession: items of a stage, or a stage that has none.
+    """Work that one process does in succession: items of a stage, or a stage without items.
 
     Packages of third parties share no process, and the items of a stage may need several.
 
@@ -56,7 +61,7 @@ class Batch:
 
 
 def batches(stage: Stage, done: Container[int]) -> Iterator[Batch]:
-    """What is left of a stage, in the order of its items; those in `done` are not."""
+    """The rest of a stage, in the order of its items without those in `done`."""
     if not isinstance(stage, ItemwiseStage):
         yield Batch(stage.packages, (), ends=True)
         return
@@ -69,59 +74,57 @@ def batches(stage: Stage, done: Container[int]) -> Iterator[Batch]:
 
 @dataclass
 class Progress:
-    """The values of the items of a stage that are done, and the items that are lost, by their numbers."""
+    """Values of the items of a stage that are done, and reasons of those that are lost, by their numbers."""
 
     done: dict[int, Any] = field(default_factory=dict)
     lost: dict[int, Failed] = field(default_factory=dict)
 
 
 class CurrentItem:
-    """The item that a worker is in, in memory that it shares with its supervisor.
+    """The current item of a worker, in memory shared with its supervisor.
 
-    A message would wake the supervisor before and after every query, which takes longer than a small one.
+    A message would wake the supervisor before and after every query, which takes longer than a small query.
 
     Parameters
     ----------
     file
-        Descriptor of an open file of `SIZE` bytes.
+        Descriptor of an open file of 8 bytes.
     """
 
-    SIZE = 8
-    """One number, which is written at once: of changes (31 bits), the item (31) and whether it is watched (1)."""
-
     def __init__(self, file: int) -> None:
-        self._memory = memoryview(mmap.mmap(file, self.SIZE)).cast("q")
+        # One number, because it is written at once: count of changes (31 bits), item (31), has a time limit (1).
+        self._memory = memoryview(mmap.mmap(file, 8)).cast("q")
 
     def leave(self) -> None:
-        """Note that the worker is in no item; changes are counted anew."""
+        """Reset: the worker is in no item."""
         self._memory[0] = 0
 
-    def enter(self, number: int, *, watched: bool) -> None:
-        """Note that it is in an item; `watched` while it is in an operation with a time limit of its own."""
+    def enter(self, number: int, *, limited: bool) -> None:
+        """Set the item; `limited` inside an operation that has a time limit of its own."""
         changes = (self._memory[0] >> 32) % 2**30 + 1
-        self._memory[0] = changes << 32 | number << 1 | watched
+        self._memory[0] = changes << 32 | number << 1 | limited
 
     def read(self) -> tuple[int, int | None, bool]:
-        """How often that was noted, the item, and whether it is watched."""
-        noted = self._memory[0]
-        return noted >> 32, noted % 2**32 >> 1 if noted else None, bool(noted & 1)
+        """Count of changes, the item, and whether its current operation has a time limit."""
+        state = self._memory[0]
+        return state >> 32, state % 2**32 >> 1 if state else None, bool(state & 1)
 
 
 @dataclass(frozen=True)
 class Begun:
-    """A worker has received its job."""
+    """The worker has received its job."""
 
 
 @dataclass(frozen=True)
-class Share:
-    """A worker has done this share of its stage."""
+class FractionDone:
+    """The worker has done this fraction of its stage."""
 
-    share: float
+    fraction: float
 
 
 @dataclass(frozen=True)
 class ItemDone:
-    """A worker has done an item."""
+    """The worker has done an item."""
 
     number: int
     value: Any
@@ -129,11 +132,11 @@ class ItemDone:
 
 @dataclass(frozen=True)
 class BatchDone:
-    """A batch is done that does not end its stage."""
+    """The worker has done a batch that does not end its stage."""
 
 
 @dataclass(frozen=True)
 class OutOfMemory:
-    """A worker has no memory left, for its work (`failed`) or for another job, and has to be replaced."""
+    """The worker has to be replaced: it has no memory left for its work (`failed`) or for another job."""
 
     failed: Failed | None

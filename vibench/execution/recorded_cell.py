@@ -34,9 +34,6 @@ from vibench.study.cells import NOT_MOVED, Cell
 from vibench.study.matrix import study_of_cell
 from vibench.study.spec import Study
 
-UNLIMITED = (1e6, 1e6, 1e6)
-"""Limits (seconds, seconds, GiB) of stages that are run again: they succeeded before."""
-
 
 @dataclass(frozen=True)
 class RecordedCell:
@@ -93,7 +90,7 @@ class RecordedCell:
         self._refuse_other_code()
         if self.cell.formulation is None:
             raise RequestError(f"cell {self.row['cell']} has the mixed formulation: see `open_run(…).model(cell)`")
-        store, stage = usable_store(), formulation_queries(self.cell, UNLIMITED[0])
+        store, stage = usable_store(), formulation_queries(self.cell, query_seconds=1e6)
         _provide(stage.timed_inputs, store)
         return stage.built.formulated(store, stage.solver, stage.accuracy)
 
@@ -106,7 +103,7 @@ class RecordedCell:
 
     @cached_property
     def certificate(self) -> OnlineCertificate | None:
-        """What bounds the errors of the model at online cost; `None` where the cell is not certified.
+        """The certificate that bounds the errors of the model at online cost; `None` where the cell has none.
 
         Raises
         ------
@@ -114,7 +111,7 @@ class RecordedCell:
             As for `model`.
         """
         self.model  # noqa: B018  refuses other code
-        goal = cell_queries(self.cell, UNLIMITED[0])
+        goal = cell_queries(self.cell, query_seconds=1e6)
         stage = goal.certificate if isinstance(goal, CellQueries) else None
         if stage is None:
             return None
@@ -151,21 +148,19 @@ def _provide(stages: Iterable[Stage], store: Store) -> None:
         graph.add_goal(stage, lambda needed: store.get(needed.key) is not None)
     with closing(Supervisor()) as supervisor, store.used():
         for stage in graph.stages.values():  # inputs come first
-            outcome = supervisor.run(Job(str(store.folder), stage, *UNLIMITED))
+            # The stages succeeded before: these limits (seconds, seconds, GiB) only need to be large.
+            outcome = supervisor.run(Job(str(store.folder), stage, 1e6, 1e6, 1e6))
             if not isinstance(outcome, Done):
                 raise RequestError(f"{stage.label}, a stage of the cell, failed when run again: {outcome.reason}")
 
 
-KEY = re.compile(r"[0-9a-f]{16}")
-"""A key of a cell, which names files."""
-
-
 def _rows(run: str) -> tuple[Path, list[dict[str, Any]]]:
-    """Results file of a run, and its cells; refuses keys that could name a file elsewhere."""
+    """Results file of a run, and the rows of its cells."""
     path = results_file(run)
     rows = [{str(name): value for name, value in row.items()} for row in read_table(path, "cells").to_dict("records")]
     for row in rows:
-        if not KEY.fullmatch(str(row["cell"])):
+        # Keys name files: one from a stranger's results file must not lead elsewhere.
+        if not re.fullmatch(r"[0-9a-f]{16}", str(row["cell"])):
             raise RequestError(f"'{path}' has a cell named {str(row['cell'])[:60]!a}, expected 16 hexadecimal digits")
     return path, rows
 
@@ -210,15 +205,9 @@ def recorded_study(run: str, cell: str, places: Mapping[str, str] = NOT_MOVED) -
     settings = {} if pd.isna(rounds) else {"timing_rounds": int(rounds)}
     try:
         definition = recorded.cell
-    except (
-        ValueError,
-        TypeError,
-        KeyError,
-        AttributeError,
-    ) as error:  # whoever wrote the file may have written anything
-        raise RequestError(
-            f"'{recorded.path}': the definition of cell {recorded.row['cell']} cannot be read"
-        ) from error
+    except (ValueError, TypeError, KeyError, AttributeError) as error:  # the file may come from a stranger
+        what = f"the definition of cell {recorded.row['cell']} cannot be read"
+        raise RequestError(f"'{recorded.path}': {what}") from error
     return study_of_cell(definition, name, **settings)
 
 

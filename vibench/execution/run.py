@@ -44,21 +44,12 @@ from vibench.study.cells import Cell
 from vibench.study.matrix import expand
 from vibench.study.spec import Study
 
-CHECK_INTERVAL = 5.0
-"""Seconds between two checks that the executor still runs."""
-
-MOST_REPEATS = 100
-"""Most cold processes in which seconds are measured."""
-
-JOBS_PER_CORE = 16
-"""Most worker processes per core: more than one makes a run slower, and thousands stop the machine."""
-
 
 @dataclass(frozen=True)
 class Agenda:
-    """The work of a run: cells of the matrix, those that have no row yet, and those of them that cannot be run here.
+    """The work of a run, as numbers of cells in the matrix, of those without a row, and of those not available here.
 
-    `stages` are what the other cells need, `workers` is the number of worker processes.
+    `stages` are those that the other cells need, `workers` is the number of worker processes.
     """
 
     cells: int
@@ -69,33 +60,33 @@ class Agenda:
 
 
 class Observer:
-    """Follows a run; this one shows nothing."""
+    """Callbacks of a run; these do nothing."""
 
     def note(self, line: str) -> None:
-        """Something the user should know."""
+        """Show a line that the user should know."""
 
     def start(self, agenda: Agenda) -> None:
-        """The run begins."""
+        """Called when the run begins."""
 
     def begin(self, stage: Stage) -> None:
-        """A stage begins."""
+        """Called when a stage begins."""
 
-    def shares(self, done: Sequence[tuple[Stage, float]]) -> None:
-        """These stages are running, and these shares of them are done as far as that is known; told often."""
+    def fractions_done(self, running: Sequence[tuple[Stage, float]]) -> None:
+        """Called often, with the running stages and the fractions of them that are known to be done."""
 
     def stage(self, stage: Stage, wall: float) -> None:
-        """A stage is done, after so many wall seconds."""
+        """Called when a stage is done, with its wall seconds."""
 
     def plan(self, stage: Stage) -> None:
-        """Another stage was added to the agenda."""
+        """Called when a stage is added to the agenda."""
 
     def cell(self, cell: Cell, row: Mapping[str, Any]) -> None:
-        """A cell has its row."""
+        """Called when a cell has its row."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended: rows of all cells, whether it was interrupted, and cells whose earlier rows were damaged."""
+    """Rows of all cells after a run, how many are missing, whether it was interrupted, and cells with damaged rows."""
 
     rows: tuple[dict[str, Any], ...]
     missing: int
@@ -105,10 +96,9 @@ class Outcome:
 
 def identity(study: Study) -> dict[str, Any]:
     """The settings that all numbers of a study depend on; a run folder holds results of one identity only."""
-    asked = study.validation
-    validation: Any = asked
-    if not isinstance(asked, int):
-        plugin = asked.plugin(SAMPLING)
+    validation: Any = study.validation
+    if not isinstance(validation, int):
+        plugin = validation.plugin(SAMPLING)
         validation = {"name": plugin.name, "options": json.loads(plugin.options)}
     return {"name": study.name, "seed": study.seed, "validation": validation}
 
@@ -130,7 +120,7 @@ class Options:
     scheduler
         Address of a dask scheduler; `None` for a cluster on this machine.
     repeats
-        Cold processes in which seconds are measured, at least; 0 for what decides the comparisons of the study.
+        Minimal number of cold processes in which seconds are measured; 0 for as many as decide the comparisons.
 
     Raises
     ------
@@ -146,18 +136,17 @@ class Options:
     repeats: int = 0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.repeats <= MOST_REPEATS:
-            raise RequestError(f"repeats is {self.repeats}, expected 0 to {MOST_REPEATS} processes")
-        cores = provenance.cores()
-        if not 0 <= self.jobs <= JOBS_PER_CORE * cores:
-            expected = (
-                f"at most {JOBS_PER_CORE * cores} worker processes, {JOBS_PER_CORE} per core, or 0 for one per core"
+        if not 0 <= self.repeats <= 100:
+            raise RequestError(f"repeats is {self.repeats}, expected 0 to 100 processes")
+        # More than one process per core makes a run slower, and thousands stop the machine.
+        most = 16 * provenance.cores()
+        if not 0 <= self.jobs <= most:
+            raise RequestError(
+                f"jobs is {self.jobs}, expected at most {most} worker processes, 16 per core, or 0 for one per core"
             )
-            raise RequestError(f"jobs is {self.jobs}, expected {expected}")
 
     @property
     def workers(self) -> int:
-        """Number of worker processes."""
         return self.jobs or provenance.cores()
 
 
@@ -211,7 +200,15 @@ def _to_do(cell: Cell, finished: Mapping[str, tuple[str, str]], retry: bool) -> 
 
 @dataclass
 class _Run:
-    """One execution of a study: the graph of its stages, and what is recorded when they end."""
+    """One execution of a study: the graph of its stages, and the recording of their results.
+
+    Attributes
+    ----------
+    cells
+        The cells that get their rows from a goal, by its key; several cells may share a goal.
+    lost
+        The dispensable stages that failed, by key.
+    """
 
     study: Study
     folder: Path
@@ -221,9 +218,7 @@ class _Run:
     options: Options
     graph: Graph = field(default_factory=Graph)
     cells: dict[str, list[Cell]] = field(default_factory=dict)
-    """The cells that get their rows from a goal, by its key; several cells may share a goal."""
     lost: dict[str, Failed] = field(default_factory=dict)
-    """The dispensable stages that failed, by key."""
     timing: TimingPlan = field(init=False)
     offline: OfflinePlan = field(init=False)
     machines: Set[str] = frozenset()
@@ -235,8 +230,8 @@ class _Run:
         goals = {cell: cell_queries(cell, seconds) for cell in cells if cell.key not in reasons}
         runnable = [cell for cell in todo if cell in goals]
         rounds, fewest = self.study.timing_rounds, self.study.timing_rounds_min
-        asked = SHARE * self.options.repeats
-        self.timing = TimingPlan(goals, max(rounds, asked), self.writer, max(fewest, asked))
+        requested = SHARE * self.options.repeats
+        self.timing = TimingPlan(goals, max(rounds, requested), self.writer, max(fewest, requested))
         self.offline = OfflinePlan(self.store, self.writer, max(self.options.repeats - 1, 0))
         untimed = self.timing.start(runnable)
         workers: Executor | None = None
@@ -244,13 +239,13 @@ class _Run:
         try:
             workers = self._workers() if runnable or untimed else None
             self.machines = self.machines if workers is None else workers.machines
-            pictured: dict[Plugin, Stage] = {}  # one training set of a problem is drawn: the first one
+            pictured: dict[Plugin, Stage] = {}  # of the first training set of a problem
             for cell in cells:
                 pictured.setdefault(cell.problem, PictureStage(cell.problem, cell.training))
             for cell in runnable:
                 self.cells.setdefault(goals[cell].key, []).append(cell)
                 for stage in (goals[cell], pictured[cell.problem]):
-                    self.graph.add_goal(stage, self._is_there)
+                    self.graph.add_goal(stage, self._is_available)
             for group in untimed:
                 self._time(group, plan=False)
             slots = workers.slots if workers is not None else 0
@@ -262,7 +257,7 @@ class _Run:
             if workers is not None:
                 self._loop(workers)
         except KeyboardInterrupt:
-            interrupts.ignore()  # until the results are complete
+            interrupts.ignore()  # another Ctrl-C must not leave the results incomplete
             interrupted = True
         finally:
             if workers is not None:
@@ -276,7 +271,7 @@ class _Run:
             return Dask(options.scheduler, options.workers, self.store.folder)
         return Local(options.workers, self.folder / LOG)
 
-    def _is_there(self, stage: Stage) -> bool:
+    def _is_available(self, stage: Stage) -> bool:
         """Whether the artefact of a stage can be reused; its histories are recorded if so.
 
         Seconds of different machines are not comparable: an artefact of another machine is computed again.
@@ -304,15 +299,16 @@ class _Run:
                 raise ExecutorError(
                     f"{len(self.graph.waiting)} stages wait for inputs that are not running: this is a bug in vibench"
                 )
-            done, _ = wait(running, timeout=CHECK_INTERVAL, return_when=FIRST_COMPLETED)
+            # Wake up now and then: an executor that was lost completes nothing.
+            done, _ = wait(running, timeout=5.0, return_when=FIRST_COMPLETED)
             workers.check()
-            shares = workers.shares()
-            self.observer.shares([(stage, shares.get(stage.key, 0.0)) for stage in running.values()])
+            fractions = workers.fractions_done()
+            self.observer.fractions_done([(stage, fractions.get(stage.key, 0.0)) for stage in running.values()])
             for future in done:
                 self._finish(running.pop(future), _outcome(future))
 
     def _finish(self, stage: Stage, outcome: Done | Failed) -> None:
-        """Record the end of a stage; if it failed, every cell that cannot do without gets a row with the reason."""
+        """Record the end of a stage; if it failed, every cell that needs it gets a row with the reason."""
         if isinstance(outcome, Failed) and stage.dispensable:
             self.lost[stage.key] = outcome
             self.graph.done(stage)
@@ -338,17 +334,17 @@ class _Run:
             self._ended(cell)
 
     def _ended(self, cell: Cell) -> None:
-        """Plan the timing of the cell's group if this was its last one."""
+        """Plan the timing of a group after the last of its cells."""
         group = self.timing.ended(cell)
         if group is not None:
             self._time(group)
 
     def _time(self, group: TimingRounds, *, plan: bool = True) -> None:
         """Plan the first block of a group's rounds, and before it repeats of the offline stages of its cells."""
-        # What a stage depends on notes its seconds when it is planned.
-        self.graph.add_goal(group, self._is_there)
+        # Plan the group first: the inputs of a stage register their seconds with the offline plan then.
+        self.graph.add_goal(group, self._is_available)
         for stage in (group, *self.offline.repeats(self.timing.members(group))):
-            self.graph.add_goal(stage, self._is_there)
+            self.graph.add_goal(stage, self._is_available)
             if plan and stage.key in self.graph.waiting:
                 self.observer.plan(stage)
 
@@ -356,7 +352,7 @@ class _Run:
         """Record the rounds of a group, and plan its next block."""
         following = self.timing.record(stage, outcome)
         if following is not None:
-            self.graph.add_goal(following, self._is_there)
+            self.graph.add_goal(following, self._is_available)
             self.observer.plan(following)
 
     def _fail_cell(self, cell: Cell, failed: Failed) -> None:
@@ -366,10 +362,7 @@ class _Run:
 
 
 def unavailable(cell: Cell) -> str:
-    """Why a cell cannot be run on this machine: its solver, or what a plugin needs, is not installed; "" if it can.
-
-    A name that several packages use is as good as none.
-    """
+    """Reason why a cell cannot be run here: something is not installed, or a name is ambiguous; "" if none."""
     plugins = [plugin.registered for plugin in cell.plugins]
     for plugin in (*plugins, *([] if cell.solver is None else [find(SOLVER, cell.solver)])):
         if plugin.conflict:

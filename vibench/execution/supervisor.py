@@ -1,8 +1,8 @@
 """Stages in worker processes with hard limits: every job has an outcome, even if its process dies or hangs.
 
 A supervisor runs one job at a time, in a worker process for the packages that the job needs, and talks to it through a
-socket. It follows what the worker reports, kills it when a limit is exceeded, and starts another one. Of a stage
-in items only the current one is lost.
+socket. It follows the reports of the worker, kills it when a limit is exceeded, and starts another one. A stage with
+items loses only the current item.
 """
 
 from __future__ import annotations
@@ -28,34 +28,19 @@ from vibench.execution.jobs import (
     BatchDone,
     Begun,
     CurrentItem,
+    FractionDone,
     ItemDone,
     Job,
     OutOfMemory,
     Progress,
-    Share,
     batches,
 )
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, ItemwiseStage, Unstored
 from vibench.timing import KEPT_MEMORY, ONE_THREAD
 
-POLL = 0.2
-"""Seconds between two checks of the limits."""
-
-START_SECONDS = 300.0
-"""Time limit of the start of a worker process and its imports; the limits of a job begin when its work begins."""
-
-KEPT = 4
-"""Worker processes that a supervisor keeps between two stages, each of other packages."""
-
-GRACE = 2.0
-"""Seconds allowed beyond the limit of a query, for the work before and after the solver."""
-
 MARK = "VIBENCH_WORKER"
 """Variable in the environment of a worker process and of whatever is started in it; its value is unique."""
-
-PASSES = 100
-"""Searches for processes that were started during the one before."""
 
 
 class StoppedError(Exception):
@@ -71,19 +56,26 @@ class _WorkerLostError(Exception):
 
 
 class _JobState:
-    """What workers have reported of a job: finished items, the share that is done, the deadline of the current item.
+    """Reports of workers on a job: finished items, the fraction done, the deadline of the current item.
 
-    Time is added up in steps of bounded length, so that a suspended machine does not exhaust the limits. The start of a
-    process counts separately: on a busy machine it may take longer than a limit.
+    Attributes
+    ----------
+    grace
+        Seconds allowed beyond the limit of a query, for the work before and after the solver.
+    start_seconds
+        Time limit of the start of a worker process and its imports; on a busy machine it may exceed that of a job.
     """
+
+    grace = 2.0
+    start_seconds = 300.0
 
     def __init__(self, job: Job, observe: Callable[[Any], None]) -> None:
         self.job, self.progress, self._observe = job, Progress(), observe
-        self.seconds = self.share = 0.0
+        self.seconds = self.fraction = 0.0
         self._begin(Batch(frozenset(), (), ends=False), None)
 
     def start(self, batch: Batch, current: CurrentItem) -> Progress:
-        """Note that a process is given a batch of the job; returns what it needs to know of the others."""
+        """Begin a batch of the job in a process; returns the values of other processes that it needs."""
         current.leave()
         self._begin(batch, current)
         return self.progress if batch.ends else Progress()
@@ -95,41 +87,39 @@ class _JobState:
 
     @property
     def item(self) -> int | None:
-        """The item that the worker is in, or was in when it died."""
+        """The current item of the worker, or the last one before it died."""
         number = None if self._current is None else self._current.read()[1]
         return None if number in self.progress.done else number
 
     def tick(self, limit: float) -> None:
-        """Count the seconds since the last call; a `_WorkerLostError` beyond a limit, `limit` being the stage's."""
+        """Add the seconds since the last call; raises a `_WorkerLostError` beyond a limit, `limit` for the stage."""
         now = time.monotonic()
-        step = min(now - self._last, 5.0 * POLL)
+        # Steps are of bounded length, so that a suspended machine does not exhaust the limits.
+        step = min(now - self._last, 1.0)
         self._last = now
         if not self._begun:
             self._starting += step
-            if self._starting > START_SECONDS:
-                raise _WorkerLostError(Failed(Status.CRASHED, f"no worker process began within {START_SECONDS:g} s"))
+            if self._starting > self.start_seconds:
+                reason = f"no worker process began within {self.start_seconds:g} s"
+                raise _WorkerLostError(Failed(Status.CRASHED, reason))
             return
         self.seconds += step
-        self._follow_item()
+        changes, _, limited = (0, None, False) if self._current is None else self._current.read()
+        if changes != self._changes:  # an operation has begun or ended since the last call
+            self._changes = changes
+            self._item_limit = self.seconds + self.job.query_seconds + self.grace if limited else float("inf")
         if self.seconds > limit:
             raise _WorkerLostError(_beyond("cell_seconds", self.job.cell_seconds))
         if self.seconds > self._item_limit:
             raise _WorkerLostError(_beyond("query_seconds", self.job.query_seconds))
 
-    def _follow_item(self) -> None:
-        """Set the limit of an operation that was begun since the last call, and none where it has ended."""
-        changes, _, watched = (0, None, False) if self._current is None else self._current.read()
-        if changes != self._changes:
-            self._changes = changes
-            self._item_limit = self.seconds + self.job.query_seconds + GRACE if watched else float("inf")
-
     def update(self, message: Any) -> Done | Failed | Unstored | BatchDone | None:
-        """Process a message of the worker; returns the outcome if it is one."""
+        """Process a message of the worker, which is returned if it is an outcome."""
         match message:
             case Begun():
                 self._begun, self._last = True, time.monotonic()
-            case Share():
-                self.share = message.share
+            case FractionDone():
+                self.fraction = message.fraction
             case ItemDone():
                 self.progress.done[message.number] = message.value
                 self._observe(message.value)
@@ -141,14 +131,14 @@ class _JobState:
 
 
 _Worker = tuple[Connection, "subprocess.Popen[bytes]", str, CurrentItem]
-"""The connection to a worker process, the process, the mark of it and of what it starts, and its current item."""
+"""The connection to a worker process, the process, the mark of its descendants, and its current item."""
 
 
 class Supervisor:
-    """Runs stages, one at a time, in worker processes that it starts, watches and replaces.
+    """Runs stages, one at a time, in worker processes that it starts, monitors and replaces.
 
-    Every set of packages of third parties has a process of its own: whatever they do to it concerns no others. Items
-    of one stage that need several are done by these in turn.
+    Every set of third-party packages has a process of its own: whatever they do to it concerns no others. Items of one
+    stage that need several processes are done by these in turn.
 
     Parameters
     ----------
@@ -160,13 +150,13 @@ class Supervisor:
 
     def __init__(self, log: Path | None = None, environment: Mapping[str, str] | None = None) -> None:
         self._log, self._environment = log, dict(environment or {})
-        self._workers: OrderedDict[frozenset[str], _Worker] = OrderedDict()  # the one used last comes last
+        self._workers: OrderedDict[frozenset[str], _Worker] = OrderedDict()  # the most recently used comes last
         self._session = 0
         self._state: _JobState | None = None
         self._stop = threading.Event()
 
     def run(self, job: Job, observe: Callable[[Any], None] = lambda _: None) -> Done | Failed | Unstored:
-        """Run a stage until it ends or exceeds its limits; `observe` gets the value of every item that is done.
+        """Run a stage until it ends or exceeds its limits; `observe` is called with the value of every item done.
 
         Raises
         ------
@@ -183,10 +173,10 @@ class Supervisor:
             raise
 
     @property
-    def share(self) -> tuple[str, float]:
-        """The key of the stage that is run, and which share of it is done as far as that is known."""
+    def fraction_done(self) -> tuple[str, float]:
+        """The key of the running stage, and the fraction of it known to be done."""
         state = self._state
-        return ("", 0.0) if state is None else (state.job.stage.key, state.share)
+        return ("", 0.0) if state is None else (state.job.stage.key, state.fraction)
 
     def stop(self) -> None:
         """Make `run`, which may be active in another thread, return soon."""
@@ -201,7 +191,7 @@ class Supervisor:
         state, limit, retried = _JobState(job, observe), job.cell_seconds, False
         self._state = state
         done, lost = state.progress.done, state.progress.lost
-        while len(self._workers) > KEPT:
+        while len(self._workers) > 4:  # idle processes hold memory, each with the imports of its packages
             self._kill(next(iter(self._workers)))
         while True:
             try:
@@ -239,7 +229,7 @@ class Supervisor:
         try:
             connection.send((state.job, state.start(batch, current), batch))
             while not self._stop.is_set():
-                if connection.poll(POLL):
+                if connection.poll(0.2):
                     outcome = state.update(connection.recv())
                     if outcome is not None:
                         return outcome
@@ -252,12 +242,12 @@ class Supervisor:
         raise StoppedError
 
     def _worker(self, packages: frozenset[str]) -> _Worker:
-        """The connection to the worker process of some packages, and the process, started where there is none."""
+        """The worker process of some packages, started if there is none."""
         if packages not in self._workers:
             (ours, theirs), mark = socket.socketpair(), secrets.token_hex(8)
             environment = _environment({**os.environ, **self._environment}) | {MARK: mark}
             with theirs, tempfile.TemporaryFile() as shared:
-                shared.truncate(CurrentItem.SIZE)
+                shared.truncate(8)
                 socket.send_fds(ours, [b"+"], [shared.fileno()])
                 current = CurrentItem(shared.fileno())
                 process = start_worker(theirs.fileno(), str(self._log or os.devnull), environment)
@@ -265,9 +255,9 @@ class Supervisor:
         self._workers.move_to_end(packages)
         return self._workers[packages]
 
-    def _kill(self, *those: frozenset[str]) -> None:
-        """End the worker processes of some packages, or all."""
-        for packages in those or tuple(self._workers):
+    def _kill(self, *sets: frozenset[str]) -> None:
+        """End the worker processes of some sets of packages, or all."""
+        for packages in sets or tuple(self._workers):
             if (worker := self._workers.pop(packages, None)) is None:
                 continue
             connection, process, mark, _ = worker
@@ -279,7 +269,7 @@ class Supervisor:
 
 
 def start_worker(descriptor: int, log: str, environment: Mapping[str, str]) -> subprocess.Popen[bytes]:
-    """A worker process that serves the other end of a socket; what plugins print goes to `log`.
+    """A worker process that serves the other end of a socket; the output of plugins goes to `log`.
 
     It leads its own process group: Ctrl-C on the terminal does not reach it, and children of plugins die with it, as do
     those in other groups, by their mark.
@@ -301,7 +291,7 @@ def _cause_of_death(process: subprocess.Popen[bytes]) -> str:
 
 
 def manner_of_death(code: int) -> str:
-    """What an exit code of `subprocess` says: an exit code, or the name of a signal."""
+    """A return code of `subprocess` in words: an exit code, or the name of a signal."""
     if code >= 0:
         return f"exit code {code}"
     names = {number.value: number.name for number in signal.Signals}
@@ -309,7 +299,7 @@ def manner_of_death(code: int) -> str:
 
 
 def _environment(parent: Mapping[str, str]) -> dict[str, str]:
-    """One thread for numerical libraries, freed memory kept, and the modules that this process finds."""
+    """Environment with one thread for numerical libraries, freed memory kept, and the import path of this process."""
     path = os.pathsep.join(folder for folder in sys.path if folder)
     return {**parent, **ONE_THREAD, **KEPT_MEMORY, "PYTHONPATH": path}
 
@@ -318,9 +308,9 @@ def kill_marked(mark: str) -> None:
     """Kill all processes with this value of `MARK` but the calling one.
 
     A process that became a daemon is in no group or session of the worker, and after the worker's death not among its
-    children. Systems without /proc do not tell the environment of a process: only its group ends with a worker there.
+    children. On systems without /proc only the process group ends with a worker.
     """
-    for _ in range(PASSES):
+    for _ in range(100):  # processes may be started during a search; no more, in case one multiplies for ever
         processes = list(_marked(mark))
         if not processes:
             return

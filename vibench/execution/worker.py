@@ -29,11 +29,11 @@ from vibench.execution.jobs import (
     BatchDone,
     Begun,
     CurrentItem,
+    FractionDone,
     ItemDone,
     Job,
     OutOfMemory,
     Progress,
-    Share,
     code_here,
 )
 from vibench.execution.supervisor import MARK, kill_marked
@@ -44,14 +44,7 @@ from vibench.storage.artefacts import Store
 T = TypeVar("T")
 Send = Callable[[Any], None]
 Enter = Callable[[int, bool], None]
-"""Notes the item that this process is in, and whether it is in an operation with a time limit of its own."""
-
-KEPT, SHARE_KEPT = 2**30, 0.125
-"""Bytes of artefacts that this process keeps after it has read them, and the share of its memory limit that they take
-at most."""
-
-OF_THIS_PROCESS = (errno.EBADF, errno.EFBIG, errno.EMFILE)
-"""Errors of writing that other processes need not have."""
+"""Sets the item that this process is in, and whether its current operation has a time limit of its own."""
 
 
 class _NoMemoryError(Exception):
@@ -67,9 +60,10 @@ def main() -> None:
     current = CurrentItem(shared)
     os.close(shared)
     connection = Connection(ours.detach())
-    for stream in (1, 2):  # what plugins print must not look like output of vibench
+    # The output of plugins must not look like output of vibench, and must not be lost with a buffer in a crash.
+    for stream in (1, 2):
         os.dup2(log, stream)
-    if isinstance(sys.stdout, io.TextIOWrapper):  # what was printed before a crash would be lost with its buffer
+    if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(line_buffering=True)
     faulthandler.enable()
     interrupts.ignore()
@@ -78,16 +72,16 @@ def main() -> None:
     own, first = os.getpid(), True
 
     def end_in_child() -> None:
-        if os.getpid() != own:  # a plugin forked: the child must not speak to the supervisor
+        if os.getpid() != own:  # a plugin forked: the child must not talk to the supervisor
             os._exit(0)
 
     def send(message: Any) -> None:
         end_in_child()
         connection.send(message)
 
-    def enter(number: int, watched: bool) -> None:
+    def enter(number: int, limited: bool) -> None:
         end_in_child()
-        current.enter(number, watched=watched)
+        current.enter(number, limited=limited)
 
     while True:
         try:
@@ -95,18 +89,19 @@ def main() -> None:
         except EOFError:
             return
         send(Begun())
-        # The allocator keeps freed memory: a large process is replaced before the next job instead of failing it.
+        # The allocator keeps freed memory: replace a large process before the next job, which it might fail.
         if not first and not _last and _address_space() > 0.5 * job.memory_gib * 2**30:
             send(OutOfMemory(None))
             return
         first = False
-        faulthandler.dump_traceback_later(2.0 * job.cell_seconds + 60.0, exit=True)  # in case the supervisor has died
+        # The supervisor enforces the limits; this one is for a supervisor that has died.
+        faulthandler.dump_traceback_later(2.0 * job.cell_seconds + 60.0, exit=True)
         send(perform(job, progress, batch, send, enter))
         faulthandler.cancel_dump_traceback_later()
 
 
 def _end_with(parent: int) -> None:
-    """Kill this process and the children of plugins once the parent has died, since its limits are not enforced."""
+    """Kill this process and the children of plugins once the parent has died, which enforced their limits."""
     while os.getppid() == parent:
         time.sleep(1.0)
     kill_marked(os.environ[MARK])
@@ -116,12 +111,13 @@ def _end_with(parent: int) -> None:
 def perform(
     job: Job, progress: Progress, batch: Batch, send: Send, enter: Enter
 ) -> Done | BatchDone | Failed | Unstored | OutOfMemory:
-    """Run a batch of a stage; an exception of a plugin is the reason of a failed stage and ends no run."""
+    """Run a batch of a stage; an exception of a plugin fails the stage and not the run."""
     start = time.perf_counter()
 
     def work() -> Done | BatchDone:
         _check_code(job, batch)
-        store = _store(job.store, min(KEPT, int(SHARE_KEPT * job.memory_gib * 2**30)))
+        # Artefacts that were read stay in memory: at most 1 GiB, and an eighth of the limit.
+        store = _store(job.store, min(2**30, int(0.125 * job.memory_gib * 2**30)))
         LOST.set(job.lost)
         if isinstance(job.stage, ItemwiseStage):
             items = _begun(job.stage, store)
@@ -133,7 +129,7 @@ def perform(
             _last.clear()
             value = items.finish([done[number] for number in range(job.stage.items)])
             return Done((), value, time.perf_counter() - start)
-        SHARE.set(lambda share: send(Share(share)))
+        SHARE.set(lambda fraction: send(FractionDone(fraction)))
         result = job.stage.run(store)
         store.put(job.stage.key, result.value, result.seconds, result.histories)
         return Done(result.histories, None, time.perf_counter() - start, result.seconds)
@@ -141,7 +137,9 @@ def perform(
     try:
         return _guarded(job.memory_gib, work)
     except StorageError as error:
-        if isinstance(error.__context__, OSError) and error.__context__.errno in OF_THIS_PROCESS:
+        # Other processes can still write: the fault is one of this process.
+        own = (errno.EBADF, errno.EFBIG, errno.EMFILE)
+        if isinstance(error.__context__, OSError) and error.__context__.errno in own:
             return Failed(Status.ERROR, f"{error}; a plugin limits or closes the files of its process")
         return Unstored(str(error))
     except _NoMemoryError:
@@ -149,10 +147,10 @@ def perform(
 
 
 def _check_code(job: Job, batch: Batch) -> None:
-    """Refuse a job that was planned with other code than this process has: its artefact would have the wrong key."""
+    """Refuse a job that was planned with other code than this process has: its artefact would get the wrong key."""
     stage = job.stage
     stages = [stage.stage_of(number) for number in batch.numbers] if isinstance(stage, ItemwiseStage) else [stage]
-    # Each once: stages reach the same plugins through many of their inputs.
+    # Check every plugin once: stages reach the same ones through many of their inputs.
     used = dict.fromkeys(plugin for one in {one.key: one for one in stages}.values() for plugin in one.plugins)
     changed = [f"the {plugin}" for plugin in used if plugin.as_installed() != plugin]
     if job.code != code_here():
@@ -162,7 +160,7 @@ def _check_code(job: Job, batch: Batch) -> None:
 
 
 _last: dict[str, Items] = {}
-"""The items of the stage that was begun and has not ended, by its key; other processes may do batches of it, too."""
+"""Items of the stage that this process has begun and not ended, by its key; other processes may do batches of it."""
 
 
 def _begun(stage: ItemwiseStage, store: Store) -> Items:
@@ -173,7 +171,6 @@ def _begun(stage: ItemwiseStage, store: Store) -> Items:
 
 
 def _done(job: Job, items: Items, batch: Batch, send: Send, enter: Enter) -> dict[int, Any]:
-    """The values of the items of a batch, which are done here."""
     done = {}
     for number in batch.numbers:
 
@@ -182,7 +179,7 @@ def _done(job: Job, items: Items, batch: Batch, send: Send, enter: Enter) -> dic
 
         watch(False)
         value = _guarded(job.memory_gib, partial(items.item, number, watch))
-        watch(False)  # what has failed has not said so
+        watch(False)  # an item that raised may not have done so
         done[number] = items.lost(number, value) if isinstance(value, Failed) else value
         send(ItemDone(number, done[number]))
     return done
@@ -207,7 +204,7 @@ def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:
 
 @contextmanager
 def _memory_limit(gib: float) -> Iterator[None]:
-    """Limit the address space inside the block; outside it the worker needs memory to reply."""
+    """Limit the address space inside the block; outside it the worker needs memory for its reply."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     limit = int(gib * 2**30)
     if _address_space() > limit:

@@ -104,7 +104,7 @@ class TimeLeft:
         """Note when a stage begins."""
         self._running[stage.key] = _Running(_sort(stage), monotonic())
 
-    def shares(self, done: Sequence[tuple[Stage, float]]) -> float:
+    def fractions_done(self, done: Sequence[tuple[Stage, float]]) -> float:
         """Note which shares of the running stages are done.
 
         Returns how long the longest one of those has taken whose pace is known.
@@ -238,9 +238,9 @@ class ProgressDisplay(Observer):
             self._begun.add(stage.label)
             print_line(self._console, f"{stage.label} …")
 
-    def shares(self, done: Sequence[tuple[Stage, float]]) -> None:
+    def fractions_done(self, done: Sequence[tuple[Stage, float]]) -> None:
         """Shares of running stages: the bar has the time left from the first one on, and so does one line."""
-        longest = self._left.shares(done)
+        longest = self._left.fractions_done(done)
         if self._bar is not None:
             self._bar.update(self._task, left=self._left_text())
         elif longest > FIRST_SECONDS and not self._has_estimated:

@@ -143,11 +143,8 @@ def test_dask_workers_get_the_classes_of_a_notebook(cluster: LocalCluster, tmp_p
 @pytest.mark.parametrize(
     ("client", "job_status"), [("closed", "finished"), ("running", "finished"), ("running", "error")]
 )
-def test_a_client_that_closes_while_it_is_asked_holds_up_nobody(
-    client: str, job_status: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_client_that_closes_while_it_is_asked_holds_up_nobody(client: str, job_status: str) -> None:
     """The callbacks of all clients share one thread: a result that never comes would be the end of all later runs."""
-    monkeypatch.setattr(executors, "ASKED_AGAIN", 0.0)
     asked: list[float] = []
 
     def result(timeout: float) -> str:
@@ -222,11 +219,8 @@ def test_a_scheduler_that_does_not_answer_is_named(vibench: Vibench, tmp_path: P
         (b"HTTP/1.1 400 Bad\r\n\r\n", "Error: "),
     ],
 )
-def test_a_port_that_is_no_scheduler_is_refused_in_a_line(
-    said: bytes, words: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_port_that_is_no_scheduler_is_refused_in_a_line(said: bytes, words: str) -> None:
     """One accepts and says nothing, the others say how much they are about to say."""
-    monkeypatch.setattr(executors, "ANSWER_SECONDS", 0.5 if not said else 60.0)
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def answer() -> None:
@@ -239,7 +233,7 @@ def test_a_port_that_is_no_scheduler_is_refused_in_a_line(
         threading.Thread(target=answer, daemon=True).start()
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
         with pytest.raises(RequestError, match=f"no dask scheduler answers at '{address}': .*{words}") as error:
-            executors._greet(address)
+            executors._greet(address, 60.0 if said else 0.5)
         assert "\n" not in str(error.value)
         for one in taken:
             one.close()

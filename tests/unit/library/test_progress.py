@@ -61,10 +61,10 @@ def test_a_stage_that_tells_its_share_counts_before_its_end(monkeypatch: pytest.
     monkeypatch.setattr("vibench.library.progress.monotonic", lambda: now[0])
     left = TimeLeft(CHUNK[:4], 2)
     left.begin(CHUNK[0])
-    assert left.shares([(CHUNK[0], 0.0)]) == 0.0
+    assert left.fractions_done([(CHUNK[0], 0.0)]) == 0.0
     assert left.seconds() is None
     now[0] += 10.0
-    assert left.shares([(CHUNK[0], 0.25)]) == 0.0  # its pace may be that of a set-up
+    assert left.fractions_done([(CHUNK[0], 0.25)]) == 0.0  # its pace may be that of a set-up
     assert left.seconds() == pytest.approx((4 * 40.0 - 10.0) / 2)
     left.done(CHUNK[0], 30.0)
     assert left.seconds() == pytest.approx(3 * 30.0 / 2)
@@ -97,7 +97,7 @@ def test_the_set_up_of_a_long_stage_is_not_expected_of_the_others(monkeypatch: p
     left.begin(CHUNK[0])
     for seconds, share in ((30.0, 0.1), (35.0, 0.2), (37.0, 0.2), (40.0, 0.3)):
         now[0] = seconds
-        left.shares([(CHUNK[0], share)])
+        left.fractions_done([(CHUNK[0], share)])
     assert left.seconds() == pytest.approx(0.7 * 50.0 + 50.0)
 
 
@@ -132,7 +132,7 @@ def test_a_run_in_space_says_in_its_first_minute_how_long_it_will_take(monkeypat
         for stage, began, end in running.values():
             solved = int(max(0.0, (now[0] - began) / (end - began) * (SOLUTIONS + 4) - 4)) / SOLUTIONS
             told.append((stage, solved if isinstance(stage, SnapshotStage) else 0.0))
-        left.shares(told)
+        left.fractions_done(told)
         if (seconds := left.seconds()) is not None:
             estimates.append((now[0], seconds))
         first = min(end for _, _, end in running.values())
@@ -245,7 +245,7 @@ def test_a_long_first_part_says_how_long_the_run_will_take(report: Make, monkeyp
     made.begin(CHUNK[0])
     for seconds, share in ((10.0, 0.1), (15.0, 0.25), (15.0, 0.4)):
         now[0] += seconds
-        made.shares([(CHUNK[0], share)])
+        made.fractions_done([(CHUNK[0], share)])
     assert printed.getvalue().count("left") == 1
     assert "high-fidelity solutions: 25% of one part, about 6 min left" in printed.getvalue()
 
