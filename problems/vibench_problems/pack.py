@@ -24,7 +24,9 @@ class Pack(Problem):
     def __init__(self, path: Path) -> None:
         self._pack = pack = read_model_pack(path)
         if pack.V is None:
-            raise RequestError(f"pack '{path}' has multipliers and X_W alone, which are not a problem: `vibench cones`")
+            raise RequestError(
+                f"pack '{path}' has multipliers and X_W alone, which are not a problem: `vibench pack FOLDER --cones`"
+            )
         self.parameters, self.V, self.W = pack.box, pack.V, pack.W
         # Declared by classes of other problems; here by what the folder holds.
         self.constant, self.entrywise = pack.constant, pack.entrywise  # type: ignore[misc]

@@ -162,10 +162,10 @@ def test_commands_refuse_a_damaged_cell_by_its_name(results: Path, main: Main) -
         ("show", folder),
         ("show", folder, "--table", "queries", "--format", "json"),
         ("report", folder, "--no-figures"),
-        ("diff", folder, folder),
+        ("compare", folder, folder, "--table", "changes"),
         ("compare", folder, folder),
         ("replay", folder, cell),
-        ("export-qps", folder, "set"),
+        ("export", folder, "set"),
     ):
         code, _, errors = main(*command)
         assert (code, errors.startswith(line), errors.count("\n")) == (2, True, 1), errors
@@ -246,7 +246,7 @@ def test_a_status_that_does_not_exist_is_refused(table: str, results: Path, main
     """Written by a stranger, with the right digest."""
     execute(results.parent, f"UPDATE {table} SET status = 'fine'")
     folder = str(results.parent)
-    code, _, errors = main("diff", folder, folder)
+    code, _, errors = main("compare", folder, folder, "--table", "changes")
     assert code == 2
     assert f"has the status 'fine' in '{table}', expected one of ok, inaccurate" in errors
 
@@ -261,7 +261,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("wrong", WRONG, ids=str)
-@pytest.mark.parametrize("command", ["show", "report", "figures", "diff"])
+@pytest.mark.parametrize("command", ["show", "report", "figures", "compare"])
 def test_a_value_that_is_none_of_its_column_is_refused(
     command: str, wrong: tuple[str, str, str], results: Path, main: Main
 ) -> None:
@@ -269,7 +269,7 @@ def test_a_value_that_is_none_of_its_column_is_refused(
     table, column, value = wrong
     execute(results.parent, f"UPDATE {table} SET {column} = {value} WHERE rowid = 1")
     folder = str(results.parent)
-    beside = {"show": ["--table", table], "diff": [folder], "report": ["--no-figures"], "figures": ["--jobs", "1"]}
+    beside = {"show": ["--table", table], "compare": [folder], "report": ["--no-figures"], "figures": ["--jobs", "1"]}
     code, _, errors = main(command, folder, *beside.get(command, []))
     assert code == 2
     assert f"in the column '{column}' of '{table}', expected {WRONG[wrong]}" in errors

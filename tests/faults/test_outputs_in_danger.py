@@ -58,8 +58,8 @@ def test_an_export_that_is_killed_is_whole_or_not_there(small_run: Run, vibench:
     rng, run = random.Random(9), str(small_run.path.parent)
     key = small_run.cells.set_index(["problem", "assembly"]).loc[("radial-obstacle", "reduced"), "cell"].iloc[0]
     for arguments, made in (
-        (["export-qps", run, "set"], tmp_path / "set" / "check.py"),
-        (["export-model", run, key, "model.npz"], tmp_path / "model.npz"),
+        (["export", run, "set"], tmp_path / "set" / "check.py"),
+        (["export", run, key, "model.npz"], tmp_path / "model.npz"),
     ):
         start = time.monotonic()
         assert vibench(tmp_path, *arguments[:-1], f"whole-{arguments[-1]}").returncode == 0
@@ -86,8 +86,8 @@ def test_a_site_on_a_full_disk_is_one_line(kib: int, run: Path, vibench: Vibench
     [
         ("show", "loop"), ("publish", "--yes", "run", "loop"), ("publish", "--yes", "run", "loop/site"),
         ("run", "loop"),
-        ("run", "study.toml", "--out", "loop/x"), ("import", "loop"), ("export-qps", "run", "loop/x"),
-        ("export-model", "run", "0", "loop/m.npz"), ("bench", "--read", "loop"), ("run", "loop/study.toml"),
+        ("run", "study.toml", "--out", "loop/x"), ("pack", "loop"), ("export", "run", "loop/x"),
+        ("export", "run", "0", "loop/m.npz"), ("bench", "--read", "loop"), ("run", "loop/study.toml"),
         ("report", "run", "--out", "loop/x", "--no-figures"),
     ],
     ids=" ".join,

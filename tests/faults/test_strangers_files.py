@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from running import PATIENCE, seal
 
-from vibench.cli.output_commands import export_qps, write_report
+from vibench.cli.output_commands import export, write_report
 from vibench.cli.result_commands import replay_query, show
 from vibench.errors import NumericalError, RequestError
 from vibench.execution.recording import LOCK, REPORT, claimed
@@ -110,7 +110,7 @@ def test_a_cell_that_would_name_a_file_elsewhere_is_refused(name: str, run: Path
     change(run, "PRAGMA foreign_keys=OFF", f"UPDATE cells SET cell = '{quoted}' WHERE cell = '{cell}'")
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(RequestError, match="expected 16 hexadecimal digits"):
-        export_qps(str(run), tmp_path / "set")
+        export(str(run), [str(tmp_path / "set")])
     with pytest.raises(RequestError, match="expected 16 hexadecimal digits"):
         replay_query(str(run), name[:4])
     assert sorted(tmp_path.rglob("*")) == before
@@ -125,8 +125,7 @@ def test_a_cell_that_would_name_a_file_elsewhere_is_refused(name: str, run: Path
 )
 def test_a_results_file_with_code_of_its_own_is_refused(planted: str, run: Path, tmp_path: Path) -> None:
     change(run, planted)
-    export = partial(export_qps, folder=tmp_path / "set")
-    for command in (show, write_report, export):
+    for command in (show, write_report, partial(export, words=["set"])):
         with pytest.raises(RequestError, match=r"is not a results file of vibench: it has a (trigger|view)"):
             command(str(run))
 

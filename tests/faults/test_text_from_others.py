@@ -133,7 +133,8 @@ def test_whatever_is_printed_and_written_is_printable(ended: tuple[Path, str], v
     texts = [printed, *(path.read_text(encoding="utf-8") for path in written)]
     assert (run / FILE).stat().st_size < 5_000_000
     cell = next(row["cell"] for row in rows(run) if (row["solver"], row["status"]) == ("odd-counts", "ok"))
-    commands = [["report", "run"], ["diff", "run", "run"], ["replay", "run", cell], ["run", "study.toml", "--dry-run"]]
+    commands = [["report", "run"], ["compare", "run", "run"], ["replay", "run", cell]]
+    commands += [["run", "study.toml", "--dry-run"]]
     commands += [["show", "run", "--table", table] for table in ("benefits", "queries")]
     commands += [["show", "run", "--format", form] for form in formats.FORMS]
     for command in commands:

@@ -134,7 +134,7 @@ class TestAuthor:
     """Somebody with a model of their own."""
 
     def test_what_can_be_done_with_a_pack(self, home: Path, narrow: Main) -> None:
-        _, out, _ = narrow("import", "my-model")
+        _, out, _ = narrow("pack", "my-model")
         text = " ".join(out.split())
         assert "mean deflection" in text
         assert "interpolates" not in text  # all members are declared
@@ -168,7 +168,7 @@ class TestEngineer:
     def exported(self, home: Path, narrow: Main) -> Path:
         """The folder of an exported model."""
         (home / "out").mkdir()
-        code, out, err = narrow("export-model", "mine", key(home, **CERTIFIED)[:8], "out/string.npz", "--c")
+        code, out, err = narrow("export", "mine", key(home, **CERTIFIED)[:8], "out/string.c")
         assert (code, err) == (0, "")
         assert re.search(r"query.*\bms\b", out, re.DOTALL)  # what it costs
         return home / "out"

@@ -63,8 +63,8 @@ def test_a_pack_that_was_moved_and_renamed_is_where_the_user_says(made: Path, ma
     code, out, err = main("replay", run, key(made)[:6], "--at", at, "--out", "program.npz")
     assert (code, err) == (0, "")
     assert "piqp (recorded)" in out
-    assert main("export-model", run, key(made), "model.npz", "--at", at)[0] == 0
-    assert main("export-qps", run, "set", "--at", at)[0] == 0
+    assert main("export", run, key(made), "model.npz", "--at", at)[0] == 0
+    assert main("export", run, "set", "--at", at)[0] == 0
     code, _, err = main(
         "run", f"{run}/{FILE}", "--cell", key(made), "--at", at, "--out", "again", "--jobs", "1", "--no-figures"
     )
@@ -82,8 +82,8 @@ def test_an_edited_pack_is_noticed_wherever_it_is(moved: bool, made: Path, main:
         pack = pack.rename(tmp_path / "rope")
         at = ["--at", f"packs/cable={pack}"]
     sp.save_npz(pack / "A.npz", 2.0 * Cable().A)
-    for command in (["replay"], ["export-model"]):
-        files = ["model.npz"] if command == ["export-model"] else []
+    for command in (["replay"], ["export"]):
+        files = ["model.npz"] if command == ["export"] else []
         refused(main(*command, str(made / "run"), key(made), *files, *at), "from files that were changed since")
 
 

@@ -256,7 +256,7 @@ def test_only_an_edit_of_what_computes_numbers_runs_anything_again(
         "testing/sample.py",
     ):
         edit(module)
-    printed = vibench(run, ("export-qps", "wire", "programs"))
+    printed = vibench(run, ("export", "wire", "programs"))
     assert "1 cells, 0 to run, 0 stages" in printed
     assert "3 programs" in printed  # of the model as it was
     edit("stages/query.py")  # determines the queries, and nothing before them

@@ -42,23 +42,23 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     ),
     "report": ("vibench report quick", "vibench report runs/quick --no-figures --out quick.html"),
     "figures": ("vibench figures quick", "vibench figures runs/quick --out pictures -j 1"),
-    "diff": ("vibench diff runs/before runs/after", "vibench diff runs/before runs/after --limit 1.1 --format json"),
     "compare": (
         "vibench compare runs/laptop runs/server runs/cluster",
         "vibench compare runs/2024 runs/2025 --column online_s",
         "vibench compare runs/2024 runs/2025 --table columns --format csv",
+        "vibench compare runs/before runs/after --table changes --strict",
     ),
     "publish": (
         "vibench publish quick site",
         'vibench publish a b site --author "Doe, Jane" --doi 10.5281/zenodo.1234567',
     ),
     "replay": ("vibench replay quick 3f9a", "vibench replay quick 3f9a --query 7"),
-    "export-qps": ("vibench export-qps quick programs",),
-    "export-model": (
-        "vibench export-model quick 3f9a membrane.npz",
-        "vibench export-model quick 3f9a membrane.npz --interpolate 1e-6 --c",
+    "export": (
+        "vibench export quick programs",
+        "vibench export quick 3f9a membrane.npz",
+        "vibench export quick 3f9a membrane.c --tolerance 1e-6",
+        "vibench export quick 3f9a membrane.vtu --mu 1.0,0.02,-0.01",
     ),
-    "export-vtu": ("vibench export-vtu quick 3f9a 1.0,0.02,-0.01 --out membrane.vtu",),
     "check": (
         "vibench check my-problem --option resolution=medium",
         "vibench check primal:mine",
@@ -78,14 +78,14 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench new problem cable",
         "vibench new dual my-cone --out packages",
     ),
-    "import": ("vibench import my-model",),
     "pack": (
+        "vibench pack my-model",
+        "vibench pack my-model --cones --dual-tol 1e-3",
         "vibench pack my-problem my-model --option resolution=coarse",
         "vibench pack my-problem my-model --seed 2022 --validation 16 --solutions",
     ),
-    "cones": ("vibench cones my-model", "vibench cones my-model --dual-tol 1e-3"),
     "clean": ("vibench clean --dry-run", "vibench clean --older-than 30"),
-    "help": ("vibench help show", "vibench help timing_rounds", "vibench help beta_cone_lower_min"),
+    "help": ("vibench help show", "vibench help timing_rounds", "vibench help online_s", "vibench help supremizer"),
     "doctor": ("vibench doctor", "vibench doctor --out /scratch/runs"),
 }
 """Examples of every command."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 import sys
+import textwrap
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TextIO
 
 import typer
 
@@ -32,13 +34,24 @@ LONG = 60
 def echo(*lines: str) -> None:
     """Print lines; what is not printable in them, such as an escape sequence or a line break, is shown as an escape."""
     if lines:
-        typer.echo("\n".join(map(printable, lines)))
+        typer.echo("\n".join(fitted(printable(line), sys.stdout) for line in lines))
 
 
 def warn(*lines: str) -> None:
     """Print lines on standard error, each as those of errors begin: what is printed may go into a file."""
     for line in lines:
-        sys.stderr.write(f"vibench: {printable(line)}\n")
+        sys.stderr.write(f"{fitted(f'vibench: {printable(line)}', sys.stderr)}\n")
+
+
+def fitted(line: str, stream: TextIO) -> str:
+    """A line, wrapped between words on a terminal.
+
+    Elsewhere a program may read it, and an indented line holds a command that somebody may copy: both stay whole.
+    """
+    width = shutil.get_terminal_size().columns
+    if len(line) <= width or line.startswith(" ") or not stream.isatty():
+        return line
+    return textwrap.fill(line, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
 
 def run_argument(folder: Path) -> str:

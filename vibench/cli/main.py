@@ -1,4 +1,4 @@
-"""The command line: the commands that run studies and look after the machine, and what runs them all.
+"""The command line: its commands, the words that `vibench help` knows, and the call that runs a command.
 
 Help and completion have to answer at once, so modules that define commands import nothing heavy at the top (no numpy,
 pandas, rich or pydantic): every command imports what it needs when it runs.
@@ -8,44 +8,32 @@ from __future__ import annotations
 
 import io
 import os
+import re
+import shlex
 import sys
 import warnings
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator
+from importlib.resources import files
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any
 
-import typer
+import typer.core
 from typer import Argument, Option
 
-from vibench.cli import output_commands
 from vibench.cli.bench_command import bench_plugins
-from vibench.cli.completion import CORRECTIONS, examples, formulations, names, solvers, studies, whole_words, words
-from vibench.cli.console import echo, warn
-from vibench.cli.output_commands import (
-    draw_figures,
-    export_mesh_fields,
-    export_qps,
-    export_reduced_model,
-    publish_runs,
-    write_report,
-)
-from vibench.cli.pack_commands import import_pack, pack_problem, reduce_cones
+from vibench.cli.completion import SHOWN, examples, whole_words
+from vibench.cli.console import echo, fitted, warn
+from vibench.cli.output_commands import draw_figures, export, publish_runs, write_report
+from vibench.cli.pack_commands import pack
 from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
-from vibench.cli.result_commands import At, compare_runs, diff_runs, places_of, replay_query, show
-from vibench.errors import RequestError, VibenchError
-from vibench.interrupts import INTERRUPTED, Interrupted, interrupted_at_once, interruptible
-from vibench.plugins.kinds import DUAL, PRIMAL, PROBLEM
+from vibench.cli.result_commands import compare_runs, replay_query, show
+from vibench.cli.run_command import run_study_command
+from vibench.errors import RequestError, VibenchError, unknown_name
+from vibench.interrupts import INTERRUPTED, Interrupted, interruptible
+from vibench.plugins.kinds import PluginKind
 from vibench.text import unbroken
-
-if TYPE_CHECKING:
-    from vibench.execution.run import Outcome
-    from vibench.study.spec import Study
-
-Names = list[str] | None
-Tolerances = list[float] | None
-
-SQLITE = ".sqlite"
-"""How the name of a results file ends."""
 
 app = typer.Typer(
     name="vibench",
@@ -75,131 +63,6 @@ def _global_options(
     ] = False,
 ) -> None:
     pass
-
-
-def run_study_command(
-    study: Annotated[
-        str,
-        Argument(help="A registered study, or a TOML file; with --cell a results file, too.", autocompletion=studies),
-    ] = "quick",
-    cell: Annotated[str, Option(metavar="KEY", help="Run one cell alone, by its key or the beginning of that.")] = "",
-    problem: Annotated[
-        Names, Option(help="Replace the problems of the study (repeatable).", autocompletion=names(PROBLEM))
-    ] = None,
-    formulation: Annotated[Names, Option(help="Replace the formulations.", autocompletion=formulations)] = None,
-    dual: Annotated[Names, Option(help="Replace the dual strategies.", autocompletion=names(DUAL))] = None,
-    primal: Annotated[Names, Option(help="Replace the primal strategies.", autocompletion=names(PRIMAL))] = None,
-    solver: Annotated[Names, Option(help="Replace the QP solvers.", autocompletion=solvers)] = None,
-    correction: Annotated[
-        Names, Option(help="Replace the corrections of solutions.", autocompletion=words(lambda: CORRECTIONS))
-    ] = None,
-    pod_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the POD.")] = None,
-    dual_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the dual strategies.")] = None,
-    primal_tol: Annotated[Tolerances, Option(help="Replace the tolerances of the primal strategies.")] = None,
-    at: At = None,
-    out: Annotated[Path | None, Option(help="Results folder; runs/STUDY by default.")] = None,
-    jobs: Annotated[
-        int, Option("--jobs", "-j", min=0, help="Worker processes; 0 for one per core. Does not affect results.")
-    ] = 0,
-    repeats: Annotated[
-        int, Option(min=0, metavar="K", help="Measure seconds in at least K cold processes, offline stages K times.")
-    ] = 0,
-    dry_run: Annotated[bool, Option("--dry-run", help="List the cells of the matrix and stop.")] = False,
-    fresh: Annotated[bool, Option("--fresh", help="Remove earlier results and recompute everything.")] = False,
-    retry: Annotated[bool, Option("--retry", help="Also rerun cells that did not end ok.")] = False,
-    strict: Annotated[bool, Option("--strict", help="Exit with 1 if a cell is neither ok nor unavailable.")] = False,
-    draw: Annotated[bool, Option("--figures/--no-figures", help="Draw the figures at the end.")] = True,
-    executor: Annotated[Literal["local", "dask"], Option(help="Local processes, or a dask cluster.")] = "local",
-    scheduler: Annotated[
-        str | None, Option(metavar="ADDRESS", help="A dask scheduler; a new cluster on this machine by default.")
-    ] = None,
-) -> None:
-    """Run a study. An interrupted run resumes where it stopped."""
-    with interrupted_at_once():  # the libraries and plugins of a study take a second to import
-        from vibench.execution.run import Options, run_study
-        from vibench.library.progress import ProgressDisplay
-        from vibench.study.matrix import expand
-
-        overrides = {
-            "problem": problem, "formulation": formulation, "dual": dual, "primal": primal, "solvers": solver,
-            "correction": correction, "pod": pod_tol, "dual_tol": dual_tol, "primal_tol": primal_tol,
-        }  # fmt: skip
-        loaded = _study(study, cell, {axis: values for axis, values in overrides.items() if values}, at)
-    if dry_run:
-        cells = expand(loaded)
-        echo(*(f"{cell.key}  {cell}" for cell in cells), f"{len(cells)} cells")
-        return
-    if scheduler is not None:
-        _warn_of_open_scheduler(scheduler, executor)
-    folder = out or Path("runs") / loaded.name
-    options = Options(jobs, fresh, retry, executor, scheduler, repeats)
-    with ProgressDisplay() as progress:
-        outcome = run_study(loaded, folder, progress, options)
-    _conclude(loaded.name, outcome, folder, draw=options.workers if draw else None, fresh=fresh, strict=strict)
-
-
-def _conclude(name: str, outcome: Outcome, folder: Path, *, draw: int | None, fresh: bool, strict: bool) -> None:
-    """Export, print and draw what a run found, on as many processes as `draw` says; exit as its statuses ask for."""
-    from vibench.cli import run_summary
-    from vibench.qp.status import Status
-    from vibench.results import show
-    from vibench.results.read import results_file
-
-    path = results_file(str(folder))
-    show.export(path, folder / "tables")
-    if outcome.damaged:
-        echo(f"computed again, as their rows were damaged: {', '.join(outcome.damaged)}")
-    if outcome.interrupted:
-        missing = f"{outcome.missing} cells have no row yet" if outcome.missing else "all cells have their rows"
-        again = "the same command without --fresh" if fresh else "the same command"
-        echo(f"interrupted: {missing}; {again} resumes the run")
-        raise typer.Exit(INTERRUPTED)
-    statuses = [row["status"] for row in outcome.rows]
-    nothing_ran = set(statuses) == {Status.UNAVAILABLE}
-    if not nothing_ran:
-        run_summary.print_summary(name, path, outcome.rows)
-    echo(f"results: {path}, tables: {folder / 'tables'}")
-    if (fresh or draw is not None) and (folder / "figures").is_dir():
-        from vibench.report import figures
-
-        figures.remove(folder / "figures")
-    if nothing_ran:
-        raise VibenchError(f"no cell could run here: {run_summary.reasons(outcome.rows)}")
-    if draw is not None:
-        output_commands.draw_run(path, folder / "figures", draw)
-    fine = statuses.count(Status.OK)
-    run_summary.next_steps(folder, len(statuses), len(statuses) - fine, figures=draw is not None)
-    if strict and any(status not in (Status.OK, Status.UNAVAILABLE) for status in statuses):
-        raise typer.Exit(1)
-
-
-def _warn_of_open_scheduler(scheduler: str, executor: str) -> None:
-    from vibench.execution.executors import is_authenticated
-
-    if executor != "dask":
-        raise RequestError(f"--scheduler {scheduler} is for --executor dask")
-    if not is_authenticated(scheduler):
-        warning = "the connection is not authenticated: others who reach the scheduler can run code on its workers"
-        sys.stderr.write(f"vibench: {unbroken(scheduler)}: {warning}\n")
-
-
-def _study(request: str, key: str, overrides: dict[str, list[Any]], at: list[str] | None) -> Study:
-    """The study that is asked for, or what it has, or a results file, of one cell."""
-    from vibench.execution.recorded_cell import recorded_study
-    from vibench.study.matrix import expand, only_cell, read_study, study_of_cell
-
-    if key and Path(request).suffix == SQLITE:
-        if overrides:
-            raise RequestError(f"a cell of a results file is run as it is recorded: leave out {', '.join(overrides)}")
-        return recorded_study(request, key, places_of(at))
-    if at:
-        raise RequestError("--at is for a cell of a results file; a study file says itself where its files are")
-    study = read_study(request, overrides)
-    if not key:
-        return study
-    cell = only_cell(expand(study), key, f"'{request}'")
-    rounds = {name: getattr(study, name) for name in ("timing_rounds", "timing_rounds_min")}
-    return study_of_cell(cell, study.name, limits=study.limits, **rounds)
 
 
 def clean(
@@ -247,37 +110,128 @@ def doctor(out: Annotated[Path, Option(metavar="DIR", help="Folder of the runs."
 
 
 def help_on(
-    topic: Annotated[
-        str, typer.Argument(help="A command, a key of study files, or a column of the results or its heading.")
+    word: Annotated[
+        str, Argument(help="A command, a key of study files, a column, a status, a plugin, or a term.")
     ] = "",
 ) -> None:
-    """Say what a command does, or what a key or a column means."""
-    if topic in ("", *COMMANDS):
-        app(args=[*topic.split(), "--help"], standalone_mode=False)
+    """Explain a command, or a word of studies and results."""
+    if word in ("", *COMMANDS):
+        app(args=[*word.split(), "--help"], standalone_mode=False)
         return
     from vibench.cli.console import shown
-    from vibench.cli.meanings import meanings
     from vibench.text import new_console
 
-    for line in meanings(topic, COMMANDS):
+    known = list(COMMANDS)
+    lines = [f"`vibench {word}` is now `vibench {shlex.join(new)}`"] if (new := renamed([word])) else []
+    for names, line in chain(_keys(), _columns(), _tables_and_plugins(), glossary()):
+        known += names
+        lines += [line] * (word.casefold() in map(str.casefold, names))
+    if not lines:
+        raise unknown_name("command, key, column, status, plugin or term", word, set(known))
+    for line in lines:
         new_console().print(shown(line))
+
+
+Explained = Iterator[tuple[Collection[str], str]]
+"""Words, and the line that explains them."""
+
+
+def _keys() -> Explained:
+    """Keys of study files."""
+    from vibench.plugins.options import keys, places
+    from vibench.study.spec import Study
+
+    schema = Study.model_json_schema()
+    for key in keys(schema):
+        holders = places(schema, key.table) if key.table else []
+        where = f"in {', '.join(holders)} of a study file" if holders else "in a study file"
+        default = "required" if key.required else f"default {key.default}" * bool(key.default)
+        about = ", ".join(filter(None, (key.expected.replace("`", ""), default)))
+        yield [key.name], f"{key.name}, {where} ({about}): {key.meaning}"
+
+
+def _columns() -> Explained:
+    """Columns by their names and headings, with and without units."""
+    from vibench.results.ranking import ADDED
+    from vibench.results.schema import STORED
+
+    # Tables share columns: a meaning is said once, with the tables in which it holds.
+    tables = defaultdict[tuple[str, str, str, str], list[str]](list)
+    for table, columns in {**STORED, "best": ADDED}.items():
+        for name, column in columns.items():
+            tables[name, column.heading, column.unit, column.meaning].append(table)
+    for (name, heading, unit, meaning), holders in tables.items():
+        line = f"{name}{f' [{unit}]' * bool(unit)}, in {', '.join(holders)}: {meaning}"
+        yield {name, heading, heading.partition(" [")[0]} - {""}, line
+
+
+def _tables_and_plugins() -> Explained:
+    from vibench.plugins.registry import registered
+    from vibench.qp.settings import SETTINGS
+
+    for table in SHOWN:
+        yield [table], f"{table}, a table of a run: `vibench show RUN --table {table}`"
+    for kind in PluginKind:
+        for name, plugin in registered(kind).items():
+            about = f"{name}, a {kind} of {plugin.origin}: {plugin.summary.removesuffix('.')}"
+            yield [name], f"{about} (`vibench list {kind.plural}`)"
+    for name in SETTINGS:
+        yield [name], f"{name}, a QP solver (`vibench list solvers`)"
+
+
+def glossary() -> Explained:
+    """Entries of the glossary; each explains the words of its title and those that its text emphasises or quotes."""
+    source = (files("vibench.cli") / "glossary.md").read_text(encoding="utf-8")
+    entries = re.findall(
+        r"^(?:\*\*(.+)\*\*\n:   |\| (?!symbol|status|verdict|---)(.+?) \| )(.+?)(?: \|)?$", source, re.M
+    )
+    for title, row, text in entries:
+        head = (title or row).replace("`", "")
+        words = [*re.split(r"[,:()]|\band\b", head), *re.findall(r"(?<=\*)[^*]+(?=\*)|(?<=`)[^`]+(?=`)", text)]
+        # A terminal shows the text of a link; its target is a page of the documentation.
+        plain = re.sub(r"\[([^]]+)\]\([^)]+\)", r"\1", text).replace("*", "").replace("`", "")
+        yield [word.strip() for word in (head, *words) if word.strip()], f"{head}: {plain}"
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "run": run_study_command, "list": list_plugins, "show": show, "report": write_report, "figures": draw_figures,
-    "diff": diff_runs, "compare": compare_runs, "publish": publish_runs,
-    "replay": replay_query, "export-qps": export_qps,
-    "export-model": export_reduced_model, "export-vtu": export_mesh_fields, "clean": clean, "doctor": doctor,
-    "check": check_plugin, "bench": bench_plugins, "new": new_plugin,
-    "import": import_pack, "pack": pack_problem, "cones": reduce_cones, "help": help_on,
+    "compare": compare_runs, "replay": replay_query, "export": export, "pack": pack, "check": check_plugin,
+    "new": new_plugin, "bench": bench_plugins, "publish": publish_runs, "clean": clean, "doctor": doctor,
+    "help": help_on,
 }  # fmt: skip
-NEGATIVE = ("export-vtu",)
-"""Commands with a parameter of a problem as an argument, whose first component may be negative: -0.1 is no option."""
+
+
+class _Command(typer.core.TyperCommand):
+    """A command whose usage shows its arguments as `RUN [CELL]`, without the braces and dots of typer."""
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        pieces = (piece.translate({ord("{"): "", ord("}"): ""}) for piece in super().collect_usage_pieces(ctx))
+        return [piece.removesuffix("...") if " " in piece else piece for piece in pieces]
+
 
 for _name, _command in COMMANDS.items():
-    # a command would take the default above of the option of its name, as that of --help, for its own
-    _settings = {"default_map": {}, "ignore_unknown_options": _name in NEGATIVE}
-    app.command(_name, epilog=examples(_name), context_settings=_settings)(interruptible(_command))
+    # Without an own default map a command would take the default above of an option of the same name for its own.
+    app.command(_name, cls=_Command, epilog=examples(_name), context_settings={"default_map": {}})(
+        interruptible(_command)
+    )
+
+
+def renamed(arguments: list[str]) -> list[str] | None:
+    """What to write in place of a command of version 0.1; `None` for the commands of today."""
+    old, *rest = arguments
+    if old == "diff":
+        return ["compare", *rest, "--table", "changes", "--strict"]
+    if old in ("import", "cones"):
+        return ["pack", *rest, *["--cones"] * (old == "cones")]
+    if old in ("export-qps", "export-model"):
+        ends = {".npz": ".c"} if "--c" in rest else {}
+        words = ("--tolerance" if word == "--interpolate" else word for word in rest if word != "--c")
+        return ["export", *(f"{word[:-4]}{ends.get(word[-4:], word[-4:])}" for word in words)]
+    if old == "export-vtu":
+        file = rest.pop(rest.index("--out") + 1) if "--out" in rest[:-1] else f"{(rest[1:2] or ['CELL'])[0]}.vtu"
+        run, cell, mu, *more = [word for word in rest if word != "--out"] + ["RUN", "CELL", "MU"][len(rest) :]
+        return ["export", run, cell, file, "--mu", mu, *more]
+    return None
 
 
 def run_command_line() -> None:
@@ -286,12 +240,16 @@ def run_command_line() -> None:
     An expected error is one line; the exit code is 2 for a wrong request, 1 for anything else.
     """
     usage_error = typer.BadParameter.__mro__[2]  # click's ClickException, whichever copy of click typer brings
+    arguments = sys.argv[1:] or ["--help"]
     try:
         _print_any_text()
         warnings.showwarning = _warning
         _search_working_directory_last()
+        if new := renamed(arguments):
+            warn(f"`vibench {arguments[0]}` will go; write `vibench {shlex.join(new)}`")
+            arguments = new
         with whole_words():
-            code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
+            code = app(args=arguments, standalone_mode=False)
     except VibenchError as error:
         code = _print_error(error, 2 if isinstance(error, RequestError) else 1)
     except OSError as error:
@@ -311,7 +269,7 @@ def run_command_line() -> None:
 def _print_any_text() -> None:
     """Print a question mark for what the encoding of a terminal or a pipe lacks, rather than abort a run."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # not what has taken its place in a test or a notebook
+        if isinstance(stream, io.TextIOWrapper):  # tests and notebooks replace the streams by others
             stream.reconfigure(errors="replace")
 
 
@@ -327,7 +285,7 @@ def _search_working_directory_last() -> None:
 
 
 def _warning(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: Any, **__: Any) -> None:
-    """Show a warning for users as one line, without the line of code that it is from; others as Python does."""
+    """Show a warning for users as one line, without the line of code that raised it; others as Python does."""
     if category is UserWarning:
         warn(unbroken(str(message)))
     else:
@@ -335,5 +293,5 @@ def _warning(message: Warning | str, category: type[Warning], filename: str, lin
 
 
 def _print_error(error: object, code: int) -> int:
-    sys.stderr.write(f"vibench: {unbroken(str(error))}\n")
+    sys.stderr.write(f"{fitted(f'vibench: {unbroken(str(error))}', sys.stderr)}\n")
     return code

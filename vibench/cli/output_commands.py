@@ -126,46 +126,68 @@ def publish_runs(
     echo(f"site of {len(run)} run{'s' * (len(run) > 1)}: {page}")
 
 
-def export_qps(
+def export(
     run: RunArgument,
-    folder: Annotated[Path, Argument(metavar="DIR", help="A new or empty folder.")],
+    words: Annotated[
+        list[str],
+        Argument(
+            metavar="[CELL] TARGET",
+            help="Without the key of a CELL a new folder for all programs of the run, a test set for QP solvers; "
+            "with CELL a new file: NAME.npz for its model, NAME.c for a C program, too, or NAME.vtu for ParaView.",
+            autocompletion=cells,
+        ),
+    ],
+    mu: Annotated[str, Option(help="Parameter of NAME.vtu: its components, separated by commas.")] = "",
+    tolerance: Annotated[
+        float | None,
+        Option(metavar="TOL", help="Error of the polynomials that replace members of a model; 1e-11 by default."),
+    ] = None,
+    bases: Annotated[bool, Option("--bases/--no-bases", help="Include the bases that reconstruct u and λ.")] = True,
     sequence: Annotated[
-        bool, Option("--sequence", help="Only ordered validation sets, as sequences: a test set of qpbenchmark.")
+        bool, Option("--sequence", help="Only programs of ordered validation sets, as sequences for qpbenchmark.")
     ] = False,
     at: At = None,
 ) -> None:
-    """Export the programs of a run as a test set for QP solvers. The set includes their solutions."""
-    from vibench.report import replay
+    """Export programs, a reduced model, or a solution for ParaView.
 
-    count = replay.export(run, folder, places_of(at), sequence=sequence)
-    echo(f"{count} programs in {folder / 'programs'}; `python {folder / replay.CHECKER}` rechecks every solution")
+    A model is used without vibench, in Python or C; the fields for ParaView are u, λ and their errors at a parameter.
+    """
+    *cell, last = words
+    target, kind = Path(last), Path(last).suffix
+    if len(cell) > 1 or bool(cell) != (kind in {".npz", ".c", ".vtu"}):
+        raise RequestError("expected DIR, a folder for programs, or CELL FILE, whose name ends in .npz, .c or .vtu")
+    others: dict[str, object] = {"--mu": mu and kind != ".vtu", "--sequence": sequence and cell}
+    others |= {
+        "--tolerance": tolerance and kind not in {".npz", ".c"},
+        "--no-bases": not bases and kind not in {".npz", ".c"},
+    }
+    if wrong := [option for option, is_wrong in others.items() if is_wrong]:
+        raise RequestError(f"{', '.join(wrong)} has no meaning for '{last}'")
+    if not cell:
+        from vibench.report import replay
+
+        count = replay.export(run, target, places_of(at), sequence=sequence)
+        echo(f"{count} programs in {target / 'programs'}; `python {target / replay.CHECKER}` rechecks every solution")
+    elif kind == ".vtu":
+        _export_fields(run, cell[0], mu, target, places_of(at))
+    else:
+        _export_model(run, cell[0], target, tolerance, bases, places_of(at))
 
 
-def export_reduced_model(
-    run: RunArgument,
-    cell: Annotated[str, Argument(metavar="CELL", help="Key of a cell, or its beginning.", autocompletion=cells)],
-    file: Annotated[Path, Argument(metavar="FILE", help="A new file, whose name ends in .npz.")],
-    interpolate: Annotated[
-        float | None,
-        Option(metavar="TOL", help="Allowed error of the polynomials that replace members; 1e-11 by default."),
-    ] = None,
-    evaluations: Annotated[
-        int, Option(min=16, help="Largest number of parameters at which a member is evaluated.")
-    ] = 4096,
-    bases: Annotated[bool, Option("--bases/--no-bases", help="Include the bases that reconstruct u and λ.")] = True,
-    c: Annotated[bool, Option("--c", help="Also write a C99 source and its header, under the same name.")] = False,
-    at: At = None,
+def _export_model(
+    run: str, cell: str, target: Path, tolerance: float | None, bases: bool, places: Mapping[str, str]
 ) -> None:
-    """Export a reduced model for use without vibench."""
+    """Export a model, and say which errors its polynomials have, what it bounds and how long its queries take."""
     from vibench.library import exported_seconds
     from vibench.library.export import BOUNDS, RUNTIME, export_model
     from vibench.library.runs import open_run
     from vibench.model.chebyshev import MEASURED
     from vibench.offline.polynomials import TOLERANCE
 
-    model = open_run(run, at=places_of(at)).model(cell)
-    tolerance = TOLERANCE if interpolate is None else interpolate
-    exported = export_model(model, file, tolerance, evaluations=evaluations, bases=bases, c=c)
+    model, file = open_run(run, at=places).model(cell), target.with_suffix(".npz")
+    exported = export_model(
+        model, file, TOLERANCE if tolerance is None else tolerance, bases=bases, c=target.suffix == ".c"
+    )
     echo(*(f"{name}: {_member_in_words(member)}" for name, member in exported.members.items()))
     echo(f"relative errors are those at {MEASURED} random parameters and at the corners of the box")
     if exported.about["solver"] != model.solver:
@@ -176,30 +198,21 @@ def export_reduced_model(
     echo(*_outputs_in_words(exported.about["outputs"]))
     echo(exported_seconds.in_words(model, file))
     beside = [file.with_name(BOUNDS)] if has_bounds else []
-    sources = [file.with_suffix(end) for end in (".c", ".h") if c]
+    sources = [file.with_suffix(end) for end in (".c", ".h") if target.suffix == ".c"]
     written = ", ".join(map(str, [file, file.with_name(RUNTIME), *beside, *sources]))
     script = Path(BOUNDS if has_bounds else RUNTIME).stem
     echo(f"{written}: `from {script} import Model`, then `Model({str(file)!r}).solve(mu)`")
 
 
-def export_mesh_fields(
-    run: RunArgument,
-    cell: Annotated[str, Argument(metavar="CELL", help="Key of a cell, or its beginning.", autocompletion=cells)],
-    mu: Annotated[str, Argument(metavar="MU", help="The parameter: its components, separated by commas.")],
-    out: Annotated[Path | None, Option(metavar="FILE", help="A new file; RUN/vtu/CELL.vtu by default.")] = None,
-    at: At = None,
-) -> None:
-    """Export u, λ and their errors at a parameter for ParaView."""
+def _export_fields(run: str, cell: str, mu: str, file: Path, places: Mapping[str, str]) -> None:
     from vibench.library.runs import open_run
     from vibench.library.vtu import export_vtu
 
     try:
         components = [float(each) for each in mu.split(",")]
     except ValueError:
-        raise RequestError(f"MU is {mu!r}, expected numbers separated by commas, such as 1.2,0.05") from None
-    opened = open_run(run, at=places_of(at))
-    model = opened.model(cell)
-    file = export_vtu(model, components, out or opened.path.parent / "vtu" / f"{model.row['cell']}.vtu")
+        raise RequestError(f"--mu is {mu!r}, expected numbers separated by commas, such as 1.2,0.05") from None
+    export_vtu(open_run(run, at=places).model(cell), components, file)
     echo(f"u, λ and their errors at mu = {components}: {file}")
 
 

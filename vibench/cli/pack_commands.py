@@ -1,47 +1,67 @@
-"""Commands on model packs: `vibench import`, `vibench pack`, and `vibench cones` for their multipliers."""
+"""`vibench pack`: model packs are checked, written, and reduced to cones."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option
 
 from vibench.cli.completion import names
 from vibench.cli.console import echo
 from vibench.cli.plugin_commands import key_value
-from vibench.errors import NumericalError
+from vibench.errors import NumericalError, RequestError
 from vibench.files import write_atomically
 from vibench.plugins.kinds import DUAL, PROBLEM
 
 if TYPE_CHECKING:
     from vibench.packs.pack import ModelPack
 
-Folder = Annotated[Path, Argument(metavar="FOLDER", help="Folder of the pack, with its manifest pack.toml.")]
 
-
-def import_pack(folder: Folder) -> None:
-    """Check a model pack, and say what can be done with it.
-
-    One line names the first thing that is wrong, and what was probably meant.
-    """
-    from vibench.packs.checks import read_model_pack
-
-    pack = read_model_pack(folder)
-    echo(*_description(pack), *_uses(pack, folder))
-
-
-def pack_problem(
-    problem: Annotated[str, Argument(help="A registered problem.", autocompletion=names(PROBLEM))],
-    folder: Annotated[Path, Argument(metavar="FOLDER", help="Folder to be made.")],
+def pack(
+    words: Annotated[
+        list[str],
+        Argument(
+            metavar="[PROBLEM] FOLDER",
+            help="FOLDER alone is a pack to check. With a registered PROBLEM it is a new folder, for a pack of that.",
+            autocompletion=names(PROBLEM),
+        ),
+    ],
     option: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="Option of the problem (repeatable).")] = None,
-    validation: Annotated[int, Option(min=1, help="Number of validation parameters.")] = 64,
+    validation: Annotated[int, Option(min=1, help="Number of validation parameters of a new pack.")] = 64,
     seed: Annotated[int, Option(min=0, help="Seed of the validation parameters, as in a study.")] = 0,
     solutions: Annotated[bool, Option("--solutions", help="Add the high-fidelity solutions, as references.")] = False,
+    cones: Annotated[bool, Option("--cones", help="Build cones from the multipliers of the pack.")] = False,
+    dual: Annotated[
+        list[str] | None, Option(help="Dual strategies of --cones; all by default.", autocompletion=names(DUAL))
+    ] = None,
+    dual_tol: Annotated[float, Option(min=1e-12, max=1.0, help="Tolerance of --cones.")] = 1e-2,
+    out: Annotated[Path, Option(metavar="DIR", help="Folder of the table and the figure of --cones.")] = Path("cones"),
 ) -> None:
-    """Write a model pack of any problem.
+    """Check a model pack, write one of a problem, or build cones.
+
+    A pack is a folder of matrices with a manifest pack.toml. A check says what can be done with it, or what is wrong.
+    Cones are the dual half of a reduced model, which needs no operators; their errors are relative to the largest norm.
+    """
+    *problem, last = words
+    folder = Path(last)
+    if len(problem) > 1 or (problem and cones):
+        raise RequestError("expected FOLDER, a pack to check, or PROBLEM FOLDER, the new pack of a problem")
+    if problem:
+        _write(problem[0], folder, dict(map(key_value, option or [])), validation, seed, solutions)
+    elif cones:
+        _reduce_cones(folder, dual or [], dual_tol, out)
+    else:
+        from vibench.packs.checks import read_model_pack
+
+        checked = read_model_pack(folder)
+        echo(*_description(checked), *_uses(checked, folder))
+
+
+def _write(problem: str, folder: Path, options: dict[str, Any], validation: int, seed: int, solutions: bool) -> None:
+    """Write a pack of a problem.
 
     Members that the problem declares constant are written once, the others at every training and validation parameter.
     """
@@ -49,27 +69,16 @@ def pack_problem(
     from vibench.plugins.registry import find
 
     plugin = find(PROBLEM, problem)
-    created, source = plugin.create(dict(map(key_value, option or []))), f"{plugin} of {plugin.origin}"
+    created, source = plugin.create(options), f"{plugin} of {plugin.origin}"
     writer.write_pack(
         created, folder, name=problem, source=source, validation=validation, seed=seed, solutions=solutions
     )
     echo(f"{folder}: the problem '{problem}' at {len(created.training_set())} training and {validation} validation "
-         f"parameters (seed {seed})", f"  vibench import {folder}")  # fmt: skip
+         f"parameters (seed {seed})", f"  vibench pack {folder}")  # fmt: skip
 
 
-def reduce_cones(
-    folder: Folder,
-    dual: Annotated[
-        list[str] | None, Option(help="Dual strategies; all by default.", autocompletion=names(DUAL))
-    ] = None,
-    dual_tol: Annotated[float, Option(min=1e-12, max=1.0, help="Tolerance of the cones.")] = 1e-2,
-    out: Annotated[Path, Option(metavar="DIR", help="Folder of the table and the figure.")] = Path("cones"),
-) -> None:
-    """Build cones from the multipliers of a model pack.
-
-    This is the dual half of a reduced model, which needs no operators. Errors are the largest distances from the cone
-    relative to the largest norm, over the multipliers at training parameters, and over the others.
-    """
+def _reduce_cones(folder: Path, dual: list[str], dual_tol: float, out: Path) -> None:
+    """Build cones and print their errors over the multipliers at training parameters, and over the others."""
     import pandas as pd
 
     from vibench.cli.console import print_frame
@@ -136,7 +145,7 @@ def _uses(pack: ModelPack, folder: Path) -> Iterator[str]:
         yield _assembly_in_words(pack)
         yield from _interpolation(pack)
     if pack.reference is not None:
-        yield f"its multipliers give cones: vibench cones {folder}"
+        yield f"its multipliers give cones: vibench pack {folder} --cones"
     if not pack.members:
         yield "it has no operators: a study, whose primal half needs them, cannot run it"
 

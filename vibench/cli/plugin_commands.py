@@ -142,7 +142,7 @@ def new_plugin(
         steps = (
             [f"vibench run {path} --dry-run", f"vibench run {path}"]
             if kind == "study"
-            else [f"python {path}/write.py", f"vibench import {path}"]
+            else [f"python {path}/write.py", f"vibench pack {path}"]
         )
         echo(f"{start}: a {kind} that works as it is, to edit", *(f"  {step}" for step in steps))
         return

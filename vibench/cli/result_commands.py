@@ -5,13 +5,18 @@ from __future__ import annotations
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from typer import Argument, Exit, Option
 
 from vibench.cli.completion import SHOWN, cell_columns, cells, column_names, error_measures, runs, table_names
-from vibench.cli.console import echo, run_argument
+from vibench.cli.console import echo, print_frame, run_argument, shown
 from vibench.errors import RequestError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from vibench.report.comparison.compare import Comparison
 
 EXAMPLE = "solver = 'piqp' and beta_span_min < 1e-3"
 """Condition in the help of `--where`."""
@@ -44,7 +49,7 @@ def show(
     cell: Annotated[
         str,
         Argument(
-            metavar="[CELL]",
+            metavar="CELL",
             help="Key of a cell, or its beginning: all of its columns, or its rows in another table.",
             autocompletion=cells,
         ),
@@ -80,7 +85,6 @@ def show(
 
     On a terminal, columns that do not fit are left out; csv and json have the values and names of the results file.
     """
-    from vibench.cli.console import print_frame, shown
     from vibench.results import formats, show
     from vibench.results.read import results_file
     from vibench.results.selection import parts
@@ -105,38 +109,12 @@ def show(
         sys.stdout.write(formats.FORMS[form](view.exact if form in {"csv", "json"} else view.readable))
 
 
-LimitOption = Annotated[float, Option(min=1.0, help="Factor by which a number may get worse.")]
-
-
-def diff_runs(
-    a: Annotated[
-        str, Argument(metavar="A", help="The earlier run: a folder, or its name in runs/.", autocompletion=runs)
-    ],
-    b: Annotated[str, Argument(metavar="B", help="The later run.", autocompletion=runs)],
-    limit: LimitOption = 1.25,
-    form: FormOption = "terminal",
-) -> None:
-    """List changes between two runs; exit code 1 on a regression."""
-    from vibench.cli import comparison
-    from vibench.report.comparison.compare import compare
-    from vibench.results import formats
-    from vibench.results.read import results_file
-
-    compared = compare([results_file(a), results_file(b)], limit)
-    if form == "terminal":
-        comparison.print_changes(compared, limit)
-    else:
-        sys.stdout.write(formats.FORMS[form](compared.changes))
-    if compared.regressions:
-        raise Exit(1)
-
-
 def compare_runs(
     run: Annotated[
         list[str],
         Argument(metavar="RUN", help="Run folders or results files; the first is the reference.", autocompletion=runs),
     ],
-    limit: LimitOption = 1.25,
+    limit: Annotated[float, Option(min=1.0, help="Factor by which a number may get worse.")] = 1.25,
     table: Annotated[
         Literal["changes", "columns", "runs", "cells"] | None,
         Option(help="Print one table: changes, what moved by column, the runs, or cells that only some runs have."),
@@ -144,29 +122,31 @@ def compare_runs(
     column: Annotated[
         str, Option(metavar="NAME", help="Print a column of the cells in every run.", autocompletion=cell_columns)
     ] = "",
+    strict: Annotated[bool, Option("--strict", help="Exit with 1 if a number got worse.")] = False,
     form: FormOption = "terminal",
 ) -> None:
     """Compare runs: what is equal, what moved, and by how much.
 
     Numbers are compared with the first run, seconds with the first run of the same machine.
     """
-    from vibench.cli import comparison
     from vibench.report.comparison.compare import compare
     from vibench.results import formats
     from vibench.results.read import results_file, whole_numbers
 
     compared = compare([results_file(one) for one in run], limit)
-    if column:
-        title, frame = f"{column} of the cells", compared.values(column)
-    elif table is None and form == "terminal":
-        comparison.print_comparison(compared, limit)
-        return
-    else:
-        title, frame = table or "changes", compared.table(table or "changes")
-    if form == "terminal":
-        comparison.print_table(compared, frame, title)
-    else:
+    frame = compared.values(column) if column else compared.table(table or "changes")
+    if form != "terminal":
         sys.stdout.write(formats.FORMS[form](whole_numbers(frame)))
+    elif column or table not in (None, "changes"):
+        # What a table says of each run, in a column of its own, matters most.
+        first = [*(one.name for one in compared.runs), *PRIORITY]
+        print_frame(frame, f"{column} of the cells" if column else str(table), first, rest=REST)
+    else:
+        if table is None:
+            _print_overview(compared)
+        _print_changes(compared, limit)
+    if strict and compared.regressions:
+        raise Exit(1)
 
 
 def replay_query(
@@ -177,7 +157,6 @@ def replay_query(
     at: At = None,
 ) -> None:
     """Solve the program of one query again with every solver."""
-    from vibench.cli.console import print_frame
     from vibench.execution.recorded_cell import recorded_cell
     from vibench.report import replay
 
@@ -188,3 +167,73 @@ def replay_query(
     echo(f"{recorded.cell}, query {number}: mu = {recorded.parameters[number].tolist()}")
     print_frame(frame, f"accuracy {recorded.cell.accuracy:g}, our residuals; distance of u from the record")
     echo(f"the program, as qpsolvers reads it: {file}")
+
+
+MOST = 40
+"""Changes that are printed; the other formats have all."""
+
+REST = "--format csv"
+"""Option that prints the columns for which a terminal is too narrow."""
+
+PRIORITY = (
+    "run", "what", "verdict", "before", "after", "ratio", "cells", "equal", "worse", "better", "changed", "problem",
+    "formulation", "dual", "primal", "solver", "asked", "interval", "within accuracy", "within limit", "undecided",
+    "farthest ratio", "against", "accuracy", "assembly", "correction", "cell", "study", "ok", "only here", "same code",
+    "in all runs", "machine", "seed", "validation",
+)  # fmt: skip
+"""Columns of the tables, those that matter most first."""
+
+
+def _print_changes(compared: Comparison, limit: float) -> None:
+    """Print what changed between runs, the worst first, and how many changes there are."""
+    changes = readable(_by_weight(compared.changes))
+    if len(changes):
+        names = [run.name for run in compared.runs]
+        title = " → ".join(names) if len(names) == 2 else f"changes from {names[0]}"
+        print_frame(changes.head(MOST).drop(columns=_pair_columns(compared)), title, PRIORITY, rest=REST)
+    if len(changes) > MOST:
+        echo(f"{len(changes) - MOST} more changes: `{REST}` lists all of them")
+    echo(*compared.notes, f"{len(changes)} changes beyond a factor of {limit:g}, {compared.regressions} for the worse")
+
+
+def _print_overview(compared: Comparison) -> None:
+    """Print the runs, and how many cells moved by column."""
+    from vibench.report.comparison.differences import ChangeKind
+
+    print_frame(compared.by_run, "runs", PRIORITY, every=True, rest=REST)
+    echo("")
+    names = [run.name for run in compared.runs]
+    title = f"{names[1]} against {names[0]}" if len(names) == 2 else f"against {names[0]}"
+    by_column = compared.by_column
+    nobody = [verdict.value for verdict in ChangeKind if not by_column[verdict.value].any()]
+    columns = readable(by_column.drop(columns=nobody)).drop(columns=_pair_columns(compared))
+    print_frame(columns, f"cells by column, {title}", PRIORITY, rest=REST)
+    echo("")
+
+
+def readable(frame: pd.DataFrame) -> pd.DataFrame:
+    """A table with the two ends of an interval in one column, and without underscores in its headings."""
+    import pandas as pd
+
+    from vibench.results.formats import cell_text
+
+    ends = zip(frame["ratio_low"], frame["ratio_high"], strict=True)
+    texts = ["" if pd.isna(low) else f"{cell_text(low)}–{cell_text(high)}" for low, high in ends]
+    shown = frame.drop(columns=["ratio_low", "ratio_high"])
+    shown.insert(shown.columns.get_loc("ratio") + 1, "interval", texts)
+    return shown.rename(columns={"farthest_ratio": "farthest ratio"})
+
+
+def _pair_columns(compared: Comparison) -> list[str]:
+    """Columns that name the runs of a pair; a title names a single pair."""
+    return ["run", "against"] if len(compared.runs) == 2 else []
+
+
+def _by_weight(changes: pd.DataFrame) -> pd.DataFrame:
+    """The worst changes first: by verdict, then by how far the ratio is from 1."""
+    from vibench.report.comparison.differences import MOVED
+
+    order = changes["verdict"].map([verdict.value for verdict in MOVED].index)
+    far = changes["ratio"].map(lambda ratio: max(ratio, 1.0 / ratio) if ratio > 0.0 else 1.0)
+    weighed = changes.assign(order=order, far=-far).sort_values(["order", "far"], kind="stable")
+    return weighed.drop(columns=["order", "far"])

@@ -155,8 +155,8 @@ def exported(
         )
     except InaccurateError as error:
         raise RequestError(
-            f"{error}; `--interpolate {1.05 * error.error:.1e}` exports this approximation, more `--evaluations` than "
-            f"{evaluations} may reach a better one"
+            f"{error}; `--tolerance {1.05 * error.error:.1e}` exports this approximation; more evaluations than "
+            f"{evaluations}, an argument of `vibench.export_model`, may reach a better one"
         ) from None
     members = {name: polynomials.pop(name) for name in MEMBERS}
     about = _about(model, members) | {"certificate": Guarantee.NONE.value, "no_bounds": why}

@@ -42,7 +42,8 @@ def completed(line: str) -> list[str]:
         command = command.get_command(context, words.pop(0))
         context = command.make_context(command.name, words, parent=context, resilient_parsing=True)
     option = next((p for p in command.params if before and before[-1] in p.opts), None)
-    arguments = [p for p in command.params if p.param_type_name == "argument" and context.params.get(p.name) is None]
+    arguments = [p for p in command.params if p.param_type_name == "argument"]
+    arguments = [p for p in arguments if context.params.get(p.name) is None or p.nargs == -1]
     return [item.value for item in (option or arguments[0]).shell_complete(context, last)]
 
 
@@ -106,7 +107,7 @@ class TestFiles:
             Path("runs", name, FILE).touch()
         assert completed("vibench show ") == ["mine", "other"]
         assert completed("vibench replay m") == completed("vibench report m") == ["mine"]
-        assert completed("vibench diff mine o") == ["other"]
+        assert completed("vibench compare mine o") == ["other"]
 
     def test_cells_are_those_of_the_run_named_before(self, quick_run: Path) -> None:
         Path("runs").mkdir()

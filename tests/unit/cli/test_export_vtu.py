@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from running import Main, Vibench
+from running import Main, Vibench, refused
 
 from vibench import open_run
 
@@ -19,7 +19,7 @@ def test_a_solution_of_a_run_is_exported(quick_run: Path, main: Main) -> None:
     model = open_run(quick_run).model(cell)
     mu = 0.5 * (model.parameters.lower + model.parameters.upper)
     text = ",".join(map(repr, mu.tolist()))
-    code, out, err = main("export-vtu", str(quick_run), cell, text, "--out", "fields.vtu")
+    code, out, err = main("export", str(quick_run), cell, "fields.vtu", "--mu", text)
     assert (code, err) == (0, "")
     assert "fields.vtu" in out
     written = meshio.read("fields.vtu")
@@ -32,12 +32,12 @@ def test_a_solution_of_a_run_is_exported(quick_run: Path, main: Main) -> None:
     ("mu", "said"),
     [
         ("-1e9,-.5", "mu is [-1000000000.0, -0.5], expected finite numbers (radius)"),
-        ("-x,0.1", "MU is '-x,0.1', expected numbers separated by commas"),
+        ("-x,0.1", "--mu is '-x,0.1', expected numbers separated by commas"),
     ],
 )
 def test_a_component_may_be_negative(mu: str, said: str, quick_run: Path, main: Main) -> None:
     cell = str(pd.read_csv(quick_run / "tables" / "cells.csv")["cell"].iloc[0])
-    code, _, err = main("export-vtu", str(quick_run), cell, mu)
+    code, _, err = main("export", str(quick_run), cell, "fields.vtu", "--mu", mu)
     assert code == 2
     assert said in err
 
@@ -45,7 +45,21 @@ def test_a_component_may_be_negative(mu: str, said: str, quick_run: Path, main: 
 def test_a_parameter_outside_the_box_is_one_line(quick_run: Path, vibench: Vibench, tmp_path: Path) -> None:
     cell = str(pd.read_csv(quick_run / "tables" / "cells.csv")["cell"].iloc[0])
     upper = open_run(quick_run).model(cell).parameters.upper
-    done = vibench(tmp_path, "export-vtu", str(quick_run), cell, str(1.001 * upper[0]), "--out", "out.vtu")
+    done = vibench(tmp_path, "export", str(quick_run), cell, "out.vtu", "--mu", str(1.001 * upper[0]))
     assert done.returncode == 0, done.stderr
     said = "vibench: radius: outside the parameter domain, where the model was not trained"
     assert set(done.stderr.splitlines()) == {said}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["model.npz"], "expected DIR, a folder for programs, or CELL FILE"),
+        (["3f9a", "programs"], "expected DIR, a folder for programs, or CELL FILE"),
+        (["3f9a", "model.npz", "--mu", "1"], "--mu has no meaning for 'model.npz'"),
+        (["3f9a", "fields.vtu", "--no-bases", "--tolerance", "1e-3"], "--tolerance, --no-bases has no meaning for"),
+        (["3f9a", "model.c", "--sequence"], "--sequence has no meaning for 'model.c'"),
+    ],
+)
+def test_an_export_of_nothing_known_is_refused(arguments: list[str], said: str, quick_run: Path, main: Main) -> None:
+    refused(main("export", str(quick_run), *arguments), said)

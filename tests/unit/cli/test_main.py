@@ -15,11 +15,15 @@ import pytest
 from running import Main, Register, refused
 from samples import STUDY, changed, write_study
 
+from vibench.cli.main import renamed
 from vibench.cli.plugin_commands import LISTS
 from vibench.plugins import kinds, registry
-from vibench.plugins.kinds import PROBLEM
+from vibench.plugins.kinds import DUAL, PROBLEM
 from vibench.plugins.registry import find, registered
 from vibench.qp.settings import SETTINGS
+from vibench.qp.status import Status
+from vibench.report.comparison.differences import ChangeKind
+from vibench.results.break_even import Meaning
 from vibench.results.ranking import ADDED
 from vibench.results.read import read_table
 from vibench.results.schema import CELLS, STORED, TABLES
@@ -381,7 +385,7 @@ def test_a_run_of_an_odd_name_that_is_not_there_is_refused(run: str, main: Main)
     line = refused(main("show", run), "no results in")
     assert line.rstrip("\n").isprintable()
     refused(main("report", run))
-    refused(main("diff", run, run))
+    refused(main("compare", run, run))
     assert list(Path.cwd().iterdir()) == []
 
 
@@ -444,16 +448,66 @@ def test_help_on_a_key_of_study_files_is_what_it_means_wherever_it_stands(main: 
     code, out, _ = main("help", "training")
     assert code == 0
     meanings = [model.model_fields["training"].description for model in (Study, ProblemEntry)]
-    of_file, of_entry, *columns = out.splitlines()
+    of_file, of_entry, columns, of_study = out.splitlines()
     assert of_file.startswith('training, in a study file (list of table, default ["own"]): ')
     assert of_entry.startswith("training, in problem of a study file (")
     assert [line.partition("): ")[2] for line in (of_file, of_entry)] == meanings
     in_all = [table for table, described in STORED.items() if "training" in described]
-    assert columns == [f"training, in {', '.join(in_all)}: {CELLS['training'].meaning}"]
+    assert of_study.startswith("training, a study of vibench")
+    assert columns == (f"training, in {', '.join(in_all)}: {CELLS['training'].meaning}")
 
 
 def test_help_on_nothing_there_is_refused(main: Main) -> None:
-    refused(main("help", "shwo"), "no command, key of study files or column is called 'shwo'; did you mean 'show'?")
+    refused(
+        main("help", "shwo"), "no command, key, column, status, plugin or term is called 'shwo'; did you mean 'show'?"
+    )
+
+
+WORDS = {
+    "supremizer": "Supremizer: T(µ)η, the displacement",
+    "as fast": "Break-even: ",
+    "certified": "Certificate: certified, v",
+    "mcpg": "mcpg, a dual strategy of vibench",
+    "piqp": "piqp, a QP solver",
+    "quick": "quick, a study of vibench",
+    "best": "best, a table of a run: `vibench show RUN --table best`",
+    "feasible": "Correction: ",
+    "κ": "ρ, ω, κ: residual",
+    "diff": "`vibench diff` is now `vibench compare --table changes --strict`",
+}
+
+
+def test_help_knows_every_word_that_people_see(main: Main) -> None:
+    for word, said in WORDS.items():
+        assert any(line.startswith(said) for line in main("help", word)[1].splitlines()), word
+    for word in [*Status, *ChangeKind, *Meaning, *registered(DUAL), *TABLES]:
+        assert main("help", word)[0] == 0, word
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("diff a b --limit 2", "compare a b --limit 2 --table changes --strict"),
+        ("import my-model", "pack my-model"),
+        ("cones my-model --dual cpg", "pack my-model --dual cpg --cones"),
+        ("export-qps quick set --sequence", "export quick set --sequence"),
+        ("export-model quick 3f9a m.npz --interpolate 1e-6", "export quick 3f9a m.npz --tolerance 1e-6"),
+        ("export-model quick 3f9a m.npz --c", "export quick 3f9a m.c"),
+        ("export-vtu quick 3f9a -1,2 --out f.vtu", "export quick 3f9a f.vtu --mu -1,2"),
+        ("export-vtu quick 3f9a 1 --at m=x", "export quick 3f9a 3f9a.vtu --mu 1 --at m=x"),
+    ],
+)
+def test_a_command_of_before_says_what_to_write_now(old: str, new: str) -> None:
+    assert renamed(old.split()) == new.split()
+    assert renamed(new.split()) is None
+
+
+def test_a_command_of_before_still_works(main: Main, quick_run: Path) -> None:
+    run = str(quick_run)
+    assert main("diff", run, run)[:2] == main("compare", run, run, "--table", "changes", "--strict")[:2]
+    line = main("diff", run, run)[2]
+    assert line.startswith("vibench: `vibench diff` will go; write `vibench compare ")
+    assert line.count("\n") == 1
 
 
 def test_problems_are_listed_with_their_parameters(main: Main) -> None:

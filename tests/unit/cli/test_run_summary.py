@@ -13,7 +13,7 @@ from samples import cell_row
 
 from vibench.cli.console import run_argument
 from vibench.cli.main import app
-from vibench.cli.run_summary import REASONS, WHOLE, failures, next_steps, print_summary
+from vibench.cli.run_command import REASONS, WHOLE, failures, next_steps, print_summary
 from vibench.results.database import ResultsDatabase
 from vibench.results.ranking import NO_BEST_CELL
 from vibench.results.sqlite import FILE

@@ -209,9 +209,9 @@ class TestStart:
         monkeypatch.chdir(tmp_path)
         _, out, _ = main("new", "pack", "my-model")
         script, check = (line.split()[1:] for line in out.splitlines()[1:])
-        assert check == ["import", "my-model"]
+        assert check == ["pack", "my-model"]
         subprocess.run([sys.executable, "-W", "error", *script], check=True, timeout=300)
-        code, out, _ = main("import", "my-model")
+        code, out, _ = main("pack", "my-model")
         assert (code, out.splitlines()[0]) == (0, "my-model")
         pack = create("problem", "pack", {"path": "my-model"})
         found = HighFidelitySolver(pack).solve(np.array([4.0, 0.1]))

@@ -446,7 +446,7 @@ def test_indices_that_lead_elsewhere_are_refused(change: dict[str, Any], run: vi
         ("old.npz", {}, "old.npz' exists; remove it"),
         ("old.npz/model.npz", {}, "old.npz' is no folder"),
         ("taken.npz", {"c": True}, "taken.c' exists; remove it"),
-        ("model.npz", {"tolerance": 1e-13, "evaluations": 30}, r"A depends on mu .* `--interpolate \d"),
+        ("model.npz", {"tolerance": 1e-13, "evaluations": 30}, r"A depends on mu .* `--tolerance \d"),
     ],
 )
 def test_what_is_not_exported_leaves_nothing_behind(
@@ -473,7 +473,7 @@ def test_an_approximation_is_offered_with_its_error(run: vibench.Run, tmp_path: 
     model = model_of(run, "obstacle")
     with pytest.raises(vibench.RequestError, match="exports this approximation") as caught:
         export_model(model, tmp_path / "model.npz", tolerance=1e-13, evaluations=200)
-    offered = float(str(caught.value).split("`--interpolate ")[1].split("`")[0])
+    offered = float(str(caught.value).split("`--tolerance ")[1].split("`")[0])
     found = export_model(model, tmp_path / "model.npz", tolerance=offered, evaluations=200)
     assert 1e-13 < found.error <= offered
     mu = model.parameters.sample(1, seed=1)[0]
@@ -539,8 +539,8 @@ def test_a_constant_member_is_not_sampled(run: vibench.Run, monkeypatch: pytest.
 
 def test_the_command(run: vibench.Run, main: Main, tmp_path: Path) -> None:
     cell = str(model_of(run, "obstacle").row["cell"])
-    asked = ("export-model", str(run.path.parent), cell, str(tmp_path / "out" / "model.npz"))
-    code, out, err = main(*asked, "--interpolate", "1e-4", "--c")
+    asked = ("export", str(run.path.parent), cell, str(tmp_path / "out" / "model.c"))
+    code, out, err = main(*asked, "--tolerance", "1e-4")
     assert (code, err) == (0, "")
     assert "B: 1 term, polynomials of degree (2, 0, 0)" in out
     assert f"`from reduced_model import Model`, then `Model('{tmp_path / 'out' / 'model.npz'}').solve(mu)" in out
@@ -549,7 +549,7 @@ def test_the_command(run: vibench.Run, main: Main, tmp_path: Path) -> None:
     assert re.search(r"^a query takes \S+ ms; the high-fidelity solution \S+ ms$", out, re.MULTILINE)
     assert {file.name for file in (tmp_path / "out").iterdir()} == FILES | {"model.c", "model.h"}
     refused(main(*asked), "model.npz' exists; remove it")
-    refused(main(*asked[:-1], str(tmp_path / "b.npz"), "--interpolate", "1e-14"), "A depends on mu", "--evaluations")
+    refused(main(*asked[:-1], str(tmp_path / "b.npz"), "--tolerance", "1e-14"), "A depends on mu", "evaluations")
 
 
 def certified_model(run: vibench.Run, problem: str = "radial-obstacle", primal: str = "decorrelated") -> vibench.Model:
@@ -718,7 +718,7 @@ def test_polynomials_that_take_the_place_of_functions_are_not_called_certified(r
 
 def test_the_command_says_what_has_bounds(run: vibench.Run, main: Main, tmp_path: Path) -> None:
     cell, file = str(certified_model(run).row["cell"]), tmp_path / "out" / "model.npz"
-    code, out, err = main("export-model", str(run.path.parent), cell, str(file), "--c")
+    code, out, err = main("export", str(run.path.parent), cell, str(file.with_suffix(".c")))
     assert (code, err) == (0, "")
     assert "\nerror bounds: verified\n" in out
     assert re.search(r"^a query takes \S+ ms, \S+ ms with bounds, \S+ ms corrected; the high", out, re.MULTILINE)

@@ -542,7 +542,7 @@ def study_on(folder: Path, validation: int) -> Content:
 @pytest.mark.parametrize("name", ["unknown key", "missing file", "other_multiplier", "zip_bomb", "no_manifest"])
 def test_a_broken_pack_neither_imports_nor_runs(name: str, broken: Callable[[str], Path], main: Main) -> None:
     folder = broken(name)
-    code, out, line = main("import", str(folder))
+    code, out, line = main("pack", str(folder))
     assert (code, out) == (2, "")
     code, out, again = main("run", write_study(Path(), study_on(folder, 2)))
     assert (code, out) == (2, "")

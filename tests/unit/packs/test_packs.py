@@ -116,7 +116,7 @@ def test_an_infinite_entry_of_g_is_a_row_that_constrains_nothing(tmp_path: Path,
     pack = pack_with(tmp_path / "pack", content, g=g)
     assert pack.at(MU).g[-1] == ABSENT
     assert np.array_equal(pack.at(MU).g[:-1], g[:-1])
-    assert main("import", str(tmp_path / "pack"))[0] == 0
+    assert main("pack", str(tmp_path / "pack"))[0] == 0
     for name, wrong in (("one", -np.inf), ("two", np.nan)):
         g[-1] = wrong
         with pytest.raises(RequestError, match=r"operators.g: 1 of its entries are not finite \(nan or -inf; inf"):
@@ -232,17 +232,17 @@ def test_multipliers_alone_are_enough_for_cones(tmp_path: Path, main: Main) -> N
     pack = pack_with(tmp_path / "pack", content)
     cone, _ = reduce_multipliers(pack, create("dual strategy", "mcpg", {}), 1e-3)
     assert cone.errors[-1] <= 1e-3
-    code, out, _ = main("import", str(tmp_path / "pack"))
+    code, out, _ = main("pack", str(tmp_path / "pack"))
     assert (code, "it has no operators" in out) == (0, True)
-    code, out, _ = main("cones", str(tmp_path / "pack"), "--dual", "cpg", "--dual", "mcpg", "--out", "here")
+    code, out, _ = main("pack", str(tmp_path / "pack"), "--cones", "--dual", "cpg", "--dual", "mcpg", "--out", "here")
     assert code == 0
     assert {path.name for path in Path("here").iterdir()} == {"errors.csv", "errors.png", "errors.svg"}
     whole = str(write_cable(tmp_path / "whole"))
-    assert main("cones", whole, "--dual", "cpg")[0] == 0
+    assert main("pack", whole, "--cones", "--dual", "cpg")[0] == 0
 
 
 def test_import_says_what_a_pack_can_do(tmp_path: Path, main: Main) -> None:
-    code, out, _ = main("import", str(write_cable(tmp_path / "pack")))
+    code, out, _ = main("pack", str(write_cable(tmp_path / "pack")))
     assert code == 0
     for words in (
         "12 unknowns",
@@ -264,7 +264,7 @@ def test_import_says_which_members_are_interpolated_and_what_the_outputs_are(tmp
     listed = content["parameters"]["training"] + content["parameters"]["validation"]
     f = np.column_stack([-load * cable.mass for load, _ in listed])
     pack_with(tmp_path / "pack", content, f=f, sag=np.ones(len(cable.mass)))
-    code, out, _ = main("import", str(tmp_path / "pack"))
+    code, out, _ = main("pack", str(tmp_path / "pack"))
     assert code == 0
     assert "; reduced assembly interpolates f and sums the terms of g\n" in out
     assert "\n  outputs: sag [m]\n" in out
@@ -278,7 +278,7 @@ def test_import_warns_of_what_interpolation_misses(tmp_path: Path, main: Main, b
     f = np.column_stack([-load * cable.mass for load, _ in listed])
     f[0, len(content["parameters"]["training"]) :] *= 1.0 + bump
     pack_with(tmp_path / "pack", content, f=f)
-    code, out, _ = main("import", str(tmp_path / "pack"))
+    code, out, _ = main("pack", str(tmp_path / "pack"))
     warned = re.search(r"warning: f, interpolated over 3 training parameters to 1e-06, has an error of (\S+) at", out)
     assert (code, bool(warned)) == (0, bump > 0.0)
     assert warned is None or 0.2 * bump < float(warned[1]) < bump

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from running import DECIDED, Changed, Main, refused
 
-from vibench.cli.result_commands import diff_runs
+from vibench.cli.result_commands import compare_runs
 from vibench.errors import RequestError
 from vibench.provenance import PROTOCOL
 from vibench.report.comparison.compare import compare
@@ -231,13 +231,13 @@ def test_the_command_ends_with_one_where_something_got_worse(
 ) -> None:
     after = changed(f"UPDATE cells SET online_s = 2 * online_s WHERE {ONE}", *STEADY)
     with pytest.raises(Exception, match="1") as ended:
-        diff_runs(str(steady), str(after), 1.25, "terminal")
+        compare_runs([str(steady), str(after)], strict=True)
     assert getattr(ended.value, "exit_code", None) == 1
     assert "1 for the worse" in capsys.readouterr().out
-    diff_runs(str(quick_run), str(quick_run), 1.25, "csv")
+    compare_runs([str(quick_run), str(quick_run)], strict=True, form="csv")
     assert capsys.readouterr().out.startswith("run,against,problem,formulation,dual,primal,asked")
     with pytest.raises(RequestError, match="no results in 'nowhere'"):
-        diff_runs(str(quick_run), "nowhere")
+        compare_runs([str(quick_run), "nowhere"])
 
 
 @pytest.fixture
@@ -299,12 +299,12 @@ def test_comparing_two_of_many_gives_what_comparing_these_two_gives(three: list[
         pd.testing.assert_frame_equal(alone, of_it.reset_index(drop=True))
 
 
-def test_compare_prints_what_diff_prints_of_two_runs(three: list[Path], main: Main) -> None:
+def test_the_changes_are_the_end_of_a_comparison(three: list[Path], main: Main) -> None:
     pair = (str(three[0]), str(three[2]))
-    code, listed, _ = main("diff", *pair, "--format", "csv")
+    code, listed, _ = main("compare", *pair, "--table", "changes", "--strict", "--format", "csv")
     assert code == 1
     assert main("compare", *pair, "--format", "csv") == (0, listed, "")
-    code, shown, _ = main("diff", *pair)
+    code, shown, _ = main("compare", *pair, "--table", "changes", "--strict")
     assert main("compare", *pair)[1].endswith(shown)
 
 
@@ -330,7 +330,7 @@ def test_what_a_narrow_comparison_is_about_is_shown(
     _, shown, _ = main("compare", *[str(quick_run)] * 3, "--column", "online_s")
     below = shown.split("─\n")[1].split("not shown")[0].splitlines()
     assert all(re.search(r"( [0-9][0-9.e-]*){3}$", re.sub(" +", " ", line)) for line in below)
-    for command in (["compare", "--table", "changes"], ["diff"], ["compare"]):
+    for command in (["compare", "--table", "changes"], ["compare"]):
         _, shown, _ = main(command[0], str(quick_run), str(other), *command[1:])
         assert re.search(r"before +after", shown)
         assert re.search(r"present +gone", shown)

@@ -103,7 +103,7 @@ def test_a_solver_that_ends_its_process_costs_its_own_line(
 
 
 def test_the_exported_set_is_rechecked_by_a_script_that_knows_nothing_of_vibench(run: Path, tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["export-qps", str(run), str(tmp_path / "set")])
+    done = CliRunner().invoke(app, ["export", str(run), str(tmp_path / "set")])
     assert done.exit_code == 0, done.output
     assert "6 programs" in done.output  # two reduced models, three queries
     script = tmp_path / "set" / replay.CHECKER
@@ -125,17 +125,15 @@ def test_the_exported_set_is_rechecked_by_a_script_that_knows_nothing_of_vibench
     spoilt = check()
     assert spoilt.returncode == 1
     assert "1 wrong" in spoilt.stdout
-    assert CliRunner().invoke(app, ["export-qps", str(run), str(tmp_path / "set")]).exit_code != 0
+    assert CliRunner().invoke(app, ["export", str(run), str(tmp_path / "set")]).exit_code != 0
 
 
-@pytest.mark.parametrize(
-    ("kib", "arguments"), [(0, ["export-qps"]), (3, ["export-qps"]), (1, ["replay"]), (8, ["report"])]
-)
+@pytest.mark.parametrize(("kib", "arguments"), [(0, ["export"]), (3, ["export"]), (1, ["replay"]), (8, ["report"])])
 def test_on_a_full_disk_nothing_half_written_is_left(
     kib: int, arguments: list[str], run: Path, vibench: Vibench, tmp_path: Path
 ) -> None:
     target = {
-        "export-qps": ["set"],
+        "export": ["set"],
         "replay": [key(run), "--out", "one.npz"],
         "report": ["--no-figures", "--out", "one.html"],
     }

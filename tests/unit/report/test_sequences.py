@@ -68,7 +68,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def exported(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("exported") / "set"
-    done = CliRunner().invoke(app, ["export-qps", str(run), str(folder), "--sequence"])
+    done = CliRunner().invoke(app, ["export", str(run), str(folder), "--sequence"])
     assert done.exit_code == 0, done.output
     assert "5 programs" in done.output
     return folder

@@ -1,0 +1,271 @@
+"""`vibench run`, and what a run prints at its end: the best cells, failures, agreement of numbers, next commands."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+from typer import Argument, Option
+
+from vibench.cli import output_commands
+from vibench.cli.completion import CORRECTIONS, formulations, names, solvers, studies, words
+from vibench.cli.console import echo, print_frame, run_argument
+from vibench.cli.result_commands import At, places_of
+from vibench.errors import RequestError, VibenchError
+from vibench.interrupts import INTERRUPTED, interrupted_at_once
+from vibench.plugins.kinds import DUAL, PRIMAL, PROBLEM
+from vibench.qp.status import Status
+from vibench.text import unbroken
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from vibench.execution.run import Outcome
+    from vibench.results.consistency import Violation
+    from vibench.study.spec import Study
+
+Names = list[str] | None
+Tolerances = list[float] | None
+
+
+def run_study_command(
+    study: Annotated[
+        str,
+        Argument(help="A registered study, or a TOML file; with --cell a results file, too.", autocompletion=studies),
+    ] = "quick",
+    cell: Annotated[str, Option(metavar="KEY", help="Run one cell alone, by its key or the beginning of that.")] = "",
+    problem: Annotated[
+        Names, Option(help="Replace the problems of the study (repeatable).", autocompletion=names(PROBLEM))
+    ] = None,
+    formulation: Annotated[Names, Option(help="Replace the formulations.", autocompletion=formulations)] = None,
+    dual: Annotated[Names, Option(help="Replace the dual strategies.", autocompletion=names(DUAL))] = None,
+    primal: Annotated[Names, Option(help="Replace the primal strategies.", autocompletion=names(PRIMAL))] = None,
+    solver: Annotated[Names, Option(help="Replace the QP solvers.", autocompletion=solvers)] = None,
+    correction: Annotated[
+        Names, Option(help="Replace the corrections of solutions.", autocompletion=words(lambda: CORRECTIONS))
+    ] = None,
+    pod_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the POD.")] = None,
+    dual_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the dual strategies.")] = None,
+    primal_tol: Annotated[Tolerances, Option(help="Replace the tolerances of the primal strategies.")] = None,
+    at: At = None,
+    out: Annotated[Path | None, Option(help="Results folder; runs/STUDY by default.")] = None,
+    jobs: Annotated[
+        int, Option("--jobs", "-j", min=0, help="Worker processes; 0 for one per core. Does not affect results.")
+    ] = 0,
+    repeats: Annotated[
+        int, Option(min=0, metavar="K", help="Measure seconds in at least K cold processes, offline stages K times.")
+    ] = 0,
+    dry_run: Annotated[bool, Option("--dry-run", help="List the cells of the matrix and stop.")] = False,
+    fresh: Annotated[bool, Option("--fresh", help="Remove earlier results and recompute everything.")] = False,
+    retry: Annotated[bool, Option("--retry", help="Also rerun cells that did not end ok.")] = False,
+    strict: Annotated[bool, Option("--strict", help="Exit with 1 if a cell is neither ok nor unavailable.")] = False,
+    draw: Annotated[bool, Option("--figures/--no-figures", help="Draw the figures at the end.")] = True,
+    executor: Annotated[Literal["local", "dask"], Option(help="Local processes, or a dask cluster.")] = "local",
+    scheduler: Annotated[
+        str | None, Option(metavar="ADDRESS", help="A dask scheduler; a new cluster on this machine by default.")
+    ] = None,
+) -> None:
+    """Run a study. An interrupted run resumes where it stopped."""
+    with interrupted_at_once():  # the libraries and plugins of a study take a second to import
+        from vibench.execution.run import Options, run_study
+        from vibench.library.progress import ProgressDisplay
+        from vibench.study.matrix import expand
+
+        overrides = {
+            "problem": problem, "formulation": formulation, "dual": dual, "primal": primal, "solvers": solver,
+            "correction": correction, "pod": pod_tol, "dual_tol": dual_tol, "primal_tol": primal_tol,
+        }  # fmt: skip
+        loaded = _study(study, cell, {axis: values for axis, values in overrides.items() if values}, at)
+    if dry_run:
+        cells = expand(loaded)
+        echo(*(f"{cell.key}  {cell}" for cell in cells), f"{len(cells)} cells")
+        return
+    if scheduler is not None:
+        _warn_of_open_scheduler(scheduler, executor)
+    folder = out or Path("runs") / loaded.name
+    options = Options(jobs, fresh, retry, executor, scheduler, repeats)
+    with ProgressDisplay() as progress:
+        outcome = run_study(loaded, folder, progress, options)
+    _conclude(loaded.name, outcome, folder, draw=options.workers if draw else None, fresh=fresh, strict=strict)
+
+
+def _conclude(name: str, outcome: Outcome, folder: Path, *, draw: int | None, fresh: bool, strict: bool) -> None:
+    """Export, print and draw what a run found, on as many processes as `draw` says; exit as its statuses ask for."""
+    from vibench.results import show
+    from vibench.results.read import results_file
+
+    path = results_file(str(folder))
+    show.export(path, folder / "tables")
+    if outcome.damaged:
+        echo(f"computed again, as their rows were damaged: {', '.join(outcome.damaged)}")
+    if outcome.interrupted:
+        missing = f"{outcome.missing} cells have no row yet" if outcome.missing else "all cells have their rows"
+        again = "the same command without --fresh" if fresh else "the same command"
+        echo(f"interrupted: {missing}; {again} resumes the run")
+        raise typer.Exit(INTERRUPTED)
+    statuses = [row["status"] for row in outcome.rows]
+    nothing_ran = set(statuses) == {Status.UNAVAILABLE}
+    if not nothing_ran:
+        print_summary(name, path, outcome.rows)
+    echo(f"results: {path}, tables: {folder / 'tables'}")
+    if (fresh or draw is not None) and (folder / "figures").is_dir():
+        from vibench.report import figures
+
+        figures.remove(folder / "figures")
+    if nothing_ran:
+        raise VibenchError(f"no cell could run here: {reasons(outcome.rows)}")
+    if draw is not None:
+        output_commands.draw_run(path, folder / "figures", draw)
+    fine = statuses.count(Status.OK)
+    next_steps(folder, len(statuses), len(statuses) - fine, figures=draw is not None)
+    if strict and any(status not in (Status.OK, Status.UNAVAILABLE) for status in statuses):
+        raise typer.Exit(1)
+
+
+def _warn_of_open_scheduler(scheduler: str, executor: str) -> None:
+    from vibench.execution.executors import is_authenticated
+
+    if executor != "dask":
+        raise RequestError(f"--scheduler {scheduler} is for --executor dask")
+    if not is_authenticated(scheduler):
+        warning = "the connection is not authenticated: others who reach the scheduler can run code on its workers"
+        sys.stderr.write(f"vibench: {unbroken(scheduler)}: {warning}\n")
+
+
+def _study(request: str, key: str, overrides: dict[str, list[Any]], at: list[str] | None) -> Study:
+    """The study that is asked for, or what it has, or a results file, of one cell."""
+    from vibench.execution.recorded_cell import recorded_study
+    from vibench.study.matrix import expand, only_cell, read_study, study_of_cell
+
+    if key and Path(request).suffix == ".sqlite":
+        if overrides:
+            raise RequestError(f"a cell of a results file is run as it is recorded: leave out {', '.join(overrides)}")
+        return recorded_study(request, key, places_of(at))
+    if at:
+        raise RequestError("--at is for a cell of a results file; a study file says itself where its files are")
+    study = read_study(request, overrides)
+    if not key:
+        return study
+    cell = only_cell(expand(study), key, f"'{request}'")
+    rounds = {name: getattr(study, name) for name in ("timing_rounds", "timing_rounds_min")}
+    return study_of_cell(cell, study.name, limits=study.limits, **rounds)
+
+
+REASONS = 10
+"""Reasons for which cells are not ok that are printed."""
+
+WHOLE = 20
+"""Cells up to which the summary is printed whole."""
+
+Rows = Sequence[Mapping[str, Any]]
+
+
+def print_summary(study: str, path: Path, rows: Rows) -> None:
+    """Print the summary of a run, why cells are not ok, and violated invariants."""
+    from vibench.results import show
+    from vibench.results.consistency import sentence
+    from vibench.results.read import read_table
+
+    cells = read_table(path, "cells")
+    table = show.look_up(path, "summary" if len(cells) <= WHOLE else "best")
+    if len(table.rows):
+        title = study if len(cells) <= WHOLE else f"{study}, the fastest query at every error reached"
+        print_frame(table.readable, title, table.priority, axes=table.axes)
+    elif len(cells):
+        echo(table.view.empty)
+    not_ok = [row for row in rows if row["status"] != Status.OK]
+    echo(*failures(rows, run_argument(path.parent)))
+    echo(f"{len(rows)} cells, {len(rows) - len(not_ok)} ok, {len(not_ok)} not ok")
+    queries, violations = _judged_queries(path, cells)
+    for violation in violations[:REASONS]:
+        echo(f"invariant: {violation}; this is a bug of vibench or of a plugin's inner products")
+    if violations[REASONS:]:
+        echo(f"invariant: {len(violations) - REASONS} more like these")
+    if queries and not violations:
+        echo(f"invariants of the constants and the error bounds hold in all {queries} queries")
+    if agreement := sentence(read_table(path, "disagreements"), cells["solver"].nunique()):
+        echo(agreement)
+
+
+def _judged_queries(path: Path, cells: pd.DataFrame) -> tuple[int, list[Violation]]:
+    """Number of queries, and the invariants that they violate; queries may be more than memory holds."""
+    from vibench.results import consistency
+    from vibench.results.read import read_in_parts
+
+    kinds, count = cells.set_index("cell")["enrichment_kind"], 0
+    violations: list[Violation] = []
+    for part in read_in_parts(path, "queries"):
+        count += len(part)
+        violations += consistency.violations(part, kinds)
+    return count, consistency.added_up(violations)
+
+
+def failures(rows: Rows, run: str) -> Iterator[str]:
+    """A line for every reason why cells are not ok; reasons that differ in their numbers alone are one.
+
+    A solver that has missed its accuracy has a remedy: those that are ok on the same model, or the command, with the
+    run as its argument, that tries them.
+    """
+    from vibench.library.progress import kind_of_failure
+    from vibench.results import formats
+
+    groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        if row["status"] != Status.OK:
+            groups.setdefault(kind_of_failure(row), []).append(row)
+    ranked = sorted(groups.values(), key=len, reverse=True)
+    for group in ranked[:REASONS]:
+        first = group[0]
+        count = f"{len(group)} cells " * (len(group) > 1)
+        if first["status"] == Status.UNAVAILABLE:
+            yield f"{count}{first['status']}: {first['reason']}"
+            continue
+        which = f"the first is {first['cell']}, " if len(group) > 1 else f"{first['cell']}, "
+        queries = f"{first['queries_ok']} of {first['queries']} queries ok"
+        remedy = _remedy(first, rows, run) if first["status"] == Status.INACCURATE else ""
+        yield f"{count}{first['status']}: {which}{formats.name_of_cell(first)}: {queries}; {first['reason']}{remedy}"
+    if others := sum(map(len, ranked[REASONS:])):
+        yield f"{others} cells not ok for {len(ranked) - REASONS} other reasons"
+
+
+def _remedy(cell: Mapping[str, Any], rows: Rows, run: str) -> str:
+    same = [row for row in rows if all(row[name] == cell[name] for name in ("model", "accuracy", "correction"))]
+    fine = sorted({row["solver"] for row in same if row["status"] == Status.OK})
+    return f"; ok with {', '.join(fine)}" if fine else f"; `vibench replay {run} {cell['cell']}` tries other solvers"
+
+
+def reasons(rows: Rows) -> str:
+    """The reasons of cells, each once."""
+    distinct = list(dict.fromkeys(str(row["reason"]) for row in rows))
+    more = [f"{len(distinct) - REASONS} other reasons"] if len(distinct) > REASONS else []
+    return "; ".join([*distinct[:REASONS], *more])
+
+
+def next_steps(folder: Path, cells: int, not_ok: int, *, figures: bool) -> None:
+    """Print the commands that show more of a run."""
+    run = run_argument(folder)
+    steps = [(f"vibench show {run}", f"all {cells} cells" if cells > WHOLE else "this table again")]
+    if not_ok:
+        steps.append((f"vibench show {run} --columns cell,reason --where \"status != 'ok'\"", "what is not ok"))
+    steps.append((f"vibench report {run}", "one HTML page: findings, tables, figures"))
+    if not figures:
+        steps.append((f"vibench figures {run}", "the figures as PNG and SVG"))
+    echo("next:", *aligned(steps))
+
+
+def aligned(steps: Iterable[tuple[str, str]]) -> list[str]:
+    """Commands and what they do, in two columns; a command that is too long for the first has a line of its own."""
+    steps = list(steps)
+    width = max([len(command) for command, _ in steps if len(command) <= SHORT_COMMAND], default=SHORT_COMMAND)
+    lines = []
+    for command, what in steps:
+        alone = len(command) > SHORT_COMMAND
+        lines += [f"  {command}", f"  {'':<{width}}  {what}"] if alone else [f"  {command:<{width}}  {what}"]
+    return lines
+
+
+SHORT_COMMAND = 36
+"""Characters of a command that others are aligned with: 80 columns have room for what it does beside it."""
