@@ -28,7 +28,6 @@ from vibench.offline.models import Model
 from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, InaccurateError, member_polynomials
 from vibench.provenance import distribution_version
 from vibench.qp.settings import SETTINGS
-from vibench.qp.solve import MARGIN
 from vibench.study.cells import Cell
 
 RUNTIME = "reduced_model.py"
@@ -182,7 +181,7 @@ def _about(model: Model, members: Mapping[str, AffinePolynomial]) -> dict[str, A
     return {
         "parameters": {"names": list(box.names), "units": list(box.units)},
         "solver": solver if solver in SOLVERS else next(iter(SOLVERS)),
-        "settings": {name: SETTINGS[name].at(MARGIN * accuracy) for name in SOLVERS},
+        "settings": {name: SETTINGS[name].at(accuracy) for name in SOLVERS},
         "accuracy": accuracy,
         "members": {
             name: {"degrees": list(member.degrees), "terms": len(member.terms), "error": member.error}

@@ -1,7 +1,12 @@
-"""Programs solved to round-off as least distance problems, whether their constraints are independent or not.
+"""Programs with parallel, opposite or dependent constraints: which rows matter, and solutions up to round-off.
 
-Reduced ones are solved as a whole: the part of an error that a QP solver makes is measured against these solutions. Of
-large ones with sparse matrices the constraints are added that the solution so far violates.
+Rows b u ≤ g and −c b u ≤ g', c > 0, with c g + g' = 0 are the equality b u = g. No u satisfies both by a margin, and
+they are linearly dependent. An equality in their place, with a multiplier of any sign, has neither defect: its positive
+part belongs to the one row, its negative part to the other. Rows that are absent constrain nothing.
+
+Programs are solved as least distance problems. Reduced ones are solved as a whole: the part of an error that a QP
+solver makes is measured against these solutions. For large sparse ones, constraints are added that the solution so far
+violates.
 """
 
 from __future__ import annotations
@@ -22,11 +27,8 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import project_out
 from vibench.qp.scaling import row_norms, size
 
-PARALLEL = 8.0 * EPS
-"""Largest difference of entries of two parallel rows of length 1, which were scaled with a rounding."""
-
-CLOSE = 1e-12
-"""Rows of length 1 with the same product with a random vector, but for this, may be parallel."""
+ROUND_OFF = 1e-12
+"""Residuals below this fraction of their terms are round-off."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +42,9 @@ class Rows:
     equal
         Which of them are equalities (k,).
     opposite, ratio
-        Of equalities the row on the other side (k,), and the length of this row over that of the other.
+        For equalities the row on the other side (k,), and the length of this row over that of the other.
     implied
-        Rows (m,) that need no look of their own: equalities, those parallel to them, and absent ones.
+        Rows (m,) that need no check of their own: equalities, those parallel to them, and absent ones.
     """
 
     kept: Indices
@@ -63,7 +65,7 @@ class Rows:
         return replace(vi, B=sp.csr_array(vi.B)[self.kept], g=vi.g[self.kept])
 
     def multipliers(self, forces: Array, count: int) -> Array:
-        """λ ≥ 0 (m,) from multipliers (k,) of the rows that are kept, of any sign on equalities."""
+        """λ ≥ 0 (m,) from multipliers (k,) of the rows that matter, of any sign on equalities."""
         lam = np.zeros(count)
         lam[self.kept] = np.where(self.equal, np.maximum(forces, 0.0), forces)
         lam[self.opposite[self.equal]] = (self.ratio * np.maximum(-forces, 0.0))[self.equal]
@@ -89,22 +91,43 @@ class Directions:
 
     @classmethod
     def of(cls, B: SparseMatrix, present: Mask) -> Directions:
-        """Of the rows of B (m×n) that are `present` (m,)."""
+        """Find parallel rows of B (m×n) among those that are `present` (m,)."""
         lengths = row_norms(B)
-        return cls(lengths, *_parallel(B, lengths, present))
+        # Parallel rows of length 1 have the same product with a random vector but for round-off, which few others have.
+        probes = B @ _probe(B.shape[1]) / lengths
+        rows = np.flatnonzero(present & (probes != 0.0))
+        rows = rows[np.argsort(np.abs(probes[rows]), kind="stable")]
+        sizes = np.abs(probes[rows])
+        group = np.cumsum(np.diff(sizes, prepend=-1.0) > 1e-12 * (1.0 + sizes)) - 1
+        first = np.flatnonzero(np.diff(group, prepend=-1))
+        shared = np.bincount(group, minlength=len(first))[group] > 1
+        rows, first, group = rows[shared], rows[first][group][shared], group[shared]
+        if not len(rows):
+            return cls(lengths, rows, group, np.zeros(0))
+        side = np.sign(probes)
+        unit = sp.csr_array(sp.diags_array(side / lengths) @ B)
+        gaps = abs(unit[rows] - unit[first]).max(axis=1)
+        # Both rows were scaled to length 1 with a rounding.
+        same = np.asarray(gaps.todense()).ravel() <= 8.0 * EPS
+        return cls(lengths, rows[same], group[same], side[rows[same]])
+
+
+@lru_cache(maxsize=4)  # new random numbers would cost more than the product
+def _probe(count: int) -> Array:
+    return np.random.default_rng(0).standard_normal(count)
 
 
 def rows_that_matter(
     B: SparseMatrix, g: Array, room: Array, preferred: Array | None = None, directions: Directions | None = None
 ) -> Rows:
-    """The rows of B (m×n) and g (m,) that matter.
+    """Find the rows of B (m×n) and g (m,) that matter: the tightest of parallel ones, one equality for opposite ones.
 
     Parameters
     ----------
     room
         Opposite rows are an equality where there is at most this room (m,) between them, in the unit of g.
     preferred
-        Of an equality the row with the larger of these (m,) is kept, in units of its length.
+        An equality is represented by the row with the larger of these (m,), in units of its length.
     directions
         Those of the rows that are not absent, where they are known.
     """
@@ -122,7 +145,8 @@ def rows_that_matter(
     tightest = np.flatnonzero((np.diff(group, prepend=-1) != 0) | (np.diff(side, prepend=0) != 0))
     dropped[members] = True
     dropped[members[tightest]] = False
-    both, of_equalities = np.flatnonzero(np.diff(group[tightest]) == 0), []  # a group has a tightest row on either side
+    # A group has at most one tightest row on either side, and these follow each other.
+    both, of_equalities = np.flatnonzero(np.diff(group[tightest]) == 0), []
     for low, high in zip(tightest[both], tightest[both + 1], strict=True):
         i, j = int(members[low]), int(members[high])
         if abs(bounds[low] + bounds[high]) <= max(room[i] / lengths[i], room[j] / lengths[j]):
@@ -135,50 +159,6 @@ def rows_that_matter(
     return Rows(kept, equal[kept], opposite[kept], ratio[kept], implied)
 
 
-@lru_cache(maxsize=4)
-def _random(count: int) -> Array:
-    """A random vector (count,)."""
-    return np.random.default_rng(0).standard_normal(count)
-
-
-def _parallel(B: SparseMatrix, lengths: Array, present: Mask) -> tuple[Indices, Indices, Array]:
-    """The rows (p,) that are parallel to others, the number of the direction of each, and its sign in it."""
-    probes = B @ _random(B.shape[1]) / lengths
-    rows = np.flatnonzero(present & (probes != 0.0))
-    rows = rows[np.argsort(np.abs(probes[rows]), kind="stable")]
-    sizes = np.abs(probes[rows])
-    group = np.cumsum(np.diff(sizes, prepend=-1.0) > CLOSE * (1.0 + sizes)) - 1
-    first = np.flatnonzero(np.diff(group, prepend=-1))
-    shared = np.bincount(group, minlength=len(first))[group] > 1
-    rows, first, group = rows[shared], rows[first][group][shared], group[shared]
-    if not len(rows):
-        return rows, group, np.zeros(0)
-    side = np.sign(probes)
-    unit = sp.csr_array(sp.diags_array(side / lengths) @ B)
-    gaps = abs(unit[rows] - unit[first]).max(axis=1)
-    same = np.asarray(gaps.todense()).ravel() <= PARALLEL
-    return rows[same], group[same], side[rows[same]]
-
-
-ROUND_OFF = 1e-12
-"""Residuals below this fraction of their terms are round-off."""
-
-DEPENDENT = 1e-10
-"""Constraints are dependent where a pivot of their factorisation is below this fraction of the largest."""
-
-CANCELLED = 32.0 * EPS
-"""Round-off in B x, relative to what the load alone would make of it."""
-
-FARTHEST = 1e-50 * ABSENT
-"""Constraints are absent from here on: reduced ones are sums of products of absent ones with generators of any unit."""
-
-TIGHT = 1e-8
-"""Constraints with a smaller slack than this fraction of its terms may carry a multiplier."""
-
-MAX_ITERATIONS = 20
-"""Active sets tried after the first, and how often constraints are added."""
-
-
 @dataclass(frozen=True)
 class ExactSolution:
     """The solution x (n,) of a program, and multipliers α (m,); there may be others where these are not `unique`."""
@@ -189,7 +169,7 @@ class ExactSolution:
 
 
 def exact_solution(program: VariationalInequality) -> ExactSolution | None:
-    """The solution of a dense program up to round-off; `None` if it has none or is too badly conditioned.
+    """Solve a dense program up to round-off; `None` if it has no solution or is too badly conditioned.
 
     With A = L Lᵀ and z = L⁻¹(f − Ax) the program is a least distance problem, min ‖z‖ subject to Cᵀz ≥ d, C = L⁻¹Bᵀ.
     Nonnegative least squares finds its active set (Lawson and Hanson 1974, chapter 23); orthogonal factors of the
@@ -198,31 +178,30 @@ def exact_solution(program: VariationalInequality) -> ExactSolution | None:
     """
     if not len(program.f):
         return ExactSolution(np.zeros(0), np.zeros(len(program.g)), unique=True)
-    if (absent := program.g >= FARTHEST).any():
+    # Reduced constraints are sums of products of absent ones with generators of any unit, and so absent much earlier.
+    if (absent := program.g >= 1e-50 * ABSENT).any():
         present = exact_solution(replace(program, B=program.B[~absent], g=program.g[~absent]))
         if present is None:
             return None
         alpha = np.zeros(len(absent))
         alpha[~absent] = present.alpha
         return replace(present, alpha=alpha)
-    return _exact_solution(program)
-
-
-def _exact_solution(program: VariationalInequality) -> ExactSolution | None:
-    """That of a program that has unknowns, without absent constraints."""
     try:
         for member in (program.A, program.f, program.B, program.g):
             np.asarray_chkfinite(member)
-        L = np.linalg.cholesky(program.A)
+        whitened = _Whitened(program, np.linalg.cholesky(program.A))
     except (ValueError, np.linalg.LinAlgError):
         return None
-    whitened = _Whitened(program, L)
+    return _active_set_solution(program, whitened)
+
+
+def _active_set_solution(program: VariationalInequality, whitened: _Whitened) -> ExactSolution | None:
     active, seen = whitened.least_distance_set(), set[bytes]()
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(20):  # active sets after the first; few programs need more than two
         x, alpha = whitened.solve_active(active)
         if not (np.all(np.isfinite(x)) and np.all(np.isfinite(alpha))):  # something has overflowed
             return None
-        # An excess is compared with the terms that it is the difference of, not with g alone, which may be small.
+        # Compare an excess with the terms that it is the difference of: g alone may be small.
         excess, terms = program.B @ x - program.g, np.abs(program.B) @ np.abs(x) + np.abs(program.g)
         violated, pulling = excess > ROUND_OFF * terms + whitened.noise, alpha < -ROUND_OFF * size(alpha)
         if not np.any(violated) and not np.any(pulling):
@@ -230,8 +209,9 @@ def _exact_solution(program: VariationalInequality) -> ExactSolution | None:
             forces = np.abs(program.A) @ np.abs(x) + np.abs(program.f) + np.abs(program.B.T) @ alpha
             if np.any(np.abs(program.A @ x - program.f + program.B.T @ alpha) > ROUND_OFF * np.max(forces)):
                 return None
-            tight = excess > -TIGHT * terms  # multipliers are unique where these constraints are independent
-            return ExactSolution(x, alpha, len(whitened.factorised(tight)[0]) == int(np.sum(tight)))
+            # Only constraints without slack may carry a multiplier, which is unique where they are independent.
+            tight = excess > -1e-8 * terms
+            return ExactSolution(x, alpha, len(whitened.factorise(tight)[0]) == int(np.sum(tight)))
         seen.add(active.tobytes())
         active = violated | (active & ~pulling)
         if active.tobytes() in seen:
@@ -242,7 +222,7 @@ def _exact_solution(program: VariationalInequality) -> ExactSolution | None:
 def least_distance_solution(
     vi: VariationalInequality, factor: SparseCholesky, equal: Mask, start: Mask
 ) -> tuple[Array, Array] | None:
-    """The solution u (n,) and λ (m,) of a sparse program whose constraints may be dependent; `None` if none is found.
+    """Find the solution u (n,) and λ (m,) of a sparse program whose constraints may be dependent; `None` if it fails.
 
     Parameters
     ----------
@@ -254,7 +234,7 @@ def least_distance_solution(
     B, lengths = sp.csr_array(vi.B), row_norms(vi.B)
     tolerance = ROUND_OFF * lengths
     chosen, load = start | equal, factor.solve_factor_transposed(vi.f)
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(20):  # constraints are added so often; each time all violated ones are
         rows = np.flatnonzero(chosen)
         scaled = sp.csr_array(sp.diags_array(1.0 / lengths[rows]) @ B[rows])
         K = factor.solve_factor_transposed(scaled.toarray().T)
@@ -277,15 +257,12 @@ def least_distance(K: Array, load: Array, g: Array, equal: Mask) -> Array | None
     The columns of K (n×k) may be dependent; the point itself is y = load − K · multipliers.
     """
     held, free, forces = np.flatnonzero(equal), np.flatnonzero(~equal), np.zeros(len(g))
-    Q, R = np.zeros((len(K), 0)), np.zeros((0, 0))
-    if len(held):
-        q, r, order = scipy.linalg.qr(K[:, held], mode="economic", pivoting=True)
-        pivots = np.abs(np.diag(r))
-        rank = int(np.sum(pivots > DEPENDENT * pivots[0]))
-        Q, R, held = q[:, :rank], r[:rank, :rank], held[order[:rank]]
+    independent, Q, R = _independent_columns(K[:, held])
+    held = held[independent]
     prescribed = scipy.linalg.solve_triangular(R, g[held], trans="T") if len(held) else np.zeros(0)
     rest = project_out(Q, K[:, free])
-    left = np.linalg.norm(rest, axis=0) > DEPENDENT * np.linalg.norm(K[:, free], axis=0)  # others follow from `equal`
+    # Constraints of which nothing is left follow from the equalities.
+    left = np.linalg.norm(rest, axis=0) > 1e-10 * np.linalg.norm(K[:, free], axis=0)
     free, rest = free[left], rest[:, left]
     along = Q.T @ K[:, free]
     P, S = np.linalg.qr(rest)
@@ -298,6 +275,16 @@ def least_distance(K: Array, load: Array, g: Array, equal: Mask) -> Array | None
     return forces
 
 
+def _independent_columns(K: Array) -> tuple[Indices, Array, Array]:
+    """A largest independent set of columns (r,) of K (n×k), and their QR factors (n×r, r×r)."""
+    if not K.shape[1]:  # LAPACK does not factorise matrices without columns
+        return np.zeros(0, np.intp), np.zeros((len(K), 0)), np.zeros((0, 0))
+    q, r, order = scipy.linalg.qr(K, mode="economic", pivoting=True)
+    pivots = np.abs(np.diag(r))
+    rank = int(np.sum(pivots > 1e-10 * np.max(pivots, initial=0.0)))
+    return order[:rank], q[:, :rank], r[:rank, :rank]
+
+
 class _Whitened:
     """A program in the coordinates z = L⁻¹(f − A x), in which its constraints are Cᵀz ≥ d, in units of their norms."""
 
@@ -305,8 +292,9 @@ class _Whitened:
         self._program, self._L, self._rows = program, L, row_norms(program.B)
         self._C, self._load = self._whiten((program.B / self._rows[:, None]).T), self._whiten(program.f)
         self._factors: tuple[bytes, tuple[Indices, Array, Array]] | None = None
-        # What is left of the load where forces balance it: all there is of x where constraints hold it at zero.
-        self.noise = CANCELLED * self._rows * np.linalg.norm(self._C, axis=0) * np.linalg.norm(self._load)
+        # Round-off in B x that is left of the load where forces balance it, which is all of x where constraints hold it
+        # at zero.
+        self.noise = 32.0 * EPS * self._rows * np.linalg.norm(self._C, axis=0) * np.linalg.norm(self._load)
 
     def _whiten(self, right: Array) -> Array:
         return _solve_triangular(self._L, right, lower=True)
@@ -323,41 +311,32 @@ class _Whitened:
             return np.zeros(len(d), dtype=bool)
         return np.asarray(weights > 0.0)
 
-    def factorised(self, chosen: Mask) -> tuple[Indices, Array, Array]:
-        """A largest independent set of constraints, and the QR factors of their columns of C.
-
-        The last ones are kept: where no other constraint is tight, those that are active are asked for twice.
-        """
+    def factorise(self, chosen: Mask) -> tuple[Indices, Array, Array]:
+        """A largest independent set of chosen constraints, and the QR factors of their columns of C."""
+        # Cached: where no other constraint is tight, the factors of the active ones are needed twice.
         key = chosen.tobytes()
         if self._factors is None or self._factors[0] != key:
-            self._factors = key, self._factorised(chosen)
+            columns = np.flatnonzero(chosen)
+            independent, q, r = _independent_columns(self._C[:, columns])
+            self._factors = key, (columns[independent], q, r)
         return self._factors[1]
-
-    def _factorised(self, chosen: Mask) -> tuple[Indices, Array, Array]:
-        columns = np.flatnonzero(chosen)
-        if not len(columns):  # LAPACK does not factorise matrices without columns
-            return columns, np.zeros((len(self._C), 0)), np.zeros((0, 0))
-        q, r, order = scipy.linalg.qr(self._C[:, columns], mode="economic", pivoting=True)
-        pivots = np.abs(np.diag(r))
-        rank = int(np.sum(pivots > DEPENDENT * np.max(pivots, initial=0.0)))
-        return columns[order[:rank]], q[:, :rank], r[:rank, :rank]
 
     def solve_active(self, active: Mask) -> tuple[Array, Array]:
         """Solution x (n,), α (m,) with the active constraints as equalities, refined once."""
-        kept, q, r = self.factorised(active)
-        program, B = self._program, self._program.B[kept] / self._rows[kept, None]
+        held, q, r = self.factorise(active)
+        program, B = self._program, self._program.B[held] / self._rows[held, None]
         x, alpha = np.zeros(len(program.f)), np.zeros(len(program.g))
         for _ in range(2):  # the second time for the residual of the first
             load = self._whiten(program.f - program.A @ x - program.B.T @ alpha)
-            right = r.T @ (q.T @ load) - (program.g[kept] / self._rows[kept] - B @ x)
+            right = r.T @ (q.T @ load) - (program.g[held] / self._rows[held] - B @ x)
             y = _solve_triangular(r, right, transposed=True)
             x = x + _solve_triangular(self._L, load - q @ y, lower=True, transposed=True)
-            alpha[kept] += _solve_triangular(r, y) / self._rows[kept]
+            alpha[held] += _solve_triangular(r, y) / self._rows[held]
         return x, alpha
 
 
 def _solve_triangular(factor: Array, right: Array, *, lower: bool = False, transposed: bool = False) -> Array:
-    """LAPACK's solution with a triangular matrix (k×k), without the checks that take longer in SciPy's function.
+    """Solve with a triangular matrix (k×k) by LAPACK, without SciPy's checks, which cost more than the solution.
 
     Raises a `LinAlgError` if the matrix is exactly singular.
     """

@@ -10,9 +10,8 @@ the error bound of `vibench.model.error_bounds`: (s_i)₊ / ‖B_i‖_{A⁻¹} i
 row i needs alone. Whether a row is violated is decided row by row, against the round-off of its own s_i: a far row, as
 one with g_i = ∞, says nothing of the others.
 
-How far apart can two solutions of one program be when the residuals of both meet an accuracy? For two solutions
-k = 1, 2 with α_k ≥ 0, residuals r_k = f − Ax_k − Bᵀα_k and excesses
-s_k = Bx_k − g, the difference d = x₁ − x₂ satisfies
+Two solutions of one program whose residuals meet an accuracy have a bounded distance. For solutions k = 1, 2 with
+α_k ≥ 0, residuals r_k = f − Ax_k − Bᵀα_k and excesses s_k = Bx_k − g, the difference d = x₁ − x₂ satisfies
 
     ‖d‖²_A = dᵀ(r₂ − r₁) − (α₁ − α₂)ᵀ(s₁ − s₂) ≤ ‖d‖_A (‖r₁‖ + ‖r₂‖) + |α₁ᵀs₁| + |α₂ᵀs₂| + α₁ᵀ(s₂)₊ + α₂ᵀ(s₁)₊
 
@@ -43,8 +42,8 @@ from vibench.qp.scaling import row_norms
 from vibench.qp.status import Status
 from vibench.text import above
 
+# From functionals, the columns of an array (n×k), to their norms (k,) in A⁻¹.
 DualNorms = Callable[[Array], Array]
-"""From functionals, the columns of an array (n×k), to their norms (k,) in A⁻¹."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,7 @@ def kkt_residuals(program: VariationalInequality, x: Array, alpha: Array, norms:
     NumericalError
         If A is not positive definite.
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # what a diverging solver returns has infinite residuals
+    with np.errstate(over="ignore", invalid="ignore"):  # a diverging solver returns infinite residuals
         return _residuals(program, x, alpha, norms or dual_norms(program.A))
 
 
@@ -121,7 +120,7 @@ def _residuals(program: VariationalInequality, x: Array, alpha: Array, norms: Du
     residual, excess = accurate_residuals(program, x, alpha)
     violated = np.flatnonzero(excess > round_off(B, x, g))
     rows = B[violated].T if isinstance(B, np.ndarray) else sp.csr_array(B)[violated].toarray().T
-    lengths = norms(np.column_stack([rows, B.T @ alpha, residual]))  # one solve of all takes the least
+    lengths = norms(np.column_stack([rows, B.T @ alpha, residual]))  # one solve for all costs the least
     reach, energy = lengths[:-2], _energy(program, x, float(lengths[-2]))
     steps = np.divide(excess[violated], reach, out=np.full(len(violated), np.inf), where=reach > 0.0)
     pressed = alpha > 0.0  # elsewhere s may be infinite
@@ -134,9 +133,9 @@ def _residuals(program: VariationalInequality, x: Array, alpha: Array, norms: Du
 
 
 def accurate_residuals(program: VariationalInequality, x: Array, alpha: Array) -> tuple[Array, Array]:
-    """F − A x − Bᵀα (n,) and B x − g (m,), summed in extended precision where the machine has one.
+    """The residuals f − A x − Bᵀα (n,) and B x − g (m,), summed in extended precision where the machine has one.
 
-    Of a stiff A, double precision would leave round-off times the condition number in the norm of A⁻¹.
+    For a stiff A, double precision would leave round-off times the condition number in the norm of A⁻¹.
     """
     A, B, u, lam = map(_extended, (program.A, program.B, x, alpha))
     residual, excess = program.f - A @ u - B.T @ lam, B @ u - program.g
@@ -151,12 +150,11 @@ def _extended(array: Any) -> Any:
 
 
 def solution_energy(program: VariationalInequality, x: Array, alpha: Array, norms: DualNorms) -> float:
-    """S of a solution x (n,), α (m,)."""
+    """The energy S of a solution x (n,), α (m,)."""
     return _energy(program, x, float(norms((program.B.T @ alpha)[:, None])[0]))
 
 
 def _energy(program: VariationalInequality, x: Array, force: float) -> float:
-    """S from ‖Bᵀα‖ in the norm of A⁻¹."""
     return float(np.hypot(np.sqrt(max(float(x @ (program.A @ x)), 0.0)), force))
 
 
@@ -194,12 +192,13 @@ def round_off(B: SparseMatrix | Array, x: Array, g: Array) -> Array:
 
 
 def round_off_of_terms(entries: Indices, sizes: Array) -> Array:
-    """The same from numbers of entries of the rows (m,) and sums of absolute values of the terms (m,)."""
+    """`round_off` from numbers of entries of the rows (m,) and sums of absolute values of their terms (m,)."""
+    # The factor 1.01 covers the round-off in this bound itself.
     return np.asarray(1.01 * EPS * (entries + 2.0) * sizes)
 
 
 def _over(value: float, scale: float) -> float:
-    """A residual over its scale; infinite beside a solution without energy, not a number where either is none."""
+    """A residual over its scale; infinite for a solution without energy, not a number where either is not one."""
     return 0.0 if value == 0.0 else value / scale if scale != 0.0 else float("inf")
 
 
@@ -209,7 +208,7 @@ def verify(program: VariationalInequality, answer: QPSolution, accuracy: float) 
         if infeasibility_certificate(program) is not None:
             return Status.INFEASIBLE, "no point satisfies the constraints (certified)", None
         return Status.FAILED, f"the solver returned nothing: {answer.solver_status}", None
-    # before any residual: max(0, nan) is 0 and would hide it
+    # Check this before any residual: max(0, nan) is 0 and would hide it.
     if not (np.all(np.isfinite(answer.x)) and np.all(np.isfinite(answer.alpha))):
         return Status.NONFINITE, f"the solution is not finite: {answer.solver_status}", None
     residuals = kkt_residuals(program, answer.x, answer.alpha)
@@ -248,10 +247,11 @@ def infeasibility_certificate(program: VariationalInequality, tolerance: float =
     B, g = program.B[kept], program.g[kept]
     rows = row_norms(B)
     depth = float(np.max(-g / rows, initial=0.0))
-    if not depth > 0.0:  # x = 0 satisfies them
+    if not depth > 0.0:  # x = 0 satisfies all constraints
         return None
     system = np.vstack([(B / rows[:, None]).T, g / (rows * depth)])
-    columns = np.linalg.norm(system, axis=0)  # far constraints have huge ones, rows of zeros may have none
+    # Scale columns: those of far constraints are huge, those of zero rows may vanish.
+    columns = np.linalg.norm(system, axis=0)
     columns[columns == 0.0] = 1.0
     target = np.append(np.zeros(len(system) - 1), -1.0)
     try:
@@ -267,7 +267,7 @@ def infeasibility_certificate(program: VariationalInequality, tolerance: float =
 
 @dataclass(frozen=True)
 class Slack:
-    """The terms l and c of one solution in the bound above, for ‖d‖ instead of ‖d‖_A."""
+    """The terms l and c of one solution in the bound of this module, for ‖d‖ instead of ‖d‖_A."""
 
     linear: float
     constant: float
