@@ -264,8 +264,8 @@ FAULTS = (
     Fault(
         "duality-gap-without-the-residual",
         "vibench/model/error_bounds.py",
-        "on.norm(riesz.plus(w), largest)",
-        "on.norm(w, largest)",
+        "contact.norm(riesz.plus(correction.values, correction.load), largest)",
+        "omega",
         ("tests/unit/model/test_error_bounds.py",),
     ),
     Fault(
@@ -285,7 +285,7 @@ FAULTS = (
     Fault(
         "equalities-without-their-round-off",
         "vibench/model/bound_terms.py",
-        "return SAFETY * float(",
+        "return 2.0 * float(",
         "return 0.0 * float(",
         ("tests/unit/model/test_equalities.py",),
     ),
@@ -313,15 +313,15 @@ FAULTS = (
     Fault(
         "exported-bounds-without-errors-of-polynomials",
         "vibench/library/exported_certificate.py",
-        "SAFETY * polynomial.error * polynomial.scale",
+        "2.0 * polynomial.error * polynomial.scale",
         "0.0",
         ("tests/unit/library/test_export.py",),
     ),
     Fault(
         "online-bound-without-kappa",
         "vibench/model/certificates/bounds.py",
-        "square = rho**2 / lower + omega**2 + 2.0 * kappa",
-        "square = rho**2 / lower + omega**2",
+        "norm * sqrt(upper), kappa, work)",
+        "norm * sqrt(upper), 0.0, work)",
         ("tests/unit/model/certificates/test_bounds.py",),
     ),
     Fault(
@@ -411,8 +411,8 @@ FAULTS = (
     Fault(
         "corrected-pair-without-the-loss-of-spectral-bounds",
         "vibench/model/certificates/bounds.py",
-        "rho = bound.rho + (0.5 * (gamma - alpha_A) * norm + middle * eta) / sqrt(alpha_A)",
-        "rho = bound.rho + middle * eta / sqrt(alpha_A)",
+        "rho = bound.rho + (0.5 * (upper - lower) * norm + middle * eta) / sqrt(lower)",
+        "rho = bound.rho + middle * eta / sqrt(lower)",
         ("tests/unit/model/certificates/test_bounds.py",),
     ),
     Fault(

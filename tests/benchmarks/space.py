@@ -88,7 +88,7 @@ def unseen(resolution: str, count: str = "1000") -> int:
         for name, model in models.items():
             found = model.solve(mu)
             assert found.bound is not None
-            errors = energy.norm(exact.u - found.u), on.of_force(exact.lam - found.lam).norm
+            errors = energy.norm(exact.u - found.u), on.force_representer(exact.lam - found.lam).norm
             bounds = found.bound.u_energy, found.bound.lambda_natural
             violations[name] += any(e > b + VIOLATION * size for e, b in zip(errors, bounds, strict=True))
             row.append([b / e for e, b in zip(errors, bounds, strict=True)])

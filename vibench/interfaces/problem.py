@@ -96,12 +96,15 @@ class ContactLoads:
         The first of these rows.
     reach
         The largest j; `None` for all rows from the first one on.
+    from_contact
+        From the constraint to what `varying` returns, where that evaluates it: queries evaluate it once then.
     """
 
     fixed: Array
     varying: Callable[[Array], tuple[Array, Array]]
     first: int = 0
     reach: int | None = None
+    from_contact: Callable[[Contact], tuple[Array, Array]] | None = None
 
     @property
     def reached(self) -> slice:
@@ -206,12 +209,16 @@ class Problem(ABC):
         """
         assert self.contact_dofs is not None  # implied by `has_contact`
 
+        def from_contact(contact: Contact) -> tuple[Array, Array]:
+            return np.asarray(contact.B.T @ eta), np.asarray(eta.T @ contact.g)
+
         def varying(mu: Array) -> tuple[Array, Array]:
             contact = self.contact(mu)
             assert contact is not None  # implied by `has_contact`
-            return np.asarray(contact.B.T @ eta), np.asarray(eta.T @ contact.g)
+            return from_contact(contact)
 
-        return ContactLoads(np.zeros((len(self.contact_dofs), eta.shape[1])), varying)
+        fixed = np.zeros((len(self.contact_dofs), eta.shape[1]))
+        return ContactLoads(fixed, varying, from_contact=from_contact)
 
     def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
         """Function that evaluates chosen entries of the members in `entrywise`, at the cost of these entries alone.

@@ -8,7 +8,7 @@ import numpy as np
 
 from vibench.arrays import Array, Indices
 from vibench.interfaces.problem import MEMBERS
-from vibench.model.certificates.base import ONE, SAFETY, Guarantee
+from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.chebyshev import AffinePolynomial
 
@@ -30,7 +30,7 @@ def reason_for_none(certificate: OnlineCertificate | None) -> str:
 
 def thetas(certificate: OnlineCertificate, samples: Mapping[str, Array]) -> dict[str, Array]:
     """θ (Q,) of A, f, B and g in the terms of the certificate, from what a query evaluates."""
-    found = certificate.base.coefficients(samples) | {"g": samples.get("g", ONE)}
+    found = certificate.base.coefficients(samples) | {"g": samples.get("g", np.ones(1))}
     return {f"theta_{name}": value for name, value in found.items()}
 
 
@@ -46,7 +46,7 @@ def arrays(
     """The arrays of a certificate for which there is no `reason_for_none`.
 
     With the positions of the contact `unknowns`, those that take ν to a corrected u at mesh size are among them.
-    Bounds grow by what the measured errors of the polynomials, of A and of all θ, may add, with the factor `SAFETY`.
+    Bounds grow by what the measured errors of the polynomials, of A and of all θ, may add, doubled.
     """
     base, residual, corrections, terms = (
         certificate.base, certificate.residual, certificate.prepared, certificate.base.bound_terms
@@ -94,7 +94,7 @@ def arrays(
 
 def _error(polynomial: AffinePolynomial) -> float:
     """Absolute error to expect of a polynomial; none where it is the function that it replaces."""
-    return 0.0 if polynomial.error <= EXACT else SAFETY * polynomial.error * polynomial.scale
+    return 0.0 if polynomial.error <= EXACT else 2.0 * polynomial.error * polynomial.scale
 
 
 def guarantee(certificate: OnlineCertificate, constant: Set[str]) -> Guarantee:

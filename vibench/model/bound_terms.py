@@ -1,14 +1,15 @@
-"""Corrections that hold equalities up to round-off, which no margin covers, and how far the exact ones are from them.
+"""Terms of the error bounds (ii) of MATH.md §10, and what their corrections have in common at any cost.
 
-A row and its opposite ask for B_E w = s_E. In floating-point arithmetic w misses that by δ = s_E − B_E w. As s_E is in
-the range of B_E where the problem has a solution, w' = w + d holds it, with the smallest d such that B_E d = δ: with
-K = F⁻ᵀB_Eᵀ = Q R for the inner product X = FᵀF,
+`vibench.model.error_bounds` derives the bounds. A *correction* is any w with B w ≥ s, s = B u_N − g. In floating-point
+arithmetic margins show that: s is raised above its round-off, and w is accepted if it satisfies the rows by more than
+the round-off of B w and s. Equalities, a row and its opposite, leave no room for a margin. There w misses B_E w = s_E
+by δ = s_E − B_E w. As s_E is in the range of B_E if the problem has a solution, w' = w + d holds it, with the smallest
+d such that B_E d = δ. With K = F⁻ᵀB_Eᵀ = Q R for the inner product X = FᵀF,
 
     d = M R⁻ᵀδ,    M = F⁻¹Q,    ‖d‖_X ≤ η = ‖δ‖ / σ_min(R),    |b d| ≤ ‖b M‖ η    for any row b.
 
-So w' satisfies all rows where w satisfies the others by a margin of ‖b M‖ η, and the bounds hold for it, with ω + η.
-Rows are taken in units of their norms in X⁻¹, in which no scaling of them changes σ_min. Those that depend on others
-are left out of Q and R. w itself is moved by its computed d, so that η is of round-off.
+So w' satisfies all rows if w satisfies the others by a margin of ‖b M‖ η, and the bounds hold for w', with ω + η. The
+computed w is moved by its computed d, so that η is of the size of round-off.
 """
 
 from __future__ import annotations
@@ -16,29 +17,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+from math import sqrt
 
 import numpy as np
 import scipy.linalg
 
 from vibench.arrays import Array, Indices, SparseMatrix
-
-NO_ROOM = 1e-12
-"""Opposite rows are an equality where there is less room between them than this share of the terms of B u_N − g."""
-
-IMPLIED = 1e4
-"""Equalities that depend on others hold with them up to this multiple of round-off, or the problem has no solution."""
-
-REFERENCE = 1e-6
-"""Largest error bound of a high-fidelity solution, relative to it in the energy norms."""
-
-MARGIN = 4.0
-"""The first margin of s, as a multiple of the round-off in s."""
-
-IMPLAUSIBLE = 1e8
-"""Multipliers this many times those that rows alone would have are of dependent constraints, solved in round-off."""
-
-ATTEMPTS = 4
-"""Margins that are tried, each at least ten times the one before."""
 
 
 class BoundNote(StrEnum):
@@ -60,7 +44,7 @@ class BoundNote(StrEnum):
 
 
 class CorrectionMode(StrEnum):
-    """Which solutions are corrected: none, all, or those whose violation dominates the bound, ω > ρ."""
+    """Choice of the solutions to correct: none, all, or those whose violation dominates the bound, ω > ρ."""
 
     NONE = "none"
     FEASIBLE = "feasible"
@@ -71,32 +55,64 @@ class CorrectionMode(StrEnum):
         return self is CorrectionMode.FEASIBLE or (self is CorrectionMode.AUTO and omega > rho)
 
 
+def in_dual_set(lam: Array) -> bool:
+    """Whether λ (m,) is in the dual set K; today K has a ray for every row, λ ≥ 0."""
+    return not lam.min(initial=0.0) < 0.0
+
+
+def dual_gap(lam: Array, slack: Array) -> float:
+    """The term κ = σ_K(s − B w) − λᵀ(s − B w) of λ ∈ K from B w − s (m,), see MATH.md §13.
+
+    The support function σ_K of rays is zero where B w ≥ s. All uses of K in the bounds are here and in `in_dual_set`.
+    """
+    # round-off may leave a negative product of numbers that vanish in pairs
+    return max(0.0, float(lam @ slack))
+
+
 @dataclass(frozen=True)
 class BoundTerms:
-    """The terms of (ii), and ‖r + A w‖_{A⁻¹}, that need no constants."""
+    """Terms of the bounds (ii) of one pair u_N and λ_N with one correction w, or upper bounds of these terms.
+
+    Attributes
+    ----------
+    rho, omega
+        ρ = ‖r‖_{A⁻¹} and ω = ‖w‖_A.
+    kappa
+        κ, see `dual_gap`.
+    gap
+        ‖r + A w‖²_{A⁻¹} + 2κ, twice the duality gap of λ_N and the feasible u_N − w.
+    """
 
     rho: float
     omega: float
     kappa: float
-    feasible_rho: float
+    gap: float
+
+    @classmethod
+    def from_work(cls, rho: float, omega: float, kappa: float, work: float) -> BoundTerms:
+        """Terms from rᵀw: the gap is Δ_A² + 2 rᵀw, which cancellation leaves with half of its digits."""
+        return cls(rho, omega, kappa, rho**2 + omega**2 + 2.0 * kappa + 2.0 * work)
+
+    @classmethod
+    def corrected(cls, rho: float, kappa: float) -> BoundTerms:
+        """Terms of a corrected pair u_N − w and ν, from its own residual and κ: it violates nothing, and ω = 0."""
+        return cls(rho, 0.0, kappa, rho**2 + 2.0 * kappa)
 
     @property
     def primal(self) -> float:
-        """Δ_A."""
-        return float(np.sqrt(self.rho**2 + self.omega**2 + 2.0 * self.kappa))
+        """The bound Δ_A of ‖u − u_N‖_A."""
+        return sqrt(self.rho**2 + self.omega**2 + 2.0 * self.kappa)
 
     @property
     def dual(self) -> float:
-        """The bound of ‖Bᵀε‖ in the norm of A⁻¹."""
-        gap = self.feasible_rho**2 + 2.0 * self.kappa  # twice the duality gap
-        return min(float(np.sqrt(gap)), self.omega + self.primal)
+        """The bound of ‖Bᵀ(λ − λ_N)‖_{A⁻¹}."""
+        return min(sqrt(max(0.0, self.gap)), self.omega + self.primal)
 
 
-DEPENDENT = 1e-12
-"""Equalities are dependent where a pivot of R is below this."""
-
-SAFETY = 2.0
-"""Factor on η for the round-off in σ_min."""
+def first_margin(round_off: Array) -> Array:
+    """Margin by which s is raised first, from the round-off (m,) in s."""
+    # B w has about the round-off of s, and the bounds of both are summed: four times leaves room for twice the sum
+    return 4.0 * round_off
 
 
 @dataclass(frozen=True)
@@ -110,7 +126,7 @@ class Equalities:
     lengths
         Norms (r,) of these in X⁻¹.
     factor, smallest
-        R (r×r) in units of these, and σ_min.
+        R (r×r) in units of these norms, in which no scaling of rows changes σ_min, and σ_min.
     liftings
         M (·×r).
     reach
@@ -125,13 +141,13 @@ class Equalities:
     reach: Array
 
     @classmethod
-    def of(cls, K: Array, unwhiten: Callable[[Array], Array], B: SparseMatrix) -> Equalities:
-        """From K (n×e), F⁻¹ and all rows B (m×·)."""
+    def from_rows(cls, K: Array, unwhiten: Callable[[Array], Array], B: SparseMatrix) -> Equalities:
+        """Factorise K (n×e); `unwhiten` applies F⁻¹, and B (m×·) has all rows."""
         lengths = np.linalg.norm(K, axis=0)
         lengths[lengths == 0.0] = 1.0
         Q, R, order = scipy.linalg.qr(K / lengths, mode="economic", pivoting=True)
-        pivots = np.abs(np.diag(R))
-        rank = int(np.sum(pivots > DEPENDENT))
+        # rows of length 1 are dependent where a pivot is below 1e-12; dependent ones hold with the others
+        rank = int(np.sum(np.abs(np.diag(R)) > 1e-12))
         R, chosen = R[:rank, :rank], order[:rank]
         smallest = float(np.min(np.linalg.svd(R, compute_uv=False), initial=1.0))
         M = unwhiten(np.ascontiguousarray(Q[:, :rank]))
@@ -148,5 +164,6 @@ class Equalities:
         return np.asarray(scipy.linalg.solve_triangular(self.factor, scaled) / self.lengths)
 
     def distance(self, missing: Array) -> float:
-        """η for a bound (e,) of |δ|."""
-        return SAFETY * float(np.linalg.norm(missing[self.chosen] / self.lengths)) / self.smallest
+        """Bound η of ‖w' − w‖ for a bound (e,) of |δ|."""
+        # twice the quotient, for the round-off in σ_min
+        return 2.0 * float(np.linalg.norm(missing[self.chosen] / self.lengths)) / self.smallest

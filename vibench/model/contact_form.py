@@ -26,35 +26,23 @@ from vibench.interfaces.problem import VariationalInequality, is_absent
 from vibench.qp.exact import Directions
 from vibench.qp.scaling import near_rows
 
-SMALL = 2**18
-"""Entries of D up to which it is computed for a sparse Ŝ; beyond, systems are solved for every set."""
-
-KEPT = 4
-"""Factors of compliances that are kept: of all rows that matter, and of active sets, whose first one pairs share."""
-
-FEW_PRESSED = 3
-"""A multiplier has few entries where these are less than this part of all."""
-
-CANCELLED = 1e-4
-"""A representer A⁻¹ℓ that is a sum of terms, whose norm is below this share of theirs, is computed anew from ℓ."""
-
 
 @dataclass(frozen=True)
 class Representer:
-    """A⁻¹ℓ of a functional ℓ: its values on c (c,), the load ℓ̂ (c,), and ℓ_iᵀA_ii⁻¹ℓ_i, zero for forces on c alone."""
+    """The representer A⁻¹ℓ of a functional ℓ: its values on c (c,), the load ℓ̂ (c,), and `rest`, ℓ_iᵀA_ii⁻¹ℓ_i."""
 
     values: Array
     load: Array
-    rest: float = 0.0
+    rest: float
 
     @property
     def norm(self) -> float:
         """‖ℓ‖ in A⁻¹, the energy norm of the representer."""
         return float(np.sqrt(max(self.rest + float(self.load @ self.values), 0.0)))
 
-    def plus(self, force: Representer) -> Representer:
-        """The sum with the representer of a force on c alone."""
-        return Representer(self.values + force.values, self.load + force.load, self.rest + force.rest)
+    def plus(self, values: Array, load: Array) -> Representer:
+        """The sum with the representer of a force on c alone, from its values (c,) and its load (c,)."""
+        return Representer(self.values + values, self.load + load, self.rest)
 
 
 class ContactForm:
@@ -67,8 +55,7 @@ class ContactForm:
     stiffness
         Its A, condensed on unknowns that include those that B touches.
     shared
-        Whether bounds of many pairs may share D and K. For a sparse Ŝ they are computed only then, and only if they are
-        small: where they are not kept until the next pair they cost more than sparse systems.
+        Whether bounds of many pairs share D and K.
 
     Attributes
     ----------
@@ -83,12 +70,14 @@ class ContactForm:
         self.B: SparseMatrix = sp.csr_array(sp.csc_array(vi.B)[:, self._retained])
         self.sizes: SparseMatrix = abs(self.B)
         m, c = self.B.shape
-        self.is_dense = stiffness.dense or (shared and m * c <= SMALL)
-        self._factors: LRUCache[bytes, _Factor] = LRUCache(KEPT)
+        # For a sparse Ŝ a D that is large, or not reused by the next pair, costs more than a sparse system per set.
+        self.is_dense = stiffness.dense or (shared and m * c <= 2**18)
+        # of all rows that matter, and of active sets, whose first one pairs share
+        self._factors: LRUCache[bytes, _Factor] = LRUCache(4)
 
     @property
     def nbytes(self) -> int:
-        """Memory, about, once everything is computed: B in two precisions, |B|, D, K, factors of K."""
+        """Approximate memory once everything is computed: B in two precisions, |B|, D, K, factors of K."""
         m, c = self.B.shape
         return 48 * int(self.B.nnz) + (8 * m * (c + 3 * m) if self.is_dense else 0)
 
@@ -107,7 +96,7 @@ class ContactForm:
 
     @cached_property
     def near(self) -> Mask:
-        """Constraints (m,) that solvers see: see `near_rows`."""
+        """Constraints (m,) that solvers see, by `near_rows`."""
         return near_rows(self.vi)
 
     @cached_property
@@ -134,29 +123,32 @@ class ContactForm:
 
     @cached_property
     def in_extended_precision(self) -> SparseMatrix:
-        """B in extended precision, where the machine has one."""
+        """B in extended precision, if the machine has one."""
         return self.B.astype(np.longdouble)
 
     @cached_property
     def compliance(self) -> Array:
-        """K (m×m), not symmetrised: what forces displace is to the last digit what B says of it."""
+        """The compliance K (m×m)."""
+        # not symmetrised: then K η agrees to the last digit with B applied to the displacements D η
         return np.ascontiguousarray(times_dense(self.B, self.liftings.T))
 
-    def of_force(self, multiplier: Array) -> Representer:
+    def force_representer(self, multiplier: Array) -> Representer:
         """The representer of a force Bᵀη of a multiplier η (m,)."""
         load = np.asarray(self.B.T @ multiplier)
-        return Representer(self._displaced(multiplier) if self.is_dense else self._stiffness.compliance(load), load)
+        values = self._displaced(multiplier) if self.is_dense else self._stiffness.compliance(load)
+        return Representer(values, load, 0.0)
 
     def force_norm(self, multiplier: Array) -> float:
         """‖Bᵀη‖ in A⁻¹ of a multiplier η (m,): from K alone, where it is computed."""
         if not self.is_dense:
-            return self.of_force(multiplier).norm
+            return self.force_representer(multiplier).norm
         return float(np.sqrt(max(float(multiplier @ (self.compliance @ multiplier)), 0.0)))
 
     def _displaced(self, multiplier: Array) -> Array:
         """D η (c,) of a multiplier η (m,)."""
         pressed = np.flatnonzero(multiplier)
-        if FEW_PRESSED * len(pressed) > len(multiplier):  # a copy of so many rows takes more than their products
+        # Use all rows unless two thirds of η are zero: copying the rows costs more than multiplying them.
+        if 3 * len(pressed) > len(multiplier):
             return np.asarray(multiplier @ self.liftings)
         return np.asarray(multiplier[pressed] @ self.liftings[pressed])
 
@@ -166,7 +158,8 @@ class ContactForm:
 
     def norm(self, terms: Representer, largest: float) -> float:
         """The norm of a sum of terms whose norm is at most about `largest`."""
-        if terms.norm >= CANCELLED * largest:
+        # where more than four digits of the sum cancelled, solve again for its load, which has lost none
+        if terms.norm >= 1e-4 * largest:
             return terms.norm
         return Representer(self._stiffness.compliance(terms.load), terms.load, terms.rest).norm
 
@@ -199,35 +192,33 @@ class ContactForm:
         RuntimeError, numpy.linalg.LinAlgError
             If the rows are linearly dependent.
         """
-        given, multiplier = (self.B @ values)[rows], np.zeros(self.B.shape[0])
+        prescribed, multiplier = (self.B @ values)[rows], np.zeros(self.B.shape[0])
         if self.is_dense:
-            multiplier[rows] = self._factor(rows).solve(given)
-            return self.of_force(multiplier)
+            multiplier[rows] = self._factor(rows).solve(prescribed)
+            return self.force_representer(multiplier)
         vi = self.vi
-        program = VariationalInequality(vi.A, np.zeros_like(vi.f), sp.csr_array(vi.B)[rows], -given)
+        program = VariationalInequality(vi.A, np.zeros_like(vi.f), sp.csr_array(vi.B)[rows], -prescribed)
         moved, multiplier[rows] = self._stiffness.active_set_system(program).solve_active(np.arange(len(rows)))
-        return Representer(-moved, -self.load(moved, -multiplier))
+        return Representer(-moved, -self.load(moved, -multiplier), 0.0)
 
     def _factor(self, rows: Indices) -> _Factor:
-        """A factor of K in some rows (k,): active sets and kept rows are often those of the pair before."""
+        """A factor of K in some rows (k,), cached: active sets and kept rows are often those of the pair before."""
         key = rows.tobytes()
         if key not in self._factors:
-            self._factors[key] = _Factor(self._compliance_of(rows))
+            if len(rows) == self.B.shape[0]:
+                compliance = self.compliance
+            elif "compliance" in vars(self):
+                compliance = self.compliance[np.ix_(rows, rows)]
+            else:  # all of K would cost more than these rows
+                compliance = np.asarray(self.B[rows] @ self.liftings[rows].T)
+            self._factors[key] = _Factor(compliance)
         return self._factors[key]
-
-    def _compliance_of(self, rows: Indices) -> Array:
-        """K in some rows (k,), of which all are computed only where they are asked for."""
-        if len(rows) == self.B.shape[0]:
-            return self.compliance
-        if "compliance" in vars(self):
-            return self.compliance[np.ix_(rows, rows)]
-        return np.asarray(self.B[rows] @ self.liftings[rows].T)
 
 
 def representers(stiffness: CondensedStiffness, functionals: Array) -> list[Representer]:
-    """A⁻¹ℓ of functionals, the columns (n×k), all in one block."""
+    """The representers A⁻¹ℓ of functionals, the columns (n×k), solved in one block."""
     loads, values, rest = stiffness.represent(functionals)
-    return [Representer(*of_one) for of_one in zip(values.T, loads.T, rest.tolist(), strict=True)]
+    return [Representer(*one) for one in zip(values.T, loads.T, rest.tolist(), strict=True)]
 
 
 class _Factor:
@@ -237,11 +228,12 @@ class _Factor:
         self._compliance, self._unit = compliance, 1.0 / np.sqrt(np.diag(compliance))
         self._factor = scipy.linalg.cho_factor(compliance * self._unit * self._unit[:, None], overwrite_a=True)
 
-    def solve(self, given: Array) -> Array:
-        """Forces (k,) that displace the rows by given values (k,); refined once."""
-        forces = self._solve_once(given)
-        return forces + self._solve_once(given - self._compliance @ forces)
+    def solve(self, prescribed: Array) -> Array:
+        """Forces (k,) that displace the rows by prescribed values (k,)."""
+        forces = self._solve_once(prescribed)
+        # one step of refinement: rows that are nearly parallel lose half of the digits in the factor
+        return forces + self._solve_once(prescribed - self._compliance @ forces)
 
-    def _solve_once(self, given: Array) -> Array:
-        solved = scipy.linalg.cho_solve(self._factor, self._unit * given, overwrite_b=True, check_finite=False)
+    def _solve_once(self, right: Array) -> Array:
+        solved = scipy.linalg.cho_solve(self._factor, self._unit * right, overwrite_b=True, check_finite=False)
         return np.asarray(self._unit * solved)

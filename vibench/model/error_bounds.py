@@ -52,6 +52,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import hypot, inf
 
 import numpy as np
 import scipy.sparse as sp
@@ -61,22 +62,15 @@ from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import active_set_iterations
 from vibench.interfaces.problem import VariationalInequality, is_absent
 from vibench.linalg import UNIT_ROUND_OFF
-from vibench.model.bound_terms import (
-    ATTEMPTS,
-    IMPLAUSIBLE,
-    IMPLIED,
-    MARGIN,
-    NO_ROOM,
-    REFERENCE,
-    BoundNote,
-    BoundTerms,
-    Equalities,
-)
+from vibench.model.bound_terms import BoundNote, BoundTerms, Equalities, dual_gap, first_margin, in_dual_set
 from vibench.model.contact_form import ContactForm, Representer
 from vibench.model.errors import EnergyNorm, riesz_representatives
 from vibench.qp.exact import Rows, least_distance_solution, rows_that_matter
 from vibench.qp.scaling import ratio
 from vibench.stability.coercivity import Constant, Stability
+
+REFERENCE = 1e-6
+"""Largest error bound of a high-fidelity solution, relative to it in the energy norms."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +102,7 @@ class ErrorBounds:
     @classmethod
     def none(cls, note: str) -> ErrorBounds:
         """No bounds, and why."""
-        inf = float("inf")
-        return cls(inf, inf, inf, inf, inf, inf, inf, inf, note)
+        return cls(inf, inf, inf, inf, inf, inf, inf, inf, str(note))
 
 
 def error_bounds(
@@ -128,8 +121,8 @@ def error_bounds(
     """
     residuals = residuals or [residual(vi, u[:, k], lam[:, k]) for k, vi in enumerate(vis)]
     starts = [None] * len(vis) if pressed is None else pressed.T
-    given = zip(vis, energies, constants, u.T, lam.T, riesz_representatives(energies, residuals), starts, strict=True)
-    return [_bounds(vi, energy, c.coercivity, c.energy_inf_sup, *one) for vi, energy, c, *one in given]
+    columns = zip(vis, energies, constants, u.T, lam.T, riesz_representatives(energies, residuals), starts, strict=True)
+    return [_bounds(vi, energy, c.coercivity, c.energy_inf_sup, *one) for vi, energy, c, *one in columns]
 
 
 def bound_errors_at(
@@ -141,7 +134,7 @@ def bound_errors_at(
 
 
 def residual(vi: VariationalInequality, u: Array, lam: Array) -> Array:
-    """R = f − A u − Bᵀλ (n,)."""
+    """The residual r = f − A u − Bᵀλ (n,)."""
     return np.asarray(vi.f - vi.A @ u - vi.B.T @ lam)
 
 
@@ -156,21 +149,20 @@ def _bounds(
     pressed: Mask | None = None,
 ) -> ErrorBounds:
     """Bounds (ii), with the representer A⁻¹r, and rows (m,) that the multiplier presses."""
-    if np.min(lam, initial=0.0) < 0.0:
+    if not in_dual_set(lam):
         return ErrorBounds.none(BoundNote.NOT_IN_CONE)
     if np.any(lam[is_absent(vi.g)]):
         return ErrorBounds.none(BoundNote.ON_ABSENT_ROW)
     correction = find_correction(vi, energy, u, lam, pressed)
     if correction is None:
         return ErrorBounds.none(BoundNote.NO_CORRECTION)
-    of_u = terms(correction, u, lam, riesz)
-    with_d = _with_constrained_residual(correction, u, lam, riesz)
-    of_lam = min((of_u, *with_d), key=lambda terms: terms.rho)
+    of_u = bound_terms(correction, u, lam, riesz)
+    of_lam = min((of_u, *_constrained_terms(correction, u, lam, riesz)), key=lambda terms: terms.rho)
     in_V = of_u.primal / float(np.sqrt(alpha.value))
-    in_W = of_lam.dual / beta.value if beta.value > 0.0 else float("inf")
-    terms_of_both = of_u.rho, of_lam.rho, of_u.omega, of_u.kappa
+    in_W = of_lam.dual / beta.value if beta.value > 0.0 else inf
     notes = [BoundNote.ESTIMATED] * (not alpha.proved) + [BoundNote.NOT_UNIQUE] * (not beta.value > 0.0)
-    return ErrorBounds(of_u.primal, in_V, of_lam.dual, in_W, *terms_of_both, "; ".join(notes))
+    terms = of_u.rho, of_lam.rho, of_u.omega, of_u.kappa
+    return ErrorBounds(of_u.primal, in_V, of_lam.dual, in_W, *terms, "; ".join(notes))
 
 
 def reference_bound(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam: Array) -> float:
@@ -185,13 +177,13 @@ def reference_bound(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam
     """
     correction = find_correction(vi, energy, u, lam)
     if correction is None:
-        return float("inf")
+        return inf
     (riesz,) = riesz_representatives([energy], [residual(vi, u, lam)])
-    bound = terms(correction, u, lam, riesz).primal
-    on = correction.on
-    size = float(np.hypot(energy.norm(u), on.force_norm(lam)))
-    round_off = np.nan_to_num(_round_off(on, on.values(u), correction.values), posinf=0.0)
-    open_by_round_off = np.sqrt(4.0 * MARGIN * float(lam @ round_off))
+    bound, contact = bound_terms(correction, u, lam, riesz).primal, correction.contact
+    size = hypot(energy.norm(u), contact.force_norm(lam))
+    round_off = np.nan_to_num(_round_off(contact, contact.values(u), correction.values), posinf=0.0)
+    # 2κ is at most twice λᵀ times the first margin and the round-off itself, where w was found at once
+    open_by_round_off = np.sqrt(4.0 * float(lam @ first_margin(round_off)))
     if not bound <= max(REFERENCE * size, open_by_round_off):
         raise NumericalError(
             f"the error bound of the high-fidelity solution is {ratio(bound, size):.1e} of it in the energy norm, "
@@ -202,7 +194,7 @@ def reference_bound(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam
 
 @dataclass(frozen=True)
 class CorrectedPair:
-    """v = u_N − w (n,) and ν ≥ 0 (m,), and the ω and ρ of u_N and λ_N: the pair is more accurate where ω > ρ.
+    """The pair v = u_N − w (n,) and ν ≥ 0 (m,), and ω and ρ of u_N and λ_N: it is more accurate where ω > ρ.
 
     v is feasible, ν complementary to it, and the residual of both is r: they solve (7) with the load f − r. The errors
     are bounded by `bound_errors_at`, as those of any other pair; nothing but the residual is left there.
@@ -220,47 +212,51 @@ def corrected_pair(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam:
     if correction is None:
         return None
     (riesz,) = riesz_representatives([energy], [residual(vi, u, lam)])
-    found = terms(correction, u, lam, riesz)
-    return CorrectedPair(u - correction.w, np.maximum(correction.nu, 0.0), found.omega, found.rho)
+    terms = bound_terms(correction, u, lam, riesz)
+    return CorrectedPair(u - correction.w, np.maximum(correction.nu, 0.0), terms.omega, terms.rho)
 
 
 @dataclass(frozen=True)
 class Constraints:
     """The rows of one inequality that matter, and those of them that are equalities."""
 
-    on: ContactForm
+    contact: ContactForm
     rows: Rows
     equalities: Equalities | None
 
     @classmethod
-    def of(cls, vi: VariationalInequality, energy: EnergyNorm, u: Array, lam: Array) -> Constraints:
-        """As a correction of u_N with retained unknowns u (c,) and λ_N (m,) reads them."""
-        on = energy.contact_form(vi)
-        room = NO_ROOM * (on.sizes @ np.abs(u) + np.abs(vi.g))
-        rows, equalities = rows_that_matter(on.B, vi.g, room, lam, on.directions), None
+    def classify(cls, energy: EnergyNorm, contact: ContactForm, u: Array, lam: Array) -> Constraints:
+        """Choose rows for a correction of u_N with retained unknowns u (c,) and λ_N (m,)."""
+        vi = contact.vi
+        # opposite rows with less room than 1e-12 of the terms of s are an equality: no margin would fit between them
+        room = 1e-12 * (contact.sizes @ np.abs(u) + np.abs(vi.g))
+        rows, equalities = rows_that_matter(contact.B, vi.g, room, lam, contact.directions), None
         if rows.equal.any():
             K = energy.factor.solve_factor_transposed(sp.csr_array(vi.B)[rows.equalities].toarray().T)
-            equalities = Equalities.of(K, lambda y: on.values(energy.factor.solve_factor(y)), on.B)
-        return cls(on, rows, equalities)
+            equalities = Equalities.from_rows(K, lambda y: contact.values(energy.factor.solve_factor(y)), contact.B)
+        return cls(contact, rows, equalities)
 
     def moved(self, u: Array, w: Array, forces: Array) -> tuple[Array, Array]:
         """The correction w (c,) with the equalities held, and the forces (m,) that it follows from as w from others."""
         if self.equalities is None:
             return w, forces
-        missing, moved = _slack(self.on, u, w)[self.rows.equalities], forces.copy()
+        missing, moved = _slack(self.contact, u, w)[self.rows.equalities], forces.copy()
         moved[self.rows.equalities[self.equalities.chosen]] -= self.equalities.forces(missing)
         return w - self.equalities.step(missing), moved
 
     def lacking(self, u: Array, w: Array) -> tuple[Array, float]:
-        """What rows may lack of B w' ≥ s in exact arithmetic (m,), and η, a bound of ‖w' − w‖_A."""
-        slack, round_off, eta, equal = _slack(self.on, u, w), _round_off(self.on, u, w), 0.0, self.rows.equalities
-        lacking = np.where(self.rows.implied, 0.0, round_off - slack)
-        if self.equalities is not None:
-            eta = self.equalities.distance((np.abs(slack) + round_off)[equal])
-            lacking = np.where(self.rows.implied, 0.0, lacking + eta * self.equalities.reach)
-            missed = np.abs(slack[equal]) > IMPLIED * round_off[equal]
-            missed[self.equalities.chosen] = False
-            lacking[equal[missed]] = np.inf
+        """Upper bounds (m,) of what rows lack of B w' ≥ s in exact arithmetic, and η, a bound of ‖w' − w‖_A."""
+        slack, round_off = _slack(self.contact, u, w), _round_off(self.contact, u, w)
+        if self.equalities is None:
+            return np.where(self.rows.implied, 0.0, round_off - slack), 0.0
+        equal = self.rows.equalities
+        eta = self.equalities.distance((np.abs(slack) + round_off)[equal])
+        lacking = np.where(self.rows.implied, 0.0, round_off - slack + eta * self.equalities.reach)
+        # Equalities that depend on the chosen ones hold with them. Where one misses by 10⁴ times the round-off they
+        # contradict each other, and the problem has no solution.
+        missed = np.abs(slack[equal]) > 1e4 * round_off[equal]
+        missed[self.equalities.chosen] = False
+        lacking[equal[missed]] = np.inf
         return lacking, eta
 
 
@@ -269,7 +265,7 @@ class Correction:
     """A w with B w ≥ s also in exact arithmetic, and ν ≥ 0 (m,) with A w = Bᵀ(ν − λ_N).
 
     As A(u_N − w) + Bᵀν = f − r and ν is complementary to B(u_N − w) ≤ g, u_N − w and ν solve (7) with the load f − r:
-    up to the residual of (u_N, λ_N), ν is the high-fidelity multiplier. It is approximate where w is. Where there are
+    up to the residual of (u_N, λ_N), ν is the high-fidelity multiplier. It is only approximate if w is. Where there are
     equalities B w ≥ s holds for a w' with ‖w' − w‖_A ≤ `eta`.
 
     `values` are the retained unknowns (c,) of w, the extension of these with the smallest energy; `load` is A w there.
@@ -282,49 +278,52 @@ class Correction:
     constraints: Constraints
 
     @property
-    def on(self) -> ContactForm:
+    def contact(self) -> ContactForm:
         """The inequality on the retained unknowns."""
-        return self.constraints.on
+        return self.constraints.contact
 
     @cached_property
     def w(self) -> Array:
-        """W (n,)."""
-        return self.on.extended(self.values)
+        """The correction w (n,)."""
+        return self.contact.extended(self.values)
 
 
-def terms(correction: Correction, u: Array, lam: Array, riesz: Representer) -> BoundTerms:
+def bound_terms(correction: Correction, u: Array, lam: Array, riesz: Representer) -> BoundTerms:
     """The terms with a correction of u_N (n,) and λ_N ≥ 0 (m,), from A⁻¹r; A⁻¹(r + A w) = A⁻¹r + w."""
-    return _terms(correction, correction.on.values(u), lam, riesz, riesz.norm)
+    return _terms(correction, correction.contact.values(u), lam, riesz, riesz.norm)
 
 
 def _terms(correction: Correction, u: Array, lam: Array, riesz: Representer, largest: float) -> BoundTerms:
-    """The same for u_N with retained unknowns u (c,), and an A⁻¹r that is a difference of terms of a norm `largest`."""
-    on, eta, equalities = correction.on, correction.eta, correction.constraints.equalities
-    kappa, w = max(0.0, float(lam @ _slack(on, u, correction.values))), Representer(correction.values, correction.load)
+    """As `bound_terms`, from contact values u (c,).
+
+    `largest` is the norm of the terms whose difference A⁻¹r is; it decides when A⁻¹r is recomputed.
+    """
+    contact, eta, equalities = correction.contact, correction.eta, correction.constraints.equalities
+    kappa = dual_gap(lam, _slack(contact, u, correction.values))
     if equalities is not None:
         kappa += eta * float(lam @ equalities.reach)
-    of_feasible = on.norm(riesz.plus(w), largest) + eta
-    return BoundTerms(on.norm(riesz, largest), w.norm + eta, kappa, of_feasible)
+    omega = Representer(correction.values, correction.load, 0.0).norm + eta
+    feasible = contact.norm(riesz.plus(correction.values, correction.load), largest) + eta
+    return BoundTerms(contact.norm(riesz, largest), omega, kappa, feasible**2 + 2.0 * kappa)
 
 
-def _with_constrained_residual(
-    correction: Correction, u: Array, lam: Array, riesz: Representer
-) -> Iterator[BoundTerms]:
+def _constrained_terms(correction: Correction, u: Array, lam: Array, riesz: Representer) -> Iterator[BoundTerms]:
     """The terms for u + d, whose residual is the part of r in the range of Bᵀ, if w is feasible for it and d exists.
 
     d is A⁻¹r without the displacement A⁻¹Bᵀξ of the forces that hold B d = 0, which is A⁻¹ times the residual left.
     """
-    on, constraints = correction.on, correction.constraints
-    rows = constraints.rows.kept[on.near[constraints.rows.kept]]  # any d will do for which w is feasible
-    if len(rows) == on.B.shape[0] == on.B.shape[1]:
+    contact, constraints = correction.contact, correction.constraints
+    # any d will do for which w is feasible: far rows are left out, and the check below covers them
+    rows = constraints.rows.kept[contact.near[constraints.rows.kept]]
+    if len(rows) == contact.B.shape[0] == contact.B.shape[1]:
         # as many rows as unknowns: B d = 0 leaves nothing of d there, and w is feasible for u + d as for u
-        yield _terms(correction, on.values(u), lam, replace(riesz, rest=0.0), riesz.norm)
+        yield _terms(correction, contact.values(u), lam, replace(riesz, rest=0.0), riesz.norm)
         return
     try:
-        held = on.holding(rows, riesz.values)
+        held = contact.holding(rows, riesz.values)
     except (RuntimeError, np.linalg.LinAlgError):  # an exactly singular system
         return
-    moved = on.values(u) + (riesz.values - held.values)
+    moved = contact.values(u) + (riesz.values - held.values)
     lacking, eta = constraints.lacking(moved, correction.values)
     if np.all(lacking <= 0.0):
         yield _terms(replace(correction, eta=eta), moved, lam, held, riesz.norm)
@@ -344,19 +343,20 @@ def find_correction(
     pressed
         Rows (m,) where active sets start; those that λ_N presses by default.
     """
-    on = energy.contact_form(vi)
-    u = on.values(u)
-    constraints = Constraints.of(vi, energy, u, lam)
+    contact = energy.contact_form(vi)
+    u = contact.values(u)
+    constraints = Constraints.classify(energy, contact, u, lam)
     kept, equal = constraints.rows.kept, constraints.rows.equal
-    excess = (on.B @ u - vi.g)[kept]
-    margin = np.where(equal, 0.0, MARGIN * _round_off(on, u, np.zeros_like(u))[kept])
+    excess = (contact.B @ u - vi.g)[kept]
+    margin = np.where(equal, 0.0, first_margin(_round_off(contact, u, np.zeros_like(u)))[kept])
     # the largest multiplier s / b A⁻¹bᵀ that a row b w ≥ s would have alone, from above
-    alone = float(np.max(excess * on.stiffnesses[kept], initial=0.0))
-    largest = IMPLAUSIBLE * max(np.max(lam, initial=0.0), alone)
+    alone = float(np.max(excess * contact.stiffnesses[kept], initial=0.0))
+    # multipliers 10⁸ times larger are those of dependent constraints, solved in round-off
+    largest = 1e8 * max(np.max(lam, initial=0.0), alone)
     starts, doubtful = [chosen[kept] for chosen in (pressed, lam > 0.0) if chosen is not None], None
-    for _ in range(ATTEMPTS):
+    for _ in range(4):
         least = excess + margin
-        for values, forces in _minimisers(on, energy, kept, lam, least, equal, starts, largest):
+        for values, forces in _minimisers(contact, energy, kept, lam, least, equal, starts, largest):
             multipliers = np.zeros(len(vi.g))
             multipliers[kept] = forces
             w, multipliers = constraints.moved(u, values, multipliers)
@@ -364,17 +364,18 @@ def find_correction(
             if not np.all(lacking <= 0.0):  # NaN is not
                 margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking[kept], nan=0.0, posinf=0.0))
                 continue
-            nu, load = constraints.rows.multipliers(forces, len(vi.g)), on.load(w, multipliers - lam)
-            found = Correction(w, load, nu, eta, constraints)
+            nu, load = constraints.rows.multipliers(forces, len(vi.g)), contact.load(w, multipliers - lam)
+            correction = Correction(w, load, nu, eta, constraints)
             if np.max(forces[~equal], initial=0.0) <= largest:
-                return found
-            doubtful = found
+                return correction
+            doubtful = correction
+        # ten times the margin: four attempts reach far beyond any round-off that is left
         margin = 10.0 * margin
     return doubtful
 
 
 def _minimisers(
-    on: ContactForm,
+    contact: ContactForm,
     energy: EnergyNorm,
     kept: Indices,
     lam: Array,
@@ -388,26 +389,26 @@ def _minimisers(
     Up to round-off, by active sets, then as a least distance problem: active sets of constraints that are dependent but
     for round-off may have a w that is feasible and huge, with a multiplier above `largest`. `least` is s (k,).
     """
-    system = on.correction_system(kept, lam, least)
+    system = contact.correction_system(kept, lam, least)
     for active in (*starts, np.zeros_like(equal)):
         settled = active_set_iterations(system, active, equal)
         if settled is not None:
             yield settled[:2]
             if np.max(settled[1][~equal], initial=0.0) <= largest:
                 return
-    vi = on.vi
+    vi = contact.vi
     program = VariationalInequality(vi.A, -(vi.B.T @ lam), -sp.csr_array(vi.B)[kept], -least)
     if (nearest := least_distance_solution(program, energy.factor, equal, starts[-1])) is not None:
-        yield on.values(nearest[0]), nearest[1]
+        yield contact.values(nearest[0]), nearest[1]
 
 
-def _slack(on: ContactForm, u: Array, w: Array) -> Array:
+def _slack(contact: ContactForm, u: Array, w: Array) -> Array:
     """B w − s (m,), from retained unknowns (c,)."""
-    return np.asarray(on.B @ w - (on.B @ u - on.vi.g))
+    return np.asarray(contact.B @ w - (contact.B @ u - contact.vi.g))
 
 
-def _round_off(on: ContactForm, u: Array, w: Array) -> Array:
-    """Bound (m,) of the round-off in `_slack` (Higham 2002, §3.1)."""
-    return np.asarray(
-        1.01 * (on.entries + 4.0) * UNIT_ROUND_OFF * (on.sizes @ (np.abs(w) + np.abs(u)) + np.abs(on.vi.g))
-    )
+def _round_off(contact: ContactForm, u: Array, w: Array) -> Array:
+    """Bound (m,) of the round-off in `_slack`."""
+    # a row of k terms and four operations more has at most γ_{k+4} < 1.01 (k + 4) u times its terms (Higham 2002, §3.1)
+    terms = contact.sizes @ (np.abs(w) + np.abs(u)) + np.abs(contact.vi.g)
+    return np.asarray(1.01 * (contact.entries + 4.0) * UNIT_ROUND_OFF * terms)

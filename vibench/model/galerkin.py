@@ -31,7 +31,8 @@ class Evaluated:
     samples
         Values of the sampled entries, by member.
     contact
-        The constraint on the contact unknowns, where B or g are evaluated there.
+        The constraint on the contact unknowns, where B or g are evaluated there; valid until the problem evaluates
+        another one, which may be written into the same arrays.
     coordinates
         Coordinates of the primal basis Z in the space Φ of the model, without those at the end that are zero in all of
         Z; `None` where Z is Φ.
@@ -42,11 +43,11 @@ class Evaluated:
     samples: Mapping[str, Array] = field(default_factory=dict)
     contact: Contact | None = None
     coordinates: Array | None = None
-    dim: int = 0
+    dim: int | None = None
 
     def in_space(self, x: Array) -> Array:
         """Coordinates (d,) in Φ from those (N',) in Z."""
-        if self.coordinates is None:
+        if self.coordinates is None or self.dim is None:
             return x
         y = np.zeros(self.dim)
         y[: len(self.coordinates)] = self.coordinates @ x
@@ -205,6 +206,13 @@ class ReducedModel:
         """Galerkin projection of an assembled variational inequality."""
         Z = self.primal_basis(vi)
         return ReducedProblem(project(vi, Z, self.generators), partial(np.matmul, Z))
+
+
+def contact_at(problem: Problem, mu: Array) -> Contact:
+    """B and g at mu (d,) on the contact unknowns of a problem that has them."""
+    contact = problem.contact(mu)
+    assert contact is not None  # implied by `has_contact`
+    return contact
 
 
 def _agree(one: Array, other: Array) -> bool:

@@ -14,18 +14,15 @@ from scipy.linalg.lapack import dgeqp3, dorgqr
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError
-from vibench.interfaces.problem import MEMBERS, ContactLoads, VariationalInequality
+from vibench.interfaces.problem import MEMBERS, Contact, ContactLoads, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.linalg.inner_product import RANK_RTOL
 from vibench.model.affine import AffineMember, Evaluation, coefficients, evaluated_members
-from vibench.model.galerkin import Evaluated, ReducedModel, ReducedProblem
+from vibench.model.galerkin import Evaluated, ReducedModel, ReducedProblem, contact_at
 from vibench.reduction.supremizers import LoadCoordinates, PlainCoordinates, SpannedCoordinates, supremizers
 
-SPANNED = 1e-14
-"""Generators are combinations of η where they differ from them by less than this share: round-off."""
-
+# coefficients θ of the terms at one parameter, by member
 Samples = Mapping[str, Array]
-"""Coefficients θ of the terms at one parameter, by member."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,7 @@ class ProjectedMember:
     unpack: Indices | None = None
 
     @classmethod
-    def of(cls, terms: list[Array], member: AffineMember) -> ProjectedMember:
+    def from_terms(cls, terms: list[Array], member: AffineMember) -> ProjectedMember:
         """A member from its projected terms."""
         shape = terms[0].shape
         return cls(np.array([term.ravel() for term in terms]), shape, member.way is Evaluation.CONSTANT)
@@ -65,14 +62,14 @@ class ProjectedMember:
         packed = np.array([(0.5 * (term + term.T))[upper] for term in terms])
         return cls(packed, (d, d), member.way is Evaluation.CONSTANT, where.ravel())
 
-    def at(self, theta: Array | None) -> Array:
+    def evaluate(self, theta: Array | None) -> Array:
         """The member with coefficients θ (Q,)."""
         if self.constant or theta is None:
             return self._constant_value
-        # of one term a product with a matrix takes three times as long
+        # for one term a matrix product takes three times as long as a scaling
         return self._unpacked(theta[0] * self.terms[0] if len(self.terms) == 1 else theta @ self.terms)
 
-    def at_all(self, thetas: Sequence[Array]) -> Array:
+    def evaluate_all(self, thetas: Sequence[Array]) -> Array:
         """The member with each of P coefficients θ (Q,), in one product (P×shape)."""
         return self._unpacked(np.stack(thetas) @ self.terms)
 
@@ -155,17 +152,17 @@ def hyper_reduce(model: ReducedModel, members: Mapping[str, AffineMember]) -> Re
         sampled_entries=sampled,
         affine=affine,
         A=A,
-        f=ProjectedMember.of([Z.T @ term for term in members["f"].terms], members["f"]),
+        f=ProjectedMember.from_terms([Z.T @ term for term in members["f"].terms], members["f"]),
         g=None
         if members["g"].way is Evaluation.CONTACT
-        else ProjectedMember.of([model.generators.T @ term for term in members["g"].terms], members["g"]),
+        else ProjectedMember.from_terms([model.generators.T @ term for term in members["g"].terms], members["g"]),
         B=None
         if contact
-        else ProjectedMember.of([chi.T @ np.asarray(B @ Z) for B in members["B"].terms], members["B"]),
+        else ProjectedMember.from_terms([chi.T @ np.asarray(B @ Z) for B in members["B"].terms], members["B"]),
         contact_basis=np.ascontiguousarray(Z[problem.contact_dofs]) if contact and coordinates is None else None,
         supremizer_coordinates=coordinates,
         basis=basis,
-        factor=scipy.linalg.cholesky(A.at(None), lower=True) if dual_is_regular else None,
+        factor=scipy.linalg.cholesky(A.evaluate(None), lower=True) if dual_is_regular else None,
     )
 
 
@@ -183,7 +180,7 @@ def _tested(model: ReducedModel, eta: Array) -> tuple[Array, Array | None]:
     """Multipliers whose contact loads give those of (η, χ): η and C, where χ = η C up to round-off, or all of them."""
     combination = _combination(model, eta)
     W, chi = model.problem.W, model.generators
-    missed = W.norm(chi - eta @ combination) > SPANNED * W.norm(chi)
+    missed = W.norm(chi - eta @ combination) > 1e-14 * W.norm(chi)  # more than round-off
     return (np.hstack([eta, chi]), None) if missed.any() else (eta, combination)
 
 
@@ -229,8 +226,14 @@ class HyperReducedModel:
         NumericalError
             If the reduced problem has entries that are not finite.
         """
-        samples = self.coefficients(mu)
-        return self._in_basis(mu, samples, self._members(samples, self._varying(mu)))
+        samples, contact = self.coefficients(mu), None
+        if self._loads is not None and self._loads.from_contact is not None:
+            # a certificate needs the constraint, too: pass on the one that the loads come from
+            contact = contact_at(self.problem, mu)
+            varying: tuple[Array, Array] | None = self._loads.from_contact(contact)
+        else:
+            varying = self._varying(mu)
+        return self._in_basis(mu, samples, self._members(samples, varying), contact)
 
     def assemble_all(self, mus: Array) -> list[ReducedProblem]:
         """The reduced problems at mus (P×d): those of `assemble` up to round-off, sums of terms in one product each.
@@ -245,14 +248,17 @@ class HyperReducedModel:
         samples = [self.coefficients(mu) for mu in mus]
         sums = {name: getattr(self._operators, name) for name in MEMBERS}
         varying = {name: of for name, of in sums.items() if of is not None and not of.constant and name in samples[0]}
-        values = {name: of.at_all([each[name] for each in samples]) for name, of in varying.items()}
+        values = {name: of.evaluate_all([each[name] for each in samples]) for name, of in varying.items()}
         assembled = []
         for k, (mu, own) in enumerate(zip(mus, samples, strict=True)):
             members = self._members(own, self._varying(mu), {name: value[k] for name, value in values.items()})
-            assembled.append(self._in_basis(mu, own, members))
+            # without the constraints, whose arrays a problem may reuse at the next parameter
+            assembled.append(self._in_basis(mu, own, members, None))
         return assembled
 
-    def _in_basis(self, mu: Array, samples: Samples, members: VariationalInequality) -> ReducedProblem:
+    def _in_basis(
+        self, mu: Array, samples: Samples, members: VariationalInequality, contact: Contact | None
+    ) -> ReducedProblem:
         """The reduced problem at mu (d,) of members on Φ."""
         space, program, Y = self.space, members, None
         if space is not None:
@@ -265,13 +271,13 @@ class HyperReducedModel:
         stiffness = self._sum_of_stiffness if known else program.A.sum()
         if not isfinite(stiffness + program.f.sum() + program.B.sum() + program.g.sum()):
             raise NumericalError(f"the reduced problem has entries that are not finite at mu = {mu.tolist()}")
-        evaluated = Evaluated(samples, None, Y, 0 if space is None else len(space.plain))
+        evaluated = Evaluated(samples, contact, Y, None if space is None else len(space.plain))
         return ReducedProblem(program, reconstruct, self._operators.factor, evaluated)
 
     @cached_property
     def _sum_of_stiffness(self) -> float:
-        """Of a constant A, whose entries are not looked at in every query."""
-        return float(self._operators.A.at(None).sum())
+        """Cached sum of the entries of a constant A, so that queries skip its finiteness check."""
+        return float(self._operators.A.evaluate(None).sum())
 
     def reconstruct(self, mu: Array, vi: VariationalInequality, x: Array) -> Array:  # noqa: ARG002
         """Vectors u = Z x (n×k) with coordinates x (N'×k) at mu, for reconstruction; it assembles again."""
@@ -284,11 +290,11 @@ class HyperReducedModel:
     def members(self, mu: Array, samples: Samples) -> VariationalInequality:
         """A, f, B, g at mu (d,) on Φ, a space that does not depend on mu; B on (η, χ) where Φ has `space`.
 
-        `samples` are the `coefficients` at mu, which whoever needs members on Φ evaluates for other purposes, too.
+        `samples` are the `coefficients` at mu, which callers evaluate for other purposes, too.
         """
-        found = self._members(samples, self._varying(mu))
-        missing = len(found.f) - found.B.shape[1]  # coordinates of supremizers that are zero
-        return replace(found, B=np.pad(found.B, ((0, 0), (0, missing)))) if missing else found
+        members = self._members(samples, self._varying(mu))
+        missing = len(members.f) - members.B.shape[1]  # coordinates of supremizers that are zero
+        return replace(members, B=np.pad(members.B, ((0, 0), (0, missing)))) if missing else members
 
     def _varying(self, mu: Array) -> tuple[Array, Array] | None:
         """The varying contact loads and the bounds at mu (d,), where a member is projected from contact unknowns."""
@@ -303,7 +309,7 @@ class HyperReducedModel:
 
     @cached_property
     def _tested(self) -> tuple[Array, Array | None]:
-        """The multipliers whose contact loads are evaluated, and what makes χ of them; `None` if they end with χ."""
+        """The multipliers whose contact loads are evaluated, and C with χ = η C; `None` if they end with χ."""
         eta, space = self.model.enrichment.eta, self.space
         if eta is None or not isinstance(space, LoadCoordinates):
             return self.generators, None
@@ -316,10 +322,10 @@ class HyperReducedModel:
     ) -> VariationalInequality:
         """The members on Φ but for `known` ones; of a varying space B has what supremizers use alone."""
         operators, count = self._operators, self.generators.shape[1]
-        A = known["A"] if "A" in known else operators.A.at(samples.get("A"))
-        f = known["f"] if "f" in known else operators.f.at(samples.get("f"))
+        A = known["A"] if "A" in known else operators.A.evaluate(samples.get("A"))
+        f = known["f"] if "f" in known else operators.f.evaluate(samples.get("f"))
         if operators.g is not None:
-            g = known["g"] if "g" in known else operators.g.at(samples.get("g"))
+            g = known["g"] if "g" in known else operators.g.evaluate(samples.get("g"))
         else:
             assert varying is not None  # from `_varying`
             combination, bounds = self._tested[1], varying[1]
@@ -341,7 +347,7 @@ class HyperReducedModel:
     def _constraint(self, samples: Samples, varying: tuple[Array, Array] | None) -> Array:
         operators = self._operators
         if operators.B is not None:
-            return operators.B.at(samples.get("B"))
+            return operators.B.evaluate(samples.get("B"))
         assert varying is not None  # from `_varying`
         loads = varying[0]
         if isinstance(self.space, LoadCoordinates):

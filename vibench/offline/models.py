@@ -286,7 +286,7 @@ class Model:
 
     @cached_property
     def output_weights(self) -> dict[str, tuple[float, float] | None]:
-        """What bounds errors of outputs by those of u and λ, see `vibench.model.output_bounds`; `None` without any."""
+        """Weights that bound errors of outputs by those of u and λ; `None` without any."""
         certificate, found = self.certificate, dict[str, tuple[float, float] | None]()
         for output in self.problem.outputs:
             known = None if certificate is None or not output.linear else certificate.base

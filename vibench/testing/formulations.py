@@ -200,7 +200,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         lam = residual_multiplier(vi, energy, u) if result.pair[1] is None else result.pair[1]
         on = energy.contact_form(vi)
         of_u = energy.norm(u - snapshots.u[:, 0]) / energy.norm(snapshots.u[:, 0])
-        of_lam = on.of_force(lam - snapshots.lam[:, 0]).norm / on.of_force(snapshots.lam[:, 0]).norm
+        of_lam = on.force_representer(lam - snapshots.lam[:, 0]).norm / on.force_representer(snapshots.lam[:, 0]).norm
         for what, error in (("u", of_u), ("λ", of_lam)):
             if not error < 1.0:
                 yield f"{name}, a training parameter, the error of {what} is {error:.2g} of it: zero would be nearer"

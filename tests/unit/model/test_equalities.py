@@ -20,7 +20,7 @@ def test_what_holds_the_equalities_is_within_the_distance_and_moves_no_row_by_mo
     B *= lengths[:, None]
     F = np.linalg.cholesky(X).T
     K, unwhiten = np.linalg.solve(F.T, B[:3].T), lambda y: np.linalg.solve(F, y)
-    held = Equalities.of(K, unwhiten, B)
+    held = Equalities.from_rows(K, unwhiten, B)
     assert len(held.chosen) == (2 if dependent else 3)
     wanted = B[:3] @ rng.standard_normal(7)  # consistent
     d = held.step(wanted)

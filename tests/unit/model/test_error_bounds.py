@@ -15,8 +15,9 @@ from vibench.highfidelity.active_set import ACCURACY, HighFidelitySolver
 from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
 from vibench.model import error_bounds as module
-from vibench.model.bound_terms import REFERENCE, BoundNote
+from vibench.model.bound_terms import BoundNote
 from vibench.model.error_bounds import (
+    REFERENCE,
     ErrorBounds,
     bound_errors_at,
     corrected_pair,
@@ -282,7 +283,7 @@ def test_as_many_constraints_as_unknowns_see_all_of_a_residual_there() -> None:
         multiplier = np.zeros(len(seen))
         multiplier[:few] = rng.random(few)
         assert on.force_norm(multiplier) == pytest.approx(np.sqrt(multiplier @ K @ multiplier), rel=1e-10)
-        assert on.of_force(multiplier).norm == pytest.approx(on.force_norm(multiplier), rel=1e-10)
+        assert on.force_representer(multiplier).norm == pytest.approx(on.force_norm(multiplier), rel=1e-10)
 
 
 def test_what_is_not_proved_is_said() -> None:

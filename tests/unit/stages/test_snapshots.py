@@ -17,7 +17,7 @@ from running import Register
 
 from vibench import NumericalError, Problem, VariationalInequality
 from vibench.interfaces.validation import AGREEMENT_RTOL, Fingerprint, ReferenceAssembly, fingerprint
-from vibench.model.bound_terms import REFERENCE
+from vibench.model.error_bounds import REFERENCE
 from vibench.plugins.plugin import Plugin
 from vibench.stages.base import build_problem
 from vibench.stages.snapshots import fingerprint_here, gather, solution_stages
@@ -135,6 +135,6 @@ def test_references_are_verified_by_their_error_bounds(
     assert set(chunks[1].run(store).value.bounds) == {np.inf}
     monkeypatch.undo()
     monkeypatch.setattr("vibench.model.error_bounds.REFERENCE", 1e-15)
-    monkeypatch.setattr("vibench.model.error_bounds.MARGIN", 0.0)
+    monkeypatch.setattr("vibench.model.error_bounds.first_margin", np.zeros_like)
     with pytest.raises(NumericalError, match=r"at mu = \[.*\]: the error bound of the high-fidelity solution is "):
         chunks[1].run(store)

@@ -1,6 +1,6 @@
-"""Lower bounds of the inf-sup constant β_A(µ) at online cost, from one number that is proved offline.
+"""Offline data shared by the certificates of all reduced models of a problem: X, A against it, B₀, β_A and outputs.
 
-β_A(µ)² is the smallest eigenvalue of B A⁻¹Bᵀ against X_W. With A ≼ γ X it is at least that of B X⁻¹Bᵀ/γ, and
+**β_A.** β_A(µ)² is the smallest eigenvalue of B A⁻¹Bᵀ against X_W. With A ≼ γ X it is at least that of B X⁻¹Bᵀ/γ, and
 
 - where B(µ) = θ(µ) B₀ is declared, β_A ≥ |θ| β₀/√γ;
 - where X has a block for every one of several bodies and B(µ) = B₀ + B₁(µ), B₀ on some of the bodies and B₁ on the
@@ -8,11 +8,8 @@
 
 Here β₀² is the smallest eigenvalue of B₀X⁻¹B₀ᵀ against X_W, see `vibench.stability.coercivity` for its proof.
 
-What certificates of all reduced models of a problem have in common: the inner product, A against it, and B₀.
-
-Bounds of the errors of linear outputs, from those of u and λ at online cost.
-
-An output s(u, λ) = l(u) + m(λ) has the error l(e) + m(ε), e = u − u_N and ε = λ − λ_N. With α X ≼ A(µ) ≼ γ X,
+**Outputs.** An output s(u, λ) = l(u) + m(λ) has the error l(e) + m(ε), e = u − u_N and ε = λ − λ_N. With
+α X ≼ A(µ) ≼ γ X,
 
     |l(e)| ≤ ‖l‖_{A⁻¹} ‖e‖_A ≤ ‖l‖_{X⁻¹} ‖e‖_A / √α,
 
@@ -20,7 +17,7 @@ and where B(µ) = θ B₀, or B₀ on the bodies on which it is constant with θ
 
     |m(ε)| ≤ c ‖B₀ᵀε‖_{X⁻¹} ≤ c √γ/|θ| ‖Bᵀε‖_{A⁻¹},    c = √(zᵀS z) + ‖m − S z‖_{W⁻¹}/β₀,
 
-since β₀ ‖ε‖_W ≤ ‖B₀ᵀε‖_{X⁻¹}. z = S⁻¹m makes c small also where β₀ is, which the modes of ε on single elements decide.
+since β₀ ‖ε‖_W ≤ ‖B₀ᵀε‖_{X⁻¹}. z = S⁻¹m makes c small even if β₀ is, which the modes of ε on single elements decide.
 """
 
 from __future__ import annotations
@@ -39,7 +36,7 @@ from scipy.sparse.csgraph import connected_components
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.errors import UnsupportedError
 from vibench.interfaces.outputs import Output
-from vibench.interfaces.problem import Contact, Problem
+from vibench.interfaces.problem import Problem
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.definite import dense_inverse
 from vibench.linalg.inner_product import InnerProduct
@@ -48,12 +45,21 @@ from vibench.model.affine import AffineMember, Evaluation, coefficients, evaluat
 from vibench.model.bound_terms import BoundNote
 from vibench.model.certificates.prepared_correction import constant_unknowns
 from vibench.model.certificates.spectral import SpectralBounds, combined, leading_terms, rotated, spectral_bounds
+from vibench.model.galerkin import contact_at
 from vibench.stability.coercivity import MARGINS, energy_inf_sup, largest_quotient
+
+
+class Guarantee(StrEnum):
+    """Worth of a bound: proved, valid up to interpolation errors that were measured, or none."""
+
+    CERTIFIED = "certified"
+    VERIFIED = "verified"
+    NONE = "none"
 
 
 @dataclass(frozen=True)
 class OnlineInfSup:
-    """What bounds β_A(µ) from below at online cost; see above.
+    """Data of lower bounds of β_A(µ) at online cost.
 
     Attributes
     ----------
@@ -72,7 +78,7 @@ class OnlineInfSup:
     bodies: Mask | None
     reason: str = ""
 
-    def at(self, theta: float, B: SparseMatrix | None, gamma: float) -> tuple[float, str]:
+    def lower_bound(self, theta: float, B: Callable[[], SparseMatrix], gamma: float) -> tuple[float, str]:
         """A lower bound of β_A(µ), 0 if there is none, and which it is or why there is none.
 
         Parameters
@@ -80,19 +86,18 @@ class OnlineInfSup:
         theta
             θ(µ) where B(µ) = θ(µ) B₀ is declared.
         B
-            B(µ) (m×k) on the contact unknowns; else.
+            Gives B(µ) (m×k) on the contact unknowns; else.
         gamma
             γ(µ).
         """
         if self.reason:
             return 0.0, self.reason
         if self.bodies is None:
-            return abs(theta) * self.value / sqrt(gamma), BoundNote.SCALED
-        assert B is not None  # evaluated where B is no multiple of one matrix
-        difference = sp.csr_array(sp.csr_array(B) - self.constraint)
+            return abs(theta) * self.value / sqrt(gamma), BoundNote.SCALED.value
+        difference = sp.csr_array(sp.csr_array(B()) - self.constraint)
         if np.any(difference.data[self.bodies[difference.indices]] != 0.0):  # NaN is not zero
-            return 0.0, BoundNote.NOT_CONSTANT
-        return self.value / sqrt(gamma), BoundNote.ON_BODIES
+            return 0.0, BoundNote.NOT_CONSTANT.value
+        return self.value / sqrt(gamma), BoundNote.ON_BODIES.value
 
 
 def online_inf_sup(
@@ -109,39 +114,19 @@ def online_inf_sup(
         bodies = ~np.isin(body, body[~same])
         constraint = sp.csr_array(constraint @ sp.diags_array(bodies.astype(float)))
         if not bodies.any():
-            return OnlineInfSup(0.0, constraint, bodies, BoundNote.NO_BODY)
+            return OnlineInfSup(0.0, constraint, bodies, BoundNote.NO_BODY.value)
     entries = sp.coo_array(constraint)
     rows, columns = entries.coords
     B = sp.csr_array((entries.data, (rows, contact[columns])), shape=(constraint.shape[0], X.dim))
-    found = energy_inf_sup(X.matrix, B, W)
-    proved = found.proved and found.value > 0.0
-    return OnlineInfSup(found.value if proved else 0.0, constraint, bodies, "" if proved else BoundNote.NOT_PROVED)
-
-
-VERIFICATION = 16
-"""Random parameters at which interpolation errors are measured."""
-
-SEED = 21
-"""Seed of these parameters, which are none of the training or validation sets."""
-
-SAFETY = 2.0
-"""Factor on the largest error measured."""
-
-ONE = np.ones(1)
-"""θ of a constant member."""
-
-
-class Guarantee(StrEnum):
-    """What a bound is worth: proved, valid up to interpolation errors that were measured, or not there."""
-
-    CERTIFIED = "certified"
-    VERIFIED = "verified"
-    NONE = "none"
+    beta = energy_inf_sup(X.matrix, B, W)
+    if not (beta.proved and beta.value > 0.0):
+        return OnlineInfSup(0.0, constraint, bodies, BoundNote.NOT_PROVED.value)
+    return OnlineInfSup(beta.value, constraint, bodies)
 
 
 @dataclass(frozen=True)
 class CertificateBase:
-    """What certificates of all reduced models of a problem have in common.
+    """Offline data shared by the certificates of all reduced models of a problem.
 
     Attributes
     ----------
@@ -164,7 +149,7 @@ class CertificateBase:
     bound_terms
         The terms of g (m×Q) where B is a multiple of one matrix and g an exact sum; `None` elsewhere.
     inf_sup
-        What bounds β_A(µ) from below.
+        Lower bounds of β_A(µ).
     """
 
     X: InnerProduct
@@ -181,16 +166,20 @@ class CertificateBase:
 
     @property
     def guarantee(self) -> Guarantee:
-        """What bounds are worth."""
+        """Worth of the bounds of all models."""
         proved = self.spectral is None or self.spectral.proved
         return Guarantee.CERTIFIED if proved and self.is_exact else Guarantee.VERIFIED
 
     def coefficients(self, samples: Mapping[str, Array]) -> dict[str, Array]:
-        """θ of f, A and B from those that a query evaluated; those of A rotated, one for what is constant."""
-        theta = {name: samples.get(name, ONE) for name in ("f", "A", "B")}
+        """θ of f, A and B from those that a query evaluated; those of A rotated, one for a constant member."""
+        theta = {name: samples.get(name, np.ones(1)) for name in ("f", "A", "B")}
         if self.rotation is not None:
             theta["A"] = self.rotation @ theta["A"]
         return theta
+
+    def spectrum(self, mu: Array, theta: Array) -> tuple[float, float]:
+        """α(µ) and γ(µ) at mu (d,) with the rotated θ of A (Q,)."""
+        return (1.0, 1.0) if self.spectral is None else self.spectral.evaluate(mu, theta)
 
 
 def unsupported(problem: Problem, members: Mapping[str, AffineMember]) -> str:
@@ -215,6 +204,12 @@ def is_exact(problem: Problem, name: str, member: AffineMember) -> bool:
     return member.way is Evaluation.AFFINE or (member.way is Evaluation.CONSTANT and name in problem.constant)
 
 
+def contact_unknowns(problem: Problem) -> Indices:
+    """Contact unknowns E (k,) of a problem that certificates support."""
+    assert problem.contact_dofs is not None  # `unsupported` refuses problems without
+    return problem.contact_dofs
+
+
 def certificate_base(problem: Problem, members: Mapping[str, AffineMember], training: Array) -> CertificateBase:
     """Prepare certificates of reduced models of a problem whose members have been decomposed over `training` (P×d).
 
@@ -233,15 +228,18 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
     terms, rotation, spectral, leading = list(A.terms), None, None, len(A.terms)
     evaluate = coefficients(problem, *evaluated_members({"A": A, "f": f}))
     if not constant:
-        samples = np.column_stack([evaluate(mu).get("A", ONE) for mu in training])
+        samples = np.column_stack([evaluate(mu).get("A", np.ones(1)) for mu in training])
         rotation, terms = T, _ = rotated(A.terms, samples)
         leading = len(terms) if is_exact(problem, "A", A) else leading_terms(T @ samples)
-    load, stiffness, of_leading = _interpolation_errors(problem, X, members, evaluate, rotation, terms, leading)
+    load, stiffness, left_out = _interpolation_errors(problem, X, members, evaluate, rotation, terms, leading)
     if not constant:
-        spectral = spectral_bounds(problem, X, terms[:leading], lambda mu: T @ evaluate(mu).get("A", ONE), of_leading)
+        spectral = spectral_bounds(
+            problem, X, terms[:leading], lambda mu: T @ evaluate(mu).get("A", np.ones(1)), left_out
+        )
     pattern = EliminationPattern.of(X.matrix, dofs, X.factorisation)
     condensed = StaticCondensation(X.matrix, pattern, X.factorisation)
-    C = dense_inverse(condensed.dense_schur, "A")  # Eᵀ X⁻¹ E is the inverse of a Schur complement
+    # Eᵀ X⁻¹ E is the inverse of a Schur complement: no solution of mesh size for each contact unknown
+    C = dense_inverse(condensed.dense_schur, "A")
     constraint, bound, inf_sup = _constant_constraint(problem, members, X, C, training)
     exact = all(is_exact(problem, name, members[name]) for name in "Af")
     return CertificateBase(X, C, tuple(terms), rotation, spectral, load, stiffness, exact, constraint, bound, inf_sup)
@@ -256,25 +254,13 @@ def _constant_constraint(
     if multiple is not None and is_exact(problem, "g", g):
         inf_sup = online_inf_sup(X, problem.W, contact, multiple, None)
         return multiple, np.column_stack(g.terms), inf_sup
+    # copies: a problem may write the next constraint into the same arrays
     constraints = [contact_at(problem, mu).B.copy() for mu in training]
-    kept = constant_unknowns(compliance, constraints)
-    constraint = sp.csr_array(sp.csr_array(constraints[0]) @ sp.diags_array(kept.astype(float)))
+    same = constant_unknowns(compliance, constraints)
+    constraint = sp.csr_array(sp.csr_array(constraints[0]) @ sp.diags_array(same.astype(float)))
     if multiple is not None:
         return constraint, None, online_inf_sup(X, problem.W, contact, multiple, None)
-    return constraint, None, online_inf_sup(X, problem.W, contact, constraint, kept)
-
-
-def contact_unknowns(problem: Problem) -> Indices:
-    """E (k,): the contact unknowns of a problem that certificates support."""
-    assert problem.contact_dofs is not None  # `unsupported` refuses problems without
-    return problem.contact_dofs
-
-
-def contact_at(problem: Problem, mu: Array) -> Contact:
-    """B and g at mu (d,) on the contact unknowns."""
-    contact = problem.contact(mu)
-    assert contact is not None  # `unsupported` refuses problems without
-    return contact
+    return constraint, None, online_inf_sup(X, problem.W, contact, constraint, same)
 
 
 def _interpolation_errors(
@@ -294,23 +280,26 @@ def _interpolation_errors(
     exact = {name: is_exact(problem, name, member) for name, member in (("A", A), ("f", f))}
     if all(exact.values()):
         return 0.0, 0.0, 0.0
-    load = stiffness = of_leading = 0.0
-    mus = problem.parameters.sample(VERIFICATION, SEED)
+    load = stiffness = left_out = 0.0
+    # 16 random parameters, by a seed that no sampling of training or validation sets uses
+    mus = problem.parameters.sample(16, 21)
     thetas = [evaluate(mu) for mu in mus]
     if not exact["A"]:
         assert rotation is not None  # that of an A which is not exactly constant
-        of_A = rotation @ np.column_stack([theta.get("A", ONE) for theta in thetas])
-        sums = list(zip(combined(terms, of_A), combined(terms[:leading], of_A[:leading]), strict=True))
+        theta = rotation @ np.column_stack([one.get("A", np.ones(1)) for one in thetas])
+        sums = list(zip(combined(terms, theta), combined(terms[:leading], theta[:leading]), strict=True))
     for k, mu in enumerate(mus):
         vi = checked_assembly(problem, mu)
         if not exact["f"]:
-            interpolated = sum(t * term for t, term in zip(thetas[k].get("f", ONE), f.terms, strict=True))
+            coefficients = thetas[k].get("f", np.ones(1))
+            interpolated = sum(t * term for t, term in zip(coefficients, f.terms, strict=True))
             load = max(load, float(np.linalg.norm(X.whiten_functional(vi.f - interpolated))))
         if not exact["A"]:
-            missed, left_out = (largest_quotient(vi.A - part, X) for part in sums[k])
-            stiffness, of_leading = max(stiffness, missed), max(of_leading, left_out)
-    moved = SAFETY * (1.0 + MARGINS[0])
-    return SAFETY * load, moved * stiffness, moved * of_leading
+            missed, without_last = (largest_quotient(vi.A - part, X) for part in sums[k])
+            stiffness, left_out = max(stiffness, missed), max(left_out, without_last)
+    # Twice the largest errors: other parameters may have larger ones. Quotients are estimated from below.
+    factor = 2.0 * (1.0 + MARGINS[0])
+    return 2.0 * load, factor * stiffness, factor * left_out
 
 
 def output_coefficients(problem: Problem, output: Output) -> tuple[Array, Array]:
@@ -323,27 +312,24 @@ def output_coefficients(problem: Problem, output: Output) -> tuple[Array, Array]
     """
     sizes = problem.V.dim, problem.W.dim
     output.values(problem.parameters.lower[None], *(np.zeros((size, 1)) for size in sizes))
-    given = zip((output.u, output.lam), sizes, strict=True)
-    of_u, of_lam = (np.zeros(size) if weights is None else np.asarray(weights, float) for weights, size in given)
+    pairs = zip((output.u, output.lam), sizes, strict=True)
+    of_u, of_lam = (np.zeros(size) if weights is None else np.asarray(weights, float) for weights, size in pairs)
     return of_u, of_lam
 
 
 def output_weights(problem: Problem, base: CertificateBase, output: Output) -> tuple[float, float]:
     """‖l‖_{X⁻¹} and c of a linear output; c is infinite where no β₀ is proved."""
     of_u, of_lam = output_coefficients(problem, output)
-    return float(np.linalg.norm(base.X.whiten_functional(of_u))), _of_multiplier(problem, base, of_lam)
-
-
-def _of_multiplier(problem: Problem, base: CertificateBase, of_lam: Array) -> float:
     beta, B = base.inf_sup.value, base.inf_sup.constraint
+    in_u = float(np.linalg.norm(base.X.whiten_functional(of_u)))
     if not of_lam.any():
-        return 0.0
+        return in_u, 0.0
     if not beta > 0.0 or base.inf_sup.reason:
-        return inf
+        return in_u, inf
     S = np.asarray(B @ np.asarray(B @ base.compliance).T)
-    S, found = 0.5 * (S + S.T), [float(np.linalg.norm(problem.W.whiten_functional(of_lam))) / beta]
+    S, bounds = 0.5 * (S + S.T), [float(np.linalg.norm(problem.W.whiten_functional(of_lam))) / beta]
     with suppress(np.linalg.LinAlgError):  # rows that are dependent up to round-off
         z = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), of_lam)
         rest = float(np.linalg.norm(problem.W.whiten_functional(of_lam - S @ z)))
-        found.append(float(np.sqrt(max(0.0, z @ S @ z))) + rest / beta)
-    return min(found)
+        bounds.append(float(np.sqrt(max(0.0, z @ S @ z))) + rest / beta)
+    return in_u, min(bounds)

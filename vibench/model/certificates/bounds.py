@@ -6,7 +6,7 @@ With an inner product X that does not depend on the parameter, bounds α X ≼ A
 
 follow from the bounds (ii) there, as ‖r‖²_{A⁻¹} ≤ ρ²/α and ‖w‖²_A ≤ γ ω². Where A does not depend on the parameter X is
 A, α = γ = 1, and nothing is lost. Elsewhere X is A at the centre of the parameter box. In W, ‖ε‖_W ≤ ‖Bᵀε‖_{A⁻¹}/β_A
-where there is one of the lower bounds of β_A in `vibench.model.certificates.base`.
+if there is a lower bound of β_A (`vibench.model.certificates.base`).
 
 - ρ comes from coordinates of the residual in an orthonormal basis (`vibench.model.certificates.residual`). Its terms
   are those of f, of A times the basis of the reduced space, and of Bᵀ times the generators. Where B is assembled on
@@ -36,8 +36,6 @@ are solved in any case, `vibench.model.certificates.contact_correction` has boun
 
 Round-off is bounded where it decides whether w is feasible, and in the coordinates of the residual: it may be all that
 is left of Δ² + 2 rᵀw, in which these are multiplied with those of X w.
-
-Preparation of what bounds the errors of one reduced model at online cost, from arrays of mesh size.
 """
 
 from __future__ import annotations
@@ -54,11 +52,12 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.errors import UnsupportedError
 from vibench.highfidelity.active_set import FALLBACK_SOLVER
-from vibench.interfaces.problem import Problem
+from vibench.interfaces.problem import Contact, Problem
+from vibench.linalg import EPS
 from vibench.linalg.factorisations import implementation
 from vibench.model.affine import AffineMember
-from vibench.model.bound_terms import BoundNote, CorrectionMode
-from vibench.model.certificates.base import ONE, CertificateBase, Guarantee, contact_at, contact_unknowns, is_exact
+from vibench.model.bound_terms import BoundNote, BoundTerms, CorrectionMode, in_dual_set
+from vibench.model.certificates.base import CertificateBase, Guarantee, contact_unknowns, is_exact
 from vibench.model.certificates.contact_correction import (
     ContactCompliance,
     defect_corrected_bounds,
@@ -74,7 +73,7 @@ from vibench.model.certificates.residual import (
     residual_basis,
     residual_coefficients,
 )
-from vibench.model.galerkin import Evaluated, ReducedProblem
+from vibench.model.galerkin import ReducedProblem, contact_at
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.qp.solve import solve_qp
 
@@ -94,9 +93,9 @@ class OnlineBound:
     coercivity
         α.
     guarantee, note
-        What they are worth; and why there are none, that no prepared correction was feasible, or "".
+        Their worth; and why there are none, that no prepared correction was feasible, or "".
     lam
-        Of ‖λ − λ_N‖ in the norm of W: `lambda_natural` over `inf_sup`.
+        Bound of ‖λ − λ_N‖ in the norm of W: `lambda_natural` over `inf_sup`.
     inf_sup, inf_sup_note
         A lower bound of β_A, and which it is; 0, and why there is none.
     """
@@ -109,15 +108,15 @@ class OnlineBound:
     kappa: float
     coercivity: float
     guarantee: Guarantee
-    note: str = ""
-    lam: float = inf
-    inf_sup: float = 0.0
-    inf_sup_note: str = ""
+    note: str
+    lam: float
+    inf_sup: float
+    inf_sup_note: str
 
     @classmethod
     def none(cls, note: str) -> OnlineBound:
         """No bound, and why."""
-        return cls(inf, inf, inf, inf, inf, inf, 0.0, Guarantee.NONE, note)
+        return cls(inf, inf, inf, inf, inf, inf, 0.0, Guarantee.NONE, str(note), inf, 0.0, "")
 
 
 @dataclass(frozen=True)
@@ -139,14 +138,57 @@ class OnlineCorrection:
     bound: OnlineBound
 
 
+class _Query:
+    """One reduced solution, and the data that its bounds and its correction evaluate, each at most once."""
+
+    def __init__(
+        self,
+        certificate: OnlineCertificate,
+        problem: Problem,
+        mu: Array,
+        reduced: ReducedProblem,
+        x: Array,
+        alpha: Array,
+    ) -> None:
+        self._certificate, self._evaluated = certificate, reduced.evaluated
+        self.problem, self.mu, self.program, self.x, self.alpha = problem, mu, reduced.program, x, alpha
+        self.lam, self.y = certificate.generators @ alpha, reduced.evaluated.in_space(x)
+        self.theta = certificate.base.coefficients(reduced.evaluated.samples)
+
+    @cached_property
+    def contact(self) -> Contact:
+        """B and g on the contact unknowns; the assembly of the program may have evaluated them."""
+        return self._evaluated.contact or contact_at(self.problem, self.mu)
+
+    @cached_property
+    def spectrum(self) -> tuple[float, float]:
+        """α and γ."""
+        return self._certificate.base.spectrum(self.mu, self.theta["A"])
+
+    @cached_property
+    def on_contact(self) -> tuple[Array, Array]:
+        """u_N (k,) on the contact unknowns, and a bound of its round-off."""
+        certificate = self._certificate
+        return certificate.contact_basis @ self.y, float(np.linalg.norm(self.y)) * certificate.unit_round_off
+
+    @cached_property
+    def constraint(self) -> tuple[float | SparseMatrix, Array, Array]:
+        """B and g as prepared corrections take them, and a bound of the terms of g."""
+        terms = self._certificate.base.bound_terms
+        if terms is None:
+            return self.contact.B, self.contact.g, np.abs(self.contact.g)
+        theta, of_g = (self._evaluated.samples.get(name, np.ones(1)) for name in ("B", "g"))
+        return float(theta[0]), terms @ of_g, self._certificate.bound_sizes @ np.abs(of_g)
+
+
 @dataclass(frozen=True)
 class OnlineCertificate:
-    """What bounds the errors of one reduced model at online cost; from `vibench.model.certificates.bounds`.
+    """Data that bound the errors of one reduced model at online cost, made by `prepare`.
 
     Attributes
     ----------
     base
-        What it shares with other models of the problem.
+        Data shared with other models of the problem.
     residual
         The basis of its residuals; their coefficients are those of f, of A for every vector of Φ, and of Bᵀλ_N.
     contact_directions
@@ -173,64 +215,21 @@ class OnlineCertificate:
     prepared: PreparedCorrections | None = None
 
     @cached_property
-    def _bound_sizes(self) -> Array:
-        """|g_q| (m×Q)."""
+    def bound_sizes(self) -> Array:
+        """Absolute values |g_q| (m×Q) of the terms of g."""
         assert self.base.bound_terms is not None  # where this is called
         return np.abs(self.base.bound_terms)
 
     @cached_property
-    def _round_off(self) -> Array:
+    def unit_round_off(self) -> Array:
         """Round-off (k,) of u_N at the contact unknowns, for coefficients of norm 1."""
+        # d products, their sum, and the round-off of Φ itself: at most (d + 4) eps by Cauchy and Schwarz
         terms = self.contact_basis.shape[1] + 4.0
-        return np.asarray(terms * np.finfo(float).eps * np.linalg.norm(self.contact_basis, axis=1))
+        return np.asarray(terms * EPS * np.linalg.norm(self.contact_basis, axis=1))
 
     def evaluate(self, problem: Problem, mu: Array, reduced: ReducedProblem, x: Array, alpha: Array) -> OnlineBound:
         """Bounds of a solution x (N',), α (R,) of a reduced program that a `HyperReducedModel` assembled at mu (d,)."""
-        lam, base = self.generators @ alpha, self.base
-        if lam.min(initial=0.0) < 0.0:
-            return OnlineBound.none(BoundNote.NOT_IN_CONE)
-        evaluated = reduced.evaluated
-        if self.forces is not None and evaluated.contact is None:
-            evaluated = replace(evaluated, contact=contact_at(problem, mu))
-        if not base.is_exact and problem.parameters.outside(mu).any():
-            return OnlineBound.none(BoundNote.OUTSIDE)
-        y, theta = evaluated.in_space(x), base.coefficients(evaluated.samples)
-        lower, upper = (1.0, 1.0) if base.spectral is None else base.spectral.at(mu, theta["A"])
-        if not lower > base.stiffness_error:
-            return OnlineBound.none(BoundNote.NOT_COERCIVE)
-        corrected, note = self._corrected(problem, mu, evaluated, y, lam, upper)
-        if corrected is None:
-            return OnlineBound.none(note)
-        along, norm, kappa, eta = corrected
-        z = residual_coefficients(theta, y, self.forces, evaluated.contact, alpha, lam)
-        coordinates, beside, missing = self.residual.parts(z)
-        square_of_u = float(x @ (reduced.program.A @ x))
-        u_norm = sqrt(max(0.0, square_of_u) / (lower - base.stiffness_error))  # of u_N in X
-        lacking = base.load_error + base.stiffness_error * u_norm
-        rho = sqrt(float(coordinates @ coordinates) + beside**2) + missing + lacking
-        omega = norm * sqrt(upper)
-        square = rho**2 / lower + omega**2 + 2.0 * kappa
-        bound = sqrt(square)
-        work = float(along @ coordinates) + (beside + missing + lacking) * norm + rho * eta  # at least rᵀw
-        natural = min(sqrt(max(0.0, square + 2.0 * work)), omega + bound)
-        if self.prepared is None and base.spectral is not None:
-            solution = *self._on_contact(y), lam
-            shown = coordinates, beside + missing + lacking
-            of_u, of_lam = defect_corrected_bounds(
-                self.compliance,
-                self.contact_directions,
-                evaluated.contact or contact_at(problem, mu),
-                solution,
-                shown,
-                (lower, upper),
-            )
-            bound, natural = min(bound, of_u), min(natural, of_lam)
-        least = sqrt(max(0.0, square_of_u - base.stiffness_error * u_norm**2)) - bound  # of ‖u‖
-        relative = bound / least if least > 0.0 else inf
-        beta, which = self._inf_sup(problem, mu, evaluated, float(theta["B"][0]), upper)
-        in_W = natural / beta if beta > 0.0 else inf
-        terms = rho / sqrt(lower), omega, kappa, lower
-        return OnlineBound(bound, natural, relative, *terms, base.guarantee, note, in_W, beta, which)
+        return self._bound(_Query(self, problem, mu, reduced, x, alpha))
 
     def certify(
         self,
@@ -242,33 +241,83 @@ class OnlineCertificate:
         mode: CorrectionMode = CorrectionMode.FEASIBLE,
     ) -> tuple[OnlineBound, OnlineCorrection | None]:
         """The bounds of `evaluate`, and the corrected pair with its own where the mode asks for it and there is one."""
-        bound = self.evaluate(problem, mu, reduced, x, alpha)
+        query = _Query(self, problem, mu, reduced, x, alpha)
+        bound = self._bound(query)
         if bound.guarantee is Guarantee.NONE or not mode.applies(bound.omega, bound.rho):
             return bound, None
-        return bound, self._corrected_pair(problem, mu, reduced, x, alpha, bound)
+        return bound, self._corrected_pair(query, bound)
 
-    def _corrected_pair(
-        self, problem: Problem, mu: Array, reduced: ReducedProblem, x: Array, alpha: Array, bound: OnlineBound
-    ) -> OnlineCorrection | None:
+    def _bound(self, query: _Query) -> OnlineBound:
+        base, problem, mu = self.base, query.problem, query.mu
+        if not in_dual_set(query.lam):
+            return OnlineBound.none(BoundNote.NOT_IN_CONE)
+        if not base.is_exact and problem.parameters.outside(mu).any():
+            return OnlineBound.none(BoundNote.OUTSIDE)
+        lower, upper = query.spectrum
+        if not lower > base.stiffness_error:
+            return OnlineBound.none(BoundNote.NOT_COERCIVE)
+        correction, note = self._correction(query, upper)
+        if correction is None:
+            return OnlineBound.none(note)
+        along, norm, kappa, eta = correction
+        contact = None if self.forces is None else query.contact
+        z = residual_coefficients(query.theta, query.y, self.forces, contact, query.alpha, query.lam)
+        coordinates, beside, missing = self.residual.parts(z)
+        square_of_u = float(query.x @ (query.program.A @ query.x))
+        u_norm = sqrt(max(0.0, square_of_u) / (lower - base.stiffness_error))  # of u_N in X
+        lacking = base.load_error + base.stiffness_error * u_norm
+        rho = sqrt(float(coordinates @ coordinates) + beside**2) + missing + lacking
+        # an upper bound of rᵀw: what r has besides its coordinates may act along w, and w' is within η of w
+        work = float(along @ coordinates) + (beside + missing + lacking) * norm + rho * eta
+        terms = BoundTerms.from_work(rho / sqrt(lower), norm * sqrt(upper), kappa, work)
+        of_u, of_lam = terms.primal, terms.dual
+        if self.prepared is None and base.spectral is not None:
+            others = defect_corrected_bounds(
+                self.compliance,
+                self.contact_directions,
+                query.contact,
+                (*query.on_contact, query.lam),
+                (coordinates, beside + missing + lacking),
+                query.spectrum,
+            )
+            of_u, of_lam = min(of_u, others[0]), min(of_lam, others[1])
+        least = sqrt(max(0.0, square_of_u - base.stiffness_error * u_norm**2)) - of_u  # of ‖u‖
+        relative = of_u / least if least > 0.0 else inf
+        beta, which = base.inf_sup.lower_bound(float(query.theta["B"][0]), lambda: query.contact.B, upper)
+        in_W = of_lam / beta if beta > 0.0 else inf
+        own = terms.rho, terms.omega, kappa, lower
+        return OnlineBound(of_u, of_lam, relative, *own, base.guarantee, str(note), in_W, beta, which)
+
+    def _correction(self, query: _Query, gamma: float) -> tuple[tuple[Array, float, float, float] | None, str]:
+        """Coordinates of X w in the basis of residuals, ‖w‖, κ and η; and why w is not prepared, or there is none."""
+        prepared = self.prepared
+        if prepared is not None:
+            quick = prepared.correction(*query.constraint, query.y, query.lam, gamma)
+            if quick is not None:
+                return (*quick, 0.0), ""
+        best = find_contact_correction(self.compliance, query.contact, *query.on_contact, query.lam, gamma)
+        if best is None:
+            return None, BoundNote.NO_CORRECTION
+        along = best.load @ self.contact_directions[best.unknowns]
+        return (along, best.norm, best.kappa, best.eta), "" if prepared is None else BoundNote.NOT_PREPARED
+
+    def _corrected_pair(self, query: _Query, bound: OnlineBound) -> OnlineCorrection | None:
         """The corrected pair of a solution whose bounds are known."""
-        base = self.base
-        evaluated, lam, alpha_A = reduced.evaluated, self.generators @ alpha, bound.coercivity
-        contact, y = evaluated.contact or contact_at(problem, mu), evaluated.in_space(x)
-        theta = base.coefficients(evaluated.samples)
-        gamma = 1.0 if base.spectral is None else base.spectral.at(mu, theta["A"])[1]
-        middle = 0.5 * (alpha_A + gamma)
-        found, eta = None, 0.0
-        if self.prepared is not None and base.bound_terms is not None:
-            B, g, g_size = self._constraint(problem, mu, evaluated)
-            found = self.prepared.multiplier(float(B), g, g_size, y, lam, middle)
-        if found is None:  # the best of all w
-            best = find_contact_correction(self.compliance, contact, *self._on_contact(y), lam, middle)
+        (lower, upper), lam, contact = query.spectrum, query.lam, query.contact
+        middle = 0.5 * (lower + upper)
+        pair, eta = None, 0.0
+        # prepared corrections of some bodies alone are not the best ones, and no ν belongs to them
+        if self.prepared is not None and self.base.bound_terms is not None:
+            B, g, g_size = query.constraint
+            pair = self.prepared.multiplier(float(B), g, g_size, query.y, lam, middle)
+        if pair is None:
+            best = find_contact_correction(self.compliance, contact, *query.on_contact, lam, middle)
             if best is None or best.nu is None:
                 return None
-            found, eta = (best.nu, best.norm, best.gap), best.eta
-        nu, norm, gap = found
-        rho = bound.rho + (0.5 * (gamma - alpha_A) * norm + middle * eta) / sqrt(alpha_A)
-        both = sqrt(rho**2 + 2.0 * gap) + eta * sqrt(gamma)
+            pair, eta = (best.nu, best.norm, best.gap), best.eta
+        nu, norm, gap = pair
+        rho = bound.rho + (0.5 * (upper - lower) * norm + middle * eta) / sqrt(lower)
+        both = BoundTerms.corrected(rho, gap).primal + eta * sqrt(upper)
         relative = inf
         if 0.0 < bound.relative < inf:
             relative = both / (bound.u_energy / bound.relative)  # over the least ‖u‖ that is known
@@ -279,89 +328,38 @@ class OnlineCertificate:
         return OnlineCorrection(np.asarray(contact.B.T @ (nu - lam)) / middle, nu, corrected)
 
     def corrected(self, u: Array, correction: OnlineCorrection, unknowns: Indices) -> Array:
-        """V = u_N − w (n,) from u_N (n,) and the contact unknowns (k,) of the problem; by arrays of mesh size."""
+        """The corrected solution v = u_N − w (n,) from u_N (n,) and the contact unknowns (k,).
+
+        Costs one solve with X, by arrays of mesh size.
+        """
         load = np.zeros(self.base.X.dim)
         load[unknowns] = correction.load
         return np.asarray(u - self.base.X.riesz(load))
-
-    def _on_contact(self, y: Array) -> tuple[Array, Array]:
-        """u_N (k,) of coefficients y (d,) on the contact unknowns, and a bound of its round-off."""
-        return self.contact_basis @ y, float(np.linalg.norm(y)) * self._round_off
-
-    def _inf_sup(
-        self, problem: Problem, mu: Array, evaluated: Evaluated, theta: float, gamma: float
-    ) -> tuple[float, str]:
-        """A lower bound of β_A, and which it is."""
-        known = self.base.inf_sup
-        if known.reason or known.bodies is None:
-            return known.at(theta, None, gamma)
-        return known.at(1.0, (evaluated.contact or contact_at(problem, mu)).B, gamma)
-
-    def _corrected(
-        self, problem: Problem, mu: Array, evaluated: Evaluated, y: Array, lam: Array, gamma: float
-    ) -> tuple[tuple[Array, float, float, float] | None, str]:
-        """Coordinates of X w in the basis of residuals, ‖w‖, κ and η; and why w is not prepared, or there is none."""
-        prepared = self.prepared
-        if prepared is not None:
-            B, g, g_size = self._constraint(problem, mu, evaluated)
-            quick = prepared.correction(B, g, g_size, y, lam, gamma)
-            if quick is not None:
-                return (*quick, 0.0), ""
-        contact = evaluated.contact or contact_at(problem, mu)
-        correction = find_contact_correction(self.compliance, contact, *self._on_contact(y), lam, gamma)
-        if correction is None:
-            return None, BoundNote.NO_CORRECTION
-        along = correction.load @ self.contact_directions[correction.unknowns]
-        return (
-            along,
-            correction.norm,
-            correction.kappa,
-            correction.eta,
-        ), "" if prepared is None else BoundNote.NOT_PREPARED
-
-    def _constraint(
-        self, problem: Problem, mu: Array, evaluated: Evaluated
-    ) -> tuple[float | SparseMatrix, Array, Array]:
-        """B and g as prepared corrections take them, and a bound of the terms of g."""
-        if self.base.bound_terms is None:
-            contact = evaluated.contact or contact_at(problem, mu)
-            return contact.B, contact.g, np.abs(contact.g)
-        theta, of_g = evaluated.samples.get("B", ONE), evaluated.samples.get("g", ONE)
-        return float(theta[0]), self.base.bound_terms @ of_g, self._bound_sizes @ np.abs(of_g)
-
-
-SAMPLES = 200
-"""Training parameters at most whose reduced solutions tell what terms of the residual contribute."""
-
-RINGS = 1
-"""Rings of rows around the support of the generators whose contact unknowns corrections usually involve."""
-
-SAMPLE_ACCURACY = 1e-8
 
 
 def prepare(
     model: HyperReducedModel, members: Mapping[str, AffineMember], base: CertificateBase, training: Array
 ) -> OnlineCertificate:
-    """Prepare what bounds the errors of a reduced model, from the members it was made of and `certificate_base`.
+    """Prepare the certificate of a reduced model, from the members it was made of and its `certificate_base`.
 
-    Sharpness alone depends on `training` (P×d), parameters that show which terms of residuals contribute.
+    Only sharpness depends on `training` (P×d), parameters that show which terms of residuals contribute.
     """
     problem, Phi, chi, B = model.problem, model.basis, model.generators, members["B"]
     X, dofs, scaled = base.X.matrix, contact_unknowns(problem), base.bound_terms is not None
     factor = implementation(base.X.factorisation).eliminate_with_factor(X, dofs, "A")
     forces = None if is_exact(problem, "B", B) else np.asarray(base.constraint.T @ chi)
 
-    def known(functionals: Array) -> ColumnBlock:
+    def block(functionals: Array) -> ColumnBlock:
         return ColumnBlock(factor.solve_factor_transposed(np.asarray(functionals)))
 
-    blocks: list[ResidualTerms] = [known(np.column_stack(members["f"].terms))]
+    blocks: list[ResidualTerms] = [block(np.column_stack(members["f"].terms))]
     if base.spectral is None:
         blocks.append(ColumnBlock(factor.apply_factor(Phi)))  # A is X
     else:
-        blocks += [known(term @ Phi) for term in base.terms]
+        blocks += [block(term @ Phi) for term in base.terms]
     on_contact = ContactFunctionals(factor.trailing_factor, len(X.indptr) - 1)
     if forces is None:
-        blocks += [known(B_q.T @ chi) for B_q in B.terms]
+        blocks += [block(B_q.T @ chi) for B_q in B.terms]
     else:
         blocks += [on_contact, ColumnBlock(on_contact.combined(forces))]
     compliance = ContactCompliance(base.compliance, _near(problem, chi, training))
@@ -379,9 +377,7 @@ def _near(problem: Problem, chi: Array, training: Array) -> Indices:
     for mu in training:
         contact = contact_at(problem, mu)
         touches, rows = abs(sp.csr_array(contact.B)) > 0.0, np.any(chi > 0.0, axis=1)
-        for _ in range(RINGS):
-            rows = touches @ (touches.T @ rows)
-        near |= touches.T @ rows
+        near |= touches.T @ (touches @ (touches.T @ rows))  # one ring of neighbours around the support
     return np.flatnonzero(near)
 
 
@@ -393,16 +389,17 @@ def _sampled(
     forces: Array | None,
     training: Array,
 ) -> tuple[Array, float, Mask]:
-    """What reduced solutions at training parameters have.
+    """Samples of reduced solutions at training parameters.
 
-    Coefficients (Z×S) of their residuals, the median norm of corrections, and the rows (m,) that some of these hold.
+    They are coefficients (Z×S) of residuals, the median norm of corrections, and the rows (m,) that some of these hold.
     `rows` are those of Φ (k×d) at the contact unknowns, `forces` those of `residual_coefficients`.
     """
     problem, residuals, norms = model.problem, [], [0.0]
     held = np.zeros(len(model.generators), bool)
-    for number, mu in enumerate(training[:: -(-len(training) // SAMPLES)]):
+    # up to 200 samples, and a correction of every eighth: only medians and maxima of them are used
+    for number, mu in enumerate(training[:: -(-len(training) // 200)]):
         reduced = model.assemble(mu)
-        answer = solve_qp(reduced.program, FALLBACK_SOLVER, SAMPLE_ACCURACY, factor=reduced.factor)
+        answer = solve_qp(reduced.program, FALLBACK_SOLVER, 1e-8, factor=reduced.factor)
         if answer.x is None or answer.alpha is None or not np.all(np.isfinite(answer.x)):
             continue
         evaluated, alpha = reduced.evaluated, np.maximum(answer.alpha, 0.0)
@@ -418,9 +415,9 @@ def _sampled(
     return np.column_stack(residuals), float(np.median(norms)), held
 
 
-def output_error_bound(of_output: tuple[float, float], base: CertificateBase, bound: OnlineBound) -> float:
-    """Bound of the error of an output with these `weights`, where u and λ have these bounds; or infinity."""
-    (of_u, of_lam), beta = of_output, base.inf_sup.value
+def output_error_bound(weights: tuple[float, float], base: CertificateBase, bound: OnlineBound) -> float:
+    """Bound of the error of an output with these `output_weights`, where u and λ have these bounds; or infinity."""
+    (of_u, of_lam), beta = weights, base.inf_sup.value
     if bound.guarantee is Guarantee.NONE or (of_lam and not bound.inf_sup > 0.0):
         return inf
     in_u = of_u * bound.u_energy / sqrt(bound.coercivity)

@@ -1,19 +1,4 @@
-"""Linear complementarity problems of corrections: ν = ν₀ + M v ≥ 0, v ≥ 0, νᵀv = 0, with M symmetric positive definite.
-
-They have one solution. The primal-dual active set method exchanges all unknowns with the wrong sign at once and takes
-few steps, but it may cycle where M is no M-matrix. Then v is found as the minimiser of ½ vᵀM v + ν₀ᵀv over v ≥ 0 by the
-method of Lawson and Hanson for nonnegative least squares (Solving Least Squares Problems, 1974, chapter 23). Its
-objective falls in every step, so that it meets no set twice and ends. What decides here is round-off where ν and v are
-both zero: ν counts as negative beyond its round-off alone, and an unknown that would not become positive is passed
-over. SciPy's own method, which has no such bounds, returns wrong solutions in such cases (1.17.1).
-
-Corrections of constraints among which there are equalities, by their values on the contact unknowns.
-
-No margin covers an equality, and the rows of a row and its opposite are dependent. The program of
-`vibench.model.certificates.contact_correction` is then solved as a least distance problem in y, w_E = L y, with
-C = L Lᵀ and ‖w‖ = |y|. The w' that holds the equalities is within η of w (`vibench.model.bound_terms`).
-
-Corrections of constraint violations that are known by their values on the contact unknowns, at the cost of those.
+"""Corrections of constraint violations that are known by their values on the contact unknowns, at the cost of those.
 
 Of all w with given values w_E on the contact unknowns E, w = X⁻¹ E c with c = C⁻¹ w_E, C = Eᵀ X⁻¹ E, has the smallest
 norm ‖w‖² = cᵀ C c. As B w depends on w_E alone, the minimiser of
@@ -23,19 +8,28 @@ norm ‖w‖² = cᵀ C c. As B w depends on w_E alone, the minimiser of
 is of this form with γ c = Bᵀ(ν − λ), multipliers ν ≥ 0 and complementarity. Let S = B C Bᵀ / γ and v = B w − s. Let I
 be the rows with λ_i > 0 in which releasing λ_i alone violates the constraint, λ_i S_ii > −s_i, and those that other w
 violate; on the other rows, J, ν = 0. Then ν = λ + S_II⁻¹(s + v + S_IJ λ_J) on I: a linear complementarity problem for
-v ≥ 0 and ν ≥ 0, solved from v = 0, where λ > 0 costs nothing, by a primal-dual active set method (Hintermüller, Ito and
-Kunisch, 2002) and by one that always ends where that cycles (`vibench.model.certificates.contact_correction`). Few rows
-leave v = 0, so that one factorisation of S_II serves all steps.
+v ≥ 0 and ν ≥ 0, solved from v = 0, where λ > 0 costs nothing. Few rows leave v = 0, so that one factorisation of S_II
+serves all steps.
 
 Any w with B w ≥ s is as good as another for a bound to hold. Optimality is not verified, feasibility is: s is raised by
-a margin above its round-off. Rows far from the contact are not evaluated where |B w| ≤ Σ_j |B_ij| √C_jj ‖w‖, which is
-the inequality of Cauchy and Schwarz, suffices.
+a margin above its round-off. Rows far from the contact are skipped if |B w| ≤ Σ_j |B_ij| √C_jj ‖w‖, the inequality of
+Cauchy and Schwarz, suffices.
 
-Bounds of u and of λ from one step of defect correction, at online cost.
+**Complementarity.** ν = ν₀ + M v ≥ 0, v ≥ 0, νᵀv = 0, with M symmetric positive definite, has one solution. The
+primal-dual active set method (Hintermüller, Ito and Kunisch, 2002) exchanges all unknowns with the wrong sign at once
+and takes few steps, but it may cycle where M is no M-matrix. Then v is found as the minimiser of ½ vᵀM v + ν₀ᵀv over
+v ≥ 0 by the method of Lawson and Hanson (Solving Least Squares Problems, 1974, chapter 23). Its objective falls in
+every step, so that it meets no set twice and ends. Round-off decides where ν and v are both zero: ν counts as negative
+beyond its round-off alone, and an unknown that would not become positive is skipped. SciPy's own method, which has no
+such bounds, returns wrong solutions in such cases (1.17.1).
 
-The identity (i) of `vibench.model.error_bounds` bounds the sum of both errors by the residual. Where one error is much
-smaller than the other, its bound is that of the larger one. They are told apart by a better pair, which solves the
-inequality with c X in place of A(µ), c > 0, for the residual r = f − A u_N − Bᵀλ_N,
+**Equalities.** No margin covers an equality, and the rows of a row and its opposite are dependent. The program is then
+solved as a least distance problem in y, w_E = L y, with C = L Lᵀ and ‖w‖ = |y|. The w' that holds the equalities is
+within η of w (`vibench.model.bound_terms`).
+
+**Bounds of u and λ apart.** The identity (i) of `vibench.model.error_bounds` bounds the sum of both errors by the
+residual. If one error is much smaller than the other, its bound is that of the larger one. A better pair separates
+them. It solves the inequality with c X in place of A(µ), c > 0, for the residual r = f − A u_N − Bᵀλ_N,
 
     c X (û − u_N) + Bᵀ(ν − λ_N) = r,     B û ≤ g,    ν ≥ 0,    νᵀ(B û − g) = 0.
 
@@ -45,12 +39,10 @@ Its residual is f − A û − Bᵀν = (c X − A)(û − u_N), it violates not
     max(‖u − û‖_A, ‖Bᵀ(λ − ν)‖_{A⁻¹}) ≤ δ = ½ (γ − α)/√α ‖û − u_N‖_X,
     ‖u − u_N‖_A ≤ √γ ‖û − u_N‖_X + δ,         ‖Bᵀ(λ − λ_N)‖_{A⁻¹} ≤ ‖Bᵀ(ν − λ_N)‖_{X⁻¹}/√α + δ.
 
-What of r is orthogonal to all Bᵀη moves û alone. Where A is constant, δ = 0 and the pair is the high-fidelity solution.
-
-With z = X⁻¹r, û = u_N + z/c − w and c X w = Bᵀ(ν − λ_N): w is the correction of `contact_correction` for u_N + z/c in
-place of u_N. Of r only the part r_U in the span of the basis of residuals is used; the rest, and what is not known of
-r, adds its norm to that of the residual. Then z has the coordinates of r_U, and its values on the contact unknowns are
-the products of these with the coordinates of the functionals that act on one unknown each.
+The part of r that is orthogonal to all Bᵀη moves û alone. With z = X⁻¹r, û = u_N + z/c − w and c X w = Bᵀ(ν − λ_N): w
+is the correction of u_N + z/c in place of u_N. Only the part r_U of r in the span of the basis of residuals is used;
+the rest, and what is not known of r, adds its norm to that of the residual. Then z has the coordinates of r_U, and its
+values on the contact unknowns are the products of these with the coordinates of the functionals of one unknown each.
 """
 
 from __future__ import annotations
@@ -69,34 +61,29 @@ from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.interfaces.problem import Contact
 from vibench.linalg import EPS
 from vibench.linalg.definite import BlockDiagonal
-from vibench.model.bound_terms import ATTEMPTS, MARGIN, NO_ROOM, Equalities
+from vibench.model.bound_terms import Equalities, dual_gap, first_margin
 from vibench.qp.exact import least_distance, rows_that_matter
 from vibench.qp.scaling import row_norms
 
-STEPS = 30
-"""Steps of the primal-dual active set method."""
-
-MOST = 20
-"""Steps of the other one, as a multiple of the number of unknowns; about as many as unknowns are usual."""
-
 
 def complementary(fixed: Array, rows_of: Callable[[Indices], Array], released: Mask) -> Array:
-    """ν (i,) of the problem above up to round-off; whether what it is for is feasible has to be verified in any case.
+    """ν (i,) up to round-off; the correction that it belongs to has to be verified in any case.
 
     Parameters
     ----------
     fixed, released
         ν₀ (i,), and where v may be positive at first (i,); the systems that are solved have the size of such sets.
     rows_of
-        Gives rows of M (·×i) from their numbers.
+        Rows of M (·×i) from their numbers.
     """
-    for _ in range(STEPS):
+    # two or three exchanges are usual; after 30 they cycle
+    for _ in range(30):
         rows = released.nonzero()[0]
         nu, wrong = fixed, fixed < 0.0
         if len(rows):
             among = rows_of(rows)
             _, v, singular = dposv(among[:, rows], -fixed[rows])
-            if singular:
+            if singular:  # also a cycle is left to the descent, which needs no start
                 break
             nu = fixed + v @ among
             nu[rows] = 0.0
@@ -115,7 +102,8 @@ def descent(M: Array, fixed: Array) -> Array:
     """
     size, unit = len(fixed), 1.0 / np.sqrt(M.diagonal())
     v, positive, passed = np.zeros(size), np.zeros(size, bool), np.zeros(size, bool)
-    for _ in range(MOST * size):
+    # as many steps as unknowns are usual; round-off alone could make it go on
+    for _ in range(20 * size):
         nu = fixed + M @ v + EPS * size * (np.abs(fixed) + np.abs(M) @ v)
         nu[positive | passed] = 0.0
         entering = int(np.argmin(nu * unit))
@@ -127,7 +115,8 @@ def descent(M: Array, fixed: Array) -> Array:
             _, z[rows], singular = dposv(M[np.ix_(rows, rows)], -fixed[rows])
             if singular:
                 return np.asarray(M @ v)
-            if first and not z[entering] > 0.0:  # NaN is not
+            # round-off made the sign of ν there: skip the unknown until another one has moved; NaN is not positive
+            if first and not z[entering] > 0.0:
                 positive[entering], passed[entering] = False, True
                 break
             blocking, first = positive & (z <= 0.0), False
@@ -157,15 +146,16 @@ def tied_correction(
         λ ≥ 0 (m,) and γ.
     """
     B = sp.csr_array(contact.B)
-    rows = rows_that_matter(B, contact.g, NO_ROOM * size, lam)
+    # opposite rows with less room than 1e-12 of the terms of s are an equality, as in `vibench.model.error_bounds`
+    rows = rows_that_matter(B, contact.g, 1e-12 * size, lam)
     if not rows.equal.any():
         return None
     L, kept, lengths = np.linalg.cholesky(C), rows.kept, row_norms(B)[rows.kept]
     whitened = np.asarray((B @ L).T)
-    equalities = Equalities.of(whitened[:, rows.equalities], lambda y: np.asarray(L @ y), B)
+    equalities = Equalities.from_rows(whitened[:, rows.equalities], lambda y: np.asarray(L @ y), B)
     K, load = -whitened[:, kept] / lengths / np.sqrt(gamma), -(whitened @ lam) / np.sqrt(gamma)
-    margin = np.where(rows.equal, 0.0, MARGIN * round_off[kept])
-    for _ in range(ATTEMPTS):
+    margin = np.where(rows.equal, 0.0, first_margin(round_off)[kept])
+    for _ in range(4):
         forces = least_distance(K, load, -(excess[kept] + margin) / lengths, rows.equal)
         if forces is None:
             return None
@@ -181,26 +171,17 @@ def tied_correction(
         if np.all(lacking <= 0.0):  # NaN is not
             y = scipy.linalg.solve_triangular(L, w, lower=True)
             nu = rows.multipliers(np.where(rows.equal, forces, np.maximum(forces, 0.0)) / lengths, len(lam))
-            products = [max(0.0, float(of @ np.where(of > 0.0, slack, 0.0))) + float(of @ reach) for of in (lam, nu)]
+            # slack may be infinite on absent rows, where multipliers are zero
+            kappa, gap = (dual_gap(one, np.where(one > 0.0, slack, 0.0)) + float(one @ reach) for one in (lam, nu))
             c = scipy.linalg.solve_triangular(L, y, lower=True, trans="T")
-            return c, float(np.linalg.norm(y)) + eta, products[0], nu, products[1], eta
+            return c, float(np.linalg.norm(y)) + eta, kappa, nu, gap, eta
         margin = 10.0 * np.maximum(margin, np.where(rows.equal, 0.0, np.nan_to_num(lacking[kept], posinf=0.0)))
     return None
 
 
-EXTENSIONS = 10
-"""How often rows are added to I."""
-
-NEGLIGIBLE = 1e-6
-"""Below this share of what a row lacks, a multiplier of it does not move the minimiser."""
-
-REGULAR = 1e-13
-"""Share of the diagonal of S_II that is added to it, so that dependent rows have a factorisation."""
-
-
 @dataclass(frozen=True)
 class ContactCorrection:
-    """A w = X⁻¹ E c with B w ≥ s.
+    """Correction w = X⁻¹ E c with B w ≥ s.
 
     Attributes
     ----------
@@ -223,12 +204,12 @@ class ContactCorrection:
     kappa: float
     nu: Array | None
     gap: float
-    eta: float = 0.0
+    eta: float
 
 
 @dataclass(frozen=True)
 class ContactCompliance:
-    """C on all contact unknowns, and on those that corrections usually involve.
+    """The compliance C on all contact unknowns, and on those that corrections usually involve.
 
     Attributes
     ----------
@@ -289,6 +270,7 @@ def find_contact_correction(
     for unknowns, position, C in compliance.blocks:
         if not len(C):
             continue  # no generator, no unknown near one
+        # The near unknowns are tried first: their rows are enough unless λ or a violation is elsewhere.
         inside = position[B.indices] >= 0
         restricted = sp.csr_array((B.data * inside, np.maximum(position[B.indices], 0), B.indptr), (len(lam), len(C)))
         near = np.ones(len(lam), bool)
@@ -305,7 +287,7 @@ def find_contact_correction(
 
 @dataclass(frozen=True)
 class _Program:
-    """The program above in the unknowns of a block of C; rows that are not `near` involve others, too."""
+    """The program in the unknowns of a block of C; rows that are not `near` involve others, too."""
 
     compliance: BlockDiagonal
     B: SparseMatrix
@@ -317,20 +299,22 @@ class _Program:
     lam: Array
     gamma: float
 
-    def best(self) -> tuple[Array, float, float, Array | None, float] | None:
-        """What a `ContactCorrection` has besides its unknowns, in this order."""
-        B, margin = self.B, MARGIN * self.round_off
+    def best(self) -> tuple[Array, float, float, Array | None, float, float] | None:
+        """The attributes of a `ContactCorrection` besides its unknowns, in their order."""
+        B, margin = self.B, first_margin(self.round_off)
         size = sp.csr_array((np.abs(B.data), B.indices, B.indptr), B.shape)
-        for _ in range(ATTEMPTS):
+        for _ in range(4):
             for load, values, norm, nu in self._minimisers(self.excess + margin):
                 slack = self.B @ values - self.excess
                 lacking = self.terms * (size @ np.abs(values)) + self.round_off - slack
+                # 1e-10 more than the round-off in ‖w‖ and in the bound of |B w|
                 far = self.reach * norm * (1.0 + 1e-10) + self.excess + self.round_off
                 lacking = np.where(self.near, lacking, far)
                 if np.all(lacking <= 0.0):  # NaN is not
-                    kappa, pushing = max(0.0, float(self.lam @ slack)), np.maximum(nu, 0.0)
+                    pushing = np.maximum(nu, 0.0)
                     pulls = np.any(nu < -8.0 * EPS * self.lam)  # beyond the round-off in ν − λ + λ
-                    return load, norm, kappa, None if pulls else pushing, max(0.0, float(pushing @ slack))
+                    gap = dual_gap(pushing, slack)
+                    return load, norm, dual_gap(self.lam, slack), None if pulls else pushing, gap, 0.0
                 if np.any(lacking[~self.near] > 0.0):
                     return None
                 margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking, nan=0.0, posinf=0.0))
@@ -341,7 +325,8 @@ class _Program:
         """The last w of the active set method: c, w on the unknowns of the block, its norm, and ν of any sign."""
         size = self.reach**2 / self.gamma  # at least the diagonal of S
         chosen = (self.lam > 0.0) & (self.lam * size > -excess)
-        for _ in range(EXTENSIONS):
+        # each extension adds all rows that w violates; ten are never needed where rows are independent
+        for _ in range(10):
             difference = self._difference(chosen, excess, size)
             load = (self.B.T @ difference) / self.gamma
             values = self.compliance @ load
@@ -354,7 +339,8 @@ class _Program:
     def _difference(self, chosen: Mask, excess: Array, size: Array) -> Array:
         """ν − λ (m,) with ν = 0 on rows that are not chosen, but for those where λ is negligible: there ν = λ."""
         lam, rows = self.lam, np.flatnonzero(chosen)
-        difference = np.where(chosen | (lam * size <= NEGLIGIBLE * np.abs(excess)), 0.0, -lam)
+        # Multipliers below 1e-6 of the row's slack are kept as they are: they do not change the minimiser.
+        difference = np.where(chosen | (lam * size <= 1e-6 * np.abs(excess)), 0.0, -lam)
         if not len(rows):
             return difference
         block, wanted = _selected_rows(self.B, chosen), excess[rows]
@@ -364,7 +350,8 @@ class _Program:
         units = np.sqrt(S.diagonal())  # of rows, which may have any scale
         units[~(units > 0.0)] = 1.0
         S /= np.outer(units, units)
-        S[np.diag_indices_from(S)] += REGULAR
+        # 1e-13 of the diagonal, so that dependent rows have a factorisation; w is verified in any case
+        S[np.diag_indices_from(S)] += 1e-13
         factor, singular = dpotrf(S, lower=1, clean=0)
         wanted, known = wanted / units, lam[rows] * units
         difference[rows] = (

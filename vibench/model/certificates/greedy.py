@@ -1,17 +1,15 @@
-"""Estimates of the error bounds of a growing model at the cost of the contact, to rank candidates by.
+"""The model that an adaptive training grows with: all solutions so far, and an error bound at any parameter.
 
-The bounds (ii) of `vibench.model.error_bounds` take two factorisations of mesh size at a parameter. Here A(µ) is
-replaced by γ X in them, X = A(µ₁) at the first solution and γ = ‖u_N‖²_A / ‖u_N‖²_X: the correction is that of
-`vibench.model.certificates.contact_correction` with the compliance C = Eᵀ X⁻¹ E of the contact unknowns E, which is
-computed once. Where A and f are constant nothing of mesh size is left: X is A, the estimates are the bounds, and with
-Φ and z the basis and u_N = Φ z,
+The bounds (ii) of `vibench.model.error_bounds` take two factorisations of mesh size at a parameter. Candidates are
+ranked by estimates at the cost of the contact. There A(µ) is replaced by γ X, X = A(µ₁) at the first solution and
+γ = ‖u_N‖²_A / ‖u_N‖²_X: the correction is that of `vibench.model.certificates.contact_correction` with the compliance
+C = Eᵀ X⁻¹ E of the contact unknowns E, which is computed once. If A and f are constant, nothing of mesh size is left: X
+is A, the estimates are the bounds, and with Φ and z the basis and u_N = Φ z,
 
     ‖r‖²_{A⁻¹} = ‖f‖² − 2 fᵀu_N + ‖u_N‖²_A − 2 (A⁻¹f)_Eᵀ F + 2 (u_N)_Eᵀ F + Fᵀ C F,    F = Bᵀλ_N on E.
 
-This sum keeps half of the digits: a residual below 1e-7 of u_N is round-off, and what is not far above that is no
-bound. Otherwise r is formed, and X⁻¹ r solved.
-
-The model that an adaptive training grows with: all solutions so far, and an error bound at any parameter.
+Cancellation halves the number of correct digits of this sum: values near 1e-7·‖u_N‖ are estimates, not bounds.
+Otherwise r is formed, and X⁻¹ r solved.
 """
 
 from __future__ import annotations
@@ -19,12 +17,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf, sqrt
-from typing import TypeVar
 
 import numpy as np
 import scipy.sparse as sp
+from cachetools import LRUCache
 
-from vibench.arrays import Array, Indices, Mask, SparseMatrix
+from vibench.arrays import Array, Mask, SparseMatrix
 from vibench.highfidelity.active_set import (
     ActiveSetSolution,
     HighFidelitySolution,
@@ -32,17 +30,19 @@ from vibench.highfidelity.active_set import (
     solve_unverified,
 )  # fmt: skip
 from vibench.highfidelity.kkt_systems import CondensedStiffness
-from vibench.interfaces.problem import Contact, Problem, VariationalInequality
+from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Trainer
 from vibench.interfaces.validation import ReferenceAssembly, checked_assembly
+from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.definite import dense_inverse
 from vibench.linalg.inner_product import orthonormal_range
 from vibench.linalg.schur_complement import EliminationPattern, StaticCondensation
-from vibench.model.certificates.contact_correction import ContactCompliance, ContactCorrection, find_contact_correction
-from vibench.model.error_bounds import find_correction, residual, terms
-from vibench.model.errors import EnergyNorm, riesz_representatives
-from vibench.model.galerkin import project
+from vibench.model.bound_terms import BoundTerms
+from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction
+from vibench.model.error_bounds import bound_terms, find_correction, residual
+from vibench.model.errors import EnergyNorm, T, riesz_representatives
+from vibench.model.galerkin import contact_at, project
 from vibench.qp.exact import ExactSolution, exact_solution
 from vibench.qp.scaling import ratio
 from vibench.qp.solve import solve_qp
@@ -50,15 +50,6 @@ from vibench.qp.verification import QPSolution
 from vibench.reduction.cone_subtraction import subtract_cone_component
 from vibench.reduction.supremizers import supremizers
 from vibench.timing import NO_TIME, Seconds, timed
-
-MOST_CONTACT = 4000
-"""Largest number of contact unknowns whose compliance is a dense matrix here."""
-
-KEPT = 1000
-"""Parameters whose projected stiffness is kept."""
-
-RESOLVED = 1e-9
-"""Squares of bounds that are at least this share of the largest of their terms have lost no more than nine digits."""
 
 
 @dataclass(frozen=True)
@@ -72,18 +63,18 @@ class Reduced:
 
 @dataclass(frozen=True)
 class ErrorEstimate:
-    """About what the bound of `vibench.model.certificates.greedy` is, and whether it is this bound up to round-off.
+    """Approximate value of `IncrementalModel.bound`, and whether it is this bound up to round-off.
 
     `reduced` is of a problem whose A or f vary.
     """
 
     value: float
-    is_bound: bool = False
-    reduced: Reduced | None = None
+    is_bound: bool
+    reduced: Reduced | None
 
 
 class ContactEstimates:
-    """What estimates of one growing model are computed from; see above.
+    """Estimates of the bounds of one incremental model.
 
     Parameters
     ----------
@@ -104,18 +95,20 @@ class ContactEstimates:
             self._solve, compliance = SparseCholesky(vi.A, "A").solve, dense_inverse(condensed.dense_schur, "A")
         self._compliance = ContactCompliance(compliance, np.zeros(0, np.intp))
         self._near = np.zeros(len(self._dofs), bool)
-        of_load = self._solve(self._f[:, None])[:, 0]
-        self._of_load, self._square_of_load = of_load[self._dofs], float(self._f @ of_load)
+        load = self._solve(self._f[:, None])[:, 0]
+        self._load, self._square_of_load = load[self._dofs], float(self._f @ load)
         self._basis, self._at_contact = np.zeros((len(vi.f), 0)), np.zeros((len(self._dofs), 0))
         self._sizes = np.zeros(len(self._dofs))
         self._stiffness, self._loads, self._generators = np.zeros((0, 0)), np.zeros(0), np.zeros((len(vi.g), 0))
-        self._projected = dict[bytes, Array]()
+        # projected stiffnesses of candidates, which are evaluated again with a larger basis
+        self._projected: LRUCache[bytes, Array] = LRUCache(1000)
 
     @staticmethod
     def supports(problem: Problem) -> bool:
         """Whether the problem assembles its constraint on contact unknowns, which are not too many."""
         dofs = problem.contact_dofs
-        return problem.has_contact and dofs is not None and len(dofs) <= MOST_CONTACT
+        # the compliance of 4,000 unknowns is a dense matrix of 128 MB
+        return problem.has_contact and dofs is not None and len(dofs) <= 4000
 
     def grow(self, vi: VariationalInequality, basis: Array, generators: Array) -> None:
         """Take the basis Φ (n×d) and the generators (m×R) of the model, after it has taken a solution of `vi`.
@@ -135,7 +128,8 @@ class ContactEstimates:
     def _grown(self, projected: Array, A: SparseMatrix, f: Array) -> tuple[Array, Array]:
         """ΦᵀAΦ (d×d), from that on the first vectors of Φ, and Φᵀf (d,)."""
         size, (n, count) = len(projected), self._basis.shape
-        right = np.empty((n, count - size + 1))  # one product with Φ, which is large, for all
+        # one product with Φ, which is large, for all
+        right = np.empty((n, count - size + 1))
         right[:, :-1], right[:, -1] = A @ self._basis[:, size:], f
         products = self._basis.T @ right
         new, grown = products[:, :-1], np.zeros((count, count))
@@ -143,64 +137,54 @@ class ContactEstimates:
         grown[size:, size:] = 0.5 * (new[size:] + new[size:].T)
         return grown, products[:, -1]
 
-    def _program(self, mu: Array, vi: VariationalInequality, contact: Contact) -> VariationalInequality:
-        """The reduced program at mu (d,), where A varies; candidates are evaluated again with a larger basis."""
-        key, chi = mu.tobytes(), self._generators
-        A, f = self._grown(self._projected.pop(key, np.zeros((0, 0))), vi.A, vi.f)
-        self._projected[key] = A
-        if len(self._projected) > KEPT:
-            del self._projected[next(iter(self._projected))]
-        return VariationalInequality(A, f, chi.T @ np.asarray(contact.B @ self._at_contact), chi.T @ contact.g)
-
     def _next_to(self, touches: Mask) -> Mask:
         """Contact unknowns (k,) in rows of the support of a generator, or in rows that touch one of these."""
         rows = np.any(self._generators > 0.0, axis=1)
         return np.asarray(touches.T @ (touches @ (touches.T @ rows)), bool)
 
-    def at(self, mu: Array) -> ErrorEstimate:
+    def estimate(self, mu: Array) -> ErrorEstimate:
         """The estimate at mu (d,); infinite where the reduced program has no solution, or no correction was found."""
-        contact = self._problem.contact(mu)
-        assert contact is not None  # as `supports` says
+        contact = contact_at(self._problem, mu)
         chi, rows = self._generators, sp.csr_array(contact.B)
-        vi = None if self.may_be_bounds else checked_assembly(self._problem, mu)
-        if vi is None:
-            B = chi.T @ np.asarray(rows @ self._at_contact)
-            program = VariationalInequality(self._stiffness, self._loads, B, chi.T @ contact.g)
-        else:
-            program = self._program(mu, vi, contact)
-        answer = exact_solution(program)
+        vi, A, f = None, self._stiffness, self._loads
+        if not self.may_be_bounds:
+            vi, key = checked_assembly(self._problem, mu), mu.tobytes()
+            A, f = self._grown(self._projected.get(key, np.zeros((0, 0))), vi.A, vi.f)
+            self._projected[key] = A
+        B = chi.T @ np.asarray(rows @ self._at_contact)
+        answer = exact_solution(VariationalInequality(A, f, B, chi.T @ contact.g))
         if answer is None:
-            return ErrorEstimate(inf)
+            return ErrorEstimate(inf, False, None)
         z, lam = answer.x, chi @ np.maximum(answer.alpha, 0.0)
-        energy, force, on_contact = float(z @ (program.A @ z)), np.asarray(rows.T @ lam), self._at_contact @ z
+        energy, force, on_contact = float(z @ (A @ z)), np.asarray(rows.T @ lam), self._at_contact @ z
         gamma = 1.0 if vi is None else ratio(energy, float(z @ (self._stiffness @ z))) or 1.0
-        uncertain = (len(z) + 4.0) * float(np.finfo(float).eps) * float(np.linalg.norm(z)) * self._sizes
-        found = find_contact_correction(self._compliance, contact, on_contact, uncertain, lam, gamma)
+        # d products, their sum, and the round-off of Φ: as in `OnlineCertificate.unit_round_off`
+        uncertain = (len(z) + 4.0) * EPS * float(np.linalg.norm(z)) * self._sizes
+        best = find_contact_correction(self._compliance, contact, on_contact, uncertain, lam, gamma)
         reduced = None if vi is None else Reduced(vi, z, lam)
-        if found is None:
-            return ErrorEstimate(inf, reduced=reduced)
-        _, _, C = self._compliance.blocks[len(found.unknowns) > len(self._compliance.near)]
-        pushed = C @ force[found.unknowns]  # no force is elsewhere, or the correction would have other unknowns
-        pressed, size_of_load = float(force[found.unknowns] @ pushed), self._square_of_load
+        if best is None:
+            return ErrorEstimate(inf, False, reduced)
+        _, _, C = self._compliance.blocks[len(best.unknowns) > len(self._compliance.near)]
+        # no force is on other unknowns, or the correction would involve them
+        pushed = C @ force[best.unknowns]
+        pressed, size_of_load = float(force[best.unknowns] @ pushed), self._square_of_load
         if vi is None:
-            riesz = (self._of_load - on_contact)[found.unknowns] - pushed
-            square = size_of_load + energy - 2.0 * float(self._loads @ z + (self._of_load - on_contact) @ force)
+            riesz = (self._load - on_contact)[best.unknowns] - pushed
+            square = size_of_load + energy - 2.0 * float(self._loads @ z + (self._load - on_contact) @ force)
             square += pressed
         else:
-            riesz, square = self._residual(vi, z, force, found.unknowns)
-        bounds = _Bounds.of(found, max(square, 0.0) / gamma, gamma, riesz)
-        value = self._relative(bounds, lam, found.nu, sqrt(max(energy, 0.0)), sqrt(max(pressed, 0.0) / gamma))
-        resolved = bounds.smallest_square >= RESOLVED * max(size_of_load, energy, pressed)
-        return ErrorEstimate(value, vi is None and resolved and found.nu is not None and not found.eta, reduced)
+            residual = vi.f - vi.A @ (self._basis @ z)
+            residual[self._dofs] -= force
+            whole = self._solve(residual[:, None])[:, 0]
+            riesz, square = whole[self._dofs[best.unknowns]], float(residual @ whole)
+        rho, omega, work = sqrt(max(square, 0.0) / gamma), sqrt(gamma) * best.norm, float(riesz @ best.load)
+        terms = BoundTerms.from_work(rho, omega, best.kappa, work)
+        value = self._relative(terms, lam, best.nu, sqrt(max(energy, 0.0)), sqrt(max(pressed, 0.0) / gamma))
+        # a square of 1e-9 of its largest term has lost nine of sixteen digits; below, it is no bound
+        resolved = min(terms.primal**2, terms.gap) >= 1e-9 * max(size_of_load, energy, pressed)
+        return ErrorEstimate(value, vi is None and resolved and best.nu is not None and not best.eta, reduced)
 
-    def _residual(self, vi: VariationalInequality, z: Array, force: Array, unknowns: Indices) -> tuple[Array, float]:
-        """X⁻¹ r on some contact unknowns (l,), and the square of ‖r‖ in X⁻¹."""
-        residual = vi.f - vi.A @ (self._basis @ z)
-        residual[self._dofs] -= force
-        riesz = self._solve(residual[:, None])[:, 0]
-        return riesz[self._dofs[unknowns]], float(residual @ riesz)
-
-    def _relative(self, bounds: _Bounds, lam: Array, nu: Array | None, energy: float, pressed: float) -> float:
+    def _relative(self, bounds: BoundTerms, lam: Array, nu: Array | None, energy: float, pressed: float) -> float:
         """The largest of the bounds of u and λ and the estimate of λ in W, relative to u_N and λ_N, as in `bound`.
 
         `energy` and `pressed` are ‖u_N‖_A and the norm of Bᵀλ_N.
@@ -208,35 +192,16 @@ class ContactEstimates:
         of_u = ratio(bounds.primal, energy)
         if not pressed > 0.0:
             return of_u
-        X = self._problem.W.matrix  # as no digit is lost in a sum of squares, no factor of it is needed
+        # no digit is lost in a sum of squares: no factor of X_W is needed
+        X = self._problem.W.matrix
         squares = (float(eta @ (X @ eta)) for eta in (np.zeros_like(lam) if nu is None else nu - lam, lam))
         in_W = ratio(*(sqrt(max(0.0, square)) for square in squares))
         return max(of_u, ratio(bounds.dual, pressed), in_W)
 
 
 @dataclass(frozen=True)
-class _Bounds:
-    """Bounds (ii) with a correction: Δ_A, that of λ, and the smallest of the squares that they are roots of."""
-
-    primal: float
-    dual: float
-    smallest_square: float
-
-    @classmethod
-    def of(cls, found: ContactCorrection, square: float, gamma: float, riesz: Array) -> _Bounds:
-        """With ρ² and X⁻¹ r (l,) on the unknowns of the correction."""
-        omega = sqrt(gamma) * found.norm
-        total = square + omega**2 + 2.0 * found.kappa
-        primal, gap = sqrt(total), total + 2.0 * float(riesz @ found.load)
-        return cls(primal, min(sqrt(max(0.0, gap)), omega + primal), min(total, gap))
-
-
-T = TypeVar("T")
-
-
-@dataclass(frozen=True)
 class BoundState:
-    """What a bound at mu (d,) leaves to a solution there: where to start, and what was assembled and condensed.
+    """Start, assembly and factors that a bound at mu (d,) leaves to a solution there.
 
     The multiplier of the correction, which presses rows (m,), is that of the solution but for the residual.
     """
@@ -245,13 +210,6 @@ class BoundState:
     vi: VariationalInequality
     stiffness: CondensedStiffness
     pressed: Mask
-
-
-IN_CONE = 1e-6
-"""A multiplier is in the cone where less than this share of it is outside: it may be what a solver left."""
-
-SOLVER, ACCURACY = "piqp", 1e-9
-"""Solver of the programs that cannot be solved to round-off."""
 
 
 class IncrementalModel:
@@ -275,7 +233,7 @@ class IncrementalModel:
         self.generators = np.zeros((problem.W.dim, 0))
         self._estimates: ContactEstimates | None = None
         self._last: tuple[bytes, ErrorEstimate] | None = None
-        self._bounded: BoundState | None = None
+        self._state: BoundState | None = None
 
     def add(self, vi: VariationalInequality, solution: HighFidelitySolution) -> str:
         """Add the solution of `vi`; returns what was less accurate than usual, "" if nothing."""
@@ -283,16 +241,18 @@ class IncrementalModel:
         rest, note = subtract_cone_component(solution.lam, self.generators, W)
         new = [solution.u[:, None]]
         norm = float(W.norm(rest))
-        if norm > IN_CONE * float(W.norm(solution.lam)):
+        # less than 1e-6 outside the cone may be what a solver left
+        if norm > 1e-6 * float(W.norm(solution.lam)):
             new.append(supremizers(V, vi.B, rest[:, None]))
             self.generators = np.hstack([self.generators, rest[:, None] / norm])
-        for column in new:  # one after the other: u must not lose to its supremizer
+        # orthonormalise u first, so that its supremizer cannot displace it
+        for column in new:
             more = orthonormal_range(V.whiten(column), self._whitened)
             self._whitened = np.hstack([self._whitened, more])
         self._basis = np.hstack([self._basis, V.unwhiten(self._whitened[:, size:])])
         if self._estimates is None and ContactEstimates.supports(self._problem):
             self._estimates = ContactEstimates(self._problem, vi, self._solver.condensed(vi))
-        self._last = self._bounded = None
+        self._last = self._state = None
         if self._estimates is not None:
             self._estimates.grow(vi, self._basis, self.generators)
         return note
@@ -302,26 +262,27 @@ class IncrementalModel:
         program = project(vi, self._basis, self.generators)
         answer: ExactSolution | QPSolution | None = exact_solution(program)
         if answer is None:
-            answer = solve_qp(program, SOLVER, ACCURACY)
+            answer = solve_qp(program, "piqp", 1e-9)  # no active set is exact up to round-off
         if answer.x is None or answer.alpha is None:
             return None
         return self._basis @ answer.x, self.generators @ np.maximum(answer.alpha, 0.0)
 
     def estimate(self, mu: Array) -> float | None:
-        """What `bound` is about, at the cost of the contact; `None` where the problem does not allow it."""
+        """A cheap estimate of `bound`, evaluated on the contact unknowns only; `None` where the problem has none."""
         return None if self._estimates is None else self._estimated(self._estimates, mu).value
 
     def _estimated(self, estimates: ContactEstimates, mu: Array) -> ErrorEstimate:
-        """The estimate at mu (d,); the last one is kept, which is what a bound is asked for next."""
+        """The estimate at mu (d,), cached: the next bound is usually at the parameter of the last estimate."""
         key = mu.tobytes()
         if self._last is None or self._last[0] != key:
-            self._bounded = None  # a problem may assemble into the arrays of that
-            self._last = key, estimates.at(mu)
+            # a problem may assemble into the arrays of the last bound
+            self._state = None
+            self._last = key, estimates.estimate(mu)
         return self._last[1]
 
-    def bounded(self, mu: Array) -> BoundState | None:
-        """What the last bound leaves to a solution at mu (d,), unless it was at another parameter."""
-        return self._bounded if self._bounded is not None and np.array_equal(self._bounded.mu, mu) else None
+    def state(self, mu: Array) -> BoundState | None:
+        """State that the last bound leaves to a solution at mu (d,), unless it was at another parameter."""
+        return self._state if self._state is not None and np.array_equal(self._state.mu, mu) else None
 
     def bound(self, mu: Array) -> float:
         """The largest of two bounds and an estimate at mu (d,), relative to the reduced solution; infinite without one.
@@ -337,25 +298,25 @@ class IncrementalModel:
                 return estimated.value
         vi, solved = self._assembled(mu)
         if solved is None:
-            return float("inf")
+            return inf
         u, lam = solved
         energy = EnergyNorm(vi.A, self._solver.condensed(vi))
         corrected = find_correction(vi, energy, u, lam)
         if corrected is None:
-            return float("inf")
-        self._bounded = BoundState(mu, vi, energy.stiffness, corrected.nu > 0.0)
+            return inf
+        self._state = BoundState(mu, vi, energy.stiffness, corrected.nu > 0.0)
         (riesz,) = riesz_representatives([energy], [residual(vi, u, lam)])
-        of_pair = terms(corrected, u, lam, riesz)
-        of_u = ratio(of_pair.primal, energy.norm(u))
-        pressed, W = corrected.on.of_force(lam).norm, self._problem.W
+        terms = bound_terms(corrected, u, lam, riesz)
+        of_u = ratio(terms.primal, energy.norm(u))
+        pressed, W = corrected.contact.force_representer(lam).norm, self._problem.W
         if not pressed > 0.0:
             return of_u
         in_W = ratio(float(W.norm(corrected.nu - lam)), float(W.norm(lam)))
-        return max(of_u, ratio(of_pair.dual, pressed), in_W)
+        return max(of_u, ratio(terms.dual, pressed), in_W)
 
     def _assembled(self, mu: Array) -> tuple[VariationalInequality, tuple[Array, Array] | None]:
-        """The inequality at mu (d,) and its reduced solution: what an estimate just there has left, or made anew."""
-        last, self._last, self._bounded = self._last, None, None
+        """The inequality at mu (d,) and its reduced solution, those of the last estimate if it was there."""
+        last, self._last, self._state = self._last, None, None
         if last is not None and last[0] == mu.tobytes() and (reduced := last[1].reduced) is not None:
             return reduced.vi, (self._basis @ reduced.z, reduced.lam)
         vi = checked_assembly(self._problem, mu)
@@ -405,20 +366,22 @@ class GreedyTrainer(Trainer):
     def solve(self, mu: Array, bound: float = float("nan")) -> None:
         """Assemble, solve, and let the model grow."""
         mu = np.array(mu, float)
-        bounded = self._model.bounded(mu)
+        state = self._model.state(mu)
 
         def work() -> tuple[VariationalInequality, ActiveSetSolution]:
-            if bounded is not None:
-                return bounded.vi, solve_unverified(bounded.vi, bounded.stiffness, bounded.pressed)
+            if state is not None:
+                return state.vi, solve_unverified(state.vi, state.stiffness, state.pressed)
             vi = checked_assembly(self._problem, mu)
             return vi, self._solver.solve_assembled(mu, vi)
 
         (vi, unverified), seconds = timed(work)
-        solution = self._solver.verify(mu, vi, unverified)  # as what follows, this is not timed
+        # verification and checks are not timed
+        solution = self._solver.verify(mu, vi, unverified)
         self._solver.check_coercive(mu, vi)
         self._reference.refuse_false_constants(mu, vi)
         self._solver.remember(mu, solution)
-        if not self.solved:  # without a start, which later ones have; with one it is a solution like those
+        if not self.solved:
+            # the first solution has no start: what it takes beyond its repetition, which has one, is the set-up
             (vi, _), marginal = timed(work)
             self.setup, seconds = seconds.beyond(marginal), marginal
         note, growing = timed(lambda: self._model.add(vi, solution))
@@ -431,10 +394,10 @@ class GreedyTrainer(Trainer):
         return self._evaluate(self._model.bound, mu)
 
     def estimate(self, mu: Array) -> float | None:
-        """What the bound is about, or `None`."""
+        """The estimate of the model, or `None`."""
         return self._evaluate(self._model.estimate, mu)
 
     def _evaluate(self, judge: Callable[[Array], T], mu: Array) -> T:
-        found, seconds = timed(lambda: judge(np.array(mu, float)))
-        self.selecting, self._evaluated = self.selecting + seconds, self._evaluated + int(found is not None)
-        return found
+        value, seconds = timed(lambda: judge(np.array(mu, float)))
+        self.selecting, self._evaluated = self.selecting + seconds, self._evaluated + int(value is not None)
+        return value

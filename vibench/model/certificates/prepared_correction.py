@@ -27,16 +27,13 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.linalg import EPS
 from vibench.linalg.definite import connected_blocks
-from vibench.model.bound_terms import ATTEMPTS, MARGIN
+from vibench.model.bound_terms import dual_gap, first_margin
 from vibench.model.certificates.contact_correction import complementary
-
-LARGEST_CONDITION = 1e9
-"""Rows of a B₀ whose S₀ has a larger condition number are treated as dependent: S₀ is not inverted."""
 
 
 @dataclass(frozen=True)
 class PreparedCorrections:
-    """What depends on no parameter; see above.
+    """Parameter-independent data of prepared corrections.
 
     Where B(µ) is θ(µ) B₀ everywhere arrays called (p×·) are multiplied by B₀, or by |B₀| (p = m), and have one row per
     contact unknown (p = k) otherwise.
@@ -92,7 +89,7 @@ class PreparedCorrections:
         if found is None:
             return None
         _, a, norm, slack = found
-        return a @ self.directions, norm, max(0.0, float(lam @ slack))
+        return a @ self.directions, norm, dual_gap(lam, slack)
 
     def multiplier(
         self, theta: float, g: Array, g_size: Array, y: Array, lam: Array, gamma: float
@@ -106,7 +103,7 @@ class PreparedCorrections:
             return None
         (nu, _, norm, slack), on_all = found, lam.copy()
         on_all[self.rows] = np.maximum(nu, 0.0)
-        return on_all, norm, max(0.0, float(on_all @ slack))
+        return on_all, norm, dual_gap(on_all, slack)
 
     def _feasible(
         self, B: float | SparseMatrix, g: Array, g_size: Array, y: Array, lam: Array, gamma: float
@@ -114,12 +111,12 @@ class PreparedCorrections:
         """ν on the rows J, a with c = B₀ᵀ a, ‖w‖ and B w − s (m,) of a w that is feasible."""
         B = B if isinstance(B, (float, sp.csr_array)) else sp.csr_array(B)
         theta, terms = (B, self.terms) if isinstance(B, float) else (1.0, self.terms + int(np.diff(B.indptr).max()))
-        if theta == 0.0:
+        if theta == 0.0:  # B vanishes, and no load on its rows lifts anything
             return None
         excess, size, unit = _times(B, self.basis @ y) - g, _times(abs(B), self.sizes), 1.01 * terms * EPS
         round_off = unit * (float(y @ y) ** 0.5 * size[:, 0] + g_size)
-        margin, here = MARGIN * round_off, lam[self.rows]
-        for _ in range(ATTEMPTS):
+        margin, here = first_margin(round_off), lam[self.rows]
+        for _ in range(4):
             wanted, scale = (excess + margin)[self.rows], gamma / theta**2
             released = here * self._diagonal <= -scale * wanted
             nu = complementary(here + scale * (self.inverse @ wanted), self.inverse.__getitem__, released)
@@ -182,13 +179,15 @@ def prepare_corrections(
     responses = np.asarray((chosen @ compliance).T)
     S = np.asarray(chosen @ responses)
     S = 0.5 * (S + S.T)
-    if not len(J) or not np.linalg.cond(S) <= LARGEST_CONDITION:
+    # rows are dependent beyond a condition number of 1e9: M would have lost more digits than margins cover
+    if not len(J) or not np.linalg.cond(S) <= 1e9:
         return None
     inverse = scipy.linalg.inv(S)
     sizes = np.column_stack([np.linalg.norm(basis, axis=1), root])
     if scaled:
         basis, responses, sizes = B @ basis, np.asarray(B @ responses), abs(B) @ sizes
     moved = np.flatnonzero(responses.any(axis=1))
+    # products with Φ or M, twice with a row of B, and the operations between them
     terms = max(basis.shape[1], len(J)) + 2 * int(np.diff(B.indptr).max()) + 8
     reach, along = abs(chosen) @ root, np.asarray(chosen @ directions)
     symmetric = 0.5 * (inverse + inverse.T)

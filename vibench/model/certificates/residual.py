@@ -30,28 +30,9 @@ from vibench.interfaces.problem import Contact
 from vibench.linalg import EPS
 from vibench.linalg.inner_product import project_out
 
-TERMS, DIRECTIONS = 0.05, 0.4
-"""Bounds of what is left out are these shares of the typical norm: of terms, and of directions, which are orthogonal to
-those that are kept."""
-
-NEGLIGIBLE = 1e-12
-"""Contributions below this share of the largest one are not worth computing."""
-
-FEW, SHARE_OF_FEW = 1000, 0.25
-"""All principal directions of up to so many terms are computed, and this share of the above is left out."""
-
-TERMS_OF_FEW = 0.003
-"""Few terms in all are kept but for this share: what they contribute elsewhere may be larger than in samples."""
-
-MOST, OVERSAMPLING = 800, 100
-"""Largest number of principal directions, and how many more a randomised method computes."""
-
-BLOCK = 100
-"""Directions that the randomised method computes at once."""
-
 
 class ResidualTerms(Protocol):
-    """Some of the F⁻ᵀt_j, of which not all may be wanted."""
+    """A block of the F⁻ᵀt_j, of which only some columns may be computed."""
 
     @property
     def norms(self) -> Array:
@@ -66,21 +47,18 @@ class ResidualTerms(Protocol):
 
 @dataclass(frozen=True)
 class ColumnBlock:
-    """All of them, as an array (n×p)."""
+    """A block that is stored as an array (n×p)."""
 
     values: Array
 
     @property
     def norms(self) -> Array:
-        """Their norms (p,)."""
         return np.asarray(np.linalg.norm(self.values, axis=0))
 
     def columns(self, chosen: Indices) -> Array:
-        """The chosen ones (n×c)."""
         return self.values[:, chosen]
 
     def combined(self, samples: Array) -> Array:
-        """Their sums (n×S) with coefficients (p×S)."""
         return np.asarray(self.values @ samples)
 
 
@@ -96,16 +74,13 @@ class ContactFunctionals:
 
     @cached_property
     def norms(self) -> Array:
-        """Their norms (k,)."""
         inverse = scipy.linalg.solve_triangular(self.trailing, np.eye(len(self.trailing)), check_finite=False)
         return np.asarray(np.linalg.norm(inverse, axis=1))
 
     def columns(self, chosen: Indices) -> Array:
-        """The chosen ones (n×c)."""
         return self.combined(np.eye(len(self.trailing))[:, chosen])
 
     def combined(self, samples: Array) -> Array:
-        """Their sums (n×S) with coefficients (k×S)."""
         result = np.zeros((self.dim, samples.shape[1]))
         if samples.size:
             last = scipy.linalg.solve_triangular(self.trailing, samples, trans="T", check_finite=False)
@@ -115,7 +90,7 @@ class ContactFunctionals:
 
 @dataclass(frozen=True)
 class ResidualBasis:
-    """An orthonormal basis U of residuals; see above.
+    """An orthonormal basis U of residuals.
 
     Attributes
     ----------
@@ -156,27 +131,31 @@ class ResidualBasis:
 def residual_basis(
     blocks: Sequence[ResidualTerms], samples: Array, beside: float, last: int | None = None
 ) -> tuple[ResidualBasis, Array]:
-    """Basis of the F⁻ᵀt_j, given as blocks (n×·), from samples of their coefficients (Z×S), and U itself (n×K).
+    """Basis of the F⁻ᵀt_j, blocks (n×·), from samples of their coefficients (Z×S), and U itself (n×K).
 
-    What is left out is compared with the sampled norms and `beside`, what else enters the same bound in quadrature.
-    With `last`, U is returned in so many rows at the end alone (last×K): where few terms have entries in the rows
-    before, these are replaced by as many by an orthogonal factorisation.
+    Remainders are compared with the sampled norms and `beside`, the other term of the same bound, in quadrature. With
+    `last`, only that many rows of U are returned (last×K), from the end: if few terms have entries in the rows before,
+    an orthogonal factorisation replaces these by as few.
     """
     norms = np.concatenate([block.norms for block in blocks])
     sizes, ranges = np.abs(samples), list(pairwise(np.cumsum([0, *(len(block.norms) for block in blocks)])))
     scale = sizes.max(axis=1, initial=0.0)
     sampled = sum(block.combined(samples[a:b]) for block, (a, b) in zip(blocks, ranges, strict=True))
     typical = float(np.hypot(np.median(np.linalg.norm(sampled, axis=0)), beside))
-    share = TERMS if np.count_nonzero(scale) > FEW else TERMS_OF_FEW
-    kept = _worth_keeping(norms * scale, norms * sizes.mean(axis=1), share * typical)
+    # Of many terms those are dropped that add up to 5 % of the typical norm. Few cost little: there 0.3 %, as what
+    # they contribute elsewhere may be larger than in the samples.
+    fraction = 0.05 if np.count_nonzero(scale) > 1000 else 0.003
+    kept = _worth_keeping(norms * scale, norms * sizes.mean(axis=1), fraction * typical)
     pairs = zip(blocks, ranges, strict=True)
     R = np.hstack([block.columns(kept[(kept >= a) & (kept < b)] - a) for block, (a, b) in pairs])
     if last is not None:
         R = _with_fewer_rows(R, last)
     inverse = 1.0 / scale[kept]
     reach = float(np.linalg.norm(inverse[:, None] * samples[kept], axis=0).mean())
-    U, remainder = _directions(R, scale[kept], DIRECTIONS * typical / max(reach, np.finfo(float).tiny))
+    # directions left out are orthogonal to the others: 40 % of the typical norm adds 8 % in quadrature
+    U, remainder = _directions(R, scale[kept], 0.4 * typical / max(reach, np.finfo(float).tiny))
     norms[kept], factor = 0.0, U.T @ R
+    # the round-off in sums of p terms, of the product UᵀR and of that with z, see Higham 2002, §3.1
     round_off = 1.01 * EPS * (len(kept) + 8.0) * float(np.linalg.norm(factor * scale[kept]))
     basis = ResidualBasis(kept, factor, inverse, remainder + round_off, norms)
     return basis, U if last is None else U[len(U) - last :]
@@ -194,55 +173,63 @@ def _with_fewer_rows(R: Array, last: int) -> Array:
 
 
 def _worth_keeping(largest: Array, mean: Array, allowed: float) -> Indices:
-    """Positions of the terms to keep, rising: the others contribute `allowed` at most on average."""
+    """Positions of the terms to keep, rising: the others contribute `allowed` at most on average.
+
+    Contributions below 1e-12 of the largest one are round-off of the others.
+    """
     order = np.argsort(mean)
     dropped = np.cumsum(mean[order]) <= allowed
     keep = np.ones(len(mean), bool)
     keep[order[dropped]] = False
-    return np.flatnonzero(keep & (largest > NEGLIGIBLE * largest.max(initial=0.0)))
+    return np.flatnonzero(keep & (largest > 1e-12 * largest.max(initial=0.0)))
 
 
 def _directions(R: Array, scale: Array, allowed: float) -> tuple[Array, float]:
     """Orthonormal basis (n×K) of S = R D (n×p), D = diag(`scale`), up to a remainder, and a bound of its norm.
 
-    It is at most `allowed`. All of the columns where `MOST` principal directions are not enough, or few of the columns
-    are saved: then nothing remains.
+    It is at most `allowed`. If 800 principal directions are not enough, or save few of the columns, the basis is of all
+    columns, and nothing remains.
     """
-    count = R.shape[1]
-    if count > FEW:
-        found = _random_range(R, scale, allowed)
-        if found is None:
+    count, rest = R.shape[1], 0.0
+    if count > 1000:  # a decomposition of all would cost more than a randomised one
+        randomised = _random_range(R, scale, allowed, limit=900, block=100)  # 100 directions more than are used
+        if randomised is None:
             return np.linalg.qr(R * scale)[0], 0.0
-        Q, small, rest = found
+        Q, small, rest = randomised
     else:
         Q, small = np.linalg.qr(R * scale)
-        rest, allowed = 0.0, allowed * SHARE_OF_FEW  # but for round-off
+        allowed *= 0.25  # few directions cost little: a quarter of the remainder
     # The transpose of a triangular factor has the same left singular vectors.
     triangle = scipy.linalg.qr(small.T, mode="r", check_finite=False)[0][: len(small)]
     left, sigma, _ = np.linalg.svd(triangle.T, full_matrices=False)
     remainders = np.hypot(np.append(sigma, 0.0), rest)
     enough = int(np.argmax(remainders <= allowed))
-    if remainders[enough] <= allowed and enough <= min(MOST, 0.7 * count):
+    if remainders[enough] <= allowed and enough <= min(800, 0.7 * count):
         return Q @ left[:, :enough], float(remainders[enough])
-    return (Q if count <= FEW else np.linalg.qr(R * scale)[0]), 0.0
+    return (Q if count <= 1000 else np.linalg.qr(R * scale)[0]), 0.0
 
 
-def _random_range(R: Array, scale: Array, allowed: float) -> tuple[Array, Array, float] | None:
+def _random_range(
+    R: Array, scale: Array, allowed: float, *, limit: int, block: int
+) -> tuple[Array, Array, float] | None:
     """Orthonormal Q (n×k), QᵀS (k×p) and ‖S − QQᵀS‖ in the Frobenius norm, at most half of `allowed`, for S = R D.
 
-    A randomised range finder by blocks (Martinsson and Voronin, 2016): each of them is found in what the ones before
-    leave, so that no more are computed than are needed. `None` where the decay says that `MOST` will not do.
+    A randomised range finder by blocks of directions (Martinsson and Voronin, 2016): each of them is computed from the
+    remainder of those before, so that no more are computed than are needed. `None` if the decay of remainders says that
+    `limit` directions are not enough.
     """
-    rng, limit = np.random.default_rng(0), min(MOST + OVERSAMPLING, *R.shape)
-    left = np.empty(R.shape, order="F")  # updated in place: to allocate so much takes as long as to compute it
+    rng, limit = np.random.default_rng(0), min(limit, *R.shape)
+    # updated in place: allocating so much takes as long as computing it
+    left = np.empty(R.shape, order="F")
     np.multiply(R, scale, out=left)
     bases, parts, rests = list[Array](), list[Array](), [float(np.linalg.norm(left))]
     while rests[-1] > 0.5 * allowed:
         remaining = limit - sum(basis.shape[1] for basis in bases)
-        decay = rests[-1] / rests[-2] if len(bases) > 1 else 0.0  # of a block; the first one is the fastest
-        if not remaining or rests[-1] * decay ** (remaining / BLOCK) > allowed:
+        # the decay in one block; that of the first one is the fastest, and predicts nothing
+        decay = rests[-1] / rests[-2] if len(bases) > 1 else 0.0
+        if not remaining or rests[-1] * decay ** (remaining / block) > allowed:
             return None
-        Q = np.linalg.qr(left @ rng.standard_normal((R.shape[1], min(BLOCK, remaining))))[0]
+        Q = np.linalg.qr(left @ rng.standard_normal((R.shape[1], min(block, remaining))))[0]
         Q = np.linalg.qr(left @ (left.T @ Q))[0]
         if bases:
             Q = np.linalg.qr(project_out(np.hstack(bases), Q))[0]

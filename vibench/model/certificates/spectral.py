@@ -32,20 +32,10 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct
 from vibench.stability.coercivity import Constant, coercivity_and_continuity, operator_norm
 
-ANCHORS = 81
-"""Largest number of anchors; a grid has from 2 to 9 points per direction, or one point alone where 2^d are too many."""
-
-MOST_PER_DIRECTION = 9
-
-LEFT_OUT = 1e-4
-"""Share of the variation of A over the parameters, in coefficients, that directions may have to be left out."""
-
-TINY = float(np.finfo(float).tiny)
-
 
 @dataclass(frozen=True)
 class SpectralBounds:
-    """What α(µ) and γ(µ) follow from; see above.
+    """Offline data of α(µ) and γ(µ).
 
     Attributes
     ----------
@@ -58,7 +48,7 @@ class SpectralBounds:
     theta
         θ(µ_i) (Q×P) in the rotated coordinates.
     norms
-        s_q (Q,) of the rotated A_q; zero for those that D has.
+        s_q (Q,) of the rotated A_q; zero for those left to D.
     error
         η.
     proved
@@ -75,15 +65,15 @@ class SpectralBounds:
     error: float
     proved: bool
 
-    def at(self, mu: Array, theta: Array) -> tuple[float, float]:
-        """α(µ) and γ(µ) at mu (d,) with the rotated θ(µ) (Q,); α(µ) ≤ 0 says nothing."""
+    def evaluate(self, mu: Array, theta: Array) -> tuple[float, float]:
+        """α(µ) and γ(µ) at mu (d,) with the rotated θ(µ) (Q,); a negative α(µ) is no bound."""
         where, c = self._weights(mu)
-        combined = np.array(c) @ self._known[where]
+        combined = np.array(c) @ self._rows[where]
         lacking = float(np.abs(theta - combined[2:]) @ self.norms) + 2.0 * self.error
         return float(combined[0]) - lacking, float(combined[1]) + lacking
 
     @cached_property
-    def _known(self) -> Array:
+    def _rows(self) -> Array:
         """α_i, γ_i and θ(µ_i), one row per anchor."""
         return np.column_stack([self.alpha, self.gamma, self.theta.T])
 
@@ -93,17 +83,19 @@ class SpectralBounds:
         if self.count == 1:
             return where, c
         # Few numbers: loops over them take less time than calls of NumPy.
-        for at, low, high in zip(mu.tolist(), self.lower.tolist(), self.upper.tolist(), strict=True):
-            place = min(max((at - low) / max(high - low, TINY), 0.0), 1.0) * (self.count - 1)
+        for value, low, high in zip(mu.tolist(), self.lower.tolist(), self.upper.tolist(), strict=True):
+            width = max(high - low, np.finfo(float).tiny)  # a box may be flat
+            place = min(max((value - low) / width, 0.0), 1.0) * (self.count - 1)
             first = min(int(place), self.count - 2)
             where = [k * self.count + first + end for k in where for end in (0, 1)]
-            c = [weight * share for weight in c for share in (first + 1.0 - place, place - first)]
+            c = [weight * factor for weight in c for factor in (first + 1.0 - place, place - first)]
         return where, c
 
 
 def anchors(box: ParameterBox) -> tuple[Array, int]:
     """The grid of anchors (P×d), and its points per direction."""
-    fitting = [count for count in range(2, MOST_PER_DIRECTION + 1) if count**box.dim <= ANCHORS]
+    # each anchor costs two eigenvalue problems of mesh size, and more than 9 points make δ no smaller than round-off
+    fitting = [count for count in range(2, 10) if count**box.dim <= 81]
     if not fitting:
         return 0.5 * (box.lower + box.upper)[None, :], 1
     return box.grid(*[fitting[-1]] * box.dim), fitting[-1]
@@ -114,14 +106,15 @@ def spectral_bounds(
 ) -> SpectralBounds:
     """Bounds from the first terms A_q (n×n) of A, coefficients θ (Q,) of all as a function of mu, and η of these."""
     points, count = anchors(problem.parameters)
-    found: dict[bytes, tuple[Constant, Constant]] = {}  # A often depends on a few of the parameters alone
+    # A often depends on a few of the parameters alone: the same matrix at many anchors
+    by_matrix: dict[bytes, tuple[Constant, Constant]] = {}
     constants = []
     for mu in points:
         A = checked_assembly(problem, mu).A
         key = digest(A)
-        if key not in found:
-            found[key] = coercivity_and_continuity(A, X)
-        constants.append(found[key])
+        if key not in by_matrix:
+            by_matrix[key] = coercivity_and_continuity(A, X)
+        constants.append(by_matrix[key])
     norms, coefficients = [operator_norm(term, X) for term in terms], np.column_stack([theta(mu) for mu in points])
     return SpectralBounds(
         lower=problem.parameters.lower,
@@ -161,7 +154,7 @@ def combined(terms: Sequence[SparseMatrix], theta: Array) -> list[SparseMatrix]:
 
 
 def leading_terms(theta: Array) -> int:
-    """How many of the rotated terms are more than `LEFT_OUT` of the variation of A over samples θ (Q×P)."""
+    """Number of rotated terms that are more than 1e-4 of the variation of A over samples θ (Q×P)."""
     varying = np.linalg.norm(theta - theta.mean(axis=1, keepdims=True), axis=0).max()
     rest = np.sqrt(np.cumsum((theta**2)[::-1], axis=0)[::-1].max(axis=1))  # of this term and those after it
-    return int(np.count_nonzero(rest > LEFT_OUT * varying))
+    return int(np.count_nonzero(rest > 1e-4 * varying))

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import exact, space, spd
 
+from vibench import create
 from vibench.errors import UnsupportedError
 from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.parameters import ParameterBox
@@ -21,7 +22,6 @@ from vibench.interfaces.strategies import Enrichment, Kind
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import affine_decomposition
 from vibench.model.bound_terms import BoundNote
-from vibench.model.certificates import base as base_module
 from vibench.model.certificates import bounds as bounds_module
 from vibench.model.certificates import contact_correction
 from vibench.model.certificates.base import CertificateBase, Guarantee, certificate_base, unsupported
@@ -30,6 +30,8 @@ from vibench.model.certificates.prepared_correction import prepare_corrections
 from vibench.model.certificates.residual import ColumnBlock, residual_basis
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
+from vibench.offline.sweep import high_fidelity_sweep
+from vibench.qp.exact import exact_solution
 
 N, M = 14, 5
 CONTACT = np.arange(3, 11)
@@ -274,7 +276,7 @@ def test_what_equalities_may_miss_enters_where_the_derivation_says(
     assert pair is not None
     assert other is not None
     spectral, at = certificate.base.spectral, certificate.base.coefficients(reduced.evaluated.samples)
-    lower, upper = (1.0, 1.0) if spectral is None else spectral.at(mu, at["A"])
+    lower, upper = (1.0, 1.0) if spectral is None else spectral.evaluate(mu, at["A"])
     added = bound.lambda_natural**2 - before.lambda_natural**2
     assert bound.lambda_natural < bound.omega + bound.u_energy  # the other bound of the two
     assert added == pytest.approx(2.0 * before.rho * np.sqrt(lower) * eta, rel=1e-6)
@@ -574,7 +576,7 @@ def test_problems_that_cannot_be_certified_say_why() -> None:
 
 
 def test_verification_parameters_are_none_of_the_training_set() -> None:
-    mus = BOX.sample(base_module.VERIFICATION, base_module.SEED)
+    mus = BOX.sample(16, 21)
     assert not any(np.allclose(mu, other) for mu in mus for other in Family("constant").training_set())
 
 
@@ -598,3 +600,33 @@ def test_what_is_interpolated_from_listed_parameters_alone_is_not_certified() ->
         problem.parameters = replace(BOX, listed=training)
         assert word in unsupported(problem, members)
         assert bool(unsupported(problem, members)) == bool(word)
+
+
+@pytest.mark.parametrize("name", ["hertz", "moving"])
+def test_a_query_with_bounds_and_a_correction_evaluates_the_constraint_once(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The assembly of "moving" projects it, that of Hertz takes less, and certificate and correction share one."""
+    if name == "moving":
+        problem, model, certificate = prepared("interpolated")
+    else:
+        problem = create("problem", "hertz", {"resolution": 300})
+        training = problem.parameters.grid(*[2] * problem.parameters.dim)
+        snapshots = high_fidelity_sweep(problem, training)
+        members = affine_decomposition(problem, training, 1e-6)
+        basis = problem.V.orthonormalise(snapshots.u)
+        chi = snapshots.lam[:, :3] / problem.W.norm(snapshots.lam[:, :3])
+        span = problem.W.orthonormalise(chi)
+        whole = ReducedModel(problem, basis, Enrichment(Kind.NONE), chi, span)
+        model = HyperReducedModel(whole, hyper_reduce(whole, members))
+        certificate = prepare(model, members, certificate_base(problem, members, training), training)
+    mu, evaluated, contact = problem.parameters.sample(1, 3)[0], list[float](), problem.contact
+    monkeypatch.setattr(problem, "contact", lambda at: evaluated.append(1.0) or contact(at))
+    reduced = model.assemble(mu)
+    assert len(evaluated) == (name == "moving")
+    solution = exact_solution(reduced.program)
+    assert solution is not None
+    bound, pair = certificate.certify(problem, mu, reduced, solution.x, solution.alpha)
+    assert bound.u_energy < np.inf
+    assert pair is not None
+    assert len(evaluated) == 1

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from cachetools import LRUCache
 from numerics import Tied, Varying
 
 from vibench import Array, create, project_on_cone
@@ -13,7 +14,6 @@ from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySo
 from vibench.interfaces.problem import Contact, Problem, VariationalInequality
 from vibench.interfaces.validation import ReferenceAssembly
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.model.certificates import greedy as contact_estimates
 from vibench.model.certificates.greedy import GreedyTrainer, IncrementalModel
 from vibench.reduction import subtract_cone_component
 
@@ -91,9 +91,9 @@ def test_estimates_are_bounds_where_no_stiffness_and_no_load_vary_unless_round_o
         model.add(vi, solver.solve_assembled(mu, vi))
     assert model._estimates is not None
     unseen = problem.parameters.sample(20, 2)
-    cheap, is_bound = [model.bound(mu) for mu in unseen], [model._estimates.at(mu).is_bound for mu in unseen]
+    cheap, is_bound = [model.bound(mu) for mu in unseen], [model._estimates.estimate(mu).is_bound for mu in unseen]
     assert np.mean(is_bound) > 0.8
-    assert not any(model._estimates.at(mu).is_bound for mu in solved)
+    assert not any(model._estimates.estimate(mu).is_bound for mu in solved)
     assert all(model.bound(mu) < 1e-5 for mu in solved)
     model._estimates.may_be_bounds, model._last = False, None
     np.testing.assert_allclose(cheap, [model.bound(mu) for mu in unseen], rtol=1e-6)
@@ -148,9 +148,8 @@ def test_a_solution_starts_from_what_a_bound_has_left_only_at_its_parameter(rewr
 
 
 @pytest.mark.parametrize("kept", [1000, 2])
-def test_what_is_kept_of_a_candidate_changes_no_estimate(monkeypatch: pytest.MonkeyPatch, kept: int) -> None:
+def test_what_is_kept_of_a_candidate_changes_no_estimate(kept: int) -> None:
     """Estimates of a model that grows under its candidates are those of one that sees them for the first time."""
-    monkeypatch.setattr(contact_estimates, "KEPT", kept)
     problem = create("problem", "obstacle", {"resolution": 160})
     solver, candidates = HighFidelitySolver(problem), problem.parameters.sample(6, 4)
     growing, solved = IncrementalModel(problem, solver), list[tuple[VariationalInequality, HighFidelitySolution]]()
@@ -158,6 +157,9 @@ def test_what_is_kept_of_a_candidate_changes_no_estimate(monkeypatch: pytest.Mon
         vi = problem.assemble(mu).copy()
         solved.append((vi, solver.solve(mu)))
         growing.add(*solved[-1])
+        if len(solved) == 1:
+            assert growing._estimates is not None
+            growing._estimates._projected = LRUCache(kept)
         fresh = IncrementalModel(problem, solver)
         for one in solved:
             fresh.add(*one)

@@ -53,29 +53,28 @@ def test_what_is_left_out_is_small_beside_what_else_enters_the_bound() -> None:
     assert len(loose.kept) < len(TRUNCATED.kept) <= 60
 
 
-def test_few_directions_are_enough_for_many_terms(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(residual, "FEW", 5)
-    found, U = residual_basis(WHITENED, SAMPLES, 1.0)
-    assert len(found.factor) < len(found.kept)
+def test_few_directions_are_enough_for_many_terms() -> None:
+    """More than 1,000 terms, of which a randomised method finds the directions."""
+    terms = X.whiten_functional(rng.standard_normal((40, 40)) * 0.5 ** np.arange(40) @ rng.standard_normal((40, 1100)))
+    samples = rng.standard_normal((1100, 30))
+    found, U = residual_basis([ColumnBlock(terms)], samples, 1.0)
+    assert len(found.factor) < 40 < len(found.kept)
     assert found.remainder > 0.0
     np.testing.assert_allclose(U.T @ U, np.eye(U.shape[1]), atol=1e-12)
-    for z in SAMPLES.T:
-        assert exact(z) * (1.0 - 1e-12) <= found.norm(z)
+    for z in samples.T:
+        assert np.linalg.norm(terms @ z) * (1.0 - 1e-12) <= found.norm(z)
 
 
-def test_a_random_range_leaves_what_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(residual, "BLOCK", 6)
+def test_a_random_range_leaves_what_it_says() -> None:
     S = np.linalg.qr(rng.standard_normal((50, 50)))[0] * 0.5 ** np.arange(50) @ rng.standard_normal((50, 80))
-    found = residual._random_range(S, np.ones(S.shape[1]), 1e-3)
+    found = residual._random_range(S, np.ones(S.shape[1]), 1e-3, limit=900, block=6)
     assert found is not None
     Q, small, rest = found
     np.testing.assert_allclose(Q.T @ Q, np.eye(Q.shape[1]), atol=1e-12)
     assert np.linalg.norm(S - Q @ small) == pytest.approx(rest, rel=1e-6)
     assert rest <= 0.5e-3
     assert Q.shape[1] < 40
-    monkeypatch.setattr(residual, "MOST", 12)
-    monkeypatch.setattr(residual, "OVERSAMPLING", 0)
-    assert residual._random_range(S, np.ones(S.shape[1]), 1e-3) is None
+    assert residual._random_range(S, np.ones(S.shape[1]), 1e-3, limit=12, block=6) is None
 
 
 def test_rows_that_few_terms_enter_are_made_fewer() -> None:
