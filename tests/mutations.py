@@ -676,7 +676,7 @@ FAULTS = (
     ),
     Fault(
         "means-over-whatever-is-ok",
-        "vibench/report/common_queries.py",
+        "vibench/report/figures/data.py",
         "common = by.index[by == len(kept)]",
         "common = by.index",
         ("tests/unit/report/test_common_queries.py",),

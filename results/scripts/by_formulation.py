@@ -14,8 +14,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from page import SECONDS, Page, made_by, origin, read, start
 
-from vibench.report.figures.looks import Looks, Series
-from vibench.report.figures.style import Sheet, scatter, styled
+from vibench.report.figures.style import Looks, Series, Sheet, scatter, styled
 from vibench.results import formats
 
 ROUND_OFF = 1e-10

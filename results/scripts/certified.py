@@ -12,8 +12,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from page import SECONDS, Page, made_by, origin, read, start
 
-from vibench.report.figures.looks import look_of
-from vibench.report.figures.style import Sheet, scatter, styled
+from vibench.report.figures.style import Sheet, look_of, scatter, styled
 from vibench.results import ranking
 from vibench.study.cells import CERTIFIED, FEASIBLE, UNCORRECTED
 from vibench.study.parameter_sets import OWN

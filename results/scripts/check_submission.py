@@ -19,7 +19,7 @@ from page import start
 from vibench.errors import VibenchError
 from vibench.provenance import PROTOCOL
 from vibench.qp.status import Status
-from vibench.report.comparison.runs import ComparedRun
+from vibench.report.differences import ComparedRun
 from vibench.results import consistency
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE

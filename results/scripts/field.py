@@ -18,8 +18,7 @@ from matplotlib.figure import Figure
 from page import SECONDS, Page, made_by, origin, read, start
 
 from vibench.report.figures.data import label
-from vibench.report.figures.looks import MARKERS, Looks, Series, look_of
-from vibench.report.figures.style import Sheet, plot, styled
+from vibench.report.figures.style import MARKERS, Looks, Series, Sheet, look_of, plot, styled
 
 SHARES = (0.3, 0.5, 0.7, 0.9)
 REFERENCE = "mcpg"

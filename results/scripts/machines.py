@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 from page import Page, origin, protocols, start
 
-from vibench.report.comparison.differences import agreement
+from vibench.report.differences import agreement
 from vibench.results.break_even import HIGH_FIDELITY
 
 BOTH = ["cell_a", "cell_b"]

@@ -16,8 +16,8 @@ from typing import Any
 import pandas as pd
 from page import start
 
-from vibench.report.site.citation import Citation
-from vibench.report.site.publish import publish
+from vibench.report.citation import Citation
+from vibench.report.site import publish
 from vibench.results.database import ResultsDatabase
 from vibench.results.schema import STORED, TEXT
 from vibench.results.sqlite import FILE

@@ -25,7 +25,7 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.plugins import registry
 from vibench.qp.verification import QPSolution
 from vibench.report import html
-from vibench.report.figures import dimension, problems
+from vibench.report.figures import dimension, problem_tables
 from vibench.report.figures.style import styled, write_figure
 from vibench.results import formats, pictures
 from vibench.results.database import ResultsDatabase
@@ -107,7 +107,7 @@ def page(path: Path) -> str:
 def drawn(path: Path) -> str:
     """One of the figures, which has labels everywhere."""
     stream = io.BytesIO()
-    (data,) = [data for _, data in problems(path)]
+    (data,) = [data for _, data in problem_tables(path)]
     with styled():
         (figure,) = dimension(data)
         write_figure(figure, stream, "svg")

@@ -16,7 +16,7 @@ from samples import write_study
 
 from vibench.errors import RequestError
 from vibench.execution import run  # noqa: F401  lists the classes of all stages
-from vibench.report.comparison.compare import compare
+from vibench.report.comparison import compare
 from vibench.results.database import ResultsDatabase
 from vibench.results.read import results_file
 from vibench.results.schema import STORED

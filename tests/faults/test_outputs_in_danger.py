@@ -17,7 +17,7 @@ from sample_run import write_sample_run
 from samples import wire_study, write_study
 
 from vibench.library.runs import Run
-from vibench.report.site import folder
+from vibench.report import site as folder
 from vibench.results.sqlite import FILE
 
 KILLS = 2

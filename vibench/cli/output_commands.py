@@ -107,8 +107,8 @@ def publish_runs(
     Links are relative: the site can be opened from a disk and served by any host of static files. Paths, your name and
     that of the host are taken out; the command lists what could still identify somebody, and asks.
     """
-    from vibench.report.site.citation import Citation
-    from vibench.report.site.publish import publish
+    from vibench.report.citation import Citation
+    from vibench.report.site import publish
     from vibench.results.read import results_file
 
     if not title.strip():

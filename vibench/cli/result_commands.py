@@ -16,7 +16,7 @@ from vibench.errors import RequestError
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vibench.report.comparison.compare import Comparison
+    from vibench.report.comparison import Comparison
 
 EXAMPLE = "solver = 'piqp' and beta_span_min < 1e-3"
 """Condition in the help of `--where`."""
@@ -129,7 +129,7 @@ def compare_runs(
 
     Numbers are compared with the first run, seconds with the first run of the same machine.
     """
-    from vibench.report.comparison.compare import compare
+    from vibench.report.comparison import compare
     from vibench.results import formats
     from vibench.results.read import results_file, whole_numbers
 
@@ -198,7 +198,7 @@ def _print_changes(compared: Comparison, limit: float) -> None:
 
 def _print_overview(compared: Comparison) -> None:
     """Print the runs, and how many cells moved by column."""
-    from vibench.report.comparison.differences import ChangeKind
+    from vibench.report.differences import ChangeKind
 
     print_frame(compared.by_run, "runs", PRIORITY, every=True, rest=REST)
     echo("")
@@ -231,7 +231,7 @@ def _pair_columns(compared: Comparison) -> list[str]:
 
 def _by_weight(changes: pd.DataFrame) -> pd.DataFrame:
     """The worst changes first: by verdict, then by how far the ratio is from 1."""
-    from vibench.report.comparison.differences import MOVED
+    from vibench.report.differences import MOVED
 
     order = changes["verdict"].map([verdict.value for verdict in MOVED].index)
     far = changes["ratio"].map(lambda ratio: max(ratio, 1.0 / ratio) if ratio > 0.0 else 1.0)

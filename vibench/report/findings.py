@@ -15,15 +15,20 @@ import pandas as pd
 from vibench.interfaces.strategies import Kind
 from vibench.model.errors import UNMEASURABLE
 from vibench.qp.status import Status
-from vibench.report.common_queries import FEWEST, MEANS, WAY, Comparable, common_programs, on_common_queries
 from vibench.report.figures.data import (
+    FEWEST,
+    MEANS,
     PRIMAL,
     TABLES,
+    WAY,
+    Comparable,
     ProblemTables,
     best_solver,
     by_dimensions,
+    common_programs,
     label,
     label_of,
+    on_common_queries,
     problem_tables,
     whole,
 )

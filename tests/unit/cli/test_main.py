@@ -22,7 +22,7 @@ from vibench.plugins.kinds import DUAL, PROBLEM
 from vibench.plugins.registry import find, registered
 from vibench.qp.settings import SETTINGS
 from vibench.qp.status import Status
-from vibench.report.comparison.differences import ChangeKind
+from vibench.report.differences import ChangeKind
 from vibench.results.break_even import Meaning
 from vibench.results.ranking import ADDED
 from vibench.results.read import read_table

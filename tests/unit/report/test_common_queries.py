@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import query_rows
 
-from vibench.report.common_queries import FEWEST, PROGRAM, common_programs, on_common_queries
+from vibench.report.figures.data import FEWEST, PROGRAM, common_programs, on_common_queries
 
 QUERIES = 6
 solved_by_cell = st.lists(st.sets(st.integers(0, QUERIES - 1)), min_size=1, max_size=5)

@@ -13,9 +13,8 @@ from running import DECIDED, Changed, Main, refused
 from vibench.cli.result_commands import compare_runs
 from vibench.errors import RequestError
 from vibench.provenance import PROTOCOL
-from vibench.report.comparison.compare import compare
-from vibench.report.comparison.differences import ChangeKind, agreement
-from vibench.report.comparison.runs import run_names
+from vibench.report.comparison import compare
+from vibench.report.differences import ChangeKind, agreement, run_names
 from vibench.results.sqlite import FILE
 
 STEADY = (

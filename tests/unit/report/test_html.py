@@ -15,7 +15,7 @@ from running import Changed, Main
 from vibench.report import html
 from vibench.report.figures.data import problem_tables
 from vibench.report.findings import MOST, findings
-from vibench.report.page.grids import FIRST
+from vibench.report.html import FIRST
 from vibench.results.ranking import leaderboard
 from vibench.results.read import in_order, read_table
 from vibench.results.schema import CELLS, TABLES

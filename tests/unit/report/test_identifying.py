@@ -13,9 +13,9 @@ from packs import write_cable
 from running import Main, Shared, execute, refused, rows
 from samples import toml
 
-from vibench.report.site import identifying
-from vibench.report.site.citation import Citation, requirements
-from vibench.report.site.publish import publish
+from vibench.report import identifying
+from vibench.report.citation import Citation, requirements
+from vibench.report.site import publish
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
 

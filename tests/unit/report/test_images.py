@@ -8,7 +8,7 @@ from pathlib import Path
 from vibench.report.figures import OF_DUAL, OF_HISTORIES, OF_PROBLEM, drawings, processes, render
 from vibench.report.figures.data import problem_tables
 from vibench.report.html import tasks_of
-from vibench.report.page.images import image_of
+from vibench.report.plots import image_of
 from vibench.results.sqlite import FILE
 
 

@@ -17,10 +17,9 @@ from selenium.webdriver import Chrome
 
 from vibench.errors import RequestError
 from vibench.report import html
-from vibench.report.site import folder
-from vibench.report.site.citation import Citation, requirements
-from vibench.report.site.publish import publish
-from vibench.report.site.published_run import folder_names
+from vibench.report import site as folder
+from vibench.report.citation import Citation, requirements
+from vibench.report.site import folder_names, publish
 from vibench.results.paired_timing import PairedTiming
 from vibench.results.ranking import leaderboard
 from vibench.results.read import in_order, read_table

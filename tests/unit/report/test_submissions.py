@@ -15,8 +15,8 @@ import pandas as pd
 import pytest
 
 from vibench.provenance import PROTOCOL
-from vibench.report.site.citation import Citation
-from vibench.report.site.publish import publish
+from vibench.report.citation import Citation
+from vibench.report.site import publish
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
 

@@ -19,7 +19,7 @@ from vibench.offline.compiled import CompiledModel, compiler
 from vibench.offline.polynomials import InaccurateError
 from vibench.qp.status import Status
 from vibench.qp.verification import verify
-from vibench.report.common_queries import of_solvers
+from vibench.report.figures.data import of_solvers
 from vibench.stages.compilation import CompiledQuery
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")

@@ -23,10 +23,9 @@ from vibench.errors import RequestError, unknown_name
 from vibench.files import TEMPORARY, read_regular, write_atomically
 from vibench.report.figures.constants import inf_sup, shares
 from vibench.report.figures.convergence import diagnostics, enrichment, orthogonality, projection_errors
-from vibench.report.figures.costs import break_even, dimension, outputs, total_cost, work_precision
+from vibench.report.figures.costs import break_even, dimension, outputs, precision, solvers, total_cost, work_precision
 from vibench.report.figures.data import Extent, ProblemTables, file_names, problem_tables
 from vibench.report.figures.solutions import solutions
-from vibench.report.figures.solvers import precision, solvers
 from vibench.report.figures.style import FORMATS, WRITTEN, Pages, caption_of, save, styled
 from vibench.text import json_object
 

@@ -22,13 +22,16 @@ from vibench.report.figures.data import (
     some,
     titled_parts,
 )
-from vibench.report.figures.looks import HIGH_FIDELITY_LOOK, Look, Looks, Series
 from vibench.report.figures.style import (
     ABREAST,
     DEEP,
+    HIGH_FIDELITY_LOOK,
     SERIES,
     Layout,
+    Look,
+    Looks,
     Pages,
+    Series,
     Sheet,
     counted,
     plot,

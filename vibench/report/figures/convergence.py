@@ -23,8 +23,19 @@ from vibench.report.figures.data import (
     some,
     titled_parts,
 )
-from vibench.report.figures.looks import Looks, Series
-from vibench.report.figures.style import DEEP, SERIES, CaptionedFigure, Pages, Sheet, counted, plot, positive, scatter
+from vibench.report.figures.style import (
+    DEEP,
+    SERIES,
+    CaptionedFigure,
+    Looks,
+    Pages,
+    Series,
+    Sheet,
+    counted,
+    plot,
+    positive,
+    scatter,
+)
 
 ROUND_OFF = 1e-12
 """The tail of a POD below this is round-off."""

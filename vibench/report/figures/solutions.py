@@ -13,8 +13,7 @@ from matplotlib.tri import Triangulation
 from vibench.arrays import Array
 from vibench.interfaces.pictures import Picture
 from vibench.report.figures.data import ProblemTables
-from vibench.report.figures.looks import BLACK, COLOURS
-from vibench.report.figures.style import ABREAST, CaptionedFigure, Layout, Pages, Sheet
+from vibench.report.figures.style import ABREAST, BLACK, COLOURS, CaptionedFigure, Layout, Pages, Sheet
 
 Limits = tuple[float, float]
 """Range of the values of a field."""

@@ -13,19 +13,21 @@ import numpy as np
 import pandas as pd
 
 from vibench.errors import RequestError, unknown_name
-from vibench.report.comparison.differences import (
+from vibench.report.differences import (
+    AXES,
     ERRORS,
     MOVED,
     UNKNOWN,
     WHATS,
     Agreement,
     ChangeKind,
+    ComparedRun,
     Difference,
     agreement,
+    compared_runs,
     of_numbers,
     of_seconds,
 )
-from vibench.report.comparison.runs import AXES, ComparedRun, compared_runs
 from vibench.results import formats
 from vibench.results.break_even import FEWEST_ROUNDS
 from vibench.results.schema import CELLS

@@ -1,0 +1,397 @@
+"""A static site of some runs: pages and data with relative links, for any host of files and for none."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shlex
+import sqlite3
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from vibench.errors import RequestError
+from vibench.files import PART, TEMPORARY
+from vibench.interfaces.formulations import MIXED
+from vibench.plugins.kinds import STUDY
+from vibench.plugins.registry import registered
+from vibench.provenance import distribution_version
+from vibench.report import html
+from vibench.report.citation import Citation, requirements
+from vibench.report.comparison import Comparison, compare
+from vibench.report.differences import ComparedRun, compared_runs
+from vibench.report.figures.data import way
+from vibench.report.identifying import cleaned, left
+from vibench.results import formats
+from vibench.results.formats import asked, cell_text, solver_text
+from vibench.results.paired_timing import PairedTiming
+from vibench.results.ranking import Criterion, Standings, leaderboard
+from vibench.results.read import in_order, read_table, whole_numbers
+from vibench.results.sqlite import FILE, open_read_only
+from vibench.text import parsed_json
+
+CATALOGUE = "vibench-site.json"
+"""File of a site that lists its files with their digests: what a later `vibench publish` may replace."""
+
+FIRST_PAGE = "index.html"
+
+
+def check(site: Path) -> None:
+    """Refuse a folder that a site cannot be written into.
+
+    Raises a `RequestError` if it is a file, or holds files and is no site, or its list of files cannot be read.
+    """
+    if site.is_dir():
+        if any(site.iterdir()):
+            _written(site)
+    elif site.exists() or site.is_symlink():
+        raise RequestError(f"'{site}' is not a folder; choose another for the site")
+
+
+def write(site: Path, fill: Callable[[Path], None]) -> None:
+    """Write a site: a new one appears whole, the files of an earlier one are replaced one by one, its first page last.
+
+    The folder is new, empty, or written by this function; `fill` writes the files into one that it is given.
+
+    Raises a `RequestError` if the folder holds files of others under names of the site, or cannot be written; nothing
+    is changed then.
+    """
+    check(site)
+    try:
+        site.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=site.parent, prefix=TEMPORARY, suffix=PART) as scratch:
+            new = Path(scratch) / "site"
+            new.mkdir()
+            fill(new)
+            files = _digests(new)
+            _write_catalogue(new, {name: [digest] for name, digest in files.items()})
+            if site.is_dir() and any(site.iterdir()):
+                _replace_files(site, new, files)
+            else:
+                new.replace(site)
+    except (OSError, sqlite3.Error) as error:
+        why = getattr(error, "strerror", None) or error
+        raise RequestError(f"'{site}' cannot be written: {why}") from None
+
+
+def _replace_files(site: Path, new: Path, files: Mapping[str, str]) -> None:
+    """Replace the files of a site, remove those it has no more, and keep all others."""
+    before = _written(site)
+    for name in (*files, *before):
+        _refuse_links(site, name)
+    for name in files:
+        if (site / name).exists() and _digest(site / name) not in (*before.get(name, ()), files[name]):
+            raise RequestError(f"'{site / name}' was not written by vibench, or changed since; move it elsewhere")
+    # Whatever interrupts the next steps: all files that they have written by then are in the catalogue.
+    both = {name: [*before.get(name, ()), *([files[name]] if name in files else [])] for name in {**before, **files}}
+    _write_catalogue(new, both)
+    (new / CATALOGUE).replace(site / CATALOGUE)
+    for name in sorted(files, key=lambda name: name == FIRST_PAGE):
+        (site / name).parent.mkdir(parents=True, exist_ok=True)
+        (new / name).replace(site / name)
+    for name, digests in before.items():
+        if name not in files and (site / name).is_file() and _digest(site / name) in digests:
+            (site / name).unlink()
+            _remove_empty(site, (site / name).parent)
+    _write_catalogue(new, {name: [digest] for name, digest in files.items()})
+    (new / CATALOGUE).replace(site / CATALOGUE)
+
+
+def _refuse_links(site: Path, name: str) -> None:
+    """Refuse names that lead out of the site, by themselves or through links."""
+    parts = Path(name).parts
+    if not parts or ".." in parts or Path(name).is_absolute():
+        raise RequestError(f"'{site / CATALOGUE}' lists '{name}', which is not in the site; move the file elsewhere")
+    for depth in range(1, len(parts) + 1):
+        if site.joinpath(*parts[:depth]).is_symlink():
+            raise RequestError(f"'{site.joinpath(*parts[:depth])}' is a symbolic link; move it elsewhere")
+
+
+def _remove_empty(site: Path, folder: Path) -> None:
+    while folder != site and not any(folder.iterdir()):
+        folder.rmdir()
+        folder = folder.parent
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    return {path.relative_to(folder).as_posix(): _digest(path) for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+
+
+def _write_catalogue(folder: Path, files: Mapping[str, Sequence[str]]) -> None:
+    content = {"format": "vibench-site 1", "files": dict(sorted(files.items()))}
+    (folder / CATALOGUE).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _written(site: Path) -> dict[str, list[str]]:
+    """Files that vibench has written into a site, with the digests of what it wrote."""
+    catalogue = site / CATALOGUE
+    if not catalogue.is_file():
+        raise RequestError(f"'{site}' is not empty and was not written by `vibench publish`; choose another folder")
+    try:
+        files = parsed_json(catalogue.read_text(encoding="utf-8"))["files"]
+        return {str(name): [str(digest) for digest in digests] for name, digests in dict(files).items()}
+    except (OSError, ValueError, KeyError, TypeError):
+        raise RequestError(f"'{catalogue}' cannot be read as the list of the files of a site") from None
+
+
+FILTERED = ("study", "problem", "dual", "primal", "solver", "machine", "vibench")
+"""What the list of runs is filtered by."""
+
+SHOWN_CELLS = ("N", "R", "enrichment", "error_u_mean", "error_lambda_mean", "online_s", "offline_s")
+"""Columns of the cells on the page of a run, beside those that name a cell."""
+
+
+@dataclass(frozen=True, eq=False)
+class PublishedRun:
+    """A run and the folder of the site that is about it."""
+
+    run: ComparedRun
+    folder: str
+    """Name of its folder below `runs/`: letters, digits, "-", "_" and "." only."""
+    note: str = ""
+    """A remark on where the file comes from, "" where there is none."""
+
+    @cached_property
+    def values(self) -> dict[str, list[str]]:
+        """What the run is found by: all values that its cells have of each of `FILTERED`."""
+        axes = {
+            axis: sorted({str(row[axis]) for row in self.run.cells.values()})
+            for axis in ("problem", "dual", "primal", "solver")
+        }
+        versions = self.run.versions.get("vibench", "")
+        study = str(self.run.identity["study"])
+        return {"study": [study], **axes, "machine": self.run.machines, "vibench": versions.split(", ")}
+
+    @property
+    def code(self) -> str:
+        """Hashes of the code of its cells."""
+        return ", ".join(sorted({str(row["code"]) for row in self.run.cells.values() if row["code"]}))
+
+    @property
+    def facts(self) -> Iterator[tuple[str, str]]:
+        """Where the numbers come from."""
+        rows = self.run.cells.values()
+        yield "study", "{study}, seed {seed}, validation parameters: {validation}".format(**self.run.identity)
+        for axis in ("problem", "dual", "primal", "solver"):
+            yield axis, ", ".join(self.values[axis])
+        counts = pd.Series([row["status"] for row in rows], dtype=object).value_counts()
+        yield "cells", f"{len(rows)}: " + ", ".join(f"{count} {status}" for status, count in counts.items())
+        yield "machine", "; ".join(self.run.machines)
+        disturbed = sum(row["disturbed"] == 1 for row in rows)
+        yield (
+            "seconds",
+            f"CPU seconds on one thread; {disturbed} of {len(rows)} cells were timed on a disturbed machine",
+        )
+        yield "versions", ", ".join(f"{name} {text}" for name, text in self.run.versions.items() if text)
+        yield "code", self.code
+        yield "study file", ", ".join(sorted({str(row["study_hash"]) for row in rows if row["study_hash"]}))
+        if self.note:
+            yield "note", self.note
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """The same for programs."""
+        return {
+            **self.run.identity,
+            "cells": len(self.run.cells),
+            "ok": self.run.ok,
+            "machines": self.run.machines,
+            "versions": self.run.versions,
+            "code": self.code.split(", "),
+            "values": self.values,
+            "note": self.note,
+        }
+
+    @property
+    def commands(self) -> list[tuple[str, str]]:
+        """Commands on the run as a whole, and what they do; they are meant for the folder of the results file."""
+        study = str(self.run.identity["study"])
+        commands = [("pip install -r requirements.txt", "the versions that computed it")]
+        if study in registered(STUDY):
+            commands.append((f"vibench run {shlex.quote(study)}", "the whole study, on your machine"))
+        commands.append((f"vibench compare {FILE} YOUR-RUN", "your run beside this one"))
+        return commands
+
+    def cells(self) -> list[dict[str, Any]]:
+        """The cells of the run with the command that makes each of them again, in the order of the axes."""
+        return [
+            {
+                "key": key,
+                "axes": [
+                    str(row["problem"]), str(row["dual"]), f"{_formulation(row)}{row['primal']}{_tolerance(row)}",
+                    f"{asked(row, 'pod')}, {asked(row, 'dual')}", solver_text(row),
+                    way(row["assembly"], row["correction"]) or "full",
+                ],
+                "status": str(row["status"]),
+                "numbers": [cell_text(row[name]) for name in SHOWN_CELLS],
+                "command": f"vibench run {FILE} --cell {shlex.quote(key)} --out again",
+            }
+            for key, row in self.run.cells.items()
+        ]  # fmt: skip
+
+
+def _formulation(row: Mapping[str, Any]) -> str:
+    return "" if row["formulation"] == MIXED else f"{row['formulation']}: "
+
+
+def _tolerance(row: Mapping[str, Any]) -> str:
+    return "" if pd.isna(row["primal_tol"]) else f" {row['primal_tol']:g}"
+
+
+def folder_names(names: Sequence[str]) -> list[str]:
+    """Names of folders for runs of these names: what a link needs no escapes for, all different in any case."""
+    folders: list[str] = []
+    for name in names:
+        plain = re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "run"
+        taken = {other.lower() for other in folders}
+        same = (plain if k == 1 else f"{plain}-{k}" for k in range(1, len(names) + 2))
+        folders.append(next(one for one in same if one.lower() not in taken))
+    return folders
+
+
+TABLES = ("cells", "thresholds", "disagreements")
+"""Tables that are published as CSV, too; all of them are in the results file."""
+
+LIMIT = 1.25
+"""Factor of the comparisons on a site."""
+
+MOST_CHANGES = 500
+"""Changes that a page lists; the CSV beside it has all."""
+
+
+def publish(
+    paths: Sequence[Path],
+    site: Path,
+    citation: Citation,
+    notes: Mapping[Path, str] | None = None,
+    *,
+    figures: bool = True,
+    ask: Callable[[Iterator[str]], None] = lambda _: None,
+) -> Path:
+    """Write the site of some results files; the same files give the same site.
+
+    The folder is new, empty, or one that was written by this function, whose files are replaced. Notes are remarks on
+    results files, which stand on the pages of their runs; with `figures` reports have pictures. Paths, the user's name
+    and that of the host are taken out; `ask` gets lines on what could still identify somebody, before anything is
+    written.
+
+    Returns the first page. Raises a `RequestError` if a results file cannot be read, or the folder holds files of
+    others or cannot be written.
+    """
+    check(site)
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as scratch:
+        copies = [Path(scratch, name, FILE) for name in _names(paths)]
+        for path, copy in zip(paths, copies, strict=True):
+            cleaned(path, copy)
+        runs = compared_runs(copies)
+        names = [run.name for run in runs]
+        ask(left(copies, names, citation.authors))
+        published = [
+            PublishedRun(run, own, (notes or {}).get(path, ""))
+            for run, path, own in zip(runs, paths, folder_names(names), strict=True)
+        ]
+        write(site, lambda new: _fill(new, published, citation, figures=figures))
+    return site / FIRST_PAGE
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Names of runs, all different: the last folder or the file, without the folders before it, which could tell."""
+    names: list[str] = []
+    for path in paths:
+        name = path.absolute().parent.name if path.name == FILE else path.stem
+        count = 1 + sum(one.rpartition(" (")[0] == name or one == name for one in names)
+        names.append(name if count == 1 else f"{name} ({count})")
+    return names
+
+
+def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation, *, figures: bool) -> None:
+    """Write all files of the site."""
+    pages = _Pages(citation)
+    comparisons = {study: compare([run.run.path for run in group], LIMIT) for study, group in _comparable(runs)}
+    for run in runs:
+        _write_run(site / "runs" / run.folder, run, pages, figures)
+    links = {run.run.name: f"runs/{run.folder}/index.html" for run in runs}
+    pages.write(site / "leaderboard.html", "leaderboard", "", boards=list(_boards(runs)), links=links, way=html.way)
+    sections = [_section(site, number, *item) for number, item in enumerate(comparisons.items(), start=1)]
+    pages.write(site / "comparison.html", "comparison", "", sections=sections, limit=LIMIT)
+    filters = {name: sorted({value for run in runs for value in run.values[name]}) for name in FILTERED}
+    pages.write(site / FIRST_PAGE, "index", "", runs=runs, filters=filters)
+    _write(site / "CITATION.cff", citation.cff())
+    _write(site / "citation.bib", citation.bibtex())
+
+
+def _write_run(own: Path, run: PublishedRun, pages: _Pages, figures: bool) -> None:
+    """Write the folder of one run: its page and report, its data, and what installs its versions."""
+    (own / "tables").mkdir(parents=True)
+    with open_read_only(run.run.path) as db:
+        db.execute("VACUUM INTO ?", (str((own / FILE).absolute()),))
+    _write(own / "report.html", html.page(run.run.path, figures=figures))
+    for name in TABLES:
+        rows = whole_numbers(in_order(read_table(run.run.path, name)))
+        _write(own / "tables" / f"{name}.csv", formats.to_csv(rows))
+    _write(own / "requirements.txt", requirements(run.run.versions, run.code))
+    _write(own / "provenance.json", json.dumps(run.provenance, indent=1, ensure_ascii=True, sort_keys=True) + "\n")
+    pages.write(own / "index.html", "run", "../../", run=run, cells=run.cells(), columns=SHOWN_CELLS, tables=TABLES)
+
+
+def _comparable(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, list[PublishedRun]]]:
+    """Runs that have cells in common with the first one of their study, by the study's name."""
+    by_study: dict[str, list[PublishedRun]] = {}
+    for run in runs:
+        by_study.setdefault(str(run.run.identity["study"]), []).append(run)
+    for study, group in by_study.items():
+        first = group[0].run.cells.keys()
+        comparable = [run for run in group if run.run.cells.keys() & first]
+        if len(comparable) > 1:
+            yield study, comparable
+
+
+def _boards(runs: Sequence[PublishedRun]) -> Iterator[tuple[PublishedRun, tuple[Standings, ...]]]:
+    """The leaderboard of every run: seconds of other runs may have come from a busier machine, or other parameters."""
+    for run in runs:
+        cells, timings = (read_table(run.run.path, name) for name in ("cells", "timings"))
+        yield run, leaderboard(in_order(cells), PairedTiming(timings.to_dict("records")))
+
+
+def _section(site: Path, number: int, study: str, comparison: Comparison) -> dict[str, Any]:
+    """What the page of comparisons says of the runs of one study; their changes are a file, too."""
+    file = f"comparison-{number}.csv"
+    _write(site / file, formats.to_csv(comparison.changes))
+    frames = {
+        "runs": comparison.by_run,
+        "cells by column": comparison.by_column,
+        "changes": comparison.changes.head(MOST_CHANGES),
+    }
+    return {"study": study, "file": file, "notes": comparison.notes, "count": len(comparison.changes), "tables": frames}
+
+
+def _write(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8", newline="\n")
+
+
+class _Pages:
+    """The templates, with what all pages show."""
+
+    def __init__(self, citation: Citation) -> None:
+        self._environment = html.environment("templates/site")
+        self._environment.filters["number"] = formats.cell_text
+        self._shared = {
+            "citation": citation,
+            "vibench": distribution_version("vibench"),
+            "criteria": list(Criterion),
+        }
+
+    def write(self, path: Path, name: str, root: str, **content: Any) -> None:
+        """Write a page of the template of that name; `root` leads from it to the folder of the site."""
+        template = self._environment.get_template(f"{name}.html.j2")
+        _write(path, template.render(**self._shared, **content, root=root, page=name))
