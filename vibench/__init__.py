@@ -16,10 +16,10 @@ _attached, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> object:
-    """A public name; of one that a submodule has, the error says which.
+    """A public name.
 
-    Raises an `ImportError` if a submodule has the name. `from vibench import NAME` would not show the message of an
-    `AttributeError`.
+    Raises an `ImportError` that names the submodule if a submodule has it: `from vibench import NAME` would not show
+    the message of an `AttributeError`.
     """
     if name not in __all__ and not name.startswith("_"):
         for group in GROUPS:

@@ -1,4 +1,4 @@
-"""The errors vibench raises on purpose; the command line turns them into one line and an exit code."""
+"""The errors that vibench raises on purpose; the command line turns them into one line and an exit code."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class StorageError(VibenchError):
 
 
 class ExecutorError(VibenchError):
-    """Whoever was to run stages is gone: a cluster that was shut down, a network that broke."""
+    """The executor of a run was lost: a cluster that was shut down, a network that broke."""
 
 
 class NumericalError(VibenchError):
-    """A computation cannot go on: a matrix that is not SPD, values that are not finite, no convergence."""
+    """A computation cannot continue: a matrix that is not SPD, values that are not finite, no convergence."""
 
 
 class UnsupportedError(VibenchError):
@@ -41,7 +41,7 @@ class UnsupportedError(VibenchError):
 
 
 def in_a_line(error: BaseException) -> str:
-    """The sort of an exception and its message, in one line of bounded length."""
+    """Type and message of an exception, in one line of bounded length."""
     return one_line(f"{type(error).__name__}: {_text_of(error)}")
 
 
@@ -62,21 +62,21 @@ T = TypeVar("T")
 
 
 def requested(function: Callable[P, T]) -> Callable[P, T]:
-    """A function that users of the library call: its arguments are checked against their annotations.
+    """Check the arguments of a public function against their annotations; nothing is converted.
 
-    Arguments that do not fit end in a `RequestError` that names the first of them, with what was given and what would
-    be right; nothing is converted. Arguments that the function does not have remain a `TypeError`, as Python's own.
+    An argument that does not fit raises a `RequestError` with its name, its value and the expected type. Arguments that
+    the function does not have remain a `TypeError`, as Python's own.
     """
     signature = inspect.signature(function)
 
     @functools.wraps(function)
-    def call(*given: P.args, **named: P.kwargs) -> T:
-        for name, value in signature.bind(*given, **named).arguments.items():
+    def call(*arguments: P.args, **named: P.kwargs) -> T:
+        for name, value in signature.bind(*arguments, **named).arguments.items():
             if name != "self" and not _fits(function, name, value):
                 expected = str(signature.parameters[name].annotation)
                 shown = brief(repr(value), 80)
                 raise RequestError(f"{name} of {function.__qualname__} is {shown}, expected {expected}")
-        return function(*given, **named)
+        return function(*arguments, **named)
 
     return call
 
@@ -89,12 +89,12 @@ def _fits(function: Callable[..., Any], name: str, value: Any) -> bool:
         _adapters(function)[name].validate_python(value)
     except ValidationError:
         return False
-    return not (isinstance(value, str) and "\0" in value)  # of no path and no name
+    return not (isinstance(value, str) and "\0" in value)  # no path and no name holds this character
 
 
 @functools.cache
 def _adapters(function: Callable[..., Any]) -> dict[str, TypeAdapter[Any]]:
-    """What checks the arguments of a function, by name; instances of models are not made anew."""
+    """Validators of the arguments of a function, by name; an instance of a model passes as it is."""
     from pydantic import BaseModel, ConfigDict, InstanceOf, TypeAdapter  # noqa: PLC0415
 
     given = SimpleNamespace(__annotations__={k: v for k, v in function.__annotations__.items() if k != "return"})
@@ -108,16 +108,12 @@ def _adapters(function: Callable[..., Any]) -> dict[str, TypeAdapter[Any]]:
     }
 
 
-MANY = 30
-"""Names up to which an error lists all that are known."""
-
-
 def unknown_name(kind: str, name: str, choices: Iterable[str]) -> RequestError:
-    """Build the error for a name nobody registered, with the nearest of the choices suggested."""
+    """Error for a name that is not among the choices, which suggests the nearest of them."""
     choices = sorted(choices)
     near = difflib.get_close_matches(name, choices, n=5)
     hint = f"; did you mean '{near[0]}'?" if near else ""
-    if len(choices) > MANY:
+    if len(choices) > 30:  # a longer list helps nobody
         listed = f"{len(choices)} are known{', such as ' * bool(near[1:])}{', '.join(near[1:])}"
     else:
         listed = f"known: {', '.join(choices) or 'none'}"
@@ -125,15 +121,15 @@ def unknown_name(kind: str, name: str, choices: Iterable[str]) -> RequestError:
 
 
 def fault_line(fault: ValidationError, root: type[BaseModel], named: Collection[str] = ()) -> str:
-    """The key that is wrong in a file of a user, what is wrong, and what was found, from an error of pydantic.
+    """The first error of pydantic in a line: the key in a user's file, what was expected and what was found.
 
-    Of several errors the first one counts. `root` is the model of the whole file, `named` are the keys under which a
-    name stands for a table.
+    `root` is the model of the whole file, `named` are the keys where a name may replace a table.
     """
     error = fault.errors(include_url=False)[0]
     # The last part of an unexpected key's path is the key itself, whatever its first character.
     outer = error["loc"][:-1] if error["type"] == "extra_forbidden" else error["loc"]
-    where = [part for part in outer if isinstance(part, int) or not {*"<["} & {*part}]  # validators and types of unions
+    # Parts with brackets are validators and types of unions, no keys.
+    where = [part for part in outer if isinstance(part, int) or not {*"<["} & {*part}]
     message, shown = error["msg"].removeprefix("Value error, "), ""
     if isinstance(error["input"], str | int | float):
         shown = f" (found {error['input']!r:.80})"

@@ -1,4 +1,4 @@
-"""Files written whole or not at all, never through what others put in their place, and locks that name a holder."""
+"""Files that are written whole or not at all, never through a link in their place, and locks that name their holder."""
 
 from __future__ import annotations
 
@@ -15,20 +15,15 @@ from typing import TextIO
 
 from vibench.errors import RequestError
 
-TEMPORARY = "vibench-"
-"""How the names of temporary files begin; the rest is random."""
-
-PART = ".part"
-"""How they end."""
+TEMPORARY, PART = "vibench-", ".part"
+"""Prefix and suffix of the names of temporary files; what is between is random."""
 
 
 def write_atomically(path: Path, content: bytes | Iterable[bytes], *, durable: bool = False) -> None:
     """Write a file under a random name in the same folder and rename it; a link under its name is replaced.
 
-    Its content may come in parts, which are written one after the other.
-
-    Who may read it is decided by the user's mask, as of files that other programs write. `durable` content is on the
-    disk when the function returns.
+    The content may come in parts. Permissions follow the user's mask. `durable` content is on the disk when the
+    function returns.
 
     Raises an `OSError` if it cannot be written; nothing is left behind.
     """
@@ -48,7 +43,7 @@ def write_atomically(path: Path, content: bytes | Iterable[bytes], *, durable: b
 
 @contextlib.contextmanager
 def writing(target: Path) -> Iterator[None]:
-    """Block in which a file that cannot be written makes the request for `target` a wrong one."""
+    """Turn an `OSError` in the block into a `RequestError`: `target` cannot be written."""
     try:
         yield
     except OSError as error:
@@ -56,10 +51,11 @@ def writing(target: Path) -> Iterator[None]:
 
 
 def read_regular(path: Path) -> bytes:
-    """The content of a regular file. Of a pipe or a device, which somebody else has put there, there may be no end.
+    """The content of a regular file.
 
-    Raises an `OSError` if it is none, or cannot be read.
+    Raises an `OSError` if it is not a regular file, or cannot be read.
     """
+    # A pipe or a device in its place would block here, or have no end.
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise OSError(errno.EINVAL, "it is no regular file")

@@ -1,4 +1,4 @@
-"""Ctrl-C: what it does to a command, to a run, and to the processes that these start."""
+"""Ctrl-C: how it ends a command and a run, and how processes that these start ignore it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 
 INTERRUPTED = 130
-"""Exit code of a command that Ctrl-C has ended."""
+"""Exit code of a command that Ctrl-C ended."""
 
 Handler = Callable[[int, FrameType | None], object] | int | None
 
@@ -22,7 +22,7 @@ class Interrupted(Exception):  # noqa: N818  what happened is no error
 
 
 def interruptible(command: Callable[..., None]) -> Callable[..., None]:
-    """A command that raises `Interrupted` in place of `KeyboardInterrupt`, which Typer would end without a word."""
+    """A command that raises `Interrupted` in place of `KeyboardInterrupt`, at which Typer would exit silently."""
 
     @functools.wraps(command)
     def wrapped(*arguments: object, **options: object) -> None:
@@ -38,10 +38,10 @@ def interruptible(command: Callable[..., None]) -> Callable[..., None]:
 
 @contextlib.contextmanager
 def interrupted_at_once() -> Iterator[None]:
-    """Block in which Ctrl-C ends the process with a line; where it is ignored, it remains so.
+    """End the process with a line at Ctrl-C inside the block, unless Ctrl-C is ignored.
 
-    A `KeyboardInterrupt` that is raised in the import of an extension module may become an `ImportError`, or be lost;
-    outside of all commands nobody catches it.
+    A `KeyboardInterrupt` in the import of an extension module may become an `ImportError`, or be lost; outside of all
+    commands nobody catches it.
     """
     ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     with contextlib.nullcontext() if ignored else _handled(_leave):
@@ -55,7 +55,7 @@ def ignore() -> None:
 
 @contextlib.contextmanager
 def restored() -> Iterator[None]:
-    """Block after which Ctrl-C does what it did before, whatever the block has set."""
+    """Restore the handler of Ctrl-C after the block."""
     before = signal.getsignal(signal.SIGINT)
     try:
         yield
@@ -65,7 +65,7 @@ def restored() -> Iterator[None]:
 
 @contextlib.contextmanager
 def held() -> Iterator[None]:
-    """Block Ctrl-C: processes that are started in the block inherit this and never receive it."""
+    """Block Ctrl-C: processes that are started inside inherit this and never receive it."""
     from multiprocessing import resource_tracker  # noqa: PLC0415  most commands start no processes
 
     resource_tracker.ensure_running()  # its start would unblock SIGINT
@@ -78,7 +78,7 @@ def held() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _handled(handler: Handler) -> Iterator[None]:
-    """Block with a handler of Ctrl-C; the one of before comes back unless the block has set another, for good."""
+    """Handle Ctrl-C inside the block; the previous handler returns unless the block has set another one."""
     before = signal.getsignal(signal.SIGINT)
     _set(handler)
     try:
@@ -89,7 +89,7 @@ def _handled(handler: Handler) -> Iterator[None]:
 
 
 def _set(handler: Handler) -> None:
-    """Set a handler of Ctrl-C; only the main thread can."""
+    # Only the main thread can set handlers.
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, handler)
 

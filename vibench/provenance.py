@@ -1,4 +1,4 @@
-"""Where numbers come from: machine, versions, and the code that computed them."""
+"""Provenance of numbers: machine, versions, and the code that computed them."""
 
 from __future__ import annotations
 
@@ -13,19 +13,16 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
 
 PROTOCOL = "4"
-"""Version of the benchmark: what is measured, and how seconds are. Results say by which they were measured.
+"""Version of the benchmark protocol, recorded in results; docs/benchmark.md has a line for each.
 
 It changes with every change after which seconds, or the meaning of a number, can no longer be compared with earlier
-ones; the page docs/benchmark.md has a line for each. Names, formats and new columns do not change it.
+ones. Names, formats and new columns do not change it.
 """
-
-SOLVER_DISTRIBUTIONS = {"highs": "highspy", "proxqp": "proxsuite"}
-"""Distributions of the solvers that are not called like their solver."""
 
 
 @cache
 def machine() -> str:
-    """The machine as results quote it: processor with its model and caches, cores usable, memory, system."""
+    """The machine as recorded in results: processor with its model and caches, usable cores, memory, system."""
     parts = [processor(), *caches(), f"{cores()} cores", f"{memory() / 2**30:.0f} GiB"]
     return ", ".join([*parts, f"{platform.system()} {platform.machine()}"])
 
@@ -47,7 +44,7 @@ def processor(info: Path = Path("/proc/cpuinfo")) -> str:
 
 
 def caches(folder: Path = Path("/sys/devices/system/cpu/cpu0/cache")) -> list[str]:
-    """Sizes of the caches of data of one core, "L2 1024K", from the first level to the last; none where nobody says."""
+    """Sizes of the data caches of one core, "L2 1024K", from the first level to the last; none if unknown."""
     sizes: dict[str, str] = {}
     for index in sorted(folder.glob("index*")):
         with contextlib.suppress(OSError):
@@ -58,7 +55,7 @@ def caches(folder: Path = Path("/sys/devices/system/cpu/cpu0/cache")) -> list[st
 
 
 def memory(groups: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> int:
-    """Bytes of memory that this process may use: those of the machine, or what its control groups (v2, v1) allow."""
+    """Bytes of memory that this process may use: of the machine, or the limit of its control groups (v2, v1)."""
     amounts = [int(os.sysconf("SC_PAGE_SIZE")) * int(os.sysconf("SC_PHYS_PAGES"))]
     for line in groups.read_text().splitlines() if groups.is_file() else ():
         _, controllers, name = line.split(":", 2)
@@ -66,7 +63,8 @@ def memory(groups: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/
             continue
         top, limit = (root / "memory", "memory.limit_in_bytes") if controllers else (root, "memory.max")
         inside = PurePosixPath(name.lstrip("/"))
-        for group in (inside, *inside.parents):  # every group above limits, too; "." is the top, as in a container
+        # Groups above limit it, too; "." is the top group, as seen in a container.
+        for group in (inside, *inside.parents):
             with contextlib.suppress(OSError, ValueError):  # no such file, or "max"
                 amounts.append(int((top / group / limit).read_text()))
     return min(amounts)
@@ -80,34 +78,28 @@ def cores() -> int:
 def versions(solver: str | None) -> dict[str, str]:
     """Versions of the benchmark protocol, of Python, the numerical libraries, vibench and a solver, if any.
 
-    That of vibench has the commit, "0.1.0 at 1a2b3c4d5e", where it runs from a checkout.
+    In a checkout the version of vibench includes the commit: "0.1.0 at 1a2b3c4d5e".
     """
     numerical = {name: distribution_version(name) for name in ("numpy", "scipy", "scikit-fem", "qpsolvers", "vibench")}
     numerical["vibench"] += f" at {commit()}" if commit() else ""
-    found = {"protocol": PROTOCOL, "python": platform.python_version(), **numerical}
-    return found if solver is None else found | {solver: solver_version(solver)}
-
-
-CODE = ("*.py", "*.toml", "*.template")
-"""Files that determine what is computed and written."""
+    own = {"protocol": PROTOCOL, "python": platform.python_version(), **numerical}
+    return own if solver is None else own | {solver: solver_version(solver)}
 
 
 @cache
 def commit(checkout: Path = Path(__file__).parents[1]) -> str:
-    """The commit of a checkout, "+" after it if tracked code was changed since; "" elsewhere and without git.
-
-    Pages that a run wrote are no change: those written after them name the same commit.
-    """
+    """The commit of a checkout, with "+" if tracked code was changed since; "" elsewhere and without git."""
     if not (checkout / ".git").exists():
         return ""
 
-    def said(*arguments: str) -> str:
+    def git(*arguments: str) -> str:
         command = ["git", "-C", str(checkout), *arguments]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
     try:
-        changed = said("diff", "--name-only", "HEAD", "--", *CODE)
-        return said("rev-parse", "--short=10", "HEAD") + "+" * bool(changed)
+        # Only code counts: pages that a run wrote do not change the commit of the next ones.
+        changed = git("diff", "--name-only", "HEAD", "--", "*.py", "*.toml", "*.template")
+        return git("rev-parse", "--short=10", "HEAD") + "+" * bool(changed)
     except (OSError, subprocess.CalledProcessError):  # there is no git, or no repository
         return ""
 
@@ -122,18 +114,14 @@ def distribution_version(name: str) -> str:
 
 
 def solver_distribution(solver: str) -> str:
-    """The distribution a QP solver comes in."""
-    return SOLVER_DISTRIBUTIONS.get(solver, solver)
+    """The distribution that provides a QP solver."""
+    return {"highs": "highspy", "proxqp": "proxsuite"}.get(solver, solver)
 
 
 @cache
 def solver_version(solver: str) -> str:
-    """Version of the distribution a QP solver comes in, "" where it is not installed."""
+    """Version of the distribution of a QP solver, "" where it is not installed."""
     return distribution_version(solver_distribution(solver))
-
-
-LIBRARIES = ("numpy", "scipy", "scikit-fem", "qpsolvers", "piqp", "proxsuite")
-"""Libraries that numbers are computed with; the solver of a cell and what a plugin needs count with these."""
 
 
 @cache
@@ -165,8 +153,9 @@ def numerical_code(below: str = "") -> str:
 
 @cache
 def libraries() -> str:
-    """Versions of Python and of the libraries that results of stages depend on."""
-    installed = [f"{name} {distribution_version(name)}" for name in LIBRARIES]
+    """Versions of Python and of the libraries that the results of all stages depend on."""
+    names = ("numpy", "scipy", "scikit-fem", "qpsolvers", "piqp", "proxsuite")
+    installed = [f"{name} {distribution_version(name)}" for name in names]
     return ", ".join([f"python {platform.python_version()}", *installed])
 
 

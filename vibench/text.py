@@ -1,4 +1,4 @@
-"""Text from others as data: nothing that a plugin, a solver, a study or a results file says acts where it is shown."""
+"""Text from others, made harmless: control characters and markup of plugins and files have no effect where shown."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 LONGEST = 2000
-"""Characters that are kept of a message or a status."""
+"""Longest message or status, in characters."""
 
 
 def parsed_json(text: str | bytes) -> Any:
-    """The value of a JSON text that others wrote.
+    """The value of an untrusted JSON text.
 
-    Raises a `ValueError` if it is no JSON, or nested too deeply to be read.
+    Raises a `ValueError` if it is no JSON, or nested too deeply.
     """
     try:
         return json.loads(text)
@@ -27,7 +27,7 @@ def parsed_json(text: str | bytes) -> Any:
 
 
 def json_object(text: object) -> dict[str, Any] | None:
-    """The object of a JSON text that others wrote; `None` where it is no such text."""
+    """The object of an untrusted JSON text; `None` where it is not the text of an object."""
     try:
         value = parsed_json(text) if isinstance(text, str) else None
     except ValueError:
@@ -36,9 +36,9 @@ def json_object(text: object) -> dict[str, Any] | None:
 
 
 def printable(text: str) -> str:
-    r"""A text with its characters that are not printable as JSON escapes: ``\u001b``, ``\n``, ``\ud800``.
+    r"""A text with JSON escapes, such as ``\u001b``, ``\n``, ``\ud800``, in place of unprintable characters.
 
-    These are control and format characters, lone surrogates and all white space but the blank. JSON keeps its content.
+    These are control and format characters, lone surrogates and all white space but the blank.
     """
     if text.isprintable():
         return text
@@ -56,7 +56,7 @@ def unbroken(text: str) -> str:
 
 
 def brief(text: str, longest: int = LONGEST) -> str:
-    """A text as `printable` shows it, of at most `longest` characters; what is cut says how long it was."""
+    """A `printable` text of at most `longest` characters; one that was cut ends with its former length."""
     return _cut(printable(text[:longest]), len(text), longest)
 
 
@@ -66,13 +66,13 @@ def one_line(text: str) -> str:
 
 
 def above(value: float, limit: float) -> str:
-    """A number above a limit with the digits that tell it from the limit, such as "3.1e-07 above 1e-07"."""
+    """A number above a limit with enough digits to distinguish them, such as "3.1e-07 above 1e-07"."""
     digits = next((n for n in range(1, 16) if float(f"{value:.{n}e}") > limit), 16)
     return f"{value:.{digits}e} above {limit:g}"
 
 
 def _cut(shown: str, length: int, longest: int) -> str:
-    """What is shown of a text of that length, of which no more than the `longest` first characters were looked at."""
+    """Cut the printable form of a text whose `length` is noted; it was made of its `longest` first characters only."""
     if max(length, len(shown)) <= longest:
         return shown
     note = f"… ({length} characters)"
@@ -85,7 +85,7 @@ def normal_name(name: str) -> str:
 
 
 def new_console() -> Console:
-    """A console for the standard output that interprets no markup; of 10,000 columns where the output is no terminal.
+    """A console for the standard output that interprets no markup, with 10,000 columns if that is not a terminal.
 
     A positive integer in `COLUMNS` sets the width.
     """

@@ -17,54 +17,41 @@ import numpy as np
 T = TypeVar("T")
 
 REPEATS = 5
-"""Timed repeats after one warm-up; the median counts."""
+"""Upper limit of timed runs after one warm-up; the median counts."""
 
 SLOW = 1.0
-"""Seconds of repeats after which there are no more; what takes longer is timed once."""
+"""Seconds after which runs are not repeated; work that takes longer is timed once."""
 
 DISTURBED = 1.3
-"""A row is marked as disturbed if the calibration is slower than when the machine is calm by more than this factor."""
-
-CALM = 0.1
-"""Share of the runs of the calibration that are taken for those of a calm machine: the very best one is luck."""
-
-WAITED = 1.5
-"""Wall seconds above this multiple of the CPU seconds are those of a process that often waits for a core."""
+"""Slowdown of the calibration, relative to a calm machine, above which a row is marked as disturbed."""
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
 """Environment in which numerical libraries start with one thread."""
-
-KEPT_MEMORY = {
-    "MALLOC_MMAP_THRESHOLD_": "33554432",
-    "MALLOC_TRIM_THRESHOLD_": "1073741824",
-    "MALLOC_TOP_PAD_": "67108864",
-}
-"""Environment in which glibc keeps up to 1 GiB that was freed: large arrays are not mapped page by page every time."""
 
 
 @dataclass(frozen=True)
 class Seconds:
     """CPU and wall seconds of some work."""
 
-    cpu: float = 0.0
-    wall: float = 0.0
+    cpu: float
+    wall: float
 
     def __add__(self, other: Seconds) -> Seconds:
         return Seconds(self.cpu + other.cpu, self.wall + other.wall)
 
     def beyond(self, other: Seconds) -> Seconds:
-        """The seconds by which these exceed others, not less than nothing."""
+        """The seconds by which these exceed others, at least 0."""
         return Seconds(max(self.cpu - other.cpu, 0.0), max(self.wall - other.wall, 0.0))
 
 
-NO_TIME = Seconds()
+NO_TIME = Seconds(0.0, 0.0)
 
 
 class Stopwatch:
-    """Seconds since it was made: those of all threads of the process, and of children that have ended.
+    """Seconds since its creation, of all threads of the process and of children that have ended.
 
-    Whoever works in a thread or in a child process works no less. A child that outlives the work is not counted; the
-    wall seconds then exceed the CPU seconds.
+    Work in a thread or in a child process counts. A child that outlives the work does not; the wall seconds then exceed
+    the CPU seconds.
     """
 
     def __init__(self) -> None:
@@ -90,17 +77,17 @@ def timed(work: Callable[[], T]) -> tuple[T, Seconds]:
 
 
 def median_seconds(
-    work: Callable[..., T], given: Iterable[Any] | None = None, enough: float = SLOW
+    work: Callable[..., T], arguments: Iterable[Any] | None = None, enough: float = SLOW
 ) -> tuple[T, Seconds]:
-    """Result of the first run of some work, and its seconds: one warm-up, then the median of at most `REPEATS` repeats.
+    """Result of the first run of some work, and its seconds: one warm-up, then the median of at most `REPEATS` runs.
 
-    Repeats end after `enough` wall seconds; the warm-up counts if it takes longer than that. Every run gets another of
-    the arguments `given`, or none; what it takes to make them is not timed.
+    No run begins after `enough` wall seconds; the warm-up counts if it takes longer than that. Every run gets the next
+    of the `arguments`, if any, whose computation is not timed.
     """
-    arguments = repeat(()) if given is None else ((argument,) for argument in given)
+    each = repeat(()) if arguments is None else ((argument,) for argument in arguments)
 
     def once() -> tuple[T, Seconds]:
-        return timed(partial(work, *next(arguments)))
+        return timed(partial(work, *next(each)))
 
     result, first = once()
     if first.wall > enough:
@@ -119,12 +106,14 @@ def median_of(runs: Sequence[Seconds]) -> Seconds:
 def median_interval(values: Sequence[float]) -> tuple[float, float]:
     """Interval that contains the median of the distribution of independent values (n,) with probability 0.95.
 
-    Its ends are order statistics, whatever the distribution is (Conover 1999, section 3.2); fewer than six values give
-    their range, which has a smaller probability.
+    Its ends are order statistics, for any distribution (Conover 1999, section 3.2). Fewer than six values give their
+    range, which has a smaller probability.
     """
     ordered, n = sorted(values), len(values)
-    outside, below = 0, 0.0  # values left out on each side; probability that the median is among or below them
-    ways, every = 1, 2**n  # to choose as many values, of any number: each follows from the one before
+    # Values left out on each side, and the probability that the median is among or below them. It is a sum of binomial
+    # coefficients over 2^n, in integers because 2^n overflows a float.
+    outside, below = 0, 0.0
+    ways, every = 1, 2**n
     while (below := below + ways / every) <= 0.025:
         ways = ways * (n - outside) // (outside + 1)
         outside += 1
@@ -133,10 +122,10 @@ def median_interval(values: Sequence[float]) -> tuple[float, float]:
 
 
 class Calibration:
-    """Fixed numerical work whose CPU time, relative to that on a calm machine, measures how much this one is disturbed.
+    """Fixed numerical work whose CPU time, relative to a calm machine, measures how much this machine is disturbed.
 
-    Other processes on the core, a shared cache and a lower clock rate slow down all that is timed beside it. That a
-    process waits for a core does not: its CPU seconds stop meanwhile.
+    Hyperthreads, a shared cache and a lower clock rate slow down all that is timed beside it. Waiting for a core does
+    not count: CPU seconds stop meanwhile.
     """
 
     def __init__(self) -> None:
@@ -145,18 +134,19 @@ class Calibration:
         self.slowdown()
 
     def slowdown(self) -> float:
-        """CPU seconds of the work, the quicker of two runs, over the lowest `CALM` of all in this process so far."""
+        """CPU seconds of the work relative to a calm machine, from all its runs in this process."""
         now = self.seconds().cpu
         insort(self._sorted, now)
-        return now / self._sorted[int(CALM * len(self._sorted))]
+        # The lowest 10 % stand for a calm machine: the very best run is luck.
+        return now / self._sorted[int(0.1 * len(self._sorted))]
 
     def seconds(self) -> Seconds:
-        """Seconds of the work, the quicker of two runs."""
+        """Seconds of the quicker of two runs."""
         runs = [timed(self._work)[1] for _ in range(2)]
         return Seconds(min(run.cpu for run in runs), min(run.wall for run in runs))
 
     def _work(self) -> float:
-        """Dense products, as BLAS does them, and a loop of small calls, as Python does."""
+        """Dense products, whose time is that of BLAS, and a loop of small calls, whose time is that of Python."""
         product, total = self._matrix, 0.0
         for _ in range(4):
             product = self._matrix @ product

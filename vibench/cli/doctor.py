@@ -38,7 +38,7 @@ from vibench.qp.status import Status
 from vibench.storage.artefacts import CACHE_VARIABLE, LOCK, Store, default_folder
 from vibench.study.matrix import read_study
 from vibench.text import new_console
-from vibench.timing import DISTURBED, WAITED, Calibration, Stopwatch
+from vibench.timing import DISTURBED, Calibration, Stopwatch
 
 ACCURACY = 1e-7
 """Relative accuracy that solvers are tried at: the default of studies."""
@@ -274,7 +274,7 @@ def check_timings() -> Iterator[Diagnosis]:
     for subject, text, doubtful in (
         ("other load", f"{others:.1f} of {cores} cores", others > MAX_OTHER_LOAD * cores),
         ("slowdown", f"{slowdown:.2f}; rows are marked above {DISTURBED}", slowdown > DISTURBED),
-        ("wall over CPU", f"{ratio:.2f}; above {WAITED} processes often wait for a core", ratio > WAITED),
+        ("wall over CPU", f"{ratio:.2f}; above 1.5 processes often wait for a core", ratio > 1.5),
     ):
         yield Diagnosis(subject, text, _note_if(doubtful))
         doubts += [subject] * doubtful

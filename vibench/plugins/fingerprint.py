@@ -1,4 +1,4 @@
-"""Fingerprints of classes and objects, which tell those apart that a study was given and no distribution has."""
+"""Fingerprints of classes and objects that a study was given in Python, in place of a distribution's version."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dis
 import functools
 import hashlib
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
@@ -17,58 +17,49 @@ from vibench.provenance import package_hash
 
 
 def fingerprint_of(value: Any) -> tuple[str, dict[str, str]]:
-    """Hash of a value and of the code that it runs, equal in all processes that make it in the same way.
+    """Hash of a value and of its code, equal in all processes that make it in the same way.
 
     Functions and classes of scripts and notebooks count with their bytecode and the global names that it uses, those of
-    modules with the `module_version`. What is computed again when it is asked for
-    (`functools.cached_property`) does not count.
+    modules with the `module_version`. Values of cached properties do not count.
 
-    Returned with it are the versions of the modules that it names. Raises a `TypeError` if the value holds something
-    that cannot be pickled.
+    Returns also the versions of the modules that it uses. Raises a `TypeError` if the value cannot be pickled.
     """
-    met: dict[int, tuple[int, Any]] = {}
-    own = _hash_of(value, met)
-    modules = [one for _, one in met.values() if isinstance(one, ModuleType)]
+    seen: dict[int, tuple[int, Any]] = {}
+    own = _hash_of(value, seen)
+    modules = [one for _, one in seen.values() if isinstance(one, ModuleType)]
     return own, {one.__name__: version for one in modules if (version := module_version(one))}
 
 
-def _hash_of(value: Any, met: dict[int, tuple[int, Any]]) -> str:
-    """Hash of a value within another; what was met before has a number, and is kept, since identities are reused."""
+def _hash_of(value: Any, seen: dict[int, tuple[int, Any]]) -> str:
+    """Hash of a value within another; values `seen` before count with their number."""
     if type(value) in (type(None), bool, int, float, complex, str, bytes):
         words = [repr(value)]
     elif type(value) in (set, frozenset):
-        words = sorted(_hash_of(one, dict(met)) for one in value)
-    elif not isinstance(value, tuple) and id(value) in met:
-        words = [f"again {met[id(value)][0]}"]
+        words = sorted(_hash_of(one, dict(seen)) for one in value)
+    elif not isinstance(value, tuple) and id(value) in seen:
+        words = [f"again {seen[id(value)][0]}"]
     else:
-        met[id(value)] = len(met), value
+        seen[id(value)] = len(seen), value  # the value, too: identities of values that are gone are reused
         if type(value) is dict:
-            keys = {_hash_of(key, dict(met)): key for key in value}
-            words = [word for name in sorted(keys) for word in (name, _hash_of(value[keys[name]], met))]
+            keys = {_hash_of(key, dict(seen)): key for key in value}
+            words = [word for name in sorted(keys) for word in (name, _hash_of(value[keys[name]], seen))]
         else:
-            words = [part if k == 0 else _hash_of(part, met) for k, part in enumerate(_parts(value))]
+            words = [part if k == 0 else _hash_of(part, seen) for k, part in enumerate(_parts(value))]
     return hashlib.sha256("\0".join([type(value).__name__, *words]).encode()).hexdigest()[:16]
 
 
-PARTS: Mapping[type, tuple[str, ...]] = {
-    property: ("fget", "fset"),
-    staticmethod: ("__wrapped__",),
-    classmethod: ("__wrapped__",),
-    functools._lru_cache_wrapper: ("__wrapped__",),
-    cached_property: ("func",),
-    CodeType: (
-        "co_code", "co_consts", "co_names", "co_varnames", "co_freevars", "co_argcount", "co_posonlyargcount",
-        "co_kwonlyargcount", "co_flags",
-    ),
-}  # fmt: skip
-"""What counts of some values, by their types."""
-
-
 def _parts(value: Any) -> Iterator[Any]:
-    """What a value is, in words, and what it consists of."""
-    kind = next((kind for kind in PARTS if isinstance(value, kind)), None)
-    if kind is not None:
-        yield from ("", *(getattr(value, name) for name in PARTS[kind]))
+    """A value in words, and the values that it consists of."""
+    if isinstance(value, property):
+        yield from ("", value.fget, value.fset)
+    elif isinstance(value, staticmethod | classmethod | functools._lru_cache_wrapper):
+        yield from ("", value.__wrapped__)
+    elif isinstance(value, cached_property):
+        yield from ("", value.func)
+    elif isinstance(value, CodeType):
+        # Line numbers and names of files are left out: a comment changes no number.
+        yield from ("", value.co_code, value.co_consts, value.co_names, value.co_varnames, value.co_freevars)
+        yield from (value.co_argcount, value.co_posonlyargcount, value.co_kwonlyargcount, value.co_flags)
     elif isinstance(value, ModuleType):
         yield f"{value.__name__} {module_version(value)}"
     elif isinstance(value, type | FunctionType) and is_importable(value):
@@ -86,19 +77,19 @@ def _parts(value: Any) -> Iterator[Any]:
 
 
 def _pickled_parts(value: Any) -> Iterator[Any]:
-    """What pickle would make a value of."""
+    """The parts of which pickle would make a value."""
     reduced = value.__reduce_ex__(4)
     if isinstance(reduced, str):
         yield from (reduced, sys.modules.get(getattr(value, "__module__", None) or ""))
         return
     function, arguments, state, items, pairs = (*reduced, None, None, None)[:5]
     if isinstance(state, dict):
-        state = {name: one for name, one in state.items() if not is_computed_again(type(value), name)}
+        state = {name: one for name, one in state.items() if not is_cached(type(value), name)}
     yield from ("", function, arguments, state, list(items or ()), dict(pairs or ()))
 
 
-def is_computed_again(cls: type, name: str) -> bool:
-    """Whether an attribute of objects of a class keeps what the class computes when it is asked for."""
+def is_cached(cls: type, name: str) -> bool:
+    """Whether an attribute of the objects of a class is the value of a cached property."""
     return isinstance(getattr(cls, name, None), cached_property)
 
 

@@ -1,4 +1,4 @@
-"""The kinds of plugins, and what each is called: completion and help read this, so it imports nothing heavy."""
+"""The kinds of plugins and their names; completion and help read this, so that it imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -8,16 +8,24 @@ from pkgutil import resolve_name
 
 
 class PluginKind(StrEnum):
-    """A kind of plugin; as a text it is what messages and records call it: "dual strategy"."""
+    """A kind of plugin; its text, such as "dual strategy", is its name in messages and records.
+
+    Attributes
+    ----------
+    plural
+        Name of the list of `vibench list` that shows it.
+    entry_points
+        Group of entry points.
+    cli_name
+        Prefix on the command line, as in `vibench check NAME:…`; "" where its plugins are not checked.
+    module
+        Module that `vibench new` writes.
+    """
 
     plural: str
-    """The list of `vibench list` that shows it."""
     entry_points: str
-    """Its group of entry points."""
     cli_name: str
-    """What stands for it on the command line, in `vibench check NAME:…`; "" where no plugin of it is checked."""
     module: str
-    """The module that `vibench new` writes it to."""
     _base: str
 
     def __new__(
@@ -48,11 +56,11 @@ class PluginKind(StrEnum):
 
     @cached_property
     def base(self) -> type | None:
-        """The abstract base class of its plugins; `None` where they are no classes."""
+        """Abstract base class of its plugins; `None` where they are not classes."""
         return resolve_name(self._base) if self._base else None
 
 
 PROBLEM, SAMPLING, PRIMAL, DUAL, FORMULATION, STUDY, SOLVER = PluginKind
 
 CHECKED = {kind.cli_name: kind for kind in PluginKind if kind.cli_name}
-"""The kinds whose plugins `vibench check` examines and `vibench new` writes, by their names on the command line."""
+"""Kinds that `vibench check` and `vibench new` know, by their names on the command line."""

@@ -1,4 +1,4 @@
-"""Options of plugins: the arguments of their constructors, checked against the annotations."""
+"""Options of plugins, which are the arguments of their constructors, and keys of TOML files, in words."""
 
 from __future__ import annotations
 
@@ -16,42 +16,37 @@ from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
 from vibench.errors import RequestError, in_a_line, unknown_name
 
-FINITE = ConfigDict(allow_inf_nan=False)
-"""Options of plugins are finite."""
-
 
 @dataclass(frozen=True)
 class Option:
-    """One option of a plugin, an argument of its constructor."""
+    """One option of a plugin, an argument of its constructor; `preset` is its default or `Parameter.empty`."""
 
     name: str
     annotation: Any
     preset: Any
-    """Its default; `Parameter.empty` if it is required."""
 
     def __str__(self) -> str:
         return f"{self.name}: {self.expected}" + f" = {self.preset!r}" * (not self.required)
 
     @property
     def required(self) -> bool:
-        """Whether it has no default."""
         return self.preset is Parameter.empty
 
     @property
     def expected(self) -> str:
         """The annotation in words: "float > 0.0", "'coarse', 'fine' or int ≥ 150"."""
         schema = TypeAdapter(self.annotation).json_schema()
-        return " or ".join(_words(part) for part in schema.get("anyOf", [schema]))
+        return " or ".join(_in_words(part) for part in schema.get("anyOf", [schema]))
 
     def read(self, value: Any) -> Any:
         """A value, converted to the type of the annotation; a `ValidationError` if it does not conform to it."""
         # In strict mode pydantic converts lists to tuples and texts to enumerations only from JSON.
-        text = json.dumps(value, default=str)
-        return TypeAdapter(self.annotation, config=FINITE).validate_json(text, strict=True)
+        text, finite = json.dumps(value, default=str), ConfigDict(allow_inf_nan=False)
+        return TypeAdapter(self.annotation, config=finite).validate_json(text, strict=True)
 
     @property
     def doubt(self) -> str:
-        """What is doubtful of it: no annotation, or a default that does not conform to it; "" if nothing."""
+        """A fault of its declaration: no annotation, or a default that does not conform to it; "" if none."""
         if self.annotation is Any:
             return "has no annotation that says what study files may set it to"
         try:
@@ -66,14 +61,14 @@ class Option:
 
 
 BESIDE = "/./"
-"""What stands between the folder of a study and the path of a file in it, as rsync writes what it keeps of a path."""
+"""Separator between the folder of a study and the path of a file in it, as in the syntax of rsync."""
 
 
-def named(path: Any) -> tuple[Any, Any]:
-    """The name under which results know a file or a folder, and its absolute path; what is no path twice.
+def named_path(path: Any) -> tuple[Any, Any]:
+    """The name of a file or a folder in results, and its absolute path; twice the value if it is no path.
 
-    The name is the path from the folder of the study, or the current one; of what lies elsewhere its last part, so that
-    results do not depend on where a study is, and do not tell.
+    The name is the path from the folder of the study, or from the current one. For other places it is the last part:
+    results neither depend on the place of a study nor reveal it.
     """
     path = os.fspath(path) if isinstance(path, os.PathLike) else path
     if not isinstance(path, str) or not path:
@@ -103,7 +98,7 @@ def options_of(plugin: Any) -> Mapping[str, Option]:
 
 
 def checked_arguments(plugin: type, what: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of a class, converted to the types in its constructor's annotations; `what` is its name in messages.
+    """Options of a class, converted to the types of its constructor's annotations; `what` names it in messages.
 
     Raises a `RequestError` if an option is unknown, missing, or not of its type.
     """
@@ -128,37 +123,39 @@ def options_as_json(options: Mapping[str, Any]) -> str:
     return json.dumps(TypeAdapter(dict[str, Any]).dump_python(dict(options), mode="json"), sort_keys=True)
 
 
-def _words(schema: Mapping[str, Any]) -> str:
+def _bounds(schema: Mapping[str, Any]) -> str:
+    signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+    values = ((sign, schema[key]) for key, sign in signs.items() if key in schema)
+    return " and ".join(f"{sign} {f'{value:g}' if isinstance(value, float) else value}" for sign, value in values)
+
+
+def _in_words(schema: Mapping[str, Any]) -> str:
+    """The value of a Python argument that a schema expects."""
     if "enum" in schema:
         return ", ".join(repr(value) for value in schema["enum"])
     if "const" in schema:
         return repr(schema["const"])
     kind = str(schema.get("type", "any value"))
     python = {"integer": "int", "number": "float", "string": "str", "boolean": "bool", "array": "list"}.get(kind, kind)
-    bounds = [f"{sign} {schema[key]:g}" for key, sign in SIGNS.items() if key in schema]
-    return " ".join([python, " and ".join(bounds)]).strip()
-
-
-KINDS = {"integer": "int", "number": "float", "string": "text", "boolean": "true or false"}
-SIGNS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+    return f"{python} {_bounds(schema)}".strip()
 
 
 class Key(NamedTuple):
-    """A key of a file."""
+    """A key of a TOML file, in words.
+
+    `table` is the name of the model of its table, "" for the file itself; `default` is JSON, "" where there is none.
+    """
 
     table: str
-    """Name of the model of the table it stands in; "" for the file itself."""
     name: str
     expected: str
-    """What its value may be."""
     required: bool
     default: str
-    """What stands for a missing one, as JSON; "" if that is nothing."""
     meaning: str
 
 
 def keys(schema: Mapping[str, Any], link: Callable[[str], str] = lambda _: "table") -> Iterator[Key]:
-    """The keys of a file and of the tables in it; `link` writes what refers to the table of a model."""
+    """The keys of a file and of its tables; `link` makes the reference to the table of a model."""
     for table, model in {"": schema, **schema["$defs"]}.items():
         required = model.get("required", [])
         for name, field in model["properties"].items():
@@ -167,23 +164,23 @@ def keys(schema: Mapping[str, Any], link: Callable[[str], str] = lambda _: "tabl
 
 
 def places(schema: Mapping[str, Any], model: str) -> list[str]:
-    """The keys that hold a table of a model."""
+    """The keys whose values are tables of a model."""
     reference = json.dumps(f"#/$defs/{model}")
     tables = [schema, *schema["$defs"].values()]
-    held = [key for table in tables for key, field in table["properties"].items() if reference in json.dumps(field)]
-    return list(dict.fromkeys(held))
+    holders = [key for table in tables for key, field in table["properties"].items() if reference in json.dumps(field)]
+    return list(dict.fromkeys(holders))
 
 
 def _preset(value: Any) -> str:
     if value in (None, "", {}) or (isinstance(value, dict) and "query_seconds" in value):
         return ""
-    if isinstance(value, list) and value and isinstance(value[0], dict):  # entries, which may be given by their names
+    if isinstance(value, list) and value and isinstance(value[0], dict):  # a name may stand for an entry
         value = [entry["name"] for entry in value]
     return json.dumps(value)
 
 
 def _expected(schema: Mapping[str, Any], link: Callable[[str], str]) -> str:
-    """What a schema expects, in words."""
+    """The value of a TOML key that a schema expects."""
     for key in ("anyOf", "oneOf"):
         if key in schema:
             return " or ".join(_expected(part, link) for part in schema[key] if part.get("type") != "null")
@@ -196,9 +193,5 @@ def _expected(schema: Mapping[str, Any], link: Callable[[str], str]) -> str:
     if schema["type"] == "object":
         values = schema["additionalProperties"]
         return "table" if values is True else f"table: name = {_expected(values, link)}"
-    bounds = [f"{sign} {_number(schema[key])}" for key, sign in SIGNS.items() if key in schema]
-    return " ".join([KINDS[schema["type"]], " and ".join(bounds)]).strip()
-
-
-def _number(value: float) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    kinds = {"integer": "int", "number": "float", "string": "text", "boolean": "true or false"}
+    return f"{kinds[schema['type']]} {_bounds(schema)}".strip()

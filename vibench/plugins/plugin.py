@@ -1,4 +1,4 @@
-"""A plugin on an axis of a study: one that is registered, or a class or an object that the study was given."""
+"""Plugins on the axes of a study: registered ones, and classes or objects passed in Python."""
 
 from __future__ import annotations
 
@@ -16,114 +16,124 @@ from typing import Any
 import cloudpickle
 
 from vibench.errors import RequestError, in_a_line, message_of
-from vibench.plugins.fingerprint import fingerprint_of, is_computed_again, is_importable, module_version
+from vibench.plugins.fingerprint import fingerprint_of, is_cached, is_importable, module_version
 from vibench.plugins.kinds import PluginKind
-from vibench.plugins.options import named
+from vibench.plugins.options import named_path
 from vibench.plugins.registry import RegisteredPlugin, find
 from vibench.provenance import distribution_version
 
 
 @dataclass(frozen=True)
 class Plugin:
-    """A plugin with its options as canonical JSON, and the version of its code and of the files that these name."""
+    """A plugin with its options.
+
+    Attributes
+    ----------
+    kind, name
+        Kind and name of the plugin.
+    options
+        Its options as canonical JSON.
+    code
+        Version of its code, with a digest of the files that its options name.
+    places
+        Absolute paths of these files and folders, as JSON by option; not part of the identity.
+    """
 
     kind: PluginKind
     name: str
     options: str
     code: str
     places: str = field(default="{}", compare=False)
-    """Where the files and folders are that its options name, absolute, as JSON by option; no part of the identity."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "kind", PluginKind(self.kind))  # a text, where it is read from a results file
+        object.__setattr__(self, "kind", PluginKind(self.kind))  # it is a text in a results file
 
     def __str__(self) -> str:
         return f"{self.kind} '{self.name}'"
 
     def __reduce__(self) -> Any:
-        """Worker processes get what was given with it; it is part of no field, so that no file ever holds it."""
-        given = self.registered if self.code.startswith(GIVEN) else None
+        # Worker processes receive a given class or object with it. No field holds it, so that no file ever does.
+        given = self.registered if self.is_given else None
         return _received, (self.kind, self.name, self.options, self.code, self.places, given)
 
     @classmethod
     def of(
         cls, registered: RegisteredPlugin, options: Mapping[str, Any], places: Mapping[str, str] | None = None
     ) -> Plugin:
-        """A registered plugin, or a given one, with options; `places` is where those are that were found before."""
-        found = {name: named(given) for name, given in options.items() if name in registered.path_options}
-        names, where = {name: one[0] for name, one in found.items()}, {name: one[1] for name, one in found.items()}
-        canonical = registered.canonical_options({**options, **names})
-        return cls(
-            registered.kind, registered.name, canonical, registered.code, json.dumps(where | dict(places or {}))
-        ).as_installed()
+        """A registered or given plugin with options; `places` are known paths of files and folders, by option."""
+        paths = {name: named_path(value) for name, value in options.items() if name in registered.path_options}
+        canonical = registered.canonical_options({**options, **{option: name for option, (name, _) in paths.items()}})
+        where = json.dumps({option: place for option, (_, place) in paths.items()} | dict(places or {}))
+        return cls(registered.kind, registered.name, canonical, registered.code, where).as_installed()
+
+    @property
+    def is_given(self) -> bool:
+        """Whether it is a class or an object passed in Python."""
+        return self.code.startswith("object ")
 
     @property
     def registered(self) -> RegisteredPlugin:
-        """What is registered under its name, or was given."""
-        code = self.code.partition(DATA)[0]
-        if not code.startswith(GIVEN):
+        """The registry entry, or the class or object passed in Python."""
+        if not self.is_given:
             return find(self.kind, self.name)
+        code = self.code.partition(" data ")[0]
         return _given.get((self.kind, self.name, code)) or GivenPlugin(self.kind, self.name, (), code)
 
     def as_installed(self) -> Plugin:
-        """The plugin with the version that its code and the files that its options name have now.
+        """The plugin with the present version of its code and of the files that its options name.
 
         Raises a `RequestError` if it is not installed, or one of its files cannot be read.
         """
         data = self.registered.data_digest(self.arguments)
-        return replace(self, code=self.registered.code + f"{DATA}{data}" * bool(data))
+        return replace(self, code=self.registered.code + f" data {data}" * bool(data))
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Its options, with the places of files and folders."""
+        """Its options, with absolute paths of files and folders."""
         places = json.loads(self.places)
         return {name: places.get(name, value) for name, value in json.loads(self.options).items()}
 
     @property
     def paths(self) -> dict[str, str]:
-        """The names under which results know the files and folders that its options name, by option."""
+        """Names in results of the files and folders in its options, by option."""
         known = self.registered.path_options
         return {name: str(value) for name, value in json.loads(self.options).items() if name in known}
 
     def moved(self, places: Mapping[str, str]) -> Plugin:
-        """The plugin whose files and folders are at other places, by the names under which results know them."""
+        """The plugin with files and folders at other places, by their names in results."""
         there = {option: places[name] for option, name in self.paths.items() if name in places}
         return replace(self, places=json.dumps(json.loads(self.places) | there))
 
     def create(self) -> Any:
-        """A new instance."""
         return self.registered.create(self.arguments)
 
     @property
     def check(self) -> str:
-        """What checks the plugin with these options: a command, or a function for what was given."""
-        if self.code.startswith(GIVEN):
+        """The command that checks the plugin with these options, or the function for a given one."""
+        if self.is_given:
             return "vibench.testing.check"
         options = (f"{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in self.arguments.items())
         check = ["vibench", "check", f"{self.kind.cli_name}:{self.name}", *(f"--option={text}" for text in options)]
         return shlex.join(check)
 
 
-DATA = " data "
-"""What stands between the version of a plugin's code and that of its files."""
-
-GIVEN = "object "
-"""What the code of a given plugin begins with; that of others begins with a distribution and its version."""
-
-
 @dataclass(frozen=True)
 class GivenPlugin(RegisteredPlugin):
-    """A class or an object that a study was given in Python.
+    """A class or an object passed to a study in Python; known only to that process and to its workers.
 
-    Only the process that has made it knows it, and the workers that this process sends it to.
+    Attributes
+    ----------
+    fingerprint
+        "object " and the hash of its code and state.
+    pickled
+        The class or the object by cloudpickle; empty where only another process has it.
+    modules
+        Versions of the modules that it uses, which are imported and not pickled, by name.
     """
 
     fingerprint: str = ""
-    """`GIVEN` and the hash of its code and state."""
     pickled: bytes = b""
-    """The class or the object by cloudpickle; empty where another process was given it."""
     modules: Mapping[str, str] = field(default_factory=dict, compare=False)
-    """Versions of the modules that it uses, which are imported and not pickled, by name."""
 
     def __reduce__(self) -> Any:
         return GivenPlugin, (self.kind, self.name, (), self.fingerprint, self.pickled, self.modules)
@@ -132,8 +142,7 @@ class GivenPlugin(RegisteredPlugin):
     def given(self) -> Any:
         """The class or the object.
 
-        Raises a `RequestError` if this process neither was given it nor received it, or cannot import what it is made
-        of.
+        Raises a `RequestError` if this process has not received it, or cannot import something that it needs.
         """
         if not self.pickled:
             raise RequestError(
@@ -147,27 +156,24 @@ class GivenPlugin(RegisteredPlugin):
 
     @property
     def is_class(self) -> bool:
-        """Whether it is a class, whose options a study sets."""
         return isinstance(self.given, type)
 
     @cached_property
     def package(self) -> str:
-        """The package that its class is in, "__main__" of a script or a notebook."""
+        """Package of its class; "__main__" in a script or a notebook."""
         return str(self.load().__module__).partition(".")[0]
 
     @cached_property
     def code(self) -> str:
-        """Its fingerprint; another text if a module was edited since it was given."""
-        self.given  # noqa: B018  refuses what another process was given
+        """Its fingerprint; another text if a module was edited since."""
+        self.given  # noqa: B018  raises if this process does not have it
         edited = (name for name, version in self.modules.items() if module_version(import_module(name)) != version)
         return " ".join([self.fingerprint, *edited])
 
     def load(self) -> Any:
-        """The class, be it given or that of the object."""
         return self.given if self.is_class else type(self.given)
 
     def check_options(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Options of a class, checked; an object has none."""
         if self.is_class:
             return super().check_options(given)
         if given:
@@ -175,22 +181,21 @@ class GivenPlugin(RegisteredPlugin):
         return {}
 
     def data_digest(self, options: Mapping[str, Any]) -> str:
-        """Digest of the files that a class reads with these options; an object has read its own."""
+        """Digest of the files that a class reads with these options; an object has read its files already."""
         return super().data_digest(options) if self.is_class else ""
 
     def create(self, options: Mapping[str, Any]) -> Any:
-        """A new instance of the class, or a copy of the object."""
         return super().create(options) if self.is_class else copy.deepcopy(self.given)
 
 
 _given: dict[tuple[str, str, str], GivenPlugin] = {}
-"""What studies of this process were given, or a worker has received, by kind, name and fingerprint."""
+"""Classes and objects given in this process or received by it, by kind, name and fingerprint."""
 
 
 def give(kind: PluginKind, name: str, given: Any) -> GivenPlugin:
-    """Take a class or an object, as it is now, for a plugin of this process.
+    """Register a class or an object in its present state as a plugin of this process.
 
-    Raises a `RequestError` if it is none of the kind, or cannot be sent to worker processes.
+    Raises a `RequestError` if it is not of the kind, or cannot be sent to worker processes.
     """
     cls, base = given if isinstance(given, type) else type(given), kind.base
     assert base is not None  # plugins of the axes are classes
@@ -200,34 +205,33 @@ def give(kind: PluginKind, name: str, given: Any) -> GivenPlugin:
             f"{kind}: expected a name, or a class or an object of vibench.{base.__name__}, found {instead}"
         )
     try:
-        kept = given if given is cls else copy.deepcopy(_without_cache(given))
-        _Pickler(file := io.BytesIO()).dump(kept)
+        snapshot = given if given is cls else copy.deepcopy(_without_cache(given))
+        _Pickler(file := io.BytesIO()).dump(snapshot)
         needs = {one: distribution_version(one) for one in getattr(cls, "requires", ())}
-        code, modules = fingerprint_of([kept, needs])
+        code, modules = fingerprint_of([snapshot, needs])
     except Exception as error:  # noqa: BLE001  pickling runs third-party code
         raise RequestError(
             f"the {kind} '{name}' cannot be sent to worker processes: {message_of(error)}; keep such objects out of "
             "attributes and global names, or make them where they are used"
         ) from None
-    plugin = GivenPlugin(kind, name, (), f"{GIVEN}{code}", file.getvalue(), modules)
-    plugin.__dict__["given"] = kept  # unpickled here, a class of a notebook would lose its global names
+    plugin = GivenPlugin(kind, name, (), f"object {code}", file.getvalue(), modules)
+    plugin.__dict__["given"] = snapshot  # unpickled here, a class of a notebook would lose its global names
     return _given.setdefault((kind, name, plugin.fingerprint), plugin)
 
 
 def _without_cache(given: Any) -> Any:
-    """A copy of an object without what it computes again when asked for (`functools.cached_property`)."""
-    kept = copy.copy(given)
-    for name in [*getattr(kept, "__dict__", ())]:
-        if is_computed_again(type(kept), name):
-            del kept.__dict__[name]
-    return kept
+    """A copy of an object without the values of its cached properties."""
+    bare = copy.copy(given)
+    for name in [*getattr(bare, "__dict__", ())]:
+        if is_cached(type(bare), name):
+            del bare.__dict__[name]
+    return bare
 
 
 class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
-    """Cloudpickle, which also sends what `functools.cache` and `cached_property` decorate."""
+    """Cloudpickle for functions and properties that `functools.cache` and `cached_property` decorate, too."""
 
     def reducer_override(self, obj: Any) -> Any:
-        """How an object is pickled."""
         if isinstance(obj, functools._lru_cache_wrapper) and not is_importable(obj):
             return _cached, (obj.__wrapped__, obj.cache_parameters())
         if isinstance(obj, cached_property):  # it has a lock in Python 3.11
@@ -240,13 +244,13 @@ def _cached(function: Callable[..., Any], parameters: Mapping[str, Any]) -> Any:
 
 
 def _computed_once(function: Callable[[Any], Any], name: str) -> Any:
-    made = cached_property(function)
-    made.__set_name__(object, name)
-    return made
+    cached = cached_property(function)
+    cached.__set_name__(object, name)
+    return cached
 
 
 def _received(kind: PluginKind, name: str, options: str, code: str, places: str, given: GivenPlugin | None) -> Plugin:
-    """A plugin that was pickled, and what was given with it."""
+    """A plugin that was pickled, with its class or object if it is a given one."""
     if given is not None:
         _given.setdefault((kind, name, given.fingerprint), given)
     return Plugin(kind, name, options, code, places)

@@ -1,7 +1,7 @@
-"""The registry of plugins: what the distributions of this environment register, and what each needs.
+"""The registry of plugins: entry points of the distributions of this environment, with their options.
 
-Only `load`, and what builds on it, imports a plugin. Lists and completion want the rest at once, so nothing heavy is
-imported at the top.
+Only `load`, and methods that use it, import a plugin. Lists and completion need the rest at once, so that nothing heavy
+is imported at the top.
 """
 
 from __future__ import annotations
@@ -27,25 +27,27 @@ if TYPE_CHECKING:
 
 
 FACTORISATION = "factorisation"
-"""The option that every problem has, beside those of its constructor."""
+"""Option of every problem, in addition to those of its constructor."""
 
 
 @dataclass(frozen=True)
 class RegisteredPlugin:
-    """What is registered under a name."""
+    """The entry points of a name.
+
+    There are several if packages register different objects, and none if nobody does, as for the QP solvers of
+    qpsolvers. Both are refused only when the plugin is loaded.
+    """
 
     kind: PluginKind
     name: str
     entries: tuple[EntryPoint, ...] = ()
-    """Its entry point. There are several where packages register different objects, and none where nobody registers
-    any, as for the QP solvers of qpsolvers; either is refused only where the plugin is loaded."""
 
     def __str__(self) -> str:
         return f"{self.kind} '{self.name}'"
 
     @property
     def origins(self) -> list[str]:
-        """Distribution and version, "vibench 0.1.0", of everyone who provides it."""
+        """Distributions that provide it, with version: "vibench 0.1.0"."""
         registered = [
             f"{one.dist.name} {one.dist.version}" if one.dist is not None else "unknown" for one in self.entries
         ]
@@ -53,7 +55,7 @@ class RegisteredPlugin:
 
     @property
     def origin(self) -> str:
-        """Distribution and version it comes from; all of them, if there are several."""
+        """The `origins` in one text."""
         return ", ".join(self.origins)
 
     @property
@@ -66,9 +68,9 @@ class RegisteredPlugin:
 
     @cached_property
     def conflict(self) -> str:
-        """Why the name says too little: who else provides a plugin or a solver of qpsolvers with it; "" if it is one.
+        """Reason why the name is ambiguous: several packages, or qpsolvers, provide it; "" if it is unique.
 
-        Nothing of that name is loaded: whichever was meant, results would be recorded under the name of the other.
+        Nothing of that name is loaded: results of one plugin would be recorded under the name of another.
         """
         if len(self.entries) < 2 - self._in_qpsolvers:
             return ""
@@ -79,7 +81,7 @@ class RegisteredPlugin:
 
     @cached_property
     def package(self) -> str:
-        """Distribution of a third party that it comes from; "" for those of vibench, and for what is no plugin."""
+        """Third-party distribution that provides it; "" for plugins of vibench and solvers of qpsolvers."""
         if not self.entries:
             return ""
         entry = self.entries[0]  # the metadata of a distribution are read again at each access
@@ -88,7 +90,7 @@ class RegisteredPlugin:
 
     @property
     def reference(self) -> str:
-        """Where it is, "module:attribute"."""
+        """Location, "module:attribute"."""
         return f"{self._entry.module}:{self._entry.attr}"
 
     @property
@@ -101,7 +103,7 @@ class RegisteredPlugin:
 
     @property
     def summary(self) -> str:
-        """What it is, in a line: that of its documentation, or of the comment at the top of a study."""
+        """First line of its docstring, or first sentence of the comment at the top of a study."""
         if self.kind is not STUDY:
             return docstring(self._entry.module, self._entry.attr)
         try:
@@ -111,13 +113,13 @@ class RegisteredPlugin:
 
     @property
     def names_of_options(self) -> list[str]:
-        """Names of its options, as its source has them."""
+        """Names of its options, read from the source."""
         return [option for entry in self.entries for option in names_of_options(entry.module, entry.attr)]
 
     def load(self) -> Any:
         """The object that its entry point refers to.
 
-        Raises a `RequestError` if no plugin or several have the name, it cannot be imported, or it is not of its kind.
+        Raises a `RequestError` if the name is unknown or ambiguous, or the object is of another kind or fails to load.
         """
         where = f"{self} ({self._entry.value})"
         try:
@@ -135,9 +137,9 @@ class RegisteredPlugin:
 
     @cached_property
     def code(self) -> str:
-        """Version with a hash of its outermost package, or its module in none.
+        """Version with a hash of its outermost package, or of its module outside packages.
 
-        Of a name that several packages use it is their versions: nothing is computed with it.
+        For an ambiguous name these are all versions: nothing is computed with it.
 
         Raises a `RequestError` if no plugin has the name.
         """
@@ -150,12 +152,12 @@ class RegisteredPlugin:
 
     @property
     def requirements(self) -> tuple[str, ...]:
-        """Distributions that it `requires`, in addition to the requirements of its own distribution."""
+        """Distributions in its attribute `requires`, in addition to the requirements of its own distribution."""
         return tuple(getattr(self.load(), "requires", ()))
 
     @property
     def missing(self) -> list[str]:
-        """Distributions that it `requires` and that are not installed."""
+        """Requirements that are not installed."""
         return [one for one in self.requirements if not distribution_version(one)]
 
     @property
@@ -171,7 +173,7 @@ class RegisteredPlugin:
         return set() if self.conflict else {name for name, one in self.options.items() if one.annotation is Path}
 
     def check_options(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Options, converted to the types of its constructor's arguments; as they are if several have its name.
+        """Options, converted to the types of its constructor's arguments; unchanged for an ambiguous name.
 
         Raises a `RequestError` if an option is unknown, missing, or not of its type.
         """
@@ -183,9 +185,9 @@ class RegisteredPlugin:
         return checked_arguments(self.load(), str(self), own) | chosen
 
     def _without_factorisation(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
-        """Options without `factorisation`, which every problem has, and that one, if it is not the default.
+        """Options without `factorisation`, and this option if it is not the default.
 
-        Raises a `RequestError` if there is none of this name.
+        Raises a `RequestError` for an unknown factorisation.
         """
         if self.kind is not PROBLEM or FACTORISATION not in given or FACTORISATION in self.options:
             return dict(given), {}
@@ -205,7 +207,7 @@ class RegisteredPlugin:
         )
 
     def data_digest(self, options: Mapping[str, Any]) -> str:
-        """Digest of the files that it reads with these options, "" if it reads none, or cannot be made here.
+        """Digest of the files that it reads with these options; "" if it reads none, or is not available here.
 
         Raises a `RequestError` if one of the files cannot be read.
         """
@@ -230,7 +232,7 @@ class RegisteredPlugin:
 
 
 def find(kind: PluginKind, name: str) -> RegisteredPlugin:
-    """What is registered under a name, which may be nothing."""
+    """The entry points of a name, possibly none."""
     return registered(kind).get(name) or RegisteredPlugin(kind, name)
 
 
@@ -246,21 +248,21 @@ def registered(kind: PluginKind) -> dict[str, RegisteredPlugin]:
 def find_named(text: str, kinds: Mapping[str, PluginKind], solvers: Sequence[str]) -> RegisteredPlugin:
     """The plugin that NAME or KIND:NAME refers to, of kinds by their names on the command line.
 
-    QP solvers are those that are installed (`installed_solvers`), whether they are plugins or not.
+    `solvers` are the installed QP solvers, including plugins.
 
     Raises a `RequestError` if there is no such plugin, or several.
     """
     prefix, colon, rest = text.partition(":")
     name = rest if colon else text
-    asked = {word: kind for word, kind in kinds.items() if not colon or word == prefix}
-    names = {word: solvers if kind is SOLVER else [*registered(kind)] for word, kind in (asked or kinds).items()}
-    having = [word for word in asked if name in names[word]]
-    if not having:
+    searched = {word: kind for word, kind in kinds.items() if not colon or word == prefix}
+    names = {word: solvers if kind is SOLVER else [*registered(kind)] for word, kind in (searched or kinds).items()}
+    matching = [word for word in searched if name in names[word]]
+    if not matching:
         what = kinds.get(prefix, "plugin") if colon else "plugin"
-        raise unknown_name(what, name, (one for those in names.values() for one in those))
-    if len(having) > 1:
-        raise RequestError(f"several plugins are called '{name}': say {' or '.join(f'{k}:{name}' for k in having)}")
-    return find(kinds[having[0]], name)
+        raise unknown_name(what, name, (one for of_kind in names.values() for one in of_kind))
+    if len(matching) > 1:
+        raise RequestError(f"several plugins are called '{name}': say {' or '.join(f'{k}:{name}' for k in matching)}")
+    return find(kinds[matching[0]], name)
 
 
 @requested
@@ -287,7 +289,7 @@ def create(kind: str, name: str, options: Mapping[str, Any] | None = None) -> An
 
 
 def qp_solver(name: str) -> dict[str, QPSolver]:
-    """The solver that a plugin registers under this name, by it; empty for the solvers of qpsolvers."""
+    """The solver of a plugin, by its name; empty for a solver of qpsolvers."""
     return {name: find(SOLVER, name).load()} if name in registered(SOLVER) else {}
 
 
@@ -307,7 +309,8 @@ def _readable() -> tuple[tuple[EntryPoint, ...], dict[str, str]]:
     broken: dict[str, str] = {}
     for distribution in importlib.metadata.distributions():
         name = _distribution_name(distribution)
-        if name in readable or name in broken:  # the first on the path is the one that is imported
+        # Python imports the first one on the path.
+        if name in readable or name in broken:
             continue
         try:
             readable[name] = tuple(distribution.entry_points)
@@ -317,7 +320,7 @@ def _readable() -> tuple[tuple[EntryPoint, ...], dict[str, str]]:
 
 
 def _distribution_name(distribution: Distribution) -> str:
-    """The normalised name: from that of its folder, as importlib.metadata does, since METADATA is long to read."""
+    """The normalised name, from the name of the folder if possible, since METADATA takes long to read."""
     try:
         return str(getattr(distribution, "_normalized_name", None) or distribution.metadata["Name"])
     except Exception:  # noqa: BLE001  as above
@@ -332,17 +335,15 @@ def docstring(module: str, name: str) -> str:
 
 
 def names_of_options(module: str, name: str) -> list[str]:
-    """Names of the arguments of a class's constructor, its own or inherited."""
+    """Names of the arguments of the constructor of a class, its own or inherited."""
     methods = (node for one in _definitions(module, name) for node in one.body if isinstance(node, ast.FunctionDef))
     constructor = next((node.args for node in methods if node.name == "__init__"), None)
     return [] if constructor is None else [one.arg for one in (*constructor.args[1:], *constructor.kwonlyargs)]
 
 
 def _definitions(module: str, name: str, below: tuple[tuple[str, str], ...] = ()) -> Iterator[ast.ClassDef]:
-    """The definition of a class, and those of the classes that it inherits from; `below` are those that inherit it.
-
-    Only modules of the package of the first class are read: to find others, packages that hold them are imported.
-    """
+    """The definitions of a class and of its base classes; `below` are the classes that inherit from it."""
+    # Read modules of the package of the first class alone: finding others would import their packages.
     if (module, name) in below or (below and module.partition(".")[0] != below[0][0].partition(".")[0]):
         return
     tree = _syntax_tree(module)
@@ -365,12 +366,13 @@ def _syntax_tree(module: str) -> ast.Module:
 
 
 def top_comment(file: Path) -> str:
-    """The first sentence of the comment at the top of a study file; "" where it has none or is none."""
+    """The first sentence of the comment at the top of a study file; "" if there is none."""
     lines = file.read_text(encoding="utf-8").split("\n") if file.is_file() else []
     top = lines[: next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))]
     return first_sentence(" ".join(line.removeprefix("#").strip() for line in top))
 
 
 def first_sentence(text: str) -> str:
-    """The first sentence of a text, without its point; one before no capital letter is that of an abbreviation."""
+    """The first sentence of a text, without its full stop."""
+    # A full stop that no capital letter follows ends an abbreviation.
     return re.split(r"\.\s+(?=[A-Z])", text, maxsplit=1)[0].removesuffix(".")
