@@ -20,7 +20,6 @@ from page import SECONDS, Page, made_by, origin, read, start
 
 from vibench import HighFidelitySolver, create
 from vibench.highfidelity.active_set import solve_high_fidelity
-from vibench.linalg.factorisations import AVAILABLE
 from vibench.report.figures.style import STYLE, CaptionedFigure
 from vibench.results import formats
 from vibench.study.cells import CERTIFIED
@@ -57,7 +56,7 @@ def against_theory(resolutions: tuple[str, ...] = RESOLUTIONS) -> pd.DataFrame:
 
 
 def _on_mesh(resolution: str) -> Iterator[dict[str, object]]:
-    problem = create("problem", "hertz3d", {"resolution": resolution, "factorisation": AVAILABLE})
+    problem = create("problem", "hertz3d", {"resolution": resolution, "factorisation": "available"})
     solver, start = HighFidelitySolver(problem), None
     for mu in MUS:
         flat = mu * np.array([FLAT, FLAT, 1.0 / FLAT, 1.0])  # with the same A
@@ -85,7 +84,7 @@ def far_faces(resolution: str = "coarse") -> pd.DataFrame:
     """The same differences at one parameter with the far face at other distances, by what is outside the block."""
     rows = []
     for far, distance in product(("boussinesq", "clamped"), (10.0, 20.0, 40.0, 80.0)):
-        options = {"resolution": resolution, "factorisation": AVAILABLE, "far": far, "distance": distance}
+        options = {"resolution": resolution, "factorisation": "available", "far": far, "distance": distance}
         problem, mu = create("problem", "hertz3d", options), MUS[0]
         solution, theory = HighFidelitySolver(problem).solve(mu), problem.theory(mu)
         found = problem.measured(solution.lam)
@@ -195,7 +194,7 @@ def conditions(cells: pd.DataFrame) -> str:
 
 def pressed(resolution: str = "medium") -> Figure:
     """The surface pressed by an elliptic paraboloid, and the contact pressure beside that of Hertz."""
-    problem, mu = create("problem", "hertz3d", {"resolution": resolution, "factorisation": AVAILABLE}), MUS[1]
+    problem, mu = create("problem", "hertz3d", {"resolution": resolution, "factorisation": "available"}), MUS[1]
     solution = HighFidelitySolver(problem).solve(mu)
     picture = problem.picture(mu, solution.u, solution.lam)
     with mpl.rc_context(STYLE):

@@ -19,43 +19,26 @@ from vibench.errors import NumericalError
 from vibench.linalg import UNIT_ROUND_OFF
 from vibench.linalg.definite import BlockDiagonal, Factor, FactoredElimination, dense_cholesky, mirrored
 
-SPACE, PANEL = 32, 20
-"""Entries of a row from which on factors are so full that SuperLU is the fastest with panels of so many columns, as
-those of displacements in space; of other matrices it is with panels of one."""
-
-SPARSE_COLUMN, SPARSE_SHARE = 256, 1 / 8
-"""Columns of a factor with at most so many entries, and at most this share of all rows, are multiplied as sparse ones,
-which needs few operations there."""
-
-DENSE_COLUMNS = 256
-"""Number of consecutive longer columns that are multiplied as one dense matrix, on the rows that they have entries in:
-they belong to neighbouring separators, whose rows are nearly the same."""
-
-TOGETHER = 32
-"""Right-hand sides that SuperLU solves at once: of so few the vectors stay in the cache."""
-
-GROUP = 2**18
-"""Entries of factors that are compared at once."""
-
 
 def symmetric_lu(matrix: SparseMatrix, permutation: str) -> SuperLU:
     """LU of a symmetric matrix (CSC) without off-diagonal pivoting; raises a `RuntimeError` if it is exactly singular.
 
-    Of a definite matrix it is a Cholesky factorisation; SciPy has no sparse one of its own.
+    For a definite matrix it is a Cholesky factorisation; SciPy has no sparse one of its own.
     """
-    panel = PANEL if matrix.nnz > SPACE * matrix.shape[0] else 1
+    # Above 32 nonzeros per row, as in elasticity in space, SuperLU is fastest with panels of 20 columns, below with 1.
+    panel = 20 if matrix.nnz > 32 * matrix.shape[0] else 1
     return splu(
         matrix, permc_spec=permutation, diag_pivot_thresh=0.0, panel_size=panel, options={"SymmetricMode": True}
     )
 
 
 def few_at_once(solve: Callable[[Array], Array], right: Array) -> Array:
-    """The solutions for right-hand sides (n,) or (n, k), `TOGETHER` at most at once."""
-    if right.ndim == 1 or right.shape[1] <= TOGETHER:
+    """Solve for right-hand sides (n,) or (n, k), at most 32 at once, whose vectors stay in the cache."""
+    if right.ndim == 1 or right.shape[1] <= 32:
         return np.asarray(solve(right))
     solved = np.empty(right.shape, order="F")
-    for first in range(0, right.shape[1], TOGETHER):
-        columns = slice(first, first + TOGETHER)
+    for first in range(0, right.shape[1], 32):
+        columns = slice(first, first + 32)
         solved[:, columns] = solve(np.asfortranarray(right[:, columns], dtype=float))
     return solved
 
@@ -89,11 +72,9 @@ class SparseCholesky(Factor):
         self.order: Indices = np.argsort(self._lu.perm_c)
 
     def __getstate__(self) -> dict[str, object]:
-        """What it was made of: SuperLU objects cannot be stored."""
-        return dict(zip(("matrix", "name"), self._arguments, strict=True))
+        return dict(zip(("matrix", "name"), self._arguments, strict=True))  # SuperLU objects cannot be stored
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Factorise again."""
         SparseCholesky.__init__(self, **state)
 
     @property
@@ -104,7 +85,8 @@ class SparseCholesky(Factor):
     @cached_property
     def _lower(self) -> SparseMatrix:
         lower = sp.csc_array(self._lu.L)
-        lower.sort_indices()  # here once; a triangular solve would sort every time
+        # Sort once here; every triangular solve would otherwise sort again.
+        lower.sort_indices()
         return lower
 
     def solve(self, right: Array) -> Array:
@@ -132,7 +114,7 @@ class SparseCholesky(Factor):
 
 
 class PartialCholesky(FactoredElimination):
-    """A sparse symmetric positive definite X (n×n) of which all unknowns but a few are eliminated.
+    """A sparse symmetric positive definite X (n×n) with all unknowns eliminated but a few.
 
     With the eliminated unknowns i and the last ones c, the factors of [X_ii 0; X_ci I] without pivoting are those of
     X_ii, and L_ci with X_ci = L_ci D L_iiᵀ. Their last block has no fill-in: the Schur complement
@@ -153,7 +135,7 @@ class PartialCholesky(FactoredElimination):
     Raises
     ------
     NumericalError
-        If X_ii is not positive definite; of S, that is seen where it is factorised.
+        If X_ii is not positive definite; an indefinite S is detected where it is factorised.
     """
 
     def __init__(self, matrix: SparseMatrix, order: Indices, last: int, name: str = "the matrix") -> None:
@@ -168,17 +150,14 @@ class PartialCholesky(FactoredElimination):
         self._root, self._bodies = np.sqrt(pivots[:split]), connected_components(matrix, directed=False)[1][split:]
 
     def __getstate__(self) -> dict[str, object]:
-        """What it was made of: SuperLU objects cannot be stored."""
         return dict(zip(("matrix", "order", "last", "name"), self._arguments, strict=True))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Factorise again."""
         PartialCholesky.__init__(self, **state)
 
     @property
     def nbytes(self) -> int:
-        """Memory of the factors: a value of 8 bytes and an index of 4 per entry."""
-        return 12 * int(self._lu.nnz)
+        return 12 * int(self._lu.nnz)  # a value of 8 bytes and an index of 4 per entry
 
     @cached_property
     def _columns(self) -> SparseMatrix:
@@ -189,22 +168,15 @@ class PartialCholesky(FactoredElimination):
 
     @cached_property
     def _coupling_factor(self) -> SparseMatrix:
-        """L_ci."""
-        return self._columns[self._split :]
+        return self._columns[self._split :]  # L_ci
 
     @cached_property
     def _corner_factor(self) -> SparseMatrix:
-        """L_iiᵀ."""
         corner = sp.csc_array(self._columns[: self._split])
         corner.sort_indices()
-        return corner.T
-
-    def schur(self) -> Array:
-        """The Schur complement S (c×c) of the eliminated unknowns."""
-        return self.schur_blocks().toarray()
+        return corner.T  # L_iiᵀ
 
     def schur_blocks(self) -> BlockDiagonal:
-        """S, body by body."""
         lower = sp.csc_array(self._lu.L)[self._split :, : self._split]
         lower.data *= np.repeat(self._root, np.diff(lower.indptr))
         blocks = []
@@ -217,23 +189,19 @@ class PartialCholesky(FactoredElimination):
 
     @cached_property
     def trailing_factor(self) -> Array:
-        """The trailing block F_cc (c×c) of F, upper triangular, with F_ccᵀF_cc = S.
-
-        Raises a `NumericalError` if S, and with it X, is not positive definite.
-        """
-        return dense_cholesky(self.schur(), self._name)
+        return dense_cholesky(self.schur_blocks().toarray(), self._name)
 
     def round_off(self, weights: Array) -> Array:
-        """Row sums Σ_j |X − P|_ij w_j (n,) with weights w (n,), both in elimination order, or upper bounds of them.
+        """Bounds of the row sums Σ_j |X − P|_ij w_j (n,) with weights w (n,), both in elimination order.
 
         P is the matrix whose factors are exactly the computed L_ii, L_ci and D, with the computed S as its complement.
         """
         return round_off_of_factors(self._lu, self._split, self._corner, weights)
 
     def eliminate(self, right: Array) -> tuple[Array, Array]:
-        """For r (n,) or (n, k), X_ii⁻¹ r_i and the load of the Schur complement, r_c − X_ci X_ii⁻¹ r_i."""
         solved = np.ascontiguousarray(right[self.order], dtype=float)
-        loading = solved[: self._split].any(axis=0)  # forces of the contact load no eliminated unknown
+        # Contact forces load no eliminated unknown, and need no solution.
+        loading = solved[: self._split].any(axis=0)
         if loading.any() and not loading.all():
             solved[:, loading] = few_at_once(self._lu.solve, np.ascontiguousarray(solved[:, loading]))
         elif loading.any():
@@ -241,7 +209,6 @@ class PartialCholesky(FactoredElimination):
         return solved[: self._split], solved[self._split :]
 
     def extend(self, last: Array) -> Array:
-        """Solution (n,) or (n, k) of X u = 0 in the rows of i, with u (c,) or (c, k) given on the last unknowns."""
         right = np.zeros((len(self.order), *last.shape[1:]))
         right[: self._split] = -(self._coupling.T @ last)
         u = np.empty_like(right)
@@ -251,11 +218,9 @@ class PartialCholesky(FactoredElimination):
         return u
 
     def apply_factor(self, u: Array) -> Array:
-        """F u, for u (n,) or (n, k): first the entries of i."""
         u = u[self.order]
-        return np.concatenate([
-            _scale_rows(self._root, self._columns.T @ u), self.trailing_factor @ u[self._split :]
-        ])  # fmt: skip
+        first = _scale_rows(self._root, self._columns.T @ u)
+        return np.concatenate([first, self.trailing_factor @ u[self._split :]])
 
     def solve_factor(self, y: Array) -> Array:
         """F⁻¹ y, for y (n,) or (n, k)."""
@@ -271,7 +236,6 @@ class PartialCholesky(FactoredElimination):
         return u
 
     def solve_factor_transposed(self, right: Array) -> Array:
-        """F⁻ᵀ r, for r (n,) or (n, k); of a functional on the last unknowns only the last entries are not zero."""
         right, split = np.ascontiguousarray(right[self.order], dtype=float), self._split
         first, last = right[:split], right[split:]
         if first.any():
@@ -284,18 +248,24 @@ class PartialCholesky(FactoredElimination):
 
 
 def _less_products(corner: SparseMatrix, columns: SparseMatrix) -> Array:
-    """X_cc − C Cᵀ (c×c) for a sparse C of which most columns have few entries, and some nearly all."""
-    entries, limit = np.diff(columns.indptr), min(SPARSE_COLUMN, SPARSE_SHARE * columns.shape[0])
+    """X_cc − C Cᵀ (c×c) for a sparse C in which most columns have few entries, and some nearly all.
+
+    Columns with at most 256 entries, and entries in at most an eighth of the rows, are multiplied as sparse ones,
+    which needs few operations there.
+    """
+    entries, limit = np.diff(columns.indptr), min(256, columns.shape[0] / 8)
     few, many = columns[:, entries <= limit], np.flatnonzero(entries > limit)
     result, place = (corner - few @ few.T).toarray(order="F"), np.empty(len(entries) and corner.shape[0], np.intp)
-    for first in range(0, len(many), DENSE_COLUMNS):
-        block = columns[:, many[first : first + DENSE_COLUMNS]]
+    # Consecutive longer columns belong to neighbouring separators, and have entries in nearly the same rows: they are
+    # multiplied as one dense matrix on these rows.
+    for first in range(0, len(many), 256):
+        block = columns[:, many[first : first + 256]]
         rows = np.unique(block.indices)
         place[rows] = np.arange(len(rows))
         dense = np.zeros((len(rows), block.shape[1]), order="F")
         dense[place[block.indices], np.repeat(np.arange(block.shape[1]), np.diff(block.indptr))] = block.data
         product = dsyrk(-1.0, dense, lower=True)
-        if rows[-1] - rows[0] + 1 == len(rows):  # neighbours, which are added in place
+        if rows[-1] - rows[0] + 1 == len(rows):  # neighbours are added in place
             result[rows[0] : rows[-1] + 1, rows[0] : rows[-1] + 1] += product
         else:
             result[np.ix_(rows, rows)] += product
@@ -303,7 +273,7 @@ def _less_products(corner: SparseMatrix, columns: SparseMatrix) -> Array:
 
 
 def _pivots(matrix: SparseMatrix, permutation: str, name: str) -> tuple[SuperLU, Array]:
-    """Factors without pivoting off the diagonal, and the pivots (n,), which are positive."""
+    """Factors without pivoting off the diagonal, and the positive pivots (n,)."""
     try:
         lu = symmetric_lu(matrix, permutation)
     except RuntimeError as error:
@@ -317,13 +287,14 @@ def _pivots(matrix: SparseMatrix, permutation: str, name: str) -> tuple[SuperLU,
 
 
 def round_off_of_factors(lu: SuperLU, split: int, corner: SparseMatrix, weights: Array) -> Array:
-    """Row sums Σ_j |X − P|_ij w_j (n,) with weights w (n,), both in elimination order, or upper bounds of them.
+    """Bounds of the row sums Σ_j |X − P|_ij w_j (n,) with weights w (n,), both in elimination order.
 
     P has the first `split` columns L_i and pivots D of the computed factors exactly, and a computed Schur complement of
     X_cc, the `corner`: in the columns of i, |X − P| ≤ γ|L||U| + |L||U − D Lᵀ| (Higham 2002, Theorem 9.3). Where all
     columns are taken, P is L D Lᵀ.
     """
-    lower, upper = lu.L.tocsr(), lu.U  # sorted rows of the one; columns of the other are rows of its transpose
+    # The rows of L are sorted so; the columns of U are rows of its transpose.
+    lower, upper = lu.L.tocsr(), lu.U
     terms = int(np.max(np.diff(lower.indptr), initial=0)) + 8
     gamma, pivots = terms * UNIT_ROUND_OFF / (1.0 - terms * UNIT_ROUND_OFF), upper.diagonal()[:split]
     w_i, w_c = weights[:split], weights[split:]
@@ -346,7 +317,7 @@ def round_off_of_factors(lu: SuperLU, split: int, corner: SparseMatrix, weights:
     sums[:split] += across
     if len(w_c):
         sums[split:] += gamma * (abs(corner) @ w_c + lower[split:, :split] @ (np.abs(pivots) * back))
-    return np.asarray(1.01 * sums)
+    return np.asarray(1.01 * sums)  # the factor covers the round-off in this bound itself
 
 
 def have_one_pattern(first: SparseMatrix, second: SparseMatrix) -> bool:
@@ -359,8 +330,8 @@ def _pattern(matrix: SparseMatrix) -> tuple[Indices, Indices]:
 
 
 def _groups(pointers: Indices) -> Iterator[slice]:
-    """Consecutive rows with about `GROUP` entries: many large arrays would take longer to allocate than to fill."""
-    places = np.arange(GROUP, int(pointers[-1]) + GROUP, GROUP)
+    """Consecutive rows with about 2¹⁸ entries: many large arrays would take longer to allocate than to fill."""
+    places = np.arange(2**18, int(pointers[-1]) + 2**18, 2**18)
     edges = np.unique(np.concatenate([[0], np.searchsorted(pointers[:-1], places), [len(pointers) - 1]]))
     return (slice(first, last) for first, last in itertools.pairwise(edges.tolist()))
 
@@ -374,7 +345,7 @@ def _rows_of(matrix: SparseMatrix, rows: slice, columns: int) -> SparseMatrix:
 
 
 def _triangular_solutions(factor: SparseMatrix, right: Array, *, lower: bool) -> Array:
-    """The solutions with a factor of unit diagonal (n×n) for right-hand sides (n,) or (n, k)."""
+    """Solve with a factor of unit diagonal (n×n) for right-hand sides (n,) or (n, k)."""
     return few_at_once(lambda r: spsolve_triangular(factor, r, lower=lower, unit_diagonal=True), right)
 
 

@@ -1,4 +1,7 @@
-"""Dense symmetric positive definite matrices that may consist of blocks, such as those of bodies that do not touch."""
+"""Symmetric positive definite matrices: dense ones of blocks, and the interface of sparse factorisations.
+
+Bodies that do not touch have a block each.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +19,7 @@ from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
 
 MANY_UNKNOWNS = 1500
-"""Dense work on at most so many unknowns takes less than to find out which of them it can do without."""
-
-MIRRORED = 64
-"""Number of rows of a triangle that are mirrored at once."""
+"""Dense work on at most so many unknowns costs less than to determine which of them it can do without."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class BlockDiagonal:
 
     @classmethod
     def of(cls, matrix: Array) -> BlockDiagonal:
-        """The blocks of a symmetric matrix (c×c)."""
+        """Find the blocks of a symmetric matrix (c×c)."""
         sets = connected_blocks(matrix)
         if len(sets) == 1:
             return cls(len(matrix), ((sets[0], matrix),))
@@ -57,18 +57,17 @@ class BlockDiagonal:
         return product
 
     def times_sparse(self, values: Array) -> Array:
-        """X v of a symmetric X for values (c,) or (c, k) most rows of which may be zero."""
+        """X v for a symmetric X and values (c,) or (c, k), most rows of which may be zero."""
         product = np.zeros((self.size, *values.shape[1:]))
         for unknowns, block in self.blocks:
             part = values[unknowns]
             acting = np.flatnonzero(part if part.ndim == 1 else part.any(axis=1))
-            # rows are copied for it, and all of them take longer to copy than to multiply
+            # The rows are copied, and all of them would take longer to copy than to multiply.
             few = 4 * len(acting) < len(unknowns)
             product[unknowns] = block[acting].T @ part[acting] if few else block @ part
         return product
 
     def toarray(self) -> Array:
-        """The matrix (c×c)."""
         if len(self.blocks) == 1:
             return self.blocks[0][1]
         matrix = np.zeros((self.size, self.size))
@@ -101,16 +100,15 @@ class BlockDiagonal:
         return self._by_blocks(name, lambda block: np.asarray(scipy.linalg.cholesky(block)))
 
     def inverse(self, name: str, overwrite: bool = False) -> BlockDiagonal:
-        """X⁻¹ of a symmetric positive definite X, which may be overwritten; raises as `cholesky` does."""
+        """X⁻¹ for a symmetric positive definite X, which may be overwritten; raises as `cholesky` does."""
         return self._by_blocks(name, partial(_inverse, overwrite=overwrite))
 
     def solve_triangular(self, right: Array, transposed: bool = False) -> Array:
         """F⁻¹ r, or F⁻ᵀ r, for an upper triangular F and r (c,) or (c, k)."""
         solution, trans = np.empty_like(right, dtype=float), "T" if transposed else "N"
         for unknowns, block in self.blocks:
-            solution[unknowns] = scipy.linalg.solve_triangular(
-                block, right[unknowns], trans=trans, check_finite=False
-            )  # fmt: skip
+            part = right[unknowns]
+            solution[unknowns] = scipy.linalg.solve_triangular(block, part, trans=trans, check_finite=False)
         return solution
 
     def _by_blocks(self, name: str, function: Callable[[Array], Array]) -> BlockDiagonal:
@@ -126,7 +124,7 @@ def dense_cholesky(matrix: Array, name: str) -> Array:
 
 
 def dense_inverse(matrix: Array, name: str) -> Array:
-    """The inverse of a symmetric positive definite X (c×c), which is overwritten; likewise."""
+    """The inverse of a symmetric positive definite X (c×c), which is overwritten; raises likewise."""
     return BlockDiagonal.of(matrix).inverse(name, overwrite=True).toarray()
 
 
@@ -136,7 +134,7 @@ def connected_blocks(matrix: Array) -> list[Indices]:
     while left.any():
         block = np.zeros_like(left)
         reached = np.flatnonzero(left)[:1]
-        while len(reached):  # every row is looked at once
+        while len(reached):
             block[reached] = True
             reached = np.flatnonzero((matrix[reached] != 0.0).any(axis=0) & ~block)
         left &= ~block
@@ -146,8 +144,8 @@ def connected_blocks(matrix: Array) -> list[Indices]:
 
 def mirrored(lower: Array) -> Array:
     """The symmetric matrix (c×c) of this lower triangle, in place: a second array of this size may not fit."""
-    for first in range(0, len(lower), MIRRORED):
-        last = first + MIRRORED
+    for first in range(0, len(lower), 64):
+        last = first + 64
         corner = np.tril(lower[first:last, first:last])
         lower[first:last, first:last] = corner + np.tril(corner, -1).T
         lower[first:last, last:] = lower[last:, first:last].T
@@ -155,8 +153,8 @@ def mirrored(lower: Array) -> Array:
 
 
 def _inverse(block: Array, overwrite: bool) -> Array:
-    """The inverse, row by row in memory: sparse products copy LAPACK's columns."""
-    factor = scipy.linalg.cholesky(block.T, lower=True, overwrite_a=overwrite)  # the transpose is the columns of rows
+    # The transpose has LAPACK's order of columns. The result is stored row by row: sparse products would copy columns.
+    factor = scipy.linalg.cholesky(block.T, lower=True, overwrite_a=overwrite)
     return mirrored(np.asarray(dpotri(factor, lower=True, overwrite_c=True)[0])).T
 
 

@@ -68,7 +68,8 @@ class Implementation(ABC):
 
     def order(self, matrix: SparseMatrix, last: Indices) -> Indices:
         """Return an order (n,) for `eliminate` that ends with the unknowns `last` (c,)."""
-        return np.concatenate([np.setdiff1d(np.arange(matrix.shape[0]), last), last])  # each has its own for the others
+        # Libraries order the others themselves.
+        return np.concatenate([np.setdiff1d(np.arange(matrix.shape[0]), last), last])
 
 
 class _SuperLU(Implementation):
@@ -148,19 +149,19 @@ class CholmodFactor(Factor):
 IMPLEMENTATIONS: dict[str, Implementation] = {one.name: one for one in (_SuperLU(), _Pardiso(), _Cholmod())}
 DEFAULT: str = next(iter(IMPLEMENTATIONS))
 
-AVAILABLE = "available"
-"""Asks for the first installed one of PARDISO, CHOLMOD and SuperLU."""
-
 
 def implementation(name: str) -> Implementation:
-    """Return the implementation of a name; raises a `RequestError` if there is none."""
+    """Return the implementation of a name, or the fastest one that is "available".
+
+    Raises a `RequestError` if there is none of this name.
+    """
     if not isinstance(name, str):
         raise RequestError(f"the factorisation is {brief(repr(name), 80)}, expected the name of one")
-    if name == AVAILABLE:
+    if name == "available":
         fastest_first = (IMPLEMENTATIONS[one] for one in ("pardiso", "cholmod", DEFAULT))
         return next(one for one in fastest_first if one.is_installed)
     if name not in IMPLEMENTATIONS:
-        raise unknown_name("factorisation", name, [*IMPLEMENTATIONS, AVAILABLE])
+        raise unknown_name("factorisation", name, [*IMPLEMENTATIONS, "available"])
     return IMPLEMENTATIONS[name]
 
 

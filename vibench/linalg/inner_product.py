@@ -22,31 +22,26 @@ from vibench.linalg.factorisations import DEFAULT, implementation
 from vibench.text import brief
 
 SYMMETRY_RTOL = 1e-12
-"""Difference of two entries of a symmetric matrix, relative to its largest entry, that is taken for round-off."""
+"""Differences of two entries of a symmetric matrix, relative to its largest entry, up to this are round-off."""
 
 RANK_RTOL = 1e-12
 """Directions below this fraction of the largest one are round-off and are dropped from every orthonormal basis."""
 
-ORTHOGONALITY_ATOL = 1e-13
-"""Inner products of unit vectors below this are round-off."""
-
-_POSTPONED: ContextVar[list[InnerProduct] | None] = ContextVar(
-    "inner products that are not factorised yet", default=None
-)
+_postponed: ContextVar[list[InnerProduct] | None] = ContextVar("inner products not factorised yet", default=None)
 
 
 @contextmanager
 def factorised_later() -> Iterator[None]:
-    """Inner products made inside are factorised, and indefinite ones refused, at the end.
+    """Postpone the factorisation of inner products, and the refusal of indefinite ones, to the end of the context.
 
-    Who factorises them may be chosen until then: the default takes minutes for a space of 200,000 dimensions.
+    Another implementation may be chosen until then: the default takes minutes for a space of 200,000 dimensions.
     """
     made: list[InnerProduct] = []
-    token = _POSTPONED.set(made)
+    token = _postponed.set(made)
     try:
         yield
     finally:
-        _POSTPONED.reset(token)
+        _postponed.reset(token)
     for product in made:
         product._solver  # noqa: B018
 
@@ -81,13 +76,13 @@ class InnerProduct:
         self.matrix = sp.csc_array(matrix)
         self._name, self.factorisation = name, factorisation
         check_symmetric(self.matrix, name)
-        if (postponed := _POSTPONED.get()) is not None:
+        if (postponed := _postponed.get()) is not None:
             postponed.append(self)
         else:
-            self._solver  # noqa: B018  refuses an indefinite matrix here and not at its first use
+            self._solver  # noqa: B018  refuse an indefinite matrix here, not at its first use
 
     def __getstate__(self) -> dict[str, object]:
-        """Drop the factorisation: SuperLU objects cannot be pickled."""
+        # SuperLU objects cannot be pickled.
         return {name: value for name, value in vars(self).items() if name in ("matrix", "_name", "factorisation")}
 
     @property
@@ -106,9 +101,9 @@ class InnerProduct:
         return np.asarray(self.matrix.toarray())
 
     def factorised_by(self, name: str) -> None:
-        """Let an implementation solve with X and eliminate unknowns of it (`vibench.linalg.factorisations`).
+        """Let an implementation (`vibench.linalg.factorisations`) solve with X and eliminate unknowns of it.
 
-        F, which is explicit, is SuperLU's, which solves, too, in place of one that is not direct.
+        F, which is explicit, is always SuperLU's.
         """
         self.factorisation = name
         self.__dict__.pop("_solver", None)
@@ -123,7 +118,7 @@ class InnerProduct:
         return chosen.factorise(self.matrix, self._name) if chosen.name != DEFAULT else self._factor
 
     def _refuse_others(self, u: Array) -> None:
-        """Refuse what has not one row for each dimension of the space."""
+        """Refuse an array without one row for each dimension of the space."""
         shape = getattr(u, "shape", ())
         if shape[:1] != self.matrix.shape[:1] or len(shape) > 2:
             what = f"an array of the shape {shape}" if shape else brief(repr(u), 80)
@@ -191,7 +186,7 @@ def orthogonal_factorisation(X: SparseMatrix, y: Array) -> tuple[Array, Array]:
 
 
 def asymmetry(matrix: SparseMatrix) -> float:
-    """Largest difference of an entry of a square matrix from that of its transpose; 0.0 if they differ by round-off."""
+    """Largest difference of an entry of a square matrix from that of its transpose; 0.0 if it is round-off."""
     scale = abs(matrix).max() if matrix.nnz else 0.0
     off = float(abs(matrix - matrix.T).max()) if matrix.nnz else 0.0
     return off if off > SYMMETRY_RTOL * scale else 0.0
@@ -239,8 +234,8 @@ def orthonormal_range(y: Array, against: Array | None = None) -> Array:
         return np.zeros((y.shape[0], 0))
     q, r, _ = scipy.linalg.qr(y, mode="economic", pivoting=True)
     q = q[:, np.abs(np.diag(r)) > RANK_RTOL]
-    if against is not None and np.max(np.abs(against.T @ q), initial=0.0) > ORTHOGONALITY_ATOL:
-        # normalising a column of which little is left magnifies its round-off along `against`
+    if against is not None and np.max(np.abs(against.T @ q), initial=0.0) > 1e-13:
+        # Normalising a column of which little is left has magnified its round-off along `against`.
         q, _ = np.linalg.qr(project_out(against, q))
     return np.asarray(q)
 

@@ -14,18 +14,6 @@ from scipy.linalg.lapack import dstev
 
 from vibench.arrays import Array, SparseMatrix
 
-VECTORS = 60
-"""After so many vectors iterations start again from the Ritz vector, at most `RESTARTS` times."""
-
-RESTARTS = 20
-
-BREAKDOWN = 1e-12
-"""Vectors whose part beyond all others is below this share are the last ones: their span is invariant."""
-
-LOOKED_AT = 3
-"""The accuracy is estimated after every so many iterations: that takes as long as a tenth of a solution of a few
-thousand unknowns."""
-
 
 def largest_eigenvalue(apply: Callable[[Array], Array], M: SparseMatrix, accuracy: float) -> float:
     """Estimate of the largest |θ| with T v = θ v; infinite where M is seen not to be positive definite.
@@ -36,7 +24,10 @@ def largest_eigenvalue(apply: Callable[[Array], Array], M: SparseMatrix, accurac
 
 
 class Lanczos:
-    """Iterations that go on where they ended: a more accurate eigenvalue costs what is missing, another end often none.
+    """Lanczos iterations that continue where they ended.
+
+    A more accurate eigenvalue costs only the missing iterations, and the other end of the spectrum often none. After 60
+    vectors the iterations start again from the Ritz vector, at most 20 times.
 
     Parameters
     ----------
@@ -48,7 +39,7 @@ class Lanczos:
 
     def __init__(self, apply: Callable[[Array], Array], M: SparseMatrix) -> None:
         self._apply, self._M, n = apply, M, M.shape[0]
-        self._count = min(VECTORS, n)
+        self._count = min(60, n)
         self._basis, self._images = np.empty((self._count, n)), np.empty((self._count, n))
         self._restarted = False
         self._begin(np.random.default_rng(0).standard_normal(n))
@@ -56,7 +47,7 @@ class Lanczos:
     def largest(self, accuracy: float) -> float:
         """Estimate of the largest |θ|, whose relative error is about `accuracy`; infinite where M is not definite."""
         theta = 0.0
-        for _ in range(RESTARTS):
+        for _ in range(20):
             theta, error, vector = self._iterate(accuracy, smallest=False)
             if not error > accuracy * theta:
                 break
@@ -65,14 +56,13 @@ class Lanczos:
         return theta
 
     def smallest(self, accuracy: float) -> float | None:
-        """The same of the smallest θ of a positive definite T; `None` where so many vectors do not lead to it."""
+        """Estimate of the smallest θ of a positive definite T; `None` where the first 60 vectors do not suffice."""
         if self._restarted:  # towards the other end
             return None
         theta, error, _ = self._iterate(accuracy, smallest=True)
         return theta if error <= accuracy * theta and 0.0 < theta < np.inf else None
 
     def _begin(self, start: Array) -> None:
-        """Iterations from a vector (n,)."""
         self._size, self._diagonal, self._beside = 0, np.empty(self._count), np.empty(self._count)
         self._follow(start)
 
@@ -91,20 +81,22 @@ class Lanczos:
             self._extend()
             if not (np.isfinite(self._norm) and np.isfinite(self._diagonal[self._size - 1])):
                 return float("inf"), 0.0, ritz[2]
-            ended = self._norm <= BREAKDOWN * abs(self._diagonal[self._size - 1]) or self._size == self._count
-            if ended or self._size % LOOKED_AT == 0:
+            # The span is invariant where the next vector is round-off.
+            ended = self._norm <= 1e-12 * abs(self._diagonal[self._size - 1]) or self._size == self._count
+            # An estimate costs a tenth of a solution with a few thousand unknowns.
+            if ended or self._size % 3 == 0:
                 ritz = self._ritz(smallest)
         return ritz
 
     def _extend(self) -> None:
-        """One more vector of the basis."""
         k = self._size
         self._basis[k], self._images[k] = self._next / self._norm, self._image / self._norm
         done, images, w = self._basis[: k + 1], self._images[: k + 1], self._apply(self._basis[k])
-        last = slice(max(k - 1, 0), k + 1)  # in exact arithmetic w has no part along others
+        # In exact arithmetic w has parts along the last two vectors only; the second pass removes round-off.
+        last = slice(max(k - 1, 0), k + 1)
         along = images[last] @ w
         self._diagonal[k], w = along[-1], w - along @ done[last]
-        w -= (images @ w) @ done  # against round-off
+        w -= (images @ w) @ done
         self._follow(w)
         self._beside[k], self._size = self._norm, k + 1
 

@@ -18,7 +18,7 @@ from vibench.linalg.definite import BlockDiagonal, Factor, FactoredElimination, 
 
 
 def _library() -> str:
-    """Where the MKL is installed; "" if that is not known."""
+    """Path of the MKL; "" if that is not known."""
     try:
         names = [str(file.locate()) for file in files("mkl") or () if file.name.startswith(("libmkl_rt.", "mkl_rt."))]
     except PackageNotFoundError:
@@ -26,85 +26,71 @@ def _library() -> str:
     return os.path.realpath(names[0]) if names else ""
 
 
-# pypardiso, which loads it at once, looks in the folder of Python alone, where an environment on another has none
+# pypardiso loads the MKL when it is imported, and searches only the folder of Python, which has none in an environment
+# on top of another.
 if "PYPARDISO_MKL_RT" not in os.environ and (_place := _library()):
     os.environ["PYPARDISO_MKL_RT"] = _place
 
 from pypardiso import PyPardisoSolver  # noqa: E402
 from pypardiso.pardiso_wrapper import PyPardisoError  # noqa: E402
 
-FACTORISE, SOLVE, FORWARD, BACKWARD = 12, 33, 331, 333
-"""Phases; the last two are those of L and Lᵀ alone."""
 
-PARAMETERS = {1: 1, 2: 2, 8: 0, 10: 8, 18: -1, 21: 1, 27: 0, 35: 0}
-"""`iparm` by number, all others are 0. None is a default of the MKL: those of `iparm(1) = 0` are wrong since 2025. The
-order is that of METIS; entries of factors are counted; definite matrices need no scaling, matching or refinement;
-indices begin with one."""
+class _Factorised:
+    """A matrix (n×n) factorised by PARDISO, up to the Schur complement of its `last` unknowns if there are some."""
 
-ENTRIES, SCHUR = 18, 36
-"""`iparm` of the number of entries of a factor, and of the Schur complement of the unknowns that `perm` marks."""
+    def __init__(self, matrix: SparseMatrix, name: str, last: int) -> None:
+        upper = sp.csr_matrix(sp.triu(matrix, format="csr"))
+        upper.sort_indices()
+        self._solver, self._upper, self._name = PyPardisoSolver(mtype=2), upper, name
+        # Python does not see this memory, so that nothing else would free it.
+        weakref.finalize(self, self._solver.free_memory, everything=True).atexit = False
+        # Set all of `iparm`: its defaults, those of `iparm(1) = 0`, are wrong since 2025. The order is METIS's, entries
+        # of factors are counted, and definite matrices need no scaling, matching or refinement.
+        self._solver.iparm[:] = 0
+        for number, value in ((1, 1), (2, 2), (10, 8), (18, -1), (21, 1), (36, int(last > 0))):
+            self._solver.iparm[number - 1] = value
+        if last:
+            self._solver.perm = np.zeros(matrix.shape[0], np.int32)  # overwritten by the permutation
+            self._solver.perm[-last:] = 1
+        self._schur = self._call(12, np.zeros((last, last) if last else (matrix.shape[0], 1), order="F"))
+        self._entries = int(self._solver.iparm[17])
 
-
-def _solver() -> PyPardisoSolver:
-    solver = PyPardisoSolver(mtype=2)
-    solver.iparm[:] = 0
-    for number, value in PARAMETERS.items():
-        solver.iparm[number - 1] = value
-    return solver
-
-
-def _upper(matrix: SparseMatrix) -> SparseMatrix:
-    upper = sp.csr_matrix(sp.triu(matrix, format="csr"))
-    upper.sort_indices()
-    return upper
-
-
-def _call(solver: PyPardisoSolver, phase: int, upper: SparseMatrix, right: Array, name: str) -> Array:
-    solver.set_phase(phase)
-    try:
-        return np.asarray(solver._call_pardiso(upper, right))
-    except PyPardisoError as error:
-        raise NumericalError(f"{name} is not positive definite (PARDISO: error {error.value})") from None
+    def _call(self, phase: int, right: Array) -> Array:
+        """The result of a phase: 12 factorises, 33 solves, 331 and 333 solve with L and with Lᵀ alone."""
+        if not right.size:
+            return np.zeros_like(right, dtype=float)
+        self._solver.set_phase(phase)
+        try:
+            return np.asarray(self._solver._call_pardiso(self._upper, np.asfortranarray(right, dtype=float)))
+        except PyPardisoError as error:
+            raise NumericalError(f"{self._name} is not positive definite (PARDISO: error {error.value})") from None
 
 
-class PardisoFactor(Factor):
+class PardisoFactor(_Factorised, Factor):
     """A factor; a `NumericalError` says that the matrix is not positive definite."""
 
     def __init__(self, matrix: SparseMatrix, name: str) -> None:
-        self._solver, self._upper, self._name = _solver(), _upper(matrix), name
-        weakref.finalize(self, self._solver.free_memory, everything=True).atexit = False  # memory that NumPy has not
-        _call(self._solver, FACTORISE, self._upper, np.zeros((matrix.shape[0], 1)), name)
-        self._entries = int(self._solver.iparm[ENTRIES - 1])
+        super().__init__(matrix, name, 0)
 
     def entries(self, n: int) -> float:
         return self._entries if self._entries > 0 else super().entries(n)
 
     def solve(self, right: Array) -> Array:
-        if not right.size:
-            return np.zeros_like(right, dtype=float)
-        return _call(self._solver, SOLVE, self._upper, np.asfortranarray(right, dtype=float), self._name)
+        return self._call(33, right)
 
 
-class PardisoElimination(FactoredElimination):
-    """One factorisation for the Schur complement and for solutions: FORWARD ends with its loads, BACKWARD begins there.
+class PardisoElimination(_Factorised, FactoredElimination):
+    """One factorisation for the Schur complement and for solutions.
 
-    FORWARD solves with L, so that what it makes of functionals has their inner products in X_ii⁻¹.
+    The solution with L gives the loads of the Schur complement, that with Lᵀ begins there. Vectors L⁻¹ℓ of functionals
+    have the inner products of these in X_ii⁻¹.
     """
 
     def __init__(self, matrix: SparseMatrix, order: Indices, last: int, name: str) -> None:
         self._matrix = checked(sp.csr_array(matrix)[order][:, order], name)
-        self._order, self._split, self._name = order, len(order) - last, name
-        self._solver, self._upper = _solver(), _upper(self._matrix)
-        weakref.finalize(self, self._solver.free_memory, everything=True).atexit = False
-        self._solver.iparm[SCHUR - 1] = 1
-        self._solver.perm = np.zeros(len(order), np.int32)  # marks the last ones; overwritten by the permutation
-        self._solver.perm[self._split :] = 1
-        schur = self._call(FACTORISE, np.zeros((last, last), order="F"))
-        self._schur = 0.5 * (schur + schur.T)
-        self._entries = int(self._solver.iparm[ENTRIES - 1])
-
-    def _call(self, phase: int, right: Array) -> Array:
-        return _call(self._solver, phase, self._upper, np.asfortranarray(right, dtype=float), self._name)
+        self._order, self._split = order, len(order) - last
+        super().__init__(self._matrix, name, last)
+        self._schur = 0.5 * (self._schur + self._schur.T)
 
     @property
     def nbytes(self) -> int:
@@ -119,18 +105,18 @@ class PardisoElimination(FactoredElimination):
 
     def eliminate(self, right: Array) -> tuple[Array, Array]:
         ordered, split = np.asarray(right[self._order], float), self._split
-        if not ordered[:split].any():  # forces of the contact load no eliminated unknown
+        if not ordered[:split].any():  # contact forces load no eliminated unknown
             return ordered[:split], ordered[split:]
-        solved = self._call(FORWARD, ordered)
+        solved = self._call(331, ordered)
         load = solved[split:].copy()
         solved[split:] = 0.0
-        return self._call(BACKWARD, solved)[:split], load
+        return self._call(333, solved)[:split], load
 
     def extend(self, last: Array) -> Array:
         ordered = np.zeros((len(self._order), *last.shape[1:]))
         ordered[self._split :] = last
         u = np.empty_like(ordered)
-        u[self._order] = self._call(BACKWARD, ordered) if ordered.size else ordered
+        u[self._order] = self._call(333, ordered)
         return u
 
     @cached_property
@@ -139,17 +125,12 @@ class PardisoElimination(FactoredElimination):
 
     def apply_factor(self, u: Array) -> Array:
         ordered = u[self._order]
-        loads = np.asarray(self._matrix @ ordered)
-        return np.concatenate([
-            self._forward(loads)[: self._split], self.trailing_factor @ ordered[self._split :]
-        ])  # fmt: skip
+        first = self._call(331, np.asarray(self._matrix @ ordered))[: self._split]
+        return np.concatenate([first, self.trailing_factor @ ordered[self._split :]])
 
     def solve_factor_transposed(self, right: Array) -> Array:
-        solved = self._forward(np.asarray(right[self._order], float))
+        solved = self._call(331, np.asarray(right[self._order], float))
         last = solved[self._split :]
         if last.size:
             last = scipy.linalg.solve_triangular(self.trailing_factor, last, trans="T", check_finite=False)
         return np.concatenate([solved[: self._split], last])
-
-    def _forward(self, ordered: Array) -> Array:
-        return self._call(FORWARD, ordered) if ordered.size else ordered

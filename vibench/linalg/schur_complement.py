@@ -21,20 +21,28 @@ complement is most of the work."""
 
 @dataclass(frozen=True)
 class EliminationPattern:
-    """Which unknowns are retained and in which order the others are eliminated, for one sparsity pattern."""
+    """Retained unknowns, and the elimination order of the others, for one sparsity pattern.
+
+    Attributes
+    ----------
+    retained
+        Unknowns (c,) that the system is condensed on, rising.
+    order
+        Elimination order of all others, followed by the interface: the retained unknowns that couple to others.
+    interface
+        Positions of the interface among the retained unknowns.
+    whole
+        Extracts the whole matrix in an elimination order, where no unknown is eliminated; `None` elsewhere.
+    """
 
     retained: Indices
-    """Unknowns (c,) that the system is condensed on, rising."""
     order: Indices
-    """Elimination order of all others, followed by the interface: the retained unknowns that couple to others."""
     interface: Indices
-    """Positions of the interface among the retained unknowns."""
     whole: PrincipalSubmatrix | None = None
-    """Extracts the whole matrix in an elimination order, where no unknown is eliminated; `None` elsewhere."""
 
     @property
     def is_dense(self) -> bool:
-        """Whether most entries of the Schur complement are non-zero."""
+        """Whether most entries of the Schur complement are nonzero."""
         return 2 * len(self.interface) > len(self.retained)
 
     @cached_property
@@ -53,22 +61,17 @@ class EliminationPattern:
         columns = self._places[B.indices]
         if columns.min(initial=0) < 0:
             raise NumericalError("a constraint touches unknowns that are to be eliminated")
-        # copies, since libraries sort indices in place
+        # Copy: libraries sort indices in place.
         return sp.csr_array((B.data.copy(), columns, B.indptr.copy()), shape=(B.shape[0], len(self.retained)))
 
     @cached_property
-    def factorised_block(self) -> PrincipalSubmatrix:
-        """Extracts the block of the eliminated unknowns and the interface, in elimination order."""
-        return PrincipalSubmatrix(self.order)
-
-    @cached_property
-    def retained_block(self) -> PrincipalSubmatrix:
-        """Extracts the block of the retained unknowns."""
-        return PrincipalSubmatrix(self.retained)
+    def blocks(self) -> tuple[PrincipalSubmatrix, PrincipalSubmatrix]:
+        """Extract the block of eliminated unknowns and interface, in elimination order, and that of retained ones."""
+        return PrincipalSubmatrix(self.order), PrincipalSubmatrix(self.retained)
 
     @classmethod
     def of(cls, A: SparseMatrix, retained: Indices, factorisation: str = DEFAULT) -> EliminationPattern:
-        """Pattern for matrices with the sparsity of A (n×n), symmetric positive definite, to be factorised so."""
+        """Pattern for symmetric positive definite matrices with the sparsity of A (n×n), for a factorisation."""
         others = np.setdiff1d(np.arange(A.shape[0]), retained)
         interface = np.unique(sp.csr_array(A)[others][:, retained].indices)
         inside = np.union1d(others, retained[interface])
@@ -104,10 +107,10 @@ class PrincipalSubmatrix:
         return np.argsort(self.chosen)
 
     def of(self, A: SparseMatrix) -> SparseMatrix:
-        """The submatrix of A (CSR)."""
+        """Extract the submatrix of A (CSR)."""
         sparsity = A.indptr, A.indices
         if self._sparsity is None or not all(map(np.array_equal, self._sparsity, sparsity)):
-            self._sparsity = A.indptr.copy(), A.indices.copy()  # copies, since libraries sort indices in place
+            self._sparsity = A.indptr.copy(), A.indices.copy()  # libraries sort indices in place
             numbered = sp.csr_array((np.arange(A.nnz), *reversed(sparsity)), shape=A.shape)
             self._positions = numbered[self.chosen][:, self.chosen]
             self._positions.sort_indices()
@@ -123,32 +126,23 @@ class StaticCondensation:
     A, pattern
         The matrix (n×n) and its elimination pattern.
     factorisation
-        Who eliminates (`vibench.linalg.factorisations`).
-
-    Attributes
-    ----------
-    dense
-        Whether most entries of the Schur complement are non-zero.
+        Implementation that eliminates (`vibench.linalg.factorisations`).
     """
 
     def __init__(self, A: SparseMatrix, pattern: EliminationPattern, factorisation: str = DEFAULT) -> None:
         self._pattern, self._size = pattern, A.shape[0]
         A, count = sp.csr_array(A), len(pattern.interface)
         natural = np.arange(len(pattern.order))
-        eliminate = implementation(factorisation).eliminate
-        self._factor = eliminate(pattern.factorised_block.of(A).T, natural, count, "A") if len(natural) else None
+        eliminate, (factorised, retained) = implementation(factorisation).eliminate, pattern.blocks
+        self._factor = eliminate(factorised.of(A).T, natural, count, "A") if len(natural) else None
         self.dense = pattern.is_dense
-        self._retained_block = pattern.retained_block.of(A)
+        self._retained_block = retained.of(A)
         self._last_load: tuple[Array, tuple[Array, Array]] | None = None
 
     @property
     def nbytes(self) -> int:
         """Memory of the factor of the eliminated unknowns, twice: SuperLU allocates more than it fills."""
         return 0 if self._factor is None else 2 * self._factor.nbytes
-
-    @property
-    def _interface_schur(self) -> Array:
-        return self._factor.schur_blocks().toarray() if self._factor is not None else np.zeros((0, 0))
 
     @cached_property
     def schur(self) -> SparseMatrix:
@@ -158,7 +152,7 @@ class StaticCondensation:
         retained, interface = sp.coo_array(self._retained_block), self._pattern.interface
         rows, columns = retained.coords
         kept = ~(np.isin(rows, interface) & np.isin(columns, interface))
-        data = np.concatenate([retained.data[kept], self._interface_schur.ravel()])
+        data = np.concatenate([retained.data[kept], self._factor.schur_blocks().toarray().ravel()])
         rows = np.concatenate([rows[kept], np.repeat(interface, len(interface))])
         columns = np.concatenate([columns[kept], np.tile(interface, len(interface))])
         return sp.csc_array((data, (rows, columns)), shape=retained.shape)
@@ -173,40 +167,42 @@ class StaticCondensation:
     @property
     def dense_schur(self) -> Array:
         """Ŝ as an array."""
-        if not self.dense:  # both are asked for there, and the sparse one is kept
-            return np.asarray(sp.csr_array(self.schur).toarray())  # of columns it would go through memory row by row
+        if not self.dense:
+            # The sparse one is needed and cached there; CSC columns would be written across the rows of the array.
+            return np.asarray(sp.csr_array(self.schur).toarray())
         schur, interface = self._retained_block.toarray(), self._pattern.interface
-        schur[np.ix_(interface, interface)] = self._interface_schur
+        if self._factor is not None:
+            schur[np.ix_(interface, interface)] = self._factor.schur_blocks().toarray()
         return np.asarray(schur)
 
     def round_off(self, squares: Array) -> float:
         """A δ such that A differs by a matrix between −δS² and δS² from one whose exact complement is the computed one.
 
-        S² = diag(`squares`) (n,). Of eliminations of SuperLU alone (`PartialCholesky.round_off`).
+        S² = diag(`squares`) (n,). Only eliminations of SuperLU have a `PartialCholesky.round_off`.
         """
         if self._factor is None:
             return 0.0
-        assert isinstance(self._factor, PartialCholesky)  # nothing is known of others
+        assert isinstance(self._factor, PartialCholesky)
         inverse = 1.0 / np.sqrt(squares[self._pattern.order])
         return float(np.max(inverse * self._factor.round_off(inverse), initial=0.0))
 
     def eliminate(self, f: Array) -> tuple[Array, Array]:
-        """Condensed loads (c,) or (c, k) of f (n,) or (n, k), and what `recover` needs of the eliminated unknowns."""
+        """Condensed loads (c,) or (c, k) of f (n,) or (n, k), and the particular solution that `recover` adds."""
         condensed, particular = f[self._pattern.retained], np.zeros((0, *f.shape[1:]))
         if self._factor is not None:
             particular, condensed[self._pattern.interface] = self._factor.eliminate(f[self._pattern.order])
         return condensed, particular
 
     def eliminated_squares(self, right: Array) -> tuple[Array, Array]:
-        """Condensed loads (c, k) of r (n, k), and r_iᵀ A_ii⁻¹ r_i (k,): what ‖r‖² in A⁻¹ has beside them in Ŝ⁻¹."""
+        """Condensed loads (c, k) of r (n, k), and r_iᵀ A_ii⁻¹ r_i (k,): ‖r‖² in A⁻¹ is the sum of both parts."""
         load, particular = self.eliminate(right)
         eliminated = self._pattern.order[: len(particular)]
         return load, np.asarray(np.einsum("ik,ik->k", particular, right[eliminated]))
 
     def condense_load(self, f: Array) -> tuple[Array, Array]:
-        """The same of one load, which is remembered until another one comes."""
+        """`eliminate(f)` for one load, cached until the load changes."""
         if self._last_load is None or not np.array_equal(self._last_load[0], f):
-            self._last_load = f.copy(), self.eliminate(f)  # the next load may be written into the same vector
+            self._last_load = f.copy(), self.eliminate(f)  # copied: the next load may be written into the same vector
         return self._last_load[1]
 
     def recover(self, u_retained: Array, particular: Array) -> Array:

@@ -8,7 +8,6 @@ import scipy.linalg
 import scipy.sparse as sp
 from numerics import spd
 
-from vibench.linalg import lanczos
 from vibench.linalg.lanczos import Lanczos, largest_eigenvalue
 
 ACCURACIES = 1e-3, 1e-6, 1e-10
@@ -46,14 +45,6 @@ def test_the_eigenvalue_of_largest_magnitude_is_as_accurate_as_asked(accuracy: f
 @pytest.mark.parametrize("n", [1, 2, 3, 7])
 def test_small_matrices_are_exact(n: int) -> None:
     assert estimate(*pencil(n, np.arange(1.0, n + 1.0)), 1e-15) == pytest.approx(n, rel=1e-11)
-
-
-def test_few_vectors_start_again_from_the_last_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    K, M = pencil(80, np.linspace(0.0, 1.0, 80))
-    monkeypatch.setattr(lanczos, "VECTORS", 12)
-    assert estimate(K, M, 1e-4) == pytest.approx(1.0, rel=1e-3)
-    monkeypatch.setattr(lanczos, "RESTARTS", 1)
-    assert estimate(K, M, 1e-4) < 1.0 - 1e-3
 
 
 def test_what_is_not_definite_or_not_finite_has_an_infinite_one() -> None:
@@ -109,5 +100,5 @@ def test_an_end_that_so_many_vectors_do_not_reach_or_that_is_not_positive_has_no
     for spectrum in (np.geomspace(1e-6, 1.0, 400), np.linspace(-0.5, 1.0, 400), np.full(400, np.nan), np.zeros(400)):
         assert Lanczos(lambda v, spectrum=spectrum: spectrum * v, M).smallest(1e-3) is None
     restarted = Lanczos(lambda v: np.linspace(0.0, 1.0, 400) ** 0.1 * v, M)
-    assert restarted.largest(1e-12) == pytest.approx(1.0)
+    assert restarted.largest(1e-12) == pytest.approx(1.0, rel=1e-11)
     assert restarted.smallest(1e-3) is None
