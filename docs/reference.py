@@ -13,8 +13,29 @@ from typing import Any
 from vibench.packs.manifest import Manifest
 from vibench.plugins.options import keys, places
 from vibench.results.ranking import ADDED
-from vibench.results.schema import BREAK_EVEN, CELLS, PARAMETER, STORED, UNITS, Column, shown_columns
+from vibench.results.schema import STORED, Column, column_of, shown_columns
 from vibench.study.spec import Study
+
+UNITS: Mapping[str, str] = {
+    "": "text, or a number that counts or names something",
+    "1": "a pure number",
+    "s": "CPU seconds of one process; wall seconds where the meaning says so",
+    "ms": "milliseconds of the same kind",
+    "MiB": "2²⁰ bytes",
+    "µ": "the unit that the problem declares for the parameter",
+    "u": "the unit of the displacement",
+    "V": "the unit of the norm of V",
+    "V²": "the square of that unit",
+    "W": "the unit of the norm of W",
+    "b/AW": "the unit of b(v, η) divided by those of the energy norm and of the norm of W",
+    "A/V²": "the unit of the energy divided by the square of that of the norm of V",
+    "A": "the unit of the energy norm, the norm of A(µ)",
+    "A²": "the unit of the energy",
+    "b": "the unit of b(v, η), which is that of the energy",
+    "b/VW": "the unit of b(v, η) divided by those of the norms of V and W",
+    "o": "the unit of the output, in the column unit",
+}
+"""The units and what they stand for; those of V, W and b depend on the problem."""
 
 
 def study_fields() -> str:
@@ -50,19 +71,19 @@ def columns(table: str) -> str:
     """The columns of a table of the results, with SQLite's type, unit and meaning."""
     described = dict(STORED[table])
     if table == "queries":
-        described["mu_1, mu_2, …"] = PARAMETER
+        described["mu_1, mu_2, …"] = column_of("queries", "mu_1")
     rows = [(f"`{name}`", c.kind.split()[0].lower(), c.unit or "–", c.meaning) for name, c in described.items()]
     return markdown(("column", "type", "unit", "meaning"), rows)
 
 
 def summary() -> str:
     """The columns of the summary."""
-    return _for_reading(CELLS)
+    return _for_reading(STORED["cells"])
 
 
 def benefits() -> str:
     """The columns of the break-evens for reading."""
-    return _for_reading(BREAK_EVEN)
+    return _for_reading(STORED["thresholds"])
 
 
 def best() -> str:

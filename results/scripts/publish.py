@@ -19,7 +19,7 @@ from page import start
 from vibench.report.citation import Citation
 from vibench.report.site import publish
 from vibench.results.database import ResultsDatabase
-from vibench.results.schema import STORED, TEXT
+from vibench.results.schema import STORED, SqlType
 from vibench.results.sqlite import FILE
 from vibench.study.cells import UNCORRECTED
 from vibench.study.matrix import expand, read_study
@@ -68,7 +68,7 @@ def restore(tables: Path, folder: Path) -> Path:
 
 def rows(table: Path) -> list[dict[str, Any]]:
     """Rows of a CSV table; what is empty is missing, and a text such as a hash may look like a number."""
-    texts = {name: str for name, column in STORED[table.stem].items() if column.kind.startswith(TEXT)}
+    texts = {name: str for name, column in STORED[table.stem].items() if column.kind == SqlType.TEXT}
     frame = pd.read_csv(table, keep_default_na=False, na_values=[""], dtype=texts)
     return [
         {str(name): None if pd.isna(value) else value for name, value in row.items()}

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 import vibench
-from vibench.results.schema import TABLES
+from vibench.results.schema import STORED
 
 OF_THE_RUN = {
     "code",
@@ -35,7 +35,7 @@ OF_THE_RUN = {
 def differences(one: pd.DataFrame, other: pd.DataFrame, table: str) -> Iterator[str]:
     """Lines on the columns of joined rows that differ."""
     for name in one.columns.intersection(other.columns):
-        column = TABLES[table].get(name)
+        column = STORED[table].get(name)
         if name in OF_THE_RUN or (column is not None and column.unit in ("s", "ms")):
             continue
         mine, theirs = one[name], other[name]

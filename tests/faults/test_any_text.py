@@ -77,7 +77,7 @@ def recorded(folder: Path, text: str, count: Any) -> Path:
         "assembly_share_mean": 0.01,
         "definition": json.dumps(names),
     }
-    of_cells, of_queries = ({k: v for k, v in said.items() if k in TABLES[table]} for table in ("cells", "queries"))
+    of_cells, of_queries = ({k: v for k, v in said.items() if k in STORED[table]} for table in ("cells", "queries"))
     with contextlib.closing(ResultsDatabase(folder, {"name": text, "seed": 1, "validation": 2})) as database:
         database.write_cell(cell_row(**of_cells), query_rows(**of_queries | answered(text, count)))
         lost = {"status": "error", "reason": text}

@@ -14,7 +14,7 @@ from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Kind
 from vibench.results.break_even import break_even_rows
 from vibench.results.database import ResultsDatabase
-from vibench.results.schema import CELLS, HISTORY_KEYS, INTEGER, OUTPUTS, QUERIES, REAL, TEXT, TIMINGS, Column
+from vibench.results.schema import STORED, Column, SqlType
 from vibench.results.sqlite import FILE
 
 QUERIES_PER_CELL, ROUNDS, STEPS = 5, 8, 6
@@ -49,11 +49,12 @@ def _fill(database: ResultsDatabase) -> None:
         failed = k == len(PRIMALS)
         cell = _cell(f"{k:016x}", keys, kind, rng, failed=failed)
         queries = [] if failed else [_query(cell["cell"], keys, q, rng) for q in range(QUERIES_PER_CELL)]
-        outputs = [] if failed else [_row(OUTPUTS, rng) | keys | {"cell": cell["cell"], "output": "force", "unit": "N"}]
+        output = {"cell": cell["cell"], "output": "force", "unit": "N"}
+        outputs = [] if failed else [_row(STORED["outputs"], rng) | keys | output]
         database.write_cell(cell, queries, (), outputs)
         cells.append(cell)
         own = keys | {"cell": cell["cell"]}
-        rounds = [] if failed else [_row(TIMINGS, rng) | own | {"round": number} for number in range(ROUNDS)]
+        rounds = [] if failed else [_row(STORED["timings"], rng) | own | {"round": number} for number in range(ROUNDS)]
         database.replace("timings", rounds, cell=cell["cell"])
         timings += rounds
         database.write_histories([_history(keys, stage, name, k) for stage, name in HISTORIES if not failed])
@@ -81,7 +82,7 @@ def _keys(problem: str, dual: str, primal: str, tolerance: float | None) -> Row:
 def _cell(key: str, keys: Row, kind: Kind, rng: np.random.Generator, *, failed: bool) -> Row:
     plugins = {axis: {"name": keys[axis]} for axis in ("problem", "dual", "primal")}
     named = {"cell": key, "machine": "sample", "validation": "own", "versions": "{}", "definition": json.dumps(plugins)}
-    row = _row(CELLS, rng) | keys | named | {"status": "ok", "reason": "", "enrichment_kind": kind.value}
+    row = _row(STORED["cells"], rng) | keys | named | {"status": "ok", "reason": "", "enrichment_kind": kind.value}
     row |= {"queries": QUERIES_PER_CELL, "queries_ok": QUERIES_PER_CELL, "timing_rounds": ROUNDS, "disturbed": 0}
     row |= {"solver_share_mean": 1e-3, "assembly_share_mean": 1e-3, "bound_online_violations": None}
     if not failed:
@@ -93,13 +94,14 @@ def _cell(key: str, keys: Row, kind: Kind, rng: np.random.Generator, *, failed: 
 
 def _query(cell: str, keys: Row, number: int, rng: np.random.Generator) -> Row:
     """A query; at the first one there is no contact, so that errors of λ are missing."""
-    row = _row(QUERIES, rng) | keys | {"cell": cell, "query": number, "status": "ok", "reason": "", "outputs": "[]"}
+    row = _row(STORED["queries"], rng) | keys | {"cell": cell, "query": number, "status": "ok"}
+    row |= {"reason": "", "outputs": "[]"}
     row |= {"mu_1": 0.1 * number, "mu_2": 1.0 + 0.2 * (number % 3), "zero_u": 0, "zero_lambda": int(number == 0)}
     return row | ({"error_lambda": None, "error_lambda_natural": None} if number == 0 else {})
 
 
 def _history(keys: Row, stage: str, quantity: str, number: int) -> list[Row]:
-    named = {name: keys[name] for name in keys if name in HISTORY_KEYS}
+    named = {name: keys[name] for name in keys if name in STORED["histories"]}
     row = named | {"artefact": f"{stage}-{number}", "stage": stage, "quantity": quantity}
     return [row | {"step": step, "value": 10.0 ** (-0.5 * step)} for step in range(1, STEPS + 1)]
 
@@ -107,8 +109,8 @@ def _history(keys: Row, stage: str, quantity: str, number: int) -> list[Row]:
 def _row(columns: Mapping[str, Column], rng: np.random.Generator) -> Row:
     """A row with a positive number in every column of numbers, and no text."""
     made: dict[str, Callable[[], Any]] = {
-        INTEGER: lambda: int(rng.integers(2, 9)),
-        REAL: lambda: float(rng.uniform(0.01, 0.1)),
-        TEXT: str,
+        SqlType.INTEGER: lambda: int(rng.integers(2, 9)),
+        SqlType.REAL: lambda: float(rng.uniform(0.01, 0.1)),
+        SqlType.TEXT: str,
     }
     return {name: made[column.kind.split()[0]]() for name, column in columns.items()}

@@ -14,7 +14,7 @@ import fake_plugins
 import pandas as pd
 
 import vibench
-from vibench.results.schema import CELLS, QUERIES
+from vibench.results.schema import STORED
 from vibench.stages.base import Stage
 from vibench.storage.artefacts import Artefact, Store
 
@@ -93,7 +93,7 @@ def write_study(folder: Path, content: Mapping[str, Any] = STUDY, name: str = "s
 def cell_row(cell: str = "c1", **columns: Any) -> dict[str, Any]:
     """A row of the cells table in which every column is filled."""
     samples = {"TEXT": "text", "REAL": 0.5, "INTEGER": 3}
-    row = {name: samples[column.kind.split()[0]] for name, column in CELLS.items()}
+    row = {name: samples[column.kind.split()[0]] for name, column in STORED["cells"].items()}
     return (
         row
         | {"cell": cell, "status": "ok", "enrichment_kind": "fixed", "versions": "{}"}
@@ -113,13 +113,13 @@ def cells_of(*rows: dict[str, Any]) -> pd.DataFrame:
         "problem": "box", "problem_options": "{}", "status": "ok", "error_u_mean": 1e-9, "solver_share_mean": 1e-6,
         "assembly_share_mean": None, "beta_span_min": 0.1, "offline_s": 1.0,
     }  # fmt: skip
-    return pd.DataFrame([cell_row(**common | row) for row in rows], columns=list(CELLS))
+    return pd.DataFrame([cell_row(**common | row) for row in rows], columns=list(STORED["cells"]))
 
 
 def query_rows(cell: str = "c1", count: int = 2, **columns: Any) -> list[dict[str, Any]]:
     """Rows of the queries table in which every column is filled, for a problem with two parameters."""
     samples = {"TEXT": "text", "REAL": 0.5, "INTEGER": 3}
-    row = {name: samples[column.kind.split()[0]] for name, column in QUERIES.items()}
+    row = {name: samples[column.kind.split()[0]] for name, column in STORED["queries"].items()}
     return [
         row | {"cell": cell, "query": k, "mu_1": 0.1 * k, "mu_2": 2.0 + k, "status": "ok"} | columns
         for k in range(count)

@@ -162,12 +162,12 @@ def test_the_plugins_of_the_pages_run_through_the_whole_benchmark(
     assert sum(row["flagged"] for row in rows(tmp_path / "runs" / "mine", "disagreements")) == 0
 
 
-def test_every_column_of_every_table_has_a_unit_and_a_meaning() -> None:
+def test_every_column_of_every_table_has_a_unit_and_a_meaning(reference: ModuleType) -> None:
     everything = [column for of_table in schema.STORED.values() for column in of_table.values()]
-    for column in [*everything, schema.PARAMETER]:
-        assert column.unit in schema.UNITS
+    for column in [*everything, schema.column_of("queries", "mu_1")]:
+        assert column.unit in reference.UNITS
         assert column.meaning.strip().endswith((".", "…"))
-    assert {column.unit for name, column in schema.QUERIES.items() if name.endswith("_s")} == {"s"}
+    assert {column.unit for name, column in schema.STORED["queries"].items() if name.endswith("_s")} == {"s"}
 
 
 @pytest.mark.parametrize("table", ["cells", "thresholds"])

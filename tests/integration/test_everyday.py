@@ -16,7 +16,7 @@ from rich.cells import cell_len
 from running import Main, Shared, refused, rows
 
 import vibench
-from vibench.results.schema import CELLS
+from vibench.results.schema import STORED
 
 STUDY = """
 name = "mine"
@@ -117,7 +117,7 @@ class TestNewUser:
     def test_what_a_column_means_and_all_of_one_row(self, home: Path, narrow: Main) -> None:
         cell = key(home, **CERTIFIED)
         _, out, _ = narrow("help", "error λ")
-        assert CELLS["error_lambda_mean"].meaning in " ".join(out.split())
+        assert STORED["cells"]["error_lambda_mean"].meaning in " ".join(out.split())
         _, out, _ = narrow("show", "mine", cell[:6])
         assert out.startswith(f"cell {cell} of mine\n")
         assert "beta_cone_lower_min" in out
@@ -127,7 +127,7 @@ class TestNewUser:
         page = (home / "runs" / "mine" / "report.html").read_text(encoding="utf-8")
         plain = "".join(re.findall("<noscript>(.*?)</noscript>", page, re.DOTALL))
         assert all(row["cell"][:4] in plain for row in rows(home / "runs" / "mine"))
-        assert f'title="{CELLS["error_lambda_mean"].meaning} [1]"' in plain
+        assert f'title="{STORED["cells"]["error_lambda_mean"].meaning} [1]"' in plain
 
 
 class TestAuthor:

@@ -18,7 +18,7 @@ import typer
 
 from vibench.errors import VibenchError
 from vibench.plugins.kinds import CHECKED, FORMULATION, SOLVER, STUDY, PluginKind
-from vibench.results.schema import TABLES
+from vibench.results.schema import STORED, TABLES
 
 SHOWN = ("summary", "best", "benefits", *TABLES)
 """Tables that `vibench show` prints."""
@@ -213,7 +213,7 @@ def column_names(context: typer.Context, incomplete: str) -> list[str]:
     source = {"summary": "cells", "best": "cells", "benefits": "thresholds"}.get(table, table)
     before, comma, last = incomplete.rpartition(",")
     sign = "-" * last.startswith("-")
-    names = _beginning(last.removeprefix("-"), [*TABLES.get(source, ()), *_added(table)])
+    names = _beginning(last.removeprefix("-"), [*(STORED[source] if source in TABLES else ()), *_added(table)])
     return [f"{before}{comma}{sign}{name}" for name in names]
 
 
@@ -231,7 +231,7 @@ def error_measures(incomplete: str) -> list[str]:
     return _beginning(incomplete, [*OF_SOLUTION, OUTPUT])
 
 
-cell_columns = words(lambda: TABLES["cells"])
+cell_columns = words(lambda: STORED["cells"])
 
 
 def _registered(*kinds: PluginKind) -> set[str]:

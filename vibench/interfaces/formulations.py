@@ -96,11 +96,7 @@ class SolveQP(Protocol):
     """The QP solver of the cell."""
 
     def __call__(
-        self,
-        program: VariationalInequality,
-        *,
-        factor: Array | None = None,
-        start: tuple[Array, Array] | None = None,
+        self, program: VariationalInequality, *, factor: Array | None = None, start: tuple[Array, Array] | None = None
     ) -> QPSolution:
         """The solution x (n,), α (m,) ≥ 0 of min ½xᵀA x − fᵀx, B x ≤ g, dense; either is `None` if it has found none.
 

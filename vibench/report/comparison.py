@@ -30,7 +30,7 @@ from vibench.report.differences import (
 )
 from vibench.results import formats
 from vibench.results.break_even import FEWEST_ROUNDS
-from vibench.results.schema import CELLS
+from vibench.results.schema import STORED
 from vibench.timing import median_interval
 
 COLUMNS = [
@@ -135,8 +135,8 @@ class Comparison:
 
         Raises a `RequestError` if there is no such column.
         """
-        if column not in CELLS:
-            raise unknown_name("column of cells", column, CELLS)
+        if column not in STORED["cells"]:
+            raise unknown_name("column of cells", column, STORED["cells"])
         counts = range(2, len(self.runs) + 1)
         return self._across(counts, lambda run, key: run.cells.get(key, {}).get(column))
 

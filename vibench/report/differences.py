@@ -16,7 +16,7 @@ import pandas as pd
 from vibench.qp.status import Status
 from vibench.results.break_even import DRAWS, FEWEST_ROUNDS, TAIL, BreakEven, Meaning
 from vibench.results.read import in_order, read_table
-from vibench.results.schema import BREAK_EVEN
+from vibench.results.schema import STORED
 from vibench.results.sqlite import FILE, read_meta, study_of
 from vibench.stability.infsup import VANISHES
 
@@ -275,7 +275,7 @@ def _online_interval(before: Sequence[float], after: Sequence[float]) -> Interva
 
 
 def _break_evens(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator[Difference]:
-    keys = [name for name in BREAK_EVEN if not name.endswith(("_s", *NUMBERS, "meaning"))]
+    keys = [name for name in STORED["thresholds"] if not name.endswith(("_s", *NUMBERS, "meaning"))]
     for row in one.merge(two, on=keys, suffixes=("_one", "_two")).to_dict("records"):
         before, after = (_break_even(row, k) for k in ("one", "two"))
         verdict: ChangeKind | None = ChangeKind.CHANGED

@@ -28,7 +28,7 @@ from vibench.results.break_even import MARGIN
 from vibench.results.paired_timing import PairedTiming
 from vibench.results.ranking import LARGEST_BAND, Criterion, Winner, leaderboard
 from vibench.results.read import in_order, read_table
-from vibench.results.schema import BREAK_EVEN, CELLS, STORED, Column
+from vibench.results.schema import STORED, Column
 from vibench.results.selection import short_keys
 from vibench.results.sqlite import read_meta, study_of
 from vibench.stability.infsup import VANISHES
@@ -87,18 +87,18 @@ class TableGrid:
         return shown, [[formats.cell_text(value) for value in row] for row in rows]
 
 
-RECORDED = [pair for table in (CELLS, BREAK_EVEN, *STORED.values()) for pair in table.items()]
+RECORDED = [pair for table in (STORED["cells"], STORED["thresholds"], *STORED.values()) for pair in table.items()]
 """Columns of all tables, those of cells first."""
 
 
 def grid_of_cells(cells: pd.DataFrame, caption: str) -> TableGrid:
     """The table of all cells, in the order of the rows."""
     names = [n for n in (*OF_CELLS, *MORE_OF_CELLS) if n in ("cell", *show.AXES) or cells[n].notna().any()]
-    says_nothing = [name for name in names if CELLS[name].heading and not formats.says_something(cells, name)]
+    says_nothing = [name for name in names if STORED["cells"][name].heading and not formats.says_something(cells, name)]
     length = short_keys(cells["cell"])
-    frame = formats.under_headings(cells.assign(cell=cells["cell"].str[:length]), names, CELLS)
-    hidden = [_heading(CELLS, name) for name in (*says_nothing, *MORE_OF_CELLS) if name in names]
-    axes = tuple(_heading(CELLS, name) for name in (*show.AXES, "status"))
+    frame = formats.under_headings(cells.assign(cell=cells["cell"].str[:length]), names, STORED["cells"])
+    hidden = [_heading(STORED["cells"], name) for name in (*says_nothing, *MORE_OF_CELLS) if name in names]
+    axes = tuple(_heading(STORED["cells"], name) for name in (*show.AXES, "status"))
     disturbed, left_out = _disturbed(cells["cell"], cells), (*hidden, *_constant(frame))
     return TableGrid("summary", "All cells", caption, frame, axes, left_out, disturbed)
 
@@ -107,9 +107,9 @@ def grid_of_thresholds(name: str, title: str, caption: str, rows: pd.DataFrame, 
     """A table of break-even points; a row is disturbed if one of its cells is."""
     ordered = in_order(rows)
     frame = formats.break_even_table(rows)
-    first = _heading(BREAK_EVEN, "primal_b")
+    first = _heading(STORED["thresholds"], "primal_b")
     frame = frame[[first, *frame.columns.drop(first)]]
-    results = {_heading(BREAK_EVEN, name) for name in ("benefit_threshold", "threshold_high")}
+    results = {_heading(STORED["thresholds"], name) for name in ("benefit_threshold", "threshold_high")}
     texts = [heading for heading in frame.columns if not pd.api.types.is_numeric_dtype(frame[heading])]
     axes = tuple(heading for heading in texts if heading not in results)
     disturbed = {*_disturbed(ordered["cell_a"], cells), *_disturbed(ordered["cell_b"], cells)}

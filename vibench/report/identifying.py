@@ -13,7 +13,7 @@ from contextlib import closing
 from pathlib import Path
 
 from vibench.errors import RequestError
-from vibench.results.schema import KEYS, STORED, TEXT
+from vibench.results.schema import KEYS, STORED, SqlType
 from vibench.results.sqlite import Digests, open_read_only, read_meta, read_rows, text_reader
 from vibench.text import brief, json_object, unbroken
 
@@ -110,7 +110,7 @@ def _places(path: Path) -> Iterator[str]:
 
 
 def _texts(table: str) -> list[str]:
-    return [name for name, column in STORED[table].items() if column.kind.startswith(TEXT)]
+    return [name for name, column in STORED[table].items() if column.kind == SqlType.TEXT]
 
 
 def _clean(db: sqlite3.Connection, table: str, column: str, folders: Sequence[re.Pattern[str]]) -> int:

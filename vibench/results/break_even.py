@@ -15,7 +15,7 @@ from vibench.errors import requested
 from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Kind
 from vibench.results.paired_timing import CONDITIONS, PairedTiming
-from vibench.results.schema import BREAK_EVEN, KEYS
+from vibench.results.schema import KEYS, STORED
 from vibench.study.cells import CERTIFIED, NO_SUCH_AXIS
 
 DRAWS = 2000
@@ -140,7 +140,7 @@ about as much, and no threshold that rests on it would be found again."""
 VALIDATION = ("validation", "validation_options")
 """Columns that name the validation set: seconds of a query are means over its queries."""
 
-_SHARED = tuple(name for name in BREAK_EVEN if name in KEYS)
+_SHARED = tuple(name for name in STORED["thresholds"] if name in KEYS)
 
 FORMULATION = ("formulation", "formulation_options")
 

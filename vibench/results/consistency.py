@@ -22,14 +22,14 @@ from vibench.arrays import Array
 from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Kind
 from vibench.qp.verification import Slack, allowed
-from vibench.results.schema import BOUNDS, CONSTANTS, DISAGREEMENTS, KEYS
+from vibench.results.schema import KEYS, STORED
 from vibench.stability.infsup import ABSOLUTE, RELATIVE, UNSIGNED
 from vibench.study.cells import COMPILED
 
 if TYPE_CHECKING:  # worker processes, which start often, have no use for pandas
     import pandas as pd
 
-EFFECTIVITIES = tuple(f"effectivity_{name}" for name in BOUNDS)
+EFFECTIVITIES = tuple(name for name in STORED["queries"] if name.startswith("effectivity_"))
 """Error bound over error, at least 1."""
 
 ROUND_OFF = 1e-10
@@ -72,7 +72,7 @@ def _violations(rows: pd.DataFrame, kinds: pd.Series) -> Iterator[Violation]:
         if below.any():
             yield Violation(f"{name} ≥ 1", int(below.sum()), float(1.0 - rows[name].min()))
     rows = rows[rows["bounds"].notna()]  # other formulations than the mixed one have no constants
-    queries, kind = rows[list(CONSTANTS)].astype(float), rows["cell"].map(kinds)
+    queries, kind = rows.filter(regex="^beta_(full_|plain_|hf_)?(span|cone_)").astype(float), rows["cell"].map(kinds)
     signed = ~rows["bounds"].str.startswith(f"{UNSIGNED}/")
     scale = queries["beta_full_cone_upper"]
     for larger, smaller in ORDER:
@@ -145,7 +145,7 @@ def disagreement_rows(
     for same in programs.values():
         if len({cell["solver"] for cell in same}) < 2:
             continue
-        keys = {name: same[-1][name] for name in DISAGREEMENTS if name in KEYS}
+        keys = {name: same[-1][name] for name in STORED["disagreements"] if name in KEYS}
         answers = (_recorded(cell, row) for cell in same for row in fine_solutions(cell["cell"]))
         yield from (keys | row for row in compare(answers))
 

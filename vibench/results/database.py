@@ -17,7 +17,7 @@ import numpy as np
 
 from vibench.errors import RequestError, StorageError, VibenchError
 from vibench.qp.status import Status
-from vibench.results.schema import BLOB, HISTORY_KEYS, INTEGER, KEYS, PARAMETER, REAL, STORED, TEXT, VERSION, Column
+from vibench.results.schema import KEYS, STORED, VERSION, Column, SqlType, column_of
 from vibench.results.sqlite import (
     BUSY_SECONDS,
     CREATE,
@@ -67,11 +67,10 @@ def storable(table: str, row: Mapping[str, Any]) -> dict[str, Any]:
 
     Raises an `UnstorableError` for the first value that it cannot hold.
     """
-    columns = STORED[table]
     values: dict[str, Any] = {}
     for name, value in row.items():
-        column, kind = columns.get(name, PARAMETER), type(value)
-        if kind is float and column.kind == REAL and value == value:  # noqa: PLR0124  most values; NaN is no number
+        column, kind = column_of(table, name), type(value)
+        if kind is float and column.kind == SqlType.REAL and value == value:  # noqa: PLR0124  most values; NaN is no number
             values[name] = value
             continue
         try:
@@ -97,27 +96,27 @@ def error_row(cell: Mapping[str, Any], reason: str) -> dict[str, Any]:
 
 def stored(column: Column, value: Any) -> Any:
     """A value in the type of its column; a `TypeError` or an `OverflowError` where there is none."""
-    kind = column.kind.split()[0]
+    kind = column.kind
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or (isinstance(value, float) and math.isnan(value)):
-        if "NOT NULL" in column.kind:
+        if "NOT NULL" in column.constraint:
             raise TypeError("a value is missing")
         return None
-    if kind == TEXT and isinstance(value, str):
-        return printable(value) if column.whole else brief(value, LONGEST_TEXT)
-    if kind == BLOB and isinstance(value, bytes):
+    if kind == SqlType.TEXT and isinstance(value, str):
+        return printable(value) if column.is_json else brief(value, LONGEST_TEXT)
+    if kind == SqlType.BLOB and isinstance(value, bytes):
         return value
-    if kind == REAL and isinstance(value, int | float):
+    if kind == SqlType.REAL and isinstance(value, int | float):
         return float(value)
-    if kind == INTEGER and isinstance(value, int | float) and value == int(value):
+    if kind == SqlType.INTEGER and isinstance(value, int | float) and value == int(value):
         if not -(2**63) <= value < 2**63:
             raise OverflowError(f"a number of {int(value).bit_length()} bits, of which 64 can be stored")
         return int(value)
     raise TypeError(f"a value of the type {type(value).__name__} is no {kind}")
 
 
-NAMED = ("stage", "quantity", *HISTORY_KEYS)
+NAMED = tuple(name for name in STORED["histories"] if name not in ("artefact", "step", "value"))
 """Columns that identify a history."""
 
 OF_CELLS = tuple(table for table, columns in STORED.items() if "cell" in columns)
@@ -182,7 +181,7 @@ class ResultsDatabase:
             self._db.execute(f'DROP TABLE "{name}"')
         self._db.execute("CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT)")
         for table, columns in STORED.items():
-            declared = ", ".join(f'"{name}" {column.kind}' for name, column in columns.items())
+            declared = ", ".join(f'"{name}" {column.kind} {column.constraint}' for name, column in columns.items())
             self._db.execute(f"CREATE TABLE IF NOT EXISTS {table} ({declared})")
         for table in ("queries", "solutions", "timings", "outputs"):
             self._db.execute(f"CREATE INDEX IF NOT EXISTS {table}_of_cell ON {table}(cell)")

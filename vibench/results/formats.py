@@ -17,7 +17,7 @@ from vibench.interfaces.formulations import MIXED
 from vibench.qp.status import Status
 from vibench.results.break_even import Meaning
 from vibench.results.read import in_order
-from vibench.results.schema import BREAK_EVEN, CELLS, INTEGER, Column, shown_columns
+from vibench.results.schema import STORED, Column, SqlType, shown_columns
 from vibench.study.cells import NO_SUCH_AXIS, UNCORRECTED
 from vibench.text import printable_lines, unbroken
 
@@ -178,13 +178,13 @@ FORMS = {"markdown": to_markdown, "csv": to_csv, "latex": to_latex, "json": to_j
 
 
 def summary(cells: pd.DataFrame) -> pd.DataFrame:
-    """The summary of a run: one row per cell, the columns with a heading in `CELLS`."""
-    return _for_reading(in_order(cells), CELLS)
+    """The summary of a run: one row per cell, the columns that have a heading."""
+    return _for_reading(in_order(cells), STORED["cells"])
 
 
 def break_even_table(break_even_rows: pd.DataFrame) -> pd.DataFrame:
     """The break-even table: the number of queries from which, or until which, b is cheaper than a."""
-    return _for_reading(in_order(break_even_rows), BREAK_EVEN)
+    return _for_reading(in_order(break_even_rows), STORED["thresholds"])
 
 
 def between_formulations(break_even_rows: pd.DataFrame) -> pd.Series:
@@ -250,6 +250,6 @@ def _shown(frame: pd.DataFrame, name: str, column: Column) -> pd.Series | list[s
     if name in INTERVALS:
         low, shown = INTERVALS[name]
         return [shown(*ends) for ends in zip(frame[low], frame[name], strict=True)]
-    if column.kind == INTEGER:
+    if column.kind == SqlType.INTEGER:
         return frame[name].astype("Int64")
     return 1e3 * frame[name] if column.unit == "s" and column.heading.endswith("[ms]") else frame[name]

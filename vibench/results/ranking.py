@@ -16,7 +16,7 @@ from vibench.errors import RequestError, unknown_name
 from vibench.qp.status import Status
 from vibench.results.break_even import DRAWS, HIGH_FIDELITY, TAIL, offline_draws, shared_offline
 from vibench.results.paired_timing import Estimate, PairedTiming
-from vibench.results.schema import CELLS, Column, integer, real
+from vibench.results.schema import STORED, Column, integer, real
 from vibench.stability.infsup import VANISHES
 
 SOLUTION = "solution"
@@ -96,7 +96,7 @@ BAND = "error_below"
 """Column of the accuracy: a power of ten that the mean errors of u and λ do not exceed."""
 
 HEADINGS: Mapping[str, Column] = {
-    **CELLS,
+    **STORED["cells"],
     BAND: real("1", "Power of ten that the mean errors, of u and λ unless told, do not exceed.", "error ≤", 1),
     "ties": integer("Other models whose query may be as fast: the interval of the ratio contains 1.", "ties", 24),
 }
@@ -372,7 +372,7 @@ COLUMNS: Mapping[str, Column] = {
 }  # fmt: skip
 """Columns of the table: those of the cells, and what a number of queries adds to them."""
 
-ADDED: Mapping[str, Column] = {name: column for name, column in COLUMNS.items() if name not in CELLS}
+ADDED: Mapping[str, Column] = {name: column for name, column in COLUMNS.items() if name not in STORED["cells"]}
 """What it has beside those of the cells."""
 
 

@@ -12,18 +12,7 @@ import pandas as pd
 from vibench.errors import RequestError
 from vibench.results import ranking
 from vibench.results.break_even import Meaning
-from vibench.results.schema import (
-    BLOB,
-    INTEGER,
-    KEYS,
-    PARAMETER,
-    REAL,
-    STORED,
-    TABLES,
-    TEXT,
-    VERSION,
-    Column,
-)
+from vibench.results.schema import KEYS, STORED, TABLES, VERSION, SqlType, column_of
 from vibench.results.sqlite import FILE, Part, read_meta, read_parts, read_rows
 from vibench.study.cells import UNCORRECTED
 from vibench.text import brief, json_object
@@ -71,7 +60,7 @@ def _framed(path: Path, table: str, part: Part) -> pd.DataFrame:
     names, rows = checked(path, table, part)
     frame = pd.DataFrame.from_records(rows, columns=names, coerce_float=True)
     for name in names:
-        if not _column(table, name).kind.startswith((TEXT, BLOB)) and not pd.api.types.is_numeric_dtype(frame[name]):
+        if column_of(table, name).kind.is_number and not pd.api.types.is_numeric_dtype(frame[name]):
             frame[name] = frame[name].astype(float)  # every value is NULL
     return frame
 
@@ -80,20 +69,16 @@ def checked(path: Path, table: str, part: Part) -> Part:
     """Rows as they are; a `RequestError` if one has a value that is none of its column."""
     names, rows = part
     for name, values in zip(names, zip(*rows, strict=True), strict=False):  # no values where there are no rows
-        kind = _column(table, name).kind
+        kind = column_of(table, name).kind
         types = set(map(type, values)) - {NoneType}
-        if kind.startswith(BLOB) or (types <= {int, float} and kind.startswith((REAL, INTEGER))):
+        if kind == SqlType.BLOB or (types <= {int, float} and kind.is_number):
             continue
-        is_right, right = A_NUMBER if kind.startswith((REAL, INTEGER)) else RIGHT.get(name, A_TEXT)
+        is_right, right = A_NUMBER if kind.is_number else RIGHT.get(name, A_TEXT)
         for value in dict.fromkeys(values):
             if value is not None and not is_right(value):
                 strange = f"{brief(repr(value), 60)} in the column '{name}' of '{table}'"
                 raise RequestError(f"'{path}' has {strange}, expected {right}")
     return part
-
-
-def _column(table: str, name: str) -> Column:
-    return STORED[table].get(name, PARAMETER)
 
 
 A_NUMBER = (lambda value: isinstance(value, float | int)), "a number"
@@ -146,5 +131,5 @@ def whole_numbers(frame: pd.DataFrame) -> pd.DataFrame:
     return frame.astype(whole)
 
 
-WHOLE = {name for table in TABLES.values() for name, column in table.items() if column.kind == INTEGER}
+WHOLE = {name for table in TABLES for name, column in STORED[table].items() if column.kind == SqlType.INTEGER}
 """Columns of whole numbers; no name is a column of whole numbers in one table and of others in another."""

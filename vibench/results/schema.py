@@ -7,74 +7,91 @@ here and the line that fills it.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from enum import StrEnum
 from typing import NamedTuple
 
+# Increase it with every change of the schema: a results file of another version is refused.
 VERSION = 19
-"""Schema version of a results file; a file of another version is refused."""
 
-TEXT, REAL, INTEGER, BLOB = "TEXT", "REAL", "INTEGER", "BLOB"
-REQUIRED, KEY = "TEXT NOT NULL", "TEXT PRIMARY KEY"
-MEMBER = "TEXT NOT NULL REFERENCES cells(cell) ON DELETE CASCADE"
+
+class SqlType(StrEnum):
+    """SQLite type of a column."""
+
+    TEXT = "TEXT"
+    REAL = "REAL"
+    INTEGER = "INTEGER"
+    BLOB = "BLOB"
+
+    @property
+    def is_number(self) -> bool:
+        """Whether the values are numbers."""
+        return self in (SqlType.REAL, SqlType.INTEGER)
 
 
 class Column(NamedTuple):
-    """A column of a table."""
+    """A column of a table.
 
-    kind: str
-    """SQLite type, with its constraints."""
+    Attributes
+    ----------
+    kind
+        SQLite type of its values.
+    unit
+        Unit, explained in the documentation; "" for texts, counts and names.
+    meaning
+        Description in the documentation.
+    heading, place
+        Heading and position in the table for reading; "" and `None` if the column is not shown there.
+    constraint
+        Constraint in SQL.
+    is_json
+        Whether a text is JSON, which is never cut.
+    """
+
+    kind: SqlType
     unit: str
-    """Unit, one of `UNITS`."""
     meaning: str
-    """What the documentation says of it."""
     heading: str = ""
-    """Heading in the table for reading that is made of this one; "" where the column is not shown there."""
-    place: int = 0
-    """Place in that table."""
-    whole: bool = False
-    """Whether a text is JSON, which is never cut."""
+    place: int | None = None
+    constraint: str = ""
+    is_json: bool = False
 
 
-def real(unit: str, meaning: str, heading: str = "", place: int = 0) -> Column:
-    """A column of numbers in a unit of `UNITS`."""
-    return Column(REAL, unit, meaning, heading, place)
+def real(unit: str, meaning: str, heading: str = "", place: int | None = None) -> Column:
+    """Column of numbers in a unit."""
+    return Column(SqlType.REAL, unit, meaning, heading, place)
 
 
-def integer(meaning: str, heading: str = "", place: int = 0) -> Column:
-    """A column of numbers that count or name something."""
-    return Column(INTEGER, "", meaning, heading, place)
+def integer(meaning: str, heading: str = "", place: int | None = None) -> Column:
+    """Column of numbers that count or name something."""
+    return Column(SqlType.INTEGER, "", meaning, heading, place)
 
 
-def text(meaning: str, heading: str = "", place: int = 0, *, kind: str = TEXT) -> Column:
-    """A column of texts, which may be required or name a cell."""
-    return Column(kind, "", meaning, heading, place)
+def text(meaning: str, heading: str = "", place: int | None = None, *, constraint: str = "") -> Column:
+    """Column of texts."""
+    return Column(SqlType.TEXT, "", meaning, heading, place, constraint)
 
 
 def as_json(meaning: str) -> Column:
-    """A column of texts that are JSON."""
-    return Column(TEXT, "", meaning, whole=True)
+    """Column of texts that are JSON."""
+    return Column(SqlType.TEXT, "", meaning, is_json=True)
 
 
-UNITS: Mapping[str, str] = {
-    "": "text, or a number that counts or names something",
-    "1": "a pure number",
-    "s": "CPU seconds of one process; wall seconds where the meaning says so",
-    "ms": "milliseconds of the same kind",
-    "MiB": "2²⁰ bytes",
-    "µ": "the unit that the problem declares for the parameter",
-    "u": "the unit of the displacement",
-    "V": "the unit of the norm of V",
-    "V²": "the square of that unit",
-    "W": "the unit of the norm of W",
-    "b/AW": "the unit of b(v, η) divided by those of the energy norm and of the norm of W",
-    "A/V²": "the unit of the energy divided by the square of that of the norm of V",
-    "A": "the unit of the energy norm, the norm of A(µ)",
-    "A²": "the unit of the energy",
-    "b": "the unit of b(v, η), which is that of the energy",
-    "b/VW": "the unit of b(v, η) divided by those of the norms of V and W",
-    "o": "the unit of the output, in the column unit",
-}
-"""The units and what they stand for; those of V, W and b depend on the problem."""
+def blob(unit: str, meaning: str) -> Column:
+    """Column of arrays of numbers as bytes."""
+    return Column(SqlType.BLOB, unit, meaning)
 
+
+def column_of(table: str, name: str) -> Column:
+    """A column by its table and name; parameters mu_1, mu_2, … of queries are as many as the problem has."""
+    return STORED[table].get(name) or real("µ", "The k-th parameter; tables for reading have its name as heading.")
+
+
+def shown_columns(table: Mapping[str, Column]) -> dict[str, Column]:
+    """The columns of a table that are shown in the table for reading made of it, in the order of their places."""
+    return dict(sorted(((name, c) for name, c in table.items() if c.heading), key=lambda item: item[1].place or 0))
+
+
+# The name of a cell. Where a study prescribes N or R, `pod_size` or `dual_size` is filled instead of the tolerance.
 KEYS: Mapping[str, Column] = {
     "problem": text("Problem: its label in the study, or its name.", "problem", 1),
     "problem_options": as_json("Options of the problem that are not at their default, as JSON."),
@@ -92,502 +109,381 @@ KEYS: Mapping[str, Column] = {
     "dual_size": integer("Prescribed R; empty where the study gives a tolerance."),
     "primal_tol": real("1", "Tolerance δ of the primal strategy; empty for strategies that take none.", "δ", 6),
     "solver": text("QP solver; compiled programs use none, and – stands for that of a formulation.", "solver", 7),
-    "accuracy": real(
-        "1", "Relative accuracy prescribed to the solver; empty for formulations that reach none.", "accuracy", 8
-    ),
+    "accuracy": real("1", "Relative accuracy prescribed to the solver; empty for formulations that reach none.",
+        "accuracy", 8),
     "assembly": text("Assembly of queries: full, reduced, certified (reduced with bounds), compiled.", "assembly", 9),
-    "correction": text(
-        "Which solutions are corrected: none, feasible (all), auto (where ω > ρ); errors are of the corrected pair.",
-        "correction",
-        10,
-    ),
-}
-"""What names a cell. Where a study prescribes N or R, `pod_size` or `dual_size` is filled instead of the tolerance."""
+    "correction": text("Which solutions are corrected: none, feasible (all), auto (where ω > ρ); errors are of the "
+        "corrected pair.", "correction", 10),
+}  # fmt: skip
 
 
-BOUNDS = (
-    "u_energy", "u", "lambda_natural", "lambda", "online_u_energy", "online_lambda_natural", "online_lambda", "hsw_u",
-    "hsw_lambda",
-)  # fmt: skip
-"""Error bounds, as in the names of their columns."""
-
-CELLS: Mapping[str, Column] = {
-    "cell": text(
-        "Hash of everything that determines the numbers of the cell, except the code; commands accept its beginning.",
-        "cell",
-        0,
-        kind=KEY,
-    ),
-    **KEYS,
-    "model": text("Hash of the reduced model; cells that differ only in the solver share it."),
-    "status": text("Worst status of its queries, or of a stage that they need.", "status", 10, kind=REQUIRED),
-    "reason": text("Why the cell is not ok: the first query with this status, and its fault."),
-    "queries": integer("Number of queries, one per validation parameter."),
-    "queries_ok": integer("Number of queries with status ok; means and maxima are over these.", "ok", 10),
-    "snapshots": integer(
-        "Number of high-fidelity solutions of the training, one per parameter of the training set.", "solved", 11
-    ),
-    "dim_V": integer("Dimension n of V."),
-    "dim_W": integer("Dimension m of W."),
-    "N": integer("Dimension N of V_N; of other formulations most coefficients of u, those added apart.", "N", 11),
-    "R": integer("Number R of generators of the cone; of other formulations most coefficients of λ.", "R", 12),
-    "rank": integer("Numerical rank of the generators: dimension of their span."),
-    "rank_gap": real(
-        "1",
-        "Smallest singular value that counts towards the rank, divided by the next one or the threshold; "
-        "near 1 the rank is doubtful.",
-    ),
-    "gram_condition": real(
-        "1", "Condition number of the Gram matrix of the generators in W, from their singular values."
-    ),
-    "enrichment": integer(
-        "Vectors added to V_N; for an enrichment per parameter, the rank of the generators.", "added", 13
-    ),
-    "enrichment_kind": text("none, fixed or per-parameter."),
-    "multiplier": text(
-        "Where λ comes from: solved (unknowns of the query), recovered from u, or residual: the λ ≥ 0 with the "
-        "smallest residual, found outside the seconds of the query."
-    ),
-    "interpolation_tol": real("1", "Tolerance of the interpolation in reduced assembly; empty with full assembly."),
-    "interpolation_error": real("1", "Largest relative interpolation error of a member over the training set."),
-    "terms_A": integer(
-        "Terms of A in a reduced query, each with a coefficient to evaluate; 0 if A is constant, empty if assembled."
-    ),
-    "terms_f": integer("Likewise for f."),
-    "terms_B": integer("Likewise for B; empty if B is assembled on the contact unknowns."),
-    "terms_g": integer("Likewise for g."),
-    "correction_cost": text(
-        "What a correction costs: online, with a certificate, or high-fidelity; empty without corrections."
-    ),
-    "corrected_share": real("1", "Share of the ok queries that are corrected; empty without corrections."),
-    "offline_snapshots_s": real("s", "High-fidelity solutions at the training parameters, with one set-up."),
-    "offline_selection_s": real(
-        "s", "Choice of the training parameters by error bounds, a part of offline_snapshots_s; 0 for fixed sets."
-    ),
-    "offline_pod_s": real("s", "POD."),
-    "offline_cone_s": real("s", "Dual strategy, with the orthonormal basis of the span."),
-    "offline_enrichment_s": real("s", "Primal strategy."),
-    "offline_formulation_s": real("s", "What a formulation builds; 0 for mixed."),
-    "offline_assembly_s": real(
-        "s", "Preparation of reduced assembly, and of a compiled program; 0 with full assembly."
-    ),
-    "offline_certificate_s": real("s", "Preparation of certificates at online cost; 0 without."),
-    "offline_s": real(
-        "s",
-        "Offline time of this cell alone: the sum of these without `offline_selection_s`, a part of the first.",
-        "offline [s]",
-        22,
-    ),
-    "offline_low_s": real(
-        "s",
-        "Lower end of its 95 % interval: from the scatter of the offline stages of the run that were repeated.",
-    ),
-    "offline_high_s": real("s", "Upper end of this interval."),
-    "offline_repeats": integer(
-        "Offline stages of the cell, of at least a millisecond, that were timed more than once."
-    ),
-    "offline_wall_s": real("s", "The same sum in wall seconds."),
-    "online_s": real(
-        "s",
-        "One query with assembly, certificate and correction, mean over the ok queries: geometric mean over the blocks "
-        "of the median over their rounds, each divided by its pace.",
-        "online [ms]",
-        23,
-    ),
-    "online_q1_s": real("s", "Lower quartile over the rounds."),
-    "online_q3_s": real("s", "Upper quartile over the rounds."),
-    "online_wall_s": real("s", "The same as online_s, in wall seconds."),
-    "online_assemble_s": real("s", "Assembly of a query: median over the rounds."),
-    "online_solve_s": real("s", "Solution of a query by the solver: median over the rounds."),
-    "online_certify_s": real(
-        "s", "Certificate and correction of a query: median over the rounds; empty without either."
-    ),
-    "timing_rounds": integer(
-        "Maximal number of timing rounds of the study; empty if the timing of the cell is not finished."
-    ),
-    "timed_rounds": integer("Rounds that were timed: they end when all comparisons of the cell are decided."),
-    "timing_reason": text("Why rounds are missing."),
-    "hf_setup_s": real(
-        "s",
-        "Set-up of the high-fidelity solver, once: the time by which the first solution exceeds its repetition from a "
-        "known contact set.",
-    ),
-    "hf_s": real(
-        "s",
-        "One high-fidelity solution after the set-up, mean over the validation parameters: online_s times the gain in "
-        "the rounds; where none was timed in them, in the sweep over these parameters.",
-    ),
-    "beta_span_min": real(
-        "b/VW", "Smallest β over the span of the generators, over the validation parameters.", "min β span", 14
-    ),
-    "beta_cone_lower_min": real("b/VW", "Smallest certified lower bound of β over their cone.", "min β cone", 15),
-    "beta_cone_upper_min": real("b/VW", "Smallest upper bound of β over their cone."),
-    "share_training": real(
-        "1", "Smallest ratio of β over the span to that of the whole of V, over the training parameters."
-    ),
-    "share_validation": real("1", "The same over the validation parameters."),
-    "share_guaranteed": real(
-        "1", "√(1 − σ²), which bounds the share at training parameters where the strategy records σ."
-    ),
-    "error_u_mean": real("1", "Mean relative error of u in V over the ok queries with u ≠ 0.", "error u", 16),
-    "error_u_max": real("1", "Largest relative error of u in V over these queries."),
-    "queries_zero_u": integer(
-        "Ok queries with zero_u = 1, which means and maxima of the error of u leave out.", "u = 0", 17
-    ),
-    "error_u_zero_max": real("1", "Largest error_u_scaled of these queries.", "error, u = 0", 18),
-    "error_lambda_mean": real("1", "Mean relative error of λ in W over the ok queries with λ ≠ 0.", "error λ", 19),
-    "error_lambda_max": real("1", "Largest relative error of λ in W over these queries."),
-    "queries_zero_lambda": integer(
-        "Ok queries with zero_lambda = 1, which means and maxima of the error of λ leave out.", "λ = 0", 20
-    ),
-    "error_lambda_zero_max": real("1", "Largest error_lambda_scaled of these queries.", "error, λ = 0", 21),
-    **{
-        f"effectivity_{name}_median": real("1", f"Median effectivity of bound_{name} over the ok queries.")
-        for name in BOUNDS
-    },
-    "certificate": text("Bounds at online cost: certified, verified, or none.", "certificate", 10),
-    "bound_online_violations": integer("Ok queries where bound_online_violated is 1; empty without a certificate."),
-    "reference_bound_max": real("1", "Largest reference_bound of the queries."),
-    "solver_error_u_max": real("1", "Largest contribution of the QP solver to the relative error of u."),
-    "solver_error_lambda_max": real("1", "Largest contribution of the QP solver to the relative error of λ."),
-    "solver_share_max": real("1", "Largest ratio of this contribution to the error, over the queries."),
-    "solver_share_mean": real(
-        "1",
-        "Mean contribution of the QP solver divided by the mean error of u or λ; cells are compared only below 0.1.",
-    ),
-    "assembly_error_max": real("1", "Largest difference of a member of a reduced program from its projection."),
-    "assembly_error_u_max": real("1", "Largest contribution of reduced assembly to the relative error of u."),
-    "assembly_error_lambda_max": real("1", "Largest contribution of reduced assembly to the relative error of λ."),
-    "assembly_share_max": real("1", "Largest ratio of this contribution to the error, over the queries."),
-    "assembly_share_mean": real(
-        "1",
-        "Mean contribution of reduced assembly divided by the mean error of u or λ; cells are compared only below 0.1.",
-    ),
-    "violation_max": real("u", "Largest constraint violation of a reduced solution."),
-    "residual_max": real("1", "Largest of all natural residuals of quadratic programs."),
-    "hf_residual_max": real("1", "Largest natural residual of the high-fidelity problem over the ok queries."),
-    "error_u_predicted_mean": real("V", "Mean of error_u_predicted over the ok queries."),
-    "fallbacks": text("Steps that deviate from their algorithm, and what was done instead."),
-    "peak_memory_mib": real("MiB", "Peak resident memory of the worker process."),
-    "slowdown": real(
-        "1",
-        "CPU time of the calibration next to the rounds, divided by the lowest tenth of it in that process.",
-    ),
-    "disturbed": integer("1 if the slowdown exceeds 1.3, else 0."),
-    "seed": integer("Seed of the study."),
-    "validation": text("Validation set: own, or the label or name of its sampling strategy."),
-    "validation_options": as_json("Options of that strategy that are not at their default, as JSON."),
-    "study_hash": text("Hash of the study file."),
-    "code": text("Hash of the code of the core, the plugins and the solver."),
-    "machine": text("Machines that measured the seconds."),
-    "threads": integer("Threads of every timed process."),
-    "versions": as_json("Versions of Python, libraries and solver, as JSON."),
-    "definition": as_json("Definition of the cell as JSON."),
-}
-
-
-def _constants(prefix: str, whose: str) -> dict[str, Column]:
-    return {
-        f"{prefix}span": real("b/VW", f"β over the span of the generators, {whose}."),
-        f"{prefix}cone_lower": real("b/VW", f"Certified lower bound of β over the cone, {whose}."),
-        f"{prefix}cone_upper": real("b/VW", f"Upper bound of β over the cone, {whose}."),
-    }
-
-
-CONSTANTS: Mapping[str, Column] = {
-    **_constants("beta_", "of the reduced pair"),
-    **_constants("beta_full_", "with the whole of V"),
-    **_constants("beta_plain_", "with V_N alone"),
-    **_constants("beta_hf_", "of the high-fidelity pair, whose generators are all basis functions"),
-}
-"""Inf-sup columns of a query."""
-
-
-def _effectivities(*names: str) -> dict[str, Column]:
-    return {
-        f"effectivity_{name}": real(
-            "1",
-            f"bound_{name} divided by the absolute error; empty where the relative error in V or W, or the scaled one "
-            "if there is none, is at most 1e-8.",
-        )
-        for name in names
-    }
-
-
-QUERIES: Mapping[str, Column] = {
-    "cell": text("The cell it belongs to.", kind=MEMBER),
-    **KEYS,
-    "query": integer("Number of the validation parameter, from 0."),
-    "form": text("Form in which the program was solved: primal, dual, or compiled; formulation for plugins."),
-    "started_from": integer("Query from whose solution the solver started; empty for a cold start."),
-    "assembly_error": real("1", "Largest relative difference of a member of the program from its projection."),
-    "assemble_s": real("s", "Assembly of the reduced program: median over the rounds."),
-    "solve_s": real("s", "The solver: median over the rounds."),
-    "certify_s": real("s", "The certificate and the correction: median over the rounds; empty without either."),
-    "total_s": real("s", "Sum of the three."),
-    "total_wall_s": real("s", "The same in wall seconds."),
-    "corrected": integer("1 if the corrected pair is returned, 0 if the reduced solution; empty without corrections."),
-    "correction_share": real("1", "ω/ρ of the reduced solution, above which auto corrects at 1; empty if unknown."),
-    "correction_note": text("Why the solution is not corrected although a correction was requested."),
-    "reference_bound": real(
-        "1",
-        "Bound of the energy error of the high-fidelity solution, relative to ‖u‖_A and ‖Bᵀλ‖_A⁻¹; at most 1e-6, or "
-        "what round-off of B u − g leaves open; empty where no correction is found.",
-    ),
-    "hf_s": real(
-        "s", "High-fidelity solution at this parameter, with assembly but without set-up: median of the repetitions."
-    ),
-    "zero_u": integer("1 if the high-fidelity ‖u‖ is at most 1e-8 of the largest in the training set, else 0."),
-    "zero_lambda": integer("Likewise for ‖λ‖; 1 means that there is no contact."),
-    "error_u": real("1", "‖u − u_N‖ / ‖u‖ in V; empty where zero_u is 1."),
-    "error_lambda": real("1", "‖λ − λ_N‖ / ‖λ‖ in W; empty where zero_lambda is 1."),
-    "error_u_energy": real("1", "The error of u in the norm of A(µ), relative; empty where zero_u is 1."),
-    "error_lambda_natural": real("1", "‖Bᵀ(λ − λ_N)‖ / ‖Bᵀλ‖ in the norm of A(µ)⁻¹; empty where zero_lambda is 1."),
-    "error_u_absolute": real("V", "‖u − u_N‖ in V."),
-    "error_lambda_absolute": real("W", "‖λ − λ_N‖ in W."),
-    "error_u_energy_absolute": real("A", "‖u − u_N‖ in the norm of A(µ)."),
-    "error_lambda_natural_absolute": real(
-        "A", "‖Bᵀ(λ − λ_N)‖ in the norm of A(µ)⁻¹, which has the unit of the energy norm."
-    ),
-    "error_u_scaled": real("1", "‖u − u_N‖ over the largest ‖u‖ of the training set."),
-    "error_lambda_scaled": real("1", "‖λ − λ_N‖ over the largest ‖λ‖ of the training set."),
-    "solver_error_u": real(
-        "1",
-        "Distance of u from the solution of the reduced program to round-off, relative to ‖u‖; empty if error_u is "
-        "empty or there is no such solution.",
-    ),
-    "solver_error_lambda": real(
-        "1", "Likewise for λ; also empty if the tight constraints are dependent, so that λ is not unique."
-    ),
-    "solver_share": real(
-        "1", "The larger of these two, each divided by its error of u or λ; empty if both errors are at most 1e-8."
-    ),
-    "assembly_error_u": real(
-        "1",
-        "Distance of u from that with assembly in full, both solved to round-off, relative to ‖u‖; empty with full "
-        "assembly, or if error_u is empty or there are no such solutions.",
-    ),
-    "assembly_error_lambda": real("1", "Likewise for λ; also empty if λ is not unique."),
-    "assembly_share": real(
-        "1", "The larger of these two, each divided by its error of u or λ; empty if both errors are at most 1e-8."
-    ),
-    "bound_u_energy": real("A", "Bound √(ρ² + ω² + 2κ) of error_u_energy_absolute."),
-    "bound_u": real("V", "Bound of error_u_absolute: bound_u_energy divided by √α; see bound_note."),
-    "bound_lambda_natural": real("A", "Bound of error_lambda_natural_absolute."),
-    "bound_lambda": real(
-        "W", "Bound of error_lambda_absolute: bound_lambda_natural divided by β_A; infinite if no β_A > 0 is proved."
-    ),
-    **_effectivities("u_energy", "u", "lambda_natural", "lambda"),
-    "bound_rho": real("A", "ρ, the residual in the norm of A(µ)⁻¹."),
-    "bound_rho_range": real(
-        "A", "ρ_B, the part of ρ in the range of Bᵀ, which bounds λ; ρ itself where constraints are dependent."
-    ),
-    "bound_omega": real("A", "ω, the norm of the correction w of the constraint violation."),
-    "bound_kappa": real("A²", "κ = λ_Nᵀ(B w − s), the complementarity of w and λ_N."),
-    "bound_note": text(
-        "Why there are no bounds, or none of λ in W, or which constant is estimated; empty if all are proved."
-    ),
-    "certificate": text(
-        "Bounds at online cost: certified, verified up to interpolation errors that were measured, or none."
-    ),
-    "bound_online_u_energy": real("A", "Bound of error_u_energy_absolute at online cost."),
-    "bound_online_lambda_natural": real("A", "Bound of error_lambda_natural_absolute at online cost."),
-    "bound_online_lambda": real(
-        "W", "Bound of error_lambda_absolute at online cost; empty where beta_energy_online_note says why."
-    ),
-    **_effectivities("online_u_energy", "online_lambda_natural", "online_lambda"),
-    "bound_online_rho": real("A", "Its bound of ρ."),
-    "bound_online_omega": real("A", "Its bound of ω."),
-    "bound_online_kappa": real("A²", "Its κ."),
-    "coercivity_online": real(
-        "1", "Lower bound of A(µ) against A at the centre of the parameters; 1 where A is constant."
-    ),
-    "beta_energy_online": real("b/AW", "Lower bound of β_A at online cost; 0 where there is none."),
-    "beta_energy_online_note": text("Which lower bound of β_A this is, or why there is none."),
-    "bound_online_violated": integer(
-        "1 where an error is above its bound by more than 1e-10 of the solution, else 0; empty without."
-    ),
-    "bound_online_note": text(
-        "Why there are no bounds at online cost, or no prepared correction was feasible and the best one was computed."
-    ),
-    "bound_hsw_u": real(
-        "V", "Bound Δ_u of Haasdonk, Salomon and Wohlmuth with an estimated β_HF; infinite if β_HF over the span is 0."
-    ),
-    "bound_hsw_lambda": real("W", "Their bound Δ_λ of the error of λ, with the same constant."),
-    **_effectivities("hsw_u", "hsw_lambda"),
-    "coercivity": real("A/V²", "α, a lower bound of the smallest vᵀA(µ)v / ‖v‖²."),
-    "coercivity_proved": integer("1 if a factorisation proves it, 0 if it is a Lanczos estimate."),
-    "continuity": real("A/V²", "γ_a, an upper bound of the largest vᵀA(µ)v / ‖v‖²."),
-    "continuity_proved": integer("1 if a factorisation proves it, 0 if it is a Lanczos estimate."),
-    "beta_energy": real(
-        "b/AW", "β_A, proved lower bound of the inf-sup constant of V in the norm of A(µ) and W over the span."
-    ),
-    "outputs": as_json(
-        "Quantities of interest as JSON: value, high-fidelity reference, relative error, error over the scale."
-    ),
-    "violation": real("u", "Largest (B u_N − g)₊, each row divided by the integral of its multiplier function."),
-    "complementarity": real("b", "λᵀ(B u_N − g), λ the high-fidelity multiplier."),
-    **CONSTANTS,
-    "bounds": text("Bounds that determine the interval of the reduced pair, lower/upper."),
-    "status": text("ok, inaccurate, nonfinite, infeasible, failed, timeout, crashed or error.", kind=REQUIRED),
-    "reason": text("Why the status is not ok."),
-    "solver_status": text("Status reported by the solver."),
-    "primal_residual": real("1", "Natural primal residual: a correction of one row over the solution, in energy."),
-    "dual_residual": real("1", "Natural dual residual: its norm in A⁻¹ over the energy norm of the solution."),
-    "gap": real("1", "Natural gap: |αᵀs| over the energy of the solution."),
-    "hf_primal_residual": real(
-        "1", "Natural primal residual of u_N in the high-fidelity problem, whatever the formulation."
-    ),
-    "hf_dual_residual": real("1", "Natural dual residual of u_N and λ_N in the high-fidelity problem."),
-    "hf_gap": real("1", "Natural gap of u_N and λ_N in the high-fidelity problem."),
-    "error_u_predicted": real("V", "The formulation's own estimate of error_u_absolute; empty where it makes none."),
-    "iterations": integer("Iterations reported by the solver."),
-    "repeatable": integer("1 if a second solution was identical to the last bit, else 0; empty if there was none."),
-}
-
-TIMINGS: Mapping[str, Column] = {
-    "cell": text("The cell it belongs to.", kind=MEMBER),
-    **KEYS,
-    "round": integer("Number of the round, from 0; the rounds of cells that are compared are interleaved."),
-    "queries": integer("Number of ok queries solved in the round."),
-    "assemble_s": real("s", "Assembly of a query: mean over these, or with full assembly that of one of them."),
-    "solve_s": real("s", "Solution of a query by the solver: mean over these."),
-    "certify_s": real("s", "Certificate and correction of a query: mean over these; empty without either."),
-    "total_s": real("s", "Sum of the three."),
-    "total_wall_s": real("s", "The same in wall seconds."),
-    "block": text("Block of rounds, which cells that were timed together share; each block is a process of its own."),
-    "hf_s": real(
-        "s",
-        "High-fidelity solution, mean over the parameters of the round: that of the block, at the pace of the round.",
-    ),
-    "pace": real(
-        "1", "Factor by which the timings of this round exceed those of the other rounds of the block: the median."
-    ),
-    "slowdown": real(
-        "1", "CPU time of the calibration next to the round, divided by the lowest tenth of it in that process."
-    ),
-}
-
-PARAMETER = real("µ", "The k-th parameter; tables for reading have its name as heading.")
-"""What mu_1, mu_2, … of the queries are, as many as the problem has parameters."""
-
-
-def _without(*names: str) -> dict[str, Column]:
+def _keys_without(*names: str) -> dict[str, Column]:
     return {name: column for name, column in KEYS.items() if name not in names}
 
 
-HISTORY_KEYS = _without("formulation", "formulation_options", "solver", "accuracy", "assembly", "correction")
-
-HISTORIES: Mapping[str, Column] = {
-    "artefact": text("Hash of the stage it comes from."),
-    "stage": text("pod, cone, enrichment or selection; training or validation for diagnostics of the problem."),
-    **HISTORY_KEYS,
-    "quantity": text("Name of the quantity."),
-    "step": integer("Step of the algorithm, or number of the parameter."),
-    "value": real("1", "The value; inf-sup constants are in the unit of β, diagnostics in their own units."),
-}
-
-BREAK_EVEN: Mapping[str, Column] = {
-    **_without("formulation", "formulation_options", "primal", "primal_options", "primal_tol", "assembly"),
-    "cell_a": text("Cell of model a; empty for the high-fidelity model."),
-    "cell_b": text("Cell of model b."),
-    "formulation_a": text(
-        "Formulation of a; mixed for the high-fidelity model, too, which is the program of V and W.",
-        "formulation of a",
-        10,
-    ),
-    "formulation_b": text("Formulation of b.", "formulation of b", 10),
-    "primal_a": text("Model a: its primal strategy, or high-fidelity.", "a", 11),
-    "primal_tol_a": real("1", "Tolerance of the primal strategy of a."),
-    "assembly_a": text("Assembly of the queries of a.", "assembly a", 12),
-    "primal_b": text("Model b: its primal strategy.", "b", 13),
-    "primal_tol_b": real("1", "Tolerance of the primal strategy of b.", "δ of b", 15),
-    "assembly_b": text("Assembly of the queries of b.", "assembly b", 14),
-    "offline_a_s": real("s", "Offline seconds of a.", "offline a [s]", 16),
-    "online_a_s": real("s", "Seconds of a query of a, in the blocks of rounds that both share.", "online a [ms]", 17),
-    "offline_b_s": real("s", "Offline seconds of b.", "offline b [s]", 18),
-    "online_b_s": real("s", "Seconds of a query of b, in these blocks.", "online b [ms]", 19),
-    "gain": real("1", "Seconds of a query of a divided by those of b, paired within rounds.", "gain", 19),
-    "gain_low": real("1", "Lower end of the 95 % interval of the gain."),
-    "gain_high": real("1", "Upper end of this interval."),
-    "benefit_threshold": real(
-        "1", "Number n* of queries at break-even; empty if there is none, or none is claimed.", "break-even", 20
-    ),
-    "threshold_low": real("1", "Lower end of the 95 % interval of n*; if undecided, the smallest n*."),
-    "threshold_high": real("1", "Upper end of the 95 % interval of n*; tables for reading show both.", "interval", 21),
-    "meaning": text(
-        "When b is cheaper than a in total: from n* on, until n*, never or at once; as fast where the seconds of their "
-        "queries differ by less than a factor of 1.25; or undecided."
-    ),
-    "rounds_missing": integer(
-        "If undecided, how many more rounds would decide it; empty where the offline seconds are too close.",
-        "more rounds",
-        22,
-    ),
-}
-
-DISAGREEMENTS: Mapping[str, Column] = {
-    **_without("solver", "correction"),
-    "solver_a": text("One solver."),
-    "solver_b": text("The other."),
-    "queries": integer("Number of queries that both solved."),
-    "difference_max": real("1", "Largest distance of their u in V, relative to that of solver_a."),
-    "query_worst": integer("Query with this difference."),
-    "allowed_worst": real("1", "Largest difference that the accuracy allows there, relative."),
-    "flagged": integer("Number of queries with a difference larger than the accuracy allows."),
-    "query_flagged": integer("First of these queries."),
-}
-
-SOLUTIONS: Mapping[str, Column] = {
-    "cell": text("The cell it belongs to.", kind=MEMBER),
-    "query": integer("Number of the validation parameter."),
-    "x": Column(BLOB, "V", "Coefficients in the V-orthonormal primal basis, little-endian doubles."),
-    "alpha": Column(BLOB, "W", "Coefficients of the generators, little-endian doubles."),
-    "slack_linear": real("V", "Linear coefficient l of the distance that the accuracy leaves open."),
-    "slack_constant": real("V²", "Constant c in the square of that distance."),
-}
-
-OUTPUTS: Mapping[str, Column] = {
-    "cell": text("The cell it belongs to.", "cell", 0, kind=MEMBER),
-    **KEYS,
-    "output": text("Quantity of interest, as its problem names it.", "output", 10),
-    "unit": text("Its unit.", "unit", 11),
-    "linear": integer("1 where it is linear in u and λ with fixed coefficients, else 0."),
-    "scale": real("o", "Its largest absolute value over the training set.", "scale", 12),
-    "queries_ok": integer("Number of ok queries; means and maxima are over these."),
-    "error_mean": real("1", "Mean relative error, where the output is not zero.", "error", 13),
-    "error_max": real("1", "Largest relative error, likewise.", "largest", 14),
-    "queries_zero": integer("Ok queries where it is at most 1e-8 of its scale: no contact, for instance."),
-    "error_zero_max": real("1", "Largest error of these, over the scale."),
-    "error_scaled_mean": real("1", "Mean error over the scale, of all ok queries.", "error / scale", 15),
-    "error_scaled_max": real("1", "Largest error over the scale, likewise."),
-}
-
-PICTURES: Mapping[str, Column] = {
-    "problem": text("Problem: its label in the study, or its name."),
-    "problem_options": as_json("Options of the problem that are not at their default, as JSON."),
-    "number": integer("Number of the picture."),
-    "title": text("The parameter, as text."),
-    "names": as_json("Names of the field and of the multiplier with their units, as JSON."),
-    "data": Column(BLOB, "", "Mesh, field and multiplier in single precision, a compressed archive of NumPy."),
-    "reason": text("Why there is no picture, if it could not be made."),
-}
-
-TABLES: Mapping[str, Mapping[str, Column]] = {
-    "cells": CELLS,
-    "queries": QUERIES,
-    "histories": HISTORIES,
-    "timings": TIMINGS,
-    "thresholds": BREAK_EVEN,
-    "disagreements": DISAGREEMENTS,
-    "outputs": OUTPUTS,
-}
-"""The tables for reading; each is exported as CSV."""
-
-STORED: Mapping[str, Mapping[str, Column]] = {**TABLES, "solutions": SOLUTIONS, "pictures": PICTURES}
-"""All tables of the results file."""
+def _cell() -> Column:
+    return text("The cell it belongs to.", constraint="NOT NULL REFERENCES cells(cell) ON DELETE CASCADE")
 
 
-def shown_columns(table: Mapping[str, Column]) -> dict[str, Column]:
-    """The columns of a table that are shown in the table for reading made of it, in the order of their places."""
-    return dict(sorted(((name, c) for name, c in table.items() if c.heading), key=lambda item: item[1].place))
+def _infsup_constants(prefix: str, pair: str) -> dict[str, Column]:
+    return {
+        f"{prefix}span": real("b/VW", f"β over the span of the generators, {pair}."),
+        f"{prefix}cone_lower": real("b/VW", f"Certified lower bound of β over the cone, {pair}."),
+        f"{prefix}cone_upper": real("b/VW", f"Upper bound of β over the cone, {pair}."),
+    }
+
+
+def _effectivities(*names: str) -> dict[str, Column]:
+    meaning = (
+        "divided by the absolute error; empty where the relative error in V or W, or the scaled one if there is none, "
+        "is at most 1e-8."
+    )
+    return {f"effectivity_{name}": real("1", f"bound_{name} {meaning}") for name in names}
+
+
+# All tables of the results file, by name.
+STORED: Mapping[str, Mapping[str, Column]] = {
+    "cells": {
+        "cell": text("Hash of everything that determines the numbers of the cell, except the code; commands accept its "
+            "beginning.", "cell", 0, constraint="PRIMARY KEY"),
+        **KEYS,
+        "model": text("Hash of the reduced model; cells that differ only in the solver share it."),
+        "status": text("Worst status of its queries, or of a stage that they need.",
+            "status", 10, constraint="NOT NULL"),
+        "reason": text("Why the cell is not ok: the first query with this status, and its fault."),
+        "queries": integer("Number of queries, one per validation parameter."),
+        "queries_ok": integer("Number of queries with status ok; means and maxima are over these.", "ok", 10),
+        "snapshots": integer("Number of high-fidelity solutions of the training, one per parameter of the training "
+            "set.", "solved", 11),
+        "dim_V": integer("Dimension n of V."),
+        "dim_W": integer("Dimension m of W."),
+        "N": integer("Dimension N of V_N; of other formulations most coefficients of u, those added apart.", "N", 11),
+        "R": integer("Number R of generators of the cone; of other formulations most coefficients of λ.", "R", 12),
+        "rank": integer("Numerical rank of the generators: dimension of their span."),
+        "rank_gap": real("1", "Smallest singular value that counts towards the rank, divided by the next one or the "
+            "threshold; near 1 the rank is doubtful."),
+        "gram_condition": real("1", "Condition number of the Gram matrix of the generators in W, from their singular "
+            "values."),
+        "enrichment": integer("Vectors added to V_N; for an enrichment per parameter, the rank of the generators.",
+            "added", 13),
+        "enrichment_kind": text("none, fixed or per-parameter."),
+        "multiplier": text("Where λ comes from: solved (unknowns of the query), recovered from u, or residual: the λ ≥ "
+            "0 with the smallest residual, found outside the seconds of the query."),
+        "interpolation_tol": real("1", "Tolerance of the interpolation in reduced assembly; empty with full assembly."),
+        "interpolation_error": real("1", "Largest relative interpolation error of a member over the training set."),
+        "terms_A": integer("Terms of A in a reduced query, each with a coefficient to evaluate; 0 if A is constant, "
+            "empty if assembled."),
+        "terms_f": integer("Likewise for f."),
+        "terms_B": integer("Likewise for B; empty if B is assembled on the contact unknowns."),
+        "terms_g": integer("Likewise for g."),
+        "correction_cost": text("What a correction costs: online, with a certificate, or high-fidelity; empty without "
+            "corrections."),
+        "corrected_share": real("1", "Share of the ok queries that are corrected; empty without corrections."),
+        "offline_snapshots_s": real("s", "High-fidelity solutions at the training parameters, with one set-up."),
+        "offline_selection_s": real("s", "Choice of the training parameters by error bounds, a part of "
+            "offline_snapshots_s; 0 for fixed sets."),
+        "offline_pod_s": real("s", "POD."),
+        "offline_cone_s": real("s", "Dual strategy, with the orthonormal basis of the span."),
+        "offline_enrichment_s": real("s", "Primal strategy."),
+        "offline_formulation_s": real("s", "What a formulation builds; 0 for mixed."),
+        "offline_assembly_s": real("s", "Preparation of reduced assembly, and of a compiled program; 0 with full "
+            "assembly."),
+        "offline_certificate_s": real("s", "Preparation of certificates at online cost; 0 without."),
+        "offline_s": real("s", "Offline time of this cell alone: the sum of these without `offline_selection_s`, a "
+            "part of the first.", "offline [s]", 22),
+        "offline_low_s": real("s", "Lower end of its 95 % interval: from the scatter of the offline stages of the run "
+            "that were repeated."),
+        "offline_high_s": real("s", "Upper end of this interval."),
+        "offline_repeats": integer("Offline stages of the cell, of at least a millisecond, that were timed more than "
+            "once."),
+        "offline_wall_s": real("s", "The same sum in wall seconds."),
+        "online_s": real("s", "One query with assembly, certificate and correction, mean over the ok queries: "
+            "geometric mean over the blocks of the median over their rounds, each divided by its pace.",
+            "online [ms]", 23),
+        "online_q1_s": real("s", "Lower quartile over the rounds."),
+        "online_q3_s": real("s", "Upper quartile over the rounds."),
+        "online_wall_s": real("s", "The same as online_s, in wall seconds."),
+        "online_assemble_s": real("s", "Assembly of a query: median over the rounds."),
+        "online_solve_s": real("s", "Solution of a query by the solver: median over the rounds."),
+        "online_certify_s": real("s", "Certificate and correction of a query: median over the rounds; empty without "
+            "either."),
+        "timing_rounds": integer("Maximal number of timing rounds of the study; empty if the timing of the cell is not "
+            "finished."),
+        "timed_rounds": integer("Rounds that were timed: they end when all comparisons of the cell are decided."),
+        "timing_reason": text("Why rounds are missing."),
+        "hf_setup_s": real("s", "Set-up of the high-fidelity solver, once: the time by which the first solution "
+            "exceeds its repetition from a known contact set."),
+        "hf_s": real("s", "One high-fidelity solution after the set-up, mean over the validation parameters: online_s "
+            "times the gain in the rounds; where none was timed in them, in the sweep over these parameters."),
+        "beta_span_min": real("b/VW", "Smallest β over the span of the generators, over the validation parameters.",
+            "min β span", 14),
+        "beta_cone_lower_min": real("b/VW", "Smallest certified lower bound of β over their cone.", "min β cone", 15),
+        "beta_cone_upper_min": real("b/VW", "Smallest upper bound of β over their cone."),
+        "share_training": real("1", "Smallest ratio of β over the span to that of the whole of V, over the training "
+            "parameters."),
+        "share_validation": real("1", "The same over the validation parameters."),
+        "share_guaranteed": real("1", "√(1 − σ²), which bounds the share at training parameters where the strategy "
+            "records σ."),
+        "error_u_mean": real("1", "Mean relative error of u in V over the ok queries with u ≠ 0.", "error u", 16),
+        "error_u_max": real("1", "Largest relative error of u in V over these queries."),
+        "queries_zero_u": integer("Ok queries with zero_u = 1, which means and maxima of the error of u leave out.",
+            "u = 0", 17),
+        "error_u_zero_max": real("1", "Largest error_u_scaled of these queries.", "error, u = 0", 18),
+        "error_lambda_mean": real("1", "Mean relative error of λ in W over the ok queries with λ ≠ 0.", "error λ", 19),
+        "error_lambda_max": real("1", "Largest relative error of λ in W over these queries."),
+        "queries_zero_lambda": integer("Ok queries with zero_lambda = 1, which means and maxima of the error of λ "
+            "leave out.", "λ = 0", 20),
+        "error_lambda_zero_max": real("1", "Largest error_lambda_scaled of these queries.", "error, λ = 0", 21),
+        **{f"effectivity_{name}_median": real("1", f"Median effectivity of bound_{name} over the ok queries.")
+           for name in (
+            "u_energy", "u", "lambda_natural", "lambda", "online_u_energy", "online_lambda_natural", "online_lambda",
+            "hsw_u", "hsw_lambda",
+        )},
+        "certificate": text("Bounds at online cost: certified, verified, or none.", "certificate", 10),
+        "bound_online_violations": integer("Ok queries where bound_online_violated is 1; empty without a certificate."),
+        "reference_bound_max": real("1", "Largest reference_bound of the queries."),
+        "solver_error_u_max": real("1", "Largest contribution of the QP solver to the relative error of u."),
+        "solver_error_lambda_max": real("1", "Largest contribution of the QP solver to the relative error of λ."),
+        "solver_share_max": real("1", "Largest ratio of this contribution to the error, over the queries."),
+        "solver_share_mean": real("1", "Mean contribution of the QP solver divided by the mean error of u or λ; cells "
+            "are compared only below 0.1."),
+        "assembly_error_max": real("1", "Largest difference of a member of a reduced program from its projection."),
+        "assembly_error_u_max": real("1", "Largest contribution of reduced assembly to the relative error of u."),
+        "assembly_error_lambda_max": real("1", "Largest contribution of reduced assembly to the relative error of λ."),
+        "assembly_share_max": real("1", "Largest ratio of this contribution to the error, over the queries."),
+        "assembly_share_mean": real("1", "Mean contribution of reduced assembly divided by the mean error of u or λ; "
+            "cells are compared only below 0.1."),
+        "violation_max": real("u", "Largest constraint violation of a reduced solution."),
+        "residual_max": real("1", "Largest of all natural residuals of quadratic programs."),
+        "hf_residual_max": real("1", "Largest natural residual of the high-fidelity problem over the ok queries."),
+        "error_u_predicted_mean": real("V", "Mean of error_u_predicted over the ok queries."),
+        "fallbacks": text("Steps that deviate from their algorithm, and what was done instead."),
+        "peak_memory_mib": real("MiB", "Peak resident memory of the worker process."),
+        "slowdown": real("1", "CPU time of the calibration next to the rounds, divided by the lowest tenth of it in "
+            "that process."),
+        "disturbed": integer("1 if the slowdown exceeds 1.3, else 0."),
+        "seed": integer("Seed of the study."),
+        "validation": text("Validation set: own, or the label or name of its sampling strategy."),
+        "validation_options": as_json("Options of that strategy that are not at their default, as JSON."),
+        "study_hash": text("Hash of the study file."),
+        "code": text("Hash of the code of the core, the plugins and the solver."),
+        "machine": text("Machines that measured the seconds."),
+        "threads": integer("Threads of every timed process."),
+        "versions": as_json("Versions of Python, libraries and solver, as JSON."),
+        "definition": as_json("Definition of the cell as JSON."),
+    },
+    "queries": {
+        "cell": _cell(),
+        **KEYS,
+        "query": integer("Number of the validation parameter, from 0."),
+        "form": text("Form in which the program was solved: primal, dual, or compiled; formulation for plugins."),
+        "started_from": integer("Query from whose solution the solver started; empty for a cold start."),
+        "assembly_error": real("1", "Largest relative difference of a member of the program from its projection."),
+        "assemble_s": real("s", "Assembly of the reduced program: median over the rounds."),
+        "solve_s": real("s", "The solver: median over the rounds."),
+        "certify_s": real("s", "The certificate and the correction: median over the rounds; empty without either."),
+        "total_s": real("s", "Sum of the three."),
+        "total_wall_s": real("s", "The same in wall seconds."),
+        "corrected": integer("1 if the corrected pair is returned, 0 if the reduced solution; empty without "
+            "corrections."),
+        "correction_share": real("1", "ω/ρ of the reduced solution, above which auto corrects at 1; empty if unknown."),
+        "correction_note": text("Why the solution is not corrected although a correction was requested."),
+        "reference_bound": real("1", "Bound of the energy error of the high-fidelity solution, relative to ‖u‖_A and "
+            "‖Bᵀλ‖_A⁻¹; at most 1e-6, or what round-off of B u − g leaves open; empty where no correction is found."),
+        "hf_s": real("s", "High-fidelity solution at this parameter, with assembly but without set-up: median of the "
+            "repetitions."),
+        "zero_u": integer("1 if the high-fidelity ‖u‖ is at most 1e-8 of the largest in the training set, else 0."),
+        "zero_lambda": integer("Likewise for ‖λ‖; 1 means that there is no contact."),
+        "error_u": real("1", "‖u − u_N‖ / ‖u‖ in V; empty where zero_u is 1."),
+        "error_lambda": real("1", "‖λ − λ_N‖ / ‖λ‖ in W; empty where zero_lambda is 1."),
+        "error_u_energy": real("1", "The error of u in the norm of A(µ), relative; empty where zero_u is 1."),
+        "error_lambda_natural": real("1", "‖Bᵀ(λ − λ_N)‖ / ‖Bᵀλ‖ in the norm of A(µ)⁻¹; empty where zero_lambda is 1."),
+        "error_u_absolute": real("V", "‖u − u_N‖ in V."),
+        "error_lambda_absolute": real("W", "‖λ − λ_N‖ in W."),
+        "error_u_energy_absolute": real("A", "‖u − u_N‖ in the norm of A(µ)."),
+        "error_lambda_natural_absolute": real("A", "‖Bᵀ(λ − λ_N)‖ in the norm of A(µ)⁻¹, which has the unit of the "
+            "energy norm."),
+        "error_u_scaled": real("1", "‖u − u_N‖ over the largest ‖u‖ of the training set."),
+        "error_lambda_scaled": real("1", "‖λ − λ_N‖ over the largest ‖λ‖ of the training set."),
+        "solver_error_u": real("1", "Distance of u from the solution of the reduced program to round-off, relative to "
+            "‖u‖; empty if error_u is empty or there is no such solution."),
+        "solver_error_lambda": real("1", "Likewise for λ; also empty if the tight constraints are dependent, so that λ "
+            "is not unique."),
+        "solver_share": real("1", "The larger of these two, each divided by its error of u or λ; empty if both errors "
+            "are at most 1e-8."),
+        "assembly_error_u": real("1", "Distance of u from that with assembly in full, both solved to round-off, "
+            "relative to ‖u‖; empty with full assembly, or if error_u is empty or there are no such solutions."),
+        "assembly_error_lambda": real("1", "Likewise for λ; also empty if λ is not unique."),
+        "assembly_share": real("1", "The larger of these two, each divided by its error of u or λ; empty if both "
+            "errors are at most 1e-8."),
+        "bound_u_energy": real("A", "Bound √(ρ² + ω² + 2κ) of error_u_energy_absolute."),
+        "bound_u": real("V", "Bound of error_u_absolute: bound_u_energy divided by √α; see bound_note."),
+        "bound_lambda_natural": real("A", "Bound of error_lambda_natural_absolute."),
+        "bound_lambda": real("W", "Bound of error_lambda_absolute: bound_lambda_natural divided by β_A; infinite if no "
+            "β_A > 0 is proved."),
+        **_effectivities("u_energy", "u", "lambda_natural", "lambda"),
+        "bound_rho": real("A", "ρ, the residual in the norm of A(µ)⁻¹."),
+        "bound_rho_range": real("A", "ρ_B, the part of ρ in the range of Bᵀ, which bounds λ; ρ itself where "
+            "constraints are dependent."),
+        "bound_omega": real("A", "ω, the norm of the correction w of the constraint violation."),
+        "bound_kappa": real("A²", "κ = λ_Nᵀ(B w − s), the complementarity of w and λ_N."),
+        "bound_note": text("Why there are no bounds, or none of λ in W, or which constant is estimated; empty if all "
+            "are proved."),
+        "certificate": text("Bounds at online cost: certified, verified up to interpolation errors that were measured, "
+            "or none."),
+        "bound_online_u_energy": real("A", "Bound of error_u_energy_absolute at online cost."),
+        "bound_online_lambda_natural": real("A", "Bound of error_lambda_natural_absolute at online cost."),
+        "bound_online_lambda": real("W", "Bound of error_lambda_absolute at online cost; empty where "
+            "beta_energy_online_note says why."),
+        **_effectivities("online_u_energy", "online_lambda_natural", "online_lambda"),
+        "bound_online_rho": real("A", "Its bound of ρ."),
+        "bound_online_omega": real("A", "Its bound of ω."),
+        "bound_online_kappa": real("A²", "Its κ."),
+        "coercivity_online": real("1", "Lower bound of A(µ) against A at the centre of the parameters; 1 where A is "
+            "constant."),
+        "beta_energy_online": real("b/AW", "Lower bound of β_A at online cost; 0 where there is none."),
+        "beta_energy_online_note": text("Which lower bound of β_A this is, or why there is none."),
+        "bound_online_violated": integer("1 where an error is above its bound by more than 1e-10 of the solution, else "
+            "0; empty without."),
+        "bound_online_note": text("Why there are no bounds at online cost, or no prepared correction was feasible and "
+            "the best one was computed."),
+        "bound_hsw_u": real("V", "Bound Δ_u of Haasdonk, Salomon and Wohlmuth with an estimated β_HF; infinite if β_HF "
+            "over the span is 0."),
+        "bound_hsw_lambda": real("W", "Their bound Δ_λ of the error of λ, with the same constant."),
+        **_effectivities("hsw_u", "hsw_lambda"),
+        "coercivity": real("A/V²", "α, a lower bound of the smallest vᵀA(µ)v / ‖v‖²."),
+        "coercivity_proved": integer("1 if a factorisation proves it, 0 if it is a Lanczos estimate."),
+        "continuity": real("A/V²", "γ_a, an upper bound of the largest vᵀA(µ)v / ‖v‖²."),
+        "continuity_proved": integer("1 if a factorisation proves it, 0 if it is a Lanczos estimate."),
+        "beta_energy": real("b/AW", "β_A, proved lower bound of the inf-sup constant of V in the norm of A(µ) and W "
+            "over the span."),
+        "outputs": as_json("Quantities of interest as JSON: value, high-fidelity reference, relative error, error over "
+            "the scale."),
+        "violation": real("u", "Largest (B u_N − g)₊, each row divided by the integral of its multiplier function."),
+        "complementarity": real("b", "λᵀ(B u_N − g), λ the high-fidelity multiplier."),
+        **_infsup_constants("beta_", "of the reduced pair"),
+        **_infsup_constants("beta_full_", "with the whole of V"),
+        **_infsup_constants("beta_plain_", "with V_N alone"),
+        **_infsup_constants("beta_hf_", "of the high-fidelity pair, whose generators are all basis functions"),
+        "bounds": text("Bounds that determine the interval of the reduced pair, lower/upper."),
+        "status": text("ok, inaccurate, nonfinite, infeasible, failed, timeout, crashed or error.",
+            constraint="NOT NULL"),
+        "reason": text("Why the status is not ok."),
+        "solver_status": text("Status reported by the solver."),
+        "primal_residual": real("1", "Natural primal residual: a correction of one row over the solution, in energy."),
+        "dual_residual": real("1", "Natural dual residual: its norm in A⁻¹ over the energy norm of the solution."),
+        "gap": real("1", "Natural gap: |αᵀs| over the energy of the solution."),
+        "hf_primal_residual": real("1", "Natural primal residual of u_N in the high-fidelity problem, whatever the "
+            "formulation."),
+        "hf_dual_residual": real("1", "Natural dual residual of u_N and λ_N in the high-fidelity problem."),
+        "hf_gap": real("1", "Natural gap of u_N and λ_N in the high-fidelity problem."),
+        "error_u_predicted": real("V", "The formulation's own estimate of error_u_absolute; empty where it makes none."
+            ),
+        "iterations": integer("Iterations reported by the solver."),
+        "repeatable": integer("1 if a second solution was identical to the last bit, else 0; empty if there was none."),
+    },
+    "histories": {
+        "artefact": text("Hash of the stage it comes from."),
+        "stage": text("pod, cone, enrichment or selection; training or validation for diagnostics of the problem."),
+        **_keys_without("formulation", "formulation_options", "solver", "accuracy", "assembly", "correction"),
+        "quantity": text("Name of the quantity."),
+        "step": integer("Step of the algorithm, or number of the parameter."),
+        "value": real("1", "The value; inf-sup constants are in the unit of β, diagnostics in their own units."),
+    },
+    "timings": {
+        "cell": _cell(),
+        **KEYS,
+        "round": integer("Number of the round, from 0; the rounds of cells that are compared are interleaved."),
+        "queries": integer("Number of ok queries solved in the round."),
+        "assemble_s": real("s", "Assembly of a query: mean over these, or with full assembly that of one of them."),
+        "solve_s": real("s", "Solution of a query by the solver: mean over these."),
+        "certify_s": real("s", "Certificate and correction of a query: mean over these; empty without either."),
+        "total_s": real("s", "Sum of the three."),
+        "total_wall_s": real("s", "The same in wall seconds."),
+        "block": text("Block of rounds, which cells that were timed together share; each block is a process of its "
+            "own."),
+        "hf_s": real("s", "High-fidelity solution, mean over the parameters of the round: that of the block, at the "
+            "pace of the round."),
+        "pace": real("1", "Factor by which the timings of this round exceed those of the other rounds of the block: "
+            "the median."),
+        "slowdown": real("1", "CPU time of the calibration next to the round, divided by the lowest tenth of it in "
+            "that process."),
+    },
+    "thresholds": {
+        **_keys_without("formulation", "formulation_options", "primal", "primal_options", "primal_tol", "assembly"),
+        "cell_a": text("Cell of model a; empty for the high-fidelity model."),
+        "cell_b": text("Cell of model b."),
+        "formulation_a": text("Formulation of a; mixed for the high-fidelity model, too, which is the program of V and "
+            "W.", "formulation of a", 10),
+        "formulation_b": text("Formulation of b.", "formulation of b", 10),
+        "primal_a": text("Model a: its primal strategy, or high-fidelity.", "a", 11),
+        "primal_tol_a": real("1", "Tolerance of the primal strategy of a."),
+        "assembly_a": text("Assembly of the queries of a.", "assembly a", 12),
+        "primal_b": text("Model b: its primal strategy.", "b", 13),
+        "primal_tol_b": real("1", "Tolerance of the primal strategy of b.", "δ of b", 15),
+        "assembly_b": text("Assembly of the queries of b.", "assembly b", 14),
+        "offline_a_s": real("s", "Offline seconds of a.", "offline a [s]", 16),
+        "online_a_s": real("s", "Seconds of a query of a, in the blocks of rounds that both share.",
+            "online a [ms]", 17),
+        "offline_b_s": real("s", "Offline seconds of b.", "offline b [s]", 18),
+        "online_b_s": real("s", "Seconds of a query of b, in these blocks.", "online b [ms]", 19),
+        "gain": real("1", "Seconds of a query of a divided by those of b, paired within rounds.", "gain", 19),
+        "gain_low": real("1", "Lower end of the 95 % interval of the gain."),
+        "gain_high": real("1", "Upper end of this interval."),
+        "benefit_threshold": real("1", "Number n* of queries at break-even; empty if there is none, or none is "
+            "claimed.", "break-even", 20),
+        "threshold_low": real("1", "Lower end of the 95 % interval of n*; if undecided, the smallest n*."),
+        "threshold_high": real("1", "Upper end of the 95 % interval of n*; tables for reading show both.",
+            "interval", 21),
+        "meaning": text("When b is cheaper than a in total: from n* on, until n*, never or at once; as fast where the "
+            "seconds of their queries differ by less than a factor of 1.25; or undecided."),
+        "rounds_missing": integer("If undecided, how many more rounds would decide it; empty where the offline seconds "
+            "are too close.", "more rounds", 22),
+    },
+    "disagreements": {
+        **_keys_without("solver", "correction"),
+        "solver_a": text("One solver."),
+        "solver_b": text("The other."),
+        "queries": integer("Number of queries that both solved."),
+        "difference_max": real("1", "Largest distance of their u in V, relative to that of solver_a."),
+        "query_worst": integer("Query with this difference."),
+        "allowed_worst": real("1", "Largest difference that the accuracy allows there, relative."),
+        "flagged": integer("Number of queries with a difference larger than the accuracy allows."),
+        "query_flagged": integer("First of these queries."),
+    },
+    "outputs": {
+        "cell": _cell()._replace(heading="cell", place=0),
+        **KEYS,
+        "output": text("Quantity of interest, as its problem names it.", "output", 10),
+        "unit": text("Its unit.", "unit", 11),
+        "linear": integer("1 where it is linear in u and λ with fixed coefficients, else 0."),
+        "scale": real("o", "Its largest absolute value over the training set.", "scale", 12),
+        "queries_ok": integer("Number of ok queries; means and maxima are over these."),
+        "error_mean": real("1", "Mean relative error, where the output is not zero.", "error", 13),
+        "error_max": real("1", "Largest relative error, likewise.", "largest", 14),
+        "queries_zero": integer("Ok queries where it is at most 1e-8 of its scale: no contact, for instance."),
+        "error_zero_max": real("1", "Largest error of these, over the scale."),
+        "error_scaled_mean": real("1", "Mean error over the scale, of all ok queries.", "error / scale", 15),
+        "error_scaled_max": real("1", "Largest error over the scale, likewise."),
+    },
+    "solutions": {
+        "cell": _cell(),
+        "query": integer("Number of the validation parameter."),
+        "x": blob("V", "Coefficients in the V-orthonormal primal basis, little-endian doubles."),
+        "alpha": blob("W", "Coefficients of the generators, little-endian doubles."),
+        "slack_linear": real("V", "Linear coefficient l of the distance that the accuracy leaves open."),
+        "slack_constant": real("V²", "Constant c in the square of that distance."),
+    },
+    "pictures": {
+        "problem": text("Problem: its label in the study, or its name."),
+        "problem_options": as_json("Options of the problem that are not at their default, as JSON."),
+        "number": integer("Number of the picture."),
+        "title": text("The parameter, as text."),
+        "names": as_json("Names of the field and of the multiplier with their units, as JSON."),
+        "data": blob("", "Mesh, field and multiplier in single precision, a compressed archive of NumPy."),
+        "reason": text("Why there is no picture, if it could not be made."),
+    },
+}  # fmt: skip
+
+# The tables for reading; each is exported as CSV.
+TABLES = tuple(name for name in STORED if name not in ("solutions", "pictures"))

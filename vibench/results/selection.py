@@ -15,7 +15,7 @@ import pandas as pd
 
 from vibench.arrays import Array
 from vibench.errors import RequestError, unknown_name
-from vibench.results.schema import PARAMETER, STORED, Column
+from vibench.results.schema import STORED, Column, column_of
 from vibench.results.sqlite import of_cells, open_read_only
 from vibench.text import printable
 
@@ -124,7 +124,7 @@ def _opened(
             yield db
         return
     columns = {**STORED[table], **added}
-    kinds = ", ".join(f'"{name}" {columns.get(name, PARAMETER).kind.split()[0]}' for name in frame.columns)
+    kinds = ", ".join(f'"{name}" {(columns.get(name) or column_of(table, name)).kind}' for name in frame.columns)
     values = frame.astype(object).where(frame.notna(), None)
     with contextlib.closing(sqlite3.connect(":memory:")) as db:
         db.execute(f'CREATE TABLE "{table}" ({kinds})')

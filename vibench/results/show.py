@@ -25,7 +25,7 @@ from vibench.results.read import (
     terms_in_order,
     whole_numbers,
 )
-from vibench.results.schema import BREAK_EVEN, CELLS, STORED, TABLES, Column
+from vibench.results.schema import STORED, TABLES, Column
 from vibench.results.sqlite import parameters_of, read_parts
 from vibench.text import json_object
 
@@ -73,12 +73,14 @@ class View:
 
 
 VIEWS: Mapping[str, View] = {
-    "summary": View("cells", (*OF_CELLS, *(name for name in CELLS if CELLS[name].heading)), CELLS),
+    "summary": View("cells", (*OF_CELLS, *(n for n, c in STORED["cells"].items() if c.heading)), STORED["cells"]),
     "best": View(
         "cells", ("problem", BAND, *OF_CELLS[:14], "ties", *OF_CELLS[14:]), ranking.HEADINGS, ranking.fastest,
         ranking.NO_BEST_CELL,
     ),
-    "benefits": View("thresholds", (*OF_BENEFITS, *(n for n in BREAK_EVEN if BREAK_EVEN[n].heading)), BREAK_EVEN),
+    "benefits": View(
+        "thresholds", (*OF_BENEFITS, *(n for n, c in STORED["thresholds"].items() if c.heading)), STORED["thresholds"],
+    ),
     "cells": View("cells", (*OF_CELLS, "reason")),
     "queries": View(
         "queries",

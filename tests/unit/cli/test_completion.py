@@ -20,7 +20,7 @@ from vibench.plugins.kinds import DUAL, STUDY
 from vibench.plugins.registry import find, first_sentence, registered
 from vibench.qp.settings import SETTINGS
 from vibench.results.read import read_table
-from vibench.results.schema import TABLES
+from vibench.results.schema import STORED, TABLES
 from vibench.results.show import VIEWS
 from vibench.results.sqlite import FILE
 
@@ -68,7 +68,7 @@ def completed(line: str) -> list[str]:
         ("vibench show quick --table best --columns error_b", ["error_below"]),
         ("vibench show quick --table benefits --columns error_", ["error_a", "error_b"]),
         ("vibench show quick --error ", ["lambda", "output:", "solution", "u"]),
-        ("vibench compare a b --column onl", [name for name in sorted(TABLES["cells"]) if name.startswith("onl")]),
+        ("vibench compare a b --column onl", [name for name in sorted(STORED["cells"]) if name.startswith("onl")]),
         ("vibench list s", ["sampling", "solvers", "studies"]),
         ("vibench show quick --table th", ["thresholds"]),
         ("vibench show quick --table s", ["summary"]),

@@ -19,7 +19,7 @@ from vibench.cli.completion import SHOWN
 from vibench.cli.console import new_console, print_frame
 from vibench.results import formats, show
 from vibench.results.read import read_table, results_file
-from vibench.results.schema import CELLS
+from vibench.results.schema import STORED
 
 WIDTHS = (80, 120, 200)
 
@@ -215,7 +215,7 @@ class TestShow:
         assert line.split(None, 3)[1:3] == [f"{row['online_s']:.3g}", "s"]
         assert line.split(None, 3)[3].startswith("One query with assembly")
         named = {line.split()[0] for line in body.splitlines()[3:] if not line.startswith(" ")}
-        assert named | {name.strip() for name in empty.split(",")} == set(CELLS)
+        assert named | {name.strip() for name in empty.split(",")} == set(STORED["cells"])
         _, out, _ = main("show", str(quick_run), row["cell"], "--table", "queries", "--format", "csv")
         assert set(pd.read_csv(io.StringIO(out))["cell"]) == {row["cell"]}
         code, out, err = main("show", str(quick_run), "x")

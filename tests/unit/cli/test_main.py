@@ -26,7 +26,7 @@ from vibench.report.differences import ChangeKind
 from vibench.results.break_even import Meaning
 from vibench.results.ranking import ADDED
 from vibench.results.read import read_table
-from vibench.results.schema import CELLS, STORED, TABLES
+from vibench.results.schema import STORED, TABLES
 from vibench.results.sqlite import FILE
 from vibench.study.entries import ProblemEntry
 from vibench.study.matrix import expand, read_study
@@ -353,7 +353,7 @@ def test_show_prints_every_table_as_csv(table: str, main: Main, quick_run: Path)
     source = {"summary": "cells", "benefits": "thresholds"}.get(table, table)
     assert len(rows) == len(read_table(quick_run / FILE, source)) > 0
     if table == source:
-        assert [name for name in rows[0] if not name.startswith("mu_")] == list(TABLES[table])
+        assert [name for name in rows[0] if not name.startswith("mu_")] == list(STORED[table])
 
 
 @pytest.mark.parametrize("table", ["summary", "benefits", "cells"])
@@ -429,7 +429,7 @@ def test_help_on_a_command_is_its_own(main: Main) -> None:
 def test_help_on_a_column_is_what_it_means(name: str, main: Main) -> None:
     code, out, _ = main("help", name)
     assert code == 0
-    assert f"online_s [s], in cells: {CELLS['online_s'].meaning}" in out.splitlines()
+    assert f"online_s [s], in cells: {STORED['cells']['online_s'].meaning}" in out.splitlines()
 
 
 @pytest.mark.parametrize(
@@ -454,7 +454,7 @@ def test_help_on_a_key_of_study_files_is_what_it_means_wherever_it_stands(main: 
     assert [line.partition("): ")[2] for line in (of_file, of_entry)] == meanings
     in_all = [table for table, described in STORED.items() if "training" in described]
     assert of_study.startswith("training, a study of vibench")
-    assert columns == (f"training, in {', '.join(in_all)}: {CELLS['training'].meaning}")
+    assert columns == (f"training, in {', '.join(in_all)}: {STORED['cells']['training'].meaning}")
 
 
 def test_help_on_nothing_there_is_refused(main: Main) -> None:

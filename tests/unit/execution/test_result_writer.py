@@ -11,7 +11,7 @@ from samples import STUDY, changed, write_study
 
 from vibench.execution.recording import axis_columns, cell_columns, labels_of
 from vibench.interfaces.strategies import Stop
-from vibench.results.schema import HISTORY_KEYS, KEYS
+from vibench.results.schema import KEYS, STORED
 from vibench.stages.base import Stage
 from vibench.stages.cell_queries import cell_queries
 from vibench.stages.enrichment import NestedEnrichment
@@ -90,7 +90,7 @@ def test_a_history_is_named_by_what_its_stage_depends_on(
 ) -> None:
     columns = axis_columns(first(stages, sort).axes, labels_of([cell]))
     assert set(columns) == names
-    assert set(columns) <= set(HISTORY_KEYS)
+    assert set(columns) <= set(STORED["histories"])
     of_cell = cell_columns(cell)
     assert columns == {name: of_cell[name] for name in names}
 
@@ -100,7 +100,7 @@ def test_every_stage_of_every_cell_has_names(study: Study) -> None:
     labels = labels_of(cells)
     for cell in cells:
         for stage in stages_of(cell_queries(cell, 20.0)):
-            assert set(axis_columns(stage.axes, labels)) <= set(HISTORY_KEYS)
+            assert set(axis_columns(stage.axes, labels)) <= set(STORED["histories"])
 
 
 def test_the_first_of_two_labels_names_the_history(cell: Cell, stages: list[Stage]) -> None:

@@ -18,7 +18,7 @@ from vibench.report.findings import MOST, findings
 from vibench.report.html import FIRST
 from vibench.results.ranking import leaderboard
 from vibench.results.read import in_order, read_table
-from vibench.results.schema import CELLS, TABLES
+from vibench.results.schema import STORED
 from vibench.results.sqlite import FILE
 from vibench.text import brief
 
@@ -50,7 +50,7 @@ def test_every_heading_says_what_it_means(made: Path) -> None:
     embedded = data(made.read_text(encoding="utf-8"), "table-data")
     meant = {column["name"]: column["meaning"] for grid in embedded.values() for column in grid["columns"]}
     assert {name for name, meaning in meant.items() if not meaning} == set()
-    assert meant["error λ"].startswith(f"{CELLS['error_lambda_mean'].meaning} [1]")
+    assert meant["error λ"].startswith(f"{STORED['cells']['error_lambda_mean'].meaning} [1]")
 
 
 def test_without_javascript_tables_have_their_first_rows(made: Path, reported: Path) -> None:
@@ -143,7 +143,7 @@ def test_a_label_is_no_markup_wherever_it_stands(label: str, changed: Changed) -
         f"UPDATE {table} SET {axis} = '{brief(label)}'"
         for table in ("cells", "queries", "histories", "thresholds", "disagreements")
         for axis in ("problem", "dual", "primal", "solver")
-        if axis in TABLES[table]
+        if axis in STORED[table]
     ]
     results = changed(
         *axes,

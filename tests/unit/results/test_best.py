@@ -10,12 +10,7 @@ from vibench.results.ranking import BAND, HEADINGS, fastest
 
 def test_every_error_that_is_reached_has_its_fastest_cell() -> None:
     found = fastest(
-        cells_of(
-            row_of("a", 0.05, 0.1),
-            row_of("b", 0.06, 0.2),
-            row_of("c", 0.004, 0.3),
-            row_of("d", 0.003, 0.25),
-        )
+        cells_of(row_of("a", 0.05, 0.1), row_of("b", 0.06, 0.2), row_of("c", 0.004, 0.3), row_of("d", 0.003, 0.25))
     )
     assert list(zip(found["cell"], found[BAND], strict=True)) == [("a", 0.1), ("d", 0.01)]
 

@@ -23,7 +23,7 @@ from vibench.results.break_even import (
     break_even,
     break_even_rows,
 )
-from vibench.results.schema import BREAK_EVEN
+from vibench.results.schema import STORED
 
 OTHER_RUNS = float(np.exp(NORMAL_95 * paired_timing.CONDITIONS))
 """Half the width of the interval of a ratio that all rounds of a run agree on, as a factor."""
@@ -275,7 +275,7 @@ def test_cells_without_an_answer_are_left_out() -> None:
 
 def test_rows_fit_the_table() -> None:
     for row in compared(EVERY):
-        assert set(row) == set(BREAK_EVEN)
+        assert set(row) == set(STORED["thresholds"])
 
 
 def test_nothing_comes_of_nothing() -> None:

@@ -20,7 +20,7 @@ from samples import RECORDED, cell_row, query_rows
 from vibench.errors import RequestError, StorageError
 from vibench.results import database as module
 from vibench.results.database import LONGEST_TEXT, ResultsDatabase
-from vibench.results.schema import CELLS, TABLES, VERSION
+from vibench.results.schema import STORED, TABLES, VERSION
 from vibench.results.sqlite import FILE, read_meta, read_rows
 
 
@@ -58,7 +58,7 @@ def test_a_cell_and_its_queries_come_back_as_written(journal: ResultsDatabase, t
 def test_missing_columns_are_null(journal: ResultsDatabase) -> None:
     journal.write_cell({"cell": "c1", "status": "error"}, [])
     (row,) = journal.rows("cells")
-    assert row == dict.fromkeys(CELLS) | {"cell": "c1", "status": "error"}
+    assert row == dict.fromkeys(STORED["cells"]) | {"cell": "c1", "status": "error"}
 
 
 def test_columns_are_added_for_every_parameter(journal: ResultsDatabase) -> None:

@@ -22,7 +22,7 @@ from vibench.report.figures.data import problem_tables
 from vibench.results.break_even import break_even_rows
 from vibench.results.database import FILE, ResultsDatabase
 from vibench.results.ranking import BAND, errors_of, fastest, measures, with_errors, within
-from vibench.results.schema import CELLS, KEYS, OUTPUTS
+from vibench.results.schema import KEYS, STORED
 
 MODELS = {
     # offline seconds, seconds of a query, errors of u, of λ, of the force, and of the area
@@ -56,7 +56,7 @@ def cell(name: str) -> dict[str, Any]:
 def outputs_of(name: str) -> list[dict[str, Any]]:
     keys = {key: value for key, value in cell(name).items() if key in KEYS}
     return [
-        dict.fromkeys(OUTPUTS) | keys | {"cell": name, "output": output, "unit": "N", "error_mean": error}
+        dict.fromkeys(STORED["outputs"]) | keys | {"cell": name, "output": output, "unit": "N", "error_mean": error}
         for output, error in zip(("contact force", "area"), MODELS[name][-2:], strict=True)
     ]
 
@@ -138,7 +138,7 @@ def test_the_table_shows_selects_and_sorts_by_these_errors(path: Path, main: Mai
 
 
 def test_the_fastest_cells_are_those_of_the_measure(path: Path, main: Main) -> None:
-    cells = pd.DataFrame([cell(name) for name in MODELS], columns=list(CELLS))
+    cells = pd.DataFrame([cell(name) for name in MODELS], columns=list(STORED["cells"]))
     outputs = pd.DataFrame([row for name in MODELS for row in outputs_of(name)])
     found = fastest(cells, errors_of(cells, outputs, "output:contact force"))
     assert list(zip(found["cell"], found[BAND], strict=True)) == [("c", 1e-3)]

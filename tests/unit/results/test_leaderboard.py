@@ -19,12 +19,7 @@ def won(standings: Standings, criterion: Criterion) -> list[tuple[float, str]]:
 
 def test_the_fastest_query_is_named_for_every_band() -> None:
     (found,) = leaderboard(
-        cells_of(
-            row_of("a", 0.05, 0.1),
-            row_of("b", 0.06, 0.2),
-            row_of("c", 4e-3, 0.3),
-            row_of("d", 3e-3, 0.25),
-        )
+        cells_of(row_of("a", 0.05, 0.1), row_of("b", 0.06, 0.2), row_of("c", 4e-3, 0.3), row_of("d", 3e-3, 0.25))
     )
     assert won(found, Criterion.QUERY) == [(0.1, "a"), (0.01, "d")]
     assert [band.cells for band in found.bands] == [4, 2]
@@ -101,11 +96,7 @@ def test_constants_that_were_not_computed_exclude_nobody() -> None:
 
 def test_problems_are_apart_and_an_empty_table_has_none() -> None:
     found = leaderboard(
-        cells_of(
-            row_of("a", 0.05, 0.2),
-            row_of("b", 0.05, 0.1, problem="bar"),
-            row_of("c", 0.5, 0.1, problem="c"),
-        )
+        cells_of(row_of("a", 0.05, 0.2), row_of("b", 0.05, 0.1, problem="bar"), row_of("c", 0.5, 0.1, problem="c"))
     )
     assert [(one.problem, won(one, Criterion.QUERY)) for one in found] == [
         ("box", [(0.1, "a")]),

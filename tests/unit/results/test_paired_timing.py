@@ -14,15 +14,7 @@ import pytest
 from scipy.stats import t as student
 
 from vibench.results.break_even import TAIL, compared
-from vibench.results.paired_timing import (
-    CONDITIONS,
-    CommonVariance,
-    Estimate,
-    PairedTiming,
-    beside,
-    blocks_of,
-    paces,
-)
+from vibench.results.paired_timing import CONDITIONS, CommonVariance, Estimate, PairedTiming, beside, blocks_of, paces
 
 GROUPS, CELLS, ROUNDS, SECONDS = 3, 6, 3, 0.08
 """Groups, cells of each, rounds of a block, and seconds of a cell's part of a round."""

@@ -26,7 +26,7 @@ from vibench.results.break_even import break_even_rows
 from vibench.results.database import ResultsDatabase
 from vibench.results.formats import break_even_table, cell_text, summary, to_csv, to_json, to_latex, to_markdown
 from vibench.results.read import in_order, read_table, results_file
-from vibench.results.schema import BREAK_EVEN, CELLS, HISTORIES, KEYS, QUERIES, TABLES, VERSION
+from vibench.results.schema import KEYS, STORED, TABLES, VERSION
 from vibench.results.show import export, look_up
 from vibench.results.sqlite import FILE
 from vibench.study.matrix import expand, read_study
@@ -41,14 +41,22 @@ CELL = cell_row(
 
 
 def cells(*changes: dict[str, Any]) -> pd.DataFrame:
-    return pd.DataFrame([CELL | {"cell": str(k)} | change for k, change in enumerate(changes)], columns=list(CELLS))
+    return pd.DataFrame(
+        [CELL | {"cell": str(k)} | change for k, change in enumerate(changes)], columns=list(STORED["cells"])
+    )
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     """A run folder with two cells, one of which never got an answer."""
     journal = ResultsDatabase(tmp_path / "runs" / "sample", STUDY)
-    missing = dict.fromkeys(CELLS) | {"cell": "c2", "status": "error", "reason": "broke", "queries": 4, "queries_ok": 0}
+    missing = dict.fromkeys(STORED["cells"]) | {
+        "cell": "c2",
+        "status": "error",
+        "reason": "broke",
+        "queries": 4,
+        "queries_ok": 0,
+    }
     output = {"cell": "c1", "output": "force", "unit": "N", "scale": 2.0, "queries_ok": 4, "error_mean": 0.1}
     journal.write_cell(CELL | {"cell": "c1"}, query_rows("c1", 4, gap=1.0 / 3.0), outputs=[output])
     journal.write_cell(missing | {name: CELL[name] for name in KEYS} | {"solver": "osqp"}, [])
@@ -89,7 +97,7 @@ def test_another_schema_is_refused(run: Path, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize("table", TABLES)
 def test_a_table_is_read_with_all_its_columns(table: str, run: Path) -> None:
     frame = read_table(run / FILE, table)
-    assert [name for name in frame.columns if not name.startswith("mu_")] == list(TABLES[table])
+    assert [name for name in frame.columns if not name.startswith("mu_")] == list(STORED[table])
     assert len(frame) == {"cells": 2, "queries": 4}.get(table, 1)
 
 
@@ -208,7 +216,7 @@ def rounds(cells: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def test_the_benefits_say_from_when_on_a_strategy_pays() -> None:
     a = CELL | {"cell": "a", "enrichment_kind": "per-parameter", "primal": "varying", "online_s": 0.004, "hf_s": 0.1}
     b = CELL | {"cell": "b", "enrichment_kind": "fixed", "primal": "fixed", "offline_s": 2.5, "hf_s": 0.1}
-    frame = break_even_table(pd.DataFrame(break_even_rows([a, b], rounds([a, b])), columns=list(BREAK_EVEN)))
+    frame = break_even_table(pd.DataFrame(break_even_rows([a, b], rounds([a, b])), columns=list(STORED["thresholds"])))
     paired = frame[(frame["a"] == "varying") & (frame["b"] == "fixed")].iloc[0]
     assert paired["break-even"] == f"from {(2.5 - 1.5) / (0.004 - 0.0025):.0f}"
     assert (paired["offline a [s]"], paired["online a [ms]"], paired["online b [ms]"]) == pytest.approx((1.5, 4.0, 2.5))
@@ -220,14 +228,16 @@ def test_the_benefits_say_from_when_on_a_strategy_pays() -> None:
 def test_benefits_without_a_number_are_words() -> None:
     slow = CELL | {"hf_s": 0.001, "enrichment_kind": "none"}
     assert list(
-        break_even_table(pd.DataFrame(break_even_rows([slow], rounds([slow])), columns=list(BREAK_EVEN)))["break-even"]
+        break_even_table(pd.DataFrame(break_even_rows([slow], rounds([slow])), columns=list(STORED["thresholds"])))[
+            "break-even"
+        ]
     ) == ["never"]
 
 
 def test_tables_of_nothing_are_empty() -> None:
     assert summary(cells()).empty
-    assert break_even_table(pd.DataFrame(columns=list(BREAK_EVEN))).empty
-    for columns in (CELLS, QUERIES, HISTORIES):
+    assert break_even_table(pd.DataFrame(columns=list(STORED["thresholds"]))).empty
+    for columns in (STORED["cells"], STORED["queries"], STORED["histories"]):
         assert in_order(pd.DataFrame(columns=list(columns))).empty
 
 

@@ -17,7 +17,7 @@ from vibench.model.galerkin import ReducedModel, project
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.plugins.plugin import Plugin
 from vibench.results.ranking import too_loose
-from vibench.results.schema import CELLS as CELL_COLUMNS
+from vibench.results.schema import STORED
 from vibench.stages.assembly import AffineDecomposition, AssemblyStage
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
@@ -132,7 +132,7 @@ def test_what_interpolation_misses_between_training_parameters_is_measured_noted
         assert abs(row["error_u"] - right["error_u"]) <= row["assembly_error_u"] * (1.0 + 1e-6)
         assert row["assembly_share"] >= row["assembly_error_u"] / row["error_u"]
     assert one.cell["assembly_share_mean"] > 0.1
-    cells = pd.DataFrame([dict.fromkeys(CELL_COLUMNS) | rows.cell for rows in (one, other)])
+    cells = pd.DataFrame([dict.fromkeys(STORED["cells"]) | rows.cell for rows in (one, other)])
     assert too_loose(cells, "assembly").tolist() == [True, False]
 
 
