@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from vibench.errors import RequestError
 from vibench.results.selection import matching, parts, short_keys, sorted_by
 
-COLUMNS = ("cell", "solver", "N", "beta_span_min")
+FRAME = pd.DataFrame(columns=["cell", "solver", "N", "beta_span_min"])
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_a_condition_selects_rows(condition: str, rows: list[int], file: Path) -> None:
-    assert [k for k, found in enumerate(matching(file, "cells", condition, COLUMNS)) if found] == rows
+    assert [k for k, found in enumerate(matching(file, "cells", condition, FRAME)) if found] == rows
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_a_condition_selects_rows(condition: str, rows: list[int], file: Path) -
 def test_whatever_else_is_refused_in_one_line_and_changes_nothing(condition: str, file: Path) -> None:
     before = hashlib.sha256(file.read_bytes()).digest()
     with pytest.raises(RequestError) as caught:
-        matching(file, "cells", condition, COLUMNS)
+        matching(file, "cells", condition, FRAME)
     assert "--where" in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
     assert hashlib.sha256(file.read_bytes()).digest() == before
@@ -72,13 +72,13 @@ def test_whatever_else_is_refused_in_one_line_and_changes_nothing(condition: str
 
 def test_a_wrong_column_is_named_with_the_nearest(file: Path) -> None:
     with pytest.raises(RequestError, match="no column of cells is called 'beta_spn_min'; did you mean 'beta_span_min'"):
-        matching(file, "cells", "beta_spn_min < 1", COLUMNS)
+        matching(file, "cells", "beta_spn_min < 1", FRAME)
 
 
 @given(st.text(max_size=30))
 def test_any_text_selects_rows_or_is_refused(file: Path, text: str) -> None:
     with contextlib.suppress(RequestError):
-        assert len(matching(file, "cells", text, COLUMNS)) == 4
+        assert len(matching(file, "cells", text, FRAME)) == 4
 
 
 def test_rows_are_sorted_up_and_down_with_missing_values_last() -> None:

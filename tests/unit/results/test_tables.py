@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from samples import QUICK_ROUNDS, cell_row, query_rows
 
 from vibench.errors import RequestError
-from vibench.results import read, sqlite
+from vibench.results import read, show, sqlite
 from vibench.results.break_even import break_even_rows
 from vibench.results.database import ResultsDatabase
 from vibench.results.formats import break_even_table, cell_text, summary, to_csv, to_json, to_latex, to_markdown
@@ -417,7 +417,7 @@ def test_the_first_rows_are_those_of_the_whole_table_and_others_are_not_read(
         sizes.extend([len(found)] * (name == table))
         return found
 
-    monkeypatch.setattr(read, "read_table", noted)
+    monkeypatch.setattr(show, "read_table", noted)
     first = look_up(path, table, where=where, sort=sort, limit=3)
     pd.testing.assert_frame_equal(first.rows, whole.rows.head(3))
     assert (first.columns, first.varying) == (whole.columns, whole.varying)
