@@ -181,7 +181,7 @@ def test_a_report_does_not_replace_the_results(run: Path) -> None:
 PIPES = """
 import os, sys
 from pathlib import Path
-from vibench.benchmarks.files import read_benchmarks
+from vibench.benchmarks.comparison import read_benchmarks
 from vibench.errors import RequestError
 from vibench.report.figures import read_captions
 from vibench.results.database import ResultsDatabase

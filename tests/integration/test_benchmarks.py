@@ -5,9 +5,12 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
+import os
 import statistics
+import subprocess
+import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +20,8 @@ from outputs import clean
 from running import Main, Register, refused
 from samples import install_fakes
 
-from vibench.benchmarks import cases, files, running
-from vibench.benchmarks.measure import PASSES, _how_often, plain
+from vibench import benchmarks
+from vibench.benchmarks.plugin import PASSES, how_often
 from vibench.errors import RequestError
 
 REGISTERED = """\
@@ -125,25 +128,41 @@ def test_what_cannot_be_made_fails_with_its_reason_and_is_not_timed(third_party:
         assert name not in third_party.benchmarks
 
 
-def test_where_all_fail_there_is_a_file_of_none(main: Main, tmp_path: Path) -> None:
-    setting, told = cases.setting("quick"), list[str]()
-    benchmarks = running.planned({"dual": ["gone"]}, ["coarse"], setting)
-    results = running.run_benchmarks(benchmarks, setting, 0.001, told.append)
-    assert len(results.failed) == len(told) > 0
-    path = tmp_path / "file.json"
-    path.write_bytes(files.written(benchmarks, results.passes))
-    assert main("bench", "--read", str(path))[:2] == (0, "0 benchmarks; times are CPU times of a call on one thread\n")
+def test_a_benchmark_that_hangs_costs_itself_and_where_all_fail_there_is_a_file_of_none(tmp_path: Path) -> None:
+    """In tests of pytest that somebody runs without the command."""
+    path = os.pathsep.join([str(install_fakes(tmp_path / "site")), *filter(None, sys.path)])
+    (tmp_path / "pytest.ini").write_text("[pytest]\n")
+    (tmp_path / "short.toml").write_text(SHORT)
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist"]
+    command += ["-p", "vibench.benchmarks.plugin", "--pyargs", "vibench.benchmarks.stages", "--seconds=0.001"]
+    command += ["--study=short.toml", "-k", "high_fidelity_solution", "--plugin=wire-sleeps"]
+    for plugins, outcome in (["--plugin=wire"], "1 failed, "), ([], "1 failed in"):
+        done = subprocess.run(
+            [*command, *plugins, "--benchmark-json=a.json"],
+            cwd=tmp_path, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert done.returncode == 1, done.stdout + done.stderr
+        assert f" {outcome}" in done.stdout
+        file = json.loads((tmp_path / "a.json").read_text())
+        assert file["failed"] == {"high_fidelity_solution[wire-sleeps]": "stopped after 5 s"}
+        names = [entry["name"] for entry in file["benchmarks"]]
+        assert names == ["test_high_fidelity_solution[wire]"] * bool(plugins)
+        assert ("test_high_fidelity_solution[wire]" in done.stdout) == bool(plugins)  # the table of pytest-benchmark
 
 
-def test_a_benchmark_that_hangs_costs_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(install_fakes(tmp_path / "site"))  # where the watched process finds them registered
-    told, problems = list[str](), [cases.TimedProblem(name, None) for name in ("wire-sleeps", "wire")]
-    benchmarks = [running.Benchmark("high_fidelity_solution", problem, ()) for problem in problems]
-    setting = replace(cases.setting("quick"), seconds=5.0)
-    results = running.run_benchmarks(benchmarks, setting, 0.001, told.append)
-    assert results.failed == {benchmarks[0].name: "stopped after 5 s"}
-    assert results.passes.keys() == {benchmarks[1].name}
-    assert f"[2/2] failed: {benchmarks[0].name}: stopped after 5 s" in told
+SHORT = """
+name = "short"
+validation = 2
+problem = ["obstacle"]
+dual = ["cpg"]
+primal = ["decorrelated"]
+solvers = ["piqp"]
+limits = { cell_seconds = 5.0 }
+
+[[tolerances]]
+pod = [1e-3]
+dual = [1e-2]
+"""
 
 
 def test_the_file_says_where_it_was_measured(third_party: Timed) -> None:
@@ -180,7 +199,7 @@ def test_only_benchmarks_with_a_chosen_plugin_are_timed(third_party: Timed) -> N
 
 
 def test_plugins_are_chosen_by_the_names_of_lists(register: Register) -> None:
-    assert cases.chosen_plugins(["obstacle", "piqp", "dual:mcpg"]) == {
+    assert benchmarks.chosen_plugins(["obstacle", "piqp", "dual:mcpg"]) == {
         "problem": ["obstacle"], "solver": ["piqp"], "dual": ["mcpg"],
     }  # fmt: skip
     for name, words in (
@@ -188,13 +207,13 @@ def test_plugins_are_chosen_by_the_names_of_lists(register: Register) -> None:
         ("pack", "needs options"), ("thing:x", "no plugin is called 'x'"),
     ):  # fmt: skip
         with pytest.raises(RequestError, match=words):
-            cases.chosen_plugins([name])
+            benchmarks.chosen_plugins([name])
     register(
         ("vibench.problems", "same", "fake_plugins:Wire"),
         ("vibench.dual_strategies", "same", "vibench_strategies.cpg:CPG"),
     )
     with pytest.raises(RequestError, match="say problem:same or dual:same"):
-        cases.chosen_plugins(["same"])
+        benchmarks.chosen_plugins(["same"])
 
 
 def test_a_wrong_request_is_refused_before_anything_is_timed(main: Main, tmp_path: Path) -> None:
@@ -220,12 +239,7 @@ def test_without_pytest_benchmark_one_line_names_the_command(main: Main, monkeyp
      (0.4, 1.0, 1, (2, 1)), (0.4, 1.0, 8, (2, 1)), (4.0, 1.0, 1, (1, 1)), (0.0, 1.0, 1, (30, 20000))],
 )  # fmt: skip
 def test_what_is_quick_is_repeated_and_what_is_slow_is_not(seconds, budget, together, expected) -> None:
-    assert _how_often(seconds, budget, together) == expected
-
-
-def test_what_json_has_no_number_for_is_nothing() -> None:
-    given = {"a": math.inf, "b": {"c": math.nan, "d": 2}, "e": "text", "f": None, "g": True}
-    assert plain(given) == {"a": None, "b": {"c": None, "d": 2}, "e": "text", "f": None, "g": True}
+    assert how_often(seconds, budget, together) == expected
 
 
 def entry(

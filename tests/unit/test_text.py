@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vibench.benchmarks import files
+from vibench.benchmarks.comparison import read_benchmarks
 from vibench.errors import RequestError, in_a_line
 from vibench.results.sqlite import study_of
 from vibench.text import LONGEST, above, brief, one_line, parsed_json, printable, printable_lines, unbroken
@@ -107,6 +107,6 @@ def test_files_with_such_json_are_refused_in_a_line(tmp_path: Path) -> None:
     deep = tmp_path / "deep.json"
     deep.write_text("[" * 100_000)
     with pytest.raises(RequestError, match="cannot be read as a file of pytest-benchmark"):
-        files.read_benchmarks(deep)
+        read_benchmarks(deep)
     with pytest.raises(RequestError, match="does not say which study"):
         study_of(deep, {"study": "[" * 100_000})

@@ -1,1 +1,198 @@
-"""Benchmarks of plugins: what is timed, what it reached, and files of pytest-benchmark written and compared."""
+"""Benchmarks of plugins by pytest-benchmark: problems at resolutions, strategies, sizes of reduced programs."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from itertools import product
+from typing import Any
+
+from vibench.errors import RequestError, VibenchError
+from vibench.execution.supervisor import manner_of_death
+from vibench.interfaces.strategies import Stop
+from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SOLVER
+from vibench.plugins.registry import find, find_named, registered
+from vibench.qp.solve import installed_solvers
+from vibench.study.matrix import read_study
+from vibench.timing import ONE_THREAD
+
+Resolution = str | int
+"""A name that a problem knows, or a number of nodes."""
+
+Timing = Callable[..., None]
+"""The fixture `timing`: see `vibench.benchmarks.plugin`."""
+
+
+@dataclass(frozen=True)
+class TimedProblem:
+    """A registered problem at a resolution; `None` where it has no such option and is timed as it is."""
+
+    problem: str
+    resolution: Resolution | None
+
+    def __str__(self) -> str:
+        return self.problem if self.resolution is None else f"{self.problem}-{self.resolution}"
+
+    @property
+    def options(self) -> dict[str, Resolution]:
+        return {} if self.resolution is None else {"resolution": self.resolution}
+
+
+@dataclass(frozen=True)
+class PrimalChoice:
+    """A registered primal strategy and its tolerance, `None` where it takes none."""
+
+    name: str
+    tolerance: float | None
+
+    def __str__(self) -> str:
+        return self.name if self.tolerance is None else f"{self.name}-{self.tolerance:g}"
+
+
+@dataclass(frozen=True)
+class ReducedSpaces:
+    """Where V_N and the reduced cone of a registered dual strategy stop."""
+
+    modes: Stop
+    generators: Stop
+    dual: str
+
+
+@dataclass(frozen=True)
+class Size:
+    """A reduced program by its prescribed dimensions; the enrichment adds to N."""
+
+    N: int
+    R: int
+
+    def __str__(self) -> str:
+        return f"N{self.N}-R{self.R}"
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The last strategies and first tolerances of a study, which complete a model of which one part is timed.
+
+    `seconds` is the wall time that the study allows for a stage.
+    """
+
+    problems: tuple[str, ...]
+    spaces: ReducedSpaces
+    primal: PrimalChoice
+    seconds: float
+
+
+def setting(study: str) -> Setting:
+    """Return the setting of a study, by its name or file.
+
+    Raises a `RequestError` if there is no such study.
+    """
+    spec = read_study(study)
+    table, dual, primal = spec.tolerances[0], spec.dual[-1], spec.primal[-1]
+    modes = Stop(tolerance=table.pod[0]) if table.pod else Stop(size=(table.N or [0])[0])
+    spaces = ReducedSpaces(modes, table.of_dual(dual)[0], dual.name)
+    problems = tuple(dict.fromkeys(entry.name for entry in spec.problem))
+    return Setting(problems, spaces, PrimalChoice(primal.name, table.of_primal(primal)[0]), spec.limits.cell_seconds)
+
+
+def chosen_plugins(plugins: Sequence[str]) -> dict[str, list[str]]:
+    """Group names of plugins, as `vibench list` shows them, or KIND:NAME, by the word for their kind.
+
+    Raises a `RequestError` if there is no such plugin, several have the name, or a solver is not installed.
+    """
+    kinds = {kind.cli_name: kind for kind in (PROBLEM, PRIMAL, DUAL, FORMULATION, SOLVER)}
+    chosen, solvers = dict[str, list[str]](), installed_solvers(registered(SOLVER))
+    for text in plugins:
+        plugin = find_named(text, kinds, solvers)
+        if plugin.kind is PROBLEM and not _takes_no_option(plugin.name):
+            raise RequestError(f"the {plugin} needs options, which `vibench bench` has no place for")
+        chosen.setdefault(plugin.kind.cli_name, []).append(plugin.name)
+    return chosen
+
+
+def resolutions(texts: Sequence[str]) -> list[Resolution]:
+    """Read resolutions; raises a `RequestError` for the first one that no problem has."""
+    wanted: list[Resolution] = [int(text) if text.isdigit() else text for text in texts]
+    for resolution in wanted:
+        if not any(_knows(problem, resolution) for problem in registered(PROBLEM)):
+            raise RequestError(f"no problem has the resolution {str(resolution)!r}")
+    return wanted
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The benchmarks in which one of the chosen plugins takes part; all that are registered where none is chosen.
+
+    Problems that are needed and not chosen are those of the setting. Problems are timed at those of the resolutions
+    that they know, QP solvers at the first of these alone.
+    """
+
+    chosen: Mapping[str, Sequence[str]]
+    resolutions: Sequence[Resolution]
+    setting: Setting
+
+    def parameters(self, axes: Sequence[str]) -> list[tuple[TimedProblem, *tuple[Any, ...]]]:
+        """Problems and choices of a benchmark with these axes."""
+        if self.chosen and not self.chosen.keys() & {"problem", *axes}:
+            return []
+        chosen, primals = self.chosen, self.chosen.get("primal", registered(PRIMAL))
+        choices: dict[str, Iterable[Any]] = {
+            "size": [Size(5, 5), Size(10, 12), Size(20, 30), Size(46, 60), Size(80, 70)],
+            "dual": chosen.get("dual", registered(DUAL)),
+            "primal": [one for name in primals for one in _at_tolerances(name)] if "primal" in axes else [],
+            "formulation": chosen.get("formulation", registered(FORMULATION)),
+            "solver": chosen.get("solver", installed_solvers(registered(SOLVER))),
+            "accuracy": [1e-6, 1e-10],
+        }
+        every = self.setting.problems if self.chosen else filter(_takes_no_option, registered(PROBLEM))
+        cases = []
+        for name in self.chosen.get("problem", every):
+            known = [TimedProblem(name, one) for one in self.resolutions if _knows(name, one)]
+            cases += (known or [TimedProblem(name, None)])[: 1 if "size" in axes else None]
+        return list(product(cases, *(choices[axis] for axis in axes)))
+
+
+def run_pytest(options: Sequence[str]) -> None:
+    """Run the benchmarks by pytest with options of `vibench.benchmarks.plugin` in a process of its own.
+
+    Raises a `VibenchError` if they could not be begun.
+    """
+    folder = str(files("vibench.benchmarks"))
+    command = [sys.executable, "-P", "-m", "pytest", "-c", f"{folder}/pytest.ini", "--rootdir", folder]
+    command += ["-p", "pytest_benchmark.plugin", "-p", "no:terminal", "--benchmark-quiet", "--progress", *options]
+    # Nothing but these options counts: neither those nor the plugins that somebody else's tests have.
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")} | ONE_THREAD
+    path = os.pathsep.join(folder for folder in sys.path if folder)
+    environment |= {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTHONPATH": path}
+    done = subprocess.run([*command, f"{folder}/stages.py"], env=environment, stdout=subprocess.DEVNULL, check=False)
+    if done.returncode not in (0, 1, 5):  # passed, some failed, there are none
+        raise VibenchError(f"the process of the benchmarks failed with {manner_of_death(done.returncode)}")
+
+
+def _knows(problem: str, resolution: Resolution) -> bool:
+    """Whether a problem has such a resolution; one that cannot be loaded has none."""
+    try:
+        find(PROBLEM, problem).check_options({"resolution": resolution})
+    except RequestError:
+        return False
+    return True
+
+
+def _takes_no_option(problem: str) -> bool:
+    """Whether a problem needs no option, as a folder; one that cannot be loaded counts, its benchmarks then fail."""
+    try:
+        return not any(option.required for option in find(PROBLEM, problem).options.values())
+    except RequestError:
+        return True
+
+
+def _at_tolerances(primal: str) -> list[PrimalChoice]:
+    try:
+        tolerances = (0.5, 0.1) if find(PRIMAL, primal).load().takes_tolerance else (None,)
+    except RequestError:  # its benchmarks fail, and say why
+        tolerances = (None,)
+    return [PrimalChoice(primal, tolerance) for tolerance in tolerances]

@@ -1,75 +1,126 @@
-"""Files of benchmarks as tables, and two of them side by side: what is slower beyond its spread, and less accurate."""
+"""Files of pytest-benchmark read, as tables, and two of them side by side: slower beyond its spread, less accurate."""
 
 from __future__ import annotations
 
 import math
+import statistics
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from vibench.benchmarks.files import AXES, Measured, Timed
+from vibench.errors import RequestError
+from vibench.files import read_regular
+from vibench.text import parsed_json, unbroken
 
-LIMIT = 1.25
-"""Ratio of medians above which something is slower."""
-
-SHORTEST = 10e-6
-"""Seconds by which a median may grow whatever the ratio is: clocks and caches do not resolve less."""
-
-FACTOR, NEGLIGIBLE = 10.0, 1e-9
-"""A figure of accuracy is worse if it is more than this many times what it was; below this size none is."""
-
-Figures = tuple[str, float | None, float | None]
-"""A figure of accuracy: its name, before and after; `None` where there is none or it is not finite."""
+AXES = ("problem", "dual", "primal", "formulation", "size", "solver", "accuracy")
+"""Columns of a benchmark: the plugins that it is timed with."""
 
 
-def figures(before: Measured, after: Measured) -> list[Figures]:
-    """Figures of accuracy that either has, the one that got worse most first."""
-    names = dict.fromkeys([*before.accuracy, *after.accuracy])
-    pairs = [(name, before.accuracy.get(name), after.accuracy.get(name)) for name in names]
-    return sorted(pairs, key=_times_worse, reverse=True)
+@dataclass(frozen=True)
+class Measured:
+    """One benchmark of a file.
 
-
-def _times_worse(figure: Figures) -> tuple[float, float]:
-    """How many times what it was, and how large; infinitely worse if it is no more."""
-    _, before, after = figure
-    if after is None:
-        return (0.0 if before is None else math.inf), 0.0
-    return (after / max(before, NEGLIGIBLE / FACTOR) if before is not None else 0.0), after
-
-
-def is_worse(figure: Figures) -> bool:
-    """Whether a figure got worse by more than round-off may."""
-    _, before, after = figure
-    if before is None or after is None:
-        return before is not None
-    return after > NEGLIGIBLE and after > FACTOR * before
-
-
-def is_slower(before: Measured, after: Measured, limit: float) -> bool:
-    """Whether the seconds grew beyond a limit, beyond their spread, and beyond what the machine was slower by.
-
-    The ranges between the quartiles of any two passes must not meet, the medians must be more than 10 µs apart, and
-    their ratio must be above the limit, also relative to the calibration, fixed work that was timed beside both. Where
-    one of them has a single round, which has no spread, the ratio must be above the square of the limit.
+    Attributes
+    ----------
+    seconds, q1, q3
+        Median and quartiles over the rounds of all passes, in CPU seconds of one call.
+    low, high
+        The smallest lower and the largest upper quartile of a pass.
+    accuracy
+        Errors and residuals; `None` where one was not finite.
+    status
+        Status of the answer of a QP solver, "" where none was asked.
+    calibration
+        CPU seconds of fixed work beside it, median over the passes: how fast the machine was then; NaN where unknown.
     """
-    if after.seconds - before.seconds <= SHORTEST or after.low <= before.high:
-        return False
-    slowdown = after.calibration / before.calibration if before.calibration > 0.0 else math.nan
-    margin = limit**2 if min(before.rounds, after.rounds) == 1 else limit
-    allowed = margin * (slowdown if slowdown > 1.0 else 1.0)
-    return after.seconds > allowed * before.seconds
+
+    group: str
+    axes: Mapping[str, str]
+    seconds: float
+    q1: float
+    q3: float
+    low: float
+    high: float
+    rounds: int
+    accuracy: Mapping[str, float | None]
+    status: str
+    calibration: float
 
 
-def verdict(before: Measured, after: Measured, limit: float) -> str:
-    """What got worse, "" if nothing did."""
-    changes = ["slower"] if is_slower(before, after, limit) else []
-    changes += ["faster"] if not changes and is_slower(after, before, limit) else []
-    changes += ["less accurate"] if any(map(is_worse, figures(before, after))) else []
-    changes += [f"{before.status}, now {after.status or 'nothing'}"] if before.status == "ok" != after.status else []
-    return ", ".join(changes)
+@dataclass(frozen=True)
+class Timed:
+    """Content of a file: benchmarks by name, how many failed, and machine, libraries, timer and code."""
+
+    benchmarks: Mapping[str, Measured]
+    failed: int
+    machine: Mapping[str, str]
 
 
-def table_of(timed: Timed, earlier: Timed | None = None, limit: float = LIMIT) -> pd.DataFrame:
+def read_benchmarks(path: Path) -> Timed:
+    """Read a file of pytest-benchmark; raises a `RequestError` if it is none."""
+    try:
+        return _parsed(read_regular(path))
+    except (OSError, ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
+        reason = unbroken(f"{type(error).__name__}: {error}")
+        raise RequestError(f"'{path}' cannot be read as a file of pytest-benchmark ({reason})") from None
+
+
+def _parsed(content: bytes) -> Timed:
+    file = parsed_json(content)
+    benchmarks: dict[str, Measured] = {}
+    for entry in file["benchmarks"]:
+        # Without the folder, and what every file and function begins with.
+        name = unbroken(str(entry["fullname"]).rsplit("/", 1)[-1].split("::", 1)[-1].removeprefix("test_"))
+        if name in benchmarks:
+            raise ValueError(f"it has '{name}' twice")
+        benchmarks[name] = _measured(name, entry)
+    info, own = file["machine_info"], file["machine_info"].get("vibench", {})
+    timers = sorted({entry["options"]["timer"] for entry in file["benchmarks"] if "options" in entry})
+    processor = f"{info.get('cpu', {}).get('brand_raw', '')} {info.get('machine', '')}".strip()
+    machine = {
+        "machine": own.get("machine") or processor,
+        "libraries": own.get("libraries") or f"python {info.get('python_version', '')}",
+        "timer": ", ".join(timers),
+        "code": own.get("code", ""),
+    }
+    failed = len(file.get("failed", ()))
+    return Timed(benchmarks, failed, {name: unbroken(str(text)) for name, text in machine.items()})
+
+
+def _measured(name: str, entry: Mapping[str, Any]) -> Measured:
+    extra, stats = entry.get("extra_info", {}), entry["stats"]
+    axes = {str(axis): unbroken(str(value)) for axis, value in extra.get("axes", {}).items()}
+    axes = {"problem": axes.get("case", "")} | axes
+    passes = [stats, *extra.get("passes", [])]
+    calibrations = [_seconds(one, "calibration_s") for one in passes if "calibration_s" in one]
+    accuracy = extra.get("accuracy", {}).items()
+    return Measured(
+        group=unbroken(str(entry.get("group") or name.partition("[")[0])),
+        axes={axis: axes[axis] for axis in AXES if axes.get(axis)},
+        seconds=_seconds(stats, "median"),
+        q1=_seconds(stats, "q1"),
+        q3=_seconds(stats, "q3"),
+        low=min(_seconds(one, "q1") for one in passes),
+        high=max(_seconds(one, "q3") for one in passes),
+        rounds=int(stats["rounds"]),
+        accuracy={unbroken(str(figure)): None if value is None else float(value) for figure, value in accuracy},
+        status=unbroken(str(extra.get("status", ""))),
+        calibration=statistics.median(calibrations) if calibrations else math.nan,
+    )
+
+
+def _seconds(stats: Mapping[str, Any], name: str) -> float:
+    """Seconds of a file, which others may have written."""
+    seconds = float(stats[name])
+    if not (math.isfinite(seconds) and seconds >= 0.0):
+        raise ValueError(f"{name} is {seconds:g} s, expected a finite number that is not negative")
+    return seconds
+
+
+def table_of(timed: Timed, earlier: Timed | None, limit: float) -> pd.DataFrame:
     """A row for every benchmark; with an earlier file, for every one of both, and what changed.
 
     A row has what is timed, with what, its seconds with their quartiles, and what it reached; a row of two files has
@@ -96,8 +147,9 @@ def _row(name: str, one: Measured) -> dict[str, Any]:
 
 
 def _change(name: str, was: Measured, now: Measured, limit: float) -> dict[str, Any]:
-    changed = figures(was, now)
-    figure, before, after = next(filter(is_worse, changed), (*changed, ("", None, None))[0])
+    names = dict.fromkeys([*was.accuracy, *now.accuracy])
+    figures = [_Figure(figure, was.accuracy.get(figure), now.accuracy.get(figure)) for figure in names]
+    figure = max(figures, key=lambda one: (one.is_worse, one.growth), default=_Figure("", None, None))
     return {
         "benchmark": name,
         "group": was.group,
@@ -106,28 +158,75 @@ def _change(name: str, was: Measured, now: Measured, limit: float) -> dict[str, 
         "after_s": now.seconds,
         "ratio": now.seconds / was.seconds if was.seconds > 0.0 else math.nan,
         "apart": "yes" if now.low > was.high or was.low > now.high else "no",
-        "figure": figure,
-        "before": before,
-        "after": after,
-        "verdict": verdict(was, now, limit),
+        "figure": figure.name,
+        "before": figure.before,
+        "after": figure.after,
+        "verdict": _verdict(was, now, limit, figure),
     }
 
 
-def remarks(before: Timed, after: Timed, limit: float) -> list[str]:
-    """What is new or gone, machines and libraries that differ, and how many benchmarks got worse."""
+@dataclass(frozen=True)
+class _Figure:
+    """A figure of accuracy before and after; `None` where there is none or it is not finite."""
+
+    name: str
+    before: float | None
+    after: float | None
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether it grew by more than round-off may: ten times, and beyond 1e-9."""
+        if self.before is None or self.after is None:
+            return self.before is not None
+        return self.after > 1e-9 and self.after > 10.0 * self.before
+
+    @property
+    def growth(self) -> tuple[float, float]:
+        """Factor by which it grew, and its size; the factor is infinite if there is none any more."""
+        if self.after is None:
+            return (0.0 if self.before is None else math.inf), 0.0
+        # Growth from below 1e-10 is round-off.
+        return (0.0 if self.before is None else self.after / max(self.before, 1e-10)), self.after
+
+
+def _verdict(was: Measured, now: Measured, limit: float, figure: _Figure) -> str:
+    """Return what got worse, "" if nothing did."""
+    slower = _is_slower(was, now, limit)
+    changes = ["slower"] if slower else ["faster"] if _is_slower(now, was, limit) else []
+    changes += ["less accurate"] if figure.is_worse else []
+    changes += [f"{was.status}, now {now.status or 'nothing'}"] if was.status == "ok" != now.status else []
+    return ", ".join(changes)
+
+
+def _is_slower(was: Measured, now: Measured, limit: float) -> bool:
+    """Whether the seconds grew beyond a limit, beyond their spread, and beyond what the machine was slower by.
+
+    The ranges between the quartiles of any two passes must not meet, the medians must be more than 10 µs apart, and
+    their ratio must be above the limit, also relative to the calibration, fixed work that was timed beside both.
+    """
+    # Clocks and caches do not resolve 10 µs.
+    if now.seconds - was.seconds <= 10e-6 or now.low <= was.high:
+        return False
+    slowdown = now.calibration / was.calibration if was.calibration > 0.0 else math.nan
+    # A single round has no spread.
+    margin = limit**2 if min(was.rounds, now.rounds) == 1 else limit
+    return now.seconds > margin * (slowdown if slowdown > 1.0 else 1.0) * was.seconds
+
+
+def remarks(before: Timed, after: Timed, frame: pd.DataFrame, limit: float) -> list[str]:
+    """Lines on what is new or gone, machines and libraries that differ, and how many benchmarks got worse."""
     lines = []
     for what, some, others in (("new", after, before), ("gone", before, after)):
         names = [name for name in some.benchmarks if name not in others.benchmarks]
         lines += [f"{what}: {', '.join(names)}"] if names else []
     for what, said in before.machine.items():
-        if said != after.machine.get(what, ""):
-            lines += [f"{what} before: {said}", f"{what} after:  {after.machine.get(what, '')}"]
-    frame = table_of(after, before, limit)
+        if said != after.machine[what]:
+            lines += [f"{what} before: {said}", f"{what} after:  {after.machine[what]}"]
     ratios = frame["ratio"].dropna() if len(frame) else frame
     middle = f", median of the ratios {ratios.median():.3g}" if len(ratios) else ""
     return [*lines, f"{len(frame)} benchmarks in both files{middle}; {regressions(frame)} worse (limit {limit:g})"]
 
 
 def regressions(frame: pd.DataFrame) -> int:
-    """How many benchmarks of a table of two files got worse in any way."""
+    """Count the benchmarks of a table of two files that got worse in any way."""
     return sum(row["verdict"] not in ("", "faster") for row in frame.to_dict("records"))

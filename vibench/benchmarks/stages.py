@@ -1,0 +1,510 @@
+"""Benchmarks of every stage, as tests of pytest with the fixtures `timing` and `inputs` of `vibench.benchmarks.plugin`.
+
+The other arguments are the axes of a benchmark. What was reached is computed from the results and from nothing that
+they claim.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import wraps
+from itertools import cycle
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+import numpy as np
+import pytest
+
+from vibench.arrays import Array
+from vibench.benchmarks import PrimalChoice, ReducedSpaces, Setting, Size, TimedProblem, Timing
+from vibench.errors import UnsupportedError, VibenchError, in_a_line
+from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
+from vibench.interfaces.formulations import Formulation, FormulationAnswer, axes_of
+from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
+from vibench.interfaces.strategies import Cone, Enrichment, Stop
+from vibench.interfaces.validation import (
+    check_cone,
+    check_enrichment,
+    checked_assembly,
+    training_parameters,
+    validation_parameters,
+)
+from vibench.linalg.inner_product import InnerProduct, project_out, singular_values
+from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
+from vibench.model.errors import ReferenceSolutions, errors
+from vibench.model.galerkin import ReducedModel, ReducedProblem, project
+from vibench.model.hyperreduced import HyperReducedModel, ReducedOperators, hyper_reduce
+from vibench.offline.assemblies import assemblies
+from vibench.offline.formulated import Formulated
+from vibench.offline.models import AnyReducedModel
+from vibench.offline.reduction import Reduction
+from vibench.offline.sweep import Snapshots, high_fidelity_sweep
+from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM
+from vibench.plugins.registry import find, qp_solver
+from vibench.qp.solve import solve_qp
+from vibench.qp.verification import QPSolution, Residuals, verify
+from vibench.reduction.cones import project_on_cone
+from vibench.reduction.pod import POD, pod
+from vibench.reduction.supremizers import supremizers
+
+# CPU seconds: whoever else uses the machine counts less.
+pytestmark = pytest.mark.benchmark(timer=time.process_time)
+
+P = ParamSpec("P")
+T = TypeVar("T")
+Info = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class ValidationQuery:
+    """A validation parameter (d,), the matrices there, and the high-fidelity solution."""
+
+    mu: Array
+    vi: VariationalInequality
+    exact: ReferenceSolutions
+
+
+class InputError(VibenchError):
+    """An input of a benchmark cannot be made."""
+
+
+def _once(make: Callable[Concatenate[StageInputs, P], T]) -> Callable[Concatenate[StageInputs, P], T]:
+    """Cache a method for all benchmarks; where it fails, all fail with the same line."""
+
+    @wraps(make)
+    def made(self: StageInputs, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        key = (make.__name__, *args)
+        if key not in self.made:
+            try:
+                self.made[key] = make(self, *args, **kwargs)
+            except InputError as error:
+                self.made[key] = error
+            except (Exception, SystemExit) as error:  # noqa: BLE001  plugins are code of strangers
+                self.made[key] = InputError(f"{self.case}, {make.__name__}: {in_a_line(error)}")
+        if isinstance(value := self.made[key], InputError):
+            raise value
+        return value  # type: ignore[no-any-return]
+
+    return made
+
+
+class StageInputs:
+    """The problem of a case, and what its stages need from those before, made once and never timed.
+
+    V_N and the cone stop as the setting says, unless a method is told, and its strategies complete a model of which one
+    part is timed.
+    """
+
+    def __init__(self, case: TimedProblem, setting: Setting) -> None:
+        self.case, self.usual, self.primal = case, setting.spaces, setting.primal
+        self.interpolation = 1e-6
+        self.made: dict[Hashable, Any] = {}
+
+    def about(self) -> dict[str, object]:
+        case, problem = self.case, self.problem
+        return {"problem": case.problem, "resolution": case.resolution, "n": problem.V.dim, "m": problem.W.dim}
+
+    @property
+    @_once
+    def problem(self) -> Problem:
+        created: Problem = find(PROBLEM, self.case.problem).create(self.case.options)
+        return created
+
+    @property
+    @_once
+    def training(self) -> Array:
+        return training_parameters(self.problem)
+
+    @property
+    @_once
+    def snapshots(self) -> Snapshots:
+        return high_fidelity_sweep(self.problem, self.training)
+
+    @property
+    @_once
+    def members(self) -> Mapping[str, AffineMember]:
+        return affine_decomposition(self.problem, self.training, self.interpolation)
+
+    @property
+    @_once
+    def queries(self) -> list[ValidationQuery]:
+        problem, snapshots = self.problem, self.snapshots
+        mus = validation_parameters(problem, 8, seed=2022)
+        scales = float(problem.V.norm(snapshots.u).max()), float(problem.W.norm(snapshots.lam).max())
+        exact = [ReferenceSolutions(s.u[:, None], s.lam[:, None], *scales) for s in solve_all(problem, mus)]
+        return [ValidationQuery(mu, checked_assembly(problem, mu), one) for mu, one in zip(mus, exact, strict=True)]
+
+    @_once
+    def reduction(self, spaces: ReducedSpaces, primal: PrimalChoice | None = None) -> Reduction:
+        """V_N and the cone at some spaces, and the enrichment where there is a primal strategy.
+
+        `given()` makes the same reduction anew, whose models have nothing in store from earlier queries.
+        """
+        dual = find(DUAL, spaces.dual).create({})
+        strategy = None if primal is None else find(PRIMAL, primal.name).create({})
+        tolerance = None if primal is None else primal.tolerance
+        reduction = Reduction(
+            self.problem, dual, strategy, spaces.modes, spaces.generators, tolerance,
+            assembly="reduced", interpolation=self.interpolation, solver="piqp", accuracy=1e-10,
+        ).given(snapshots=self.snapshots, parameters=self.training)  # fmt: skip
+        if primal is not None:
+            before = self.reduction(spaces)
+            reduction = reduction.given(pod=before.pod, cone=before.cone, multipliers=before.multipliers)
+        return reduction.given(
+            pod=reduction.pod,
+            cone=reduction.cone,
+            multipliers=reduction.multipliers,
+            enrichment=reduction.enrichment,
+        )
+
+    @_once
+    def online(self, spaces: ReducedSpaces, primal: PrimalChoice) -> Reduction:
+        """The reduction with projected members, or with the reason why queries have to be assembled in full."""
+        reduction = self.reduction(spaces, primal).given(members=self.members)
+        return reduction.given(operators=reduction.operators)
+
+    @_once
+    def modes(self, stop: Stop) -> int:
+        return len(pod(self.snapshots.u, self.problem.V, stop).basis.T)
+
+    def dimensions(self, spaces: ReducedSpaces) -> tuple[int, int]:
+        reduction = self.reduction(spaces)
+        return reduction.pod.basis.shape[1], reduction.cone.size
+
+
+def solve_all(problem: Problem, mus: Array) -> list[HighFidelitySolution]:
+    """High-fidelity solutions at parameters (P×d), one after the other."""
+    solver = HighFidelitySolver(problem)
+    return [solver.solve(mu) for mu in mus]
+
+
+def test_high_fidelity_solution(timing: Timing, inputs: StageInputs) -> None:
+    """One high-fidelity solution, by a solver that has solved nothing before."""
+    problem, mu = inputs.problem, inputs.training[0]
+    timing(
+        "high-fidelity solution",
+        lambda solver: solver.solve(mu),
+        lambda solution: _judge_solutions([solution]),
+        lambda: HighFidelitySolver(problem),
+    )
+
+
+def test_high_fidelity_sweep(timing: Timing, inputs: StageInputs) -> None:
+    """High-fidelity solutions at all training parameters."""
+    problem, training = inputs.problem, inputs.training
+    timing("high-fidelity sweep", lambda: solve_all(problem, training), _judge_solutions)
+
+
+def _judge_solutions(solutions: Sequence[HighFidelitySolution]) -> Info:
+    return {
+        "solutions": len(solutions),
+        "iterations": sum(s.iterations for s in solutions),
+        "fallbacks": sum(bool(s.fallback) for s in solutions),
+        "accuracy": largest_figures(residual_figures(s.residuals) for s in solutions),
+    }
+
+
+def residual_figures(residuals: Residuals) -> dict[str, float]:
+    """Relative KKT residuals by their names in the file."""
+    return {"primal_residual": residuals.primal, "dual_residual": residuals.dual, "gap": residuals.gap}
+
+
+def test_pod(timing: Timing, inputs: StageInputs) -> None:
+    """POD of the snapshots."""
+    V, u, stop = inputs.problem.V, inputs.snapshots.u, inputs.usual.modes
+
+    def judge(modes: POD) -> Info:
+        left = u - modes.basis @ V.gram(modes.basis, u)
+        tail = np.linalg.norm(V.norm(left)) / np.linalg.norm(V.norm(u))
+        return {"N": modes.basis.shape[1], "accuracy": {"tail": tail, "orthonormality": orthonormality(modes.basis, V)}}
+
+    timing("POD", lambda: pod(u, V, stop), judge)
+
+
+def orthonormality(Z: Array, V: InnerProduct) -> float:
+    """Largest entry of ZᵀX_VZ − I."""
+    return float(np.abs(V.gram(Z, Z) - np.eye(Z.shape[1])).max(initial=0.0))
+
+
+def test_cone(timing: Timing, inputs: StageInputs, dual: str) -> None:
+    """A cone by one dual strategy; reached is the largest distance of a snapshot, relative to the largest norm."""
+    W, lam, stop = inputs.problem.W, inputs.snapshots.lam, inputs.usual.generators
+    strategy = find(DUAL, dual).create({})
+
+    def judge(cone: Cone) -> Info:
+        rays = check_cone(cone, W).rays
+        largest = max((project_on_cone(rays, theta, W).distance for theta in lam.T), default=0.0)
+        error = largest / (float(W.norm(lam).max(initial=0.0)) or 1.0)
+        return {"R": cone.size, "fallbacks": len(cone.fallbacks), "accuracy": {"projection_error": error}}
+
+    timing("cone", lambda: strategy.reduce(lam, W, stop), judge)
+
+
+def test_enrichment(timing: Timing, inputs: StageInputs, primal: PrimalChoice) -> None:
+    """An enrichment by one primal strategy; reached is σ of equation (21), at some of the training parameters."""
+    reduction, strategy = inputs.reduction(inputs.usual), find(PRIMAL, primal.name).create({})
+    offline = reduction.offline
+
+    def judge(enrichment: Enrichment) -> Info:
+        check_enrichment(enrichment, offline.problem.V, offline.basis)
+        model = reduction.given(enrichment=enrichment).projection
+        some = np.unique(np.linspace(0, len(offline.training) - 1, 9).round().astype(int))
+        return {
+            "N": offline.basis.shape[1],
+            "R": model.generators.shape[1],
+            "enrichment": 0 if enrichment.vectors is None else enrichment.vectors.shape[1],
+            "kind": enrichment.kind.value,
+            "fallbacks": len(enrichment.fallbacks),
+            "accuracy": {"sigma": max(_sigma(model, offline.training[k]) for k in some)},
+        }
+
+    timing("enrichment", lambda: strategy.build(offline, primal.tolerance), judge)
+
+
+def _sigma(model: ReducedModel, mu: Array) -> float:
+    """Largest sine between a supremizer at mu (d,) and the enriched space."""
+    V, vi = model.problem.V, checked_assembly(model.problem, mu)
+    wanted = V.whiten(V.orthonormalise(supremizers(V, vi.B, model.span)))
+    return float(singular_values(project_out(V.whiten(model.primal_basis(vi)), wanted)).max(initial=0.0))
+
+
+def test_separation(timing: Timing, inputs: StageInputs) -> None:
+    """The members as sums of parameter-independent terms, or samples of them; reached is the interpolation error."""
+    problem, training = inputs.problem, inputs.training
+
+    def judge(members: Mapping[str, AffineMember]) -> Info:
+        ways = {f"way_{name}": member.way.value for name, member in members.items()}
+        terms = {f"terms_{name}": len(member.terms) for name, member in members.items()}
+        return {**ways, **terms, "accuracy": {"interpolation_error": _interpolation_error(inputs, members)}}
+
+    timing("separation", lambda: affine_decomposition(problem, training, inputs.interpolation), judge)
+
+
+def _interpolation_error(inputs: StageInputs, members: Mapping[str, AffineMember]) -> float:
+    """Largest relative error of a member at validation parameters, no further than the problem samples."""
+    sampled = {name: m for name, m in members.items() if m.way is Evaluation.INTERPOLATED}
+    if not sampled:
+        return 0.0
+    sampler = inputs.problem.sampler({name: (m.rows, m.columns) for name, m in sampled.items()})
+    largest = 0.0
+    for query in inputs.queries:
+        for name, theta in sampler(query.mu).items():
+            exact = getattr(query.vi, name)
+            summed = sum(value * term for value, term in zip(theta, sampled[name].terms, strict=True))
+            largest = max(largest, relative_difference(summed, exact))
+    return largest
+
+
+def relative_difference(value: Array, exact: Array) -> float:
+    """Euclidean norm of the difference of two members, dense or sparse, relative to that of the second."""
+
+    def norm(member: Array) -> float:
+        return float(np.linalg.norm(member if isinstance(member, np.ndarray) else member.data))
+
+    return norm(value - exact) / (norm(exact) or 1.0)
+
+
+def test_projection_of_members(timing: Timing, inputs: StageInputs, primal: PrimalChoice) -> None:
+    """What reduced assembly prepares for one enrichment."""
+    _check_reduced(inputs, primal)
+    reduction, members = inputs.reduction(inputs.usual, primal), inputs.members
+
+    def judge(operators: ReducedOperators) -> Info:
+        return _judge_programs(inputs, HyperReducedModel(reduction.given().projection, operators))
+
+    timing(
+        "projection of members",
+        lambda model: hyper_reduce(model, members),
+        judge,
+        lambda: reduction.given().projection,
+    )
+
+
+def test_assembly_in_full(timing: Timing, inputs: StageInputs, primal: PrimalChoice) -> None:
+    """A reduced program from matrices of full size."""
+    _time_assembly(timing, inputs, "assembly in full", inputs.reduction(inputs.usual, primal).given().projection)
+
+
+def test_assembly_reduced(timing: Timing, inputs: StageInputs, primal: PrimalChoice) -> None:
+    """A reduced program from projected members."""
+    _check_reduced(inputs, primal)
+    _time_assembly(timing, inputs, "assembly, reduced", inputs.online(inputs.usual, primal).given().assembled)
+
+
+def _check_reduced(inputs: StageInputs, primal: PrimalChoice) -> None:
+    """Leave out a benchmark of reduced assembly where there is none."""
+    if isinstance(why := inputs.online(inputs.usual, primal).operators, str):
+        pytest.skip(f"queries have to be assembled in full: {why}")
+
+
+def _time_assembly(timing: Timing, inputs: StageInputs, group: str, model: AnyReducedModel) -> None:
+    mus = _in_turn(inputs)
+    timing(
+        group, lambda: model.assemble(next(mus)), lambda _: _judge_programs(inputs, model), together=len(inputs.queries)
+    )
+
+
+def _judge_programs(inputs: StageInputs, model: AnyReducedModel) -> Info:
+    """Difference of the programs that a model assembles from the projections on its basis, which is orthonormal."""
+    figures = []
+    for query in inputs.queries:
+        reduced = model.assemble(query.mu)
+        exact = project(query.vi, reduced.basis, model.generators)
+        pairs = ((getattr(reduced.program, name), getattr(exact, name)) for name in MEMBERS)
+        off = orthonormality(reduced.basis, inputs.problem.V)
+        figures.append({"difference": max(relative_difference(*pair) for pair in pairs), "orthonormality": off})
+    return {**_shape(reduced), "accuracy": largest_figures(figures)}
+
+
+def test_query(timing: Timing, inputs: StageInputs, primal: PrimalChoice) -> None:
+    """Assembly in the quickest way there is, and solution; reached are errors against high-fidelity solutions."""
+    reduction = inputs.online(inputs.usual, primal).given()
+    model, why = reduction.model, reduction.operators
+    mus = _in_turn(inputs)
+
+    def query() -> QPSolution:
+        reduced = model.reduced.assemble(next(mus))
+        return solve_qp(reduced.program, model.solver, model.accuracy, factor=reduced.factor)
+
+    def judge(_: QPSolution) -> Info:
+        answers = [model.solve(query.mu) for query in inputs.queries]
+        worst = max(answers, key=lambda answer: answer.status.severity)
+        figures = [
+            residual_figures(answer.residuals) | errors_of(inputs, query, answer.u, answer.lam)
+            for query, answer in zip(inputs.queries, answers, strict=True)
+            if answer.residuals is not None
+        ]
+        return {
+            **_shape(model.reduced.assemble(inputs.queries[0].mu)), "solver": model.solver,
+            "status": worst.status.value, "reason": worst.reason,
+            "assembly": f"full: {why}" if isinstance(why, str) else "reduced",
+            "accuracy": largest_figures(figures) if len(figures) == len(answers) else {},
+        }  # fmt: skip
+
+    timing("query", query, judge, together=len(inputs.queries))
+
+
+def _in_turn(inputs: StageInputs) -> Iterator[Array]:
+    """The validation parameters, again and again."""
+    return cycle([query.mu for query in inputs.queries])
+
+
+def errors_of(inputs: StageInputs, query: ValidationQuery, u: Array, lam: Array) -> dict[str, float]:
+    """Relative errors of u and λ, scaled ones where the high-fidelity u or λ is zero."""
+    energy = assemblies(inputs.problem).energy_at(query.mu)
+    (error,) = errors(inputs.problem, [query.vi], [energy], query.exact, u[:, None], lam[:, None])
+    measured = {"error_u": error.error_u, "error_lambda": error.error_lambda}
+    scaled = {"error_u_scaled": error.error_u_scaled, "error_lambda_scaled": error.error_lambda_scaled}
+    figures = {name: value for name, value in measured.items() if value is not None}
+    return figures | {name: value for name, value in scaled.items() if name.removesuffix("_scaled") not in figures}
+
+
+def test_solver(timing: Timing, inputs: StageInputs, size: Size, solver: str, accuracy: float) -> None:
+    """One reduced program, solved to an accuracy."""
+    registered, spaces = qp_solver(solver), _spaces(inputs, size)
+    N, R = inputs.dimensions(spaces)
+    # The snapshots of a problem give so many dimensions; larger programs would be the same.
+    if inputs.made.setdefault(("size", N, R), size) != size:
+        pytest.skip(f"the snapshots of {inputs.case} give N = {N} and R = {R} at most")
+    reduced = inputs.online(spaces, inputs.primal).given().assembled.assemble(inputs.queries[0].mu)
+
+    def judge(answer: QPSolution) -> Info:
+        status, reason, residuals = verify(reduced.program, answer, accuracy)
+        return {
+            "solver": solver, "asked": accuracy, "N": N, **_shape(reduced),
+            "status": status.value, "reason": reason, "solver_status": answer.solver_status,
+            "iterations": answer.iterations, "accuracy": {} if residuals is None else residual_figures(residuals),
+        }  # fmt: skip
+
+    timing(
+        f"QP of N = {N}, R = {R}",
+        lambda: solve_qp(reduced.program, solver, accuracy, registered, reduced.factor),
+        judge,
+    )
+
+
+def _spaces(inputs: StageInputs, size: Size) -> ReducedSpaces:
+    """ReducedSpaces of this size, as far as the snapshots give them."""
+    modes = min(size.N, inputs.modes(Stop(tolerance=1e-8)))
+    return ReducedSpaces(Stop(size=modes), Stop(size=size.R), inputs.usual.dual)
+
+
+def _shape(reduced: ReducedProblem) -> dict[str, int | str]:
+    """Unknowns N' and constraints R of a reduced program, and the form in which it is solved."""
+    form = "primal" if reduced.factor is None else "dual"
+    return {"dimension": len(reduced.program.f), "R": len(reduced.program.g), "form": form}
+
+
+def test_formulation(timing: Timing, inputs: StageInputs, formulation: str) -> None:
+    """What a formulation builds, and its model."""
+    made: Formulation = find(FORMULATION, formulation).create({})
+    offline = _phase(inputs, made)
+    _built(made, offline)
+
+    def judge(built: Formulated) -> Info:
+        return _judge(inputs, built)
+
+    timing("formulation", lambda: _built(made, offline), judge)
+
+
+def test_formulated_query(timing: Timing, inputs: StageInputs, formulation: str) -> None:
+    """A query of a formulation; reached are errors, and residuals of the high-fidelity problem."""
+    made: Formulation = find(FORMULATION, formulation).create({})
+    built, mus = _built(made, _phase(inputs, made)), _in_turn(inputs)
+
+    def query() -> FormulationAnswer:
+        return built.model.solve(next(mus), built.asked()[0])
+
+    timing("query of a formulation", query, lambda _: _judge(inputs, built), together=len(inputs.queries))
+
+
+def _phase(inputs: StageInputs, formulation: Formulation) -> Reduction:
+    """The offline phase with the steps that a formulation uses, assembled in the quickest way there is."""
+    uses = axes_of(formulation, f"formulation {type(formulation).__qualname__}")
+    whole = inputs.online(inputs.usual, inputs.primal)
+    given: dict[str, Any] = {"snapshots": whole.snapshots, "parameters": whole.parameters}
+    given |= {"pod": whole.pod} if "pod" in uses else {}
+    given |= {"cone": whole.cone, "multipliers": whole.multipliers} if "dual" in uses else {}
+    given |= {"enrichment": whole.enrichment, "operators": whole.operators} if "primal" in uses else {}
+    given |= {"members": whole.members} if "assembly" in uses else {}
+    without: dict[str, Any] = {} if "primal" in uses else {"primal": None, "tolerance": None}
+    without |= {} if "dual" in uses else {"dual": None, "generators": None}
+    without |= {} if "pod" in uses else {"modes": None}
+    without |= {} if "assembly" in uses else {"assembly": "full"}
+    return replace(whole, **without).given(**given)
+
+
+def _built(formulation: Formulation, offline: Reduction) -> Formulated:
+    """The formulation on an offline phase, its model made."""
+    try:
+        built = offline.formulated(formulation)
+    except UnsupportedError as error:
+        pytest.skip(str(error))
+    built.model  # noqa: B018  is made
+    return built
+
+
+def _judge(inputs: StageInputs, built: Formulated) -> Info:
+    """Status, residuals and errors of its answers at the validation parameters."""
+    answers = [built.solve(query.mu) for query in inputs.queries]
+    worst = max(answers, key=lambda answer: answer.status.severity)
+    figures: list[Mapping[str, float]] = [
+        residual_figures(answer.residuals) | errors_of(inputs, query, answer.u, answer.lam)
+        for query, answer in zip(inputs.queries, answers, strict=True)
+        if answer.verdict.pair is not None
+    ]
+    return {
+        "N": built.model.dimension, "R": built.model.generators, "status": worst.status.value, "reason": worst.reason,
+        "accuracy": largest_figures(figures) if len(figures) == len(answers) else {},
+    }  # fmt: skip
+
+
+def largest_figures(several: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """Return the largest of every figure, NaN where one is."""
+    largest: dict[str, float] = {}
+    for figures in several:
+        for name, value in figures.items():
+            largest[name] = value if math.isnan(value) else max(largest.get(name, value), value)
+    return largest
