@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-import re
 import sqlite3
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -20,9 +19,10 @@ from vibench.errors import VibenchError
 from vibench.plugins.kinds import CHECKED, FORMULATION, SOLVER, STUDY, PluginKind
 from vibench.results.schema import STORED, TABLES
 
+# Tables that `vibench show` prints.
 SHOWN = ("summary", "best", "benefits", *TABLES)
-"""Tables that `vibench show` prints."""
 
+# Examples at the end of the help of every command; a test runs their options.
 EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "run": (
         "vibench run",
@@ -88,7 +88,6 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "help": ("vibench help show", "vibench help timing_rounds", "vibench help online_s", "vibench help supremizer"),
     "doctor": ("vibench doctor", "vibench doctor --out /scratch/runs"),
 }
-"""Examples of every command."""
 
 
 def examples(command: str) -> str:
@@ -100,18 +99,18 @@ def examples(command: str) -> str:
 def whole_words() -> Iterator[None]:
     """Give the completion of bash words that it breaks at ":" and "=": `primal:name` and `key=value` are one.
 
-    What bash completes of such a word is what comes after its last break, so what is printed begins there.
+    Bash completes only what comes after the last break of such a word, so what is printed begins there.
     """
-    if "_VIBENCH_COMPLETE" in os.environ:  # it would look for plugins of pydantic, which typer checks words with
+    if "_VIBENCH_COMPLETE" in os.environ:  # typer checks words with pydantic, which would look for its own plugins
         os.environ["PYDANTIC_DISABLE_PLUGINS"] = "__all__"
     if os.environ.get("_VIBENCH_COMPLETE") != "complete_bash":
         yield
         return
-    asked, current = os.environ["COMP_WORDS"], int(os.environ["COMP_CWORD"])
-    pieces = asked.split("\n" if "\n" in asked else " ")
+    line, current = os.environ["COMP_WORDS"], int(os.environ["COMP_CWORD"])
+    pieces = line.split("\n" if "\n" in line else " ")
     joined: list[str] = []
     for k, piece in enumerate(pieces[: current + 1]):
-        together = joined and (piece[:1] in BREAKS or (piece and pieces[k - 1][-1:] in BREAKS))
+        together = joined and (piece[:1] in (":", "=") or (piece and pieces[k - 1][-1:] in (":", "=")))
         joined[-1 if together else len(joined) :] = [joined[-1] + piece if together else piece]
     last = joined[-1] if len(joined) > 1 else ""
     os.environ.update(COMP_WORDS="\n".join(joined), COMP_CWORD=str(len(joined) - 1))
@@ -119,16 +118,12 @@ def whole_words() -> Iterator[None]:
         with contextlib.redirect_stdout(io.StringIO()) as printed:
             yield
     finally:
-        done = len(re.match(".*[:=]|", last)[0])  # type: ignore[index]  # it matches any text
+        done = max(last.rfind(":"), last.rfind("=")) + 1
         sys.stdout.write("".join(f"{line[done:]}\n" for line in printed.getvalue().splitlines()))
 
 
-BREAKS = (":", "=")
-"""Characters at which bash breaks words, and which words of vibench have."""
-
-
 def words(choices: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """Completes the words of a function, which is called when a shell asks."""
+    """A completion with the words of a function, which is called when a shell asks."""
 
     def complete(incomplete: str) -> list[str]:
         return _beginning(incomplete, choices())
@@ -137,101 +132,8 @@ def words(choices: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
 
 
 def names(*kinds: PluginKind) -> Callable[[str], list[str]]:
-    """Completes names of plugins of some kinds."""
+    """A completion with the names of plugins of some kinds."""
     return words(lambda: _registered(*kinds))
-
-
-def formulations(incomplete: str) -> list[str]:
-    """Completes names of formulations, `mixed` among them."""
-    from vibench.interfaces.formulations import MIXED
-
-    return _beginning(incomplete, [MIXED, *_registered(FORMULATION)])
-
-
-def plugins(incomplete: str) -> list[str]:
-    """Completes names of plugins, alone or with their kind before them: "primal:NAME", "solver:NAME"."""
-    kind, colon, name = incomplete.partition(":")
-    if not colon:
-        return _beginning(incomplete, [*_registered(*CHECKED.values()), *(f"{kind}:" for kind in CHECKED)])
-    offered = solvers(name) if kind == "solver" else _registered(CHECKED[kind]) if kind in CHECKED else ()
-    return _beginning(incomplete, (f"{kind}:{one}" for one in offered))
-
-
-def plugin_options(context: typer.Context, incomplete: str) -> list[str]:
-    """Completes the options of the plugin named before, as "resolution=", without importing it."""
-    from vibench.plugins.registry import find
-
-    word, colon, name = (context.params.get("plugin") or "".join(context.args[:1])).rpartition(":")
-    kinds = [CHECKED[word]] if word in CHECKED else [] if colon else CHECKED.values()
-    options = {option for kind in kinds for option in find(kind, name).names_of_options}
-    return _beginning(incomplete, (f"{option}=" for option in options))
-
-
-lists = words(lambda: (kind.plural for kind in PluginKind))
-table_names = words(lambda: SHOWN)
-
-
-def studies(incomplete: str) -> list[str]:
-    """Completes registered studies, and study files in the current folder or in the folder of the word."""
-    folder, slash, _ = incomplete.rpartition("/")
-    files = (f"{folder}{slash}{path.name}" for path in Path(folder + slash).glob("*.toml"))
-    return sorted([*_beginning(incomplete, _registered(STUDY)), *_beginning(incomplete, files)])
-
-
-CORRECTIONS = ("none", "feasible", "auto")
-
-
-def solvers(incomplete: str) -> list[str]:
-    """Completes QP solvers, installed or not."""
-    from vibench.qp.settings import SETTINGS
-
-    return _beginning(incomplete, {*SETTINGS, *_registered(SOLVER)})
-
-
-def runs(incomplete: str) -> list[str]:
-    """Completes names of the runs under `runs/`."""
-    from vibench.results.sqlite import FILE
-
-    return _beginning(incomplete, (path.parent.name for path in Path("runs").glob(f"*/{FILE}")))
-
-
-def cells(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:
-    """Completes keys of the cells of the run named before, each with a description."""
-    from vibench.results.read import read_table, results_file
-
-    try:
-        table = read_table(results_file(str(context.params.get("run"))), "cells")
-    except (VibenchError, OSError, sqlite3.Error):
-        return []
-    rows = table[["cell", "problem", "dual", "primal", "solver"]].astype(str).itertuples(index=False)
-    return sorted((key, " · ".join(axes)) for key, *axes in rows if key.startswith(incomplete))
-
-
-def column_names(context: typer.Context, incomplete: str) -> list[str]:
-    """Completes the last name in a list of columns of the table that `--table` names."""
-    table = str(context.params.get("table") or "summary")
-    source = {"summary": "cells", "best": "cells", "benefits": "thresholds"}.get(table, table)
-    before, comma, last = incomplete.rpartition(",")
-    sign = "-" * last.startswith("-")
-    names = _beginning(last.removeprefix("-"), [*(STORED[source] if source in TABLES else ()), *_added(table)])
-    return [f"{before}{comma}{sign}{name}" for name in names]
-
-
-def _added(table: str) -> Iterable[str]:
-    """Columns that a table for reading has beside those of the results file."""
-    from vibench.results import ranking
-
-    return {"best": [ranking.BAND], "benefits": ranking.ERROR_COLUMNS}.get(table, ())
-
-
-def error_measures(incomplete: str) -> list[str]:
-    """Completes measures of errors; names of outputs are those of a run."""
-    from vibench.results.ranking import OF_SOLUTION, OUTPUT
-
-    return _beginning(incomplete, [*OF_SOLUTION, OUTPUT])
-
-
-cell_columns = words(lambda: STORED["cells"])
 
 
 def _registered(*kinds: PluginKind) -> set[str]:
@@ -246,3 +148,88 @@ def _beginning(word: str, choices: Iterable[str]) -> list[str]:
         return sorted(name for name in choices if name.startswith(word) and name.isprintable())
     except OSError:
         return []
+
+
+def _formulations() -> Iterable[str]:
+    from vibench.interfaces.formulations import MIXED
+
+    return [MIXED, *_registered(FORMULATION)]
+
+
+def _solvers() -> Iterable[str]:
+    """QP solvers, installed or not."""
+    from vibench.qp.settings import SETTINGS
+
+    return {*SETTINGS, *_registered(SOLVER)}
+
+
+def _runs() -> Iterable[str]:
+    from vibench.results.sqlite import FILE
+
+    return (path.parent.name for path in Path("runs").glob(f"*/{FILE}"))
+
+
+def _error_measures() -> Iterable[str]:
+    from vibench.results.ranking import OF_SOLUTION, OUTPUT
+
+    return [*OF_SOLUTION, OUTPUT]
+
+
+formulations, solvers, runs, error_measures = map(words, (_formulations, _solvers, _runs, _error_measures))
+corrections = words(lambda: ("none", "feasible", "auto"))
+lists = words(lambda: (kind.plural for kind in PluginKind))
+table_names = words(lambda: SHOWN)
+cell_columns = words(lambda: STORED["cells"])
+
+
+def plugins(incomplete: str) -> list[str]:
+    """Names of plugins, alone or with their kind before them: "primal:NAME", "solver:NAME"."""
+    kind, colon, name = incomplete.partition(":")
+    if not colon:
+        return _beginning(incomplete, [*_registered(*CHECKED.values()), *(f"{kind}:" for kind in CHECKED)])
+    offered = solvers(name) if kind == "solver" else _registered(CHECKED[kind]) if kind in CHECKED else ()
+    return _beginning(incomplete, (f"{kind}:{one}" for one in offered))
+
+
+def plugin_options(context: typer.Context, incomplete: str) -> list[str]:
+    """Options of the plugin that the line names, as "resolution=", without importing it."""
+    from vibench.plugins.registry import find
+
+    word, colon, name = (context.params.get("plugin") or "".join(context.args[:1])).rpartition(":")
+    kinds = [CHECKED[word]] if word in CHECKED else [] if colon else CHECKED.values()
+    options = {option for kind in kinds for option in find(kind, name).names_of_options}
+    return _beginning(incomplete, (f"{option}=" for option in options))
+
+
+def studies(incomplete: str) -> list[str]:
+    """Registered studies, and study files in the current folder or in the folder of the word."""
+    folder, slash, _ = incomplete.rpartition("/")
+    files = (f"{folder}{slash}{path.name}" for path in Path(folder + slash).glob("*.toml"))
+    return sorted([*_beginning(incomplete, _registered(STUDY)), *_beginning(incomplete, files)])
+
+
+def cells(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:
+    """Keys of the cells of the run that the line names, each with a description."""
+    from vibench.results.read import read_table, results_file
+
+    try:
+        table = read_table(results_file(str(context.params.get("run"))), "cells")
+    except (VibenchError, OSError, sqlite3.Error):
+        return []
+    rows = table[["cell", "problem", "dual", "primal", "solver"]].astype(str).itertuples(index=False)
+    return sorted((key, " · ".join(axes)) for key, *axes in rows if key.startswith(incomplete))
+
+
+def column_names(context: typer.Context, incomplete: str) -> list[str]:
+    """The last name in a list of columns of the table that `--table` names."""
+    from vibench.results import ranking
+
+    table = str(context.params.get("table") or "summary")
+    source = {"summary": "cells", "best": "cells", "benefits": "thresholds"}.get(table, table)
+    computed = {"best": [ranking.BAND], "benefits": ranking.ERROR_COLUMNS}.get(table, ())
+    before, comma, last = incomplete.rpartition(",")
+    sign = "-" * last.startswith("-")
+    return [
+        f"{before}{comma}{sign}{name}"
+        for name in _beginning(last.removeprefix("-"), [*(STORED[source] if source in TABLES else ()), *computed])
+    ]

@@ -21,15 +21,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from rich.text import Text
 
-SHORT = 24
-"""A text of more characters may be wrapped, between words if it can."""
-
-SUBJECT = 3
-"""Columns beside those that tell rows apart that a table is about."""
-
-LONG = 60
-"""Characters of a line of a long text, where there is room."""
-
 
 def echo(*lines: str) -> None:
     """Print lines; what is not printable in them, such as an escape sequence or a line break, is shown as an escape."""
@@ -55,7 +46,7 @@ def fitted(line: str, stream: TextIO) -> str:
 
 
 def run_argument(folder: Path) -> str:
-    """How a command names a run folder."""
+    """The name of a run folder on a command line."""
     return shlex.quote(folder.name if folder == Path("runs") / folder.name else str(folder))
 
 
@@ -72,7 +63,8 @@ def print_frame(
 
     Text columns with the same value in every row go into the title, and empty ones are left out. Where there is not
     room for all others, those of the smallest priority are left out, and a line below names them. What tells rows apart
-    is not left out: where it would take the room of the first `SUBJECT` other columns, it is one column of some lines.
+    is never left out: where it would take the room of the first three other columns, it becomes one column of several
+    lines.
 
     Parameters
     ----------
@@ -104,11 +96,10 @@ def print_frame(
     console.print(shown(title if count else f"{title}: no rows"), overflow="fold")
     if not count:
         return
-    own = [column for column in columns if column not in shared]
-    own, kept = _arranged(own, priority, axes, console.width)
+    own, kept = _arranged([column for column in columns if column not in shared], priority, axes, console.width)
     drawn = [column for column in own if column in kept]
-    whole = sum(max(column.width, _length(column.heading)) + 2 for column in drawn) <= console.width + 2
-    # the box has a blank between columns; there is another where there is room
+    whole = sum(max(column.width, cell_len(column.heading)) + 2 for column in drawn) <= console.width + 2
+    # The box has a blank between columns; where there is room, a second one makes the table easier to read.
     printed = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, int(whole), 0, 0))
     for column, width in zip(drawn, _widths(drawn, console.width, whole), strict=True):
         justify: Literal["left", "right"] = "right" if column.numeric else "left"
@@ -133,35 +124,31 @@ def _columns_of(frame: pd.DataFrame) -> list[PrintedColumn]:
 def print_rows(rows: Iterable[Sequence[str]], headings: Sequence[str], title: str) -> None:
     """Print rows of texts as `print_frame` prints a table."""
     cells = list(zip(*rows, strict=True)) or [()] * len(headings)
-    print_frame([PrintedColumn(name, tuple(own)) for name, own in zip(headings, cells, strict=True)], title)
+    print_frame([PrintedColumn(heading, column) for heading, column in zip(headings, cells, strict=True)], title)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class PrintedColumn:
-    """A column of a printed table: its texts, and the characters it needs; a long text may have lines of its own."""
+    """A column of a printed table: its heading and texts; texts of more than 24 characters may be wrapped."""
 
     heading: str
     cells: tuple[str, ...]
     numeric: bool = False
 
     @cached_property
-    def long(self) -> bool:
-        """Whether a text may be wrapped."""
-        return self.longest > SHORT
+    def longest(self) -> int:
+        """Characters of its longest line."""
+        lines = (line for cell in map(printable_lines, self.cells) for line in cell.split("\n"))
+        return max(map(cell_len, lines), default=1)
 
     @cached_property
     def width(self) -> int:
-        """Characters that it needs at least: whole texts where they are short, of long ones whole words."""
-        words = [
-            *self.heading.split(),
-            *(word for cell in self.cells for word in printable_lines(cell).split() if self.long),
-        ]
-        return max([min(_length(word), SHORT) for word in words] + [1 if self.long else self.longest])
-
-    @cached_property
-    def longest(self) -> int:
-        """Characters of its longest line."""
-        return max((_length(line) for cell in map(printable_lines, self.cells) for line in cell.split("\n")), default=1)
+        """Fewest characters that it needs: whole texts where they are short, whole words of long ones."""
+        long = self.longest > 24
+        words = [word for cell in self.cells if long for word in printable_lines(cell).split()]
+        # Words of more than 24 characters are folded, or one path would take the room of all other columns.
+        widths = [min(cell_len(word), 24) for word in (*self.heading.split(), *words)]
+        return max([*widths, 1 if long else self.longest])
 
 
 def _arranged(
@@ -172,18 +159,17 @@ def _arranged(
     ranked = sorted(own, key=lambda column: rank.get(column.heading, len(rank)))
     telling, others = ([c for c in ranked if (c.heading in axes) is told] for told in (True, False))
     kept = _fitting(ranked, width)
-    if len(telling) < 2 or set(telling + others[:SUBJECT]) <= set(kept):
+    if len(telling) < 2 or set(telling + others[:3]) <= set(kept):
         return own, kept
-    together, first = _in_one([column for column in own if column in telling]), min(map(own.index, telling))
+    # One column joins the axes of every row, and may be wrapped between two of them.
+    in_order = [column for column in own if column in telling]
+    named = [
+        [f"{axis.heading}={cell}" * bool(cell) if axis.numeric else cell for cell in axis.cells] for axis in in_order
+    ]
+    joined = tuple(" · ".join(text for text in row if text) for row in zip(*named, strict=True))
+    together, first = PrintedColumn("row", joined), own.index(in_order[0])
     arranged = [*own[:first], together, *own[first:]]
     return [column for column in arranged if column not in telling], _fitting([together, *others], width)
-
-
-def _in_one(axes: Sequence[PrintedColumn]) -> PrintedColumn:
-    """Columns that tell rows apart as one, whose texts may be wrapped between two of them."""
-    named = [[f"{axis.heading}={cell}" * bool(cell) if axis.numeric else cell for cell in axis.cells] for axis in axes]
-    joined = [" · ".join(text for text in row if text) for row in zip(*named, strict=True)]
-    return PrintedColumn("row", tuple(joined))
 
 
 def _fitting(columns: Sequence[PrintedColumn], width: int) -> list[PrintedColumn]:
@@ -198,10 +184,11 @@ def _fitting(columns: Sequence[PrintedColumn], width: int) -> list[PrintedColumn
 
 
 def _widths(columns: Sequence[PrintedColumn], width: int, whole: bool) -> list[int]:
-    """Characters of every column: what it needs, and of what is left as much as long texts may use."""
-    widths = [max(column.width, _length(column.heading)) if whole else column.width for column in columns]
+    """Characters of every column: its need, and for long texts an equal part of the rest, up to lines of 60."""
+    widths = [max(column.width, cell_len(column.heading)) if whole else column.width for column in columns]
     spare = width - sum(widths) - (1 + whole) * (len(widths) - 1)
-    long = sorted((min(column.longest, LONG) - widths[k], k) for k, column in enumerate(columns) if column.long)
+    long = sorted((min(column.longest, 60) - widths[k], k) for k, column in enumerate(columns) if column.longest > 24)
+    # The column with the smallest wish comes first, so that the others share what it leaves.
     for left, (wanted, k) in zip(range(len(long), 0, -1), long, strict=True):
         more = max(0, min(wanted, spare // left))
         widths[k], spare = widths[k] + more, spare - more
@@ -209,14 +196,14 @@ def _widths(columns: Sequence[PrintedColumn], width: int, whole: bool) -> list[i
 
 
 def shown(text: str) -> Text:
-    """A text of some lines in a table, without markup and without what is not printable."""
+    """A text of some lines in a table, without markup and without characters that are not printable."""
     from rich.text import Text
 
     return Text(printable_lines(text))
 
 
-def _length(text: str) -> int:
+def cell_len(text: str) -> int:
     """Columns of a terminal that a text takes."""
-    from rich.cells import cell_len
+    from rich import cells
 
-    return cell_len(text)
+    return cells.cell_len(text)

@@ -1,4 +1,4 @@
-"""What `vibench doctor` says: versions, QP solvers, plugins, machine, disk, and whether timings can be trusted."""
+"""`vibench doctor`: versions, QP solvers, plugins, machine, disk, and whether timings can be trusted."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import sqlite3
 import tempfile
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass
 from enum import StrEnum
 from importlib.metadata import requires
 from math import inf
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -40,21 +40,6 @@ from vibench.study.matrix import read_study
 from vibench.text import new_console
 from vibench.timing import DISTURBED, Calibration, Stopwatch
 
-ACCURACY = 1e-7
-"""Relative accuracy that solvers are tried at: the default of studies."""
-
-UNKNOWNS = 12
-"""Unknowns of the program that solvers are tried with."""
-
-MIN_GIB = 1.0
-"""Less free memory or disk space than this is a note."""
-
-MAX_OTHER_LOAD = 0.25
-"""Share of the cores that other processes may use before timings are doubtful."""
-
-MEASURED_SECONDS = 0.5
-"""Duration of the measurement of load and slowdown."""
-
 
 class Health(StrEnum):
     """Severity of a diagnosis: `BROKEN` if a required part is missing, or an installed one does not work."""
@@ -64,12 +49,8 @@ class Health(StrEnum):
     BROKEN = "broken"
 
 
-STYLES = {Health.OK: "", Health.NOTE: "yellow", Health.BROKEN: "bold red"}
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """What one check says: its subject, what is the case, and how severe that is."""
+class Diagnosis(NamedTuple):
+    """Result of one check: its subject, the finding, and how severe it is."""
 
     subject: str
     text: str
@@ -77,22 +58,22 @@ class Diagnosis:
 
 
 def print_diagnoses(out: Path) -> list[str]:
-    """Print the diagnoses of all checks; returns the subjects of those that are broken."""
+    """Print the diagnoses of all checks, and return the subjects of those that are broken."""
     console, broken = new_console(), []
+    styles = {Health.OK: "", Health.NOTE: "yellow", Health.BROKEN: "bold red"}
     sections = {
         "versions": check_versions(), "QP solvers": check_solvers(), "factorisations": check_factorisations(),
-        "plugins": check_plugins(),
-        "machine": check_machine(), "disk": check_disk(out), "timings": check_timings(),
+        "plugins": check_plugins(), "machine": check_machine(), "disk": check_disk(out), "timings": check_timings(),
     }  # fmt: skip
     for title, diagnoses in sections.items():
+        # Subjects of all sections begin in one column, and long findings are folded beside them.
         table = Table.grid(padding=(0, 2))
-        for options in ({"min_width": 6}, {"min_width": 18, "no_wrap": True}, {"overflow": "fold"}):
-            table.add_column(**options)
-        for diagnosis in diagnoses:
-            table.add_row(
-                Text(diagnosis.health, STYLES[diagnosis.health]), shown(diagnosis.subject), shown(diagnosis.text)
-            )
-            broken += [diagnosis.subject] * (diagnosis.health is Health.BROKEN)
+        table.add_column(min_width=6)
+        table.add_column(min_width=18, no_wrap=True)
+        table.add_column(overflow="fold")
+        for subject, text, health in diagnoses:
+            table.add_row(Text(health, styles[health]), shown(subject), shown(text))
+            broken += [subject] * (health is Health.BROKEN)
         console.print(title, style="bold")
         console.print(table)
     echo(f"broken: {', '.join(broken)}" if broken else "nothing is broken")
@@ -121,8 +102,8 @@ def required_distributions() -> dict[str, list[str]]:
 
 
 def check_solvers() -> Iterator[Diagnosis]:
-    """All known QP solvers; the installed ones solve a small program each."""
-    trials = solver_trials(wire(), ACCURACY, installed_solvers(registered(SOLVER)))
+    """All known QP solvers; the installed ones solve a small program each, at the default accuracy of studies."""
+    trials = solver_trials(wire(), 1e-7, installed_solvers(registered(SOLVER)))
     for name in sorted({*SETTINGS, *registered(SOLVER)}):
         version = provenance.solver_version(name) if name in SETTINGS else find(SOLVER, name).origin
         if name not in trials:
@@ -130,8 +111,9 @@ def check_solvers() -> Iterator[Diagnosis]:
         elif (trial := trials[name]).status is Status.OK and trial.residuals is not None:
             yield Diagnosis(name, f"{version}: largest residual {trial.residuals.worst:.0e}")
         else:
-            works = trial.status is Status.INACCURATE and not _is_required(name)
-            health = Health.NOTE if works else Health.BROKEN
+            # A solver of an extra may work and reach only a lower accuracy.
+            extra = required_distributions().get(provenance.solver_distribution(name)) != []
+            health = Health.NOTE if extra and trial.status is Status.INACCURATE else Health.BROKEN
             yield Diagnosis(name, f"{version}: {trial.status}, {trial.reason}", health)
 
 
@@ -145,38 +127,31 @@ def check_factorisations() -> Iterator[Diagnosis]:
             yield Diagnosis(name, f"not installed: `pip install {distribution}` ({one.summary})", Health.NOTE)
             continue
         try:
-            left = float(np.abs(A @ one.factorise(A, "A").solve(np.ones(UNKNOWNS)) - 1.0).max())
+            left = float(np.abs(A @ one.factorise(A, "A").solve(np.ones(A.shape[0])) - 1.0).max())
         except Exception as error:  # noqa: BLE001  a library may raise anything when it is imported
             yield Diagnosis(name, f"{version}: {in_a_line(error)}", Health.BROKEN)
         else:
             yield Diagnosis(name, f"{version}: residual {left:.0e} ({one.summary})")
 
 
-def wire() -> VariationalInequality:
-    """A wire of `UNKNOWNS` nodes in contact with a flat support around its middle; dense, like reduced programs."""
-    step = 1.0 / (UNKNOWNS + 1)
-    A = (2.0 * np.eye(UNKNOWNS) - np.eye(UNKNOWNS, k=1) - np.eye(UNKNOWNS, k=-1)) / step
-    return VariationalInequality(
-        A, np.full(UNKNOWNS, -4.0 * step), -step * np.eye(UNKNOWNS), np.full(UNKNOWNS, 0.2 * step)
-    )
-
-
-def _is_required(solver: str) -> bool:
-    """Whether vibench depends on a solver: one that it does not depend on may work and reach a lower accuracy."""
-    return required_distributions().get(provenance.solver_distribution(solver)) == []
+def wire(n: int = 12) -> VariationalInequality:
+    """A wire of n nodes in contact with a flat support around its middle; dense, like reduced programs."""
+    step = 1.0 / (n + 1)
+    A = (2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)) / step
+    return VariationalInequality(A, np.full(n, -4.0 * step), -step * np.eye(n), np.full(n, 0.2 * step))
 
 
 def _unavailable(solver: str, version: str) -> Diagnosis:
-    """Why a solver cannot be run."""
+    """The reason why a solver cannot be run."""
     distribution = provenance.solver_distribution(solver)
     if version:
         try:
             importlib.import_module(distribution)
         except (Exception, SystemExit) as error:  # noqa: BLE001  a library may raise anything when it is imported
-            return Diagnosis(
-                solver, f"{version} is installed and cannot be imported: {in_a_line(error)}", Health.BROKEN
-            )
-        return Diagnosis(solver, f"{version} is installed and qpsolvers does not know it", Health.BROKEN)
+            reason = f"cannot be imported: {in_a_line(error)}"
+        else:
+            reason = "qpsolvers does not know it"
+        return Diagnosis(solver, f"{version} is installed and {reason}", Health.BROKEN)
     extras = required_distributions().get(distribution)
     if extras == []:
         return Diagnosis(solver, "is required and not installed", Health.BROKEN)
@@ -196,7 +171,7 @@ def check_plugins() -> Iterator[Diagnosis]:
 
 
 def _load_error(plugin: RegisteredPlugin) -> str:
-    """The error that loading a plugin ends with; "" if it loads."""
+    """The error of loading a plugin; "" if it loads."""
     try:
         if plugin.kind is STUDY:
             read_study(plugin.name)
@@ -217,7 +192,7 @@ def check_machine() -> Iterator[Diagnosis]:
     info = Path("/proc/meminfo")
     available = re.search(r"MemAvailable:\s*(\d+) kB", info.read_text()) if info.is_file() else None
     free = min(int(available[1]) / 2**20 if available else inf, provenance.memory() / 2**30)
-    yield Diagnosis("free memory", f"{free:.1f} GiB", _note_if(free < MIN_GIB))
+    yield Diagnosis("free memory", f"{free:.1f} GiB", _note_if(free < 1.0))
     for pool in threadpool_info():
         name = f"{pool['internal_api']} {pool.get('version') or ''}".strip()
         threads = f"threads: {pool['num_threads']} here, 1 in workers"
@@ -254,7 +229,7 @@ def _folder(subject: str, folder: Path) -> Diagnosis:
     except (OSError, RequestError, sqlite3.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         return Diagnosis(subject, f"{folder}: cannot be used: {reason}", Health.BROKEN)
-    return Diagnosis(subject, f"{folder}: {free:.1f} GiB free", _note_if(free < MIN_GIB))
+    return Diagnosis(subject, f"{folder}: {free:.1f} GiB free", _note_if(free < 1.0))
 
 
 def check_timings() -> Iterator[Diagnosis]:
@@ -263,7 +238,8 @@ def check_timings() -> Iterator[Diagnosis]:
     with threadpool_limits(1):
         calibration = Calibration()
         slowdowns = [calibration.slowdown()]
-        while watch.seconds().wall < MEASURED_SECONDS:
+        # Half a second averages over the scheduler's slices and is hardly noticed.
+        while watch.seconds().wall < 0.5:
             slowdowns.append(calibration.slowdown())
     spent, after = watch.seconds(), _busy_seconds()
     cores = os.cpu_count() or 1
@@ -272,7 +248,7 @@ def check_timings() -> Iterator[Diagnosis]:
     slowdown, ratio = float(np.quantile(slowdowns, 0.9)), spent.wall / spent.cpu
     doubts = []
     for subject, text, doubtful in (
-        ("other load", f"{others:.1f} of {cores} cores", others > MAX_OTHER_LOAD * cores),
+        ("other load", f"{others:.1f} of {cores} cores", others > 0.25 * cores),
         ("slowdown", f"{slowdown:.2f}; rows are marked above {DISTURBED}", slowdown > DISTURBED),
         ("wall over CPU", f"{ratio:.2f}; above 1.5 processes often wait for a core", ratio > 1.5),
     ):
@@ -287,7 +263,7 @@ def _note_if(doubtful: bool) -> Health:
 
 
 def _busy_seconds() -> float:
-    """CPU seconds that all processes of the machine have used so far; 0 where the system does not tell."""
+    """CPU seconds used by all processes since the start of the machine; 0 where the system does not tell."""
     stat = Path("/proc/stat")
     if not stat.is_file():
         return 0.0

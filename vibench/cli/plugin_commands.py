@@ -17,10 +17,8 @@ from vibench.errors import RequestError, VibenchError, in_a_line, unknown_name
 from vibench.plugins.kinds import CHECKED, PROBLEM, SAMPLING, SOLVER, STUDY, PluginKind
 from vibench.text import parsed_json
 
+# The list of QP solvers also has those that are no plugins.
 LISTS = {kind.plural: kind for kind in PluginKind}
-"""Kind of plugin that each list shows; QP solvers are listed whether they are plugins or not."""
-
-HEADINGS = ("name", "from", "what", "options")
 
 Row = tuple[str, str, str, str]
 
@@ -53,13 +51,14 @@ def list_plugins(
     from vibench.cli.console import print_rows
     from vibench.plugins.registry import unreadable
 
+    headings = ("name", "from", "what", "options")
     if what is None:
         for kind in PluginKind:
-            print_rows(_solvers_by_version() if kind is SOLVER else _read_rows(kind), HEADINGS, kind.plural)
+            print_rows(_solvers_by_version() if kind is SOLVER else _read_rows(kind), headings, kind.plural)
         echo("", "what the options of one kind are, and whether its plugins can be loaded:")
         echo(f"  vibench list KIND, such as {PROBLEM.plural}")
     elif what in LISTS:
-        print_rows(_solver_rows() if LISTS[what] is SOLVER else _loaded_rows(LISTS[what], sizes), HEADINGS, what)
+        print_rows(_solver_rows() if LISTS[what] is SOLVER else _loaded_rows(LISTS[what], sizes), headings, what)
     else:
         raise unknown_name("list", what, LISTS)
     for distribution, reason in unreadable().items():
@@ -136,24 +135,18 @@ def new_plugin(
     """
     from vibench.cli import scaffold
 
-    if kind in scaffold.STARTS:
-        start = scaffold.write_start(kind, name, out)
-        path = shlex.quote(str(start))
-        steps = (
-            [f"vibench run {path} --dry-run", f"vibench run {path}"]
-            if kind == "study"
-            else [f"python {path}/write.py", f"vibench pack {path}"]
-        )
-        echo(f"{start}: a {kind} that works as it is, to edit", *(f"  {step}" for step in steps))
+    if kind in CHECKED:
+        folder = scaffold.write_package(CHECKED[kind], name, out)
+        module = scaffold.module_file(folder, CHECKED[kind], name)
+        echo(f"{folder}: a {CHECKED[kind]} called '{name}' that works as it is", f"  pip install -e {folder}")
+        echo(f"  vibench check {kind}:{name}", f"the code to edit: {module}; what to do next: {folder / 'README.md'}")
         return
-    folder = scaffold.write_package(CHECKED[kind], name, out)
-    module = scaffold.module_file(folder, CHECKED[kind], name)
-    echo(
-        f"{folder}: a {CHECKED[kind]} called '{name}' that works as it is",
-        f"  pip install -e {folder}",
-        f"  vibench check {kind}:{name}",
-        f"the code to edit: {module}; what to do next: {folder / 'README.md'}",
-    )
+    start = scaffold.write_start(kind, name, out)
+    path = shlex.quote(str(start))
+    steps = [f"python {path}/write.py", f"vibench pack {path}"]
+    if kind == "study":
+        steps = [f"vibench run {path} --dry-run", f"vibench run {path}"]
+    echo(f"{start}: a {kind} that works as it is, to edit", *(f"  {step}" for step in steps))
 
 
 def _read_rows(kind: PluginKind) -> Iterator[Row]:
@@ -170,12 +163,13 @@ def _read_rows(kind: PluginKind) -> Iterator[Row]:
 def _loaded_rows(kind: PluginKind, sizes: bool = False) -> Iterator[Row]:
     """Name, origin, description and options of every plugin of a kind; of one that does not load, the error."""
     from vibench.plugins.registry import registered
+    from vibench.study.matrix import expand, read_study
 
     for name, plugin in registered(kind).items():
         lines: list[str] = []
         try:
             if kind is STUDY:
-                description = _number_of_cells(name)
+                description = f"{len(expand(read_study(name)))} cells"
             else:
                 description = (plugin.load().__doc__ or "").strip().split("\n")[0]
                 lines += map(str, plugin.options.values())
@@ -189,14 +183,8 @@ def _loaded_rows(kind: PluginKind, sizes: bool = False) -> Iterator[Row]:
         yield name, plugin.origin, description, "\n".join(lines)
 
 
-def _number_of_cells(study: str) -> str:
-    from vibench.study.matrix import expand, read_study
-
-    return f"{len(expand(read_study(study)))} cells"
-
-
 def _parameters(problem: type) -> Iterator[str]:
-    """The parameters of a class of problems, each in a line; of one whose options determine them, none."""
+    """A line for each parameter of a class of problems; none if options of the class determine them."""
     from vibench.interfaces.parameters import ParameterBox
 
     box = getattr(problem, "parameters", None)
@@ -206,7 +194,7 @@ def _parameters(problem: type) -> Iterator[str]:
 
 
 def _size(plugin: RegisteredPlugin) -> str:
-    """How many unknowns and constraints a problem has with its default options, in a line."""
+    """Numbers of unknowns and constraints of a problem with its default options, in a line."""
     needed = [name for name, option in plugin.options.items() if option.required]
     if needed:
         return f"its size depends on {', '.join(needed)}"

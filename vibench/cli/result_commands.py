@@ -18,9 +18,6 @@ if TYPE_CHECKING:
 
     from vibench.report.comparison import Comparison
 
-EXAMPLE = "solver = 'piqp' and beta_span_min < 1e-3"
-"""Condition in the help of `--where`."""
-
 Form = Literal["terminal", "markdown", "csv", "latex", "json"]
 FormOption = Annotated[Form, Option("--format", help="Output format.")]
 At = Annotated[
@@ -30,10 +27,7 @@ At = Annotated[
 
 
 def places_of(at: list[str] | None) -> dict[str, str]:
-    """Places of files and folders, absolute, by name.
-
-    Raises a `RequestError` if one is none.
-    """
+    """Absolute places of files and folders by name, from texts NAME=PATH."""
     pairs = [one.partition("=") for one in at or ()]
     for name, _, path in pairs:
         if not name or not path:
@@ -58,7 +52,9 @@ def show(
     columns: Annotated[
         str, Option(metavar="NAME,…", help="Columns to print, or all.", autocompletion=column_names)
     ] = "",
-    where: Annotated[str, Option(metavar="CONDITION", help=f'Rows to print: "{EXAMPLE}".')] = "",
+    where: Annotated[
+        str, Option(metavar="CONDITION", help="Rows to print: \"solver = 'piqp' and beta_span_min < 1e-3\".")
+    ] = "",
     sort: Annotated[
         str,
         Option(metavar="NAME,…", help="Columns to sort by; -NAME for the largest first.", autocompletion=column_names),
@@ -140,7 +136,7 @@ def compare_runs(
     elif column or table not in (None, "changes"):
         # What a table says of each run, in a column of its own, matters most.
         first = [*(one.name for one in compared.runs), *PRIORITY]
-        print_frame(frame, f"{column} of the cells" if column else str(table), first, rest=REST)
+        print_frame(frame, f"{column} of the cells" if column else str(table), first, rest="--format csv")
     else:
         if table is None:
             _print_overview(compared)
@@ -169,30 +165,24 @@ def replay_query(
     echo(f"the program, as qpsolvers reads it: {file}")
 
 
-MOST = 40
-"""Changes that are printed; the other formats have all."""
-
-REST = "--format csv"
-"""Option that prints the columns for which a terminal is too narrow."""
-
+# Columns of comparisons, those that matter most first.
 PRIORITY = (
     "run", "what", "verdict", "before", "after", "ratio", "cells", "equal", "worse", "better", "changed", "problem",
     "formulation", "dual", "primal", "solver", "asked", "interval", "within accuracy", "within limit", "undecided",
     "farthest ratio", "against", "accuracy", "assembly", "correction", "cell", "study", "ok", "only here", "same code",
     "in all runs", "machine", "seed", "validation",
 )  # fmt: skip
-"""Columns of the tables, those that matter most first."""
 
 
 def _print_changes(compared: Comparison, limit: float) -> None:
     """Print what changed between runs, the worst first, and how many changes there are."""
-    changes = readable(_by_weight(compared.changes))
+    changes = readable(_by_weight(compared.changes), len(compared.runs))
     if len(changes):
         names = [run.name for run in compared.runs]
         title = " → ".join(names) if len(names) == 2 else f"changes from {names[0]}"
-        print_frame(changes.head(MOST).drop(columns=_pair_columns(compared)), title, PRIORITY, rest=REST)
-    if len(changes) > MOST:
-        echo(f"{len(changes) - MOST} more changes: `{REST}` lists all of them")
+        print_frame(changes.head(40), title, PRIORITY, rest="--format csv")
+    if len(changes) > 40:
+        echo(f"{len(changes) - 40} more changes: `--format csv` lists all of them")
     echo(*compared.notes, f"{len(changes)} changes beyond a factor of {limit:g}, {compared.regressions} for the worse")
 
 
@@ -200,33 +190,29 @@ def _print_overview(compared: Comparison) -> None:
     """Print the runs, and how many cells moved by column."""
     from vibench.report.differences import ChangeKind
 
-    print_frame(compared.by_run, "runs", PRIORITY, every=True, rest=REST)
+    print_frame(compared.by_run, "runs", PRIORITY, every=True, rest="--format csv")
     echo("")
     names = [run.name for run in compared.runs]
     title = f"{names[1]} against {names[0]}" if len(names) == 2 else f"against {names[0]}"
     by_column = compared.by_column
     nobody = [verdict.value for verdict in ChangeKind if not by_column[verdict.value].any()]
-    columns = readable(by_column.drop(columns=nobody)).drop(columns=_pair_columns(compared))
-    print_frame(columns, f"cells by column, {title}", PRIORITY, rest=REST)
+    print_frame(
+        readable(by_column.drop(columns=nobody), len(names)), f"cells by column, {title}", PRIORITY, rest="--format csv"
+    )
     echo("")
 
 
-def readable(frame: pd.DataFrame) -> pd.DataFrame:
-    """A table with the two ends of an interval in one column, and without underscores in its headings."""
+def readable(frame: pd.DataFrame, runs: int) -> pd.DataFrame:
+    """A table with both ends of an interval in one column, and without the names of runs that its title has."""
     import pandas as pd
 
     from vibench.results.formats import cell_text
 
     ends = zip(frame["ratio_low"], frame["ratio_high"], strict=True)
     texts = ["" if pd.isna(low) else f"{cell_text(low)}–{cell_text(high)}" for low, high in ends]
-    shown = frame.drop(columns=["ratio_low", "ratio_high"])
+    shown = frame.drop(columns=["ratio_low", "ratio_high", *["run", "against"] * (runs == 2)])
     shown.insert(shown.columns.get_loc("ratio") + 1, "interval", texts)
     return shown.rename(columns={"farthest_ratio": "farthest ratio"})
-
-
-def _pair_columns(compared: Comparison) -> list[str]:
-    """Columns that name the runs of a pair; a title names a single pair."""
-    return ["run", "against"] if len(compared.runs) == 2 else []
 
 
 def _by_weight(changes: pd.DataFrame) -> pd.DataFrame:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -11,8 +10,8 @@ import typer
 from typer import Argument, Option
 
 from vibench.cli import output_commands
-from vibench.cli.completion import CORRECTIONS, formulations, names, solvers, studies, words
-from vibench.cli.console import echo, print_frame, run_argument
+from vibench.cli.completion import corrections, formulations, names, solvers, studies
+from vibench.cli.console import echo, print_frame, run_argument, warn
 from vibench.cli.result_commands import At, places_of
 from vibench.errors import RequestError, VibenchError
 from vibench.interrupts import INTERRUPTED, interrupted_at_once
@@ -21,10 +20,7 @@ from vibench.qp.status import Status
 from vibench.text import unbroken
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from vibench.execution.run import Outcome
-    from vibench.results.consistency import Violation
     from vibench.study.spec import Study
 
 Names = list[str] | None
@@ -45,7 +41,7 @@ def run_study_command(
     primal: Annotated[Names, Option(help="Replace the primal strategies.", autocompletion=names(PRIMAL))] = None,
     solver: Annotated[Names, Option(help="Replace the QP solvers.", autocompletion=solvers)] = None,
     correction: Annotated[
-        Names, Option(help="Replace the corrections of solutions.", autocompletion=words(lambda: CORRECTIONS))
+        Names, Option(help="Replace the corrections of solutions.", autocompletion=corrections)
     ] = None,
     pod_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the POD.")] = None,
     dual_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the dual strategies.")] = None,
@@ -84,7 +80,13 @@ def run_study_command(
         echo(*(f"{cell.key}  {cell}" for cell in cells), f"{len(cells)} cells")
         return
     if scheduler is not None:
-        _warn_of_open_scheduler(scheduler, executor)
+        from vibench.execution.executors import is_authenticated
+
+        if executor != "dask":
+            raise RequestError(f"--scheduler {scheduler} is for --executor dask")
+        if not is_authenticated(scheduler):
+            reason = "the connection is not authenticated: others who reach the scheduler can run code on its workers"
+            warn(f"{unbroken(scheduler)}: {reason}")
     folder = out or Path("runs") / loaded.name
     options = Options(jobs, fresh, retry, executor, scheduler, repeats)
     with ProgressDisplay() as progress:
@@ -108,8 +110,7 @@ def _conclude(name: str, outcome: Outcome, folder: Path, *, draw: int | None, fr
         raise typer.Exit(INTERRUPTED)
     statuses = [row["status"] for row in outcome.rows]
     nothing_ran = set(statuses) == {Status.UNAVAILABLE}
-    if not nothing_ran:
-        print_summary(name, path, outcome.rows)
+    whole = not nothing_ran and print_summary(name, path, outcome.rows)
     echo(f"results: {path}, tables: {folder / 'tables'}")
     if (fresh or draw is not None) and (folder / "figures").is_dir():
         from vibench.report import figures
@@ -119,20 +120,10 @@ def _conclude(name: str, outcome: Outcome, folder: Path, *, draw: int | None, fr
         raise VibenchError(f"no cell could run here: {reasons(outcome.rows)}")
     if draw is not None:
         output_commands.draw_run(path, folder / "figures", draw)
-    fine = statuses.count(Status.OK)
-    next_steps(folder, len(statuses), len(statuses) - fine, figures=draw is not None)
+    table = "this table again" if whole else f"all {len(statuses)} cells"
+    next_steps(folder, table, all_ok=set(statuses) == {Status.OK}, figures=draw is not None)
     if strict and any(status not in (Status.OK, Status.UNAVAILABLE) for status in statuses):
         raise typer.Exit(1)
-
-
-def _warn_of_open_scheduler(scheduler: str, executor: str) -> None:
-    from vibench.execution.executors import is_authenticated
-
-    if executor != "dask":
-        raise RequestError(f"--scheduler {scheduler} is for --executor dask")
-    if not is_authenticated(scheduler):
-        warning = "the connection is not authenticated: others who reach the scheduler can run code on its workers"
-        sys.stderr.write(f"vibench: {unbroken(scheduler)}: {warning}\n")
 
 
 def _study(request: str, key: str, overrides: dict[str, list[Any]], at: list[str] | None) -> Study:
@@ -154,53 +145,47 @@ def _study(request: str, key: str, overrides: dict[str, list[Any]], at: list[str
     return study_of_cell(cell, study.name, limits=study.limits, **rounds)
 
 
+# Reasons for which cells are not ok, and violated invariants, that are printed one by one.
 REASONS = 10
-"""Reasons for which cells are not ok that are printed."""
-
-WHOLE = 20
-"""Cells up to which the summary is printed whole."""
 
 Rows = Sequence[Mapping[str, Any]]
 
 
-def print_summary(study: str, path: Path, rows: Rows) -> None:
-    """Print the summary of a run, why cells are not ok, and violated invariants."""
-    from vibench.results import show
-    from vibench.results.consistency import sentence
-    from vibench.results.read import read_table
+def print_summary(study: str, path: Path, rows: Rows) -> bool:
+    """Print the summary of a run, why cells are not ok, and violated invariants.
+
+    Returns whether the summary has all cells; of more than 20 cells only the best are printed.
+    """
+    from vibench.results import consistency, show
+    from vibench.results.read import read_in_parts, read_table
 
     cells = read_table(path, "cells")
-    table = show.look_up(path, "summary" if len(cells) <= WHOLE else "best")
+    whole = len(cells) <= 20
+    table = show.look_up(path, "summary" if whole else "best")
     if len(table.rows):
-        title = study if len(cells) <= WHOLE else f"{study}, the fastest query at every error reached"
+        title = study if whole else f"{study}, the fastest query at every error reached"
         print_frame(table.readable, title, table.priority, axes=table.axes)
     elif len(cells):
         echo(table.view.empty)
-    not_ok = [row for row in rows if row["status"] != Status.OK]
     echo(*failures(rows, run_argument(path.parent)))
-    echo(f"{len(rows)} cells, {len(rows) - len(not_ok)} ok, {len(not_ok)} not ok")
-    queries, violations = _judged_queries(path, cells)
+    ok = sum(row["status"] == Status.OK for row in rows)
+    echo(f"{len(rows)} cells, {ok} ok, {len(rows) - ok} not ok")
+    kinds, queries = cells.set_index("cell")["enrichment_kind"], 0
+    violations: list[consistency.Violation] = []
+    # Queries are read in parts: a large run has more than memory holds.
+    for part in read_in_parts(path, "queries"):
+        queries += len(part)
+        violations += consistency.violations(part, kinds)
+    violations = consistency.added_up(violations)
     for violation in violations[:REASONS]:
         echo(f"invariant: {violation}; this is a bug of vibench or of a plugin's inner products")
     if violations[REASONS:]:
         echo(f"invariant: {len(violations) - REASONS} more like these")
     if queries and not violations:
         echo(f"invariants of the constants and the error bounds hold in all {queries} queries")
-    if agreement := sentence(read_table(path, "disagreements"), cells["solver"].nunique()):
+    if agreement := consistency.sentence(read_table(path, "disagreements"), cells["solver"].nunique()):
         echo(agreement)
-
-
-def _judged_queries(path: Path, cells: pd.DataFrame) -> tuple[int, list[Violation]]:
-    """Number of queries, and the invariants that they violate; queries may be more than memory holds."""
-    from vibench.results import consistency
-    from vibench.results.read import read_in_parts
-
-    kinds, count = cells.set_index("cell")["enrichment_kind"], 0
-    violations: list[Violation] = []
-    for part in read_in_parts(path, "queries"):
-        count += len(part)
-        violations += consistency.violations(part, kinds)
-    return count, consistency.added_up(violations)
+    return whole
 
 
 def failures(rows: Rows, run: str) -> Iterator[str]:
@@ -244,28 +229,18 @@ def reasons(rows: Rows) -> str:
     return "; ".join([*distinct[:REASONS], *more])
 
 
-def next_steps(folder: Path, cells: int, not_ok: int, *, figures: bool) -> None:
-    """Print the commands that show more of a run."""
+def next_steps(folder: Path, table: str, *, all_ok: bool, figures: bool) -> None:
+    """Print the commands that show more of a run, each with its purpose; the first one prints a `table`."""
     run = run_argument(folder)
-    steps = [(f"vibench show {run}", f"all {cells} cells" if cells > WHOLE else "this table again")]
-    if not_ok:
+    steps = [(f"vibench show {run}", table)]
+    if not all_ok:
         steps.append((f"vibench show {run} --columns cell,reason --where \"status != 'ok'\"", "what is not ok"))
     steps.append((f"vibench report {run}", "one HTML page: findings, tables, figures"))
     if not figures:
         steps.append((f"vibench figures {run}", "the figures as PNG and SVG"))
-    echo("next:", *aligned(steps))
-
-
-def aligned(steps: Iterable[tuple[str, str]]) -> list[str]:
-    """Commands and what they do, in two columns; a command that is too long for the first has a line of its own."""
-    steps = list(steps)
-    width = max([len(command) for command, _ in steps if len(command) <= SHORT_COMMAND], default=SHORT_COMMAND)
-    lines = []
-    for command, what in steps:
-        alone = len(command) > SHORT_COMMAND
-        lines += [f"  {command}", f"  {'':<{width}}  {what}"] if alone else [f"  {command:<{width}}  {what}"]
-    return lines
-
-
-SHORT_COMMAND = 36
-"""Characters of a command that others are aligned with: 80 columns have room for what it does beside it."""
+    # Beside 36 characters of a command 80 columns have room for its purpose; a longer command has its own line.
+    width = max((len(command) for command, _ in steps if len(command) <= 36), default=36)
+    echo("next:")
+    for command, purpose in steps:
+        first = f"  {command:<{width}}" if len(command) <= 36 else f"  {command}\n  {'':<{width}}"
+        echo(*f"{first}  {purpose}".split("\n"))

@@ -14,12 +14,6 @@ from vibench.plugins.kinds import SOLVER, STUDY, PluginKind
 from vibench.plugins.registry import find
 from vibench.provenance import distribution_version
 
-NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
-MAX_LENGTH = 40
-
-RESERVED = ("problems", "strategies")
-"""Names whose packages would have the names of those that come with vibench."""
-
 
 def write_package(kind: PluginKind, name: str, parent: Path) -> Path:
     """Write a package with one plugin, completely or not at all; returns its folder `parent/vibench-NAME`.
@@ -30,11 +24,27 @@ def write_package(kind: PluginKind, name: str, parent: Path) -> Path:
     be written.
     """
     check_name(kind, name)
-    return _write(parent / f"vibench-{name}", _contents(kind, name))
-
-
-STARTS = ("study", "pack")
-"""What can be begun beside plugins: a study file, and the folder of a model pack."""
+    package, word = _package(name), kind.cli_name
+    camel, snake = "".join(word.capitalize() for word in name.split("-")), name.replace("-", "_")
+    words = {
+        "name": name,
+        "package": package,
+        "module": kind.module,
+        "cls": f"solve_{snake}" if kind is SOLVER else camel + word.capitalize(),
+        "kind": word,
+        "title": str(kind),
+        "group": kind.entry_points,
+        "test": snake,
+        "version": distribution_version("vibench"),
+    }
+    sources = {
+        "pyproject.toml": "pyproject.toml",
+        "README.md": f"README-{word}.md",
+        f"src/{package}/__init__.py": "__init__.py",
+        f"src/{package}/{kind.module}.py": f"{word}.py",
+        f"tests/test_{snake}.py": f"test_{word}.py",
+    }
+    return _write(parent / f"vibench-{name}", {path: _filled(source, words) for path, source in sources.items()})
 
 
 def write_start(what: str, name: str, parent: Path) -> Path:
@@ -59,6 +69,7 @@ def _write(target: Path, contents: Mapping[str, str]) -> Path:
         parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RequestError(f"--out '{parent}' cannot be made: {error.strerror or error}") from None
+    # A draft is renamed when it is complete, so that a full disk leaves nothing half written.
     try:
         with tempfile.TemporaryDirectory(dir=parent, prefix=".vibench-new-") as scratch:
             draft = Path(scratch) / target.name
@@ -74,17 +85,18 @@ def _write(target: Path, contents: Mapping[str, str]) -> Path:
 def check_name(kind: PluginKind, name: str) -> None:
     """Raise a `RequestError` for a name that no package can have, or that another plugin of the kind has."""
     _check_words(name, "plugin", kind.cli_name)
-    if name in RESERVED:
+    # Packages of these names would take the place of those that come with vibench.
+    if name in ("problems", "strategies"):
         raise RequestError(f"'{name}' cannot be the name of a plugin: vibench itself has a package of that name")
     if origin := find(kind, name).origin:
         raise RequestError(f"there is a {kind} '{name}' already, in {origin}; choose another name")
 
 
 def _check_words(name: str, what: str, such_as: str) -> None:
-    if not NAME.fullmatch(name) or len(name) > MAX_LENGTH:
+    if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", name) or len(name) > 40:
         raise RequestError(
             f"'{name}' cannot be the name of a {what}: expected lower case letters and digits, in words joined by '-', "
-            f"a letter first, {MAX_LENGTH} characters at most, such as 'my-{such_as}'"
+            f"a letter first, 40 characters at most, such as 'my-{such_as}'"
         )
 
 
@@ -97,33 +109,6 @@ def _package(name: str) -> str:
     return f"vibench_{name.replace('-', '_')}"
 
 
-def _contents(kind: PluginKind, name: str) -> dict[str, str]:
-    """Texts of the files of a package by path."""
-    package, word = _package(name), kind.cli_name
-    camel, snake = "".join(word.capitalize() for word in name.split("-")), name.replace("-", "_")
-    words = {
-        "name": name,
-        "package": package,
-        "module": kind.module,
-        "cls": f"solve_{snake}" if kind is SOLVER else camel + word.capitalize(),
-        "kind": word,
-        "title": str(kind),
-        "group": kind.entry_points,
-        "test": snake,
-        "column": f"{snake}_speed_up",
-        "version": distribution_version("vibench"),
-    }
-    sources = {
-        "pyproject.toml": "pyproject.toml",
-        "README.md": f"README-{word}.md",
-        f"src/{package}/__init__.py": "__init__.py",
-        f"src/{package}/{kind.module}.py": f"{word}.py",
-        f"tests/test_{words['test']}.py": f"test_{word}.py",
-    }
-    return {path: _filled(source, words) for path, source in sources.items()}
-
-
 def _filled(template: str, words: Mapping[str, str]) -> str:
-    """The text of a template with its words."""
     text = (files("vibench.cli") / "templates" / f"{template}.template").read_text(encoding="utf-8")
     return Template(text).substitute(words)

@@ -13,7 +13,7 @@ from samples import cell_row
 
 from vibench.cli.console import run_argument
 from vibench.cli.main import app
-from vibench.cli.run_command import REASONS, WHOLE, failures, next_steps, print_summary
+from vibench.cli.run_command import REASONS, failures, next_steps, print_summary
 from vibench.results.database import ResultsDatabase
 from vibench.results.ranking import NO_BEST_CELL
 from vibench.results.sqlite import FILE
@@ -69,12 +69,12 @@ def test_a_run_of_which_no_cell_is_the_best_says_why(
     tmp_path: Path, main: Main, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """At the end of the run, and where the best cells are asked for; not for rows that were not asked for."""
-    rows = [row(f"c{k}", "broke") for k in range(WHOLE + 1)]
+    rows = [row(f"c{k}", "broke") for k in range(21)]
     made = ResultsDatabase(tmp_path / "run", {"name": "sample"})
     for one in rows:
         made.write_cell(one, [])
     made.close()
-    print_summary("sample", tmp_path / "run" / FILE, rows)
+    assert not print_summary("sample", tmp_path / "run" / FILE, rows)
     assert NO_BEST_CELL in capsys.readouterr().out.splitlines()
     code, out, _ = main("show", str(tmp_path / "run"), "--table", "best")
     assert code == 0
@@ -113,7 +113,7 @@ def test_rows_that_differ_in_options_alone_say_which(
 
 def test_what_to_do_next_are_commands(capsys: pytest.CaptureFixture[str]) -> None:
     group: Any = typer.main.get_command(app)
-    next_steps(Path("a folder's"), 36, 3, figures=False)
+    next_steps(Path("a folder's"), "this table again", all_ok=False, figures=False)
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  vibench ")]
     assert len(lines) == 4
     for line in lines:
@@ -126,7 +126,7 @@ def test_what_to_do_next_are_commands(capsys: pytest.CaptureFixture[str]) -> Non
 @pytest.mark.parametrize("length", range(1, 27))
 def test_what_to_do_next_fits_80_columns(length: int, capsys: pytest.CaptureFixture[str]) -> None:
     """A command alone may be longer: it stays one line to copy."""
-    next_steps(Path("r" * length), 36, 3, figures=False)
+    next_steps(Path("r" * length), "this table again", all_ok=False, figures=False)
     lines = capsys.readouterr().out.splitlines()
     assert max(len(line) for line in lines if not line.endswith("\"status != 'ok'\"")) <= 80
     assert [line.strip() for line in lines].count("what is not ok") == 1
