@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Literal
 
 import typer
 from typer import Argument, Exit, Option
@@ -15,17 +14,6 @@ from vibench.cli.completion import cells, runs
 from vibench.cli.console import echo, run_argument
 from vibench.cli.result_commands import At, RunArgument, places_of
 from vibench.errors import RequestError
-
-if TYPE_CHECKING:
-    from vibench.model.chebyshev import AffinePolynomial
-
-
-class FigureFormat(StrEnum):
-    """Formats of figures."""
-
-    PNG = "png"
-    SVG = "svg"
-    PDF = "pdf"
 
 
 def write_report(
@@ -52,7 +40,8 @@ def draw_figures(
     ],
     out: Annotated[Path | None, Option(metavar="DIR", help="Folder; RUN/figures by default.")] = None,
     formats: Annotated[
-        list[FigureFormat] | None, Option("--format", help="Format (repeatable); PNG and SVG by default.")
+        list[Literal["png", "svg", "pdf"]] | None,
+        Option("--format", help="Format (repeatable); png and svg by default."),
     ] = None,
     jobs: Annotated[int, Option("--jobs", "-j", min=0, help="Processes; 0 for one per core.")] = 0,
 ) -> None:
@@ -69,7 +58,7 @@ def draw_figures(
 
 
 def draw_run(path: Path, folder: Path, jobs: int, formats: tuple[str, ...] = ("png", "svg")) -> None:
-    """Draw all figures of a results file and say so; Ctrl-C leaves those that are drawn, and the results."""
+    """Draw all figures of a results file; Ctrl-C leaves the results and the figures that are drawn."""
     from vibench import provenance
     from vibench.library.progress import DrawingDisplay
     from vibench.report import figures
@@ -188,19 +177,24 @@ def _export_model(
     exported = export_model(
         model, file, TOLERANCE if tolerance is None else tolerance, bases=bases, c=target.suffix == ".c"
     )
-    echo(*(f"{name}: {_member_in_words(member)}" for name, member in exported.members.items()))
+    for name, member in exported.members.items():
+        terms = f"{len(member.terms)} term{'s' * (len(member.terms) > 1)}"
+        form = f"{terms}, polynomials of degree ({', '.join(map(str, member.degrees))})"
+        echo(f"{name}: {form if any(member.degrees) else 'constant'}, relative error {member.error:.1e}")
     echo(f"relative errors are those at {MEASURED} random parameters and at the corners of the box")
     if exported.about["solver"] != model.solver:
         echo(f"the cell's solver is {model.solver}, the script solves by {exported.about['solver']}")
     why = exported.about["no_bounds"]
-    has_bounds = not why
-    echo(f"error bounds: {exported.about['certificate']}" if has_bounds else f"no error bounds: {why}")
-    echo(*_outputs_in_words(exported.about["outputs"]))
+    echo(f"no error bounds: {why}" if why else f"error bounds: {exported.about['certificate']}")
+    outputs = exported.about["outputs"]
+    held, others = ", ".join(output["name"] for output in outputs["linear"]), ", ".join(outputs["left_out"])
+    if held or others:
+        echo(f"outputs: {held or 'none'}{f'; code that the file cannot hold computes {others}' * bool(others)}")
     echo(exported_seconds.in_words(model, file))
-    beside = [file.with_name(BOUNDS)] if has_bounds else []
+    beside = [] if why else [file.with_name(BOUNDS)]
     sources = [file.with_suffix(end) for end in (".c", ".h") if target.suffix == ".c"]
     written = ", ".join(map(str, [file, file.with_name(RUNTIME), *beside, *sources]))
-    script = Path(BOUNDS if has_bounds else RUNTIME).stem
+    script = Path(RUNTIME if why else BOUNDS).stem
     echo(f"{written}: `from {script} import Model`, then `Model({str(file)!r}).solve(mu)`")
 
 
@@ -214,18 +208,3 @@ def _export_fields(run: str, cell: str, mu: str, file: Path, places: Mapping[str
         raise RequestError(f"--mu is {mu!r}, expected numbers separated by commas, such as 1.2,0.05") from None
     export_vtu(open_run(run, at=places).model(cell), components, file)
     echo(f"u, λ and their errors at mu = {components}: {file}")
-
-
-def _outputs_in_words(outputs: Mapping[str, Any]) -> list[str]:
-    """A line on which quantities of interest are exported, none where there are none."""
-    names, others = ", ".join(output["name"] for output in outputs["linear"]), ", ".join(outputs["left_out"])
-    beside = f"; code that the file cannot hold computes {others}" if others else ""
-    return [f"outputs: {names or 'none'}{beside}"] if names or others else []
-
-
-def _member_in_words(member: AffinePolynomial) -> str:
-    if not any(member.degrees):
-        return f"constant, relative error {member.error:.1e}"
-    degrees = ", ".join(map(str, member.degrees))
-    count = len(member.terms)
-    return f"{count} term{'s' * (count > 1)}, polynomials of degree ({degrees}), relative error {member.error:.1e}"

@@ -57,7 +57,7 @@ def pack(
         from vibench.packs.checks import read_model_pack
 
         checked = read_model_pack(folder)
-        echo(*_description(checked), *_uses(checked, folder))
+        echo(*_contents(checked), *_uses(checked, folder))
 
 
 def _write(problem: str, folder: Path, options: dict[str, Any], validation: int, seed: int, solutions: bool) -> None:
@@ -114,8 +114,8 @@ def _reduce_cones(folder: Path, dual: list[str], dual_tol: float, out: Path) -> 
     echo(f"table: {table}, figures: {', '.join(map(str, drawn))}")
 
 
-def _description(pack: ModelPack) -> Iterator[str]:
-    """What a pack holds."""
+def _contents(pack: ModelPack) -> Iterator[str]:
+    """Sizes, members, parameters and reference solutions of a pack."""
     manifest, d = pack.manifest, pack.box.dim
     yield f"{manifest.name or 'model pack'}{': ' * bool(manifest.description)}{manifest.description}"
     sizes = f"{pack.W.dim} multipliers" if pack.V is None else f"{pack.V.dim} unknowns, {pack.W.dim} multipliers"
@@ -126,46 +126,35 @@ def _description(pack: ModelPack) -> Iterator[str]:
     if pack.outputs:
         yield f"  outputs: {', '.join(f'{output.name} [{output.unit}]' for output in pack.outputs)}"
     if pack.reference is not None:
-        worst = pack.residual
-        checked = (
-            "not checked, since u or the operators are missing" if worst is None else f"KKT residuals up to {worst:.0e}"
-        )
+        unchecked = "not checked, since u or the operators are missing"
+        checked = unchecked if pack.residual is None else f"KKT residuals up to {pack.residual:.0e}"
         yield f"  reference solutions: {pack.reference.lam.shape[1]}, {checked}"
 
 
 def _uses(pack: ModelPack, folder: Path) -> Iterator[str]:
-    """What can be done with a pack."""
+    """The table of a study file that names a pack, how it is assembled, and where that is inaccurate."""
+    from vibench.model.affine import INTERPOLATION_RTOL, MISSED
+
     if pack.members:
-        path = json.dumps(str(folder), ensure_ascii=False)
         most = "" if pack.validation is None else f", with validation = {len(pack.validation)} at most"
         yield f"it can be run as a problem of a study{most}:"
         yield "  [[problem]]"
         yield '  name = "pack"'
-        yield f"  options = {{ path = {path} }}"
-        yield _assembly_in_words(pack)
-        yield from _interpolation(pack)
+        # JSON quotes a path as TOML does.
+        yield f"  options = {{ path = {json.dumps(str(folder), ensure_ascii=False)} }}"
+        summed, interpolated = sorted(pack.affine), sorted(pack.entrywise - set(pack.affine))
+        ways = [f"interpolates {', '.join(interpolated)}"] * bool(interpolated)
+        ways += [f"sums the terms of {', '.join(summed)}"] * bool(summed)
+        where = "anywhere in the box" if pack.everywhere else "at its listed parameters only"
+        yield f"it is evaluated {where}" + f"; reduced assembly {' and '.join(ways)}" * bool(ways)
+        for name, error in pack.interpolation_errors(INTERPOLATION_RTOL).items():
+            if error > MISSED * INTERPOLATION_RTOL:
+                yield (
+                    f"warning: {name}, interpolated over {len(pack.training)} training parameters to "
+                    f"{INTERPOLATION_RTOL:g}, has an error of {error:.1e} at the listed validation parameters: "
+                    "use full assembly, or list more"
+                )
     if pack.reference is not None:
         yield f"its multipliers give cones: vibench pack {folder} --cones"
     if not pack.members:
         yield "it has no operators: a study, whose primal half needs them, cannot run it"
-
-
-def _interpolation(pack: ModelPack) -> Iterator[str]:
-    """Which members reduced assembly gets wrong between the training parameters."""
-    from vibench.model.affine import INTERPOLATION_RTOL, MISSED
-
-    for name, error in pack.interpolation_errors(INTERPOLATION_RTOL).items():
-        if error > MISSED * INTERPOLATION_RTOL:
-            yield (
-                f"warning: {name}, interpolated over {len(pack.training)} training parameters to "
-                f"{INTERPOLATION_RTOL:g}, has an error of {error:.1e} at the listed validation parameters: "
-                "use full assembly, or list more"
-            )
-
-
-def _assembly_in_words(pack: ModelPack) -> str:
-    summed, interpolated = sorted(pack.affine), sorted(pack.entrywise - set(pack.affine))
-    ways = [f"interpolates {', '.join(interpolated)}"] * bool(interpolated)
-    ways += [f"sums the terms of {', '.join(summed)}"] * bool(summed)
-    where = "anywhere in the box" if pack.everywhere else "at its listed parameters only"
-    return f"it is evaluated {where}" + f"; reduced assembly {' and '.join(ways)}" * bool(ways)
