@@ -56,38 +56,31 @@ WRONG: Mapping[str, tuple[tuple[str | int, ...], Any, tuple[str, ...]]] = {
     "name that leaves the folder": (("name",), "../elsewhere", ("name", "letters")),
     "name that hides": (("name",), ".hidden", ("name", "letters")),
     "seed negative": (("seed",), -1, ("seed", "greater than or equal to 0", "-1")),
-    "seed no integer": (("seed",), 1.5, ("seed", "integer", "1.5")),
     "seed a truth value": (("seed",), True, ("seed", "integer")),
     "seed text": (("seed",), "7", ("seed", "integer", "'7'")),
     "seed beyond what a table holds": (("seed",), 2**63, ("seed", "less")),
     "validation missing": (("validation",), REMOVE, ("validation", "required")),
     "validation zero": (("validation",), 0, ("validation", "greater than or equal to 1")),
     "accuracy nan": (("accuracy",), float("nan"), ("accuracy", "finite")),
-    "accuracy inf": (("accuracy",), float("inf"), ("accuracy", "finite")),
     "accuracy zero": (("accuracy",), 0.0, ("accuracy", "greater than")),
-    "accuracy negative": (("accuracy",), -1e-7, ("accuracy", "greater than")),
     "accuracy too loose": (("accuracy",), 0.5, ("accuracy", "less than")),
     "accuracies none": (("accuracy",), [], ("accuracy", "at least 1")),
     "accuracies with one too loose": (("accuracy",), [1e-7, 0.5], ("accuracy.1", "less than", "0.5")),
     "solvers missing": (("solvers",), REMOVE, ("solvers", "required")),
     "solvers empty": (("solvers",), [], ("solvers", "at least 1")),
     "solvers one word": (("solvers",), "piqp", ("solvers", "'available'", "list", "'piqp'")),
-    "solvers a number": (("solvers",), 3, ("solvers", "'available'", "list")),
     "solvers of numbers": (("solvers",), [3], ("solvers", "string")),
     "correction unknown": (("correction",), ["all"], ("correction", "'none', 'feasible' or 'auto'", "'all'")),
     "correction empty": (("correction",), [], ("correction", "at least 1")),
     "solver unknown": (("solvers",), ["pipq"], ("QP solver", "'pipq'", "did you mean 'piqp'")),
     "dual missing": (("dual",), REMOVE, ("dual", "required")),
     "dual empty": (("dual",), [], ("dual", "at least 1")),
-    "dual no list": (("dual",), "cpg", ("dual", "list", "'cpg'")),
-    "dual of numbers": (("dual",), [1], ("dual.0", "found 1")),
     "dual unknown": (("dual",), ["mcgp"], ("dual strategy", "'mcgp'", "did you mean 'mcpg'")),
     "dual without name": (("dual",), [{"label": "x"}], ("dual.0.name", "required")),
     "dual label a number": (("dual",), [{"name": "cpg", "label": 3}], ("dual.0.label", "string")),
     "dual options no table": (("dual",), [{"name": "cpg", "options": 3}], ("dual.0.options", "found 3")),
     "dual with options it has not": (("dual",), [{"name": "cpg", "options": {"x": 1}}], ("dual strategy 'cpg'", "'x'")),
     "dual with a mistyped key": (("dual",), [{"name": "cpg", "lable": "x"}], ("'lable'", "did you mean 'label'")),
-    "primal empty": (("primal",), [], ("primal", "at least 1")),
     "primal unknown": (("primal",), ["decorelated"], ("primal strategy", "did you mean 'decorrelated'")),
     "assembly unknown": (("assembly",), ["fast"], ("assembly.0", "'full'", "'fast'")),
     "assembly empty": (("assembly",), [], ("assembly", "at least 1")),
@@ -99,25 +92,18 @@ WRONG: Mapping[str, tuple[tuple[str | int, ...], Any, tuple[str, ...]]] = {
     "option out of range": (("problem", 0, "options"), {"length": -1.0}, ("length", "-1.0", "float > 0")),
     "option of no choice": (("problem", 0, "options"), {"resolution": "huge"}, ("resolution", "'huge'", "'coarse'")),
     "option too small": (("problem", 0, "options"), {"resolution": 5}, ("resolution", "5", "int ≥ 150")),
-    "option nan": (("problem", 0, "options"), {"load": float("nan")}, ("load", "nan", "float")),
     "option a date": (("problem", 0, "options"), {"load": datetime.date(2022, 1, 1)}, ("load", "float")),
     "tolerances missing": (("tolerances",), REMOVE, ("tolerances", "required")),
     "tolerances empty": (("tolerances",), [], ("tolerances", "at least 1")),
     "tolerances no list": (("tolerances",), {"pod": [1e-3]}, ("tolerances", "list")),
     "pod nan": ((*TABLE, "pod"), [float("nan")], ("tolerances.0.pod.0", "finite")),
-    "pod inf": ((*TABLE, "pod"), [1e-3, float("inf")], ("tolerances.0.pod.1", "finite")),
     "pod zero": ((*TABLE, "pod"), [0.0], ("tolerances.0.pod.0", "greater than 0")),
-    "pod negative": ((*TABLE, "pod"), [-1e-3], ("tolerances.0.pod.0", "greater than 0", "-0.001")),
     "pod one": ((*TABLE, "pod"), [1.0], ("tolerances.0.pod.0", "less than 1")),
     "pod text": ((*TABLE, "pod"), ["small"], ("tolerances.0.pod.0", "number", "'small'")),
     "pod no list": ((*TABLE, "pod"), 1e-3, ("tolerances.0.pod", "list", "0.001")),
-    "pod empty": ((*TABLE, "pod"), [], ("tolerances.0.pod", "at least 1")),
     "pod missing": ((*TABLE, "pod"), REMOVE, ("tolerances.0", "'pod'", "'N'")),
     "pod and N": ((*TABLE, "N"), [3], ("tolerances.0", "either 'pod'", "'N'")),
     "dual tolerance nan": ((*TABLE, "dual"), [float("nan")], ("tolerances.0.dual", "finite")),
-    "dual tolerance zero": ((*TABLE, "dual"), [0.0], ("tolerances.0.dual", "greater than 0")),
-    "dual tolerances empty": ((*TABLE, "dual"), [], ("tolerances.0.dual", "at least 1")),
-    "dual tolerance text": ((*TABLE, "dual"), "tight", ("tolerances.0.dual", "list", "'tight'")),
     "dual tolerance missing": ((*TABLE, "dual"), REMOVE, ("tolerances.0", "'dual'", "'R'")),
     "dual tolerance and R": ((*TABLE, "R"), [3], ("tolerances.0", "either 'dual'", "'R'")),
     "dual tolerance of one strategy": (
@@ -125,10 +111,8 @@ WRONG: Mapping[str, tuple[tuple[str | int, ...], Any, tuple[str, ...]]] = {
         {"cpg": [0.0]},
         ("tolerances.0.dual", "cpg", "greater than 0"),
     ),
-    "no dual tolerance for one": ((*TABLE, "dual"), {"cpg": []}, ("tolerances.0.dual", "cpg", "at least 1")),
     "dual tolerance of a stranger": ((*TABLE, "dual"), {"mcgp": [0.1]}, ("dual strategy", "did you mean 'mcpg'")),
     "primal tolerance zero": ((*TABLE, "primal"), {"offline-pga": [0.0]}, ("primal.offline-pga.0", "greater than 0")),
-    "primal tolerances empty": ((*TABLE, "primal"), {"offline-pga": []}, ("primal.offline-pga", "at least 1")),
     "primal tolerance of a stranger": ((*TABLE, "primal"), {"offline-gpa": [0.5]}, ("did you mean 'offline-pga'",)),
     "primal tolerance for one that takes none": (
         (*TABLE, "primal"),
@@ -138,7 +122,6 @@ WRONG: Mapping[str, tuple[tuple[str | int, ...], Any, tuple[str, ...]]] = {
     "primal tolerance for nobody": ((*TABLE, "primal"), [0.5], ("tolerances.0.primal",)),
     "limits no table": (("limits",), 3, ("limits", "found 3")),
     "limit zero": (("limits",), {"query_seconds": 0.0}, ("limits.query_seconds", "greater than 0")),
-    "limit inf": (("limits",), {"cell_seconds": float("inf")}, ("limits.cell_seconds", "finite")),
     "limit text": (("limits",), {"memory_gib": "8"}, ("limits.memory_gib", "number", "'8'")),
     "limit beyond every machine": (("limits",), {"memory_gib": 1e300}, ("limits.memory_gib", "less than")),
     "limit unknown": (("limits",), {"query_second": 1.0}, ("'query_second'", "did you mean 'query_seconds'")),
@@ -149,70 +132,42 @@ WRONG: Mapping[str, tuple[tuple[str | int, ...], Any, tuple[str, ...]]] = {
 }
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_what_is_wrong_is_said_in_one_line(case: str, tmp_path: Path) -> None:
-    where, value, words = WRONG[case]
-    path = write_study(tmp_path, changed(STUDY, *where, to=value))
-    line = refusal(path)
-    assert line.startswith(f"{path}: ")
-    message = line.removeprefix(path)
-    assert [word for word in words if word.lower() not in message.lower()] == [], line
-    assert [word for word in JARGON if word in message] == [], line
+def test_what_is_wrong_is_said_in_one_line(tmp_path: Path) -> None:
+    cases = [(changed(STUDY, *where, to=value), words) for where, value, words in WRONG.values()]
+    for size, tolerance in (("N", "pod"), ("R", "dual")):
+        for value, word in (([0], "greater than"), ([1.5], "integer"), ([], "at least 1")):
+            content = changed(changed(STUDY, *TABLE, tolerance, to=REMOVE), *TABLE, size, to=value)
+            cases.append((content, (f"tolerances.0.{size}", word)))
+    cases.append((changed(STUDY, "see\nd", to=1), ("did you mean 'seed'",)))
+    for content, words in cases:
+        path = write_study(tmp_path, content)
+        line = refusal(path)
+        assert line.startswith(f"{path}: ")
+        message = line.removeprefix(path)
+        assert [word for word in words if word.lower() not in message.lower()] == [], line
+        assert [word for word in JARGON if word in message] == [], line
 
 
-@pytest.mark.parametrize("size", ["N", "R"])
-@pytest.mark.parametrize(("value", "words"), [([0], "greater than"), ([1.5], "integer"), ([], "at least 1")])
-def test_prescribed_sizes_are_positive_integers(size: str, value: list[Any], words: str, tmp_path: Path) -> None:
-    tolerance = {"N": "pod", "R": "dual"}[size]
-    content = changed(changed(STUDY, *TABLE, tolerance, to=REMOVE), *TABLE, size, to=value)
-    line = refusal(write_study(tmp_path, content))
-    assert f"tolerances.0.{size}" in line
-    assert words in line
-    assert [word for word in JARGON if word in line] == [], line
+def test_a_key_in_the_wrong_place_is_not_suggested_again(tmp_path: Path) -> None:
+    places = (((), "pod"), ((), "resolution"), (("limits",), "seed"), (TABLE, "name"))
+    for where, key in places:
+        line = refusal(write_study(tmp_path, changed(changed(STUDY, "limits", to={}), *where, key, to=1)))
+        assert f"'{key}'" in line
+        assert f"did you mean '{key}'" not in line
 
 
-@pytest.mark.parametrize(("where", "key"), [((), "pod"), ((), "resolution"), (("limits",), "seed"), (TABLE, "name")])
-def test_a_key_in_the_wrong_place_is_not_suggested_again(
-    where: tuple[str | int, ...], key: str, tmp_path: Path
-) -> None:
-    content = changed(STUDY, "limits", to={})
-    line = refusal(write_study(tmp_path, changed(content, *where, key, to=1)))
-    assert f"'{key}'" in line
-    assert f"did you mean '{key}'" not in line
-
-
-def test_a_key_of_two_lines_is_refused_in_one(tmp_path: Path) -> None:
-    assert "did you mean 'seed'" in refusal(write_study(tmp_path, changed(STUDY, "see\nd", to=1)))
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    path = str(tmp_path / "nowhere.toml")
-    line = refusal(path)
-    assert path in line
-    assert "does not exist" in line
-
-
-@pytest.mark.parametrize("name", ["folder", "folder.toml"])
-def test_a_folder_is_no_study(name: str, tmp_path: Path) -> None:
-    (tmp_path / name).mkdir()
-    line = refusal(str(tmp_path / name))
-    assert name in line
-    assert "not a file" in line
-
-
-def test_an_unknown_study_is_named_with_the_nearest() -> None:
+def test_what_is_no_file_of_a_study_is_refused(tmp_path: Path) -> None:
+    missing = str(tmp_path / "nowhere.toml")
+    assert f"'{missing}' does not exist" in refusal(missing)
+    for name in ("folder", "folder.toml"):
+        (tmp_path / name).mkdir()
+        assert f"{name}' is not a file" in refusal(str(tmp_path / name))
     assert "did you mean 'quick'" in refusal("qiuck")
-
-
-def test_a_name_too_long_for_a_file_is_refused() -> None:
-    assert "study" in refusal("a" * 300)
-
-
-@pytest.mark.parametrize("content", [b"\x00\x01\xff\xfe", b"\x89PNG\r\n\x1a\n", b"name = 'gr\xf6sse'"])
-def test_a_binary_file_is_refused(content: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "study.toml"
-    path.write_bytes(content)
-    assert refusal(str(path)).startswith(f"{path}: ")
+    assert "study" in refusal("a" * 300)  # too long for the name of a file
+    for content in (b"\x00\x01\xff\xfe", b"\x89PNG\r\n\x1a\n", b"name = 'gr\xf6sse'"):
+        path = tmp_path / "study.toml"
+        path.write_bytes(content)
+        assert refusal(str(path)).startswith(f"{path}: ")
 
 
 INVALID = {
@@ -226,17 +181,13 @@ INVALID = {
 }
 
 
-@pytest.mark.parametrize("case", INVALID)
-def test_invalid_toml_is_refused_with_the_file(case: str, tmp_path: Path) -> None:
+def test_invalid_toml_is_refused_with_the_file(tmp_path: Path) -> None:
     path = tmp_path / "study.toml"
-    path.write_text(INVALID[case])
-    line = refusal(str(path))
-    assert line.startswith(f"{path}: ")
-    assert "TOML" in line
-
-
-def test_invalid_toml_says_where(tmp_path: Path) -> None:
-    path = tmp_path / "study.toml"
+    for text in INVALID.values():
+        path.write_text(text)
+        line = refusal(str(path))
+        assert line.startswith(f"{path}: ")
+        assert "TOML" in line
     path.write_text('name = "a"\nseed = = 3\n')
     assert "line 2" in refusal(str(path))
 
@@ -268,27 +219,14 @@ def test_overrides_replace_whole_axes(tmp_path: Path) -> None:
     assert study.correction == ["auto"]
 
 
-def test_overrides_keep_the_options_of_the_entry(tmp_path: Path) -> None:
+def test_overrides_keep_entries_with_their_name_or_label(tmp_path: Path) -> None:
     study = read_study(write_study(tmp_path), {"problem": ["obstacle"]})
     assert study.problem[0].options == {"resolution": "coarse"}
-
-
-def test_overrides_find_entries_by_label(tmp_path: Path) -> None:
-    entries = [
-        {"name": "obstacle", "label": "small", "options": {"resolution": "coarse"}},
-        {"name": "obstacle", "label": "large", "options": {"resolution": "paper"}},
-    ]
-    path = write_study(tmp_path, changed(STUDY, "problem", to=entries))
-    study = read_study(path, {"problem": ["large"]})
-    assert [(entry.title, entry.options["resolution"]) for entry in study.problem] == [("large", "paper")]
-
-
-def test_an_override_keeps_every_entry_with_its_name(tmp_path: Path) -> None:
     entries = [{"name": "obstacle", "label": size, "options": {"resolution": size}} for size in ("coarse", "medium")]
-    study = read_study(
-        write_study(tmp_path, changed(STUDY, "problem", to=[*entries, "hertz"])), {"problem": ["obstacle"]}
-    )
-    assert [entry.title for entry in study.problem] == ["coarse", "medium"]
+    path = write_study(tmp_path, changed(STUDY, "problem", to=[*entries, "hertz"]))
+    assert [entry.title for entry in read_study(path, {"problem": ["obstacle"]}).problem] == ["coarse", "medium"]
+    (medium,) = read_study(path, {"problem": ["medium"]}).problem
+    assert (medium.title, medium.options) == ("medium", {"resolution": "medium"})
 
 
 def test_overrides_replace_tolerances_in_every_table(tmp_path: Path) -> None:
@@ -310,44 +248,30 @@ def test_overrides_leave_the_other_axes_alone(tmp_path: Path) -> None:
     assert replaced.tolerances[0].dual == plain.tolerances[0].dual
 
 
-@pytest.mark.parametrize("there", [{}, {"primal": {}}])
-def test_a_strategy_and_its_tolerance_can_both_be_given_by_overrides(there: dict[str, Any], tmp_path: Path) -> None:
-    content = changed(STUDY, "tolerances", to=[{"pod": [1e-3], "dual": [1e-1]} | there])
-    path = write_study(tmp_path, changed(content, "primal", to=["decorrelated"]))
-    cells = expand(read_study(path, {"primal": ["offline-pga"], "primal_tol": [0.5]}))
-    assert {cell.primal_tol for cell in cells} == {0.5}
-
-
-def test_an_override_replaces_the_tolerance_of_a_strategy_the_table_leaves_out(tmp_path: Path) -> None:
+def test_a_strategy_and_its_tolerance_can_both_be_given_by_overrides(tmp_path: Path) -> None:
+    for table in ({}, {"primal": {}}):
+        content = changed(STUDY, "tolerances", to=[{"pod": [1e-3], "dual": [1e-1]} | table])
+        path = write_study(tmp_path, changed(content, "primal", to=["decorrelated"]))
+        cells = expand(read_study(path, {"primal": ["offline-pga"], "primal_tol": [0.5]}))
+        assert {cell.primal_tol for cell in cells} == {0.5}
     content = changed(STUDY, *TABLE, "dual", to={"cpg": [0.1]})
     cells = expand(read_study(write_study(tmp_path, content), {"dual": ["mcpg"], "dual_tol": [0.2]}))
     assert {(cell.dual.name, cell.cone.tolerance) for cell in cells} == {("mcpg", 0.2)}
 
 
-@pytest.mark.parametrize(
-    ("overrides", "words"),
-    [
-        ({"pod": [float("nan")]}, ("pod", "finite")),
-        ({"dual_tol": [0.0]}, ("dual", "greater than 0")),
-        ({"primal_tol": [-1.0]}, ("primal", "greater than 0")),
-        ({"solvers": ["oqsp"]}, ("oqsp", "did you mean 'osqp'")),
-        ({"problem": ["obstcale"]}, ("did you mean 'obstacle'",)),
-        ({"primal": ["decorelated"]}, ("did you mean 'decorrelated'",)),
-    ],
-)
-def test_wrong_overrides_are_refused_and_said_to_be_overrides(
-    overrides: dict[str, Any], words: tuple[str, ...], tmp_path: Path
-) -> None:
-    line = refusal(write_study(tmp_path), overrides)
-    assert "options of the command line" in line
-    assert [word for word in words if word not in line] == [], line
-
-
-@pytest.mark.parametrize("name", ["quick", "paper-obstacle"])
-def test_the_registered_studies_load(name: str) -> None:
-    study = read_study(name)
-    assert study.name == name
-    assert expand(study)
+def test_wrong_overrides_are_refused_and_said_to_be_overrides(tmp_path: Path) -> None:
+    cases: list[tuple[dict[str, Any], str]] = [
+        ({"pod": [float("nan")]}, "finite"),
+        ({"dual_tol": [0.0]}, "greater than 0"),
+        ({"primal_tol": [-1.0]}, "greater than 0"),
+        ({"solvers": ["oqsp"]}, "did you mean 'osqp'"),
+        ({"problem": ["obstcale"]}, "did you mean 'obstacle'"),
+        ({"primal": ["decorelated"]}, "did you mean 'decorrelated'"),
+    ]
+    for overrides, words in cases:
+        line = refusal(write_study(tmp_path), overrides)
+        assert "options of the command line" in line
+        assert words in line
 
 
 SCALARS = (
