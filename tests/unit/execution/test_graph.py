@@ -4,21 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cached_property
 
-import pytest
 from counting import growth
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from vibench.execution.graph import Graph
-from vibench.plugins.kinds import STUDY
-from vibench.plugins.registry import registered
 from vibench.stages.base import Result, Stage
-from vibench.stages.cell_queries import cell_queries
-from vibench.stages.pictures import PictureStage
 from vibench.storage.artefacts import Store
-from vibench.study.matrix import expand, read_study
 
 
 @dataclass(frozen=True)
@@ -112,52 +106,3 @@ def test_a_stage_costs_the_same_however_many_wait() -> None:
         return work
 
     assert growth(run, 50) < 1.1
-
-
-Goals = dict[str, tuple[Stage, frozenset[str]]]
-"""The goals of a study, each with the keys of all that it needs."""
-
-
-@cache
-def goals_of(study: str) -> Goals:
-    known: dict[str, frozenset[str]] = {}
-
-    def closure(stage: Stage) -> frozenset[str]:
-        if stage.key not in known:
-            known[stage.key] = frozenset([stage.key]).union(*map(closure, stage.inputs()))
-        return known[stage.key]
-
-    goals: list[Stage] = [cell_queries(cell, 20.0) for cell in expand(read_study(study))]
-    goals += [PictureStage(problem) for problem in {goal.axes.problem for goal in goals} if problem is not None]
-    return {goal.key: (goal, closure(goal)) for goal in goals}
-
-
-@pytest.mark.parametrize("study", registered(STUDY))
-@settings(max_examples=5)
-@given(st.data())
-def test_whatever_fails_in_a_real_study_every_goal_ends_once(study: str, data: st.DataObject) -> None:
-    """The goals that need a stage that failed are lost, and no other; nothing waits for ever."""
-    every = sorted(goals_of(study).items())
-    # positions, not goals: the text of a strategy over goals is long enough for a warning of hypothesis, and it writes
-    # that text whenever a thread of an earlier test draws from `random` meanwhile
-    drawn = data.draw(st.lists(st.sampled_from(range(len(every))), min_size=1, max_size=12, unique=True))
-    goals = dict(every[position] for position in drawn)
-    stages = sorted(frozenset().union(*(needed for _, needed in goals.values())))
-    bad = set(data.draw(st.lists(st.sampled_from(stages), max_size=4)))
-    graph, failed, lost, done = Graph(), set(), [], []
-    for goal, _ in goals.values():
-        graph.add_goal(goal, lambda _: False)
-    assert set(graph.stages) == set(stages)
-    while graph.waiting:
-        batch = list(graph.begin(data.draw(st.integers(1, 3))))
-        assert batch
-        for stage in batch:
-            if stage.key in bad:
-                failed.add(stage.key)
-                lost += [goal.key for goal in graph.lost(stage)]
-            else:
-                done.append(stage.key)
-                graph.done(stage)
-    assert sorted(lost) == sorted(key for key, (_, needed) in goals.items() if needed & failed)
-    assert set(goals) == {*lost, *(key for key in done if key in goals)}
-    assert len(done) == len(set(done))

@@ -78,20 +78,18 @@ def test_every_combination_is_there_in_the_order_of_the_axes(cells_of: Expand) -
     ]
 
 
-DUPLICATES = {
-    "a solver twice": ("solvers", ["piqp", "osqp", "piqp"]),
-    "a strategy twice": ("dual", ["cpg", "mcpg", "cpg"]),
-    "a strategy under two labels": ("dual", ["cpg", "mcpg", {"name": "cpg", "label": "the same"}]),
-    "a problem twice": ("problem", [*STUDY["problem"], *STUDY["problem"]]),
-    "a table twice": ("tolerances", [*STUDY["tolerances"], *STUDY["tolerances"]]),
-}
-
-
-@pytest.mark.parametrize("case", DUPLICATES)
-def test_duplicates_merge(case: str, cells_of: Expand) -> None:
-    axis, entries = DUPLICATES[case]
-    merged = [cell.key for cell in cells_of(changed(STUDY, axis, to=entries))]
-    assert merged == [cell.key for cell in cells_of(STUDY)]
+def test_duplicates_merge(cells_of: Expand) -> None:
+    """Among them a strategy under two labels, defaults that are written out, and a whole number for a float."""
+    keys = [cell.key for cell in cells_of(STUDY)]
+    obstacle = [{"name": "obstacle", "options": {"resolution": "coarse"} | options} for options in (
+        {}, {"length": 1.0}, {"length": 1.0, "load": -1.0}, {"load": -1, "length": 1.0})]  # fmt: skip
+    for axis, entries in (
+        ("solvers", ["piqp", "osqp", "piqp"]),
+        ("dual", ["cpg", "mcpg", "cpg", {"name": "cpg", "label": "the same"}]),
+        ("problem", obstacle),
+        ("tolerances", [*STUDY["tolerances"], *STUDY["tolerances"]]),
+    ):
+        assert [cell.key for cell in cells_of(changed(STUDY, axis, to=entries))] == keys, axis
 
 
 def test_tables_that_overlap_add_up_once(cells_of: Expand) -> None:
@@ -111,39 +109,26 @@ def test_prescribed_sizes_take_the_place_of_tolerances(cells_of: Expand) -> None
     assert {cell.cone for cell in cells} == {Stop(size=3)}
 
 
-@pytest.mark.parametrize(("key", "make"), [("dual", lambda v: Stop(tolerance=v)), ("R", lambda v: Stop(size=v))])
-def test_dual_tolerances_and_sizes_may_differ_by_strategy(
-    key: str, make: Callable[[Any], Stop], cells_of: Expand
-) -> None:
-    values: dict[str, list[Any]] = {"dual": [0.1, 0.2, 0.3], "R": [1, 2, 3]}[key]
-    table = {"pod": [1e-3], key: {"cpg": values[:1], "mcpg": values[1:]}, "primal": {"offline-pga": [0.5]}}
-    found = {(cell.dual.name, cell.cone) for cell in cells_of(changed(STUDY, "tolerances", to=[table]))}
-    assert found == {("cpg", make(values[0])), ("mcpg", make(values[1])), ("mcpg", make(values[2]))}
-
-
-def test_tolerances_may_go_by_label(cells_of: Expand) -> None:
+def test_dual_tolerances_and_sizes_may_differ_by_strategy_and_label(cells_of: Expand) -> None:
+    for key, values in (("dual", [0.1, 0.2, 0.3]), ("R", [1, 2, 3])):
+        table = {"pod": [1e-3], key: {"cpg": values[:1], "mcpg": values[1:]}, "primal": {"offline-pga": [0.5]}}
+        found = {(cell.dual.name, cell.cone) for cell in cells_of(changed(STUDY, "tolerances", to=[table]))}
+        first, *others = (Stop(**{"tolerance" if key == "dual" else "size": value}) for value in values)
+        assert found == {("cpg", first), *(("mcpg", other) for other in others)}
     content = changed(STUDY, "dual", to=[{"name": "cpg", "label": "plain"}, "mcpg"])
     content = changed(content, "tolerances", 0, "dual", to={"plain": [0.1], "mcpg": [0.2]})
     assert {(cell.labels[1], cell.cone.tolerance) for cell in cells_of(content)} == {("plain", 0.1), ("mcpg", 0.2)}
 
 
-@pytest.mark.parametrize("primal", [REMOVE, {}])
-def test_a_strategy_that_takes_a_tolerance_must_be_given_one(primal: Any, cells_of: Expand) -> None:
-    with pytest.raises(RequestError, match=r"tolerances\.primal.*'offline-pga'.*tolerance"):
-        cells_of(changed(STUDY, "tolerances", 0, "primal", to=primal))
-
-
-def test_the_refusal_of_a_missing_tolerance_names_the_file(tmp_path: Path) -> None:
-    path = write_study(tmp_path, changed(STUDY, "tolerances", 0, "primal", to=REMOVE))
-    with pytest.raises(RequestError) as caught:
-        expand(read_study(path))
-    assert path in str(caught.value)
-
-
-@pytest.mark.parametrize("values", [{"cpg": [0.1]}, {}])
-def test_every_dual_strategy_must_be_given_a_tolerance(values: dict[str, Any], cells_of: Expand) -> None:
-    with pytest.raises(RequestError, match=r"tolerances\.dual.*'m?cpg'"):
-        cells_of(changed(STUDY, "tolerances", 0, "dual", to=values))
+def test_every_strategy_that_takes_a_tolerance_must_be_given_one(cells_of: Expand) -> None:
+    for key, values, words in (
+        ("primal", REMOVE, r"study.toml: tolerances\.primal.*'offline-pga'.*tolerance"),
+        ("primal", {}, r"tolerances\.primal.*'offline-pga'.*tolerance"),
+        ("dual", {"cpg": [0.1]}, r"tolerances\.dual.*'mcpg'"),
+        ("dual", {}, r"tolerances\.dual.*'m?cpg'"),
+    ):
+        with pytest.raises(RequestError, match=words):
+            cells_of(changed(STUDY, "tolerances", 0, key, to=values))
 
 
 SAMPLE = Cell(
@@ -199,13 +184,8 @@ def test_the_cases_cover_every_member_of_a_cell() -> None:
     assert covered | {"labels", "nested_tolerances", "formulation_label"} == {field.name for field in fields(Cell)}
 
 
-@pytest.mark.parametrize("case", OTHER)
-def test_the_key_changes_with_what_determines_the_numbers(case: str) -> None:
-    assert replace(SAMPLE, **OTHER[case]).key != SAMPLE.key
-
-
-def test_no_two_changes_give_the_same_key() -> None:
-    assert len({replace(SAMPLE, **change).key for change in OTHER.values()}) == len(OTHER)
+def test_all_changes_of_what_determines_the_numbers_give_other_keys() -> None:
+    assert len({SAMPLE.key, *(replace(SAMPLE, **change).key for change in OTHER.values())}) == 1 + len(OTHER)
 
 
 def test_the_key_does_not_depend_on_labels_or_code() -> None:
@@ -226,25 +206,23 @@ def test_the_key_of_a_cell_with_the_sets_of_its_problem_is_what_it_was_before_th
     })  # fmt: skip
 
 
-@pytest.mark.parametrize("axis", ["problem", "dual", "primal", "formulation", "training", "validation"])
-def test_the_code_changes_with_every_plugin(axis: str) -> None:
-    def code(version: str) -> str:
-        if axis == "formulation":
-            return replace(SAMPLE, formulation=replace(FORMULATION, code=version)).code
-        part = getattr(SAMPLE, axis)
-        if isinstance(part, ParameterSet):
-            return replace(SAMPLE, **{axis: replace(part, sampling=replace(SAMPLING, code=version))}).code
-        return replace(SAMPLE, **{axis: replace(part, code=version)}).code
-
-    assert code("package 1") != code("package 2")
-
-
-@pytest.mark.parametrize("what", ["numerical_code", "solver_version"])
-def test_the_code_changes_with_the_core_and_the_solver(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = SAMPLE.code
-    monkeypatch.setattr(module if what == "numerical_code" else registry, what, lambda *_, **__: "another version")
+def test_the_code_changes_with_every_plugin_the_core_and_the_solver(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = replace(SAMPLE, formulation=FORMULATION)
+    for role in ("training", "validation"):
+        whole = replace(whole, **{role: replace(getattr(whole, role), sampling=SAMPLING)})
+    codes = [whole.code]
+    for axis in ("problem", "dual", "primal", "formulation", "training", "validation"):
+        part = getattr(whole, axis)
+        sampled = isinstance(part, ParameterSet)
+        other = replace(part, sampling=replace(SAMPLING, code="2")) if sampled else replace(part, code="2")
+        codes.append(replace(whole, **{axis: other}).code)
+    for owner, function in ((module, "numerical_code"), (registry, "solver_version")):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, function, lambda *_, **__: "another version")
+            registry.registered.cache_clear()
+            codes.append(whole.code)
     registry.registered.cache_clear()
-    assert SAMPLE.code != before
+    assert len(set(codes)) == len(codes)
 
 
 def test_the_code_changes_with_a_solver_of_a_plugin(
@@ -261,25 +239,10 @@ def test_the_code_changes_with_a_solver_of_a_plugin(
     assert SAMPLE.code == before[1]
 
 
-def test_equal_options_give_one_cell(cells_of: Expand) -> None:
-    """A whole number where the plugin takes floats, and the order of options, change nothing."""
-    written = [{"length": 1.0, "load": -1.0}, {"load": -1, "length": 1.0}]
-    entries = [{"name": "obstacle", "options": {"resolution": "coarse"} | options} for options in written]
-    assert len(cells_of(changed(STUDY, "problem", to=entries))) == len(cells_of(STUDY))
-
-
 def test_entries_of_the_same_title_are_told_apart_by_their_options(cells_of: Expand) -> None:
     cells = cells_of(changed(STUDY, "problem", to=["obstacle", {"name": "obstacle", "options": {"length": 2.0}}]))
     assert {cell.problem.options for cell in cells} == {"{}", '{"length": 2.0}'}
     assert {cell.labels[0] for cell in cells} == {"obstacle"}
-
-
-def test_defaults_written_out_give_the_same_cells(cells_of: Expand) -> None:
-    short, long = (
-        cells_of(changed(STUDY, "problem", 0, "options", to={"resolution": "coarse"} | options))
-        for options in ({}, {"length": 1.0})
-    )
-    assert [cell.key for cell in short] == [cell.key for cell in long]
 
 
 def test_a_cell_says_what_it_is() -> None:
