@@ -15,14 +15,6 @@ from scipy.linalg.lapack import dstev
 from vibench.arrays import Array, SparseMatrix
 
 
-def largest_eigenvalue(apply: Callable[[Array], Array], M: SparseMatrix, accuracy: float) -> float:
-    """Estimate of the largest |θ| with T v = θ v; infinite where M is seen not to be positive definite.
-
-    `apply` and `M` are those of `Lanczos`, `accuracy` is the estimated relative error of θ at which iterations end.
-    """
-    return Lanczos(apply, M).largest(accuracy)
-
-
 class Lanczos:
     """Lanczos iterations that continue where they ended.
 

@@ -23,7 +23,7 @@ from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Kind
 from vibench.qp.verification import Slack, allowed
 from vibench.results.schema import KEYS, STORED
-from vibench.stability.infsup import ABSOLUTE, RELATIVE, UNSIGNED
+from vibench.stability.infsup import ABSOLUTE, RELATIVE
 from vibench.study.cells import COMPILED
 
 if TYPE_CHECKING:  # worker processes, which start often, have no use for pandas
@@ -73,7 +73,7 @@ def _violations(rows: pd.DataFrame, kinds: pd.Series) -> Iterator[Violation]:
             yield Violation(f"{name} ≥ 1", int(below.sum()), float(1.0 - rows[name].min()))
     rows = rows[rows["bounds"].notna()]  # other formulations than the mixed one have no constants
     queries, kind = rows.filter(regex="^beta_(full_|plain_|hf_)?(span|cone_)").astype(float), rows["cell"].map(kinds)
-    signed = ~rows["bounds"].str.startswith(f"{UNSIGNED}/")
+    signed = ~rows["bounds"].str.startswith("span/")
     scale = queries["beta_full_cone_upper"]
     for larger, smaller in ORDER:
         inside = signed if smaller == "hf_" else signed | True

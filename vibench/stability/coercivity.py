@@ -10,7 +10,7 @@ of A − aX_V, c ≥ γ_a by those of cX_V − A, and, where A is positive defin
     [ A    Bᵀ     ]
     [ B    b²X_W  ],    whose Schur complement of A is b²X_W − BA⁻¹Bᵀ (Haynsworth),
 
-see `vibench.linalg.proofs` for what proves them in floating-point arithmetic.
+see `vibench.linalg.proofs` for the proofs in floating-point arithmetic.
 """
 
 from __future__ import annotations
@@ -27,18 +27,13 @@ from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.linalg.cholesky import SparseCholesky, symmetric_lu
 from vibench.linalg.factorisations import implementation
 from vibench.linalg.inner_product import InnerProduct
-from vibench.linalg.lanczos import Lanczos, largest_eigenvalue
+from vibench.linalg.lanczos import Lanczos
 from vibench.linalg.proofs import is_proved_definite, proved_positive
 from vibench.linalg.schur_complement import FEW_PER_UNKNOWN
 from vibench.stability.infsup import InfSup
 
 MARGINS = (1e-3, 1e-2, 1e-1, 0.5)
-"""Constants are moved outwards by the first of these shares for which they are proved; by the first one if by none."""
-
-ACCURACY, FINE, ROUGH = 1e-3, 1e-5, 1e-2
-"""Relative errors of Lanczos iterations: of a first estimate, of the second where the first is not proved with the
-smallest of `MARGINS`, and for what is moved by the largest of them. Estimates err inwards: what is proved with the
-smallest margin is as close as that margin, however accurate the estimate was, and what errs by a hundredth of it is."""
+"""Fractions by which constants are moved outwards: the first for which they are proved, or the first if none is."""
 
 FEW = 30
 """Spaces of at most this dimension have their eigenvalues from a dense matrix; Lanczos needs more than two."""
@@ -54,34 +49,37 @@ class Constant:
 
 @dataclass(frozen=True)
 class Stability:
-    """Constants of the high-fidelity problem at one parameter."""
+    """Constants of the high-fidelity problem at one parameter.
+
+    Attributes
+    ----------
+    inf_sup
+        β_HF in the norms of V and W.
+    coercivity, continuity
+        Lower bound of α, and upper bound of γ_a.
+    energy_inf_sup
+        Lower bound of β_A, the inf-sup constant over the span with the norm of A instead of that of V.
+    """
 
     inf_sup: InfSup
-    """β_HF in the norms of V and W."""
     coercivity: Constant
-    """Lower bound of α."""
     continuity: Constant
-    """Upper bound of γ_a."""
     energy_inf_sup: Constant
-    """Lower bound of β_A, the inf-sup constant over the span with the norm of A instead of that of V."""
 
 
+# From a right-hand side (n,) to the solution with A.
 Solve = Callable[[Array], Array]
-"""From a right-hand side (n,) to the solution with A."""
 
-
+# From a relative error to an estimate of a constant.
 Estimate = Callable[[float], float]
-"""An estimate of a constant, from its relative error."""
 
 
-def coercivity_and_continuity(
-    A: SparseMatrix, V: InnerProduct, solve: Solve | None = None
-) -> tuple[Constant, Constant]:
+def coercivity_and_continuity(A: SparseMatrix, V: InnerProduct) -> tuple[Constant, Constant]:
     """Lower bound of α and upper bound of γ_a for A (n×n); see `coercivity` and `continuity`.
 
     Raises a `NumericalError` if A is seen not to be symmetric positive definite.
     """
-    quotients = Quotients(A, V, solve)
+    quotients = Quotients(A, V)
     return coercivity(quotients), continuity(quotients)
 
 
@@ -102,19 +100,19 @@ class Quotients:
 
     @cached_property
     def _inverse(self) -> Estimate:
-        return lowest(self.A, self.V, self._solve)
+        return _lowest(self.A, self.V, self._solve)
 
     def lowest(self, accuracy: float) -> float:
         """Estimate of α with this relative error.
 
         Raises a `NumericalError` if A is seen not to be symmetric positive definite.
         """
-        found = self._both.smallest(accuracy) if self.V.dim > FEW else None
-        return found if found is not None else self._inverse(accuracy)
+        alpha = self._both.smallest(accuracy) if self.V.dim > FEW else None
+        return alpha if alpha is not None else self._inverse(accuracy)
 
     def highest(self, accuracy: float) -> float:
-        """The same of γ_a."""
-        return self._both.largest(accuracy) if self.V.dim > FEW else highest_quotient(self.A, self.V)
+        """Estimate of γ_a with this relative error."""
+        return self._both.largest(accuracy) if self.V.dim > FEW else _largest(self.A, self.V)(accuracy)
 
 
 def coercivity(quotients: Quotients, order: Indices | None = None) -> Constant:
@@ -125,32 +123,24 @@ def coercivity(quotients: Quotients, order: Indices | None = None) -> Constant:
     """
     A, V = quotients.A, quotients.V
     chosen = implementation(V.factorisation)
-
-    def coercive(a: float) -> bool:
-        return is_proved_definite([A, -a * V.matrix], chosen, order)
-
-    return moved(quotients.lowest, -1.0, coercive)
+    return moved(quotients.lowest, -1.0, lambda a: is_proved_definite([A, -a * V.matrix], chosen, order))
 
 
 def share_of_diagonal(X: InnerProduct) -> float:
     """A ξ with X ≽ ξ diag(X), proved, of the order of the largest one; 0 where none is."""
     diagonal = X.matrix.diagonal()
-    units = InnerProduct(sp.diags_array(diagonal))
-    estimate = lowest_quotient(X.matrix, units, X.riesz, ROUGH)
-    share = estimate / (1.0 + MARGINS[-1])
-    scaled = sp.diags_array(-share * diagonal)
-    return share if proved_positive([X.matrix, scaled], np.sqrt(diagonal)) == X.dim else 0.0
+    # A rough estimate is enough: it is moved by the largest margin.
+    estimate = _lowest(X.matrix, InnerProduct(sp.diags_array(diagonal)), X.riesz)(1e-2)
+    xi = estimate / (1.0 + MARGINS[-1])
+    scaled = sp.diags_array(-xi * diagonal)
+    return xi if proved_positive([X.matrix, scaled], np.sqrt(diagonal)) == X.dim else 0.0
 
 
 def continuity(quotients: Quotients) -> Constant:
     """Upper bound of γ_a for A (n×n), symmetric positive definite."""
     A, V = quotients.A, quotients.V
     chosen = implementation(V.factorisation)
-
-    def continuous(c: float) -> bool:
-        return is_proved_definite([c * V.matrix, -A], chosen)
-
-    return moved(quotients.highest, 1.0, continuous)
+    return moved(quotients.highest, 1.0, lambda c: is_proved_definite([c * V.matrix, -A], chosen))
 
 
 def operator_norm(M: SparseMatrix, X: InnerProduct) -> Constant:
@@ -167,43 +157,22 @@ def operator_norm(M: SparseMatrix, X: InnerProduct) -> Constant:
 
 def largest_quotient(M: SparseMatrix, X: InnerProduct) -> float:
     """Rough estimate of max |vᵀMv| / ‖v‖² over v for a symmetric M (n×n); nothing is proved."""
-    return _largest(M, X)(ROUGH) if abs(M).sum() else 0.0
+    return _largest(M, X)(1e-2) if abs(M).sum() else 0.0
 
 
 def _largest(M: SparseMatrix, X: InnerProduct) -> Estimate:
-    """The estimates of `largest_quotient` for an M that is not zero."""
+    """Estimates of max |vᵀMv| / ‖v‖² over v for a symmetric M (n×n) that is not zero."""
     if X.dim <= FEW:
         largest = float(np.abs(scipy.linalg.eigvalsh(M.toarray(), X.matrix.toarray())).max())
         return lambda _: largest
     return Lanczos(lambda v: X.riesz(M @ v), X.matrix).largest
 
 
-def moved(estimate: Estimate, sign: float, proves: Callable[[float], bool]) -> Constant:
-    """An estimate moved outwards, downwards for a negative sign, until it is proved."""
-    first = estimate(ACCURACY)
-    if not 0.0 < first < np.inf:
-        return Constant(0.0 if sign < 0.0 else float("inf"), False)
-    closest = first * (1.0 + MARGINS[0]) ** sign
-    if proves(closest):
-        return Constant(closest, True)
-    accurate = estimate(FINE)
-    candidates = [accurate * (1.0 + margin) ** sign for margin in MARGINS]
-    for candidate in candidates:
-        if candidate != closest and proves(candidate):
-            return Constant(candidate, True)
-    return Constant(candidates[0], False)
-
-
-def lowest_quotient(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None, accuracy: float = ACCURACY) -> float:
-    """Estimate of α for A (n×n), the smallest eigenvalue of A against X_V, by Lanczos iterations.
+def _lowest(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None) -> Estimate:
+    """Estimates of α for A (n×n), the smallest eigenvalue of A against X_V.
 
     Raises a `NumericalError` if A is not symmetric positive definite and no `solve` is given.
     """
-    return lowest(A, V, solve)(accuracy)
-
-
-def lowest(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None) -> Estimate:
-    """The estimates of `lowest_quotient`."""
     inverse = solve or InnerProduct(A, "A", V.factorisation).riesz
     if V.dim <= FEW:
         smallest = float(scipy.linalg.eigvalsh(A.toarray(), V.matrix.toarray())[0])
@@ -212,19 +181,30 @@ def lowest(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None) -> Esti
     return lambda accuracy: 1.0 / iterations.largest(accuracy)
 
 
-def highest_quotient(A: SparseMatrix, V: InnerProduct, accuracy: float = ACCURACY) -> float:
-    """Estimate of γ_a for A (n×n), the largest eigenvalue of A against X_V, by Lanczos iterations."""
-    if V.dim <= FEW:
-        return float(scipy.linalg.eigvalsh(A.toarray(), V.matrix.toarray())[-1])
-    return largest_eigenvalue(lambda v: V.riesz(A @ v), V.matrix, accuracy)
-
-
 def extreme_quotients(A: SparseMatrix, V: InnerProduct) -> tuple[float, float]:
     """Estimates of α and γ_a for A (n×n).
 
     Raises a `NumericalError` if A is not symmetric positive definite.
     """
-    return lowest_quotient(A, V), highest_quotient(A, V)
+    return _lowest(A, V)(1e-3), _largest(A, V)(1e-3)
+
+
+def moved(estimate: Estimate, sign: float, proves: Callable[[float], bool]) -> Constant:
+    """An estimate moved outwards, downwards for a negative sign, until it is proved."""
+    # Estimates err inwards: a constant that is proved with the smallest margin is as close as that margin, however
+    # accurate its estimate. A first one of that accuracy is usually enough.
+    first = estimate(1e-3)
+    if not 0.0 < first < np.inf:
+        return Constant(0.0 if sign < 0.0 else float("inf"), False)
+    closest = first * (1.0 + MARGINS[0]) ** sign
+    if proves(closest):
+        return Constant(closest, True)
+    accurate = estimate(1e-5)
+    candidates = [accurate * (1.0 + margin) ** sign for margin in MARGINS]
+    for candidate in candidates:
+        if candidate != closest and proves(candidate):
+            return Constant(candidate, True)
+    return Constant(candidates[0], False)
 
 
 def energy_inf_sup(A: SparseMatrix, B: SparseMatrix, W: InnerProduct) -> Constant:
@@ -252,7 +232,7 @@ def energy_inf_sup(A: SparseMatrix, B: SparseMatrix, W: InnerProduct) -> Constan
 
 
 def _after_their_unknowns(order: Indices, B: SparseMatrix) -> Indices:
-    """An elimination order of the saddle point: of A (n,), every multiplier after the last unknown of its row."""
+    """An elimination order of the saddle point: that of A (n,), every multiplier after the last unknown of its row."""
     place, rows = np.empty(len(order)), sp.csr_array(B)
     place[order] = np.arange(len(order))
     ends = [np.max(place[row], initial=-1.0) for row in np.split(rows.indices, rows.indptr[1:-1])]
@@ -262,10 +242,10 @@ def _after_their_unknowns(order: Indices, B: SparseMatrix) -> Indices:
 def _smallest_compliance(
     A: SparseMatrix, B: SparseMatrix, W: InnerProduct, factor: SparseCholesky, order: Indices
 ) -> Estimate:
-    """The root of the smallest eigenvalue of BA⁻¹Bᵀ against X_W; 0 where it is singular."""
+    """Estimates of the root of the smallest eigenvalue of BA⁻¹Bᵀ against X_W; 0 where it is singular."""
     m, n = B.shape
     if m <= FEW:
-        return _of_dense(np.asarray(B @ factor.solve(B.toarray().T)), W.matrix)
+        return smallest_root(np.asarray(B @ factor.solve(B.toarray().T)), W.matrix)
     saddle = _saddle_point(A, B, sp.csc_array((m, m)))[order][:, order]
     try:
         solve = symmetric_lu(sp.csc_array(saddle), "NATURAL").solve
@@ -273,10 +253,10 @@ def _smallest_compliance(
         return lambda _: 0.0
 
     def inverse(v: Array) -> Array:
-        """−(BA⁻¹Bᵀ)⁻¹ is the last block of the inverse."""
-        found = np.empty(n + m)
-        found[order] = solve(np.concatenate([np.zeros(n), W.matrix @ v])[order])
-        return -found[n:]
+        # −(BA⁻¹Bᵀ)⁻¹ is the last block of the inverse.
+        solution = np.empty(n + m)
+        solution[order] = solve(np.concatenate([np.zeros(n), W.matrix @ v])[order])
+        return -solution[n:]
 
     iterations = Lanczos(inverse, W.matrix)
     return lambda accuracy: iterations.largest(accuracy) ** -0.5
@@ -287,9 +267,10 @@ def _saddle_point(A: SparseMatrix, B: SparseMatrix, corner: SparseMatrix) -> Spa
 
 
 def smallest_root(matrix: Array, mass: SparseMatrix) -> Estimate:
-    """The root of the smallest eigenvalue of a symmetric matrix (m×m) against `mass`; 0 if it is not positive."""
+    """Estimates of the root of the smallest eigenvalue of a symmetric matrix (m×m) against `mass`; 0 if negative."""
     if len(matrix) <= FEW:
-        return _of_dense(matrix, mass)
+        smallest = float(scipy.linalg.eigvalsh(matrix, mass.toarray())[0])
+        return lambda _: float(np.sqrt(max(0.0, smallest)))
     try:
         factor = scipy.linalg.cho_factor(matrix)
     except np.linalg.LinAlgError:
@@ -300,8 +281,3 @@ def smallest_root(matrix: Array, mass: SparseMatrix) -> Estimate:
 
     iterations = Lanczos(inverse, mass)
     return lambda accuracy: iterations.largest(accuracy) ** -0.5
-
-
-def _of_dense(matrix: Array, mass: SparseMatrix) -> Estimate:
-    smallest = float(scipy.linalg.eigvalsh(matrix, mass.toarray())[0])
-    return lambda _: float(np.sqrt(max(0.0, smallest)))

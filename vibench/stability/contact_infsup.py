@@ -45,27 +45,18 @@ from vibench.linalg.lanczos import Lanczos
 from vibench.linalg.proofs import is_proved_definite
 from vibench.stability.coercivity import FEW, Constant, moved, smallest_root
 
-COLUMNS = 128
-"""Columns of D at once: of all unknowns it may not fit in memory."""
-
-MOST_LOST = 0.5
-"""Largest δ/σ: beyond, the factorisation of A is too inaccurate to say anything."""
-
-
-PROPORTIONAL = 1e-12
-"""Difference of B and θX_W, relative to the largest entry, that is taken for round-off: a bound is close only there."""
-
 
 def multiple_of(B: SparseMatrix, W: InnerProduct) -> float:
-    """θ where B (m×c) is θX_W, with more than a few rows; 0 elsewhere."""
+    """The factor θ where B (m×c) is θX_W, with more than a few rows; 0 elsewhere."""
     if B.shape[0] != B.shape[1] or B.shape[0] <= FEW:
         return 0.0
     theta = float(B.diagonal().sum() / W.matrix.diagonal().sum())
-    return theta if abs(B - theta * W.matrix).max() <= PROPORTIONAL * abs(B).max() else 0.0
+    # A larger difference than round-off is allowed, but makes the bound loose.
+    return theta if abs(B - theta * W.matrix).max() <= 1e-12 * abs(B).max() else 0.0
 
 
+# K (m×m), and bounds of the norms (m,) of the columns of S D and of S⁻¹R, with the round-off in what is computed.
 Products = tuple[Array, Array, Array]
-"""K (m×m), and bounds of the norms (m,) of the columns of S D and of S⁻¹R, with the round-off in what is computed."""
 
 
 class ContactInfSup:
@@ -95,7 +86,7 @@ class ContactInfSup:
     ) -> None:
         self._schur, self._scale, self._lost, self._extend = schur, np.sqrt(squares), lost, extend
         self._inverse = inverse
-        # the largest row sum of S⁻¹|Ŝ|S⁻¹, which bounds its norm, and the terms of an inner product with Ŝ
+        # The largest row sum of S⁻¹|Ŝ|S⁻¹ bounds its norm; inner products with Ŝ have so many terms.
         parts = schur.blocks if isinstance(schur, BlockDiagonal) else ((np.arange(len(squares)), schur),)
         sums = [np.max((abs(part) @ (1.0 / self._scale[c])) / self._scale[c], initial=0.0) for c, part in parts]
         self._norm = float(max(sums, default=0.0))
@@ -111,7 +102,7 @@ class ContactInfSup:
         return self._inverse is not None
 
     def of_inverse(self, B: SparseMatrix, compliance: Array, W: InnerProduct) -> Constant:
-        """The same from the compliance (m×m) that is computed as B(BĈ)ᵀ, the products row by row."""
+        """Lower bound of β_A from the compliance (m×m) that is computed as B(BĈ)ᵀ, the products row by row."""
 
         def products() -> Products:
             (lifted, residuals), weights = self._of_inverse, abs(sp.csr_array(B))
@@ -129,7 +120,8 @@ class ContactInfSup:
     def _proved(self, B: SparseMatrix, W: InnerProduct, products: Callable[[], Products]) -> Constant:
         if not B.shape[0]:
             return Constant(float("inf"), True)
-        if not self._lost <= MOST_LOST:
+        # Beyond a half of σ the factorisation of A is too inaccurate to say anything.
+        if not self._lost <= 0.5:
             return Constant(0.0, True)
         compliance, lifted, residuals = products()
         if not np.all(np.diag(compliance) > 0.0):
@@ -146,13 +138,13 @@ class ContactInfSup:
             shifted += scaled
             return _proved_positive(shifted, lost + 8.0 * UNIT_ROUND_OFF * weight * of_mass)
 
-        found = moved(smallest_root(scaled, mass), -1.0, stable)
-        return found if found.proved else Constant(0.0, True)
+        constant = moved(smallest_root(scaled, mass), -1.0, stable)
+        return constant if constant.proved else Constant(0.0, True)
 
     def of_multiple(self, theta: float, B: SparseMatrix, W: InnerProduct) -> Constant | None:
-        """The same for B = θX_W and a sparse Ŝ, without liftings; `None` where no bound is proved so."""
+        """Lower bound of β_A for B = θX_W and a sparse Ŝ, without liftings; `None` where none is proved so."""
         S = self._schur
-        if isinstance(S, BlockDiagonal) or not self._lost <= MOST_LOST:
+        if isinstance(S, BlockDiagonal) or not self._lost <= 0.5:
             return None
         iterations, kept = Lanczos(lambda v: W.riesz(S @ v), W.matrix), 1.0 - 1.01 * self._lost
 
@@ -165,14 +157,15 @@ class ContactInfSup:
             parts = [2.0 * tau * B, -(tau**2) * S, -square * W.matrix]
             return is_proved_definite(parts, implementation(DEFAULT))
 
-        found = moved(estimate, -1.0, stable)
-        return found if found.proved else None
+        constant = moved(estimate, -1.0, stable)
+        return constant if constant.proved else None
 
     def _products(self, B: SparseMatrix, liftings: Array) -> Products:
-        """K, ‖S d_i‖ and ‖S⁻¹r_i‖ of `liftings`."""
+        """The K, ‖S d_i‖ and ‖S⁻¹r_i‖ of liftings (m×·)."""
         m, scale = B.shape[0], self._scale[:, None]
         compliance, lifted, residuals = np.empty((m, m)), np.empty(m), np.empty(m)
-        for columns in (slice(first, first + COLUMNS) for first in range(0, m, COLUMNS)):
+        # All columns of D at once may not fit in memory.
+        for columns in (slice(first, first + 128) for first in range(0, m, 128)):
             D = self._extend(liftings[columns].T)
             compliance[:, columns], lifted[columns] = B @ D, np.linalg.norm(scale * D, axis=0)
             left = np.asarray(B[columns].T.toarray() - self._schur @ D)
@@ -185,7 +178,7 @@ class ContactInfSup:
 
     def _left_out(self, B: SparseMatrix, lifted: Array, residuals: Array, sizes: Array) -> float:
         """A bound of the norm of DᵀR and of the round-off in K, both in units of t (m,), the roots of diag(K)."""
-        # |x_i y_j| and its transpose, by whose mean each entry is bounded, have at most the norm |x||y|
+        # Each entry is bounded by the mean of |x_i y_j| and its transpose, which have at most the norm |x||y|.
         of_products = np.linalg.norm(lifted / sizes) * np.linalg.norm(
             (residuals + _gamma(_most_entries(B) + 4) * self._forces(B)) / sizes
         )
@@ -193,7 +186,6 @@ class ContactInfSup:
 
 
 def _most_entries(B: SparseMatrix) -> int:
-    """The number of entries of a row that has most."""
     return int(np.max(np.diff(sp.csr_array(B).indptr)))
 
 
@@ -203,18 +195,16 @@ def _scaled(matrix: SparseMatrix, sizes: Array) -> SparseMatrix:
 
 
 def _proved_positive(scaled: Array, lost: float) -> bool:
-    """Whether a symmetric matrix (m×m) is positive definite of which a matrix of norm `lost` may be round-off.
-
-    It is overwritten.
-    """
+    """Prove that a symmetric matrix (m×m), to be overwritten, is definite whatever its round-off of norm `lost`."""
     m = len(scaled)
-    if not np.all(np.diag(scaled) <= 2.0):  # entries are then at most 2, and what a Cholesky factorisation loses is
+    # Entries of a definite matrix are then at most 2, which bounds the round-off of a Cholesky factorisation.
+    if not np.all(np.diag(scaled) <= 2.0):
         return False
     scaled[np.diag_indices(m)] -= lost + 4.0 * m * _gamma(m + 8)
     factor, failed = dpotrf(scaled.T, lower=True, overwrite_a=True)
-    return not failed and bool(np.all(np.diag(factor) > 0.0))  # OpenBLAS goes on with pivots that are not numbers
+    return not failed and bool(np.all(np.diag(factor) > 0.0))  # OpenBLAS accepts pivots that are not numbers
 
 
 def _gamma(terms: int) -> float:
-    """γ_k of sums of k products."""
+    """The bound γ_k = ku/(1 − ku) of the relative round-off in sums of k products (Higham 2002, §3.1)."""
     return terms * UNIT_ROUND_OFF / (1.0 - terms * UNIT_ROUND_OFF)

@@ -13,6 +13,7 @@ from vibench.stability.coercivity import (
     Constant,
     coercivity_and_continuity,
     energy_inf_sup,
+    moved,
 )
 
 
@@ -32,12 +33,14 @@ def test_proved_constants_enclose_the_spectrum_closely(n: int) -> None:
     assert_close(coercivity_and_continuity(sp.csc_array(A), V), values)
 
 
-@pytest.mark.parametrize("accuracy", [coercivity.ACCURACY, 0.5])
-def test_constants_of_a_matrix_near_to_the_inner_product_are_as_sharp(
-    monkeypatch: pytest.MonkeyPatch, accuracy: float
-) -> None:
-    """With a first Lanczos iteration that is accurate enough, and with one that is not."""
-    monkeypatch.setattr(coercivity, "ACCURACY", accuracy)
+def test_a_more_accurate_estimate_comes_before_a_larger_margin() -> None:
+    low = moved(lambda accuracy: 2.0 * (1.0 + 5.0 * accuracy), -1.0, lambda a: a <= 2.0)
+    high = moved(lambda accuracy: 2.0 / (1.0 + 5.0 * accuracy), 1.0, lambda c: c >= 2.0)
+    assert low == Constant(pytest.approx(2.0 * (1.0 + 5e-5) / (1.0 + MARGINS[0]), rel=1e-12), True)
+    assert high == Constant(pytest.approx(2.0 / (1.0 + 5e-5) * (1.0 + MARGINS[0]), rel=1e-12), True)
+
+
+def test_constants_of_a_matrix_near_to_the_inner_product_are_as_sharp() -> None:
     rng, V = np.random.default_rng(5), space(80, 5)
     A = V.matrix.toarray() + 0.3 * spd(80, rng, 10.0) / 10.0
     values = scipy.linalg.eigh(A, V.matrix.toarray(), eigvals_only=True)

@@ -67,13 +67,9 @@ def test_the_constant_is_proved_as_closely_as_by_sparse_matrices(monkeypatch: py
         assert contact.energy_inf_sup(B, rough, W).value <= exact
 
 
-@pytest.mark.parametrize("columns", [3, 128])
 @pytest.mark.parametrize("size", [0.0, 1e-8, 1e-4, 0.05])
-def test_liftings_on_all_unknowns_prove_it_without_a_factorisation(
-    monkeypatch: pytest.MonkeyPatch, size: float, columns: int
-) -> None:
+def test_liftings_on_all_unknowns_prove_it_without_a_factorisation(size: float) -> None:
     """Whoever computed them: whatever D is, nothing above β_A is proved, and of an exact one as much as otherwise."""
-    monkeypatch.setattr("vibench.stability.contact_infsup.COLUMNS", columns)
     vi, W, exact = varying(40)
     _, stiffness = condensed(sp.csc_array(vi.A), np.unique(vi.B.indices))
     rng = np.random.default_rng(0)
@@ -172,7 +168,7 @@ def test_a_matrix_with_a_wrong_entry_is_not_proved_positive(wrong: float, place:
     assert not contact_infsup._proved_positive(matrix, 1e-3)
 
 
-def string(n: int = 200, m: int = 40) -> tuple[sp.csc_array, np.ndarray, InnerProduct]:
+def string(n: int = 400, m: int = 140) -> tuple[sp.csc_array, np.ndarray, InnerProduct]:
     """The stiffness of a string, the unknowns in its middle, and the inner product of multipliers there."""
     A = sp.csc_array(sp.diags_array([2.0 * np.ones(n), -np.ones(n - 1), -np.ones(n - 1)], offsets=[0, 1, -1]) * (n + 1))
     mass = sp.diags_array([4.0 * np.ones(m), np.ones(m - 1), np.ones(m - 1)], offsets=[0, 1, -1]) / (6.0 * m)
@@ -196,6 +192,7 @@ def test_constraints_that_are_a_multiple_of_the_norm_need_no_liftings(theta: flo
         assert (1.0 - 2.0 * MARGINS[0]) * closest <= found.value <= (1.0 + 1e-12) * closest
         by_liftings = contact.energy_inf_sup(B, stiffness.liftings(B), W).value
         assert found.value >= (1.0 - 2.0 * MARGINS[0]) * by_liftings
+        assert 0.9 * closest <= by_liftings <= exact  # columns of D are taken 128 at a time
         # whatever θ is taken for, what is proved is a bound
         wrong = contact.of_multiple(1.5 * theta, B, W)
         assert wrong is None or wrong.value <= exact
