@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 from typer import Argument, Exit, Option
@@ -14,6 +15,14 @@ from vibench.cli.completion import cells, runs
 from vibench.cli.console import echo, run_argument
 from vibench.cli.result_commands import At, RunArgument, places_of
 from vibench.errors import RequestError
+
+
+class FigureFormat(StrEnum):
+    """Formats of figures; typer takes no list of literals."""
+
+    PNG = "png"
+    SVG = "svg"
+    PDF = "pdf"
 
 
 def write_report(
@@ -40,7 +49,7 @@ def draw_figures(
     ],
     out: Annotated[Path | None, Option(metavar="DIR", help="Folder; RUN/figures by default.")] = None,
     formats: Annotated[
-        list[Literal["png", "svg", "pdf"]] | None,
+        list[FigureFormat] | None,
         Option("--format", help="Format (repeatable); png and svg by default."),
     ] = None,
     jobs: Annotated[int, Option("--jobs", "-j", min=0, help="Processes; 0 for one per core.")] = 0,
