@@ -315,7 +315,7 @@ FAULTS = (
         "vibench/library/exported_certificate.py",
         "2.0 * polynomial.error * polynomial.scale",
         "0.0",
-        ("tests/unit/library/test_export.py",),
+        ("tests/unit/library/test_c_source.py",),
     ),
     Fault(
         "online-bound-without-kappa",
@@ -428,13 +428,6 @@ FAULTS = (
         "return Answer(v, correction.nu, correction.bound, is_corrected=True, share=share)",
         "return Answer(v, correction.nu, bound, is_corrected=True, share=share)",
         ("tests/unit/offline/test_correction.py",),
-    ),
-    Fault(
-        "exported-pair-without-the-loss-of-spectral-bounds",
-        "vibench/library/reduced_model_certificate.py",
-        "rho += (0.5 * (upper - lower) + missed) / sqrt(lower) * norm",
-        "rho += missed / sqrt(lower) * norm",
-        ("tests/unit/library/test_export.py",),
     ),
     Fault(
         "pair-in-c-without-what-is-left-of-complementarity",

@@ -9,6 +9,7 @@ import ctypes
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +18,6 @@ import numpy as np
 import vibench
 from vibench.library.exported_seconds import HIGH_FIDELITY, LIBRARY, SCRIPT, Call, in_turns, queries
 from vibench.library.reduced_model import Model
-from vibench.library.reduced_model_certificate import Model as WithBounds
 from vibench.offline.polynomials import TOLERANCE
 from vibench.qp.exact import exact_solution
 
@@ -29,8 +29,8 @@ def main(run: str, cell: str, tolerance: float) -> None:
     model = vibench.open_run(run).model(cell)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "model.npz"
-        vibench.export_model(model, file, tolerance, c=True)
-        exported, compiled = Model(file), in_c(file)
+        arrays = vibench.export_model(model, file, tolerance, c=True).arrays
+        exported, compiled = Model(file), in_c(file, arrays)
         mus, errors = model.parameters.sample(QUERIES, seed=0), dict[str, list[tuple[float, float]]]()
         V, W, chi = model.problem.V, model.problem.W, model.reduced.generators
         for mu in mus[: QUERIES // 10]:
@@ -54,19 +54,17 @@ def main(run: str, cell: str, tolerance: float) -> None:
             print(f"    {name:26} {1e6 * seconds:6.0f} µs")
         seconds = in_turns({HIGH_FIDELITY: model.high_fidelity}, mus[:9])[HIGH_FIDELITY]
         print(f"    {HIGH_FIDELITY:26} {1e6 * seconds:6.0f} µs")
-    if model.certificate is not None and not exported.about["no_bounds"]:
-        bounds(model, tolerance)
 
 
-def in_c(file: Path) -> dict[str, Call]:
-    """The functions of the C source beside an exported file."""
+def in_c(file: Path, exported: Mapping[str, np.ndarray]) -> dict[str, Call]:
+    """The functions of the C source beside an exported file, with the arrays that it is made of."""
     library, data = file.with_suffix(".so"), np.load(file)
     compiler = ["cc", "-std=c99", "-O3", "-shared", "-fPIC", "-o", str(library), str(file.with_suffix(".c")), "-lm"]
     subprocess.run(compiler, check=True)
     found = ctypes.CDLL(str(library))
     sizes = data["f_terms"].shape[1], data["g_terms"].shape[1], 3
-    if "certificate_responses" in data:
-        sizes += (*data["certificate_responses"].shape, 3)
+    if "certificate_responses" in exported:
+        sizes += (*exported["certificate_responses"].shape, 3)
     arrays = [np.zeros(size) for size in sizes]
     x, alpha, residuals, *others = [array.ctypes.data_as(ctypes.c_void_p) for array in arrays]
 
@@ -80,29 +78,6 @@ def in_c(file: Path) -> dict[str, Call]:
 
     bounded = {"C, with bounds": partial(certify, 0), "C, corrected": partial(certify, 1)} if others else {}
     return {"C": solve} | bounded
-
-
-def bounds(model: vibench.Model, tolerance: float) -> None:
-    """Print how far the bounds of the script are from those of vibench, relative: median and largest."""
-    certificate, differences = model.certificate, dict[str, list[float]]()
-    assert certificate is not None
-    with tempfile.TemporaryDirectory() as folder:
-        vibench.export_model(model, Path(folder) / "model.npz", tolerance)
-        exported = WithBounds(Path(folder) / "model.npz")
-    for mu in model.parameters.sample(QUERIES // 10, seed=5):
-        reduced, (solution, bound, _) = model.reduced.assemble(mu), exported.solve(mu)
-        others = {"of the same solution": (solution.x, solution.alpha)}
-        if (exact := exact_solution(reduced.program)) is not None:
-            others["of the program solved to round-off"] = exact.x, exact.alpha
-        if (own := model.solve(mu)).x is not None and own.alpha is not None:
-            others[f"of `model.solve`, accuracy {model.accuracy:g}"] = own.x, own.alpha
-        for name, (x, alpha) in others.items():
-            of_vibench = certificate.evaluate(model.problem, mu, reduced, x, alpha)
-            pairs = ((bound.u_energy, of_vibench.u_energy), (bound.lambda_natural, of_vibench.lambda_natural))
-            differences.setdefault(name, []).append(max(abs(mine / theirs - 1.0) for mine, theirs in pairs))
-    print(f"bounds of the script at {QUERIES // 10} parameters, relative to those of vibench:")
-    for name, found in differences.items():
-        print(f"    {name:45} median {np.median(found):.1e}  largest {np.max(found):.1e}")
 
 
 if __name__ == "__main__":

@@ -178,9 +178,9 @@ class TestEngineer:
         mu = [3.0, 0.05]
         code = (
             "import json, sys; sys.modules['vibench'] = None\n"
-            "from reduced_model_certificate import Model\n"
+            "from reduced_model import Model\n"
             f"one = Model('string.npz').solve({mu})\n"
-            "print(json.dumps([one.solution.status, one.solution.outputs]))"
+            "print(json.dumps([one.status, one.outputs]))"
         )
         done = subprocess.run([sys.executable, "-c", code], cwd=exported, capture_output=True, text=True, check=True)
         status, values = json.loads(done.stdout)

@@ -177,7 +177,7 @@ def _export_model(
 ) -> None:
     """Export a model, and say which errors its polynomials have, what it bounds and how long its queries take."""
     from vibench.library import exported_seconds
-    from vibench.library.export import BOUNDS, RUNTIME, export_model
+    from vibench.library.export import RUNTIME, export_model
     from vibench.library.runs import open_run
     from vibench.model.chebyshev import MEASURED
     from vibench.offline.polynomials import TOLERANCE
@@ -194,17 +194,15 @@ def _export_model(
     if exported.about["solver"] != model.solver:
         echo(f"the cell's solver is {model.solver}, the script solves by {exported.about['solver']}")
     why = exported.about["no_bounds"]
-    echo(f"no error bounds: {why}" if why else f"error bounds: {exported.about['certificate']}")
+    echo(f"no error bounds: {why}" if why else f"error bounds in C: {exported.about['certificate']}")
     outputs = exported.about["outputs"]
     held, others = ", ".join(output["name"] for output in outputs["linear"]), ", ".join(outputs["left_out"])
     if held or others:
         echo(f"outputs: {held or 'none'}{f'; code that the file cannot hold computes {others}' * bool(others)}")
     echo(exported_seconds.in_words(model, file))
-    beside = [] if why else [file.with_name(BOUNDS)]
     sources = [file.with_suffix(end) for end in (".c", ".h") if target.suffix == ".c"]
-    written = ", ".join(map(str, [file, file.with_name(RUNTIME), *beside, *sources]))
-    script = Path(RUNTIME if why else BOUNDS).stem
-    echo(f"{written}: `from {script} import Model`, then `Model({str(file)!r}).solve(mu)`")
+    written = ", ".join(map(str, [file, file.with_name(RUNTIME), *sources]))
+    echo(f"{written}: `from {Path(RUNTIME).stem} import Model`, then `Model({str(file)!r}).solve(mu)`")
 
 
 def _export_fields(run: str, cell: str, mu: str, file: Path, places: Mapping[str, str]) -> None:

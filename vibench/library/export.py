@@ -18,23 +18,21 @@ from vibench.arrays import Array
 from vibench.errors import RequestError, requested
 from vibench.files import write_atomically, writing
 from vibench.interfaces.problem import MEMBERS
-from vibench.library import exported_certificate, exported_outputs
+from vibench.library import exported_certificate
 from vibench.library.reduced_model import FORMAT, SOLVERS
 from vibench.model.certificates.base import Guarantee, contact_unknowns
 from vibench.model.chebyshev import AffinePolynomial
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline import c_source
-from vibench.offline.models import Model
-from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, InaccurateError, member_polynomials
+from vibench.offline.c_source import ExactMember
+from vibench.offline.models import AnyReducedModel, Model
+from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, InaccurateError, declared_terms, member_polynomials
 from vibench.provenance import distribution_version
 from vibench.qp.settings import SETTINGS
 from vibench.study.cells import Cell
 
 RUNTIME = "reduced_model.py"
 """The runtime, written beside the exported files."""
-
-BOUNDS = "reduced_model_certificate.py"
-"""The same with error bounds, written where there are some."""
 
 RECORDED = (
     "cell", "problem", "problem_options", "training", "training_options", "dual", "dual_options", "primal",
@@ -59,13 +57,16 @@ class ExportedModel:
     about
         Everything else in it.
     thetas
-        What the certificate evaluates at a parameter, if there is one.
+        Polynomials of the θ that the certificate evaluates at a parameter, if there is one.
+    exact
+        Members and θ of a C source whose coefficients are declared as expressions.
     """
 
     members: Mapping[str, AffinePolynomial]
     arrays: Mapping[str, Array]
     about: Mapping[str, Any]
     thetas: Mapping[str, AffinePolynomial] = field(default_factory=dict)
+    exact: Mapping[str, ExactMember] = field(default_factory=dict)
 
     @property
     def error(self) -> float:
@@ -113,14 +114,13 @@ def export_model(
         raise RequestError(f"evaluations is {evaluations}, expected a number of parameters")
     if file.parent.exists() and not file.parent.is_dir():
         raise RequestError(f"'{file.parent}' is no folder")
-    scripts = [RUNTIME] if exported_certificate.reason_for_none(model.certificate) else [RUNTIME, BOUNDS]
-    runtime = {file.with_name(name): (files("vibench.library") / name).read_bytes() for name in scripts}
+    runtime = {file.with_name(RUNTIME): (files("vibench.library") / RUNTIME).read_bytes()}
     sources = [file.with_suffix(".c"), file.with_suffix(".h")] if c else []
     _refuse_to_overwrite([file, *sources], runtime)
     found = exported(model, tolerance, evaluations, bases, c)
     contents = {file: _npz(found), **runtime}
     if c:
-        texts = c_source.source(found.members, found.arrays, found.about, file.stem, found.thetas)
+        texts = c_source.source(found.members, found.arrays, found.about, file.stem, found.thetas, found.exact)
         contents |= {path: text.encode() for path, text in zip(sources, texts, strict=True)}
     with writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -145,6 +145,8 @@ def exported(
     """The model as `export_model` writes it."""
     box = model.parameters
     why = exported_certificate.reason_for_none(model.certificate)
+    if not why and not c:
+        why = "only C programs have them; export to a name that ends in .c"
     certificate = None if why else model.certificate
     beside = None if certificate is None else partial(exported_certificate.thetas, certificate)
     rotated = {} if certificate is None else exported_certificate.rotated(certificate)
@@ -165,12 +167,21 @@ def exported(
     basis = queried.basis if isinstance(queried, HyperReducedModel) else queried.fixed_basis
     if bases:
         arrays |= {"basis": basis, "generators": queried.generators}
-    arrays |= exported_outputs.arrays(model, basis, queried.generators, certificate)
+    arrays |= exported_certificate.output_arrays(model, basis, queried.generators, certificate)
+    exact = exact_members(queried, members) if c else {}
     if certificate is not None:
+        exact |= exported_certificate.exact_thetas(certificate, exact)
         unknowns = contact_unknowns(model.problem) if bases else None
-        arrays |= exported_certificate.arrays(certificate, polynomials | members, unknowns)
-        about["certificate"] = exported_certificate.guarantee(certificate, model.problem.constant).value
-    return ExportedModel(members, arrays, about, polynomials)
+        arrays |= exported_certificate.arrays(certificate, polynomials | members, exact, unknowns)
+        about["certificate"] = exported_certificate.guarantee(certificate, {*model.problem.constant, *exact}).value
+    return ExportedModel(members, arrays, about, polynomials, exact)
+
+
+def exact_members(queried: AnyReducedModel, members: Mapping[str, AffinePolynomial]) -> dict[str, ExactMember]:
+    """The members that a model evaluates by declared sums whose coefficients are all expressions."""
+    sums = ((name, queried.problem.affine[name]) for name in declared_terms(queried))
+    found = ((name, ExactMember.from_sum(declared, members[name].terms)) for name, declared in sums)
+    return {name: member for name, member in found if member is not None}
 
 
 def _about(model: Model, members: Mapping[str, AffinePolynomial]) -> dict[str, Any]:
@@ -187,7 +198,7 @@ def _about(model: Model, members: Mapping[str, AffinePolynomial]) -> dict[str, A
             name: {"degrees": list(member.degrees), "terms": len(member.terms), "error": member.error}
             for name, member in members.items()
         },
-        "outputs": exported_outputs.descriptions(model.problem),
+        "outputs": exported_certificate.output_descriptions(model.problem),
         "cell": {name: _plain(row[name]) for name in RECORDED if name in row},
         "exported_by": f"vibench {distribution_version('vibench')}",
         "source": {"distribution": origin, "licence": model.problem.licence or _licence(origin.partition(" ")[0])},
@@ -204,15 +215,20 @@ def _licence(distribution: str) -> str:
     """Licence that a distribution declares."""
     try:
         declared = metadata(distribution)
-    except PackageNotFoundError:
+    except (PackageNotFoundError, ValueError):  # a model of no run has no distribution, whose name is empty
         return "unknown"
     return next((str(declared[key]) for key in ("License-Expression", "License") if key in declared), "unknown")
 
 
 def _npz(model: ExportedModel) -> bytes:
     arrays: dict[str, Any] = {"format": np.array(FORMAT), "about": np.array(json.dumps(dict(model.about)))}
-    arrays |= model.arrays
-    for name, member in (*model.members.items(), *model.thetas.items()):
+    # the script bounds no errors, and of a certificate only the C source needs more than its `lift`
+    arrays |= {
+        name: array
+        for name, array in model.arrays.items()
+        if name == "certificate_lift" or not name.startswith("certificate_")
+    }
+    for name, member in model.members.items():
         arrays |= {f"{name}_indices": member.indices, f"{name}_coefficients": member.coefficients}
         arrays |= {f"{name}_terms": member.terms}
     content = io.BytesIO()

@@ -1,4 +1,4 @@
-"""What an exported model needs to bound its errors: arrays of a certificate, and θ of the members at a parameter."""
+"""Arrays by which an exported C program bounds its errors, and its linear quantities of interest."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Mapping, Set
 import numpy as np
 
 from vibench.arrays import Array, Indices
-from vibench.interfaces.problem import MEMBERS
-from vibench.model.certificates.base import Guarantee
+from vibench.interfaces.outputs import Output
+from vibench.interfaces.problem import MEMBERS, Problem
+from vibench.model.certificates.base import Guarantee, contact_unknowns, output_coefficients
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.chebyshev import AffinePolynomial
-
-EXACT = 1e-14
-"""A polynomial whose measured error is smaller is the function that it replaces, up to round-off."""
+from vibench.offline.c_source import ExactMember
+from vibench.offline.models import Model
 
 
 def reason_for_none(certificate: OnlineCertificate | None) -> str:
@@ -29,24 +29,36 @@ def reason_for_none(certificate: OnlineCertificate | None) -> str:
 
 
 def thetas(certificate: OnlineCertificate, samples: Mapping[str, Array]) -> dict[str, Array]:
-    """θ (Q,) of A, f, B and g in the terms of the certificate, from what a query evaluates."""
+    """θ (Q,) of A, f, B and g in the terms of the certificate, from the coefficients that a query evaluates."""
     found = certificate.base.coefficients(samples) | {"g": samples.get("g", np.ones(1))}
     return {f"theta_{name}": value for name, value in found.items()}
 
 
 def rotated(certificate: OnlineCertificate) -> dict[str, Array]:
-    """What takes the θ of A as a query evaluates them to those of the certificate; none of a constant A."""
+    """The matrix from the θ of A as a query evaluates them to those of the certificate; none of a constant A."""
     rotation = certificate.base.rotation
     return {} if rotation is None else {"theta_A": rotation}
 
 
+def exact_thetas(certificate: OnlineCertificate, exact: Mapping[str, ExactMember]) -> dict[str, ExactMember]:
+    """`thetas` of members that are exact."""
+    rotation = certificate.base.rotation
+    terms = {name: np.eye(len(member.thetas)) for name, member in exact.items()}
+    if rotation is not None and "A" in terms:
+        terms["A"] = rotation.T
+    return {f"theta_{name}": ExactMember(exact[name].thetas, matrix) for name, matrix in terms.items()}
+
+
 def arrays(
-    certificate: OnlineCertificate, polynomials: Mapping[str, AffinePolynomial], unknowns: Indices | None
+    certificate: OnlineCertificate,
+    polynomials: Mapping[str, AffinePolynomial],
+    exact: Mapping[str, ExactMember],
+    unknowns: Indices | None,
 ) -> dict[str, Array]:
     """The arrays of a certificate for which there is no `reason_for_none`.
 
     With the positions of the contact `unknowns`, those that take ν to a corrected u at mesh size are among them.
-    Bounds grow by what the measured errors of the polynomials, of A and of all θ, may add, doubled.
+    Bounds grow by what the measured errors of the polynomials, of A and of all θ, may add.
     """
     base, residual, corrections, terms = (
         certificate.base, certificate.residual, certificate.prepared, certificate.base.bound_terms
@@ -66,7 +78,7 @@ def arrays(
         loads = np.zeros((base.X.dim, len(corrections.rows)))
         loads[unknowns] = base.constraint[corrections.rows].toarray().T
         found["lift"] = base.X.riesz(loads)
-    error = {name: _error(polynomial) for name, polynomial in polynomials.items()}
+    error = {name: 0.0 if name in exact else _error(polynomial) for name, polynomial in polynomials.items()}
     sizes = residual.norms.copy()  # of all terms of residuals
     sizes[residual.kept] = np.hypot(
         np.linalg.norm(residual.factor, axis=0), residual.remainder * residual.inverse_scale
@@ -94,13 +106,50 @@ def arrays(
 
 def _error(polynomial: AffinePolynomial) -> float:
     """Absolute error to expect of a polynomial; none where it is the function that it replaces."""
-    return 0.0 if polynomial.error <= EXACT else 2.0 * polynomial.error * polynomial.scale
+    # below 1e-14 it is the function up to round-off; other parameters may have twice the measured error
+    return 0.0 if polynomial.error <= 1e-14 else 2.0 * polynomial.error * polynomial.scale
 
 
-def guarantee(certificate: OnlineCertificate, constant: Set[str]) -> Guarantee:
-    """What the bounds are worth: verified at most where a polynomial takes the place of a function of the parameter.
+def guarantee(certificate: OnlineCertificate, exact: Set[str]) -> Guarantee:
+    """Worth of the bounds: that of the certificate if all members are exact, constant or declared by expressions.
 
-    How far it is from the function was measured at some parameters, which proves nothing about others, however small
-    it is there. The polynomials of members that the problem declares constant are numbers.
+    Where a polynomial takes the place of a function they are verified at most: its error was measured at some
+    parameters, which proves nothing about others, however small it is there.
     """
-    return certificate.base.guarantee if constant >= set(MEMBERS) else Guarantee.VERIFIED
+    return certificate.base.guarantee if exact >= set(MEMBERS) else Guarantee.VERIFIED
+
+
+def _linear(problem: Problem) -> list[Output]:
+    """The outputs that are exported."""
+    return [output for output in problem.outputs if output.linear]
+
+
+def output_descriptions(problem: Problem) -> dict[str, list[dict[str, str]] | list[str]]:
+    """Names and units of the exported outputs, and names of those that code computes, which the file cannot hold."""
+    found = [{"name": output.name, "unit": output.unit} for output in _linear(problem)]
+    return {"linear": found, "left_out": [output.name for output in problem.outputs if not output.linear]}
+
+
+def output_arrays(
+    model: Model, basis: Array, generators: Array, certificate: OnlineCertificate | None
+) -> dict[str, Array]:
+    """Coefficients of x (O×N') and α (O×R), none without linear outputs.
+
+    With a certificate also of λ on all rows (O×m), of a in u = u_N − lift · a (O×j), and the `output_weights` (O×2).
+    """
+    problem, outputs = model.problem, _linear(model.problem)
+    if not outputs:
+        return {}
+    of_u, of_lam = (
+        np.array(rows) for rows in zip(*(output_coefficients(problem, output) for output in outputs), strict=True)
+    )
+    found = {"outputs_x": of_u @ basis, "outputs_alpha": of_lam @ generators}
+    if certificate is not None and certificate.prepared is not None:
+        B, X = certificate.base.constraint[certificate.prepared.rows], certificate.base.X
+        lifted = np.array([X.riesz(row)[contact_unknowns(problem)] for row in of_u])
+        found |= {
+            "certificate_outputs_lam": of_lam,
+            "certificate_outputs_shift": lifted @ B.T,
+            "certificate_outputs_weights": np.array([model.output_weights[output.name] for output in outputs]),
+        }
+    return found

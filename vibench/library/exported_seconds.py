@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.library import reduced_model, reduced_model_certificate
+from vibench.library import reduced_model
 from vibench.offline.models import Model
 from vibench.timing import timed
 
@@ -30,18 +30,16 @@ def in_turns(calls: Mapping[str, Call], mus: Array) -> dict[str, float]:
 
 
 def queries(model: Model, file: Path) -> dict[str, Call]:
-    """The script of an exported file and its model; without bounds, with those, and with corrected solutions.
+    """The script of an exported file and its model, which give u, λ and the outputs.
 
-    Both give what the script gives: u, λ, the outputs and their bounds.
+    A certified model also answers with bounds, and with corrected solutions.
     """
     plain = model if model.certificate is None else Model(model.reduced, model.solver, model.accuracy)
     found: dict[str, Call] = {SCRIPT: reduced_model.Model(file).solve, LIBRARY: partial(_whole, plain, False)}
-    script = reduced_model.Model(file)
-    if not script.about["no_bounds"]:
-        for corrected, what in ((False, "with bounds"), (True, "corrected")):
-            bounded = reduced_model_certificate.Model(file)  # one each: it keeps what the last parameter needed
-            found[f"{SCRIPT}, {what}"] = partial(bounded.solve, corrected=corrected)
-            found[f"{LIBRARY}, {what}"] = partial(_whole, model, corrected)
+    if model.certificate is not None:
+        found |= {
+            f"{LIBRARY}, {what}": partial(_whole, model, what == "corrected") for what in ("with bounds", "corrected")
+        }
     return found
 
 
@@ -53,8 +51,7 @@ def _whole(model: Model, corrected: bool, mu: Array) -> None:
 
 def in_words(model: Model, file: Path, count: int = 5) -> str:
     """Median CPU milliseconds of queries of the script at `count` parameters, and of high-fidelity solutions there."""
-    calls = {name: call for name, call in queries(model, file).items() if name.startswith(SCRIPT)}
-    seconds = in_turns(calls | {HIGH_FIDELITY: model.high_fidelity}, model.parameters.sample(count, seed=0))
-    of = {name: f"{1e3 * value:.2g} ms" for name, value in seconds.items()}
-    takes = ", ".join(of[name] + name.removeprefix(SCRIPT).replace(",", "") for name in calls)
-    return f"a query takes {takes}; the {HIGH_FIDELITY} {of[HIGH_FIDELITY]}"
+    calls: dict[str, Call] = {SCRIPT: reduced_model.Model(file).solve, HIGH_FIDELITY: model.high_fidelity}
+    seconds = in_turns(calls, model.parameters.sample(count, seed=0))
+    script, high_fidelity = (f"{1e3 * seconds[name]:.2g} ms" for name in calls)
+    return f"a query takes {script}; the {HIGH_FIDELITY} {high_fidelity}"

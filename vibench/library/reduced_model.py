@@ -24,7 +24,7 @@ DEGREE, ROUND_OFF, SMALL = 2**20, 1e-13, 1e-3
 
 
 class Solution(NamedTuple):
-    """Status, x, α, u and λ with bases, residuals, uᵀA u, outputs by name, and with a certificate their bounds.
+    """Status, x, α, u and λ with bases, residuals, uᵀA u, and outputs by name.
 
     "ok" is a solution up to the accuracy in the file, "outside" one outside the box, "inaccurate" none, there or not;
     "failed" means that A is not positive definite or an array is not finite, and that the numbers are NaN.
@@ -38,7 +38,6 @@ class Solution(NamedTuple):
     residuals: Residuals
     energy: float
     outputs: Mapping[str, float] = MappingProxyType({})
-    output_bounds: Mapping[str, float] = MappingProxyType({})
 
 
 class Model:

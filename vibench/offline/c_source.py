@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
 from importlib.resources import files
 from string import Template
 from types import MappingProxyType
@@ -12,6 +15,9 @@ from typing import Any
 import numpy as np
 
 from vibench.arrays import Array, Indices
+from vibench.errors import RequestError
+from vibench.interfaces.affine import AffineSum, Thetas
+from vibench.interfaces.expressions import CONSTANTS, Expression
 from vibench.interfaces.problem import MEMBERS
 from vibench.model.chebyshev import AffinePolynomial
 
@@ -24,37 +30,87 @@ SPECTRAL = ("anchors", "lower", "upper", "count", "term_norms", "spectral_error"
 """Arrays of a certificate that are only there where A depends on the parameter."""
 
 
+@dataclass(frozen=True)
+class ExactMember:
+    """A member Σ_q θ_q(mu) · terms_q whose θ_q are C expressions, with its flat terms (Q×size)."""
+
+    thetas: tuple[str, ...]
+    terms: Array
+
+    @classmethod
+    def from_sum(cls, declared: AffineSum, terms: Array) -> ExactMember | None:
+        """The member of a declared sum with other terms; `None` if a θ_q is code."""
+        texts = list[str]()
+        for theta in declared.thetas.functions if isinstance(declared.thetas, Thetas) else (declared.thetas,):
+            if isinstance(theta, Expression):
+                texts.append(_in_c(ast.parse(theta.text.strip(), mode="eval").body, theta.names))
+            elif callable(theta):
+                return None
+            else:
+                texts.append(repr(float(theta)))
+        return cls(tuple(texts), terms)
+
+
+def _in_c(node: ast.expr, names: Sequence[str]) -> str:
+    """A checked expression in the parameters, as C."""
+    match node:
+        case ast.Constant(value=int() | float() as value):
+            text = repr(float(value))
+        case ast.Name(id=name):
+            text = f"mu[{names.index(name)}]" if name in names else repr(float(CONSTANTS[name]))
+        case ast.BinOp(left=left, op=op, right=right):
+            one, other = _in_c(left, names), _in_c(right, names)
+            signs: dict[type[ast.operator], str] = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
+            text = f"pow({one}, {other})" if isinstance(op, ast.Pow) else f"({one} {signs[type(op)]} {other})"
+        case ast.UnaryOp(op=op, operand=operand):
+            text = f"({'-' if isinstance(op, ast.USub) else '+'}{_in_c(operand, names)})"
+        case ast.Call(func=ast.Name(id=name), args=arguments):
+            values = [_in_c(each, names) for each in arguments]
+            # functions have the same names in both languages but for these, and two arguments at most in C
+            c_name = {"abs": "fabs", "min": "fmin", "max": "fmax"}.get(name, name)
+            text = reduce(lambda a, b: f"{c_name}({a}, {b})", values) if len(values) > 1 else f"{c_name}({values[0]})"
+        case _:
+            raise RequestError(f"{ast.unparse(node)} is no checked expression")
+    return text
+
+
 def source(
     members: Mapping[str, AffinePolynomial],
     arrays: Mapping[str, Array],
     about: Mapping[str, Any],
     stem: str,
     thetas: Mapping[str, AffinePolynomial] = MappingProxyType({}),
+    exact: Mapping[str, ExactMember] = MappingProxyType({}),
 ) -> tuple[str, str]:
     """The C source of a model whose basis does not depend on the parameter, and its header.
 
-    The names of its functions begin with `stem`. With the `thetas` of a certificate it has error bounds.
+    The names of its functions begin with `stem`. With the `thetas` of a certificate it has error bounds. Members that
+    are `exact` take the place of polynomials with their names.
     """
     name = re.sub(r"\W", "_", f"model_{stem}" if not stem[:1].isalpha() else stem, flags=re.ASCII)
     box, cell, polynomials = about["parameters"], about["cell"], {**members, **thetas}
+    own = {key: exact.get(key, polynomial) for key, polynomial in polynomials.items()}
     values = {
         "name": name,
         "macro": name.upper(),
-        "origin": _comment(f"{cell['problem']}, {cell['dual']}, {cell['primal']}; cell {cell['cell']}"),
+        "origin": _comment(", ".join(str(cell.get(key, "")) for key in ("problem", "dual", "primal", "cell"))),
         "licence": _comment(f"{about['source']['distribution']}, {about['source']['licence']}"),
         "exporter": _comment(about["exported_by"]),
         "parameters": _comment(", ".join(f"{n} [{u}]" for n, u in zip(box["names"], box["units"], strict=True))),
         "dimension": len(arrays["lower"]),
         "unknowns": members["f"].terms.shape[1],
         "constraints": members["g"].terms.shape[1],
-        "degree": max(max(member.degrees) for member in polynomials.values()),
-        "terms": max(len(member.terms) for member in polynomials.values()),
+        "degree": max((max(one.degrees) for one in own.values() if isinstance(one, AffinePolynomial)), default=0),
+        "terms": max(len(member.terms) for member in own.values()),
         "accuracy": repr(float(about["accuracy"])),
         "lower": _numbers(arrays["lower"]),
         "upper": _numbers(arrays["upper"]),
-        "members": "\n".join(_member(key, members[key]) for key in MEMBERS),
+        "members": "\n".join(_member(key, own[key]) for key in MEMBERS),
         "output_count": 0,
     }
+    # a function that nothing calls would be a warning of the compiler
+    some = any(isinstance(one, AffinePolynomial) for one in own.values())
+    values["products"] = _filled("reduced_model_products.c", {}) if some else ""
     parts: list[str] = []
     if "outputs_x" in arrays:
         names = (f"{output['name']} [{output['unit']}]" for output in about["outputs"]["linear"])
@@ -62,7 +118,7 @@ def source(
         values |= {"output_arrays": "\n".join(_array(key, arrays[key]) for key in ("outputs_x", "outputs_alpha"))}
         parts.append("outputs")
     if thetas:
-        values |= _of_certificate(thetas, arrays)
+        values |= _of_certificate({key: own[key] for key in thetas}, arrays) | {"guarantee": about["certificate"]}
         parts += ["certificate", "certified_outputs"] if parts else ["certificate"]
     for kind, name in (("h", "declarations"), ("c", "code")):
         values[name] = "".join(_filled(f"reduced_model_{part}.{kind}", values) for part in parts)
@@ -76,7 +132,9 @@ def _filled(template: str, values: Mapping[str, Any]) -> str:
     ).substitute(values)
 
 
-def _of_certificate(thetas: Mapping[str, AffinePolynomial], arrays: Mapping[str, Array]) -> dict[str, Any]:
+def _of_certificate(
+    thetas: Mapping[str, AffinePolynomial | ExactMember], arrays: Mapping[str, Array]
+) -> dict[str, Any]:
     """What the templates of a certificate have in place of names: sizes, polynomials and arrays."""
     own: dict[str, Array] = {f"{PREFIX}{name}": np.zeros(1) for name in SPECTRAL}
     own |= {name: array for name, array in arrays.items() if name.startswith(PREFIX) and name != f"{PREFIX}lift"}
@@ -101,8 +159,21 @@ def _array(name: str, array: Array | Indices) -> str:
     return f"static const {kind} {name}[] = {{\n{_numbers(array if array.size else np.zeros(1))}\n}};"
 
 
-def _member(name: str, member: AffinePolynomial) -> str:
-    """Arrays of one member: degrees, coefficients that are not zero, product by product, and terms."""
+def _member(name: str, member: AffinePolynomial | ExactMember) -> str:
+    """Terms of one member, and a function that evaluates its θ.
+
+    A polynomial has arrays of degrees, and of coefficients that are not zero, product by product.
+    """
+    head = (
+        f"static void {name}_thetas(const double *mu, double polynomials[DIMENSION][DEGREE + 1], double *theta)\n{{\n"
+    )
+    if isinstance(member, ExactMember):
+        lines = "".join(f"    theta[{q}] = {text};\n" for q, text in enumerate(member.thetas))
+        return (
+            f"enum {{ {name}_TERMS = {len(member.terms)} }};\n"
+            f"static const double {name}_terms[] = {{\n{_numbers(member.terms)}\n}};\n"
+            f"{head}    (void)mu;\n    (void)polynomials;\n{lines}}}\n"
+        )
     products, terms = member.coefficients.shape
     rows, columns = np.nonzero(member.coefficients)
     starts = np.searchsorted(rows, np.arange(products + 1))
@@ -115,6 +186,8 @@ def _member(name: str, member: AffinePolynomial) -> str:
         f"static const int {name}_columns[] = {{\n{_numbers(columns)}\n}};\n"
         f"static const double {name}_coefficients[] = {{\n{_numbers(values)}\n}};\n"
         f"static const double {name}_terms[] = {{\n{_numbers(member.terms)}\n}};\n"
+        f"{head}    (void)mu;\n    add_products(polynomials, {name}_PRODUCTS, {name}_degrees, {name}_starts, "
+        f"{name}_columns, {name}_coefficients, theta);\n}}\n"
     )
 
 

@@ -13,13 +13,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
+import scipy.sparse.linalg
+from samples import small_study
 
 import vibench
+from vibench.interfaces.affine_problem import AffineProblem
 from vibench.interfaces.outputs import Output
 from vibench.library.export import export_model, exported
 from vibench.library.reduced_model import Model as Exported
-from vibench.library.reduced_model_certificate import Model as WithBounds
 from vibench.model.certificates import contact_correction as complementarity
+from vibench.model.certificates.base import Guarantee
 from vibench.model.chebyshev import AffinePolynomial, products
 from vibench.offline import c_source
 from vibench.qp.exact import exact_solution
@@ -96,22 +100,108 @@ def test_a_c_source_gives_the_answers_of_the_model(model: vibench.Model, tmp_pat
             assert says[solve(script.upper + far * width)[0]] == script.solve(script.upper + far * width).status
 
 
+Certify = Callable[[np.ndarray, bool], tuple[int, np.ndarray, np.ndarray, np.ndarray]]
+
+
+def certify(model: vibench.Model, file: Path, tolerance: float) -> Certify:
+    """The functions of the C source of a model: the code, u, λ and three bounds at a parameter, corrected or not."""
+    arrays = export_model(model, file, tolerance=tolerance, evaluations=6000, c=True).arrays
+    found, (rows, loads), basis = (
+        library(file.with_suffix(".c")),
+        arrays["certificate_responses"].shape,
+        arrays["basis"],
+    )
+
+    def certified(mu: np.ndarray, corrected: bool) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+        x, alpha, residuals = np.zeros(basis.shape[1]), np.zeros(arrays["generators"].shape[1]), np.zeros(3)
+        lam, shift, bounds = np.full(rows, np.nan), np.full(loads, np.nan), np.full(3, np.nan)
+        assert found.model_solve(*pointers(mu, x, alpha, residuals)) in {0, 16}
+        code = found.model_certify(*pointers(mu, x, alpha), int(corrected), *pointers(lam, shift, bounds))
+        return code, basis @ x - arrays["certificate_lift"] @ shift, lam, bounds
+
+    return certified
+
+
+def assert_bounded(model: vibench.Model, mu: np.ndarray, u: np.ndarray, lam: np.ndarray, bounds: np.ndarray) -> None:
+    """No error of u and λ is above its bound."""
+    exact, vi = model.high_fidelity(mu), model.problem.assemble(mu)
+    away, force = exact.u - u, vi.B.T @ (exact.lam - lam)
+    assert float(away @ (vi.A @ away)) <= bounds[0] ** 2
+    assert float(force @ scipy.sparse.linalg.spsolve(vi.A.tocsc(), force)) <= bounds[1] ** 2
+
+
+def test_errors_of_polynomials_are_in_the_bounds(tmp_path: Path) -> None:
+    """A model whose own error is smaller than what its coarse polynomials miss."""
+    problem = [{"name": "obstacle", "options": {"resolution": 150}}]
+    study = small_study("tight", problem, assembly=["certified"], tolerances=[{"pod": [1e-6], "dual": [1e-4]}])
+    model = model_of(vibench.run(study, tmp_path / "run", progress=False, jobs=1), "obstacle", "certified")
+    certified = certify(model, tmp_path / "model.npz", tolerance=1e-2)
+    for mu in model.parameters.sample(20, seed=5):
+        code, u, lam, bounds = certified(mu, False)
+        assert code == 0
+        assert_bounded(model, mu, u, lam, bounds)
+        assert bounds[2] < 10.0
+
+
+class Expressed(AffineProblem):
+    """A string whose members are sums with expressions: no code of the problem is needed at a parameter."""
+
+    parameters = vibench.ParameterBox(("a", "b"), np.array([0.5, -1.0]), np.array([2.0, 1.0]), ("1", "1"))
+
+    def __init__(self) -> None:
+        n, rng = 24, np.random.default_rng(3)
+        K = sp.diags_array([-np.ones(n - 1), 2.0 * np.ones(n), -np.ones(n - 1)], offsets=(-1, 0, 1)) * (n + 1.0)
+        M = sp.eye_array(n) / (n + 1.0)
+        self.V = vibench.InnerProduct(sp.csc_array(K + M))
+        self.W = vibench.InnerProduct(sp.eye_array(6, format="csc"))
+        B = np.zeros((6, n))
+        B[np.arange(6), np.arange(9, 15)] = -1.0
+        B = B + 0.1 * np.abs(rng.standard_normal(B.shape)) * (B != 0.0)
+        f, g = np.full(n, -3.0 / (n + 1.0)), np.full(6, 0.02)
+        self.declare(
+            A=[("1 + max(0.1, abs(b)) * a**1.5", K), ("sqrt(a) + atan2(b, 2 * a)", M)],
+            f=[("exp(-a) * cos(pi * b) + 2", f), (0.5, f)],
+            B=[("1 + sin(a * b)**2", B)],
+            g=[("log(2 + a)", g), ("-min(0, b, a - 1) / e", g)],
+        )
+
+    def training_set(self) -> np.ndarray:
+        return self.parameters.grid(4, 4)
+
+
+def test_expressions_are_exact_in_c_and_bounds_are_certified(tmp_path: Path) -> None:
+    """The same numbers as those of vibench to round-off, though no polynomial of the file reaches that."""
+    dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
+    loose = vibench.Stop(tolerance=1e-1)
+    reduction = vibench.Reduction(Expressed(), dual, primal, loose, loose, tolerance=0.3, assembly="certified")
+    model = reduction.model
+    assert model.certificate is not None
+    assert model.certificate.base.guarantee is Guarantee.CERTIFIED
+    whole = exported(model, tolerance=1e-2, c=True)
+    assert set(whole.exact) == {*"AfBg", "theta_A", "theta_f", "theta_B", "theta_g"}
+    assert whole.about["certificate"] == "certified"
+    assert whole.error > 1e-8
+    certified = certify(model, tmp_path / "model.npz", tolerance=1e-2)
+    assert "the bounds are\n * certified" in (tmp_path / "model.h").read_text()
+    for mu in model.parameters.sample(20, seed=5):
+        for corrected in (False, True):
+            own = model.solve(mu, accuracy=1e-13, corrected=corrected)
+            assert own.bound is not None
+            code, u, lam, bounds = certified(mu, corrected)
+            assert code == 0
+            expected = own.bound.u_energy, own.bound.lambda_natural, own.bound.relative
+            assert bounds == pytest.approx(expected, rel=1e-7)
+            assert np.linalg.norm(u - own.u) <= 1e-10 * np.linalg.norm(own.u)
+            assert np.linalg.norm(lam - own.lam) <= 1e-9 * np.linalg.norm(own.lam)
+            assert_bounded(model, mu, u, lam, bounds)
+
+
 @pytest.mark.parametrize("problem", PROBLEMS)
 def test_a_c_source_has_the_bounds_and_the_corrected_pair_of_the_model(
     problem: str, small_run: vibench.Run, tmp_path: Path
 ) -> None:
     model = model_of(small_run, problem, "certified")
-    export_model(model, tmp_path / "model.npz", tolerance=2e-13, evaluations=6000, c=True)
-    found, data = library(tmp_path / "model.c"), dict(np.load(tmp_path / "model.npz"))
-    (rows, loads), basis = data["certificate_responses"].shape, data["basis"]
-
-    def certified(mu: np.ndarray, corrected: bool) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
-        x, alpha, residuals = np.zeros(basis.shape[1]), np.zeros(data["generators"].shape[1]), np.zeros(3)
-        lam, shift, bounds = np.full(rows, np.nan), np.full(loads, np.nan), np.full(3, np.nan)
-        assert found.model_solve(*pointers(mu, x, alpha, residuals)) in {0, 16}
-        code = found.model_certify(*pointers(mu, x, alpha), int(corrected), *pointers(lam, shift, bounds))
-        return code, basis @ x - data["certificate_lift"] @ shift, lam, bounds
-
+    certified = certify(model, tmp_path / "model.npz", tolerance=2e-13)
     for mu in model.parameters.sample(20, seed=5):
         for corrected in (False, True):
             own = model.solve(mu, accuracy=1e-13, corrected=corrected)
@@ -133,7 +223,7 @@ def test_a_c_source_has_the_bounds_and_the_corrected_pair_of_the_model(
 
 
 @pytest.mark.parametrize("problem", PROBLEMS)
-def test_outputs_and_their_bounds_are_those_of_the_model_in_script_and_c(
+def test_outputs_are_those_of_the_model_in_script_and_c_and_their_bounds_in_c(
     problem: str, small_run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = model_of(small_run, problem, "certified")
@@ -145,12 +235,12 @@ def test_outputs_and_their_bounds_are_those_of_the_model_in_script_and_c(
         Output("both", "1", u=rng.standard_normal(sizes[0]), lam=rng.standard_normal(sizes[1])),
     )
     monkeypatch.setattr(type(model.problem), "outputs", outputs)
-    about = export_model(model, tmp_path / "model.npz", tolerance=2e-13, evaluations=6000, c=True).about
+    whole = export_model(model, tmp_path / "model.npz", tolerance=2e-13, evaluations=6000, c=True)
+    about, data = whole.about, whole.arrays
     assert about["outputs"]["left_out"] == ["squared"]
     names = [output["name"] for output in about["outputs"]["linear"]]
     assert names == ["load", "force */", "both"]
-    found, data = library(tmp_path / "model.c"), dict(np.load(tmp_path / "model.npz"))
-    script = WithBounds(tmp_path / "model.npz")
+    found, script = library(tmp_path / "model.c"), Exported(tmp_path / "model.npz")
     x, alpha, residuals = np.zeros(data["basis"].shape[1]), np.zeros(data["generators"].shape[1]), np.zeros(3)
     lam, shift = (np.zeros(size) for size in data["certificate_responses"].shape)
     bounds, values, errors, plain = (np.zeros(3) for _ in range(4))
@@ -168,18 +258,16 @@ def test_outputs_and_their_bounds_are_those_of_the_model_in_script_and_c(
             found.model_solve(*pointers(mu, x, alpha, residuals))
             assert found.model_certify(*pointers(mu, x, alpha), int(corrected), *pointers(lam, shift, bounds)) == 0
             found.model_certified_outputs(*pointers(mu, x, lam, shift, bounds, values, errors))
-            answer = script.solve(mu, corrected=corrected).solution
-            assert list(answer.outputs) == list(answer.output_bounds) == names
             scale = np.abs(expected).max()
-            for one in (values, np.array(list(answer.outputs.values()))):
-                assert one == pytest.approx(expected, rel=1e-9, abs=1e-9 * scale)
-            for one in (errors, np.array(list(answer.output_bounds.values()))):
-                assert one == pytest.approx(proved, rel=1e-9)
+            assert values == pytest.approx(expected, rel=1e-9, abs=1e-9 * scale)
+            assert errors == pytest.approx(proved, rel=1e-9)
             if not corrected:
                 found.model_outputs(*pointers(x, alpha, plain))
                 assert plain == pytest.approx(values, rel=1e-12, abs=1e-12 * scale)
-                assert list(script.plain.solve(mu).outputs.values()) == pytest.approx(plain, abs=1e-12 * scale)
-    outside = script.plain.lower - 1.0
+                answer = script.solve(mu).outputs
+                assert list(answer) == names
+                assert list(answer.values()) == pytest.approx(plain, abs=1e-12 * scale)
+    outside = script.lower - 1.0
     assert found.model_certify(*pointers(outside, x, alpha), 0, *pointers(lam, shift, bounds)) == 4
     found.model_certified_outputs(*pointers(outside, x, lam, shift, bounds, values, errors))
     assert np.all(errors == np.inf)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import itertools
 import json
 import re
 import subprocess
@@ -17,26 +16,22 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.sparse as sp
-import scipy.sparse.linalg
 from enriching import reduced_from
 from numerics import Varying
 from running import Main, refused
-from samples import small_study
 
 import vibench
 from vibench.library import exported_certificate, reduced_model
-from vibench.library.export import BOUNDS, RUNTIME, export_model
+from vibench.library.export import RUNTIME, export_model
 from vibench.library.export import exported as exported_model
 from vibench.library.reduced_model import Model as Exported
-from vibench.library.reduced_model_certificate import Model as WithBounds
 from vibench.model.affine import affine_decomposition
-from vibench.model.certificates.base import Guarantee, contact_unknowns
+from vibench.model.certificates.base import Guarantee
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.offline import polynomials
 from vibench.qp.exact import exact_solution
 
 FILES = {"model.npz", RUNTIME}
-FOUND = " was found at this parameter"
 
 
 @pytest.fixture(scope="module")
@@ -556,176 +551,52 @@ def certified_model(run: vibench.Run, problem: str = "radial-obstacle", primal: 
     return model_of(run, problem, primal, "certified")
 
 
-@pytest.mark.parametrize(
-    ("problem", "primal", "guarantee"),
-    [
-        ("radial-obstacle", "decorrelated", "verified"),  # A and B are constant, g is a polynomial by measurement
-        ("obstacle", "decorrelated", "verified"),  # A varies, so that bounds of its spectrum are needed
-        ("obstacle", "online-supremizers", "verified"),
-    ],
-)
-def test_an_exported_certificate_gives_the_bounds_of_vibench(
-    problem: str, primal: str, guarantee: str, run: vibench.Run, tmp_path: Path
-) -> None:
-    model = certified_model(run, problem, primal)
-    assert model.certificate is not None
-    found = export_model(model, tmp_path / "model.npz")
-    assert {file.name for file in tmp_path.iterdir()} == FILES | {BOUNDS}
-    assert found.about["certificate"] == guarantee
-    exported = WithBounds(tmp_path / "model.npz")
-    for mu in model.parameters.sample(20, seed=5):
-        answer = exported.solve(mu)
-        solution, bound = answer.solution, answer.bound
-        reduced = model.reduced.assemble(mu)
-        expected = model.certificate.evaluate(model.problem, mu, reduced, solution.x, solution.alpha)
-        assert (bound.guarantee, expected.note) == (guarantee, "")
-        program, own = exact_solution(reduced.program), model.solve(mu).bound
-        assert program is not None
-        assert own is not None
-        solved = model.certificate.evaluate(model.problem, mu, reduced, program.x, program.alpha)
-        for name in ("u_energy", "lambda_natural", "relative"):
-            assert getattr(bound, name) == pytest.approx(getattr(expected, name), rel=1e-7)
-            assert getattr(bound, name) == pytest.approx(getattr(solved, name), rel=1e-6)
-            # `solve` stops at the accuracy of the cell, and its bounds are of the solution that it returns
-            assert getattr(bound, name) == pytest.approx(getattr(own, name), rel=1e-2)
-        exact, vi = model.high_fidelity(mu), model.problem.assemble(mu)
-        away = exact.u - solution.u
-        assert float(away @ (vi.A @ away)) <= bound.u_energy**2
-        assert exported.solve(mu, tolerance=1.01 * bound.relative).verdict == guarantee
-        assert exported.solve(mu, tolerance=0.99 * bound.relative).verdict == "not certified"
-        assert answer.verdict == "no tolerance"
-
-
-@pytest.mark.parametrize("problem", ["radial-obstacle", "obstacle"])
-def test_an_exported_model_gives_the_corrected_pair_of_vibench(
-    problem: str, run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    model = certified_model(run, problem)
-    assert model.certificate is not None
-    export_model(model, tmp_path / "model.npz")
-    exported, W = WithBounds(tmp_path / "model.npz"), model.problem.W
-    for mu in model.parameters.sample(10, seed=5):
-        plain, (solution, bound, _) = exported.solve(mu), exported.solve(mu, corrected=True)
-        reduced, exact, vi = model.reduced.assemble(mu), model.high_fidelity(mu), model.problem.assemble(mu)
-        _, own = model.certificate.certify(model.problem, mu, reduced, plain.solution.x, plain.solution.alpha)
-        assert own is not None
-        assert np.array_equal(solution.x, plain.solution.x)
-        assert not np.array_equal(solution.lam, plain.solution.lam)
-        assert W.norm(solution.lam - own.nu) <= 1e-7 * W.norm(exact.lam)
-        v = model.certificate.corrected(plain.solution.u, own, contact_unknowns(model.problem))
-        assert np.abs(solution.u - v).max() <= 1e-7 * np.abs(v).max()
-        assert np.max(vi.B @ solution.u - vi.g) <= 1e-12 * np.abs(vi.g).max()
-        assert bound.guarantee == plain.bound.guarantee
-        for name in ("u_energy", "lambda_natural", "relative"):
-            assert getattr(bound, name) == pytest.approx(getattr(own.bound, name), rel=1e-6)
-        away = exact.u - solution.u
-        assert float(away @ (vi.A @ away)) <= bound.u_energy**2
-        assert exported.solve(mu, 1.01 * bound.relative, corrected=True).verdict == bound.guarantee
-    outside = 2.0 * model.parameters.upper
-    with pytest.warns(UserWarning, match="outside the box"):
-        assert exported.solve(outside, corrected=True).bound.guarantee == "none"
-    found, count = exported._lifting, itertools.count()  # that of the bound, and none for the pair
-    monkeypatch.setattr(exported, "_lifting", lambda *given: None if next(count) else found(*given))
-    answer = exported.solve(mu, corrected=True)
-    if problem == "radial-obstacle":  # A is constant: the pair is corrected by the w of the bound
-        assert next(count) == 1
-        assert np.array_equal(answer.solution.lam, solution.lam)
-        return
-    assert answer.bound[:4] == plain.bound[:4]
-    assert answer.bound.note.startswith("no corrected pair was found")
-    assert np.array_equal(answer.solution.u, plain.solution.u)
-
-
 def test_one_polynomial_serves_a_and_its_certificate(run: vibench.Run) -> None:
-    model = certified_model(run, "obstacle")
-    found = exported_model(model, bases=False)
+    found = exported_model(certified_model(run, "obstacle"), bases=False, c=True)
     A, theta = found.members["A"], found.thetas["theta_A"]
     assert np.array_equal(A.indices, theta.indices)
     assert np.array_equal(A.coefficients, theta.coefficients)
     assert max(A.error, theta.error) <= 1e-11
 
 
-def test_where_an_exported_certificate_has_no_bound_it_says_why(
-    run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    model = certified_model(run, "obstacle")
-    export_model(model, tmp_path / "model.npz")
-    exported, mu = WithBounds(tmp_path / "model.npz"), model.parameters.sample(1, seed=5)[0]
-    found = exported.solve(mu).solution
-    assert found.alpha.max() > 0.0
-    bound, *_ = exported._bound(mu, found.x, -found.alpha, found.energy)
-    assert bound == (np.inf, np.inf, np.inf, "none", "λ_N has negative coefficients")
-    with monkeypatch.context() as patch:
-        patch.setattr(exported, "_lifting", lambda *_: None)
-        assert exported.solve(mu).bound == (np.inf, np.inf, np.inf, "none", f"no w with B w ≥ s{FOUND}")
-        assert exported.solve(mu, tolerance=1e9).verdict == "not certified"
-    exported = WithBounds(tmp_path / "model.npz")
-    exported._data["spectral_error"] = np.array(1.0)  # as much as A itself
-    assert exported.solve(mu).bound == (np.inf, np.inf, np.inf, "none", f"no α > 0{FOUND}")
-
-
-def test_errors_of_polynomials_are_in_the_bounds(tmp_path: Path) -> None:
-    """A model whose own error is smaller than what its coarse polynomials miss."""
-    problem = [{"name": "obstacle", "options": {"resolution": 150}}]
-    tight = [{"pod": [1e-6], "dual": [1e-4]}]
-    study = small_study("tight", problem, assembly=["certified"], tolerances=tight)
-    model = certified_model(vibench.run(study, tmp_path / "run", progress=False, jobs=1), "obstacle")
-    export_model(model, tmp_path / "model.npz", tolerance=1e-2)
-    exported = WithBounds(tmp_path / "model.npz")
-    for mu in model.parameters.sample(20, seed=5):
-        solution, bound, _ = exported.solve(mu)
-        exact, vi = model.high_fidelity(mu), model.problem.assemble(mu)
-        away, force = exact.u - solution.u, vi.B.T @ (exact.lam - solution.lam)
-        assert float(away @ (vi.A @ away)) <= bound.u_energy**2
-        assert float(force @ scipy.sparse.linalg.spsolve(vi.A.tocsc(), force)) <= bound.lambda_natural**2
-        assert bound.u_energy < 10.0 * np.sqrt(solution.energy)
-
-
-def test_there_are_no_bounds_outside_the_box_and_no_odd_tolerances(run: vibench.Run, tmp_path: Path) -> None:
-    model = certified_model(run)
-    export_model(model, tmp_path / "model.npz")
-    exported, box = WithBounds(tmp_path / "model.npz"), model.parameters
-    assert exported.solve(box.upper, tolerance=1e9).verdict == "verified"
-    with pytest.warns(UserWarning, match="outside the box"):
-        answer = exported.solve(1.1 * box.upper, tolerance=1e9)
-    assert answer.verdict == "not certified"
-    assert answer.bound == (np.inf, np.inf, np.inf, "none", "mu is outside the parameter box")
-    for tolerance in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(ValueError, match="expected a positive finite number"):
-            exported.solve(box.upper, tolerance=tolerance)
-
-
-def test_a_model_without_a_certificate_has_no_bounds_and_says_why(run: vibench.Run, tmp_path: Path) -> None:
-    file = tmp_path / "model.npz"
-    found = export_model(model_of(run, "radial-obstacle"), file)
-    assert found.about["certificate"] == "none"
-    assert 'assembly = "certified"' in found.about["no_bounds"]
-    with pytest.raises(ValueError, match="has no error bounds: its cell has no bounds"):
-        WithBounds(file)
+def test_a_file_without_bounds_says_why(run: vibench.Run) -> None:
+    for model, c, why in (
+        (model_of(run, "radial-obstacle"), True, 'assembly = "certified"'),
+        (certified_model(run), False, "only C programs have them"),
+        (certified_model(run), True, ""),
+    ):
+        found = exported_model(model, c=c)
+        assert why in found.about["no_bounds"]
+        assert (found.about["certificate"] == "none") == bool(found.about["no_bounds"]) == bool(why)
+        assert bool(found.thetas) == (not why)
 
 
 def test_polynomials_that_take_the_place_of_functions_are_not_called_certified(run: vibench.Run) -> None:
-    """However well they agree at random parameters: only members that are declared constant are numbers."""
+    """However well they agree at random parameters: only constant members and expressions are exact."""
     model = certified_model(run)
     assert model.certificate is not None
     assert model.certificate.base.guarantee is Guarantee.CERTIFIED
-    found = exported_model(model)
-    assert max(polynomial.error for polynomial in (*found.members.values(), *found.thetas.values())) < 1e-14
-    assert found.about["certificate"] == "verified"
-    for constant, worth in (("Af", "verified"), ("AfB", "verified"), ("AfBg", "certified")):
-        assert exported_certificate.guarantee(model.certificate, set(constant)).value == worth
+    found = exported_model(model, c=True)
+    assert found.exact.keys() == {"g", "theta_g"}  # the others are constant
+    assert found.about["certificate"] == "certified"
+    assert exported_model(certified_model(run, "obstacle"), c=True).about["certificate"] == "verified"
+    for exact, worth in (("Af", "verified"), ("AfB", "verified"), ("AfBg", "certified")):
+        assert exported_certificate.guarantee(model.certificate, set(exact)).value == worth
 
 
 def test_the_command_says_what_has_bounds(run: vibench.Run, main: Main, tmp_path: Path) -> None:
-    cell, file = str(certified_model(run).row["cell"]), tmp_path / "out" / "model.npz"
-    code, out, err = main("export", str(run.path.parent), cell, str(file.with_suffix(".c")))
+    cell, file = str(certified_model(run).row["cell"]), tmp_path / "out" / "model.c"
+    code, out, err = main("export", str(run.path.parent), cell, str(file))
     assert (code, err) == (0, "")
-    assert "\nerror bounds: verified\n" in out
-    assert re.search(r"^a query takes \S+ ms, \S+ ms with bounds, \S+ ms corrected; the high", out, re.MULTILINE)
-    assert "`from reduced_model_certificate import Model`" in out
-    assert {file.name for file in (tmp_path / "out").iterdir()} == FILES | {BOUNDS, "model.c", "model.h"}
-    assert "int model_certify(" in file.with_suffix(".h").read_text()
-    assert len(file.with_name(BOUNDS).read_text().splitlines()) < 300
+    assert "\nerror bounds in C: certified\n" in out
+    assert re.search(r"^a query takes \S+ ms; the high", out, re.MULTILINE)
+    assert "`from reduced_model import Model`" in out
+    assert {file.name for file in (tmp_path / "out").iterdir()} == FILES | {"model.c", "model.h"}
+    header = file.with_suffix(".h").read_text()
+    assert "int model_certify(" in header
+    assert "the bounds are\n * certified" in header
+    with np.load(file.with_suffix(".npz")) as data:
+        assert {name for name in data.files if name.startswith("certificate")} == {"certificate_lift"}
 
 
 def test_the_code_of_the_page_runs(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -737,6 +608,4 @@ def test_the_code_of_the_page_runs(run: vibench.Run, tmp_path: Path, monkeypatch
     for code in re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL):
         exec(code, found)
     assert found["solution"].status == "ok"
-    assert found["answer"].bound.guarantee == "verified"
-    for name in ("reduced_model", "reduced_model_certificate"):
-        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delitem(sys.modules, "reduced_model")
