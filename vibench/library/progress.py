@@ -5,9 +5,8 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from time import monotonic
-from typing import Any
+from typing import Any, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -20,129 +19,98 @@ from vibench.stages.base import Stage
 from vibench.study.cells import Cell
 from vibench.text import new_console, print_line, printable
 
-LINE_EVERY = 4
-"""Parts of a stage that share one line of progress."""
-
-CELL_LINES = 25
-"""Lines about ok cells where there is no terminal: of larger runs, some cells have one."""
-
-REASONS = 10
-"""Reasons for which cells are not ok that are printed."""
-
-ALIKE = 3
-"""Lines about cells that are not ok for reasons that differ in their numbers alone."""
-
-
-FIRST_SECONDS = 20.0
-"""A line says how long the run will take when a stage has taken so long, its pace is known, and none is done."""
-
-
+# Stages of one problem that take about as long: the problem, and `Stage.sort`.
 _Sort = tuple[Plugin | None, str]
-"""Stages of one problem that take about as long: the problem, and `Stage.sort`."""
 
 
-@dataclass
-class _Count:
-    """What is known of the stages of one sort: how many were planned, are left and are done, and wall seconds."""
-
-    effort: float = 0.0
-    planned: int = 0
-    left: int = 0
-    done: int = 0
-    wall: float = 0.0
-
-
-@dataclass
 class _Running:
-    """A running stage: when it began, and the shares of it (share, seconds) that were seen to be done."""
+    """A running stage: when it began, and the first and the last (fraction, seconds) that it reported."""
 
-    sort: _Sort
-    began: float
-    first: tuple[float, float] = (0.0, 0.0)
-    last: tuple[float, float] = (0.0, 0.0)
+    def __init__(self, sort: _Sort) -> None:
+        self.sort, self.began = sort, monotonic()
+        self.first = self.last = (0.0, 0.0)
 
-    def note(self, share: float, now: float) -> None:
-        """It tells this share."""
-        if share > self.last[0]:
-            self.last = share, now - self.began
+    def note(self, fraction: float, now: float) -> None:
+        """Note a fraction that is done."""
+        if fraction > self.last[0]:
+            self.last = fraction, now - self.began
             self.first = self.first if self.first[0] else self.last
 
     @property
-    def tells_more(self) -> bool:
-        """Whether two shares are known: the first one has the set-up."""
+    def has_pace(self) -> bool:
+        """Whether two fractions are known: the first one includes the set-up."""
         return self.last != self.first
 
     @property
     def seconds(self) -> float:
-        """How long it takes but for the set-up, if that is told apart; there is a share."""
-        (share, seconds), (before, setup) = self.last, self.first if self.tells_more else (0.0, 0.0)
-        return (seconds - setup) / (share - before)
+        """Seconds of all of it, without the set-up where there is a pace; needs a fraction."""
+        (fraction, seconds), (before, setup) = self.last, self.first if self.has_pace else (0.0, 0.0)
+        return (seconds - setup) / (fraction - before)
 
 
 class TimeLeft:
     """Estimate of the seconds left from the mean wall seconds of the stages of each sort done so far.
 
-    A stage that tells which share of it is done counts before its end, too. How long stages of a sort take that has not
-    been seen follows from their `effort`, and from what those of the others of the same problem take.
+    A stage that reports its fractions counts before its end. Sorts without any finished stage take as long as their
+    `effort` says, at the pace of the other sorts of the same problem.
     """
 
     def __init__(self, pending: Sequence[Stage], jobs: int) -> None:
-        self._sorts: defaultdict[_Sort, _Count] = defaultdict(_Count)
-        self._running: dict[str, _Running] = {}
         self._jobs = jobs
+        self._planned, self._left, self._done = Counter[_Sort](), Counter[_Sort](), Counter[_Sort]()
+        self._effort, self._wall = defaultdict[_Sort, float](float), defaultdict[_Sort, float](float)
+        self._running: dict[str, _Running] = {}
         for stage in pending:
             self.add(stage)
 
     def add(self, stage: Stage) -> None:
         """Count a stage that is planned."""
-        count = self._sorts[_sort(stage)]
-        count.planned += 1
-        count.left += 1
-        count.effort += stage.effort
+        sort = _sort(stage)
+        self._planned[sort] += 1
+        self._left[sort] += 1
+        self._effort[sort] += stage.effort
 
     def begin(self, stage: Stage) -> None:
         """Note when a stage begins."""
-        self._running[stage.key] = _Running(_sort(stage), monotonic())
+        self._running[stage.key] = _Running(_sort(stage))
 
     def fractions_done(self, done: Sequence[tuple[Stage, float]]) -> float:
-        """Note which shares of the running stages are done.
-
-        Returns how long the longest one of those has taken whose pace is known.
-        """
+        """Note the fractions of the running stages; returns the longest time that one with a known pace has taken."""
         now, began = monotonic(), self._running
-        self._running = {stage.key: began[stage.key] for stage, _ in done}  # without those that have failed
-        for stage, share in done:
-            self._running[stage.key].note(share, now)
-        return max((now - one.began for one in self._running.values() if one.tells_more), default=0.0)
+        # Stages that have failed are no longer among those that run.
+        self._running = {stage.key: began[stage.key] for stage, _ in done}
+        for stage, fraction in done:
+            self._running[stage.key].note(fraction, now)
+        return max((now - one.began for one in self._running.values() if one.has_pace), default=0.0)
 
     def done(self, stage: Stage, wall: float) -> None:
         """Count a finished stage."""
         self._running.pop(stage.key, None)
-        count = self._sorts[_sort(stage)]
-        count.left -= 1
-        count.done += 1
-        count.wall += wall
+        sort = _sort(stage)
+        self._left[sort] -= 1
+        self._done[sort] += 1
+        self._wall[sort] += wall
 
     def seconds(self) -> float | None:
         """Seconds left, `None` before there is anything to judge by."""
-        means = {sort: count.wall / count.done for sort, count in self._sorts.items() if count.done}
+        means = {sort: self._wall[sort] / count for sort, count in self._done.items()}
         telling = [one for one in self._running.values() if one.last[0]]
         for one in telling:
             means.setdefault(one.sort, one.seconds)
         if not means:
             return None
-        paces = {problem: self._pace(means, problem) for problem, _ in self._sorts}
+        paces = {problem: self._pace(means, problem) for problem, _ in self._left}
         left = 0.0
-        for sort, count in self._sorts.items():
-            expected = paces[sort[0]] * count.effort / max(count.planned, 1)
-            left += max(count.left, 0) * means.get(sort, expected)
+        for sort, count in self._left.items():
+            expected = paces[sort[0]] * self._effort[sort] / max(self._planned[sort], 1)
+            left += max(count, 0) * means.get(sort, expected)
         return max(0.0, left - sum(one.last[0] * means[one.sort] for one in telling)) / self._jobs
 
     def _pace(self, means: Mapping[_Sort, float], problem: Plugin | None) -> float:
-        """Seconds of what takes as long as a high-fidelity solution, by the seen stages of a problem, or of all."""
+        """Seconds per unit of effort, from the seen sorts of a problem, or of all if there are none."""
         seen = [sort for sort in means if sort[0] == problem] or list(means)
-        wall = sum(means[sort] * self._sorts[sort].planned for sort in seen)
-        return wall / max(sum(self._sorts[sort].effort for sort in seen), 1.0)
+        wall = sum(means[sort] * self._planned[sort] for sort in seen)
+        return wall / max(sum(self._effort[sort] for sort in seen), 1.0)
 
 
 def _sort(stage: Stage) -> _Sort:
@@ -164,110 +132,110 @@ def progress_bar(console: Console) -> Progress:
     return Progress(what, bar, MofNCompleteColumn(), TimeElapsedColumn(), left, console=console)
 
 
-class DrawingDisplay:
-    """Shows which figure is being drawn: a bar on a terminal, one line elsewhere."""
-
-    def __init__(self, console: Console | None = None) -> None:
-        console = console or new_console()
-        self._bar = progress_bar(console) if console.is_terminal else None
-        if self._bar is None:
-            print_line(console, "figures …")
-        else:
-            self._task = self._bar.add_task("figures", total=None, left="")
-
-    def __enter__(self) -> DrawingDisplay:
-        if self._bar is not None:
-            self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def show(self, name: str, done: int, count: int) -> None:
-        """A figure is being drawn; `done` of `count` are there."""
-        if self._bar is not None:
-            self._bar.update(self._task, completed=done, total=count, left=printable(name))
-
-
-class ProgressDisplay(Observer):
-    """Shows the progress of a run: a bar on a terminal, lines elsewhere; the observer of `run_study`."""
+class _Display:
+    """A bar on a terminal, lines elsewhere; the bar is stopped at the end of a `with` statement."""
 
     def __init__(self, console: Console | None = None) -> None:
         self._console = console or new_console()
-        self._left = TimeLeft([], 1)
-        self._cells = self._total = 0
-        self._parts: Counter[str] = Counter()
-        self._done: Counter[str] = Counter()
-        self._failures: Counter[tuple[str, str]] = Counter()
-        self._begun: set[str] = set()
-        self._none_can_run = self._has_estimated = False
         self._bar: Progress | None = None
 
-    def __enter__(self) -> ProgressDisplay:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._bar is not None:
             self._bar.stop()
 
+    def _draw(self, task: str, total: int | None) -> None:
+        if self._console.is_terminal:
+            self._bar = progress_bar(self._console)
+            self._task = self._bar.add_task(task, total=total, left="")
+            self._bar.start()
+
+    def _update(self, **changes: Any) -> bool:
+        """Change the bar; returns whether there is one."""
+        if self._bar is not None:
+            self._bar.update(self._task, **changes)
+        return self._bar is not None
+
+
+class DrawingDisplay(_Display):
+    """The name of the figure that is being drawn: in a bar on a terminal, one line for all elsewhere."""
+
+    def __enter__(self) -> Self:
+        self._draw("figures", None)
+        if self._bar is None:
+            print_line(self._console, "figures …")
+        return self
+
+    def show(self, name: str, done: int, count: int) -> None:
+        """Name the figure that is being drawn; `done` of `count` are there."""
+        self._update(completed=done, total=count, left=printable(name))
+
+
+class ProgressDisplay(_Display, Observer):
+    """Progress of a run: a bar on a terminal, lines elsewhere; the observer of `run_study`."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        super().__init__(console)
+        self._left = TimeLeft([], 1)
+        self._cells = self._total = 0
+        self._parts, self._done = Counter[str](), Counter[str]()
+        self._failures = Counter[tuple[str, str]]()
+        self._begun: set[str] = set()
+        self._none_can_run = self._has_estimated = False
+
     def note(self, line: str) -> None:
-        """Say something the user should know."""
+        """Print a line that the user should know."""
         print_line(self._console, line)
 
     def start(self, agenda: Agenda) -> None:
-        """Say what is to be done; cells that are unavailable here get their row without it."""
+        """Print the numbers of cells and stages; cells that are unavailable here get their row without a stage."""
         self._left = TimeLeft(agenda.stages, max(agenda.workers, 1))
         self._parts = Counter(stage.label for stage in agenda.stages if stage.partial)
         self._total = agenda.to_run
-        self._none_can_run = agenda.unavailable == agenda.cells  # the command ends with the reason
+        # The command ends with the reason if no cell can run.
+        self._none_can_run = agenda.unavailable == agenda.cells
         workers = f" on {agenda.workers} worker{'s' * (agenda.workers != 1)}" * (agenda.workers > 0)
         to_run = agenda.to_run - agenda.unavailable
-        print_line(self._console, f"{agenda.cells} cells, {to_run} to run, {len(agenda.stages)} stages{workers}")
-        if self._console.is_terminal and agenda.stages:
-            self._bar = progress_bar(self._console)
-            self._task = self._bar.add_task("stages", total=len(agenda.stages), left="")
-            self._bar.start()
+        self.note(f"{agenda.cells} cells, {to_run} to run, {len(agenda.stages)} stages{workers}")
+        if agenda.stages:
+            self._draw("stages", len(agenda.stages))
 
     def begin(self, stage: Stage) -> None:
-        """A stage begins: the bar names it, lines name each sort once."""
+        """Name a stage that begins: the bar names every one, lines each label once."""
         self._left.begin(stage)
-        if self._bar is not None:
-            self._bar.update(self._task, description=stage.label)
-        elif stage.label not in self._begun:
+        if not self._update(description=stage.label) and stage.label not in self._begun:
             self._begun.add(stage.label)
-            print_line(self._console, f"{stage.label} …")
+            self.note(f"{stage.label} …")
 
     def fractions_done(self, done: Sequence[tuple[Stage, float]]) -> None:
-        """Shares of running stages: the bar has the time left from the first one on, and so does one line."""
+        """Show the time left; without a bar in one line, when a stage has taken 20 s before any is done."""
         longest = self._left.fractions_done(done)
-        if self._bar is not None:
-            self._bar.update(self._task, left=self._left_text())
-        elif longest > FIRST_SECONDS and not self._has_estimated:
-            stage, share = max(done, key=lambda one: one[1])
+        if not self._update(left=self._left_text()) and longest > 20.0 and not self._has_estimated:
+            stage, fraction = max(done, key=lambda one: one[1])
             self._has_estimated = True
-            print_line(self._console, f"{stage.label}: {share:.0%} of one part{self._left_text(', ')}")
+            self.note(f"{stage.label}: {fraction:.0%} of one part{self._left_text(', ')}")
 
     def stage(self, stage: Stage, wall: float) -> None:
-        """A stage is done."""
+        """Count a stage that is done."""
         self._has_estimated = True
         self._left.done(stage, wall)
-        if self._bar is not None:
-            self._bar.update(self._task, advance=1, left=self._left_text())
-        elif stage.partial:  # the first stages of a run, which take long before a cell has its row
+        # The first stages of a run are many parts, and take long before a cell has its row: every fourth has a line.
+        if not self._update(advance=1, left=self._left_text()) and stage.partial:
             self._done[stage.label] += 1
             done, parts = self._done[stage.label], self._parts[stage.label]
-            if done % LINE_EVERY == 0 or done == parts:
-                print_line(self._console, f"{stage.label}: {done} of {parts} parts{self._left_text(', ')}")
+            if done % 4 == 0 or done == parts:
+                self.note(f"{stage.label}: {done} of {parts} parts{self._left_text(', ')}")
 
     def plan(self, stage: Stage) -> None:
-        """A stage was added: the timing of cells that have their rows."""
+        """Count a stage that was added: the timing of cells that have their rows."""
         self._left.add(stage)
         if self._bar is not None:
-            self._bar.update(self._task, total=(self._bar.tasks[0].total or 0) + 1)
+            self._update(total=(self._bar.tasks[0].total or 0) + 1)
 
     def cell(self, cell: Cell, row: Mapping[str, Any]) -> None:
-        """A cell has its row: said of some cells, and of the first ones that are not ok for a reason."""
+        """Print some of the cells that have their row, and the first ones that are not ok for a reason."""
         self._cells += 1
         count = f"[{self._cells}/{self._total}]"
         if row["reason"]:
@@ -275,13 +243,15 @@ class ProgressDisplay(Observer):
             self._failures[kind] += 1
             if row["status"] == Status.UNAVAILABLE:
                 if self._failures[kind] == 1 and not self._none_can_run:
-                    print_line(self._console, f"{row['status']}: {row['reason']}")
-            elif self._failures[kind] <= ALIKE and len(self._failures) <= REASONS:
-                print_line(self._console, f"{count} {row['status']}: {cell} ({row['reason']})")
-                if self._failures[kind] == ALIKE:
-                    print_line(self._console, "others like these are counted at the end")
-        elif self._bar is None and (self._cells % -(-self._total // CELL_LINES) == 0 or self._cells == self._total):
-            print_line(self._console, f"{count} {row['status']}: {cell}{self._left_text(', ')}")
+                    self.note(f"{row['status']}: {row['reason']}")
+            # Three cells for each of ten reasons are enough to see what is wrong while the run goes on.
+            elif self._failures[kind] <= 3 and len(self._failures) <= 10:
+                self.note(f"{count} {row['status']}: {cell} ({row['reason']})")
+                if self._failures[kind] == 3:
+                    self.note("others like these are counted at the end")
+        # Without a bar about 25 cells of a run have a line, and the last one.
+        elif self._bar is None and (self._cells % -(-self._total // 25) == 0 or self._cells == self._total):
+            self.note(f"{count} {row['status']}: {cell}{self._left_text(', ')}")
 
     def _left_text(self, before: str = "") -> str:
         seconds = self._left.seconds()
