@@ -136,13 +136,13 @@ def test_a_benchmark_that_hangs_costs_itself_and_where_all_fail_there_is_a_file_
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist"]
     command += ["-p", "vibench.benchmarks.plugin", "--pyargs", "vibench.benchmarks.stages", "--seconds=0.001"]
     command += ["--study=short.toml", "-k", "high_fidelity_solution", "--plugin=wire-sleeps"]
-    for plugins, outcome in (["--plugin=wire"], "1 failed, "), ([], "1 failed in"):
+    for plugins in ["--plugin=wire"], []:
         done = subprocess.run(
             [*command, *plugins, "--benchmark-json=a.json"],
             cwd=tmp_path, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=False,
         )  # fmt: skip
         assert done.returncode == 1, done.stdout + done.stderr
-        assert f" {outcome}" in done.stdout
+        assert " 1 failed" in done.stdout
         file = json.loads((tmp_path / "a.json").read_text())
         assert file["failed"] == {"high_fidelity_solution[wire-sleeps]": "stopped after 5 s"}
         names = [entry["name"] for entry in file["benchmarks"]]
