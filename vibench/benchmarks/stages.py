@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import wraps
 from itertools import cycle
@@ -19,7 +20,7 @@ import pytest
 
 from vibench.arrays import Array
 from vibench.benchmarks import PrimalChoice, ReducedSpaces, Setting, Size, TimedProblem, Timing
-from vibench.errors import UnsupportedError, VibenchError, in_a_line
+from vibench.errors import UnsupportedError
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.formulations import Formulation, FormulationAnswer, axes_of
 from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
@@ -66,26 +67,20 @@ class ValidationQuery:
     exact: ReferenceSolutions
 
 
-class InputError(VibenchError):
-    """An input of a benchmark cannot be made."""
-
-
 def _once(make: Callable[Concatenate[StageInputs, P], T]) -> Callable[Concatenate[StageInputs, P], T]:
-    """Cache a method for all benchmarks; where it fails, all fail with the same line."""
+    """Cache a method for all benchmarks, its exception, too: an input that cannot be made is not tried again."""
 
     @wraps(make)
     def made(self: StageInputs, /, *args: P.args, **kwargs: P.kwargs) -> T:
         key = (make.__name__, *args)
         if key not in self.made:
+            self.made[key] = Future()
             try:
-                self.made[key] = make(self, *args, **kwargs)
-            except InputError as error:
-                self.made[key] = error
+                self.made[key].set_result(make(self, *args, **kwargs))
             except (Exception, SystemExit) as error:  # noqa: BLE001  plugins are code of strangers
-                self.made[key] = InputError(f"{self.case}, {make.__name__}: {in_a_line(error)}")
-        if isinstance(value := self.made[key], InputError):
-            raise value
-        return value  # type: ignore[no-any-return]
+                self.made[key].set_exception(error)
+        value: T = self.made[key].result()
+        return value
 
     return made
 
@@ -100,7 +95,8 @@ class StageInputs:
     def __init__(self, case: TimedProblem, setting: Setting) -> None:
         self.case, self.usual, self.primal = case, setting.spaces, setting.primal
         self.interpolation = 1e-6
-        self.made: dict[Hashable, Any] = {}
+        self.made: dict[Hashable, Future[Any]] = {}
+        self.sizes: dict[tuple[int, int], Size] = {}
 
     def about(self) -> dict[str, object]:
         case, problem = self.case, self.problem
@@ -406,7 +402,7 @@ def test_solver(timing: Timing, inputs: StageInputs, size: Size, solver: str, ac
     registered, spaces = qp_solver(solver), _spaces(inputs, size)
     N, R = inputs.dimensions(spaces)
     # The snapshots of a problem give so many dimensions; larger programs would be the same.
-    if inputs.made.setdefault(("size", N, R), size) != size:
+    if inputs.sizes.setdefault((N, R), size) != size:
         pytest.skip(f"the snapshots of {inputs.case} give N = {N} and R = {R} at most")
     reduced = inputs.online(spaces, inputs.primal).given().assembled.assemble(inputs.queries[0].mu)
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+import pickle
+import sys
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import chain, count
 from typing import Any
 
+from vibench.errors import in_a_line
 from vibench.execution.jobs import Job
 from vibench.execution.supervisor import Supervisor
 from vibench.interfaces.problem import VariationalInequality
@@ -28,94 +30,68 @@ from vibench.timing import NO_TIME, Seconds, median_seconds
 storable(VariationalInequality)
 
 
+class NotImportableError(Exception):
+    """Another process cannot import a plugin: a class that is local to a function, a module that is not on the path."""
+
+
 @dataclass(frozen=True)
-class IsolatedWork(ItemwiseStage, Items):
-    """Items of work; a subclass defines the number of `items` and how to `do` one.
+class IsolatedCall(ItemwiseStage, Items):
+    """A call of a pickled function with its arguments as a stage; `path` is searched for modules, too."""
 
-    It is sent to the process that does the items; data that they share is a cached property there.
-    """
+    label = "call"
+    items = 1
 
-    label = "work"
-
-    @abstractmethod
-    def do(self, number: int, done: Mapping[int, Any]) -> Any:
-        """The value of an item; `done` has the values of earlier items, those of other processes included."""
-
-    def instead(self, number: int, failed: Failed) -> Any:  # noqa: ARG002
-        """Substitute for the value of an item that raised, exceeded its time limit or ended the process."""
-        return failed
-
-    @cached_property
-    def _done(self) -> dict[int, Any]:
-        return {}
+    pickled: bytes
+    path: tuple[str, ...]
 
     def begin(self, store: Store) -> Items:  # noqa: ARG002
         return self
 
-    def resume(self, done: Mapping[int, tuple[int, Any]]) -> None:
-        self._done.update(done.values())
-
-    def item(self, number: int, watch: Callable[[bool], None]) -> tuple[int, Any]:
-        """Number and value of an item, done under its time limit."""
+    def item(self, number: int, watch: Callable[[bool], None]) -> Any:  # noqa: ARG002
+        """Value of the function; a `NotImportableError` if this process cannot import what was pickled."""
         watch(True)
-        self._done[number] = self.do(number, self._done)
-        return number, self._done[number]
+        sys.path += [folder for folder in self.path if folder not in sys.path]
+        try:
+            function, arguments = pickle.loads(self.pickled)
+        except (ImportError, AttributeError) as error:
+            return NotImportableError(in_a_line(error))
+        return function(*arguments)
 
-    def lost(self, number: int, failed: Failed) -> tuple[int, Any]:
-        self._done[number] = self.instead(number, failed)
-        return number, self._done[number]
+    def lost(self, number: int, failed: Failed) -> Failed:  # noqa: ARG002
+        return failed
 
-    def finish(self, items: Sequence[tuple[int, Any]]) -> list[Any]:
-        return [value for _, value in items]
+    def finish(self, items: Sequence[Any]) -> Any:
+        return items[0]
 
 
-def run_isolated(
-    work: IsolatedWork,
-    seconds: float,
-    observe: Callable[[Any], None] = lambda _: None,
-    *,
-    in_all: float | None = None,
-    supervisor: Supervisor | None = None,
-) -> list[Any] | Failed:
-    """Do work in a process of its own.
-
-    Parameters
-    ----------
-    work
-        The work.
-    seconds
-        Time limit of an item; wall seconds.
-    observe
-        Called with the value of every item as soon as it is known; those of items that ended the process come last.
-    in_all
-        Time limit of all items together; by default that of an item.
-    supervisor
-        Supervisor whose process does the work; by default one that ends with it.
+def call_isolated(function: Callable[..., Any], *arguments: Any, seconds: float, supervisor: Supervisor) -> Any:
+    """Call a function in the process of a supervisor, for some wall seconds at most.
 
     Returns
     -------
-    list or Failed
-        The values of all items, or why none could be done.
+    Any
+        The value; a `Failed` if the call raised, took longer or ended the process; a `NotImportableError` if the
+        process cannot import the function or its arguments.
+
+    Raises
+    ------
+    NotImportableError
+        If they cannot be pickled.
     """
-    observed: set[int] = set()
+    try:
+        pickled = pickle.dumps((function, arguments))
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise NotImportableError(in_a_line(error)) from None
+    call = IsolatedCall(pickled, tuple(folder for folder in sys.path if folder))
+    return _outcome(supervisor, call, seconds, max(seconds, 1.0))
 
-    def tell(item: tuple[int, Any]) -> None:
-        observed.add(item[0])
-        observe(item[1])
 
-    job = Job("", work, seconds, max(in_all or seconds, 1.0), Limits().memory_gib)
-    if supervisor is None:
-        with closing(Supervisor()) as own:
-            outcome = own.run(job, tell)
-    else:
-        outcome = supervisor.run(job, tell)
-    if not isinstance(outcome, Done):
-        return Failed(outcome.status if isinstance(outcome, Failed) else Status.ERROR, outcome.reason)
-    values: list[Any] = outcome.value
-    for number, value in enumerate(values):
-        if number not in observed:
-            observe(value)
-    return values
+def _outcome(supervisor: Supervisor, stage: ItemwiseStage, seconds: float, in_all: float) -> Any:
+    """Value of a stage, or why it has none; the limits are those of an item and of all together."""
+    outcome = supervisor.run(Job("", stage, seconds, in_all, Limits().memory_gib))
+    if isinstance(outcome, Done):
+        return outcome.value
+    return Failed(outcome.status if isinstance(outcome, Failed) else Status.ERROR, outcome.reason)
 
 
 @dataclass(frozen=True)
@@ -130,7 +106,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class SolverTrials(IsolatedWork):
+class SolverTrials(ItemwiseStage, Items):
     """A program solved by one solver after the other; the solvers of every package have a process of their own."""
 
     label = "QP solvers"
@@ -150,8 +126,12 @@ class SolverTrials(IsolatedWork):
     def stage_of(self, number: int) -> Stage:
         return SolverTrials(self.program, self.accuracy, self.solvers[number : number + 1])
 
-    def do(self, number: int, done: Mapping[int, Trial]) -> Trial:  # noqa: ARG002
+    def begin(self, store: Store) -> Items:  # noqa: ARG002
+        return self
+
+    def item(self, number: int, watch: Callable[[bool], None]) -> Trial:
         """Solve the program with one solver and verify its solution; the time limit includes loading a plugin."""
+        watch(True)
         name, program, accuracy = self.solvers[number], loads(self.program), self.accuracy
         solve = partial(solve_qp, solver=name, accuracy=accuracy, extra=registry.qp_solver(name))
         # Repeats are in other units, so that a solver that caches solutions cannot be timed on a cache hit.
@@ -160,15 +140,20 @@ class SolverTrials(IsolatedWork):
         status, reason, residuals = verify(program, solution, accuracy)
         return Trial(status, reason, solution, residuals, seconds)
 
-    def instead(self, number: int, failed: Failed) -> Trial:  # noqa: ARG002
+    def lost(self, number: int, failed: Failed) -> Trial:  # noqa: ARG002
         return Trial(failed.status, failed.reason)
+
+    def finish(self, items: Sequence[Trial]) -> list[Trial]:
+        return list(items)
 
 
 def solver_trials(
     program: VariationalInequality, accuracy: float, solvers: Sequence[str], seconds: float = 60.0
 ) -> dict[str, Trial]:
     """Outcomes of installed solvers on a dense program, by name; `seconds` limits each, including its import."""
-    trials = run_isolated(SolverTrials(dumps(program), accuracy, tuple(solvers)), seconds, in_all=Limits().cell_seconds)
+    stage = SolverTrials(dumps(program), accuracy, tuple(solvers))
+    with closing(Supervisor()) as supervisor:
+        trials = _outcome(supervisor, stage, seconds, Limits().cell_seconds)
     if isinstance(trials, Failed):
         return dict.fromkeys(solvers, Trial(trials.status, trials.reason))
     return dict(zip(solvers, trials, strict=True))

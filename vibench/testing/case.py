@@ -20,14 +20,15 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError, in_a_line
+from vibench.execution.isolated import NotImportableError
 from vibench.plugins.options import options_of
 from vibench.storage.serialisation import dumps, loads
 from vibench.testing.checks import (
     SECONDS,
+    Check,
     ConformanceError,
     Doubt,
     Note,
-    NotImportableError,
     call_in_other_process,
     kind_of,
 )
@@ -51,6 +52,7 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
     """
 
     base: ClassVar[type]
+    checks: ClassVar[tuple[Check[Any], ...]]
     round_off: ClassVar[float] = 0.0
 
     create: Callable[[], PluginT]

@@ -5,12 +5,11 @@ from __future__ import annotations
 import atexit
 import os
 import pickle
-import sys
 import sysconfig
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache, lru_cache, partial
@@ -24,7 +23,7 @@ import scipy
 
 import vibench
 from vibench.errors import in_a_line
-from vibench.execution.isolated import IsolatedWork, run_isolated
+from vibench.execution.isolated import NotImportableError, call_isolated
 from vibench.execution.supervisor import Supervisor
 from vibench.plugins.kinds import CHECKED
 from vibench.qp.status import Status
@@ -86,7 +85,7 @@ class ConformanceWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Check(Generic[CaseT_contra]):
-    """A check: a name, a function from a case to its faults and notes, and the names of checks that must pass before.
+    """A name, a function from a case to its faults and notes, and the names of checks that must pass before.
 
     A function that reports its faults by a `ConformanceError` alone returns `None`.
     """
@@ -114,27 +113,15 @@ class Check(Generic[CaseT_contra]):
         return CheckResult(self.name, verdict, "; ".join(faults or lines))
 
 
-@dataclass(frozen=True)
-class Conformance(Generic[CaseT_contra]):
-    """The checks of one kind of plugin, in the order in which they are made.
-
-    `case` makes the case that all of them share from a plugin, or from a function that makes an instance of it.
-    """
-
-    case: Callable[..., CaseT_contra]
-    checks: tuple[Check[CaseT_contra], ...]
-
-
-def conformance(kind: str) -> Conformance[Any]:
-    """The registered checks of a kind of plugin, by its name in `vibench check KIND:NAME`."""
-    # The modules of the checks import this one.
+def case_of(kind: str) -> Any:
+    """Return the class with the `checks` of a kind, as in `vibench check KIND:NAME`; they take its instances."""
+    # These modules import this one.
     module = "strategies" if kind in ("dual", "primal", "sampling") else f"{kind}s"
-    checks: Conformance[Any] = getattr(import_module(f"vibench.testing.{module}"), kind.upper())
-    return checks
+    return getattr(import_module(f"vibench.testing.{module}"), f"{kind.capitalize()}Case")
 
 
 def kind_of(plugin: Any) -> str:
-    """The kind of a class, or of a `partial` of one; a function is a QP solver."""
+    """Return the kind of a class, or of a `partial` of one; a function is a QP solver."""
     cls = getattr(plugin, "func", plugin)
     if not callable(cls):
         raise TypeError(
@@ -147,9 +134,8 @@ def kind_of(plugin: Any) -> str:
 
 def examine(plugin: Any, *, kind: str | None = None, **given: Any) -> list[CheckResult]:
     """Make all checks of a plugin in this process and return their results; the parameters are those of `check`."""
-    checks = conformance(kind or kind_of(plugin))
-    case, results = checks.case(plugin, **given), list[CheckResult]()
-    for one in checks.checks:
+    case, results = case_of(kind or kind_of(plugin))(plugin, **given), list[CheckResult]()
+    for one in case.checks:
         results.append(one.result(case, results))
     return results
 
@@ -165,11 +151,10 @@ def check(plugin: Any, *, kind: str | None = None, **given: Any) -> None:
     kind
         What `plugin` makes, "problem" for instance, where it is a function that makes an instance.
     **given
-        `seconds`: longest wall time [s] of one call, for a problem of all checks. Problems and formulations: `seed` of
-        the random parameters. Dual strategies: multiplier snapshots `snapshots` (m×P), nonnegative coefficients, with
-        their space `W`, and `tolerances` and `sizes` at which the cones stop. Primal strategies: `offline`, the
-        reduced model to enrich, and `tolerances`. Formulations: `offline`, a `Reduction`. Sampling strategies: `boxes`,
-        by what they are called in messages. What is not given is that of a sample problem.
+        seconds: longest wall time [s] of one call, for a problem of all checks. For a dual strategy: multiplier
+        snapshots `snapshots` (m×P) with their space `W`, and `tolerances` and `sizes` at which cones stop. For a primal
+        strategy: `offline`, the reduced model to enrich, and `tolerances`. For a formulation: `offline`, a `Reduction`.
+        For a sampling strategy: `boxes` by their names in messages. The default is a sample problem.
 
     Raises
     ------
@@ -224,7 +209,7 @@ class Examination:
 
     def __init__(self, plugin: Any, kind: str | None = None, seconds: float = SECONDS, **given: Any) -> None:
         self.kind, self.title, self.seconds = kind or kind_of(plugin), _title(plugin), seconds
-        self.checks = {one.name: one for one in conformance(self.kind).checks}
+        self.checks = {one.name: one for one in case_of(self.kind).checks}
         self._pickled = cloudpickle.dumps((plugin, given | {"seconds": seconds}))
         self._results = dict[str, CheckResult]()
         self._left = seconds
@@ -238,19 +223,18 @@ class Examination:
 
     def results(self) -> Iterator[CheckResult]:
         """Results of all checks as soon as they are made; those that no time is left for are one result."""
-        late = []
-        for result in map(self.result, self.checks):
-            if result.message == NO_TIME:
-                late.append(result.check)
-            else:
-                yield result
-        if late:
-            yield CheckResult(", ".join(late), Verdict.SKIPPED, NO_TIME)
+        for name in self.checks:
+            if self._left <= 0.0:
+                late = [other for other in self.checks if other not in self._results]
+                yield CheckResult(", ".join(late), Verdict.SKIPPED, "no time is left")
+                return
+            yield self.result(name)
 
     def _make(self, name: str, earlier: list[CheckResult]) -> CheckResult:
         if self._left <= 0.0:
-            return CheckResult(name, Verdict.SKIPPED, NO_TIME)
-        answer = _call(_check_here, self.kind, self._pickled, name, earlier, seconds=self._left, process=_process())
+            return CheckResult(name, Verdict.SKIPPED, "no time is left")
+        arguments = self.kind, self._pickled, name, earlier
+        answer = call_isolated(_check_here, *arguments, seconds=self._left, supervisor=_supervisor())
         if not isinstance(answer, Failed):
             result: CheckResult = answer[0]
             self._left -= answer[1]
@@ -261,14 +245,11 @@ class Examination:
         return CheckResult(name, Verdict.FAILED, answer.reason)
 
 
-NO_TIME = "no time is left"
-
-
 def _check_here(kind: str, pickled: bytes, name: str, earlier: list[CheckResult]) -> tuple[CheckResult, float]:
-    """Result of a check in this process, and the wall seconds that it took."""
+    """Make a check in this process; returns its result and the wall seconds that it took."""
     begin = time.monotonic()
-    (own,) = (one for one in conformance(kind).checks if one.name == name)
-    result = own.result(_case(kind, pickled), earlier)
+    case = _case(kind, pickled)
+    result = next(one for one in case.checks if one.name == name).result(case, earlier)
     return result, time.monotonic() - begin
 
 
@@ -276,42 +257,11 @@ def _check_here(kind: str, pickled: bytes, name: str, earlier: list[CheckResult]
 def _case(kind: str, pickled: bytes) -> Any:
     """The case of a plugin, cached: its checks share what it has computed."""
     plugin, given = pickle.loads(pickled)
-    return conformance(kind).case(plugin, **given)
+    return case_of(kind)(plugin, **given)
 
 
 def _title(plugin: Any) -> str:
     return str(getattr(getattr(plugin, "func", plugin), "__name__", plugin))
-
-
-@dataclass(frozen=True)
-class Call(IsolatedWork):
-    """One call of a pickled function with its arguments; `path` is searched for modules, too."""
-
-    label = "call"
-    items = 1
-
-    pickled: bytes
-    path: tuple[str, ...]
-
-    def do(self, number: int, done: Mapping[int, Any]) -> Any:  # noqa: ARG002
-        """Return the value of the function; a `NotImportableError` if this process cannot import what was pickled."""
-        sys.path += [folder for folder in self.path if folder not in sys.path]
-        try:
-            function, arguments = pickle.loads(self.pickled)
-        except (ImportError, AttributeError) as error:
-            return NotImportableError(in_a_line(error))
-        return function(*arguments)
-
-
-class NotImportableError(Exception):
-    """Another process cannot import a plugin: a class that is local to a function, a module that is not on the path."""
-
-
-def _call(function: Callable[..., Any], *arguments: Any, seconds: float, process: Supervisor) -> Any:
-    """Value of a function in another process, or why it has none."""
-    call = Call(pickle.dumps((function, arguments)), tuple(folder for folder in sys.path if folder))
-    answer = run_isolated(call, seconds, supervisor=process)
-    return answer if isinstance(answer, Failed) else answer[0]
 
 
 def call_in_other_process(function: Callable[..., Any], *arguments: Any, seconds: float) -> Any:
@@ -322,10 +272,7 @@ def call_in_other_process(function: Callable[..., Any], *arguments: Any, seconds
     """
     # The seed orders sets of texts.
     seed = "1" if os.environ.get("PYTHONHASHSEED") != "1" else "2"
-    try:
-        value = _call(function, *arguments, seconds=seconds, process=_process(PYTHONHASHSEED=seed))
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
-        raise NotImportableError(in_a_line(error)) from None
+    value = call_isolated(function, *arguments, seconds=seconds, supervisor=_supervisor(PYTHONHASHSEED=seed))
     if isinstance(value, NotImportableError):
         raise value
     if isinstance(value, Failed):
@@ -334,8 +281,8 @@ def call_in_other_process(function: Callable[..., Any], *arguments: Any, seconds
 
 
 @cache
-def _process(**environment: str) -> Supervisor:
-    """Another process with these variables in its environment, which serves all checks of this one."""
+def _supervisor(**environment: str) -> Supervisor:
+    """Supervisor of a process with these variables in its environment, which serves all checks of this one."""
     supervisor = Supervisor(environment=environment)
     atexit.register(supervisor.close)
     return supervisor

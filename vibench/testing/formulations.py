@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -27,7 +27,7 @@ from vibench.offline.reduction import Reduction
 from vibench.qp.status import Status
 from vibench.storage.serialisation import dumps, loads
 from vibench.testing.case import Arrays, Case, at, difference, differences, largest_entry, unmutated
-from vibench.testing.checks import Check, Conformance, ConformanceError, Note
+from vibench.testing.checks import Check, ConformanceError, Note
 from vibench.testing.sample_problem import sample_reduction
 
 
@@ -46,8 +46,6 @@ class FormulationCase(Case[Formulation, Array, Answered]):
 
     base = Formulation
     offline: Reduction | None = None
-    _: KW_ONLY
-    seed: int = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -83,7 +81,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         """A training parameter, the centre of the box, and random parameters."""
         box = self.whole.problem.parameters
         fixed = np.stack([self.whole.snapshots.mu[0], 0.5 * (box.lower + box.upper)])
-        return {at(mu): mu for mu in np.concatenate([fixed, box.sample(4, self.seed)])}
+        return {at(mu): mu for mu in np.concatenate([fixed, box.sample(4, seed=0)])}
 
     def formulated(self, plugin: Formulation) -> Formulated:
         """The model of an instance, from what it has built once that was stored."""
@@ -267,6 +265,26 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         if found.status in (Status.NONFINITE, Status.ERROR) or "broken" in found.reason:
             yield f"from snapshots without contact, {found.status}: {found.reason}"
 
+    checks = (
+        Check("construction", Case.construction),
+        Check("options", Case.options, ("construction",)),
+        Check("axes", axes, ("construction",)),
+        Check("build", build, ("axes",)),
+        Check("model", model, ("build",)),
+        Check("answers", answers, ("model",)),
+        Check("pairs", pairs, ("answers",)),
+        Check("determinism", Case.determinism, ("pairs",)),
+        Check("coefficients", coefficients, ("determinism",)),
+        Check("errors", plausible, ("pairs",)),
+        Check("axes in use", axes_used, ("pairs",)),
+        Check("starts", starts, ("pairs",)),
+        Check("no mutation", no_mutation, ("pairs",)),
+        Check("snapshots without contact", without_contact, ("pairs",)),
+        Check("another process", Case.another_process, ("determinism",)),
+        Check("pickling", Case.pickling, ("determinism",)),
+        Check("time", Case.duration, ("answers",)),
+    )  # fmt: skip
+
 
 @dataclass(frozen=True, eq=False)
 class _Seen(Reduction):
@@ -299,24 +317,3 @@ def _faults_of(answer: FormulationAnswer, model: FormulationModel) -> Iterator[s
             yield f"{name} has {len(vector)} coefficients, more than `{declared}` of the model, {most}"
         elif answer.outcome is Outcome.OK and not np.all(np.isfinite(vector)):
             yield f"{name} is not finite: entry {int(np.argmin(np.isfinite(vector)))}"
-
-
-FORMULATION = Conformance(FormulationCase, (
-    Check("construction", FormulationCase.construction),
-    Check("options", FormulationCase.options, ("construction",)),
-    Check("axes", FormulationCase.axes, ("construction",)),
-    Check("build", FormulationCase.build, ("axes",)),
-    Check("model", FormulationCase.model, ("build",)),
-    Check("answers", FormulationCase.answers, ("model",)),
-    Check("pairs", FormulationCase.pairs, ("answers",)),
-    Check("determinism", FormulationCase.determinism, ("pairs",)),
-    Check("coefficients", FormulationCase.coefficients, ("determinism",)),
-    Check("errors", FormulationCase.plausible, ("pairs",)),
-    Check("axes in use", FormulationCase.axes_used, ("pairs",)),
-    Check("starts", FormulationCase.starts, ("pairs",)),
-    Check("no mutation", FormulationCase.no_mutation, ("pairs",)),
-    Check("snapshots without contact", FormulationCase.without_contact, ("pairs",)),
-    Check("another process", FormulationCase.another_process, ("determinism",)),
-    Check("pickling", FormulationCase.pickling, ("determinism",)),
-    Check("time", FormulationCase.duration, ("answers",)),
-))  # fmt: skip

@@ -21,7 +21,7 @@ from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, QPSolver, kkt_residuals, verify
 from vibench.testing.case import copies, differences, unmutated
-from vibench.testing.checks import SECONDS, Check, Conformance, ConformanceError, Doubt, Note, raised
+from vibench.testing.checks import SECONDS, Check, ConformanceError, Doubt, Note, raised
 from vibench.timing import timed
 
 ACCURACY = 1e-7
@@ -37,11 +37,9 @@ class KnownProgram:
     alpha: Array | None
 
 
-def known_program(
-    x: Array, alpha: Array, slack: Array, B: Array, seed: int = 0, *, unique: bool = True
-) -> KnownProgram:
+def known_program(x: Array, alpha: Array, slack: Array, B: Array, *, unique: bool = True) -> KnownProgram:
     """The program with this solution (n,), multipliers (m,), slacks g − B x (m,) and constraints (m×n)."""
-    root = np.random.default_rng(seed).standard_normal((len(x), len(x)))
+    root = np.random.default_rng(0).standard_normal((len(x), len(x)))
     A = root.T @ root / len(x) + np.eye(len(x))
     return KnownProgram(VariationalInequality(A, A @ x + B.T @ alpha, B, B @ x + slack), x, alpha if unique else None)
 
@@ -249,6 +247,19 @@ class SolverCase:
         self.create(self.typical, ACCURACY)
         return time.perf_counter() - begin
 
+    checks = (
+        Check("answer", answer),
+        Check("signs of multipliers", signs, ("answer",)),
+        Check("known solutions", solutions, ("signs of multipliers",)),
+        Check("accuracy", accuracies, ("signs of multipliers",)),
+        Check("infeasible program", infeasible, ("answer",)),
+        Check("no mutation", no_mutation, ("answer",)),
+        Check("determinism", determinism, ("answer",)),
+        Check("independent calls", independence, ("known solutions", "no mutation")),
+        Check("repeated programs", repetition, ("answer",)),
+        Check("time", duration, ("answer",)),
+    )  # fmt: skip
+
 
 def _scaled(program: VariationalInequality) -> VariationalInequality:
     return units_of(program).scaled(program)
@@ -261,17 +272,3 @@ def _vectors(answer: QPSolution) -> dict[str, Array]:
 def of_qpsolvers(program: VariationalInequality, accuracy: float, *, solver: str) -> QPSolution:
     """A solver that qpsolvers has, in the form of one that a plugin registers."""
     return solve_qp(program, solver, accuracy)
-
-
-SOLVER = Conformance(SolverCase, (
-    Check("answer", SolverCase.answer),
-    Check("signs of multipliers", SolverCase.signs, ("answer",)),
-    Check("known solutions", SolverCase.solutions, ("signs of multipliers",)),
-    Check("accuracy", SolverCase.accuracies, ("signs of multipliers",)),
-    Check("infeasible program", SolverCase.infeasible, ("answer",)),
-    Check("no mutation", SolverCase.no_mutation, ("answer",)),
-    Check("determinism", SolverCase.determinism, ("answer",)),
-    Check("independent calls", SolverCase.independence, ("known solutions", "no mutation")),
-    Check("repeated programs", SolverCase.repetition, ("answer",)),
-    Check("time", SolverCase.duration, ("answer",)),
-))  # fmt: skip

@@ -37,7 +37,7 @@ from vibench.reduction.nested import NestedStrategy, grow_through
 from vibench.stages.enrichment import BuiltEnrichment
 from vibench.storage.serialisation import dumps, loads
 from vibench.testing.case import Arrays, Case, array_fault, at, difference, unmutated
-from vibench.testing.checks import Check, Conformance, ConformanceError, Doubt, Note, raised
+from vibench.testing.checks import Check, ConformanceError, Doubt, Note, raised
 from vibench.testing.sample_problem import arrays_of, copy_of, sample_offline, sample_snapshots
 
 
@@ -155,20 +155,19 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
         chi = rays(cone.generators[:, :r], cone.free[:r])
         return np.array([project_on_cone(chi, theta, self.space).distance for theta in snapshots.T]) / largest
 
-
-DUAL = Conformance(DualCase, (
-    Check("construction", DualCase.construction),
-    Check("options", DualCase.options, ("construction",)),
-    Check("cone", DualCase.cone, ("construction",)),
-    Check("tolerance", DualCase.tolerance, ("cone",)),
-    Check("size", DualCase.size, ("cone",)),
-    Check("errors", DualCase.errors, ("cone",)),
-    Check("determinism", DualCase.determinism, ("cone",)),
-    Check("no mutation", DualCase.no_mutation, ("cone",)),
-    Check("snapshots without contact", DualCase.without_contact, ("cone", "tolerance")),
-    Check("pickling", DualCase.pickling, ("determinism",)),
-    Check("time", DualCase.duration, ("cone",)),
-))  # fmt: skip
+    checks = (
+        Check("construction", Case.construction),
+        Check("options", Case.options, ("construction",)),
+        Check("cone", cone, ("construction",)),
+        Check("tolerance", tolerance, ("cone",)),
+        Check("size", size, ("cone",)),
+        Check("errors", errors, ("cone",)),
+        Check("determinism", Case.determinism, ("cone",)),
+        Check("no mutation", no_mutation, ("cone",)),
+        Check("snapshots without contact", without_contact, ("cone", "tolerance")),
+        Check("pickling", Case.pickling, ("determinism",)),
+        Check("time", Case.duration, ("cone",)),
+    )  # fmt: skip
 
 
 def _round_off(error: float) -> float:
@@ -319,21 +318,20 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
         if fault := self._fault(built, offline):
             yield f"with a cone without generators: {fault}"
 
-
-PRIMAL = Conformance(PrimalCase, (
-    Check("construction", PrimalCase.construction),
-    Check("options", PrimalCase.options, ("construction",)),
-    Check("tolerance", PrimalCase.tolerance, ("construction",)),
-    Check("enrichment", PrimalCase.enrichment, ("tolerance",)),
-    Check("kind", PrimalCase.kind, ("enrichment",)),
-    Check("determinism", PrimalCase.determinism, ("enrichment",)),
-    Check("tighter tolerances", PrimalCase.tighter, ("kind", "determinism")),
-    Check("nested growth", PrimalCase.nested, ("tighter tolerances",)),
-    Check("no mutation", PrimalCase.no_mutation, ("enrichment",)),
-    Check("model without contact", PrimalCase.without_contact, ("enrichment",)),
-    Check("pickling", PrimalCase.pickling, ("determinism",)),
-    Check("time", PrimalCase.duration, ("enrichment",)),
-))  # fmt: skip
+    checks = (
+        Check("construction", Case.construction),
+        Check("options", Case.options, ("construction",)),
+        Check("tolerance", tolerance, ("construction",)),
+        Check("enrichment", enrichment, ("tolerance",)),
+        Check("kind", kind, ("enrichment",)),
+        Check("determinism", Case.determinism, ("enrichment",)),
+        Check("tighter tolerances", tighter, ("kind", "determinism")),
+        Check("nested growth", nested, ("tighter tolerances",)),
+        Check("no mutation", no_mutation, ("enrichment",)),
+        Check("model without contact", without_contact, ("enrichment",)),
+        Check("pickling", Case.pickling, ("determinism",)),
+        Check("time", Case.duration, ("enrichment",)),
+    )  # fmt: skip
 
 
 def sample_boxes() -> Mapping[str, ParameterBox]:
@@ -467,6 +465,20 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
         constructor: Callable[..., Sampling] = getattr(self.create, "func", self.create)
         return constructor(**self._given | options)
 
+    checks = (
+        Check("construction", Case.construction),
+        Check("options", Case.options, ("construction",)),
+        Check("parameters", parameters, ("construction",)),
+        Check("size", size, ("parameters",)),
+        Check("determinism", Case.determinism, ("parameters",)),
+        Check("seed", seed, ("determinism",)),
+        Check("another process", Case.another_process, ("determinism",)),
+        Check("no mutation", no_mutation, ("parameters",)),
+        Check("training", training, ("determinism",)),
+        Check("pickling", Case.pickling, ("determinism",)),
+        Check("time", Case.duration, ("parameters",)),
+    )  # fmt: skip
+
 
 class DistanceTrainer(Trainer):
     """A model whose error at a parameter is bounded by the distance to the nearest solution, in widths of the box."""
@@ -505,18 +517,3 @@ def _train(plugin: Sampling, box: ParameterBox) -> list[Array]:
     except Exception as error:
         raise ConformanceError(f"train fails after {len(trainer.solved)} solutions: {raised(error)}") from error
     return trainer.solved
-
-
-SAMPLING = Conformance(SamplingCase, (
-    Check("construction", SamplingCase.construction),
-    Check("options", SamplingCase.options, ("construction",)),
-    Check("parameters", SamplingCase.parameters, ("construction",)),
-    Check("size", SamplingCase.size, ("parameters",)),
-    Check("determinism", SamplingCase.determinism, ("parameters",)),
-    Check("seed", SamplingCase.seed, ("determinism",)),
-    Check("another process", SamplingCase.another_process, ("determinism",)),
-    Check("no mutation", SamplingCase.no_mutation, ("parameters",)),
-    Check("training", SamplingCase.training, ("determinism",)),
-    Check("pickling", SamplingCase.pickling, ("determinism",)),
-    Check("time", SamplingCase.duration, ("parameters",)),
-))  # fmt: skip

@@ -21,7 +21,7 @@ from vibench.cli import scaffold
 from vibench.errors import RequestError
 from vibench.plugins.kinds import CHECKED, DUAL, PROBLEM
 from vibench.plugins.registry import registered
-from vibench.testing.checks import conformance
+from vibench.testing.checks import case_of
 
 NAMES = {
     "problem": "my-rope", "primal": "tied", "dual": "cone", "solver": "for-rope", "sampling": "strata",
@@ -65,7 +65,7 @@ def test_the_tests_of_new_packages_are_green(written: dict[str, Path], installed
     tests = [str(folder / "tests") for folder in written.values()]
     done = installed("-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error", *tests, folder=tmp_path)
     assert done.returncode == 0, done.stdout
-    checks = sum(len(conformance(kind).checks) for kind in NAMES)
+    checks = sum(len(case_of(kind).checks) for kind in NAMES)
     assert f"{checks + len(NAMES)} passed" in done.stdout  # every package has one more test
 
 

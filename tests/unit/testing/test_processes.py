@@ -17,15 +17,14 @@ from fake_plugins import Wire
 from running import PATIENCE, Main
 
 from vibench import testing
-from vibench.testing.assembly import ProblemCase
+from vibench.execution.isolated import NotImportableError
 from vibench.testing.checks import (
     CheckResult,
     ConformanceError,
-    NotImportableError,
     Verdict,
     call_in_other_process,
 )
-from vibench.testing.problems import PROBLEM
+from vibench.testing.problems import ProblemCase
 
 
 def examined(plugin: type) -> dict[str, CheckResult]:
@@ -55,7 +54,7 @@ def test_a_check_that_ends_its_process_costs_those_that_need_it(plugin: str, cau
     assert cause in failed.message
     assert findings["training set"].verdict is Verdict.PASSED
     assert findings["assembly"] == CheckResult("assembly", Verdict.SKIPPED, "it needs 'one assembly'")
-    assert len(findings) == len(PROBLEM.checks)
+    assert len(findings) == len(ProblemCase.checks)
 
 
 def test_what_passed_in_a_process_that_died_later_is_remembered() -> None:
@@ -117,7 +116,7 @@ def test_a_slow_assembly_is_made_at_fewer_parameters(seconds: float, points: int
     case = ProblemCase(Bar)
     case.__dict__["one_assembly"] = seconds
     assert len(case.mus) == points
-    here = [check for check in PROBLEM.checks if check.name != "another process"]
+    here = [check for check in ProblemCase.checks if check.name != "another process"]
     findings = {check.name: list(check.faults(case) or ()) for check in here}
     assert findings["one assembly"][0] == f"takes {seconds:.2g} s"
     fewer = f"checks at {points} parameters instead of 7, and none for jumps, for lack of time"
