@@ -10,20 +10,8 @@ from vibench.linalg.inner_product import InnerProduct
 from vibench.qp.scaling import peak, ratio
 from vibench.qp.solve import solve_qp
 
-SOLVERS = ("piqp", "proxqp")
-"""QP solvers tried for line 9, in this order."""
-
-ACCURACY = 1e-12
-"""Accuracy requested for line 9."""
-
 ACCEPTED = 1e-9
 """A solution of line 9 with a larger residual is recorded as a fallback; Remark 4.1 holds for any feasible one."""
-
-ZERO = 1e-12
-"""Entries of θ − Υ below this share of the largest of θ are round-off; left there, they would exclude generators later.
-
-Entries are compared in units of the norms of their basis functions, so that the scaling of a row decides nothing.
-"""
 
 
 def subtract_cone_component(theta: Array, generators: Array, W: InnerProduct) -> tuple[Array, str]:
@@ -41,8 +29,8 @@ def subtract_cone_component(theta: Array, generators: Array, W: InnerProduct) ->
     Returns
     -------
     tuple
-        θ − Υ (m,), without negative entries, and with exact zeros where round-off would leave less than `ZERO` of the
-        largest entry of θ; and a note, empty where Υ is optimal to `ACCEPTED`.
+        θ − Υ (m,), without negative entries, and with exact zeros in place of round-off; and a note, empty where Υ is
+        optimal to `ACCEPTED`.
     """
     # A generator that is positive where θ is zero must have the coefficient 0. Without such generators, and restricted
     # to the support of θ, the problem has strictly feasible points; otherwise it has none, and QP solvers break down.
@@ -53,14 +41,15 @@ def subtract_cone_component(theta: Array, generators: Array, W: InnerProduct) ->
     coefficients, residual = _least_squares(theta, usable, support, W)
     part = usable @ coefficients
     over = part > theta
-    # The solver may violate Υ ≤ θ. Scaling Υ down restores feasibility and stays in the cone; a violation of the size
-    # of round-off is left to the clamp below.
+    # The solver may violate Υ ≤ θ. Scaling Υ down restores that and stays in the cone; round-off is clamped below.
     if np.any(over):
         shrink = float(np.min(theta[over] / part[over]))
         part *= shrink if shrink < 1.0 - ACCEPTED else 1.0
     rest = np.maximum(theta - part, 0.0)
     units = np.sqrt(W.matrix.diagonal())
-    rest[units * rest < ZERO * (units * theta).max()] = 0.0
+    # Round-off left there would exclude generators later. Entries are compared in units of the norms of their basis
+    # functions, so that the scaling of a row decides nothing.
+    rest[units * rest < 1e-12 * (units * theta).max()] = 0.0
     note = "" if residual <= ACCEPTED else f"line 9 solved only to {residual:.0e}, made feasible"
     return rest, note
 
@@ -76,8 +65,8 @@ def _least_squares(theta: Array, generators: Array, support: Mask, W: InnerProdu
         g=np.concatenate([np.zeros(count), units * theta[support]]),
     )
     best, smallest = np.zeros(count), np.inf
-    for solver in SOLVERS:
-        solution = solve_qp(program, solver, ACCURACY)
+    for solver in ("piqp", "proxqp"):
+        solution = solve_qp(program, solver, 1e-12)
         if solution.x is None or solution.alpha is None:
             continue
         if not np.all(np.isfinite(np.append(solution.x, solution.alpha))):

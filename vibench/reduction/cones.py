@@ -23,10 +23,6 @@ TIE = 1e-9
 mirrored snapshots must not let round-off choose."""
 
 
-FEW, SMALL = 128, 1024
-"""Unknowns up to which a dense system takes less time than a sparse one; dimensions of a dense X_W that is kept."""
-
-
 class LazyMaximum:
     """Argmax over indicators that are non-increasing from one greedy step to the next.
 
@@ -50,10 +46,7 @@ class LazyMaximum:
         self.evaluations = 0
 
     def next(self, evaluate: Callable[[int], float]) -> tuple[int, float]:
-        """Index of the largest current indicator, the smallest index within `TIE`, and the largest value.
-
-        `evaluate(p)` computes the indicator of index p.
-        """
+        """Index of the largest indicator, the smallest one within `TIE`, and the value; `evaluate(p)` is that of p."""
         fresh = np.zeros(len(self._bounds), dtype=bool)
         while True:
             largest = float(self._bounds.max())
@@ -114,9 +107,10 @@ def project_on_orthant(functional: Array, W: InnerProduct) -> Array:
 
 def _solve_block(W: InnerProduct, support: Indices, right: Array) -> Array:
     """The solution (k,) with the block of X_W of some unknowns (k,)."""
-    if len(support) > FEW:
+    # Below 128 unknowns a dense system costs less than a sparse one; a dense X_W is stored for small spaces.
+    if len(support) > 128:
         return SparseCholesky(W.matrix[support][:, support], "a block of X_W").solve(right)
-    block = W.dense[np.ix_(support, support)] if W.dim <= SMALL else W.matrix[support][:, support].toarray()
+    block = W.dense[np.ix_(support, support)] if W.dim <= 1024 else W.matrix[support][:, support].toarray()
     return np.asarray(scipy.linalg.cho_solve(scipy.linalg.cho_factor(block, check_finite=False), right))
 
 
@@ -167,7 +161,7 @@ class GrowingCone:
         self.error = 1.0 if largest else 0.0
         self._errors, self._fallbacks = [self.error], list[str]()
         if largest:
-            # Ties, as of mirrored snapshots, go to the smallest index, as in `LazyMaximum`.
+            # Ties go to the smallest index, as in `LazyMaximum`.
             self.farthest = int(np.argmax(self._norms >= largest * (1.0 - TIE)))
             self._distances = LazyDistances(whitened)
 
@@ -186,7 +180,8 @@ class GrowingCone:
         if length <= REPRODUCED * self._norms[self.farthest]:
             return False  # normalised, it would be an arbitrary generator
         self.generators = np.column_stack([self.generators, direction / length])
-        self._distances.widen(self._W.whiten(self.generators), self.farthest)  # which is in the cone now (Remark 4.1)
+        # The snapshot is in the cone now (Remark 4.1).
+        self._distances.widen(self._W.whiten(self.generators), self.farthest)
         if self.generators.shape[1] == len(self._norms):  # every snapshot has been taken
             self.error = 0.0
         else:
@@ -241,7 +236,7 @@ class LazyDistances:
         norms = np.linalg.norm(whitened, axis=0)
         self._largest = float(norms.max())
         self._generators = np.zeros((whitened.shape[0], 0))
-        self._coefficients = np.zeros((0, whitened.shape[1]))  # of one point of the cone for every snapshot
+        self._coefficients = np.zeros((0, whitened.shape[1]))  # one point of the cone for every snapshot
         self.maximum = LazyMaximum(norms / self._largest)
 
     def widen(self, generators: Array, taken: int | None = None) -> None:
@@ -249,6 +244,7 @@ class LazyDistances:
         old, new = _best_combination(self._generators @ self._coefficients, generators[:, -1], self._snapshots)
         self._coefficients = np.vstack([self._coefficients * old, new])
         self._generators = generators
+        # One sweep of coordinate descent makes the bounds much sharper at the cost of a product.
         slope = generators.T @ (self._snapshots - generators @ self._coefficients)
         for i, row in enumerate(generators.T @ generators):
             step = np.maximum(slope[i], -self._coefficients[i])
@@ -263,7 +259,7 @@ class LazyDistances:
         return self.maximum.next(self._distance)
 
     def residual(self, q: int) -> Array:
-        """Snapshot minus its stored point of the cone (m,): for the index from `next`, minus its projection."""
+        """Snapshot minus its stored point of the cone (m,), which is its projection for the index from `next`."""
         return np.asarray(self._snapshots[:, q] - self._generators @ self._coefficients[:, q])
 
     def _distance(self, q: int) -> float:
@@ -275,7 +271,7 @@ class LazyDistances:
 def _best_combination(points: Array, nu: Array, targets: Array) -> tuple[Array, Array]:
     """Coefficients a, b ≥ 0 (Q,) that minimise ‖a·point + b·ν − target‖; points, targets (m×Q), unit vector ν (m,).
 
-    The unconstrained minimiser where both are nonnegative, else the better one of a = 0 and b = 0.
+    These are the unconstrained minimiser where both are nonnegative, else the better one of a = 0 and b = 0.
     """
     square, overlap = np.sum(points**2, axis=0), nu @ points
     on_point, on_nu = np.sum(points * targets, axis=0), nu @ targets
@@ -293,7 +289,7 @@ def _best_combination(points: Array, nu: Array, targets: Array) -> tuple[Array, 
 def orthogonality(generators: Array, W: InnerProduct, free: Mask | None = None) -> Array:
     """e_orth(r) for r = 0 … R−1: distance of generator r+1 from the cone of the first r (paper, equation (41)).
 
-    `free` says which generators (R,) may be used with either sign; none by default.
+    `free` marks generators (R,) that may be used with either sign; none by default.
     """
     whitened = W.whiten(generators)
     free = no_free(whitened.shape[1]) if free is None else free

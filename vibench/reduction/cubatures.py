@@ -7,9 +7,6 @@ import scipy.linalg
 
 from vibench.arrays import Array, Indices
 
-SUMS, SUMS_PER_VECTOR = 800, 8
-"""How many sums stand for all conditions of a cubature: far more than it takes columns."""
-
 
 class Cubature:
     """The conditions of a cubature, each with a random sign in one of few sums, which keep its residual.
@@ -21,10 +18,11 @@ class Cubature:
     """
 
     def __init__(self, size: int, count: int) -> None:
-        self._sums, self._rng = np.zeros((max(SUMS, SUMS_PER_VECTOR * size), count)), np.random.default_rng(0)
+        # Far more sums than a cubature has columns represent all conditions.
+        self._sums, self._rng = np.zeros((max(800, 8 * size), count)), np.random.default_rng(0)
 
     def add(self, conditions: Array, weight: float = 1.0) -> None:
-        """Add conditions (N'×e), relative to what all columns together are."""
+        """Add conditions (N'×e), relative to their sum over all columns."""
         if size := float(np.linalg.norm(conditions.sum(axis=1))):
             signs = self._rng.choice([-1.0, 1.0], len(conditions))
             where = self._rng.choice(len(self._sums), len(conditions), replace=False)

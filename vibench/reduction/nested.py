@@ -45,13 +45,13 @@ class NestedStrategy(PrimalStrategy):
 
     @abstractmethod
     def steps(self, offline: Offline) -> Iterator[Step]:
-        """The enrichment with S = 0, 1, 2, … vectors; whoever iterates stops at the tightest tolerance.
+        """Yield the enrichment with S = 0, 1, 2, … vectors, until the caller stops at the tightest tolerance.
 
-        A `NumericalError` says that there is no further vector and what was reached.
+        Raises a `NumericalError` that says what was reached if there is no further vector.
         """
 
     def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
-        """Grow until the tolerance is reached; a `NumericalError` says why it was not."""
+        """Grow until the tolerance is reached; raises a `NumericalError` that says why it was not."""
         if tolerance is None:
             raise ValueError(f"{type(self).__name__} needs a tolerance")
         grown = grow_through(self, offline, [tolerance])
@@ -60,7 +60,7 @@ class NestedStrategy(PrimalStrategy):
 
 @dataclass(frozen=True)
 class Milestone:
-    """Where a growth reached a tolerance: number of vectors, history so far, and seconds so far."""
+    """Number of vectors, history and seconds at which a growth reached a tolerance."""
 
     count: int
     history: Mapping[str, Array]
@@ -76,7 +76,7 @@ class Grown:
     missed: str
 
     def milestone(self, tolerance: float) -> Milestone:
-        """Where a tolerance was reached; a `NumericalError` says why it was not."""
+        """The milestone of a tolerance; raises a `NumericalError` that says why it was not reached."""
         if tolerance not in self.milestones:
             raise NumericalError(f"the tolerance {tolerance:g} is not reached: {self.missed}")
         return self.milestones[tolerance]

@@ -16,21 +16,6 @@ from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal, Elimination
 from vibench.linalg.factorisations import implementation
 from vibench.linalg.inner_product import InnerProduct, orthogonal_factorisation
 
-PROPORTIONAL_RTOL = 1e-12
-"""Two constraint matrices count as proportional when they differ by less than this, relative to their norm."""
-
-FINGERPRINT_ATOL = 1e-10
-"""Fingerprints of proportional matrices differ by no more."""
-
-UNKNOWNS_PER_SUPREMIZER = 2
-"""From so many constrained unknowns per supremizer on, whitening on the mesh is cheaper than the contact factor."""
-
-SPAN_COST = 1.0
-"""Relative cost of a QR factorisation of all supremizers (n×k), against dense solves with the contact factor."""
-
-CACHED_FACTORS = 3
-"""Cached contact factors: for the unknowns of the training set, of the validation set, and the declared ones."""
-
 
 def supremizers(V: InnerProduct, B: SparseMatrix, eta: Array) -> Array:
     """T(mu)η = X_V⁻¹ Bᵀη (n×k) for B (m×n) and multipliers η (m×k)."""
@@ -43,19 +28,26 @@ def proportionality(B: SparseMatrix, reference: SparseMatrix) -> float | None:
     if norm == 0.0 or square == 0.0:
         return None
     factor = float(B.multiply(reference).sum()) / square
-    return factor if factor and sp.linalg.norm(B - factor * reference) <= PROPORTIONAL_RTOL * norm else None
+    return factor if factor and sp.linalg.norm(B - factor * reference) <= 1e-12 * norm else None
 
 
 @dataclass(frozen=True)
 class ConstraintClasses:
-    """Constraint matrices B(mu_p) sorted into classes of proportional ones, which share their supremizer space."""
+    """Constraint matrices B(mu_p) sorted into classes of proportional ones, which share their supremizer space.
+
+    Attributes
+    ----------
+    representatives
+        One matrix per class, the first one.
+    members
+        Class of every p (P,).
+    factors
+        Factors c_p (P,) with B(mu_p) = c_p · representatives[members[p]].
+    """
 
     representatives: tuple[SparseMatrix, ...]
-    """One matrix per class, the first one."""
     members: Indices
-    """Class of every p (P,)."""
     factors: Array
-    """c_p (P,) with B(mu_p) = c_p · representatives[members[p]]."""
 
     @property
     def firsts(self) -> Indices:
@@ -77,8 +69,9 @@ def constraint_classes(matrices: Iterable[SparseMatrix]) -> ConstraintClasses:
     for matrix in matrices:
         fingerprint = _fingerprint(matrix)
         for k, (representative, other) in enumerate(classes):
-            similar = _equal_up_to_sign(fingerprint, other)  # a cheap necessary condition
-            factor = proportionality(matrix, representative) if similar else None
+            # Fingerprints of proportional matrices are equal up to sign and round-off: a cheap necessary condition.
+            distances = (float(np.abs(fingerprint + sign * other).max(initial=0.0)) for sign in (-1.0, 1.0))
+            factor = proportionality(matrix, representative) if min(distances) <= 1e-10 else None
             if factor is not None:
                 placed.append((k, factor))
                 break
@@ -93,11 +86,6 @@ def _fingerprint(matrix: SparseMatrix) -> Array:
     """Normalised product (m,) with a random vector, which proportional matrices share up to its sign."""
     probe = np.random.default_rng(0).standard_normal(matrix.shape[1])
     return np.asarray(matrix @ probe) / ((sp.linalg.norm(matrix) * float(np.linalg.norm(probe))) or 1.0)
-
-
-def _equal_up_to_sign(one: Array, other: Array) -> bool:
-    distances = (float(np.abs(one + sign * other).max(initial=0.0)) for sign in (-1.0, 1.0))
-    return min(distances) <= FINGERPRINT_ATOL
 
 
 class SpannedCoordinates:
@@ -200,13 +188,16 @@ def _beside(basis: Array, vectors: Array) -> tuple[Array, Array]:
     """Orthonormal columns, first those of `basis` (d×N), that span vectors (d×k), too, and the coordinates of these."""
     count = basis.shape[1]
     q, r = np.linalg.qr(np.hstack([basis, vectors]))
-    signs = np.where(np.diagonal(r)[:count] < 0.0, -1.0, 1.0)  # of the basis itself r is the identity but for these
+    # For the basis itself r is the identity but for these signs.
+    signs = np.where(np.diagonal(r)[:count] < 0.0, -1.0, 1.0)
     q[:, :count] *= signs
     r[:count] *= signs[:, None]
     return q, r[:, count:]
 
 
-@lru_cache(maxsize=CACHED_FACTORS)  # so that all models of a problem share one factorisation
+# Cached: all models of a problem share the factors for the unknowns of the training set, of the validation set, and the
+# declared ones.
+@lru_cache(maxsize=3)
 def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[Elimination, BlockDiagonal]:
     """X_V with all unknowns but some E eliminated, and the factor F_EE (|E|×|E|) of its Schur complement."""
     last = np.frombuffer(dofs, np.intp)
@@ -217,17 +208,20 @@ def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[Elimination, BlockDia
 
 Coordinates = SpannedCoordinates | ContactCoordinates
 
+# Those in which V_N has the first coordinates.
 PlainCoordinates = SpannedCoordinates | LoadCoordinates
-"""Those in which V_N has the first ones."""
-
-IsometricSupremizers = Callable[[SparseMatrix, Array], Array]
-"""From B (m×n) and η (m×k): an isometric image (d×k) of T(mu)η."""
 
 
-def isometric_supremizers(V: InnerProduct, matrices: Sequence[SparseMatrix], count: int) -> IsometricSupremizers:
-    """The cheaper isometric image of T(mu)η, for these matrices and `count` multipliers each."""
+def isometric_supremizers(
+    V: InnerProduct, matrices: Sequence[SparseMatrix], count: int
+) -> Callable[[SparseMatrix, Array], Array]:
+    """Return the cheaper function from B (m×n) and η (m×k) to an isometric image (d×k) of T(mu)η.
+
+    It is for these matrices and `count` multipliers each.
+    """
     constrained = _constrained_unknowns(matrices)
-    if UNKNOWNS_PER_SUPREMIZER * count * len(matrices) <= len(constrained):
+    # Whitening a supremizer on the mesh costs about as much as two unknowns of the contact factor.
+    if 2 * count * len(matrices) <= len(constrained):
         return lambda B, eta: V.whiten_functional(np.asarray(B.T @ eta))
     contact = ContactCoordinates(V, np.zeros((V.dim, 0)), constrained)
     return lambda B, eta: contact.supremizers(_loads(B, constrained, eta))
@@ -239,7 +233,7 @@ def _constrained_unknowns(matrices: Sequence[SparseMatrix]) -> Indices:
 
 
 def projected_supremizers(Z: Array, B: SparseMatrix, eta: Array) -> Array:
-    """ZᵀBᵀη (N'×k) from the rows of Z (n×N') at the non-zero columns of B (m×n)."""
+    """The product ZᵀBᵀη (N'×k) from the rows of Z (n×N') at the nonzero columns of B (m×n)."""
     rows = _constrained_unknowns([B])
     return np.asarray(Z[rows].T @ _loads(B, rows, eta))
 
@@ -258,9 +252,10 @@ def supremizer_coordinates(
     """
     space: Coordinates
     constrained = _constrained_unknowns(matrices)
-    if len(constrained) > MANY_UNKNOWNS:  # those that no multiplier loads need no dense work
+    if len(constrained) > MANY_UNKNOWNS:  # unknowns that no multiplier loads need no dense work
         constrained = _constrained_unknowns([sp.csr_array(B)[eta.any(axis=1)] for B in matrices])
-    if SPAN_COST * V.dim * eta.shape[1] * len(matrices) <= len(constrained) ** 2:
+    # A QR factorisation of all supremizers costs about as much as dense solves with the contact factor of equal size.
+    if V.dim * eta.shape[1] * len(matrices) <= len(constrained) ** 2:
         space = SpannedCoordinates(V, basis, np.hstack([supremizers(V, B, eta) for B in matrices]))
         coordinates = space.represented
     else:

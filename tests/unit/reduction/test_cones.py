@@ -23,17 +23,18 @@ from vibench_strategies.mcpg import ModifiedCPG
 seeds = st.integers(0, 10_000)
 
 
-@pytest.mark.parametrize("kind", ["diagonal", "dense blocks", "sparse blocks", "no array of all"])
-def test_projection_on_the_orthant_meets_its_optimality_conditions(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    rng, m = np.random.default_rng(3), 200
-    off = 0.0 if kind == "diagonal" else 1.0
+@pytest.mark.parametrize(
+    ("off", "m", "load"),
+    [(0.0, 200, 0.0), (1.0, 200, 0.0), (1.0, 600, 0.0), (1.0, 1100, -1.5)],
+    ids=["diagonal", "dense blocks", "sparse blocks", "no array of all"],
+)
+def test_projection_on_the_orthant_meets_its_optimality_conditions(off: float, m: int, load: float) -> None:
+    rng = np.random.default_rng(3)
     X = InnerProduct(
         sp.diags_array([off * np.ones(m - 1), 4.0 + rng.random(m), off * np.ones(m - 1)], offsets=[-1, 0, 1])
     )
-    assert X.is_diagonal is (kind == "diagonal")
-    monkeypatch.setattr(cone_module, "FEW", 0 if kind == "sparse blocks" else m)
-    monkeypatch.setattr(cone_module, "SMALL", 0 if kind == "no array of all" else m)
-    functional = rng.standard_normal(m)
+    assert X.is_diagonal is (off == 0.0)
+    functional = rng.standard_normal(m) + load
     found = project_on_orthant(functional, X)
     slope = X.apply(found) - functional
     assert 0 < np.count_nonzero(found) < m
