@@ -193,13 +193,15 @@ def changed(quick_run: Path, tmp_path: Path) -> Changed:
 
 @pytest.fixture
 def register(monkeypatch: pytest.MonkeyPatch) -> Iterator[Register]:
-    """Function that makes entry points, given as (group, name, value), the only ones there are."""
+    """Function that makes entry points, given as (group, name, value), the only ones beside the default formulation."""
 
     def forget() -> None:
         registry._readable.cache_clear()
         registry.registered.cache_clear()
+        registry.default_formulation.cache_clear()
 
     def replace(*entries: tuple[str, str, str]) -> None:
+        entries = (*entries, ("vibench.formulations", "mixed", "vibench_strategies.formulations.mixed:Mixed"))
         found = [EntryPoint(name=name, group=group, value=value) for group, name, value in entries]
         monkeypatch.setattr(registry, "entry_points", lambda *, group: [e for e in found if e.group == group])
         forget()

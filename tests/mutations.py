@@ -159,8 +159,8 @@ FAULTS = (
     Fault(
         "seconds-of-another-stage",
         "vibench/stages/cell_queries.py",
-        '"enrichment": (enrichment,),',
-        '"enrichment": (enrichment.pod,),',
+        '"enrichment": (built.enrichment,),',
+        '"enrichment": (built.pod,),',
         ("tests/unit/stages/test_offline.py",),
     ),
     Fault(
@@ -599,8 +599,8 @@ FAULTS = (
     ),
     Fault(
         "compiled-query-repeated-as-it-is",
-        "vibench/stages/compilation.py",
-        "replace(self, mu=mu, program=program)",
+        "vibench/stages/query.py",
+        "replace(self, mu=mu, program=self.program and self.model.online.program(mu).program)",
         "self",
         ("tests/unit/stages/test_compilation.py",),
     ),
@@ -656,8 +656,8 @@ FAULTS = (
     Fault(
         "separation-not-paid-for",
         "vibench/stages/cell_queries.py",
-        '"assembly": () if reduction is None else (reduction.decomposition, reduction, *compiled),',
-        '"assembly": () if reduction is None else (reduction, *compiled),',
+        '"assembly": (built.decomposition, built.reduction),',
+        '"assembly": (built.reduction,),',
         ("tests/unit/stages/test_assembly.py",),
     ),
     Fault(

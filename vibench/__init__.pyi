@@ -22,12 +22,12 @@ from .highfidelity.active_set import HighFidelitySolution as HighFidelitySolutio
 from .highfidelity.active_set import HighFidelitySolver as HighFidelitySolver
 from .interfaces.affine import AffineSum as AffineSum
 from .interfaces.affine_problem import AffineProblem as AffineProblem
-from .interfaces.formulations import Asked as Asked
 from .interfaces.formulations import Formulation as Formulation
 from .interfaces.formulations import FormulationAnswer as FormulationAnswer
 from .interfaces.formulations import FormulationModel as FormulationModel
 from .interfaces.formulations import Multiplier as Multiplier
 from .interfaces.formulations import Outcome as Outcome
+from .interfaces.formulations import QuerySettings as QuerySettings
 from .interfaces.outputs import Output as Output
 from .interfaces.parameters import ParameterBox as ParameterBox
 from .interfaces.pictures import MeshFields as MeshFields
@@ -68,8 +68,11 @@ from .offline.checked_tools import project_on_cone as project_on_cone
 from .offline.checked_tools import solve_high_fidelity as solve_high_fidelity
 from .offline.checked_tools import solve_qp as solve_qp
 from .offline.checked_tools import supremizers as supremizers
+from .offline.compiled import CompiledModel as CompiledModel
+from .offline.compiled import CompiledProgram as CompiledProgram
 from .offline.models import Model as Model
 from .offline.models import Solution as Solution
+from .offline.program_model import ProgramModel as ProgramModel
 from .offline.reduction import Reduction as Reduction
 from .offline.sweep import Snapshots as Snapshots
 from .plugins.registry import create as create

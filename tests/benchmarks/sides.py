@@ -12,8 +12,8 @@ from vibench.arrays import Array
 from vibench.errors import UnsupportedError
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import Stop
-from vibench.offline.compiled import CompiledModel, Program
-from vibench.offline.models import AnyReducedModel
+from vibench.model.hyperreduced import AnyReducedModel
+from vibench.offline.compiled import CompiledModel, CompiledProgram
 from vibench.offline.reduction import Reduction
 from vibench.qp.solve import solve_qp
 from vibench.qp.verification import kkt_residuals
@@ -147,7 +147,7 @@ class Published(Side):
 class Ours(Side):
     """vibench's own."""
 
-    compiled: Program
+    compiled: CompiledProgram
     not_compiled = ""
 
     def __init__(self, problem: Problem, case: Case, solver: str, accuracy: float) -> None:

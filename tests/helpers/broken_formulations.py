@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from formulations import Program, ProgramModel
 
-from vibench import Array, Asked, FormulationAnswer, FormulationModel, Multiplier, Outcome, Reduction, solve_qp
+from vibench import Array, FormulationAnswer, FormulationModel, Multiplier, Outcome, QuerySettings, Reduction, solve_qp
 
 Change = Callable[[FormulationAnswer], FormulationAnswer]
 
@@ -62,15 +62,15 @@ class WithoutDimension(_Wrong):
 
 class AnswersInATuple(_Wrong):
     class kind(ProgramModel):  # noqa: N801
-        def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
-            answer = super().solve(mu, asked)
+        def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
+            answer = super().solve(mu, settings)
             return answer.x, answer.alpha  # type: ignore[return-value]
 
 
 class NotANumber(_Wrong):
     class kind(ProgramModel):  # noqa: N801
-        def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
-            answer = super().solve(mu, asked)
+        def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
+            answer = super().solve(mu, settings)
             assert answer.x is not None
             answer.x[2] = np.nan
             return answer
@@ -78,15 +78,15 @@ class NotANumber(_Wrong):
 
 class NeverConverges(_Wrong):
     class kind(ProgramModel):  # noqa: N801
-        def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
-            return replace(super().solve(mu, asked), outcome=Outcome.INACCURATE, reason="100 steps were too few")
+        def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
+            return replace(super().solve(mu, settings), outcome=Outcome.INACCURATE, reason="100 steps were too few")
 
 
 class SaysNotWhy(_Wrong):
     class kind(ProgramModel):  # noqa: N801
-        def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
+        def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
             outcome = Outcome.FAILED if mu[0] > 0.0 else Outcome.OK
-            return replace(super().solve(mu, asked), outcome=outcome)
+            return replace(super().solve(mu, settings), outcome=outcome)
 
 
 class MoreThanDeclared(_Wrong):
@@ -123,8 +123,8 @@ class RemembersItsScale(_Wrong):
     class kind(ProgramModel):  # noqa: N801
         scale = 1.0
 
-        def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
-            answer = super().solve(mu, asked)
+        def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
+            answer = super().solve(mu, settings)
             assert answer.x is not None
             self.scale = float(np.linalg.norm(answer.x))
             return replace(answer, x=answer.x / self.scale)
@@ -136,8 +136,8 @@ class RemembersItsScale(_Wrong):
 
 class Rolls(_Wrong):
     class kind(ProgramModel):  # noqa: N801
-        def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
-            answer = super().solve(mu, asked)
+        def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
+            answer = super().solve(mu, settings)
             assert answer.x is not None
             return replace(answer, x=answer.x * (1.0 + 1e-9 * np.random.default_rng().random()))
 
@@ -146,8 +146,8 @@ class StepsOn(_Wrong):
     """Changes the parameter that it is given."""
 
     class kind(ProgramModel):  # noqa: N801
-        def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
-            answer = super().solve(mu, asked)
+        def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
+            answer = super().solve(mu, settings)
             mu += 1e-3
             return answer
 
@@ -163,8 +163,8 @@ class NoProgram(_Wrong):
     """Says that it has a solver, and always calls the same one."""
 
     class kind(ProgramModel):  # noqa: N801
-        def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
-            found = solve_qp(self.assembled.assemble(mu).program, "piqp", asked.accuracy)
+        def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
+            found = solve_qp(self.assembled.assemble(mu).program, "piqp", settings.accuracy)
             return FormulationAnswer(found.x, found.alpha)
 
 
@@ -195,8 +195,8 @@ class MisbehavingModel(ProgramModel):
         box = offline.problem.parameters
         self.how, self.middle = how, 0.5 * (box.lower + box.upper)[0]
 
-    def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
-        answer = super().solve(mu, asked)
+    def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
+        answer = super().solve(mu, settings)
         if mu[0] < self.middle:
             return answer
         if self.how == "hangs":

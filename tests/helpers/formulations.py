@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vibench import Array, Asked, Formulation, FormulationAnswer, FormulationModel, Multiplier, Reduction
+from vibench import Array, Formulation, FormulationAnswer, FormulationModel, Multiplier, QuerySettings, Reduction
 
 
 class Program(Formulation):
@@ -28,9 +28,9 @@ class ProgramModel(FormulationModel):
         self.dimension = self.assembled.fixed_basis.shape[1] + offline.multipliers.rank
         self.generators = self.assembled.generators.shape[1]
 
-    def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
+    def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
         reduced = self.assembled.assemble(mu)
-        found = asked.solve_qp(reduced.program, factor=reduced.factor)
+        found = settings.solve_qp(reduced.program, factor=reduced.factor)
         if found.x is None or found.alpha is None:
             return FormulationAnswer.none(found.solver_status)
         return FormulationAnswer(found.x, found.alpha, iterations=found.iterations)
@@ -61,7 +61,7 @@ class NearestModel(FormulationModel):
     def __init__(self, u: Array, mus: Array, widths: Array) -> None:
         self.u, self.mus, self.widths = u, mus, widths
 
-    def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
+    def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
         nearest = int(np.argmin(np.linalg.norm((self.mus - mu) / self.widths, axis=1)))
         return FormulationAnswer(np.array([float(nearest)]), uncertainty=0.5)
 

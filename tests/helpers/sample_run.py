@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Kind
 from vibench.results.break_even import break_even_rows
 from vibench.results.database import ResultsDatabase
@@ -74,7 +73,7 @@ HISTORIES = (
 def _keys(problem: str, dual: str, primal: str, tolerance: float | None) -> Row:
     options = {f"{axis}_options": "{}" for axis in ("problem", "training", "formulation", "dual", "primal")}
     own = {"problem": problem, "training": "own", "dual": dual, "primal": primal, "primal_tol": tolerance}
-    own["formulation"] = MIXED
+    own["formulation"] = "mixed"
     stops = {"pod_tol": 1e-3, "pod_size": None, "dual_tol": 1e-2, "dual_size": None}
     return options | own | stops | {"solver": "piqp", "accuracy": 1e-8, "assembly": "full", "correction": "none"}
 

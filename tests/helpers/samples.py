@@ -14,9 +14,14 @@ import fake_plugins
 import pandas as pd
 
 import vibench
+from vibench.plugins.plugin import Plugin
 from vibench.results.schema import STORED
 from vibench.stages.base import Stage
+from vibench.stages.cell_queries import CellQueries
+from vibench.stages.enrichment import EnrichmentStage
+from vibench.stages.formulation import FormulationStage
 from vibench.storage.artefacts import Artefact, Store
+from vibench.study.parameter_sets import ParameterSet
 
 STUDY: Mapping[str, Any] = {
     "name": "sample",
@@ -255,3 +260,19 @@ SMALL = small_study(
     validation=3,
 )
 """The study of the run that tests of models share."""
+
+
+def program_queries(
+    enrichment: EnrichmentStage,
+    interpolation: float | None,
+    validation: ParameterSet,
+    solver: str,
+    accuracy: float,
+    warm_start: bool = False,
+    bounds: bool = False,
+) -> CellQueries:
+    """The queries of a cell with the mixed formulation on an enriched space."""
+    pod, cone = enrichment.pod, enrichment.cone
+    mixed = Plugin("formulation", "mixed", "{}", "test")
+    built = FormulationStage(pod.problem, mixed, pod.training, pod, cone, enrichment, interpolation)
+    return CellQueries(built, validation, solver, accuracy, 20.0, warm_start, bounds)

@@ -126,16 +126,17 @@ def test_a_formulation_is_timed_in_the_rounds_with_all_of_it(found: Run) -> None
 def test_a_recorded_formulation_answers_and_is_refused_where_it_makes_no_sense(found: Run) -> None:
     cells = found.table("cells").set_index("formulation")
     key, mixed = cells.loc["Nearest", "cell"], cells.loc["mixed", "cell"].iloc[0]
-    again = open_run(found.path).formulated(key).solve([5.0])
+    again = open_run(found.path).model(key).solve([5.0])
     exact = open_run(found.path).model(mixed).high_fidelity([5.0])
     assert again.status == "ok"
-    assert again.residuals.worst < 1.0
+    assert again.high_fidelity_residuals.worst < 1.0
     problem = Wire()
     assert problem.V.norm(again.u - exact.u) <= again.error_bounds.u
-    with pytest.raises(RequestError, match=r"has the formulation 'Nearest', whose answers are no solutions of a quad"):
-        open_run(found.path).model(key)
-    with pytest.raises(RequestError, match="has the mixed formulation"):
-        open_run(found.path).formulated(mixed)
+    nearest = open_run(found.path).model(key)
+    with pytest.raises(RequestError, match="the formulation Nearest has no quadratic program"):
+        nearest.reduced  # noqa: B018
+    with pytest.raises(RequestError, match="the formulation Nearest uses no QP solver"):
+        nearest.solve([5.0], solver="piqp")
 
 
 def test_the_study_of_a_cell_is_the_same_cell(found: Run) -> None:

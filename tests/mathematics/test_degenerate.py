@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fake_plugins import Wire
-from samples import SampleStore, carry_out
+from samples import SampleStore, carry_out, program_queries
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
@@ -14,9 +14,7 @@ from vibench.interfaces.strategies import Stop
 from vibench.plugins.kinds import PROBLEM
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find
-from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
-from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.judging.cell_goal import CellRows
 from vibench.stages.offline import ConeStage, PODStage
@@ -120,7 +118,7 @@ def rows(register, store):
         tolerance = None if primal in {"decorrelated", "online-supremizers"} else 0.5
         strategy = Plugin("primal strategy", primal, "{}", "test")
         enrichment = SingleEnrichment(PODStage(problem, Stop(tolerance=1e-6)), cone, strategy, tolerance)
-        stage = CellQueries(AssemblyStage(enrichment, None, ParameterSet("validation", 3, 1)), "piqp", 1e-8, 20.0)
+        stage = program_queries(enrichment, None, ParameterSet("validation", 3, 1), "piqp", 1e-8)
         carry_out(stage, store)
         found: CellRows = value_of(store, stage)
         return found

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numerics import Varying, space
-from samples import SampleStore, carry_out
+from samples import SampleStore, carry_out, program_queries
 
 from vibench.arrays import Array
 from vibench.highfidelity import active_set
@@ -24,9 +24,7 @@ from vibench.qp.verification import kkt_residuals, verify
 from vibench.reduction.cones import orthogonality, project_on_cone
 from vibench.results.consistency import EFFECTIVITIES, violations
 from vibench.stability.infsup import cone_basis, inf_sup
-from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
-from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.judging.cell_goal import CellRows
 from vibench.stages.offline import ConeStage, PODStage
@@ -135,11 +133,8 @@ def test_rows_of_a_negative_control_are_ok_and_keep_the_invariants(
     problem = plugin("problem", "hertz", '{"resolution": "coarse"}')
     cone = ConeStage(problem, plugin("dual strategy", "pod-dual"), Stop(tolerance=1e-2))
     pod, primal = PODStage(problem, Stop(tolerance=1e-3)), plugin("primal strategy", "infsup-greedy")
-    stage = CellQueries(
-        AssemblyStage(SingleEnrichment(pod, cone, primal, 0.7), interpolation, ParameterSet("validation", 3, 1)),
-        "piqp",
-        1e-7,
-        20.0,
+    stage = program_queries(
+        SingleEnrichment(pod, cone, primal, 0.7), interpolation, ParameterSet("validation", 3, 1), "piqp", 1e-7
     )
     carry_out(stage, store)
     found: CellRows = value_of(store, stage)

@@ -13,15 +13,12 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from packs import write_cable
 from running import Register
-from samples import SampleStore, carry_out
+from samples import SampleStore, carry_out, program_queries
 from transformed import Transformed
 
 from vibench.interfaces.strategies import Stop
 from vibench.plugins.plugin import Plugin
-from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
-from vibench.stages.cell_queries import CellQueries
-from vibench.stages.certification import CertificateStage
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.judging.cell_goal import CellRows
 from vibench.stages.offline import ConeStage, PODStage
@@ -72,10 +69,9 @@ def rows(register: Register, tmp_path: Path) -> Rows:
         pga = Plugin("primal strategy", "offline-pga", "{}", "1")
         cone = ConeStage(problem, mcpg, Stop(tolerance=1e-2))
         enrichment = SingleEnrichment(PODStage(problem, Stop(tolerance=1e-2)), cone, pga, 0.5)
-        assembly = AssemblyStage(enrichment, 1e-3, ParameterSet("validation", QUERIES, 3))
         # OSQP, a first-order method, is given an accuracy that it reaches; its errors depend on scaling up to that
         accuracy = 1e-6 if solver == "osqp" else 1e-10
-        stage = CellQueries(assembly, solver, accuracy, 20.0, certificate=CertificateStage(assembly))
+        stage = program_queries(enrichment, 1e-3, ParameterSet("validation", QUERIES, 3), solver, accuracy, bounds=True)
         store = store_of(base, transformation)
         carry_out(stage, store)
         return value_of(store, stage)

@@ -36,15 +36,15 @@ from vibench.linalg.inner_product import InnerProduct, project_out, singular_val
 from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
 from vibench.model.errors import ReferenceSolutions, errors
 from vibench.model.galerkin import ReducedModel, ReducedProblem, project
-from vibench.model.hyperreduced import HyperReducedModel, ReducedOperators, hyper_reduce
+from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel, ReducedOperators, hyper_reduce
 from vibench.offline.assemblies import assemblies
-from vibench.offline.formulated import Formulated
-from vibench.offline.models import AnyReducedModel
+from vibench.offline.models import Model
 from vibench.offline.reduction import Reduction
 from vibench.offline.sweep import Snapshots, high_fidelity_sweep
 from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM
 from vibench.plugins.registry import find, qp_solver
 from vibench.qp.solve import solve_qp
+from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, verify
 from vibench.reduction.cones import project_on_cone
 from vibench.reduction.pod import POD, pod
@@ -362,7 +362,7 @@ def test_query(timing: Timing, inputs: StageInputs, primal: PrimalChoice) -> Non
 
     def query() -> QPSolution:
         reduced = model.reduced.assemble(next(mus))
-        return solve_qp(reduced.program, model.solver, model.accuracy, factor=reduced.factor)
+        return solve_qp(reduced.program, reduction.solver, model.accuracy, factor=reduced.factor)
 
     def judge(_: QPSolution) -> Info:
         answers = [model.solve(query.mu) for query in inputs.queries]
@@ -439,7 +439,7 @@ def test_formulation(timing: Timing, inputs: StageInputs, formulation: str) -> N
     offline = _phase(inputs, made)
     _built(made, offline)
 
-    def judge(built: Formulated) -> Info:
+    def judge(built: Model) -> Info:
         return _judge(inputs, built)
 
     timing("formulation", lambda: _built(made, offline), judge)
@@ -451,7 +451,7 @@ def test_formulated_query(timing: Timing, inputs: StageInputs, formulation: str)
     built, mus = _built(made, _phase(inputs, made)), _in_turn(inputs)
 
     def query() -> FormulationAnswer:
-        return built.model.solve(next(mus), built.asked()[0])
+        return built.online.solve(next(mus), built.settings()[0])
 
     timing("query of a formulation", query, lambda _: _judge(inputs, built), together=len(inputs.queries))
 
@@ -472,27 +472,27 @@ def _phase(inputs: StageInputs, formulation: Formulation) -> Reduction:
     return replace(whole, **without).given(**given)
 
 
-def _built(formulation: Formulation, offline: Reduction) -> Formulated:
+def _built(formulation: Formulation, offline: Reduction) -> Model:
     """The formulation on an offline phase, its model made."""
     try:
-        built = offline.formulated(formulation)
+        built = offline.with_formulation(formulation).model
     except UnsupportedError as error:
         pytest.skip(str(error))
-    built.model  # noqa: B018  is made
+    built.online  # noqa: B018  is made
     return built
 
 
-def _judge(inputs: StageInputs, built: Formulated) -> Info:
+def _judge(inputs: StageInputs, built: Model) -> Info:
     """Status, residuals and errors of its answers at the validation parameters."""
     answers = [built.solve(query.mu) for query in inputs.queries]
     worst = max(answers, key=lambda answer: answer.status.severity)
     figures: list[Mapping[str, float]] = [
-        residual_figures(answer.residuals) | errors_of(inputs, query, answer.u, answer.lam)
+        residual_figures(answer.high_fidelity_residuals) | errors_of(inputs, query, answer.u, answer.lam)
         for query, answer in zip(inputs.queries, answers, strict=True)
-        if answer.verdict.pair is not None
+        if answer.x is not None and answer.status is not Status.NONFINITE
     ]
     return {
-        "N": built.model.dimension, "R": built.model.generators, "status": worst.status.value, "reason": worst.reason,
+        "N": built.online.dimension, "R": built.online.generators, "status": worst.status.value, "reason": worst.reason,
         "accuracy": largest_figures(figures) if len(figures) == len(answers) else {},
     }  # fmt: skip
 

@@ -151,9 +151,7 @@ def _beginning(word: str, choices: Iterable[str]) -> list[str]:
 
 
 def _formulations() -> Iterable[str]:
-    from vibench.interfaces.formulations import MIXED
-
-    return [MIXED, *_registered(FORMULATION)]
+    return _registered(FORMULATION)
 
 
 def _solvers() -> Iterable[str]:

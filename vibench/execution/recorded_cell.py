@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,18 +18,14 @@ from vibench.errors import RequestError
 from vibench.execution.graph import Graph
 from vibench.execution.jobs import Job
 from vibench.execution.supervisor import Supervisor
-from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.problem import VariationalInequality
-from vibench.model.certificates.bounds import OnlineCertificate
-from vibench.offline.formulated import Formulated
-from vibench.offline.models import AnyReducedModel
+from vibench.offline.models import Model
+from vibench.plugins.plugin import Plugin
 from vibench.results.read import read_table, results_file
 from vibench.results.selection import key_of
 from vibench.results.sqlite import read_meta, read_rows, study_of
-from vibench.stages.assembly import assembly_stage
 from vibench.stages.base import Done, Stage
-from vibench.stages.cell_queries import CellQueries, cell_queries
-from vibench.stages.formulations.queries import formulation_queries
+from vibench.stages.cell_queries import cell_queries
 from vibench.storage.artefacts import Store, usable_store
 from vibench.study.cells import NOT_MOVED, Cell
 from vibench.study.matrix import study_of_cell
@@ -59,65 +56,30 @@ class RecordedCell:
         return Cell.from_definition(self.row["definition"], self.places)
 
     @cached_property
-    def model(self) -> AnyReducedModel:
-        """The reduced model; stages whose artefacts are missing are run again.
+    def model(self) -> Model:
+        """The model, with its bounds; stages whose artefacts are missing are run again.
 
         Raises
         ------
         RequestError
-            If other code computed the row, so that its model cannot be reproduced, or its formulation is not mixed.
+            If other code computed the row, so that its model cannot be reproduced.
         """
-        self._refuse_other_code()
-        if self.cell.formulation is not None:
-            raise RequestError(
-                f"cell {self.row['cell']} has the formulation '{self.cell.formulation_label}', whose answers are no "
-                "solutions of a quadratic program that could be replayed or exported: `open_run(…).formulated(cell)` "
-                "answers its queries"
-            )
-        store, assembly = usable_store(), assembly_stage(self.cell)
-        _provide(assembly.model_inputs, store)
-        return assembly.model(store)[0]
-
-    @cached_property
-    def formulated(self) -> Formulated:
-        """The model of a cell whose formulation is a plugin; stages whose artefacts are missing are run again.
-
-        Raises
-        ------
-        RequestError
-            If other code computed the row, or its formulation is mixed.
-        """
-        self._refuse_other_code()
-        if self.cell.formulation is None:
-            raise RequestError(f"cell {self.row['cell']} has the mixed formulation: see `open_run(…).model(cell)`")
-        store, stage = usable_store(), formulation_queries(self.cell, query_seconds=1e6)
-        _provide(stage.timed_inputs, store)
-        return stage.built.formulated(store, stage.solver, stage.accuracy)
-
-    def _refuse_other_code(self) -> None:
         if self.cell.code != self.row["code"]:
             raise RequestError(
                 f"cell {self.row['cell']} was computed by other code, with another version of its solver, or from "
                 "files that were changed since; run its study again"
             )
-
-    @cached_property
-    def certificate(self) -> OnlineCertificate | None:
-        """The certificate that bounds the errors of the model at online cost; `None` where the cell has none.
-
-        Raises
-        ------
-        RequestError
-            As for `model`.
-        """
-        self.model  # noqa: B018  refuses other code
-        goal = cell_queries(self.cell, query_seconds=1e6)
-        stage = goal.certificate if isinstance(goal, CellQueries) else None
-        if stage is None:
-            return None
-        store = usable_store()
-        _provide((stage.base, stage), store)
-        return stage.certificate(store)
+        store, queries = usable_store(), cell_queries(self.cell, query_seconds=1e6)
+        certificate, built = queries.certificate, queries.built
+        _provide(
+            built.model_inputs if certificate is None else (*built.model_inputs, certificate.base, certificate), store
+        )
+        return replace(
+            built.model(store, queries.solver, queries.accuracy),
+            certificate=None if certificate is None else certificate.certificate(store),
+            row=self.row,
+            correction=queries.correction,
+        )
 
     @cached_property
     def parameters(self) -> Array:
@@ -126,7 +88,7 @@ class RecordedCell:
 
     def program(self, query: int) -> VariationalInequality:
         """The reduced quadratic program of one query, exactly as it was solved."""
-        return self.model.assemble(self.parameters[query]).program
+        return self.model.reduced.assemble(self.parameters[query]).program
 
     def rows(self, table: str) -> dict[int, dict[str, Any]]:
         """The cell's rows of the queries or the solutions table, by query."""
@@ -166,7 +128,7 @@ def _rows(run: str) -> tuple[Path, list[dict[str, Any]]]:
 
 
 def recorded_cells(run: str, places: Mapping[str, str] = NOT_MOVED) -> list[RecordedCell]:
-    """All cells of a run that have a reduced model, of the mixed formulation: others have no quadratic programs.
+    """All cells of a run that have a model with quadratic programs.
 
     Raises
     ------
@@ -174,7 +136,16 @@ def recorded_cells(run: str, places: Mapping[str, str] = NOT_MOVED) -> list[Reco
         If there is no such run.
     """
     path, rows = _rows(run)
-    return [RecordedCell(path, row, places) for row in rows if row["model"] and row["formulation"] == MIXED]
+    return [RecordedCell(path, row, places) for row in rows if row["model"] and _has_program(row["definition"])]
+
+
+def _has_program(definition: str) -> bool:
+    """Whether the formulation of a recorded cell has programs; before all formulations were plugins it did if none."""
+    recorded = json.loads(definition).get("formulation")
+    if recorded is None:
+        return True
+    plugin = Plugin(**recorded).registered
+    return bool(plugin.entries and not plugin.conflict and plugin.load().has_program)
 
 
 def recorded_cell(run: str, cell: str, places: Mapping[str, str] = NOT_MOVED) -> RecordedCell:

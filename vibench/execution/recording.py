@@ -191,9 +191,7 @@ def cell_columns(cell: Cell) -> dict[str, Any]:
     without: dict[str, Any] = {}
     for name, plugin in (("dual", cell.dual), ("primal", cell.primal)):
         without |= {name: NO_SUCH_AXIS, f"{name}_options": "{}"} if plugin is None else {}
-    how = {"formulation": cell.formulation_label, "formulation_options": "{}"}
-    if cell.formulation is not None:
-        how["formulation_options"] = cell.formulation.options
+    how = {"formulation": cell.formulation_label, "formulation_options": cell.formulation.options}
     solved = {"solver": cell.solver or NO_SUCH_AXIS, "accuracy": cell.accuracy, "assembly": cell.assembly}
     columns = axis_columns(cell.axes, labels_of([cell])) | without | how | solved | {"correction": cell.correction}
     return {name: columns.get(name) for name in KEYS}

@@ -12,7 +12,7 @@ from vibench.rounds.offline_repeats import OfflineRepeat, offline_columns, scatt
 from vibench.rounds.timed_seconds import TimedCell, TimedRound
 from vibench.rounds.timing_rounds import SHARE, TimingRounds, block_rows
 from vibench.stages.base import Failed, Row, Stage
-from vibench.stages.judging.cell_goal import CellGoal
+from vibench.stages.cell_queries import CellQueries
 from vibench.storage.artefacts import Store
 from vibench.study.cells import Cell
 from vibench.timing import Seconds
@@ -40,14 +40,14 @@ class OfflinePlan:
         self._sources: set[str] = set()
         self._planned: set[str] = set()
         self._spent = 0.0
-        self._cells: dict[Cell, CellGoal] = {}
+        self._cells: dict[Cell, CellQueries] = {}
 
     def note(self, stage: Stage, seconds: Seconds, wall: float) -> None:
         """Register a stage that has run, with its wall seconds, or whose artefact was reused."""
         self._seconds[stage.key] = seconds
         self._costs[stage.key] = seconds.cpu or wall
 
-    def repeats(self, cells: Iterable[tuple[Cell, CellGoal]]) -> list[OfflineRepeat]:
+    def repeats(self, cells: Iterable[tuple[Cell, CellQueries]]) -> list[OfflineRepeat]:
         """The repeats to run for some cells that have their rows, the cheapest first."""
         mine = dict(cells)
         self._cells |= mine
@@ -97,7 +97,7 @@ class OfflinePlan:
 class _Group:
     """Cells that are timed together, and their measurements so far, by the key of a goal."""
 
-    def __init__(self, members: dict[Cell, CellGoal], queries: dict[str, tuple[int, ...]]) -> None:
+    def __init__(self, members: dict[Cell, CellQueries], queries: dict[str, tuple[int, ...]]) -> None:
         self.members, self.queries = members, queries
         self.rows: dict[str, list[Row]] = defaultdict(list)
         self.rounds: dict[str, list[TimedRound]] = defaultdict(list)
@@ -125,7 +125,7 @@ class TimingPlan:
         Rounds of every cell, if the limit allows them.
     """
 
-    def __init__(self, goals: Mapping[Cell, CellGoal], rounds: int, writer: ResultWriter, fewest: int) -> None:
+    def __init__(self, goals: Mapping[Cell, CellQueries], rounds: int, writer: ResultWriter, fewest: int) -> None:
         self._goals, self._rounds, self._writer, self._fewest = goals, rounds, writer, fewest
         # All measurements so far: the scatter of the few blocks of a cell is pooled with that of other cells.
         self._paired = PairedTiming()
@@ -155,7 +155,7 @@ class TimingPlan:
         self._open[group].discard(cell)
         return None if self._open[group] else self._begin(group)
 
-    def members(self, stage: TimingRounds) -> Iterable[tuple[Cell, CellGoal]]:
+    def members(self, stage: TimingRounds) -> Iterable[tuple[Cell, CellQueries]]:
         """The cells of the group of a planned stage, with their goals."""
         return self._planned[stage.key].members.items()
 
@@ -167,7 +167,7 @@ class TimingPlan:
         fine = {goal.key: self._writer.database.fine_queries(cell.key) for cell, goal in members.items()}
         return self._block(_Group(members, fine), self._session, members.values())
 
-    def _block(self, group: _Group, session: int, goals: Iterable[CellGoal]) -> TimingRounds:
+    def _block(self, group: _Group, session: int, goals: Iterable[CellQueries]) -> TimingRounds:
         """The next block of a group, of some of its goals."""
         # Cells that differ only in their labels share one goal.
         mine = tuple({goal.key: goal for goal in goals}.values())
@@ -209,20 +209,20 @@ class TimingPlan:
             self._writer.timed(cell, self._rounds)
         return None
 
-    def _write(self, group: _Group, cell: Cell, goal: CellGoal) -> None:
+    def _write(self, group: _Group, cell: Cell, goal: CellQueries) -> None:
         count, reason = group.lost[goal.key]
         rows, rounds = group.rows[goal.key], group.rounds[goal.key]
         everything = len(rows) + count
         lost = f"{'all' if count == everything else f'{count} of {everything}'} rounds: {reason}" if count else ""
         self._writer.seconds(cell, rows, rounds, group.machines[goal.key], lost)
 
-    def _undecided(self, group: _Group) -> list[CellGoal]:
+    def _undecided(self, group: _Group) -> list[CellQueries]:
         """The goals with a comparison that further rounds may decide."""
         if group.first < min(max(self._fewest, FEWEST_ROUNDS), self._rounds) or group.blocks < FEWEST_BLOCKS:
             return list(group.members.values())
         cells = {cell.key: goal for cell, goal in group.members.items()}
         rows = [row for key in cells if (row := self._writer.database.cell(key)) is not None]
-        undecided: dict[str, CellGoal] = {}
+        undecided: dict[str, CellQueries] = {}
         # A comparison that is tested after every block reaches 5 % only if each test is stricter (Pocock 1977).
         for one in compared(rows, self._paired, tail=0.005):
             if one.result.meaning is Meaning.UNDECIDED and self._would_help(one, group.first):

@@ -1,16 +1,19 @@
-"""The interface of formulation plugins: what a reduced model solves at a parameter, and what answers it gives.
+"""The interface of formulation plugins: the models that answer the queries of a study.
 
-A study's matrix is made of mixed quadratic programs: u_N in V_N and its enrichment, λ_N in the reduced cone. That
-formulation, `MIXED`, is vibench's own. A plugin replaces everything between the offline phase and the answer, as a
-penalty method, a regression or a model with local bases does; what is measured of the answer is the same for all.
+A formulation is everything between the offline phase and the answer: the mixed quadratic program of V_N and the reduced
+cone, a penalty method, a regression, a model with local bases. The measurements of the answer are the same for all.
 
 The life of a formulation in a study:
 
-1. `Formulation.build` prepares it, offline and timed. What it returns is stored under a key and shared by cells.
+1. `Formulation.build` prepares it, offline and timed. Its result is stored under a key and shared by cells.
 2. `Formulation.model` makes the model from the stored data, in every process that needs one; not timed.
 3. `FormulationModel.solve` answers a query, timed: whatever it assembles is part of the query.
-4. `FormulationModel.reconstruct` turns the answer into u (n,) and λ (m,), not timed. Errors, the bounds of the errors,
-   the residuals of the high-fidelity problem and everything that follows from them are taken of this pair.
+4. `FormulationModel.reconstruct` turns the answer into u (n,) and λ (m,), not timed. Errors, error bounds and residuals
+   of the high-fidelity problem are those of this pair.
+
+Two capabilities are optional. With a `FormulationModel.program`, assembly and solution are timed apart, programs are
+assembled once for all QP solvers, and solver and assembly errors are reported; `vibench.ProgramModel` has all of it.
+With a `FormulationModel.certificate`, cells may ask for error bounds at online cost.
 """
 
 from __future__ import annotations
@@ -26,11 +29,11 @@ from vibench.errors import RequestError
 from vibench.interfaces.problem import VariationalInequality
 
 if TYPE_CHECKING:  # both are above this layer; a formulation is handed objects of theirs
+    from vibench.model.certificates.bounds import OnlineCertificate
+    from vibench.model.galerkin import ReducedProblem
+    from vibench.model.hyperreduced import AnyReducedModel
     from vibench.offline.reduction import Reduction
     from vibench.qp.verification import QPSolution
-
-MIXED = "mixed"
-"""The formulation that is no plugin: the quadratic program of V_N, its enrichment, and the cone."""
 
 AXES = ("pod", "dual", "primal", "solvers", "accuracy", "assembly")
 """The axes of a study that a formulation may have; it is not repeated over those that it does not have."""
@@ -101,13 +104,13 @@ class SolveQP(Protocol):
         """The solution x (n,), α (m,) ≥ 0 of min ½xᵀA x − fᵀx, B x ≤ g, dense; either is `None` if it has found none.
 
         `factor` is the Cholesky factor (lower) of A where it is known, `start` a solution to start from where the
-        solver can. The solution of the last program of a query is verified as those of `MIXED` are, outside its
-        seconds: the row of the query is not ok if its natural residuals exceed the accuracy.
+        solver can. The solution of the last program of a query is verified outside its seconds: the row of the query
+        is not ok if its natural residuals exceed the accuracy.
         """
 
 
 @dataclass(frozen=True)
-class Asked:
+class QuerySettings:
     """Settings of a query besides its parameter.
 
     Attributes
@@ -141,9 +144,11 @@ class FormulationModel(ABC):
     """How many of the coefficients of u are not of V_N, where it is not the enrichment of the offline phase."""
     fallbacks: tuple[str, ...] = ()
     """One line for every step that deviates from the algorithm."""
+    reduced: AnyReducedModel
+    """The model that assembles `program`, of formulations that declare `has_program`."""
 
     @abstractmethod
-    def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
+    def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
         """The answer at mu (d,); its seconds are those of the query."""
 
     @abstractmethod
@@ -154,6 +159,23 @@ class FormulationModel(ABC):
         and for no other. A negative coefficient of λ is an error, even one of round-off: every bound needs λ ≥ 0.
         """
 
+    def program(self, mu: Array) -> ReducedProblem:
+        """The quadratic program at mu (d,), for formulations that declare `has_program`; `alpha` is on `generators`.
+
+        `x` and `alpha` of answers are its solution, against which they are verified.
+        """
+        return self.reduced.assemble(mu)
+
+    def certificate(self, offline: Reduction) -> OnlineCertificate:
+        """The certificate of `reduced`, prepared offline and timed, for formulations that declare `has_certificate`.
+
+        Raises
+        ------
+        UnsupportedError
+            If the problem or the assembly allows none.
+        """
+        return offline.certificate_of(self.reduced)
+
 
 class Formulation(ABC):
     """Makes models of a problem from its offline phase. Constructor arguments are the plugin's options."""
@@ -163,15 +185,22 @@ class Formulation(ABC):
     uses: ClassVar[tuple[str, ...]] = AXES
     """The `AXES` of a study that it has. Without "pod" there is no V_N, without "dual" no cone and without "primal" no
     enrichment in the offline phase; "primal" needs "pod" and "dual". Without "solvers" the cell has no QP solver,
-    without "accuracy" the answer has none to reach, without "assembly" queries are always assembled in full."""
+    without "accuracy" the answer has none to reach, without "assembly" queries are assembled as `assembled` says."""
     multiplier: ClassVar[Multiplier] = Multiplier.SOLVED
     """Where λ comes from."""
     takes_start: ClassVar[bool] = False
     """Whether queries can start from the answer at a neighbouring parameter."""
+    has_program: ClassVar[bool] = False
+    """Whether its models have a `program`. If it has the axis "solvers", too, that is solved in place of `solve`."""
+    has_certificate: ClassVar[bool] = False
+    """Whether its models have a `certificate`: cells may then ask for bounds."""
+    assembled: ClassVar[str] = "full"
+    """Assembly of the offline phase where "assembly" is none of its axes: "full" or "reduced"."""
+    is_default: ClassVar[bool] = False
+    """Whether studies that name no formulation have this one; of all that are registered at most one."""
 
-    @abstractmethod
-    def build(self, offline: Reduction) -> Mapping[str, Any]:
-        """What the formulation adds to the offline phase, prepared once; its seconds are offline seconds of their own.
+    def build(self, offline: Reduction) -> Mapping[str, Any]:  # noqa: ARG002
+        """Data that the formulation adds to the offline phase, by default none; its seconds are recorded apart.
 
         Parameters
         ----------
@@ -193,12 +222,14 @@ class Formulation(ABC):
         UnsupportedError
             If the problem does not have what the formulation needs; its cells say so.
         """
+        return {}
 
     @abstractmethod
     def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
         """The model, from the offline phase and from what `build` returned, which may have been stored in between.
 
-        Steps of `offline` are read from where they are stored, and not computed again.
+        Steps of `offline` are read from where they are stored, and not computed again. Without a `build` of its own, a
+        formulation that `has_program` is given spaces and reduced operators, but no snapshots.
         """
 
 

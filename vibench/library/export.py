@@ -22,10 +22,10 @@ from vibench.library import exported_certificate
 from vibench.library.reduced_model import FORMAT, SOLVERS
 from vibench.model.certificates.base import Guarantee, contact_unknowns
 from vibench.model.chebyshev import AffinePolynomial
-from vibench.model.hyperreduced import HyperReducedModel
+from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel
 from vibench.offline import c_source
 from vibench.offline.c_source import ExactMember
-from vibench.offline.models import AnyReducedModel, Model
+from vibench.offline.models import Model
 from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, InaccurateError, declared_terms, member_polynomials
 from vibench.provenance import distribution_version
 from vibench.qp.settings import SETTINGS

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ def queries(model: Model, file: Path) -> dict[str, Call]:
 
     A certified model also answers with bounds, and with corrected solutions.
     """
-    plain = model if model.certificate is None else Model(model.reduced, model.solver, model.accuracy)
+    plain = replace(model, certificate=None)
     found: dict[str, Call] = {SCRIPT: reduced_model.Model(file).solve, LIBRARY: partial(_whole, plain, False)}
     if model.certificate is not None:
         found |= {

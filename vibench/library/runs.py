@@ -17,8 +17,6 @@ from vibench.execution.recorded_cell import recorded_cell
 from vibench.execution.recording import REPORT
 from vibench.execution.run import Observer, Options, run_study
 from vibench.files import writing
-from vibench.model.bound_terms import CorrectionMode
-from vibench.offline.formulated import Formulated
 from vibench.offline.models import Model
 from vibench.results import formats, ranking, show
 from vibench.results.read import cells_with_errors, in_order, read_table, results_file
@@ -197,7 +195,7 @@ class Run:
 
     @requested
     def model(self, cell: str) -> Model:
-        """The reduced model of a cell, ready for queries; stages whose artefacts are missing are run again.
+        """The model of a cell, ready for queries; stages whose artefacts are missing are run again.
 
         Parameters
         ----------
@@ -209,23 +207,7 @@ class Run:
         RequestError
             If there is no such cell, it failed before it had a model, or other code computed it.
         """
-        recorded = recorded_cell(str(self.path), cell, self._at)
-        reduced, asked = recorded.model, recorded.cell
-        certificate, mode = recorded.certificate, CorrectionMode(asked.correction)
-        assert asked.solver is not None  # the mixed formulation has all axes
-        assert asked.accuracy is not None
-        return Model(reduced, asked.solver, asked.accuracy, certificate, recorded.row, mode)
-
-    @requested
-    def formulated(self, cell: str) -> Formulated:
-        """The model of a cell whose formulation is a plugin, likewise: `formulated(cell).solve(mu)`.
-
-        Raises
-        ------
-        RequestError
-            As `model`, or if the formulation of the cell is mixed.
-        """
-        return recorded_cell(str(self.path), cell, self._at).formulated
+        return recorded_cell(str(self.path), cell, self._at).model
 
 
 def _following(observer: Observer | None, progress: bool) -> AbstractContextManager[Observer]:

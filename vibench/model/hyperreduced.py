@@ -405,3 +405,7 @@ def _pivoted_range(y: Array) -> Array:
 def _reconstructed(space: PlainCoordinates, Y: Array, x: Array) -> Array:
     """Vectors (n×k) from coordinates (N'×k) in an orthonormal basis with coordinates Y (d'×N')."""
     return space.vectors(Y @ x)
+
+
+AnyReducedModel = ReducedModel | HyperReducedModel
+"""A model that assembles the reduced program at a parameter."""

@@ -23,11 +23,14 @@ from vibench.arrays import Array
 from vibench.errors import RequestError, UnsupportedError
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.model.chebyshev import AffinePolynomial
+from vibench.model.hyperreduced import AnyReducedModel
 from vibench.offline import c_source
-from vibench.offline.models import AnyReducedModel
 from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, member_polynomials
 from vibench.qp.verification import QPSolution
+from vibench.storage.serialisation import storable
 from vibench.text import one_line
+
+storable(AffinePolynomial)
 
 COMPILERS = ("cc", "gcc", "clang")
 """C compilers that are looked for where the environment variable CC names none."""
@@ -45,6 +48,7 @@ SAYS = {0: "solved", 1: "inaccurate", 2: "the constraints contradict each other"
 """What the codes of the program mean."""
 
 
+@storable
 @dataclass(frozen=True)
 class CompiledModel:
     """What the C source of a model is made of: polynomials of A, f, B and g, the box (d,), the accuracy it verifies."""
@@ -85,7 +89,7 @@ class CompiledModel:
         }
         return c_source.source(self.members, {"lower": self.lower, "upper": self.upper}, about, "model")[0]
 
-    def program(self) -> Program:
+    def program(self) -> CompiledProgram:
         """Compile and load the program.
 
         Raises
@@ -93,9 +97,8 @@ class CompiledModel:
         UnsupportedError
             If there is no C compiler, or it fails.
         """
-        with TemporaryDirectory(prefix="vibench-") as folder:  # what is loaded needs its file no longer
-            loaded = ctypes.CDLL(str(_compiled(self.source, Path(folder))))
-        return Program(loaded, self.members["f"].terms.shape[1], self.members["g"].terms.shape[1])
+        sizes = (self.members[name].terms.shape[1] for name in "fg")
+        return CompiledProgram.compiled(self.source, *sizes)
 
 
 def _refuse_large(program: VariationalInequality) -> None:
@@ -107,12 +110,25 @@ def _refuse_large(program: VariationalInequality) -> None:
         raise UnsupportedError(f"{what}, at most {STACK // 2**20} MiB are safe")
 
 
-class Program:
+class CompiledProgram:
     """A loaded program of `unknowns` and `constraints`."""
 
     def __init__(self, loaded: Any, unknowns: int, constraints: int) -> None:
         self._solve, self._sizes = loaded.model_solve, (unknowns, constraints)
         self._solve.argtypes, self._solve.restype = [ctypes.c_void_p] * 4, ctypes.c_int
+
+    @classmethod
+    def compiled(cls, source: str, unknowns: int, constraints: int) -> CompiledProgram:
+        """Compile a source and load the program.
+
+        Raises
+        ------
+        UnsupportedError
+            If there is no C compiler, or it fails.
+        """
+        with TemporaryDirectory(prefix="vibench-") as folder:  # a library that is loaded needs its file no longer
+            loaded = ctypes.CDLL(str(_compiled(source, Path(folder))))
+        return cls(loaded, unknowns, constraints)
 
     def __call__(self, mu: Array) -> QPSolution:
         """The solution at mu (d,), which is not verified by anyone but the program."""

@@ -1,80 +1,143 @@
-"""A reduced model, for queries at any parameter."""
+"""Reduced models, which answer queries at any parameter, and their solutions.
+
+An answer of a formulation is judged before anything is measured of it: a vector of the wrong size, one that is not
+finite, and a negative multiplier are broken answers, whatever the formulation says of them.
+"""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from html import escape
 from math import inf
-from types import MappingProxyType
+from numbers import Integral
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.errors import RequestError, unknown_name
+from vibench.errors import NumericalError, RequestError, unknown_name
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
+from vibench.interfaces.formulations import (
+    Formulation,
+    FormulationAnswer,
+    FormulationModel,
+    Multiplier,
+    QuerySettings,
+)
 from vibench.interfaces.parameters import ParameterBox
-from vibench.interfaces.problem import Problem
+from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.strategies import Cone, Enrichment, Kind
 from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import contact_unknowns, output_weights
 from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate, OnlineCorrection, output_error_bound
 from vibench.model.error_bounds import ErrorBounds, bound_errors_at
-from vibench.model.galerkin import ReducedModel, ReducedProblem
-from vibench.model.hyperreduced import HyperReducedModel
+from vibench.model.errors import high_fidelity_residuals, residual_multiplier
+from vibench.model.galerkin import ReducedProblem
+from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel
 from vibench.offline.assemblies import assemblies
 from vibench.offline.correction import Answer, Corrector
-from vibench.offline.shown import about_model, about_solution, html
 from vibench.plugins import registry
 from vibench.plugins.kinds import SOLVER
 from vibench.qp.settings import SETTINGS
-from vibench.qp.solve import installed_solvers, solve_qp
+from vibench.qp.solve import installed_solvers, solve_qp, takes_start
 from vibench.qp.status import Status
-from vibench.qp.verification import Residuals, verify
+from vibench.qp.verification import QPSolution, Residuals, verify
+from vibench.reduction.pod import POD
+from vibench.storage.serialisation import storable
 from vibench.text import brief, normal_name
 from vibench.timing import timed
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from vibench.offline.reduction import Reduction
+
+for _step in (POD, Cone, Kind, Enrichment):
+    storable(_step)  # steps of other offline phases, which a formulation may build
+
 Parameters = Sequence[float] | Array | Mapping[str, float]
 """A parameter mu: its components in the order of `ParameterBox.names`, or by these names."""
-
-AnyReducedModel = ReducedModel | HyperReducedModel
-"""A model that assembles the reduced program at a parameter."""
-
 
 BLOCK = 256
 """Programs that `Model.solve_all` assembles at once."""
 
-NO_TOLERANCE = "no tolerance"
-"""The verdict on a solution for which no tolerance was given."""
+ACCURACY = 1e-7
+"""Accuracy of formulations without an axis of accuracies."""
+
+
+class CellSolver:
+    """The QP solver of a query, which keeps the last program that it was given and its solution."""
+
+    def __init__(self, solver: str | None, accuracy: float) -> None:
+        self._solver, self._accuracy = solver, accuracy
+        self._extra = {} if solver is None else registry.qp_solver(solver)
+        self.last: tuple[VariationalInequality, QPSolution] | None = None
+
+    def __call__(
+        self,
+        program: VariationalInequality,
+        *,
+        factor: Array | None = None,
+        start: tuple[Array, Array] | None = None,
+    ) -> QPSolution:
+        """The solution of a dense program; see `vibench.interfaces.formulations.SolveQP`."""
+        if self._solver is None:
+            raise NumericalError("the formulation solves a quadratic program without 'solvers' among its axes (`uses`)")
+        begun = None
+        if start is not None and takes_start(self._solver):
+            begun = QPSolution(*start, "the start")
+        solution = solve_qp(program, self._solver, self._accuracy, self._extra, factor, begun)
+        self.last = program, solution
+        return solution
+
+    def verdict(self, slackened: float = 1.0) -> tuple[Status, str, Residuals | None]:
+        """What verification says of the last solution, to some multiple of the accuracy; ok if there is none."""
+        if self.last is None:
+            return Status.OK, "", None
+        return verify(*self.last, slackened * self._accuracy)
 
 
 @dataclass(frozen=True)
+class QueryStatus:
+    """The status of an answer and why it is not ok, and its pair u (n,), λ (m,) unless it is broken or has a program.
+
+    `residuals` are those of the program, or of the last quadratic program that it took, if any.
+    """
+
+    status: Status
+    reason: str
+    pair: tuple[Array, Array] | None = None
+    residuals: Residuals | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Solution:
-    """The solution of a reduced model at one parameter; the fields are those of a row of the queries table.
+    """The answer of a model at one parameter; the fields are those of a row of the queries table.
 
     Attributes
     ----------
     mu
         The parameter (d,).
     status, reason
-        What verification says of the quadratic program's solution, and why it is not ok.
+        The verdict of verification, and why it is not ok.
     x, alpha
-        Coordinates of u in the primal basis (N',) and of λ on the generators (R,); `None` if the solver gave none.
+        Coefficients of u (N',) and of λ (R,); `None` if there is no answer, or α where λ has no coefficients.
     residuals
-        Its relative KKT residuals, recomputed; `None` without x and α.
+        Recomputed KKT residuals of the (last) quadratic program; `None` without one.
     assembly, solution
-        CPU seconds of the assembly of the program, and of its solution.
+        CPU seconds of the assembly of the program, 0 where it is part of the solution, and of the solution.
     bound, tolerance
-        Its error bounds at online cost where the cell is certified, and the relative error asked for; else `None`.
+        Error bounds at online cost where the model has a certificate, and the relative error asked for; else `None`.
     correction
-        What corrects it at online cost: `u`, `lam` and `bound` are of the corrected pair, x and α are not.
+        The correction at online cost: `u`, `lam` and `bound` are of the corrected pair, x and α are not.
     mode
         Whether a correction was asked for. Without a certificate it is made when `u` or `lam` is, at high-fidelity
         cost.
+    iterations, uncertainty
+        Steps of the solver or the formulation, and the formulation's own estimate of ‖u − u_N‖_V, if it makes one.
     """
 
     mu: Array
@@ -86,11 +149,13 @@ class Solution:
     assembly: float
     solution: float
     _model: Model = field(repr=False)
-    _reduced: ReducedProblem = field(repr=False)
+    _pair: Callable[[], tuple[Array, Array] | None] = field(repr=False)
     bound: OnlineBound | None = None
     tolerance: float | None = None
     correction: OnlineCorrection | None = None
     mode: CorrectionMode = CorrectionMode.NONE
+    iterations: int | None = None
+    uncertainty: float | None = None
 
     @property
     def verdict(self) -> str:
@@ -99,12 +164,26 @@ class Solution:
         "no tolerance" where none was asked for. A solution that is not ok is not certified, however small its bound is.
         """
         if self.tolerance is None or self.bound is None:
-            return NO_TOLERANCE
-        kept = self.status is Status.OK and self.bound.relative <= self.tolerance
-        return self.bound.guarantee.value if kept else "not certified"
+            return "no tolerance"
+        certified = self.status is Status.OK and self.bound.relative <= self.tolerance
+        return self.bound.guarantee.value if certified else "not certified"
 
     def _repr_html_(self) -> str:
-        return html("solution", about_solution(self, self._model.parameters.names))
+        return html("solution", self.columns())
+
+    def columns(self) -> dict[str, Any]:
+        """The solution as a row of the table that `Model.solve_all` makes."""
+        row: dict[str, Any] = dict(zip(self._model.parameters.names, self.mu.tolist(), strict=True))
+        row |= {"status": self.status.value, "reason": self.reason}
+        row["residual"] = None if self.residuals is None else self.residuals.worst
+        if (bound := self.bound) is not None:
+            row |= {"bound_u_energy": bound.u_energy, "bound_lambda_natural": bound.lambda_natural}
+            row |= {"bound_u_relative": bound.relative, "guarantee": bound.guarantee.value, "verdict": self.verdict}
+        if self.x is not None:
+            row |= {f"output:{name}": value for name, value in self.outputs.items()}
+            bounds = self.output_bounds if bound is not None else {}
+            row |= {f"bound:{name}": value for name, value in bounds.items()}
+        return row | {"assembly": self.assembly, "solution": self.solution}
 
     @property
     def u(self) -> Array:
@@ -119,21 +198,22 @@ class Solution:
     @cached_property
     def answer(self) -> Answer:
         """Both of these, whether they are a corrected pair, and why not."""
-        certificate = self._model.certificate
-        u = np.asarray(self._reduced.reconstruct(self._given(self.x)[:, None])[:, 0])
-        lam = np.asarray(self._model.reduced.generators @ self._given(self.alpha))
+        certificate, problem = self._model.certificate, self._model.problem
+        pair = self._pair()
+        if pair is None:
+            raise RequestError(f"there is no solution at mu = {self.mu.tolist()}: {self.status.value}: {self.reason}")
         if certificate is None and self.mode is not CorrectionMode.NONE:
-            return Corrector(self._model.reduced, None, self.mode).in_full(self.mu, u, lam)
+            return Corrector(self._model.reduced, None, self.mode).in_full(self.mu, *pair)
         if certificate is None or self.correction is None:
-            return Answer(u, lam, self.bound)
-        v = certificate.corrected(u, self.correction, contact_unknowns(self._model.problem))
+            return Answer(*pair, self.bound)
+        v = certificate.corrected(pair[0], self.correction, contact_unknowns(problem))
         return Answer(v, self.correction.nu, self.bound, is_corrected=True)
 
     @cached_property
     def outputs(self) -> dict[str, float]:
         """Values of the problem's quantities of interest, by name; of the corrected pair where `answer` is one."""
-        given = self.mu[None], self.u[:, None], self.lam[:, None]
-        return {output.name: float(output.values(*given)[0]) for output in self._model.problem.outputs}
+        pair = self.mu[None], self.u[:, None], self.lam[:, None]
+        return {output.name: float(output.values(*pair)[0]) for output in self._model.problem.outputs}
 
     @property
     def output_bounds(self) -> dict[str, float]:
@@ -145,73 +225,196 @@ class Solution:
         if bound is None or certificate is None:
             return dict.fromkeys(found, inf)
         return {
-            name: inf if of is None else output_error_bound(of, certificate.base, bound) for name, of in found.items()
+            name: inf if weight is None else output_error_bound(weight, certificate.base, bound)
+            for name, weight in found.items()
         }
 
     @cached_property
     def error_bounds(self) -> ErrorBounds:
         """Proved bounds on the errors of u and λ in four norms, at the cost of high-fidelity factorisations at mu."""
-        kept = assemblies(self._model.problem)
-        alpha, beta = kept.coercivity_at(self.mu), kept.energy_inf_sup_at(self.mu)
-        return bound_errors_at(kept.at(self.mu), kept.energy_at(self.mu), alpha, beta, self.u, self.lam)
+        cache = assemblies(self._model.problem)
+        alpha, beta = cache.coercivity_at(self.mu), cache.energy_inf_sup_at(self.mu)
+        return bound_errors_at(cache.at(self.mu), cache.energy_at(self.mu), alpha, beta, self.u, self.lam)
 
-    def _given(self, vector: Array | None) -> Array:
-        if vector is None:
-            raise RequestError(f"there is no solution at mu = {self.mu.tolist()}: {self.status.value}: {self.reason}")
-        return vector
+    @cached_property
+    def high_fidelity_residuals(self) -> Residuals:
+        """Natural KKT residuals of the high-fidelity problem, at the same cost."""
+        cache = assemblies(self._model.problem)
+        return high_fidelity_residuals(cache.at(self.mu), cache.energy_at(self.mu), self.u, self.lam)
 
 
-class _Asked(NamedTuple):
+class _Settings(NamedTuple):
     """Solver, accuracy, tolerance and corrections of a query."""
 
-    solver: str
+    solver: str | None
     accuracy: float
     tolerance: float | None
     mode: CorrectionMode
 
 
+@dataclass(frozen=True, eq=False)
 class Model:
     """A reduced model of a run or of a `Reduction`, which can be evaluated at any parameter.
 
     Attributes
     ----------
-    reduced
-        What assembles the reduced programs: `reduced.assemble(mu)` has `program` and `reconstruct`.
-    problem
-        The high-fidelity problem.
+    formulation, offline, built
+        The formulation that makes it, the offline phase, and what the formulation has built on that.
     solver, accuracy
-        QP solver of queries where no other is asked for, and the relative accuracy that it has to reach.
+        QP solver of queries where no other is asked for, `None` for formulations without, and the relative accuracy
+        that answers have to reach.
     certificate
-        What bounds errors at online cost; `None` where the model is not certified.
+        The certificate that bounds errors at online cost; `None` for a model without bounds.
     row
         Its row of the cells table; empty for a model that belongs to no run.
     correction
         Which solutions are corrected where nothing else is asked for: as in its cell.
     """
 
-    def __init__(
-        self,
-        reduced: AnyReducedModel,
-        solver: str,
-        accuracy: float,
-        certificate: OnlineCertificate | None = None,
-        row: Mapping[str, Any] = MappingProxyType({}),
-        correction: CorrectionMode = CorrectionMode.NONE,
-    ) -> None:
-        self.reduced, self.solver, self.accuracy = reduced, solver, accuracy
-        self.certificate, self.row, self.correction = certificate, row, correction
-        self.problem: Problem = reduced.problem
+    formulation: Formulation
+    offline: Reduction = field(repr=False)
+    built: Mapping[str, Any] = field(repr=False)
+    solver: str | None
+    accuracy: float
+    certificate: OnlineCertificate | None = field(default=None, repr=False)
+    row: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    correction: CorrectionMode = CorrectionMode.NONE
 
     def __repr__(self) -> str:
-        return f"Model({', '.join(f'{name}={value!r}' for name, value in about_model(self).items())})"
+        return f"Model({', '.join(f'{name}={value!r}' for name, value in self._about().items())})"
 
     def _repr_html_(self) -> str:
-        return html("reduced model", about_model(self))
+        return html("reduced model", self._about())
+
+    def _about(self) -> dict[str, Any]:
+        return {
+            "problem": str(self.row.get("problem") or type(self.problem).__name__), "R": self.online.generators,
+            "parameters": ", ".join(self.parameters.names), "solver": self.solver, "accuracy": self.accuracy,
+            "bounds": "none" if self.certificate is None else self.certificate.base.guarantee.value,
+        }  # fmt: skip
+
+    @property
+    def problem(self) -> Problem:
+        """The high-fidelity problem."""
+        return self.offline.problem
 
     @property
     def parameters(self) -> ParameterBox:
         """The parameter domain."""
         return self.problem.parameters
+
+    @cached_property
+    def online(self) -> FormulationModel:
+        """The model of the formulation, which answers queries.
+
+        Raises
+        ------
+        NumericalError
+            If the formulation makes something else.
+        """
+        made = self.formulation.model(self.offline, self.built)
+        if not isinstance(made, FormulationModel):
+            raise NumericalError(f"the formulation made a {type(made).__name__}, expected a FormulationModel")
+        sizes = {"dimension": getattr(made, "dimension", None), "generators": made.generators or 0}
+        for name, size in sizes.items():
+            if not isinstance(size, Integral) or size < 0:
+                raise NumericalError(f"`{name}` of the model is {brief(repr(size), 80)}, expected a whole number")
+        if self.formulation.has_program and not hasattr(made, "reduced"):
+            raise NumericalError("the formulation declares `has_program`, but its model has no `reduced`")
+        return made
+
+    @property
+    def reduced(self) -> AnyReducedModel:
+        """The reduced model that assembles the programs: `reduced.assemble(mu)` has `program` and `reconstruct`.
+
+        Raises
+        ------
+        RequestError
+            If the formulation has no programs.
+        """
+        if not self.formulation.has_program:
+            raise RequestError(
+                f"the formulation {type(self.formulation).__name__} has no quadratic program that could be replayed, "
+                "corrected or exported"
+            )
+        return self.online.reduced
+
+    @property
+    def solves_programs(self) -> bool:
+        """Whether queries are programs for a QP solver; otherwise the formulation solves them by itself."""
+        return self.formulation.has_program and "solvers" in self.formulation.uses
+
+    def solving(self, solver: str | None, accuracy: float | None = None) -> Model:
+        """The same model for another solver and accuracy."""
+        other = replace(self, solver=solver, accuracy=self.accuracy if accuracy is None else accuracy)
+        other.__dict__["online"] = self.online
+        return other
+
+    def settings(self, start: FormulationAnswer | None = None) -> tuple[QuerySettings, CellSolver]:
+        """Settings of a query that the formulation solves, and the solver in them."""
+        solver = CellSolver(self.solver, self.accuracy)
+        return QuerySettings(self.accuracy, solver, start), solver
+
+    def status_of(
+        self,
+        mu: Array,
+        answer: FormulationAnswer,
+        solver: CellSolver,
+        slackened: float = 1.0,
+        program: VariationalInequality | None = None,
+    ) -> QueryStatus:
+        """The status of an answer of the formulation at mu (d,), found with this solver, or of its `program`.
+
+        Residuals may be `slackened` times the accuracy.
+
+        Raises
+        ------
+        NumericalError
+            If the answer is of another type or size.
+        """
+        if not isinstance(answer, FormulationAnswer):
+            raise NumericalError(f"`solve` returned a {type(answer).__name__}, expected a FormulationAnswer")
+        if program is not None:
+            solution = QPSolution(answer.x, answer.alpha, answer.reason)
+            status, reason, residuals = verify(program, solution, slackened * self.accuracy)
+            return QueryStatus(status, reason, residuals=residuals)
+        status, reason = Status(answer.outcome.value), answer.reason
+        if answer.x is None:
+            return QueryStatus(Status.FAILED if status is Status.OK else status, reason or "there is no answer")
+        of_qp, why, residuals = solver.verdict(slackened)
+        if of_qp.severity > status.severity:
+            status, reason = of_qp, f"its last quadratic program: {why}"
+        for name in ("x", "alpha"):
+            _refuse_other_size(f"`solve` returned an answer whose {name} has", getattr(answer, name))
+            if not _finite(getattr(answer, name)):
+                return QueryStatus(Status.NONFINITE, f"{name} of the answer is not finite", residuals=residuals)
+        u, lam = self.pair(mu, answer)
+        if not (_finite(u) and _finite(lam)):
+            return QueryStatus(Status.NONFINITE, "the reconstructed u or λ is not finite", residuals=residuals)
+        if lam.min(initial=0.0) < 0.0:
+            worst = f"{lam.min():.1e} in row {int(lam.argmin())}"
+            return QueryStatus(Status.FAILED, f"a broken answer: λ has negative coefficients, as {worst}")
+        return QueryStatus(status, reason, (u, lam), residuals)
+
+    def pair(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:
+        """The pair u (n,), λ (m,) of an answer, of the right sizes; λ from the residual where the formulation has none.
+
+        Raises a `NumericalError` that names the fault.
+        """
+        problem, declared = self.problem, self.formulation.multiplier
+        made = self.online.reconstruct(mu, answer)
+        if not isinstance(made, tuple) or len(made) != 2:
+            raise NumericalError(f"`reconstruct` returned a {type(made).__name__}, expected a pair (u, λ)")
+        u, lam = made
+        _refuse_other_size("`reconstruct` returned a u of", u, problem.V.dim)
+        if (lam is None) != (declared is Multiplier.RESIDUAL):
+            which = "no λ" if lam is None else "a λ"
+            raise NumericalError(f"`reconstruct` returned {which}, and the formulation declares `{declared.value}`")
+        if lam is None:
+            cache = assemblies(problem)
+            return u, residual_multiplier(cache.at(mu), cache.energy_at(mu), u)
+        _refuse_other_size("`reconstruct` returned a λ of", lam, problem.W.dim)
+        return u, lam
 
     def solve(
         self,
@@ -221,11 +424,9 @@ class Model:
         tolerance: float | None = None,
         corrected: bool | None = None,
     ) -> Solution:
-        """Assemble and solve the reduced program at a parameter, verify the solution, and bound its errors.
+        """Answer a query at a parameter, verify the answer, and bound its errors where the model has bounds.
 
-        Bounds need a model with `assembly = "certified"`.
-
-        The solver runs in this process, without the limits of a study.
+        The formulation and the solver run in this process, without the limits of a study.
 
         Parameters
         ----------
@@ -244,45 +445,86 @@ class Model:
         Raises
         ------
         RequestError
-            If mu is not a parameter of the problem, the solver is not installed, the tolerance is not positive, or
-            there is one and the model is not certified.
+            If mu is not a parameter of the problem, the solver is not installed or the formulation uses none, the
+            tolerance is not positive, there is one and the model has no bounds, or a correction and it has no program.
+        NumericalError
+            If the answer is of another type or size.
         """
-        asked = self._asked(solver, accuracy, tolerance, corrected)
-        at = self._parameter(mu)
-        reduced, assembly = timed(lambda: self.reduced.assemble(at))
-        return self._solution(at, reduced, assembly.cpu, asked)
+        settings = self._settings(solver, accuracy, tolerance, corrected)
+        at = parameter_in(self.parameters, mu)
+        if not self.solves_programs:
+            return self._answered(at, settings)
+        assembled, assembly = timed(lambda: self.online.program(at))
+        return self._solution(at, assembled, assembly.cpu, settings)
 
-    def _asked(
+    def _settings(
         self, solver: str | None, accuracy: float | None, tolerance: float | None, corrected: bool | None
-    ) -> _Asked:
-        """What `solve` is asked for, checked, with what the model has by default."""
+    ) -> _Settings:
+        """The checked arguments of `solve`, with the defaults of the model."""
         if tolerance is not None and not 0.0 < tolerance < inf:
             raise RequestError(f"the tolerance is {tolerance:g}, expected a positive finite number")
         if tolerance is not None and self.certificate is None:
-            raise RequestError('the model has no error bounds: a tolerance needs one with assembly = "certified"')
+            raise RequestError("the model has no error bounds: a tolerance needs one with bounds = true")
+        if corrected:
+            self.reduced  # noqa: B018  corrections are made of programs
         mode = self.correction if corrected is None else CorrectionMode("feasible" if corrected else "none")
+        if solver is not None and self.solver is None:
+            raise RequestError(f"the formulation {type(self.formulation).__name__} uses no QP solver")
         name, own = solver or self.solver, registry.registered(SOLVER)
-        if name not in installed_solvers(own):
+        if name is not None and name not in installed_solvers(own):
             if name in SETTINGS:
                 raise RequestError(f"the QP solver '{name}' is not installed")
             raise unknown_name(SOLVER, name, {*SETTINGS, *own})
-        return _Asked(name, self.accuracy if accuracy is None else accuracy, tolerance, mode)
+        return _Settings(name, self.accuracy if accuracy is None else accuracy, tolerance, mode)
 
-    def _solution(self, at: Array, reduced: ReducedProblem, assembly: float, asked: _Asked) -> Solution:
-        """The verified solution of a reduced program that took some seconds to assemble, with its bounds."""
-        name, accuracy, mode = asked.solver, asked.accuracy, asked.mode
-        solve = partial(solve_qp, reduced.program, name, accuracy, registry.qp_solver(name), reduced.factor)
+    def _answered(self, at: Array, settings: _Settings) -> Solution:
+        """The answer of the formulation itself."""
+        model, online = self.solving(settings.solver, settings.accuracy), self.online
+        query, solver = model.settings()
+        answer, seconds = timed(lambda: online.solve(at, query))
+        if self.formulation.has_program:
+            found = QPSolution(answer.x, answer.alpha, answer.reason, answer.iterations)
+            return self._program_solution(at, online.program(at), found, (0.0, seconds.cpu), settings)
+        judged = model.status_of(at, answer, solver)
+        coefficients = judged.status, judged.reason, answer.x, answer.alpha, judged.residuals
+        own = None, settings.mode, answer.iterations, answer.uncertainty
+        return Solution(at, *coefficients, 0.0, seconds.cpu, self, lambda: judged.pair, None, None, *own)
+
+    def _solution(self, at: Array, assembled: ReducedProblem, assembly: float, settings: _Settings) -> Solution:
+        """The verified solution of a program that took some seconds to assemble, by the QP solver."""
+        assert settings.solver is not None  # `solves_programs`
+        extra = registry.qp_solver(settings.solver)
+        solve = partial(solve_qp, assembled.program, settings.solver, settings.accuracy, extra, assembled.factor)
         found, solution = timed(solve)
-        status, reason, residuals = verify(reduced.program, found, accuracy)
+        return self._program_solution(at, assembled, found, (assembly, solution.cpu), settings)
+
+    def _program_solution(
+        self,
+        at: Array,
+        assembled: ReducedProblem,
+        found: QPSolution,
+        seconds: tuple[float, float],
+        settings: _Settings,
+    ) -> Solution:
+        """The verified answer to a program, with its bounds."""
+        status, reason, residuals = verify(assembled.program, found, settings.accuracy)
         bound = correction = None
+        x, alpha = found.x, found.alpha
         if self.certificate is not None:
             bound = OnlineBound.none(f"the program has no solution: {reason}")
-            if residuals is not None and found.x is not None and found.alpha is not None:
-                given = self.problem, at, reduced, found.x, found.alpha
-                bound, correction = self.certificate.certify(*given, mode)
+            if residuals is not None and x is not None and alpha is not None:
+                bound, correction = self.certificate.certify(self.problem, at, assembled, x, alpha, settings.mode)
                 bound = bound if correction is None else correction.bound
-        answer = at, status, reason, found.x, found.alpha, residuals
-        return Solution(*answer, assembly, solution.cpu, self, reduced, bound, asked.tolerance, correction, mode)
+
+        def pair() -> tuple[Array, Array] | None:
+            if x is None or alpha is None:
+                return None
+            u = np.asarray(assembled.reconstruct(x[:, None])[:, 0])
+            return u, np.asarray(self.reduced.generators @ alpha)
+
+        fields = status, reason, x, alpha, residuals, *seconds
+        given = bound, settings.tolerance, correction, settings.mode
+        return Solution(at, *fields, self, pair, *given, found.iterations)
 
     @cached_property
     def output_weights(self) -> dict[str, tuple[float, float] | None]:
@@ -303,7 +545,7 @@ class Model:
     ) -> pd.DataFrame:
         """A table of `solve` at parameters (P×d), a row for each: what a sample or an optimisation needs.
 
-        Its columns are the parameters by name, status, reason and the worst residual; of a certified model the bounds
+        Its columns are the parameters by name, status, reason and the worst residual; of a model with bounds these
         and the verdict; `output:NAME` and with bounds `bound:NAME` of every quantity of interest; and CPU seconds.
         Reduced assembly evaluates the sums of terms of up to `BLOCK` programs at once, and each is said to have taken
         an equal share of the seconds; programs are solved one after the other.
@@ -318,8 +560,10 @@ class Model:
         given = np.asarray(mus, dtype=float)
         if given.ndim != 2:
             raise RequestError(f"the parameters have the shape {given.shape}, expected (P, {self.parameters.dim})")
-        asked, names = self._asked(solver, accuracy, tolerance, corrected), self.parameters.names
-        points = [self._parameter(mu) for mu in given]
+        settings = self._settings(solver, accuracy, tolerance, corrected)
+        points = [parameter_in(self.parameters, mu) for mu in given]
+        if not self.solves_programs:
+            return pd.DataFrame([self._answered(at, settings).columns() for at in points])
         rows = []
         for start in range(0, len(points), BLOCK):
             block = points[start : start + BLOCK]
@@ -327,15 +571,15 @@ class Model:
                 together, spent = timed(partial(self.reduced.assemble_all, np.array(block)))
                 assembled = ((reduced, spent.cpu / len(block)) for reduced in together)
             else:
-                timings = (timed(partial(self.reduced.assemble, at)) for at in block)
+                timings = (timed(partial(self.online.program, at)) for at in block)
                 assembled = ((reduced, spent.cpu) for reduced, spent in timings)
             for at, (reduced, seconds) in zip(block, assembled, strict=True):
-                rows.append(about_solution(self._solution(at, reduced, seconds, asked), names))
+                rows.append(self._solution(at, reduced, seconds, settings).columns())
         return pd.DataFrame(rows)
 
     def reconstruct(self, mu: Parameters, x: Array, alpha: Array) -> tuple[Array, Array]:
         """The solution u (n,), λ (m,) with coordinates x (N',) in the primal basis at mu and α (R,) on generators."""
-        reduced = self.reduced.assemble(self._parameter(mu))
+        reduced = self.reduced.assemble(parameter_in(self.parameters, mu))
         sizes = {"x": (x, len(reduced.program.f)), "alpha": (alpha, self.reduced.generators.shape[1])}
         for name, (given, size) in sizes.items():
             if np.shape(given) != (size,) or np.asarray(given).dtype.kind not in "fiu":
@@ -345,15 +589,11 @@ class Model:
 
     def high_fidelity(self, mu: Parameters) -> HighFidelitySolution:
         """The high-fidelity solution at a parameter, to compare with."""
-        return self._high_fidelity.solve(self._parameter(mu))
+        return self._high_fidelity.solve(parameter_in(self.parameters, mu))
 
     @cached_property
     def _high_fidelity(self) -> HighFidelitySolver:
         return HighFidelitySolver(self.problem)
-
-    def _parameter(self, mu: Parameters) -> Array:
-        """A parameter as an array (d,)."""
-        return parameter_in(self.parameters, mu, stacklevel=4)
 
 
 def parameter_in(box: ParameterBox, mu: Parameters, stacklevel: int = 3) -> Array:
@@ -381,3 +621,37 @@ def parameter_in(box: ParameterBox, mu: Parameters, stacklevel: int = 3) -> Arra
             stacklevel=stacklevel,
         )
     return at
+
+
+def html(title: str, values: Mapping[str, Any]) -> str:
+    """A table of two columns, for notebooks."""
+    texts = ((name, f"{value:.3g}" if isinstance(value, float) else str(value)) for name, value in values.items())
+    body = "".join(f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in texts if text)
+    return f"<table><caption>{escape(title)}</caption><tbody>{body}</tbody></table>"
+
+
+def check_built(built: object) -> Mapping[str, Any]:
+    """Return what a formulation has built, or refuse what is no mapping with texts as names.
+
+    Raises
+    ------
+    NumericalError
+        Naming what it is.
+    """
+    if not isinstance(built, Mapping) or not all(isinstance(name, str) for name in built):
+        raise NumericalError(f"`build` returned a {type(built).__name__}, expected a mapping whose names are texts")
+    return built
+
+
+def _finite(vector: Array | None) -> bool:
+    return vector is None or bool(np.all(np.isfinite(vector)))
+
+
+def _refuse_other_size(what: str, vector: object, size: int | None = None) -> None:
+    """Refuse what is no vector of real numbers, of this size if one is given."""
+    if vector is None and size is None:
+        return
+    array = vector if isinstance(vector, np.ndarray) else None
+    if array is None or array.dtype != np.float64 or array.shape != (array.size if size is None else size,):
+        found = f"the type {type(vector).__name__}" if array is None else f"{array.dtype} and the shape {array.shape}"
+        raise NumericalError(f"{what} {found}, expected float64 and ({'count' if size is None else size},)")

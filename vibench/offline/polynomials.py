@@ -16,8 +16,7 @@ from vibench.interfaces.validation import training_parameters
 from vibench.model.affine import affine_decomposition, check_affine
 from vibench.model.chebyshev import AffinePolynomial, interpolate_on_box
 from vibench.model.galerkin import projections
-from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
-from vibench.offline.models import AnyReducedModel
+from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel, hyper_reduce
 
 TOLERANCE = 1e-11
 """Largest relative error of a polynomial where nothing else is asked for; solutions then agree to 1e-9 and better."""

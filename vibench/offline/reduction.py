@@ -31,10 +31,17 @@ from vibench.model.certificates.base import CertificateBase, certificate_base
 from vibench.model.certificates.bounds import OnlineCertificate, prepare
 from vibench.model.certificates.greedy import GreedyTrainer
 from vibench.model.galerkin import ReducedModel
-from vibench.model.hyperreduced import HyperReducedModel, ReducedOperators, hyper_reduce, reason_for_full_assembly
-from vibench.offline.formulated import Formulated, check_built
-from vibench.offline.models import AnyReducedModel, Model
+from vibench.model.hyperreduced import (
+    AnyReducedModel,
+    HyperReducedModel,
+    ReducedOperators,
+    hyper_reduce,
+    reason_for_full_assembly,
+)
+from vibench.offline.models import Model, check_built
 from vibench.offline.sweep import Snapshots, high_fidelity_sweep
+from vibench.plugins import registry
+from vibench.plugins.kinds import FORMULATION
 from vibench.reduction.pod import POD, pod
 from vibench.stability.infsup import ConeBasis, cone_basis
 from vibench.text import brief
@@ -66,6 +73,8 @@ class Reduction:
         "full", "reduced" or "certified" as in a study, and the tolerance of empirical interpolation of the latter two.
     solver, accuracy
         QP solver of the model's queries, and the relative accuracy that it has to reach.
+    formulation
+        The formulation of the model, by default that of studies which name none.
 
     Raises
     ------
@@ -84,9 +93,13 @@ class Reduction:
     interpolation: float = INTERPOLATION_RTOL
     solver: str = "piqp"
     accuracy: float = 1e-9
+    formulation: Formulation | None = None
 
     def __post_init__(self) -> None:
-        for name, kind in (("problem", Problem), ("dual", DualStrategy), ("primal", PrimalStrategy)):
+        classes = {
+            "problem": Problem, "dual": DualStrategy, "primal": PrimalStrategy, "formulation": Formulation,
+        }  # fmt: skip
+        for name, kind in classes.items():
             value = getattr(self, name)
             if not isinstance(value, kind) and not (name != "problem" and value is None):
                 got = f"the class {value.__qualname__}" if isinstance(value, type) else brief(repr(value), 80)
@@ -212,45 +225,64 @@ class Reduction:
         """What the certificates of all reduced models of the problem have in common."""
         return certificate_base(self.problem, self.members, self.decomposed)
 
-    @cached_property
-    def certificate(self) -> OnlineCertificate:
-        """What bounds the errors of queries at online cost (`docs/certified.md`).
+    def certificate_of(self, reduced: AnyReducedModel) -> OnlineCertificate:
+        """The certificate of a reduced model of the problem, which bounds errors at online cost (`docs/certified.md`).
 
         Raises
         ------
         UnsupportedError
             If the model is assembled in full, or the problem does not allow it.
         """
-        if not isinstance(self.assembled, HyperReducedModel):
+        if not isinstance(reduced, HyperReducedModel):
             why = "as asked for" if self.assembly == "full" else self.operators
             raise UnsupportedError(
                 f"a certificate at online cost needs reduced assembly, and the model is assembled in full: {why}"
             )
-        return prepare(self.assembled, self.members, self.certificate_base, self.decomposed)
+        return prepare(reduced, self.members, self.certificate_base, self.decomposed)
 
     @cached_property
     def model(self) -> Model:
-        """The reduced model, for queries at any parameter: `model.solve(mu)`."""
-        certificate = self.certificate if self.assembly == "certified" else None
-        return Model(self.assembled, self.solver, self.accuracy, certificate)
-
-    def formulated(self, formulation: Formulation) -> Formulated:
-        """A model of another formulation on this offline phase, which is built now: `formulated(…).solve(mu)`.
+        """The model of the formulation, which is built now: `model.solve(mu)` answers queries at any parameter.
 
         Raises
         ------
         RequestError
-            If it is no instance of a formulation, or uses steps that the offline phase does not have.
+            If the formulation uses steps that the offline phase does not have, or bounds are asked for and it has no
+            certificate.
         UnsupportedError
             If the problem does not have what it needs.
         """
-        if not isinstance(formulation, Formulation):
-            kind = formulation.__qualname__ if isinstance(formulation, type) else brief(repr(formulation), 80)
-            raise RequestError(f"formulation is {kind}, expected an instance of a subclass of Formulation")
-        uses = axes_of(formulation, f"formulation {type(formulation).__qualname__}")
-        for axis, given in (("pod", self.modes), ("dual", self.dual)):
-            if axis in uses and given is None:
-                what = {"pod": "modes", "dual": "a dual strategy"}[axis]
-                raise RequestError(f"{type(formulation).__qualname__} uses '{axis}': the offline phase needs {what}")
+        formulation = self.formulation
+        if formulation is None:
+            formulation = registry.find(FORMULATION, registry.default_formulation()).create({})
+        name = type(formulation).__qualname__
+        uses = axes_of(formulation, f"formulation {name}")
+        for axis, step, what in (("pod", self.modes, "modes"), ("dual", self.dual, "a dual strategy")):
+            if axis in uses and step is None:
+                raise RequestError(f"{name} uses '{axis}': the offline phase needs {what}")
         built = check_built(formulation.build(self))
-        return Formulated(formulation, self, built, self.solver if "solvers" in uses else None, self.accuracy)
+        made = Model(formulation, self, built, self.solver if "solvers" in uses else None, self.accuracy)
+        if self.assembly != "certified":
+            return made
+        if not formulation.has_certificate:
+            raise RequestError(f"{name} has no certificate: no bounds at online cost")
+        return replace(made, certificate=self.certificate)
+
+    @cached_property
+    def certificate(self) -> OnlineCertificate:
+        """The certificate of the reduced model of this phase.
+
+        Raises
+        ------
+        UnsupportedError
+            As `certificate_of`.
+        """
+        return self.certificate_of(self.assembled)
+
+    def with_formulation(self, formulation: Formulation) -> Reduction:
+        """The same phase with another formulation: `with_formulation(…).model`; all steps of this one are kept."""
+        steps = {name: value for name, value in self.__dict__.items() if name in _STEPS}
+        return replace(self, formulation=formulation).given(**self.__dict__.get("_given", {}) | steps)
+
+
+_STEPS = {name for name, value in vars(Reduction).items() if isinstance(value, cached_property)} - {"model"}

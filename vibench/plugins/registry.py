@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vibench.errors import RequestError, in_a_line, requested, unknown_name
-from vibench.plugins.kinds import PROBLEM, SAMPLING, SOLVER, STUDY, PluginKind
+from vibench.plugins.kinds import FORMULATION, PROBLEM, SAMPLING, SOLVER, STUDY, PluginKind
 from vibench.provenance import distribution_version, package_hash, solver_version
 
 if TYPE_CHECKING:
@@ -243,6 +243,32 @@ def registered(kind: PluginKind) -> dict[str, RegisteredPlugin]:
     for entry in entry_points(group=kind.entry_points):
         named.setdefault(entry.name, {}).setdefault(entry.value, entry)
     return {name: RegisteredPlugin(kind, name, tuple(entries.values())) for name, entries in sorted(named.items())}
+
+
+@cache
+def default_formulation() -> str:
+    """Name of the formulation of studies that name none: the one whose class says `is_default = True`; "" without any.
+
+    The class is read, not imported: results are shown by this name.
+
+    Raises a `RequestError` if there are several.
+    """
+    found = [
+        name
+        for name, plugin in registered(FORMULATION).items()
+        if not plugin.conflict and _is_default(plugin.entries[0].module, plugin.entries[0].attr)
+    ]
+    if len(found) > 1:
+        raise RequestError(f"several formulations say that they are the default: {', '.join(found)}")
+    return found[0] if found else ""
+
+
+def _is_default(module: str, name: str) -> bool:
+    for node in next(_definitions(module, name), ast.ClassDef(name, [], [], [], [])).body:
+        target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
+        if isinstance(target, ast.Name) and target.id == "is_default":
+            return isinstance(node.value, ast.Constant) and node.value.value is True  # type: ignore[attr-defined]
+    return False
 
 
 def find_named(text: str, kinds: Mapping[str, PluginKind], solvers: Sequence[str]) -> RegisteredPlugin:

@@ -28,7 +28,7 @@ from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, verify
 from vibench.results.consistency import vectors
 from vibench.results.formats import to_csv
-from vibench.study.cells import COMPILED, NOT_MOVED
+from vibench.study.cells import NOT_MOVED
 
 CHECKER = "check.py"
 """Script in an exported test set that recomputes its residuals; it needs only NumPy."""
@@ -70,7 +70,7 @@ def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
         solution = QPSolution(recorded_x, alpha, rows[query]["solver_status"] or "", rows[query]["iterations"])
         status, reason, residuals = verify(program, solution, accuracy)
         line = _line(Trial(status, reason, solution, residuals), None) | {"seconds": rows[query]["solve_s"]}
-        by = COMPILED if recorded.cell.assembly == COMPILED else recorded.cell.solver
+        by = recorded.cell.solver or recorded.cell.formulation_label
         table.append({"solver": f"{by} (recorded)"} | line)
     solvers = installed_solvers(registered(SOLVER))
     for solver, trial in solver_trials(program, accuracy, solvers).items():

@@ -18,9 +18,8 @@ import pandas as pd
 
 from vibench.errors import RequestError
 from vibench.files import PART, TEMPORARY
-from vibench.interfaces.formulations import MIXED
 from vibench.plugins.kinds import STUDY
-from vibench.plugins.registry import registered
+from vibench.plugins.registry import default_formulation, registered
 from vibench.provenance import distribution_version
 from vibench.report import html
 from vibench.report.citation import Citation, requirements
@@ -241,7 +240,7 @@ class PublishedRun:
 
 
 def _formulation(row: Mapping[str, Any]) -> str:
-    return "" if row["formulation"] == MIXED else f"{row['formulation']}: "
+    return "" if row["formulation"] == default_formulation() else f"{row['formulation']}: "
 
 
 def _tolerance(row: Mapping[str, Any]) -> str:

@@ -12,8 +12,8 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import requested
-from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Kind
+from vibench.plugins.registry import default_formulation
 from vibench.results.paired_timing import CONDITIONS, PairedTiming
 from vibench.results.schema import KEYS, STORED
 from vibench.study.cells import CERTIFIED, NO_SUCH_AXIS
@@ -181,20 +181,21 @@ def compared(cells: Iterable[Mapping[str, Any]], paired: PairedTiming, tail: flo
     probability `tail` of either to be wrong.
 
     Every per-parameter enrichment (a) is compared with every fixed one (b) of the same problem, formulation, cone,
-    tolerances and solver; every reduced cell (a) with that of the same model with certificates (b); every mixed program
-    (a) with every other formulation (b) that agrees with it on the axes that b has; the high-fidelity model (a, whose
-    offline phase is its set-up) with every cell (b). One machine measured both, and but for the second of these pairs
-    both or none have certificates. Cells without an ok query are left out.
+    tolerances and solver; every reduced cell (a) with that of the same model with certificates (b); every cell of the
+    default formulation (a) with those of every other (b) that agrees with it on the axes that b has; the high-fidelity
+    model (a, whose offline phase is its set-up) with every cell (b). One machine measured both, and but for the second
+    of these pairs both or none have certificates. Cells without an ok query are left out.
     """
     timed = [cell for cell in cells if cell["online_s"] is not None]
     alike = _Groups(timed)
-    mixed = _Groups([cell for cell in timed if cell["formulation"] == MIXED])
+    usual = default_formulation()
+    default = _Groups([cell for cell in timed if cell["formulation"] == usual])
     everything = (*_SHARED, *FORMULATION, *VALIDATION, "machine")
     for b in timed:
         yield _comparison(paired, None, b, tail)
         yield from (_comparison(paired, a, b, tail) for a in alike.of(b, everything) if _compared(a, b))
-        if b["formulation"] != MIXED:
-            yield from (_comparison(paired, a, b, tail) for a in mixed.of(b, _axes(b)) if _as_certified(a, b))
+        if b["formulation"] != usual:
+            yield from (_comparison(paired, a, b, tail) for a in default.of(b, _axes(b)) if _as_certified(a, b))
 
 
 class _Groups:
@@ -293,5 +294,11 @@ def _row(one: Comparison) -> dict[str, Any]:
 
 def _high_fidelity(b: Mapping[str, Any]) -> Mapping[str, Any]:
     """The high-fidelity model beside a cell, as a cell."""
-    model = {"cell": None, "formulation": MIXED, "primal": HIGH_FIDELITY, "primal_tol": None, "assembly": ""}
+    model = {
+        "cell": None,
+        "formulation": default_formulation(),
+        "primal": HIGH_FIDELITY,
+        "primal_tol": None,
+        "assembly": "",
+    }
     return {**b, **model, "offline_s": b["hf_setup_s"]}

@@ -19,12 +19,11 @@ import numpy as np
 import pandas as pd
 
 from vibench.arrays import Array
-from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Kind
 from vibench.qp.verification import Slack, allowed
 from vibench.results.schema import KEYS, STORED
 from vibench.stability.infsup import ABSOLUTE, RELATIVE
-from vibench.study.cells import COMPILED
+from vibench.study.cells import NO_SUCH_AXIS
 
 if TYPE_CHECKING:  # worker processes, which start often, have no use for pandas
     import pandas as pd
@@ -94,29 +93,19 @@ def _at_least(rows: pd.DataFrame, larger: str, smaller: str, scale: pd.Series) -
         yield Violation(f"{larger} ≥ {smaller}", int(broken.sum()), float(missing[broken].max()))
 
 
-def solution_row(x: Array, alpha: Array, left_open: Slack) -> dict[str, Any]:
-    """Columns of the solutions table that hold x (N',), α (R,) and the slack of a solution."""
-    return {
-        "x": np.asarray(x, "<f8").tobytes(),
-        "alpha": np.asarray(alpha, "<f8").tobytes(),
-        "slack_linear": left_open.linear,
-        "slack_constant": left_open.constant,
-    }
-
-
-def answer_row(x: Array, alpha: Array | None) -> dict[str, Any]:
-    """The same columns of the answer of a formulation, whose accuracy leaves nothing open that could be compared."""
+def solution_row(x: Array, alpha: Array | None, left_open: Slack | None) -> dict[str, Any]:
+    """Columns of the solutions table: x (N',), α (R,), and the slack of a solution of a program."""
     return {
         "x": np.asarray(x, "<f8").tobytes(),
         "alpha": None if alpha is None else np.asarray(alpha, "<f8").tobytes(),
-        "slack_linear": None,
-        "slack_constant": None,
+        "slack_linear": None if left_open is None else left_open.linear,
+        "slack_constant": None if left_open is None else left_open.constant,
     }
 
 
-def vectors(row: Mapping[str, Any]) -> tuple[Array, Array]:
-    """The two vectors, x and α, of a row of the solutions table."""
-    return np.frombuffer(row["x"], "<f8"), np.frombuffer(row["alpha"], "<f8")
+def vectors(row: Mapping[str, Any]) -> tuple[Array, Any]:
+    """The two vectors, x and α, of a row of the solutions table; α is `None` where λ has no coefficients."""
+    return np.frombuffer(row["x"], "<f8"), None if row["alpha"] is None else np.frombuffer(row["alpha"], "<f8")
 
 
 @dataclass(frozen=True)
@@ -139,14 +128,15 @@ def disagreement_rows(
     """
     programs: dict[tuple[str, float], list[Mapping[str, Any]]] = {}
     for cell in cells:
-        # answers of compiled programs and of formulations are no solver's
-        if cell["model"] and cell["assembly"] != COMPILED and cell["formulation"] == MIXED:
+        if cell["model"] and cell["solver"] != NO_SUCH_AXIS:
             programs.setdefault((cell["model"], cell["accuracy"]), []).append(cell)
     for same in programs.values():
         if len({cell["solver"] for cell in same}) < 2:
             continue
         keys = {name: same[-1][name] for name in STORED["disagreements"] if name in KEYS}
-        answers = (_recorded(cell, row) for cell in same for row in fine_solutions(cell["cell"]))
+        rows = ((cell, row) for cell in same for row in fine_solutions(cell["cell"]))
+        # Without slack it is the answer of a formulation to no program that all solvers were given.
+        answers = (_recorded(cell, row) for cell, row in rows if row["slack_linear"] is not None)
         yield from (keys | row for row in compare(answers))
 
 

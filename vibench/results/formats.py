@@ -13,7 +13,7 @@ from typing import Any
 
 import pandas as pd
 
-from vibench.interfaces.formulations import MIXED
+from vibench.plugins.registry import default_formulation
 from vibench.qp.status import Status
 from vibench.results.break_even import Meaning
 from vibench.results.read import in_order
@@ -150,7 +150,7 @@ def name_of_cell(row: Mapping[str, Any] | pd.Series) -> str:
     how = "" if row["assembly"] == "full" else f" · {row['assembly']}"
     how += "" if row["correction"] == "none" else f" · corrected: {row['correction']}"
     trained = "" if row["training"] == "own" else f" ({row['training']})"
-    formulation = "" if row["formulation"] == MIXED else row["formulation"]
+    formulation = "" if row["formulation"] == default_formulation() else row["formulation"]
     spaces = [name for name in (row["dual"], f"{row['primal']}{tolerance}") if name != NO_SUCH_AXIS]
     parts = [f"{row['problem']}{trained}", formulation, *spaces, sizes, solver_text(row)]
     return " · ".join(filter(None, parts)) + how
@@ -197,19 +197,14 @@ def _for_reading(frame: pd.DataFrame, table: Mapping[str, Column]) -> pd.DataFra
     return under_headings(frame, [name for name in shown_columns(table) if says_something(frame, name)], table)
 
 
-USUAL = {
-    "correction": UNCORRECTED, "certificate": "none",
-    **dict.fromkeys(("formulation", "formulation_a", "formulation_b"), MIXED),
-}  # fmt: skip
-"""Values of columns that say nothing where all cells have them."""
-
-
 def says_something(frame: pd.DataFrame, name: str) -> bool:
     """Whether to show a column unasked: accuracy and training sets if they vary, corrections and zeros if any."""
     if name == "accuracy":
         return bool(frame[name].nunique() > 1)
-    if name in USUAL:
-        return bool((~frame[name].dropna().isin([USUAL[name], ""])).any())
+    usual = {"correction": UNCORRECTED, "certificate": "none"}
+    usual |= dict.fromkeys(("formulation", "formulation_a", "formulation_b"), default_formulation())
+    if name in usual:
+        return bool((~frame[name].dropna().isin([usual[name], ""])).any())
     if name in ("training", "snapshots"):
         return bool(frame["training"].nunique() > 1)
     if name == "rounds_missing":

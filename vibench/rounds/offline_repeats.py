@@ -9,7 +9,7 @@ import numpy as np
 
 from vibench.results.break_even import NORMAL_95, SCATTER
 from vibench.stages.base import Result, Row, Stage
-from vibench.stages.judging.cell_goal import CellGoal
+from vibench.stages.cell_queries import CellQueries
 from vibench.storage.artefacts import Store
 from vibench.timing import Seconds
 
@@ -54,7 +54,7 @@ def scatter(runs: Iterable[Sequence[Seconds]]) -> float:
     return float(np.sqrt(squares / sum(len(one) - 1 for one in logarithms)))
 
 
-def offline_columns(cell: CellGoal, setup: float, runs: Mapping[str, Sequence[Seconds]], deviation: float) -> Row:
+def offline_columns(cell: CellQueries, setup: float, runs: Mapping[str, Sequence[Seconds]], deviation: float) -> Row:
     """The offline columns of a cell: of each of its stages the median of its `runs`, by key, and one `setup`.
 
     `deviation` is the `scatter` of one run. The interval is that of seconds that all deviate alike, as by the speed of
@@ -77,6 +77,6 @@ def offline_columns(cell: CellGoal, setup: float, runs: Mapping[str, Sequence[Se
     return columns | {"offline_s": total, **ends, "offline_repeats": repeats}
 
 
-def sources(cell: CellGoal) -> Iterator[Stage]:
+def sources(cell: CellQueries) -> Iterator[Stage]:
     """The stages whose work has the offline seconds of a cell."""
     return (stage.measured_by[0] for stages in cell.offline.values() for stage in stages)

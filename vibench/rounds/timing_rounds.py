@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 
@@ -12,10 +12,9 @@ from vibench.arrays import Array, Indices
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.bounds import OnlineCertificate
-from vibench.model.hyperreduced import HyperReducedModel
+from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel
 from vibench.offline.assemblies import Assemblies
 from vibench.offline.correction import corrected_in_full
-from vibench.offline.models import AnyReducedModel
 from vibench.provenance import machine
 from vibench.results.paired_timing import beside, paces
 from vibench.rounds.marginal_solutions import (
@@ -26,12 +25,9 @@ from vibench.rounds.marginal_solutions import (
     parts_alike,
 )
 from vibench.rounds.timed_seconds import TimedCell, TimedRound, round_columns
-from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, Watch, build_problem
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.formulations.queries import FormulationModels, FormulationQueries
-from vibench.stages.judging.cell_goal import CellGoal
-from vibench.stages.query import Queries
+from vibench.stages.query import ModelQuery, Queries
 from vibench.stages.snapshots import TimedSnapshots, gather
 from vibench.storage.artefacts import Store
 from vibench.timing import NO_TIME, Seconds, calibration, timed
@@ -56,7 +52,7 @@ class TimingRounds(ItemwiseStage):
 
     label = "timing"
 
-    cells: tuple[CellGoal, ...]
+    cells: tuple[CellQueries, ...]
     queries: tuple[tuple[int, ...], ...]
     """The queries of every cell that are ok."""
     rounds: int
@@ -110,8 +106,7 @@ class _Rounds(Items):
 
     def __init__(self, stage: TimingRounds, store: Store) -> None:
         self._stage, self._store = stage, store
-        self._models: dict[str, Queries] = {}
-        self._formulations: dict[str, FormulationModels] = {}
+        self._models: dict[tuple[str, float | None], Queries] = {}
         self._certificates: dict[str, OnlineCertificate] = {}
         self._factors: dict[str, Assemblies] = {}
         self._warm: set[int] = set()
@@ -174,48 +169,34 @@ class _Rounds(Items):
         What is timed is equivalent to the queries and nowhere the same: nothing is gained by remembering it.
         """
         stage, seed = self._stage.cells[cell], (at, cell, warm_up)
-        if isinstance(stage, FormulationQueries):
-            return self._formulated(stage, (k for k, _ in alternated), watch, *seed)
-        assert isinstance(stage, CellQueries)
         assemble: dict[int, Seconds] = {}
         solve: dict[int, Seconds] = {}
         certify: dict[int, Seconds] = {}
-        queries = self._queries(stage.assembly)
-        asked = stage.certificate is not None or stage.correction is not CorrectionMode.NONE
+        queries = self._queries(stage)
+        certified = stage.certificate is not None or stage.correction is not CorrectionMode.NONE
         for k, solution in alternated:
-            near = queries.near(k, *seed)
-            further = partial(self._marginal.assemble, k, at, cell, ASSEMBLY_SEED + warm_up)
-            if (seconds := _assembly(stage, queries.model, near, solution, further, assemble)) is not None:
-                assemble[k] = seconds
-            query = stage.query(queries, k).repeated(stage.assembly.validation.seed, k, *seed)
+            query, near = stage.query(queries, k), queries.near(k, *seed)
+            if isinstance(query, ModelQuery):
+                query = query.repeated(*seed)
+                assemble[k] = NO_TIME  # it is part of the solution
+            else:
+                further = partial(self._marginal.assemble, k, at, cell, ASSEMBLY_SEED + warm_up)
+                seconds = _assembly(queries.model.reduced, near, solution, further, assemble)
+                assemble |= {} if seconds is None else {k: seconds}
+                query = query.repeated(stage.validation_set.seed, k, *seed)
             answer, solve[k] = query.prepare(watch)()
-            query.check(answer)
-            if asked and answer.x is not None and answer.alpha is not None:
+            query.check(answer)  # type: ignore[arg-type]  # what `prepare` has made
+            if certified and answer.x is not None and answer.alpha is not None:
                 certify[k] = self._certified(stage, queries, near, (query.in_model(answer.x), answer.alpha))
             if sum(seconds.wall for seconds in solve.values()) > ROUND_SECONDS:
                 break
         return assemble, solve, certify
 
-    def _formulated(
-        self, stage: FormulationQueries, order: Iterable[int], watch: Watch, *seed: int
-    ) -> tuple[dict[int, Seconds], dict[int, Seconds], dict[int, Seconds]]:
-        """Seconds of queries of a formulation, whose assembly is a part of the solution."""
-        if stage.key not in self._formulations:
-            self._formulations[stage.key] = FormulationModels(self._store, stage)
-        solve: dict[int, Seconds] = {}
-        for k in order:
-            query = self._formulations[stage.key].query(k).repeated(*seed)
-            answer, solve[k] = query.prepare(watch)()
-            query.check(answer)
-            if sum(seconds.wall for seconds in solve.values()) > ROUND_SECONDS:
-                break
-        return dict.fromkeys(solve, NO_TIME), solve, {}
-
     def _certified(self, stage: CellQueries, queries: Queries, near: Array, solution: tuple[Array, Array]) -> Seconds:
         """Seconds of the certificate of a solution at a parameter and of its correction, or of that in full."""
-        model = queries.model
+        model = queries.model.reduced
         if stage.certificate is None:
-            kept = self._factors.setdefault(stage.assembly.key, Assemblies(model.problem, 0))
+            kept = self._factors.setdefault(stage.built.key, Assemblies(model.problem, 0))
             vi, assembly = timed(lambda: checked_assembly(model.problem, near).copy())
             _, seconds = timed(partial(corrected_in_full, model, kept, near, vi, *solution))
             return assembly + seconds if isinstance(model, HyperReducedModel) else seconds
@@ -226,10 +207,11 @@ class _Rounds(Items):
         given = model.problem, near, model.assemble(near), *solution
         return timed(partial(self._certificates[key].certify, *given, stage.correction))[1]
 
-    def _queries(self, assembly: AssemblyStage) -> Queries:
-        if assembly.key not in self._models:
-            self._models[assembly.key] = Queries(self._store, assembly)
-        return self._models[assembly.key]
+    def _queries(self, stage: CellQueries) -> Queries:
+        key = stage.model, stage.accuracy
+        if key not in self._models:
+            self._models[key] = stage.queries(self._store)
+        return self._models[key]
 
     def lost(self, number: int, failed: Failed) -> Failed:  # noqa: ARG002
         """A round without a result."""
@@ -252,7 +234,6 @@ class _Rounds(Items):
 
 
 def _assembly(
-    stage: CellQueries,
     model: AnyReducedModel,
     near: Array,
     solution: MarginalSolution | None,
@@ -264,8 +245,6 @@ def _assembly(
     In full it costs the same at each parameter: some assemblies stand for all, those of the high-fidelity solutions and
     `further` ones until they are enough.
     """
-    if stage.compilation is not None:
-        return NO_TIME  # it is part of the solution
     if isinstance(model, HyperReducedModel):
         return timed(partial(model.assemble, near))[1]
     if sum(seconds.cpu for seconds in done.values()) > ASSEMBLY_SECONDS:

@@ -167,7 +167,8 @@ class Stage(ABC):
         values = self._fields().values()
         named = [value.sampling if isinstance(value, ParameterSet) else value for value in values]
         own = [value for value in named if isinstance(value, Plugin)]
-        return tuple(dict.fromkeys([*own, *(plugin for stage in self.inputs() for plugin in stage.plugins)]))
+        stages = [*(value for value in values if isinstance(value, Stage)), *self.inputs()]
+        return tuple(dict.fromkeys([*own, *(plugin for stage in stages for plugin in stage.plugins)]))
 
     @cached_property
     def packages(self) -> frozenset[str]:

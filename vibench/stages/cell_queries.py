@@ -6,133 +6,136 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from vibench.interfaces.formulations import Multiplier
+import numpy as np
+
+from vibench.interfaces.formulations import FormulationAnswer
 from vibench.interfaces.strategies import Kind
 from vibench.model.affine import MISSED
 from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineCertificate
+from vibench.offline.assemblies import assemblies
 from vibench.offline.correction import Corrector
 from vibench.plugins.plugin import Plugin
 from vibench.qp.exact import ExactSolution
 from vibench.results.consistency import vectors
 from vibench.stability.infsup import stability_ratio
-from vibench.stages.assembly import AssemblyStage, ExactSolutions, assembly_stage
+from vibench.stages.assembly import AssemblyStage, ExactSolutions, ReducedPrograms
 from vibench.stages.base import Row, Stage, Watch, value_of
 from vibench.stages.certification import CertificateStage
-from vibench.stages.compilation import CompilationStage, compiled_query, loaded_program
-from vibench.stages.formulations.queries import formulation_queries
+from vibench.stages.enrichment import EnrichmentStage, spaces_of
+from vibench.stages.formulation import FormulationStage
 from vibench.stages.infsup_constants import InfSupConstants
 from vibench.stages.judging.cell_goal import CellGoal, CellItems, QueryRows, inf_sup_columns
+from vibench.stages.judging.pairs import error_columns, pair_columns
 from vibench.stages.offline import ReducedCone
-from vibench.stages.query import Queries, Query, error_columns, run_query
+from vibench.stages.query import ModelQuery, ProgramQuery, Queries, run_query
 from vibench.storage.artefacts import Store
-from vibench.study.cells import CERTIFIED, COMPILED, Cell
+from vibench.study.cells import CERTIFIED, Cell
 from vibench.study.parameter_sets import ParameterSet
-
-CLEAR_GAP = 10.0
-"""A rank is in doubt where the singular values on both sides of the threshold differ by less than this factor."""
 
 
 @dataclass(frozen=True)
 class CellQueries(CellGoal):
-    """All queries of one cell with the mixed formulation, quadratic programs."""
+    """All queries of one cell."""
 
-    assembly: AssemblyStage
-    solver: str
-    accuracy: float
+    built: FormulationStage
+    validation_set: ParameterSet
+    solver: str | None
+    accuracy: float | None
     query_seconds: float
     warm_start: bool = False
-    certificate: CertificateStage | None = None
+    bounds: bool = False
     correction: CorrectionMode = CorrectionMode.NONE
-    compilation: CompilationStage | None = None
 
     @property
     def problem(self) -> Plugin:
-        """That of the model."""
-        return self.assembly.enrichment.pod.problem
+        """The problem."""
+        return self.built.problem
 
     @property
     def training_set(self) -> ParameterSet:
-        """That of the model."""
-        return self.assembly.enrichment.pod.training
+        """The training set."""
+        return self.built.training
 
     @property
-    def validation_set(self) -> ParameterSet:
-        """That of the reduced programs."""
-        return self.assembly.validation
+    def assembly(self) -> AssemblyStage | None:
+        """The stage of the programs; `None` for a formulation that has none."""
+        return AssemblyStage(self.built, self.validation_set) if self.built.kind.has_program else None
+
+    @property
+    def certificate(self) -> CertificateStage | None:
+        """The stage of the certificate; `None` without bounds."""
+        return CertificateStage(self.built) if self.bounds else None
 
     @property
     def model(self) -> str:
-        """The key of the reduced programs."""
-        return self.assembly.key
+        """The key of the programs, or of the formulation on its offline phase."""
+        return self.built.key if self.assembly is None else self.assembly.key
 
     @property
     def timed_inputs(self) -> tuple[Stage, ...]:
-        """The model and the reduced programs, the certificate with its base, and the compiled program."""
+        """The model and its programs, and the certificate with its base."""
+        assembly = () if self.assembly is None else (self.assembly,)
         certifying = () if self.certificate is None else (self.certificate.base, self.certificate)
-        compiled = () if self.compilation is None else (self.compilation,)
-        return (*self.assembly.model_inputs, self.assembly, *certifying, *compiled)
+        return (*self.built.model_inputs, *assembly, *certifying)
 
-    def query(self, queries: Queries, number: int) -> Query:
-        """One query of the cell's reduced model, for its solver or its compiled program."""
-        if self.compilation is not None:
-            program = loaded_program(queries.store, self.compilation)
-            return compiled_query(queries, program, number, self.solver, self.accuracy)
+    def queries(self, store: Store) -> Queries:
+        """The queries of the model, which cells that differ in their solver alone share."""
+        return Queries(store, self.built, self.validation_set, self.assembly, self.accuracy)
+
+    def query(self, queries: Queries, number: int) -> ProgramQuery | ModelQuery:
+        """One query of the model, for the solver of the cell."""
         return queries.query(number, self.solver, self.accuracy, self.warm_start)
 
     @property
     def constants(self) -> tuple[InfSupConstants, ...]:
         """The stages of the inf-sup constants of the reduced pair, of V with the cone, and of V_N alone."""
-        enrichment = self.assembly.enrichment
-        return tuple(
-            InfSupConstants(space, enrichment.cone, self.reference.constraints)
-            for space in (enrichment, None, enrichment.pod)
-        )
+        enrichment = self.built.enrichment
+        if self.assembly is None or enrichment is None:
+            return ()
+        spaces = (enrichment, None, enrichment.pod)
+        return tuple(InfSupConstants(space, enrichment.cone, self.reference.constraints) for space in spaces)
 
     @property
-    def exact(self) -> ExactSolutions:
-        """The stage of the reduced programs solved to round-off."""
-        return ExactSolutions(self.assembly)
+    def exact(self) -> tuple[ExactSolutions, ...]:
+        """The stage of the programs solved to round-off, if there are any."""
+        return () if self.assembly is None else (ExactSolutions(self.assembly),)
 
     @property
     def offline(self) -> Mapping[str, tuple[Stage, ...]]:
         """The stages whose seconds add up to the offline time of the cell, by column."""
-        enrichment, reduction = self.assembly.enrichment, self.assembly.reduction
-        compiled = () if self.compilation is None else (self.compilation,)
-        return {
-            "snapshots": self.training,
-            "pod": (enrichment.pod,),
-            "cone": (enrichment.cone,),
-            "enrichment": (enrichment,),
-            "formulation": (),
-            "assembly": () if reduction is None else (reduction.decomposition, reduction, *compiled),
-            "certificate": () if self.certificate is None else (self.certificate.base, self.certificate),
+        built, certificate = self.built, self.certificate
+        parts: Mapping[str, tuple[Stage | None, ...]] = {
+            "pod": (built.pod,),
+            "cone": (built.cone,),
+            "enrichment": (built.enrichment,),
+            "formulation": (built if built.builds else None,),
+            "assembly": (built.decomposition, built.reduction),
+            "certificate": (None,) if certificate is None else (certificate.base, certificate),
         }
+        made = {name: tuple(stage for stage in stages if stage is not None) for name, stages in parts.items()}
+        return {"snapshots": self.training} | made
 
     def inputs(self) -> tuple[Stage, ...]:
         """All stages whose artefacts enter the rows of the cell."""
         timed = (stage for stages in self.offline.values() for stage in stages)
-        read = (self.assembly, self.exact, *self.assembly.model_inputs, *timed)
-        stages = (*read, *self.constants, *self.reference.stages, *self.validation)
+        stages = (*self.timed_inputs, *self.exact, *timed, *self.constants, *self.reference.stages, *self.validation)
         return tuple(dict.fromkeys(stages))
 
     def begin(self, store: Store) -> _Queries:
-        """Load the reduced programs and the reference solutions."""
+        """Load the model, its programs and the reference solutions."""
         return _Queries(self, store)
 
 
-def cell_queries(cell: Cell, query_seconds: float) -> CellGoal:
+def cell_queries(cell: Cell, query_seconds: float) -> CellQueries:
     """The last stage of a cell; all its other stages are inputs of it, directly or indirectly."""
-    if cell.formulation is not None:
-        return formulation_queries(cell, query_seconds)
-    assert cell.solver is not None  # the mixed formulation has all axes
-    assert cell.accuracy is not None
-    assembly = assembly_stage(cell)
-    certificate = CertificateStage(assembly) if cell.assembly == CERTIFIED else None
-    mode, asked = CorrectionMode(cell.correction), (cell.solver, cell.accuracy, query_seconds, cell.warm_start)
-    compilation = CompilationStage(assembly, cell.accuracy) if cell.assembly == COMPILED else None
-    return CellQueries(assembly, *asked, certificate, mode, compilation)
+    spaces = spaces_of(cell)
+    built = FormulationStage(cell.problem, cell.formulation, cell.training, *spaces, cell.interpolation)
+    return CellQueries(
+        built, cell.validation, cell.solver, cell.accuracy, query_seconds, cell.warm_start,
+        cell.assembly == CERTIFIED, CorrectionMode(cell.correction),
+    )  # fmt: skip
 
 
 class _Queries(CellItems):
@@ -140,81 +143,114 @@ class _Queries(CellItems):
 
     def __init__(self, stage: CellQueries, store: Store) -> None:
         super().__init__(stage, store)
-        self._stage, self._queries = stage, Queries(store, stage.assembly)
-        self._model, self._reduced = self._queries.model, self._queries.reduced
-        self._cone: ReducedCone = value_of(store, stage.assembly.enrichment.cone)
-        self._own, self._full, self._plain = (value_of(store, one) for one in stage.constants)
-        self._exact: tuple[ExactSolution | None, ...] = value_of(store, stage.exact)
-        self._certificate: OnlineCertificate | None = (
+        self._stage, self._queries = stage, stage.queries(store)
+        self._model = self._queries.model
+        certificate: OnlineCertificate | None = (
             None if stage.certificate is None else stage.certificate.certificate(store)
         )
-        self._corrector = Corrector(self._model, self._certificate, stage.correction)
+        self._certificate = certificate
+        self._constants = [value_of(store, one) for one in stage.constants]
+        self._exact: list[ExactSolution | None] = [one for exact in stage.exact for one in value_of(store, exact)]
 
     def answer(self, number: int, watch: Watch) -> QueryRows:
-        """The rows of one query."""
+        """The rows of one query; u and λ of a formulation are reconstructed here, where a broken answer costs one."""
         row, solution = run_query(self._stage.query(self._queries, number), self._stage.query_seconds, watch)
         return self.known(number) | row, solution and {"query": number} | solution
 
     def assess(self, solutions: Mapping[int, Row]) -> list[Row]:
         """Error columns of some queries."""
-        numbers = list(solutions)
-        return error_columns(
-            self._corrector,
-            self._reference.mu[numbers],
-            [vectors(solution) for solution in solutions.values()],
-            self._compared.at(numbers),
-            self.constants(numbers),
-            [self._exact[k] for k in numbers],
-            [self._reduced.projected[k] for k in numbers] if self._reduced.projected else (),
-        )
+        numbers, mus = list(solutions), self._queries.mus[list(solutions)]
+        compared, constants, programs = self._compared.at(numbers), self.constants(numbers), self._queries.programs
+        if programs is not None:
+            return error_columns(
+                self._corrector,
+                mus,
+                [vectors(solution) for solution in solutions.values()],
+                compared,
+                constants,
+                [self._exact[k] for k in numbers],
+                [programs.projected[k] for k in numbers] if programs.projected else (),
+            )
+        answers = [FormulationAnswer(*vectors(solution)) for solution in solutions.values()]
+        pairs = [self._model.pair(mu, answer) for mu, answer in zip(mus, answers, strict=True)]
+        u, lam = (np.column_stack(columns) for columns in zip(*pairs, strict=True))
+        vis = [assemblies(self._problem).at(mu) for mu in mus]
+        return pair_columns(self._problem, mus, vis, u, lam, compared, constants)
+
+    @property
+    def _corrector(self) -> Corrector:
+        return Corrector(self._model.reduced, self._certificate, self._stage.correction)
 
     def known(self, number: int) -> Row:
         """With the constants of the reduced pair, and what its assembly in reduced form misses."""
-        return (
-            super().known(number)
-            | inf_sup_columns("beta_", self._own[number])
-            | inf_sup_columns("beta_full_", self._full[number])
-            | inf_sup_columns("beta_plain_", self._plain[number])
-            | {"bounds": self._own[number].sharp, "assembly_error": self._reduced.errors[number]}
-        )
+        row = super().known(number)
+        for prefix, constants in zip(("beta_", "beta_full_", "beta_plain_"), self._constants, strict=False):
+            row |= inf_sup_columns(prefix, constants[number])
+        if self._constants:
+            row["bounds"] = self._constants[0][number].sharp
+        programs = self._queries.programs
+        return row if programs is None else row | {"assembly_error": programs.errors[number]}
 
     def sizes(self, rows: Sequence[Row]) -> tuple[Row, list[str]]:
-        """Dimensions, and the fallbacks of cone, enrichment, assembly and corrections."""
-        assembly, cone = self._stage.assembly, self._cone
-        built = assembly.enrichment.enrichment(self._store)
-        size = value_of(self._store, assembly.enrichment.pod).basis.shape[1]
-        fallbacks = [*cone.cone.fallbacks, *built.fallbacks, *([self._queries.note] if self._queries.note else [])]
-        tolerance, error = assembly.interpolation, max(self._reduced.errors)
+        """Dimensions, and the fallbacks of model, cone, enrichment, assembly and corrections."""
+        built, offline, online = self._stage.built, self._model.offline, self._model.online
+        fallbacks = [*online.fallbacks]
+        kind, added = Kind.NONE, None
+        if built.cone is not None:
+            fallbacks += offline.cone.fallbacks
+        if built.enrichment is not None:
+            fallbacks += offline.enrichment.fallbacks
+            kind, vectors = offline.enrichment.kind, offline.enrichment.vectors
+            fixed = 0 if vectors is None else vectors.shape[1]
+            added = offline.multipliers.rank if kind is Kind.PER_PARAMETER else fixed
+        added = added if online.enrichment is None else online.enrichment
+        row: Row = {
+            "enrichment_kind": kind.value,
+            "N": online.dimension - (added or 0),
+            "R": online.generators,
+            "enrichment": added,
+            "multiplier": self._model.formulation.multiplier.value,
+            "correction_cost": "",
+            "certificate": (Guarantee.NONE if self._certificate is None else self._certificate.base.guarantee).value,
+        }
+        if self._queries.programs is not None and self._stage.assembly is not None:
+            row |= self._program_sizes(self._stage.assembly, self._queries.programs, rows, fallbacks)
+        return row, fallbacks
+
+    def _program_sizes(
+        self, assembly: AssemblyStage, programs: ReducedPrograms, rows: Sequence[Row], fallbacks: list[str]
+    ) -> Row:
+        """Columns of a model with programs; adds the fallbacks of these."""
+        built, offline, online = assembly.built, self._model.offline, self._model.online
+        if built.reduction is not None and isinstance(why := offline.operators, str):
+            fallbacks.append(f"assembled in full: {why}")
+        tolerance, error = built.interpolation, max(programs.errors)
         if tolerance is not None and error > MISSED * tolerance:
             fallbacks.append(
                 f"reduced assembly differs from the Galerkin projection by up to {error:.1e} at validation parameters: "
                 f"the interpolation tolerance {tolerance:g} holds at training parameters only"
             )
-        if (gap := cone.prepared.rank_gap) < CLEAR_GAP:
-            rank = cone.prepared.rank
-            fallbacks.append(f"the rank {rank} is in doubt: its last singular value is {gap:.2g} times what is below")
-        if uncorrected := [note for row in rows if (note := row.get("correction_note"))]:
+        row: Row = {"correction_cost": self._corrector.cost} | assembly.columns(self._store)
+        if built.cone is not None:
+            cone: ReducedCone = value_of(self._store, built.cone)
+            prepared = cone.prepared
+            # The singular values on both sides of the threshold should differ by a clear factor.
+            if prepared.rank_gap < 10.0:
+                fallbacks.append(
+                    f"the rank {prepared.rank} is in doubt: its last singular value is {prepared.rank_gap:.2g} times "
+                    "what is below"
+                )
+            if online.generators == cone.cone.rays.shape[1]:
+                row["R"] = cone.cone.size  # a free generator is one, with two coefficients
+            row |= {"rank": prepared.rank, "rank_gap": prepared.rank_gap, "gram_condition": prepared.gram_condition}
+        if uncorrected := [note for one in rows if (note := one.get("correction_note"))]:
             fallbacks.append(f"{len(uncorrected)} of {len(rows)} queries are not corrected: {uncorrected[0]}")
-        added = self._model.fixed_basis.shape[1] - size
-        return {
-            "enrichment_kind": built.kind.value,
-            "multiplier": Multiplier.SOLVED.value,
-            "N": size,
-            "R": cone.cone.size,
-            "rank": cone.prepared.rank,
-            "rank_gap": cone.prepared.rank_gap,
-            "gram_condition": cone.prepared.gram_condition,
-            "enrichment": cone.prepared.rank if built.kind is Kind.PER_PARAMETER else added,
-            **assembly.columns(self._store),
-            "correction_cost": self._corrector.cost,
-            "certificate": (Guarantee.NONE if self._certificate is None else self._certificate.base.guarantee).value,
-            **self._shares(),
-        }, fallbacks
+        return row | (self._shares(built.enrichment) if built.enrichment is not None else {})
 
-    def _shares(self) -> Row:
+    def _shares(self, enrichment: EnrichmentStage) -> Row:
         """The smallest shares of β_span in that of V, and the share that the last σ of the enrichment guarantees."""
-        histories = {h.quantity: h.values for h in self._artefact(self._stage.assembly.enrichment).histories}
-        validation = [stability_ratio(own.span, full.span) for own, full in zip(self._own, self._full, strict=True)]
+        histories = {h.quantity: h.values for h in self._artefact(enrichment).histories}
+        validation = [stability_ratio(own.span, full.span) for own, full in zip(*self._constants[:2], strict=True)]
         row: Row = {"share_validation": min(validation)}
         if "share_min" in histories:
             row["share_training"] = histories["share_min"][-1]

@@ -12,8 +12,8 @@ from vibench.model.certificates.contact_correction import ContactCompliance
 from vibench.model.certificates.prepared_correction import PreparedCorrections
 from vibench.model.certificates.residual import ResidualBasis
 from vibench.model.certificates.spectral import SpectralBounds
-from vibench.stages.assembly import AffineDecomposition, AssemblyStage
 from vibench.stages.base import Result, Stage, build_problem, value_of
+from vibench.stages.formulation import AffineDecomposition, FormulationStage
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
 from vibench.timing import timed
@@ -58,7 +58,7 @@ class CertificateStage(Stage):
 
     label = "certificate"
 
-    assembly: AssemblyStage
+    built: FormulationStage
 
     @property
     def effort(self) -> float:
@@ -68,12 +68,12 @@ class CertificateStage(Stage):
     @property
     def base(self) -> CertificateBaseStage:
         """The stage of what it shares with other models."""
-        assert self.assembly.reduction is not None  # certified cells have reduced assembly
-        return CertificateBaseStage(self.assembly.reduction.decomposition)
+        assert self.built.decomposition is not None  # cells with bounds have reduced assembly
+        return CertificateBaseStage(self.built.decomposition)
 
     def inputs(self) -> tuple[Stage, ...]:
         """The model, its members, and the base."""
-        return (*self.assembly.model_inputs, self.base.decomposition, self.base)
+        return (*self.built.model_inputs, self.base.decomposition, self.base)
 
     def certificate(self, store: Store) -> OnlineCertificate:
         """The certificate, once the stage has been run."""
@@ -84,13 +84,13 @@ class CertificateStage(Stage):
 
         Raises an `UnsupportedError` if the model is assembled in full.
         """
-        problem = build_problem(self.base.decomposition.problem)
-        reduction = self.assembly.offline(store).given(
+        model = self.built.model(store)
+        offline = model.offline.given(
             members=value_of(store, self.base.decomposition),
             certificate_base=value_of(store, self.base),
-            decomposed=self.base.decomposition.parameters(problem),
+            decomposed=self.base.decomposition.parameters(model.problem),
         )
-        reduction.assembled  # noqa: B018  the clock begins after it
-        prepared, seconds = timed(lambda: reduction.certificate)
+        model.reduced  # noqa: B018  the clock begins after it
+        prepared, seconds = timed(lambda: model.online.certificate(offline))
         own = (one.name for one in fields(prepared) if one.name != "base")
         return Result({name: getattr(prepared, name) for name in own}, seconds)

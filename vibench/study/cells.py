@@ -10,19 +10,15 @@ from functools import cached_property
 from typing import Any
 
 from vibench.errors import RequestError, unknown_name
-from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Stop
-from vibench.plugins.kinds import SOLVER
+from vibench.plugins.kinds import FORMULATION, SOLVER
 from vibench.plugins.plugin import Plugin
-from vibench.plugins.registry import find
+from vibench.plugins.registry import default_formulation, find
 from vibench.provenance import numerical_code
 from vibench.study.parameter_sets import OWN, OWN_TRAINING, ParameterSet
 
 CERTIFIED = "certified"
 """Assembly of queries that are assembled as reduced ones, and have certificates."""
-
-COMPILED = "compiled"
-"""Assembly of queries that a compiled program answers, without a QP solver."""
 
 
 def digest(content: Any) -> str:
@@ -63,10 +59,9 @@ class Cell:
     """One cell: a problem, strategies, tolerances, a QP solver, and how queries are assembled and corrected.
 
     `interpolation` is the tolerance of reduced assembly, `None` for full assembly; certified queries are assembled as
-    reduced ones, and compiled programs are made of them. Without a `formulation` it is the mixed one; what another does
-    not use is `None`. `labels` of problem, dual and primal strategy are no part of
-    the identity, nor are those of the parameter sets; nor are `nested_tolerances`, all tolerances of a nested primal
-    strategy in the study, whose enrichments are stages of one.
+    reduced ones. What the `formulation` does not use is `None`. `labels` of problem, dual and primal strategy are no
+    part of the identity, nor are those of the parameter sets; nor are `nested_tolerances`, all tolerances of a nested
+    primal strategy in the study, whose enrichments are stages of one.
     """
 
     problem: Plugin
@@ -82,11 +77,11 @@ class Cell:
     accuracy: float | None
     validation: ParameterSet
     labels: tuple[str, str, str]
+    formulation: Plugin
     nested_tolerances: tuple[float, ...] = ()
     training: ParameterSet = OWN_TRAINING
     correction: str = UNCORRECTED
-    formulation: Plugin | None = None
-    formulation_label: str = MIXED
+    formulation_label: str = ""
 
     @cached_property
     def key(self) -> str:
@@ -112,8 +107,6 @@ class Cell:
         training, validation = content.pop("training"), content.pop("validation")
         if self.correction == UNCORRECTED:  # as before there was a choice
             del content["correction"]
-        if self.formulation is None:  # likewise
-            del content["formulation"], content["formulation_label"]
         return content | {
             "seed": validation["seed"],
             "validation": validation["count"],
@@ -136,6 +129,10 @@ class Cell:
         known = {name for one in plugins.values() if places for name in one.paths.values()}
         for name in places.keys() - known:
             raise unknown_name("file or folder of the cell", name, known)
+        if content.get("formulation") is None:  # as before all formulations were plugins
+            name = "compiled" if content["assembly"] == "compiled" else default_formulation()
+            plugins["formulation"] = Plugin.of(find(FORMULATION, name), {}, {})
+            content["formulation_label"] = name
         for name in PLUGINS:
             content[name] = _found(plugins[name].moved(places)) if name in plugins else None
         for axis in ("pod", "cone"):
@@ -158,8 +155,8 @@ class Cell:
     def plugins(self) -> tuple[Plugin, ...]:
         """Its plugins, the solver aside."""
         samplings = (one.sampling for one in (self.training, self.validation) if one.sampling is not None)
-        chosen = (one for one in (self.dual, self.primal, self.formulation) if one is not None)
-        return (self.problem, *chosen, *samplings)
+        chosen = (one for one in (self.dual, self.primal) if one is not None)
+        return (self.problem, *chosen, self.formulation, *samplings)
 
     @property
     def code(self) -> str:
@@ -180,7 +177,7 @@ class Cell:
         solver = " ".join([*filter(None, [self.solver]), *([] if self.accuracy is None else [f"{self.accuracy:g}"])])
         chosen = [
             problem,
-            "" if self.formulation is None else self.formulation_label,
+            "" if self.formulation_label == default_formulation() else self.formulation_label,
             "" if self.dual is None else dual,
             "" if self.primal is None else f"{primal}{tolerance}",
             stops,

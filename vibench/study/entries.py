@@ -20,10 +20,10 @@ from pydantic import (
     model_validator,
 )
 
-from vibench.interfaces.formulations import AXES, MIXED, axes_of
+from vibench.interfaces.formulations import Formulation, axes_of
 from vibench.plugins.kinds import FORMULATION, PluginKind
 from vibench.plugins.plugin import GivenPlugin, Plugin, give
-from vibench.plugins.registry import RegisteredPlugin, find
+from vibench.plugins.registry import RegisteredPlugin, default_formulation, find
 from vibench.study.parameter_sets import OWN
 
 Size: TypeAlias = Annotated[int, Ge(1), Le(100_000)]
@@ -110,35 +110,28 @@ class Entry(BaseModel):
 
 
 class FormulationEntry(Entry):
-    """One entry of the axis of formulations: `mixed`, which is no plugin, or one that is."""
+    """One entry of the axis of formulations."""
 
     @model_validator(mode="after")
-    def _no_options_of_mixed(self) -> FormulationEntry:
-        if self.name == MIXED and self.options:
-            raise ValueError(f"'{MIXED}' has no options (found {', '.join(map(repr, self.options))})")
-        if self.label == MIXED != self.name:
-            raise ValueError(f"'{MIXED}' is the formulation of vibench itself and no label of another")
+    def _no_label_of_another(self) -> FormulationEntry:
+        if self.label and self.label == default_formulation() != self.name:
+            raise ValueError(f"'{self.label}' is the formulation of studies that name none, and no label of another")
         return self
 
     @property
-    def is_mixed(self) -> bool:
-        """Whether it is the mixed formulation, which is no plugin."""
-        return self.is_registered and self.name == MIXED
+    def kind(self) -> type[Formulation]:
+        """The class; a formulation that has all axes where several packages use its name: its cells cannot be run."""
+        plugin = self.registered(FORMULATION)
+        kind: type[Formulation] = Formulation if plugin.conflict else plugin.load()
+        return kind
 
     @property
     def uses(self) -> tuple[str, ...]:
-        """The axes of a study that it has; all of them where several packages use its name, so that it cannot be run.
+        """The axes of a study that it has.
 
         Raises a `RequestError` if it declares axes that there are not.
         """
-        if self.is_mixed or (plugin := self.registered(FORMULATION)).conflict:
-            return AXES
-        return axes_of(plugin.load(), str(plugin))
-
-    @property
-    def takes_start(self) -> bool:
-        """Whether its queries can start from another answer."""
-        return self.is_mixed or (not (plugin := self.registered(FORMULATION)).conflict and plugin.load().takes_start)
+        return axes_of(self.kind, str(self.registered(FORMULATION)))
 
 
 class SamplingEntry(Entry):

@@ -18,7 +18,7 @@ from vibench.plugins.options import BESIDE
 from vibench.plugins.plugin import GivenPlugin, Plugin
 from vibench.plugins.registry import find, registered
 from vibench.reduction.nested import NestedStrategy
-from vibench.study.cells import COMPILED, NO_SUCH_AXIS, UNCORRECTED, Cell
+from vibench.study.cells import NO_SUCH_AXIS, UNCORRECTED, Cell
 from vibench.study.entries import Entry, FormulationEntry, ProblemEntry, SamplingEntry
 from vibench.study.parameter_sets import OWN, ParameterSet
 from vibench.study.spec import Study, ToleranceTable
@@ -153,7 +153,7 @@ def expand(study: Study) -> list[Cell]:
         for entry, plugin in _made(PROBLEM, study.problem)
     ]
     duals, primals = _made(DUAL, study.dual), _made(PRIMAL, study.primal)
-    formulations = [(one, None if one.is_mixed else one.plugin(FORMULATION)) for one in study.formulation]
+    formulations = _made(FORMULATION, study.formulation)
     for (problem, plugin, sets, validation), table in product(problems, study.tolerances):
         nested = {entry.title: _nested_tolerances(entry, table) for entry in study.primal}
         for training, (entry, formulation) in product(sets, formulations):
@@ -161,8 +161,6 @@ def expand(study: Study) -> list[Cell]:
             offline = _combinations(duals, primals, table, uses)
             for (dual, pod, cone, primal, tolerance), solved in product(offline, _solved(study, entry)):
                 assembly, correction, solver, accuracy = solved
-                if assembly == COMPILED and solver != study.solver_names()[0]:
-                    continue  # the answer is that of the program, whatever the solver is
                 cell = Cell(
                     problem=plugin,
                     dual=None if dual is None else dual[1],
@@ -173,7 +171,7 @@ def expand(study: Study) -> list[Cell]:
                     solver=solver,
                     assembly=assembly,
                     interpolation=None if assembly == "full" else study.interpolation,
-                    warm_start=study.warm_start and entry.takes_start,
+                    warm_start=study.warm_start and entry.kind.takes_start,
                     accuracy=accuracy,
                     correction=correction,
                     training=training,
@@ -233,14 +231,13 @@ def _combinations(
 
 
 def _solved(study: Study, entry: FormulationEntry) -> list[tuple[str, str, str | None, float | None]]:
-    """Assembly, correction, solver and accuracy of the queries of a formulation, as far as it has these axes.
-
-    Certificates, corrections and compiled programs are made of mixed models alone.
-    """
-    assemblies, corrections = list[str](study.assembly), list[str](study.correction)
-    if not entry.is_mixed:
-        reduced = "reduced" if "assembly" in entry.uses else "full"
-        assemblies = list(dict.fromkeys("full" if asked == "full" else reduced for asked in assemblies))
+    """Assembly, correction, solver and accuracy of the queries of a formulation, as far as it has these axes."""
+    kind, assemblies, corrections = entry.kind, list[str](study.assembly), list[str](study.correction)
+    if "assembly" not in entry.uses:
+        assemblies = [kind.assembled]
+    elif not kind.has_certificate:
+        assemblies = list(dict.fromkeys("reduced" if asked == "certified" else asked for asked in assemblies))
+    if not kind.has_program:
         corrections = [UNCORRECTED]
     solvers = study.solver_names() if "solvers" in entry.uses else [None]
     accuracies = study.accuracy if "accuracy" in entry.uses else [None]
@@ -260,8 +257,7 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
         for (axis, plugin), label in zip(axes.items(), cell.labels, strict=True)
         if plugin is not None
     }
-    if cell.formulation is not None:
-        chosen["formulation"] = [_plugin_entry(cell.formulation, cell.formulation_label)]
+    chosen["formulation"] = [_plugin_entry(cell.formulation, cell.formulation_label)]
     tolerances: dict[str, Any] = dict([_stop("pod", "N", cell.pod), _stop("dual", "R", cell.cone)])
     if cell.primal_tol is not None:
         tolerances["primal"] = {cell.labels[2]: [cell.primal_tol]}

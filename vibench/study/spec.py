@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
@@ -20,12 +21,11 @@ from pydantic import (
 )
 
 from vibench.errors import RequestError, fault_line, unknown_name
-from vibench.interfaces.formulations import MIXED
 from vibench.interfaces.strategies import Stop
 from vibench.linalg.factorisations import DEFAULT
 from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SAMPLING, SOLVER, PluginKind
 from vibench.plugins.plugin import Plugin
-from vibench.plugins.registry import FACTORISATION, find, registered
+from vibench.plugins.registry import FACTORISATION, default_formulation, find, registered
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.study.entries import (
@@ -171,18 +171,19 @@ class Study(_Model):
         list[FormulationEntry],
         MinLen(1),
         Field(
-            description="Formulations; `mixed` is the program of V_N and the cone. None has axes that it does not use."
+            description="Formulations; `mixed` is the program of V_N and the cone. None has axes that it does not use.",
+            default_factory=lambda: [FormulationEntry(name=default_formulation())],
         ),
-    ] = [FormulationEntry(name=MIXED)]
+    ]
     solvers: Annotated[
         Solvers, Field(description="QP solvers; `available` for all installed ones. Required by `mixed`.")
     ] = []
     dual: Annotated[list[Entry], MinLen(1), Field(description="Dual strategies. Required by `mixed`.")] = []
     primal: Annotated[list[Entry], MinLen(1), Field(description="Primal strategies. Required by `mixed`.")] = []
     assembly: Annotated[
-        list[Literal["full", "reduced", "certified", "compiled"]],
+        list[Literal["full", "reduced", "certified"]],
         MinLen(1),
-        Field(description="How queries are assembled; `compiled` programs need no QP solver and a C compiler."),
+        Field(description="How queries are assembled."),
     ] = ["full"]
     correction: Annotated[
         list[Literal["none", "feasible", "auto"]],
@@ -225,7 +226,7 @@ class Study(_Model):
     @classmethod
     def _checked(cls, given: Any, build: ModelWrapValidatorHandler[Study]) -> Study:
         try:
-            study = build(given)
+            study = build(_in_present_words(given))
         except ValidationError as error:
             raise RequestError(
                 fault_line(error, cls, named=("problem", "formulation", "dual", "primal", "training", "validation"))
@@ -252,6 +253,20 @@ class Study(_Model):
         return installed_solvers(registered(SOLVER)) if self.solvers == "available" else list(self.solvers)
 
 
+def _in_present_words(given: Any) -> Any:
+    """A study in the words of before: `compiled` was an assembly. A warning says what to write now."""
+    assembly = given.get("assembly") if isinstance(given, dict) else None
+    if not isinstance(assembly, list) or "compiled" not in assembly:
+        return given
+    others = [word for word in assembly if word != "compiled"]
+    formulations = list(given.get("formulation", [default_formulation()])) if others else []
+    formulations += [] if "compiled" in formulations else ["compiled"]
+    written = ", ".join(f'"{name}"' if isinstance(name, str) else str(name) for name in formulations)
+    warnings.warn(f'assembly = "compiled" is a formulation now: write formulation = [{written}]', stacklevel=2)
+    changed = {name: value for name, value in given.items() if name != "assembly"}
+    return changed | ({"assembly": others} if others else {}) | {"formulation": formulations}
+
+
 def _sampling(entry: SamplingEntry) -> Plugin | None:
     return None if entry.name == OWN else entry.plugin(SAMPLING)
 
@@ -265,7 +280,7 @@ def _check_names(study: Study) -> None:
     """Check names and options of plugins, and that exactly the strategies which take a tolerance have one."""
     axes: tuple[tuple[PluginKind, Sequence[Entry]], ...] = (
         (PROBLEM, study.problem), (DUAL, study.dual), (PRIMAL, study.primal),
-        (FORMULATION, [entry for entry in study.formulation if not entry.is_mixed]),
+        (FORMULATION, study.formulation),
     )  # fmt: skip
     for kind, axis in axes:
         for entry in axis:

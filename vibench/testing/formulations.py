@@ -22,7 +22,7 @@ from vibench.interfaces.formulations import (
 from vibench.interfaces.strategies import Cone, no_free
 from vibench.model.errors import residual_multiplier
 from vibench.offline.assemblies import assemblies
-from vibench.offline.formulated import ACCURACY, CellSolver, Formulated, check_built
+from vibench.offline.models import ACCURACY, CellSolver, Model, check_built
 from vibench.offline.reduction import Reduction
 from vibench.qp.status import Status
 from vibench.storage.serialisation import dumps, loads
@@ -49,7 +49,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._made: dict[int, tuple[Formulation, Formulated]] = {}
+        self._made: dict[int, tuple[Formulation, Model]] = {}
 
     @cached_property
     def whole(self) -> Reduction:
@@ -83,7 +83,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         fixed = np.stack([self.whole.snapshots.mu[0], 0.5 * (box.lower + box.upper)])
         return {at(mu): mu for mu in np.concatenate([fixed, box.sample(4, seed=0)])}
 
-    def formulated(self, plugin: Formulation) -> Formulated:
+    def model_of(self, plugin: Formulation) -> Model:
         """The model of an instance, from what it has built once that was stored."""
         if id(plugin) not in self._made:
             offline = self.phase(plugin)
@@ -92,16 +92,16 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         return self._made[id(plugin)][1]
 
     @staticmethod
-    def _of(plugin: Formulation, offline: Reduction, built: Mapping[str, Any]) -> Formulated:
+    def _of(plugin: Formulation, offline: Reduction, built: Mapping[str, Any]) -> Model:
         uses = axes_of(plugin, type(plugin).__name__)
-        return Formulated(plugin, offline, built, "piqp" if "solvers" in uses else None, ACCURACY)
+        return Model(plugin, offline, built, "piqp" if "solvers" in uses else None, ACCURACY)
 
     def evaluate(self, argument: Array, plugin: Formulation | None = None) -> Answered:
         """The answer at a parameter (d,), and its pair."""
-        of, mu = self.formulated(plugin or self.plugin), argument.copy()
-        asked, solver = of.asked()
-        answer = self.clocked("a query", lambda: of.model.solve(mu, asked))
-        return Answered(answer, solver, of.model.reconstruct(argument.copy(), answer))
+        of, mu = self.model_of(plugin or self.plugin), argument.copy()
+        settings, solver = of.settings()
+        answer = self.clocked("a query", lambda: of.online.solve(mu, settings))
+        return Answered(answer, solver, of.online.reconstruct(argument.copy(), answer))
 
     def arrays(self, result: Answered) -> Arrays:
         """Coefficients and pair."""
@@ -142,16 +142,16 @@ class FormulationCase(Case[Formulation, Array, Answered]):
     def model(self) -> None:
         """`model` makes a `FormulationModel` that says how many coefficients its answers have."""
         try:
-            self.formulated(self.plugin).model  # noqa: B018  is made and checked
+            self.model_of(self.plugin).online  # noqa: B018  is made and checked
         except NumericalError as error:
             raise ConformanceError(str(error)) from None
 
     def answers(self) -> Iterator[str]:
         """Answers are finite vectors of at most the sizes declared, with an outcome, and most are ok."""
-        model, outcomes = self.formulated(self.plugin).model, list[Outcome]()
+        model, outcomes = self.model_of(self.plugin).online, list[Outcome]()
         for name, mu in self.arguments.items():
-            of = self.formulated(self.plugin)
-            answer: object = of.model.solve(mu.copy(), of.asked()[0])
+            of = self.model_of(self.plugin)
+            answer: object = of.online.solve(mu.copy(), of.settings()[0])
             if not isinstance(answer, FormulationAnswer):
                 yield f"{name}: `solve` returns a {type(answer).__name__}; expected a vibench.FormulationAnswer"
                 return
@@ -163,13 +163,13 @@ class FormulationCase(Case[Formulation, Array, Answered]):
     def pairs(self) -> Iterator[str]:
         """`reconstruct` gives u (n,) and λ (m,) ≥ 0; λ is `None` exactly for `Multiplier.RESIDUAL`."""
         for name, mu in self.arguments.items():
-            of = self.formulated(self.plugin)
-            asked, solver = of.asked()
-            answer = of.model.solve(mu.copy(), asked)
+            of = self.model_of(self.plugin)
+            settings, solver = of.settings()
+            answer = of.online.solve(mu.copy(), settings)
             if answer.outcome is not Outcome.OK:
                 continue
             try:
-                found = of.judged(mu, answer, solver)
+                found = of.status_of(mu, answer, solver)
             except NumericalError as error:
                 yield f"{name}: {error}"
                 continue
@@ -178,9 +178,9 @@ class FormulationCase(Case[Formulation, Array, Answered]):
 
     def coefficients(self) -> Iterator[str]:
         """`reconstruct` needs x and alpha alone: another model gives the same pair, which has solved nothing."""
-        offline = self.formulated(self.plugin).offline
+        offline = self.model_of(self.plugin).offline
         for name, result in self.results.items():
-            fresh = self._of(self.plugin, offline, self.formulated(self.plugin).built).model
+            fresh = self._of(self.plugin, offline, self.model_of(self.plugin).built).online
             kept = FormulationAnswer(result.answer.x, result.answer.alpha)
             again = replace(result, pair=fresh.reconstruct(self.arguments[name].copy(), kept))
             for array, what in differences(self.arrays(again), self.arrays(result)):
@@ -207,7 +207,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
     def axes_used(self) -> Iterator[str]:
         """What `uses` declares is used: cells would be repeated over an axis on which nothing depends."""
         self.results  # noqa: B018  the first use builds and asks
-        of = self.formulated(self.plugin)
+        of = self.model_of(self.plugin)
         assert isinstance(of.offline, _Seen)
         # The attributes of an offline phase whose use shows that a formulation has an axis.
         steps = {
@@ -218,7 +218,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         }
         for axis in axes_of(self.plugin, type(self.plugin).__name__):
             if axis == "solvers" and all(result.solver.last is None for result in self.results.values()):
-                yield "uses declares 'solvers', but no query calls `asked.solve_qp`"
+                yield "uses declares 'solvers', but no query calls `settings.solve_qp`"
             elif axis in steps and of.offline.seen.isdisjoint(steps[axis]):
                 yield f"uses declares '{axis}', but nothing is made of offline.{steps[axis][0]}"
 
@@ -227,10 +227,10 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         if not self.plugin.takes_start:
             yield Note("not declared")
             return
-        of, (first, *others) = self.formulated(self.plugin), self.results.items()
+        of, (first, *others) = self.model_of(self.plugin), self.results.items()
         for name, result in others:
-            warm = of.model.solve(self.arguments[name].copy(), of.asked(first[1].answer)[0])
-            u = of.model.reconstruct(self.arguments[name].copy(), warm)[0]
+            warm = of.online.solve(self.arguments[name].copy(), of.settings(first[1].answer)[0])
+            u = of.online.reconstruct(self.arguments[name].copy(), warm)[0]
             # Both are accurate to the accuracy of the solver; a thousandth tells another solution.
             if what := difference(u, result.pair[0], 1e-3 * largest_entry(result.pair[0])):
                 yield f"{name}: started from the answer {first[0]}, u differs: {what}"
@@ -243,10 +243,10 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         of = self._of(plugin, offline, built)
         for mu in self.arguments.values():
             given = mu.copy()
-            asked, _ = of.asked()
-            answer = unmutated("solve", {"its argument mu": given}, lambda: of.model.solve(given, asked))  # noqa: B023
+            settings, _ = of.settings()
+            answer = unmutated("solve", {"its argument mu": given}, lambda: of.online.solve(given, settings))  # noqa: B023
             arrays = {name: array for name in ("x", "alpha") if (array := getattr(answer, name)) is not None}
-            unmutated("reconstruct", arrays | {"its argument mu": given}, lambda: of.model.reconstruct(given, answer))  # noqa: B023
+            unmutated("reconstruct", arrays | {"its argument mu": given}, lambda: of.online.reconstruct(given, answer))  # noqa: B023
 
     def without_contact(self) -> Iterator[str]:
         """Snapshots without contact are accepted, or refused in one line."""
@@ -258,8 +258,8 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         try:
             given = replace(offline, primal=None, tolerance=None).given(**steps)
             of = self._of(self.plugin, given, check_built(self.plugin.build(given)))
-            asked, solver = of.asked()
-            found = of.judged(mu, of.model.solve(mu.copy(), asked), solver)
+            settings, solver = of.settings()
+            found = of.status_of(mu, of.online.solve(mu.copy(), settings), solver)
         except VibenchError:  # a formulation may refuse it in one line
             return
         if found.status in (Status.NONFINITE, Status.ERROR) or "broken" in found.reason:

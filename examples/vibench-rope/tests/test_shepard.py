@@ -18,7 +18,7 @@ def offline() -> Reduction:
 
 
 def test_a_training_parameter_has_its_snapshot(offline: Reduction) -> None:
-    model, snapshots = offline.formulated(Shepard()), offline.snapshots
+    model, snapshots = offline.with_formulation(Shepard()).model, offline.snapshots
     found = model.solve(snapshots.mu[7])
     assert found.status == "ok"
     np.testing.assert_allclose(found.u, snapshots.u[:, 7], rtol=0.0, atol=1e-8)
@@ -27,8 +27,8 @@ def test_a_training_parameter_has_its_snapshot(offline: Reduction) -> None:
 
 @pytest.mark.parametrize("power", [1.0, 3.0, 40.0])
 def test_between_them_it_is_a_convex_combination(power: float, offline: Reduction) -> None:
-    found = offline.formulated(Shepard(power)).solve([0.11, 0.23])
-    weights = found.answer.alpha
+    found = offline.with_formulation(Shepard(power)).model.solve([0.11, 0.23])
+    weights = found.alpha
     assert weights is not None
     assert weights.min() >= 0.0
     assert weights.sum() == pytest.approx(1.0, abs=1e-14)

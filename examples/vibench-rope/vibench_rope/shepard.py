@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Gt
 
-from vibench import Array, Asked, Formulation, FormulationAnswer, FormulationModel, Reduction
+from vibench import Array, Formulation, FormulationAnswer, FormulationModel, QuerySettings, Reduction
 
 
 class Shepard(Formulation):
@@ -44,7 +44,7 @@ class _Interpolant(FormulationModel):
         self._x, self._lam, self._mus = x, lam, mus
         self.dimension, self.generators = x.shape[0], lam.shape[1]
 
-    def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:  # noqa: ARG002
+    def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:  # noqa: ARG002
         distances = np.linalg.norm((self._mus - mu) / self._widths, axis=1)
         nearest = max(float(distances.min()), np.finfo(float).tiny)
         weights = (nearest / np.maximum(distances, nearest)) ** self._power

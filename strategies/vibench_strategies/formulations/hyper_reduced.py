@@ -11,12 +11,12 @@ from annotated_types import Ge, Gt, Lt
 
 from vibench import (
     Array,
-    Asked,
     Formulation,
     FormulationAnswer,
     FormulationModel,
     Indices,
     Problem,
+    QuerySettings,
     UnsupportedError,
     VariationalInequality,
     projected_members,
@@ -112,10 +112,10 @@ class HyperReducedContact(FixedSpacesModel):
         self._projected = projected_members(problem, V, tests, left_out=integrated)
         self._domain = ReducedDomain(problem, integrated, V, *built["elements"]) if integrated else None
 
-    def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
+    def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
         """The program of the reduced domain."""
         members = self._projected(mu) | (self._domain.at(mu) if self._domain else {})
-        return solved(asked, VariationalInequality(**members))
+        return solved(settings, VariationalInequality(**members))
 
 
 class ReducedDomain:

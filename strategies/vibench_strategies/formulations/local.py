@@ -14,13 +14,13 @@ from scipy.cluster.vq import kmeans2
 from vibench import (
     POD,
     Array,
-    Asked,
     Formulation,
     FormulationAnswer,
     FormulationModel,
     Indices,
     ParameterBox,
     Problem,
+    QuerySettings,
     Snapshots,
     Stop,
     UnsupportedError,
@@ -117,10 +117,10 @@ class LocalModel(PhasesModel):
         """The cluster that answers at mu (d,), at the cost of one polynomial for each."""
         return _largest(self._box.to_unit(mu), self._weights)
 
-    def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
+    def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
         """The mixed program of the cluster, solved by the QP solver of the cell."""
         reduced = self.assembled(mu)
-        return solved(asked, reduced.program, reduced.factor)
+        return solved(settings, reduced.program, reduced.factor)
 
 
 def _largest(place: Array, weights: Array) -> int:

@@ -10,13 +10,13 @@ import numpy as np
 
 from vibench import (
     Array,
-    Asked,
     Cone,
     Formulation,
     FormulationAnswer,
     FormulationModel,
     Kind,
     Outcome,
+    QuerySettings,
     UnsupportedError,
     VariationalInequality,
 )
@@ -79,14 +79,14 @@ class ProgramModel(PhasesModel):
         super().__init__([offline])
         self._formulation = formulation
 
-    def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:
+    def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
         """Assemble, whiten, solve, and return to the coordinates of the model."""
         reduced = self.assembled(mu)
         program = Whitened.of(reduced.program, reduced.factor)
         if program.is_free:
             x, alpha = program.back(program.y, np.zeros(len(program.g)))
             return FormulationAnswer(x, alpha, iterations=0)
-        z, nu, steps, reason = self._formulation.algorithm(program, asked.accuracy)
+        z, nu, steps, reason = self._formulation.algorithm(program, settings.accuracy)
         x, alpha = program.back(z, nu)
         outcome = Outcome.INACCURATE if reason else Outcome.OK
         return FormulationAnswer(x, alpha, outcome, reason, steps)
@@ -112,9 +112,9 @@ def refuse_free(cone: Cone) -> None:
         raise UnsupportedError("the formulation needs λ ≥ 0, and the cone has generators that are free in sign")
 
 
-def solved(asked: Asked, program: VariationalInequality, factor: Array | None = None) -> FormulationAnswer:
+def solved(settings: QuerySettings, program: VariationalInequality, factor: Array | None = None) -> FormulationAnswer:
     """The answer of the QP solver of the cell; `factor` is the Cholesky factor of A where it is known."""
-    found = asked.solve_qp(program, factor=factor)
+    found = settings.solve_qp(program, factor=factor)
     if found.x is None or found.alpha is None:
         return FormulationAnswer.none(found.solver_status)
     return FormulationAnswer(found.x, found.alpha, iterations=found.iterations)

@@ -12,7 +12,7 @@ from annotated_types import Gt, Le
 from scipy.interpolate import RBFInterpolator
 from scipy.optimize import nnls
 
-from vibench import Array, Asked, Formulation, FormulationAnswer, FormulationModel, UnsupportedError
+from vibench import Array, Formulation, FormulationAnswer, FormulationModel, QuerySettings, UnsupportedError
 from vibench_strategies.formulations.reduced_programs import FixedSpacesModel, refuse_free
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ class RegressionModel(FixedSpacesModel):
         self._box, self._u, self._lam = offline.problem.parameters, u, lam
         self._left_out, self._rays = built["left_out"], built["rays"]
 
-    def solve(self, mu: Array, asked: Asked) -> FormulationAnswer:  # noqa: ARG002
+    def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:  # noqa: ARG002
         """The coefficients, those of λ projected on the cone, and the uncertainty of u."""
         place = self._box.to_unit(mu)
         (x, variance), lam = self._u.with_variance(place), self._lam.at(place)

@@ -69,7 +69,7 @@ def test_repeats_that_are_asked_for_are_all_run() -> None:
 
 def test_the_seconds_of_a_nested_enrichment_are_those_of_its_growth(tmp_path_factory: pytest.TempPathFactory) -> None:
     store = SampleStore(tmp_path_factory.mktemp("artefacts"))
-    enrichment = GOAL.assembly.enrichment
+    enrichment = GOAL.built.enrichment
     carry_out(enrichment, store)
     source, name = enrichment.measured_by
     repeat = OfflineRepeat(source, 1)

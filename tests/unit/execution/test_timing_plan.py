@@ -60,7 +60,7 @@ def timed(stage: TimingRounds, unsteady: float = 0.0) -> tuple[TimedCell, ...]:
     even = stage.first // stage.rounds % 2 == 0
 
     def once(cell: CellQueries) -> TimedRound:
-        factor = np.exp(unsteady * (1.2 if even else -1.0)) if cell.assembly.enrichment.primal.name == FIXED else 1.0
+        factor = np.exp(unsteady * (1.2 if even else -1.0)) if cell.built.enrichment.primal.name == FIXED else 1.0
         own = Seconds(factor, factor), Seconds(2.0 * factor, 2.0 * factor)
         return TimedRound({0: own[0]}, {0: own[1]}, 1.0, beside=Seconds(30.0, 30.0))
 

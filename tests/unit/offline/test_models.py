@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from itertools import product
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from vibench.model.galerkin import ReducedProblem
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline import models
 from vibench.offline.assemblies import assemblies
-from vibench.offline.shown import html
+from vibench.offline.models import html, parameter_in
 
 CELLS = list(product(("online-supremizers", "offline-pga"), ("full", "reduced")))
 
@@ -153,10 +152,9 @@ def test_names_of_components_are_compared_in_their_unicode_form() -> None:
     micro, letter = "\u00b5", "\u03bc"
     box = vibench.ParameterBox((micro, "e"), np.array([1.0, 1.0]), np.array([2.0, 2.0]), ("1", "1"))
     assert box.logarithmic([letter, micro]) == [0]
-    model = vibench.Model(SimpleNamespace(problem=SimpleNamespace(parameters=box)), "piqp", 1e-8)  # type: ignore[arg-type]
-    assert list(model._parameter({letter: 1.5, "e": 2.0})) == [1.5, 2.0]
+    assert list(parameter_in(box, {letter: 1.5, "e": 2.0})) == [1.5, 2.0]
     with pytest.raises(vibench.RequestError, match="mu has the components"):
-        model._parameter({letter: 1.5, micro: 1.5, "e": 2.0})
+        parameter_in(box, {letter: 1.5, micro: 1.5, "e": 2.0})
 
 
 def test_solvers_that_are_not_there(model: vibench.Model, mus: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import pytest
 import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import carry_out
+from samples import carry_out, program_queries
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
@@ -27,11 +27,10 @@ from vibench.qp.verification import QPSolution
 from vibench.rounds import timing_rounds
 from vibench.rounds.timing_rounds import TimingRounds
 from vibench.stages import snapshots
-from vibench.stages.assembly import AssemblyStage
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
-from vibench.stages.query import Query
+from vibench.stages.query import ProgramQuery
 from vibench.stages.snapshots import SnapshotStage
 from vibench.storage.artefacts import Store
 from vibench.study.parameter_sets import ParameterSet
@@ -44,13 +43,8 @@ def cell(interpolation: float | None, solver: str = "remembers", warm_start: boo
     cone = ConeStage(PROBLEM, Plugin("dual strategy", "cpg", "{}", "repeats"), Stop(size=3))
     primal = Plugin("primal strategy", "decorrelated", "{}", "repeats")
     enrichment = SingleEnrichment(PODStage(PROBLEM, Stop(size=3)), cone, primal, None)
-    return CellQueries(
-        AssemblyStage(enrichment, interpolation, ParameterSet("validation", len(EVERY), 1)),
-        solver,
-        1e-8,
-        20.0,
-        warm_start,
-    )
+    validation = ParameterSet("validation", len(EVERY), 1)
+    return program_queries(enrichment, interpolation, validation, solver, 1e-8, warm_start)
 
 
 CELLS = (cell(None), cell(None, "other"), cell(1e-6), cell(1e-6, "other"))
@@ -165,7 +159,7 @@ def test_in_other_units_it_is_the_same_program(n: int, m: int, accuracy: float, 
     assert np.allclose(scaled.B @ x, program.B @ (d * x), rtol=1e-12, atol=1e-12)
     assert scaled.f @ x == pytest.approx(program.f @ (d * x), abs=1e-12)
     assert np.array_equal(scaled.g, program.g)
-    repeated = Query(program, np.linalg.cholesky(A), "piqp", accuracy).repeated(seed)
+    repeated = ProgramQuery(program, np.linalg.cholesky(A), "piqp", accuracy).repeated(seed)
     assert repeated.factor is not None
     assert np.allclose(repeated.factor @ repeated.factor.T, repeated.program.A, rtol=1e-12, atol=1e-12)
 
@@ -173,9 +167,9 @@ def test_in_other_units_it_is_the_same_program(n: int, m: int, accuracy: float, 
 @pytest.mark.parametrize("reduced", [False, True], ids=["primal", "dual"])
 def test_a_warm_start_is_in_the_units_of_its_program(reduced: bool, store: Store) -> None:
     """Started from its own solution, a query is solved at once; from the one in other units it would not be."""
-    queries = timing_rounds.Queries(store, CELLS[2 if reduced else 0].assembly)
+    queries = CELLS[2 if reduced else 0].queries(store)
     plain = queries.query(1, "osqp", 1e-8, warm_start=False)
-    started = Query(plain.program, plain.factor, "osqp", 1e-8, (1, plain.program)).repeated(1, 2)
+    started = ProgramQuery(plain.program, plain.factor, "osqp", 1e-8, (1, plain.program)).repeated(1, 2)
     assert started.start is not None
     assert np.array_equal(started.start[1].A, started.program.A)
     answer, _ = started.prepare(lambda _: None)()
@@ -200,6 +194,6 @@ def test_a_parameter_nearby_is_in_the_box(seed: int, one: float, other: float) -
 def test_the_factor_of_a_program_in_other_units_is_lower_triangular() -> None:
     A = np.array([[2.0, 1.0], [1.0, 3.0]])
     program = VariationalInequality(A, np.ones(2), np.eye(2), np.ones(2))
-    repeated = Query(program, scipy.linalg.cholesky(A, lower=True), "piqp", 1e-7).repeated(5)
+    repeated = ProgramQuery(program, scipy.linalg.cholesky(A, lower=True), "piqp", 1e-7).repeated(5)
     assert repeated.factor is not None
     assert repeated.factor[0, 1] == 0.0

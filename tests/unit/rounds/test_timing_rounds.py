@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import SampleStore, carry_out
+from samples import SampleStore, carry_out, program_queries
 
 from vibench.interfaces.strategies import Stop
 from vibench.model.galerkin import ReducedModel
@@ -20,7 +20,6 @@ from vibench.rounds import marginal_solutions, timing_rounds
 from vibench.rounds.marginal_solutions import MarginalSolution, MarginalSolutions, SolutionsBeside, parts_alike
 from vibench.rounds.timed_seconds import TimedCell, TimedRound, round_columns, seconds_of_cell, seconds_of_queries
 from vibench.rounds.timing_rounds import TimingRounds, block_rows
-from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Failed
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
@@ -37,9 +36,7 @@ def cell(primal: str = "decorrelated", solver: str = "piqp", interpolation: floa
     cone = ConeStage(PROBLEM, Plugin("dual strategy", "cpg", "{}", "test"), Stop(size=4))
     strategy = Plugin("primal strategy", primal, "{}", "test")
     enrichment = SingleEnrichment(PODStage(PROBLEM, Stop(size=4)), cone, strategy, None)
-    return CellQueries(
-        AssemblyStage(enrichment, interpolation, ParameterSet("validation", VALIDATION, 1)), solver, 1e-7, 20.0
-    )
+    return program_queries(enrichment, interpolation, ParameterSet("validation", VALIDATION, 1), solver, 1e-7)
 
 
 CELLS = (cell(), cell(solver="osqp"), cell("online-supremizers"), cell(interpolation=1e-6))

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from running import Register
-from samples import SampleStore, carry_out
+from samples import SampleStore, carry_out, program_queries
 
 from vibench.interfaces.problem import MEMBERS
 from vibench.interfaces.strategies import Stop
@@ -18,10 +18,10 @@ from vibench.model.hyperreduced import HyperReducedModel
 from vibench.plugins.plugin import Plugin
 from vibench.results.ranking import too_loose
 from vibench.results.schema import STORED
-from vibench.stages.assembly import AffineDecomposition, AssemblyStage
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
+from vibench.stages.formulation import AffineDecomposition
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.study.parameter_sets import ParameterSet
 
@@ -43,9 +43,7 @@ def cell(
         Plugin("primal strategy", primal, "{}", "test"),
         tolerance,
     )
-    return CellQueries(
-        AssemblyStage(enrichment, interpolation, ParameterSet("validation", QUERIES, 3)), "piqp", 1e-8, 20.0
-    )
+    return program_queries(enrichment, interpolation, ParameterSet("validation", QUERIES, 3), "piqp", 1e-8)
 
 
 CELLS = {
@@ -86,16 +84,16 @@ def wire(interpolation: float | None, problem: Plugin = WIRE) -> CellQueries:
     """A cell of few modes and generators."""
     found = cell(problem, "decorrelated", interpolation)
     enrichment = replace(
-        found.assembly.enrichment,
+        found.built.enrichment,
         pod=PODStage(problem, Stop(tolerance=1e-2)),
-        cone=replace(found.assembly.enrichment.cone, stop=Stop(tolerance=1e-2)),
+        cone=replace(found.built.enrichment.cone, stop=Stop(tolerance=1e-2)),
     )
-    return replace(found, assembly=replace(found.assembly, enrichment=enrichment))
+    return replace(found, built=replace(found.built, enrichment=enrichment, pod=enrichment.pod, cone=enrichment.cone))
 
 
 def test_rows_of_an_interpolated_problem(store: SampleStore) -> None:
     rows = value_of(store, CELLS["obstacle"])
-    members = value_of(store, CELLS["obstacle"].assembly.reduction.decomposition)
+    members = value_of(store, CELLS["obstacle"].built.reduction.decomposition)
     assert rows.cell["status"] == "ok"
     assert rows.cell["interpolation_tol"] == TOLERANCE
     assert {name: rows.cell[f"terms_{name}"] for name in "fBg"} == {"f": 7, "B": 1, "g": 1}
@@ -145,9 +143,8 @@ def test_a_looser_tolerance_has_fewer_terms_and_larger_errors(store: SampleStore
 
 @pytest.mark.parametrize("name", ["obstacle", "radial", "hertz", "hertz, per-parameter"])
 def test_the_error_of_an_assembly_is_that_of_the_worst_member(store: SampleStore, name: str) -> None:
-    stage = CELLS[name].assembly
-    model, note = stage.model(store)
-    assert note == ""
+    stage, model = CELLS[name].assembly, CELLS[name].built.model(store).reduced
+    assert not isinstance(CELLS[name].built.model(store).offline.operators, str)
     assert isinstance(model, HyperReducedModel)
     mus = model.problem.validation_set(QUERIES, 3)
     for mu, error in zip(mus, value_of(store, stage).errors, strict=True):
@@ -207,8 +204,8 @@ def test_assembly_in_full_has_no_offline_part_and_no_error(store: SampleStore, n
     stage = CELLS[name].assembly
     rows = value_of(store, CELLS[name])
     assert stage.columns(store) == {}
-    assert stage.reduction is None
-    assert isinstance(stage.model(store)[0], ReducedModel)
+    assert stage.built.reduction is None
+    assert isinstance(stage.built.model(store).reduced, ReducedModel)
     assert rows.cell["offline_assembly_s"] == 0.0
     assert "interpolation_tol" not in rows.cell
     assert [row["assembly_error"] for row in rows.queries] == [0.0] * QUERIES
@@ -217,7 +214,7 @@ def test_assembly_in_full_has_no_offline_part_and_no_error(store: SampleStore, n
 
 @pytest.mark.parametrize("name", ["obstacle", "hertz", "radial"])
 def test_reduced_assembly_costs_its_separation_and_its_projection(store: SampleStore, name: str) -> None:
-    reduction = CELLS[name].assembly.reduction
+    reduction = CELLS[name].built.reduction
     spent = [store.get(stage.key).seconds.cpu for stage in (reduction.decomposition, reduction)]
     assert min(spent) > 0.0
     row = value_of(store, CELLS[name]).cell
@@ -227,11 +224,11 @@ def test_reduced_assembly_costs_its_separation_and_its_projection(store: SampleS
 
 
 def test_the_separation_of_a_problem_serves_every_reduced_model() -> None:
-    one, other = (CELLS[name].assembly.reduction for name in ("obstacle", "obstacle, fixed"))
+    one, other = (CELLS[name].built.reduction for name in ("obstacle", "obstacle, fixed"))
     assert one.key != other.key
     assert one.decomposition.key == other.decomposition.key
-    assert one.decomposition.key != CELLS["obstacle, loose"].assembly.reduction.decomposition.key
-    assert one.decomposition.key != CELLS["hertz"].assembly.reduction.decomposition.key
+    assert one.decomposition.key != CELLS["obstacle, loose"].built.reduction.decomposition.key
+    assert one.decomposition.key != CELLS["hertz"].built.reduction.decomposition.key
     assert one.decomposition.inputs() == ()
     assert one.decomposition in CELLS["obstacle"].inputs()
     assert CELLS["obstacle"].assembly.key != CELLS["obstacle, full"].assembly.key
@@ -251,7 +248,7 @@ def test_a_problem_that_declares_nothing_is_assembled_in_full_and_the_reason_is_
     assert rows.cell["status"] == "ok"
     assert rows.cell["fallbacks"] == f"assembled in full: {why}"
     assert full.cell["fallbacks"] == ""
-    assert isinstance(stage.assembly.model(wire_store)[0], ReducedModel)
+    assert isinstance(stage.built.model(wire_store).reduced, ReducedModel)
     assert {name for name in rows.cell if name.startswith("terms_")} == {"terms_A", "terms_B", "terms_g"}
     for one, other in zip(rows.queries, full.queries, strict=True):
         assert one["assembly_error"] == 0.0

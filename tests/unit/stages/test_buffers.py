@@ -11,14 +11,13 @@ from broken_problems import Declared
 from buffered import buffered
 from numerics import Varying
 from running import without_seconds
-from samples import SampleStore, carry_out
+from samples import SampleStore, carry_out, program_queries
 
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import Stop
 from vibench.plugins.kinds import PROBLEM
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find
-from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Row, value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
@@ -53,7 +52,7 @@ def cell(name: str, primal: str, interpolation: float | None) -> CellQueries:
     problem = plugin("problem", name)
     cone = ConeStage(problem, plugin("dual strategy", "cpg"), Stop(size=2))
     enrichment = SingleEnrichment(PODStage(problem, Stop(size=2)), cone, plugin("primal strategy", primal), None)
-    return CellQueries(AssemblyStage(enrichment, interpolation, ParameterSet("validation", 4, 1)), "piqp", 1e-8, 20.0)
+    return program_queries(enrichment, interpolation, ParameterSet("validation", 4, 1), "piqp", 1e-8)
 
 
 def rows(stage: CellQueries, store: SampleStore) -> list[Row]:

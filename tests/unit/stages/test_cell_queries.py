@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import SampleStore, carry_out
+from samples import SampleStore, carry_out, program_queries
 
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import VariationalInequality
@@ -20,13 +20,11 @@ from vibench.plugins.plugin import Plugin
 from vibench.qp import verification
 from vibench.qp.solve import solve_qp, takes_start
 from vibench.stages import cell_queries
-from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
-from vibench.stages.cell_queries import CellQueries
-from vibench.stages.certification import CertificateStage
 from vibench.stages.enrichment import SingleEnrichment
+from vibench.stages.judging.pairs import error_columns
 from vibench.stages.offline import ConeStage, PODStage
-from vibench.stages.query import error_columns, path_before, query_before
+from vibench.stages.query import path_before, query_before
 from vibench.study.parameter_sets import ParameterSet
 
 BOX = ParameterBox(("a", "b"), np.array([0.0, 0.0]), np.array([1.0, 100.0]), ("1", "1"))
@@ -78,7 +76,7 @@ def test_a_query_whose_assessment_fails_costs_itself(tmp_path: Path, monkeypatch
     primal = Plugin("primal strategy", "decorrelated", "{}", "test")
     enrichment = SingleEnrichment(PODStage(PROBLEM, Stop(size=4)), cone, primal, None)
     stage, store = (
-        CellQueries(AssemblyStage(enrichment, None, ParameterSet("validation", 4, 1)), "piqp", 1e-6, 20.0),
+        program_queries(enrichment, None, ParameterSet("validation", 4, 1), "piqp", 1e-6),
         SampleStore(tmp_path),
     )
     carry_out(stage, store)
@@ -107,9 +105,8 @@ def test_a_cell_whose_factors_do_not_fit_is_assessed_in_parts(
     cone = ConeStage(problem, Plugin("dual strategy", "mcpg", "{}", "test"), Stop(size=3))
     primal = Plugin("primal strategy", "decorrelated", "{}", "test")
     enrichment = SingleEnrichment(PODStage(problem, Stop(size=4)), cone, primal, None)
-    assembly = AssemblyStage(enrichment, 1e-6 if certified else None, ParameterSet("validation", 4, 1))
-    certificate, store = CertificateStage(assembly) if certified else None, SampleStore(tmp_path)
-    stage = CellQueries(assembly, "piqp", 1e-8, 20.0, certificate=certificate)
+    store, validation = SampleStore(tmp_path), ParameterSet("validation", 4, 1)
+    stage = program_queries(enrichment, 1e-6 if certified else None, validation, "piqp", 1e-8, bounds=certified)
     carry_out(stage, store)
     whole, sizes = value_of(store, stage), []
     monkeypatch.setattr(Assemblies, "together", lambda *_: 3)
@@ -122,7 +119,7 @@ def test_a_cell_whose_factors_do_not_fit_is_assessed_in_parts(
     for row, expected in zip(found.queries, whole.queries, strict=True):
         for name in ("error_u", "bound_u_energy", "hf_dual_residual", *online):
             assert row[name] == pytest.approx(expected[name], rel=1e-9)
-    if certificate is not None:  # what is of mesh size is there once for all models
+    if (certificate := stage.certificate) is not None:  # the data of mesh size are there once for all models
         assert certificate.certificate(store).base is value_of(store, certificate.base)
         assert "base" not in value_of(store, certificate)
 
@@ -131,8 +128,8 @@ def test_rows_say_which_query_they_started_from(tmp_path: Path) -> None:
     cone = ConeStage(PROBLEM, Plugin("dual strategy", "cpg", "{}", "test"), Stop(size=3))
     primal = Plugin("primal strategy", "decorrelated", "{}", "test")
     enrichment = SingleEnrichment(PODStage(PROBLEM, Stop(size=4)), cone, primal, None)
-    assembly = AssemblyStage(enrichment, None, ParameterSet("validation", 4, 1))
-    stage, store, started = CellQueries(assembly, "osqp", 1e-6, 20.0), SampleStore(tmp_path), {}
+    stage = program_queries(enrichment, None, ParameterSet("validation", 4, 1), "osqp", 1e-6)
+    store, started = SampleStore(tmp_path), {}
     for warm, solver in ((False, "osqp"), (True, "osqp"), (True, "piqp")):
         asked = replace(stage, warm_start=warm, solver=solver)
         carry_out(asked, store)

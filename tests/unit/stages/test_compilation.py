@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
-import pandas as pd
 import pytest
 from samples import small_study
 
@@ -20,14 +20,15 @@ from vibench.offline.polynomials import InaccurateError
 from vibench.qp.status import Status
 from vibench.qp.verification import verify
 from vibench.report.figures.data import of_solvers
-from vibench.stages.compilation import CompiledQuery
+from vibench.stages.query import ModelQuery
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
 
 STUDY = small_study(
     "compiled",
     [{"name": "radial-obstacle", "options": {"resolution": 150}}],
-    assembly=["reduced", "compiled"],
+    assembly=["reduced"],
+    formulation=["mixed", "compiled"],
     solvers=["piqp", "osqp"],
     accuracy=1e-7,
     validation=4,
@@ -48,14 +49,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
 
 
 def test_a_compiled_cell_has_the_rows_of_the_reduced_one(run: vibench.Run) -> None:
-    cells = run.cells.set_index(["assembly", "solver"]).sort_index()
-    assert list(cells.index) == [("compiled", "piqp"), ("reduced", "osqp"), ("reduced", "piqp")]
-    mine, other = cells.loc[("compiled", "piqp")], cells.loc[("reduced", "piqp")]
+    cells = run.cells.set_index(["formulation", "solver"]).sort_index()
+    assert list(cells.index) == [("compiled", "–"), ("mixed", "osqp"), ("mixed", "piqp")]
+    mine, other = cells.loc[("compiled", "–")], cells.loc[("mixed", "piqp")]
     assert mine["status"] == other["status"] == "ok"
+    assert mine["assembly"] == other["assembly"] == "reduced"
     assert mine["online_assemble_s"] == 0.0 < mine["online_solve_s"]
-    assert mine["offline_assembly_s"] > other["offline_assembly_s"]
+    assert mine["offline_formulation_s"] > other["offline_formulation_s"] == 0.0
     queries = run.table("queries").set_index(["cell", "query"])
-    for cell, form in ((mine, "compiled"), (other, "primal")):
+    for cell, form in ((mine, "formulation"), (other, "primal")):
         assert set(queries.loc[cell["cell"], "form"]) == {form}
     rows, expected = (queries.loc[cell["cell"]] for cell in (mine, other))
     assert (rows["repeatable"] == 1).all()
@@ -71,7 +73,7 @@ def test_a_crash_of_the_program_costs_its_query_alone(
     crash = f"if (mu[0] > {heights.iloc[-2]:.17g}) __builtin_trap();"
     edit = rf"sed -i '/^int model_solve/,$ s/    Set set;/    Set set; {crash}/' model.c"
     monkeypatch.setenv("CC", script(tmp_path, f'{edit}\nexec cc "$@"'))
-    study = STUDY.model_copy(update={"assembly": ["compiled"], "solvers": ["piqp"]})
+    study = small_study("compiled", STUDY.problem, formulation=["compiled"], accuracy=1e-7, validation=4)
     queries = vibench.run(study, tmp_path / "run", progress=False, jobs=1).table("queries").set_index("query")
     assert queries.loc[heights.index[-1], "status"] == "crashed"
     assert set(queries.drop(heights.index[-1])["status"]) == {"ok"}
@@ -79,12 +81,13 @@ def test_a_crash_of_the_program_costs_its_query_alone(
 
 def test_without_a_compiler_a_line_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", "no-such-compiler -O2")
-    study = STUDY.model_copy(update={"validation": 1})
-    cells = vibench.run(study, tmp_path / "run", progress=False, jobs=1).cells.set_index("assembly")
+    other = [{"name": "radial-obstacle", "options": {"resolution": 140}}]  # whose formulation nobody has built
+    study = small_study("without", other, formulation=["mixed", "compiled"], assembly=["reduced"], validation=1)
+    cells = vibench.run(study, tmp_path / "run", progress=False, jobs=1).cells.set_index("formulation")
     assert cells.loc["compiled", "status"] == "unavailable"
-    reason = "in compilation: the environment variable CC names the C compiler 'no-such-compiler', which is not found"
+    reason = "in formulation: the environment variable CC names the C compiler 'no-such-compiler', which is not found"
     assert cells.loc["compiled", "reason"] == reason
-    assert pd.unique(cells.loc["reduced", "status"]).tolist() == ["ok"]
+    assert cells.loc["mixed", "status"] == "ok"
 
 
 def polynomial(value: np.ndarray, slope: float = 0.0) -> AffinePolynomial:
@@ -168,28 +171,24 @@ def test_there_is_no_program_of_a_model_that_is_too_large_or_not_smooth_enough(
 
 
 def test_repetitions_are_posed_at_parameters_near_by() -> None:
-    asked: list[tuple[int, ...]] = []
     vi = VariationalInequality(np.eye(2), np.array([1.0, 0.0]), LIMITS, np.array([0.25, 1.0]))
-
-    def near(*seed: int) -> tuple[np.ndarray, VariationalInequality]:
-        asked.append(seed)
-        return np.array([0.5, 0.5 + 1e-10]), vi
-
-    query = CompiledQuery(vi, None, "piqp", 1e-9, compiled=small_model().program(), mu=np.full(2, 0.5), near=near)
+    program = small_model().program()
+    answers = SimpleNamespace(program=lambda mu: SimpleNamespace(program=(mu, vi)), solve=lambda mu, _: program(mu))
+    model = SimpleNamespace(online=answers, settings=lambda _: (None, None))
+    query = ModelQuery(model, np.full(2, 0.5), lambda *seed: np.array([0.5, 0.5 + 1e-10 * seed[0]]), vi)  # type: ignore[arg-type]
     other = query.repeated(3, 1)
-    assert asked == [(3, 1)]
-    assert other.mu[1] > query.mu[1]
-    for one, limit in ((query, 0.25), (other, 0.25 * (1.0 + 0.4e-10))):
+    assert other.mu[1] == other.program[0][1] == 0.5 + 3e-10  # type: ignore[index]
+    for one, limit in ((query, 0.25), (other, 0.25 * (1.0 + 1.2e-10))):
         answer, seconds = one.prepare(lambda _: None)()
         assert answer.x is not None
-        assert one.in_model(answer.x)[0] == pytest.approx(limit, rel=1e-14)
+        assert answer.x[0] == pytest.approx(limit, rel=1e-14)
         assert seconds.cpu > 0.0
 
 
 def test_no_solver_is_compared_by_answers_of_a_program(run: vibench.Run) -> None:
     queries = run.table("queries")
     kept = set(of_solvers(queries)["cell"])
-    assert kept == set(run.cells[run.cells["assembly"] == "reduced"]["cell"]) < set(queries["cell"])
+    assert kept == set(run.cells[run.cells["formulation"] == "mixed"]["cell"]) < set(queries["cell"])
     compared = run.table("disagreements")
     assert len(compared) > 0
     assert (compared["solver_a"] != compared["solver_b"]).all()

@@ -2,12 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from samples import SampleStore, carry_out
+from samples import SampleStore, carry_out, program_queries
 
 from vibench.interfaces.strategies import Stop
 from vibench.plugins.plugin import Plugin
 from vibench.stability.infsup import InfSup, inf_sup_full, inf_sup_on
-from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
@@ -31,7 +30,7 @@ def cell(problem: str, primal: str) -> CellQueries:
         Plugin("primal strategy", primal, "{}", "test"),
         PRIMALS[primal],
     )
-    return CellQueries(AssemblyStage(enrichment, None, ParameterSet("validation", COUNT, 3)), "piqp", 1e-8, 20.0)
+    return program_queries(enrichment, None, ParameterSet("validation", COUNT, 3), "piqp", 1e-8)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +88,7 @@ def test_the_kinds_of_enrichment_reach_what_they_are_for(store: SampleStore, pro
 @EVERY
 @pytest.mark.parametrize("primal", list(PRIMALS))
 def test_constants_are_those_of_every_parameter_by_itself(store: SampleStore, problem: str, primal: str) -> None:
-    stage = cell(problem, primal).assembly.enrichment
+    stage = cell(problem, primal).built.enrichment
     model, basis = stage.reduction(store).projection, value_of(store, stage.pod).basis
     cone = value_of(store, stage.cone).prepared
     found = constants(store, problem, primal)

@@ -21,8 +21,6 @@ from vibench.rounds.offline_repeats import OfflineRepeat
 from vibench.rounds.timing_rounds import TimingRounds
 from vibench.stages.base import ItemwiseStage, Result, Stage, build_problem
 from vibench.stages.cell_queries import cell_queries
-from vibench.stages.formulations.building import FormulationStage
-from vibench.stages.formulations.queries import FormulationQueries
 from vibench.stages.pictures import PictureStage
 from vibench.stages.snapshots import fingerprint_here
 from vibench.storage.artefacts import Artefact, Store
@@ -47,7 +45,8 @@ TRAINED = small_study(
 )  # fmt: skip
 ADAPTIVE = small_study(
     "adaptive", [{"name": "radial-obstacle", "options": {"resolution": "coarse"}}], training=[GREEDY], validation=2,
-    dual=["orthant", "enlarged-cpg"], primal=["online-supremizers"], assembly=["full", "certified", *COMPILED],
+    dual=["orthant", "enlarged-cpg"], primal=["online-supremizers"], assembly=["full", "certified"],
+    formulation=["mixed", *COMPILED],
 )  # fmt: skip
 """Studies that need every sort of stage between them, and most of what plugins can do."""
 
@@ -146,8 +145,8 @@ def concrete(kind: type) -> Iterator[type[Stage]]:
 
 @pytest.mark.skipif(not COMPILED, reason="NO C COMPILER (cc): programs are not compiled")
 def test_every_sort_of_stage_is_among_them() -> None:
-    """But repeats, which run the code of the stages in their keys, and formulations, which are plugins."""
-    kinds = set(concrete(Stage)) - {OfflineRepeat, FormulationStage, FormulationQueries}
+    """But repeats, which run the code of the stages in their keys."""
+    kinds = set(concrete(Stage)) - {OfflineRepeat}
     assert {type(stage) for stage in [*stages_of(TRAINED), *stages_of(ADAPTIVE)]} == kinds
 
 

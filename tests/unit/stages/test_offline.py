@@ -11,7 +11,7 @@ import pytest
 import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import SampleStore, carry_out
+from samples import SampleStore, carry_out, program_queries
 
 from vibench import timing
 from vibench.arrays import Array
@@ -24,7 +24,6 @@ from vibench.qp.status import Status
 from vibench.reduction.nested import Milestone
 from vibench.stability.coercivity import Stability
 from vibench.stages import snapshots
-from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import LOST, Failed, value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import NestedEnrichment, SingleEnrichment
@@ -46,7 +45,7 @@ def cell(primal: str, tolerance: float | None, solver: str = "piqp") -> CellQuer
         Plugin("primal strategy", primal, "{}", "test"),
         tolerance,
     )
-    return CellQueries(AssemblyStage(enrichment, None, VALIDATION), solver, 1e-8, 20.0)
+    return program_queries(enrichment, None, VALIDATION, solver, 1e-8)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +65,7 @@ def test_keys_say_what_determines_a_stage_and_nothing_else() -> None:
     assert replace(one, accuracy=1e-9).assembly.key == one.assembly.key
     looser = cell("offline-pga", 0.6)
     assert looser.assembly.key != one.assembly.key
-    assert looser.assembly.enrichment.pod.key == one.assembly.enrichment.pod.key
+    assert looser.built.enrichment.pod.key == one.built.enrichment.pod.key
     edited = replace(PROBLEM, code="edited")
     assert PODStage(edited, Stop(size=3)).key != PODStage(PROBLEM, Stop(size=3)).key
     keys = {
@@ -107,7 +106,7 @@ def test_diagnostics_are_kept_beside_the_solutions(store: SampleStore) -> None:
 
 
 def test_histories_of_the_offline_stages(store: SampleStore) -> None:
-    stage = cell("offline-pga", 0.5).assembly.enrichment
+    stage = cell("offline-pga", 0.5).built.enrichment
     pod = {h.quantity: h.values for h in store.get(stage.pod.key).histories}
     cone = {h.quantity: h.values for h in store.get(stage.cone.key).histories}
     added = {h.quantity: h.values for h in store.get(stage.key).histories}
@@ -125,10 +124,10 @@ def test_histories_of_the_offline_stages(store: SampleStore) -> None:
 def test_a_cell_of_a_nested_strategy_is_the_cell_built_alone(store: SampleStore, interpolation: float | None) -> None:
     """Snapshots, POD and cone are the same stages; everything from the enrichment on has keys of its own."""
     single = cell("offline-pga", 0.5)
-    alone = replace(single, assembly=replace(single.assembly, interpolation=interpolation))
-    parts = alone.assembly.enrichment
+    alone = replace(single, built=replace(single.built, interpolation=interpolation))
+    parts = alone.built.enrichment
     enrichment = NestedEnrichment(parts.pod, parts.cone, parts.primal, parts.tolerance, (0.3, 0.5, 0.9))
-    grown = replace(alone, assembly=replace(alone.assembly, enrichment=enrichment))
+    grown = replace(alone, built=replace(alone.built, enrichment=enrichment, pod=enrichment.pod, cone=enrichment.cone))
     assert len({stage.key for stage in (enrichment, grown, parts, alone)}) == 4
     for one in (alone, grown):
         carry_out(one, store)
@@ -139,8 +138,7 @@ def test_a_cell_of_a_nested_strategy_is_the_cell_built_alone(store: SampleStore,
         assert found[name] == pytest.approx(expected[name], rel=1e-6), name
     assert found["assembly_error_max"] < 1e-5
     histories = [
-        {h.quantity: h.values for h in store.get(stage.key).histories}
-        for stage in (alone.assembly.enrichment, enrichment)
+        {h.quantity: h.values for h in store.get(stage.key).histories} for stage in (alone.built.enrichment, enrichment)
     ]
     assert histories[0].keys() == histories[1].keys()
     for quantity, values in histories[0].items():
@@ -153,7 +151,7 @@ def test_a_cell_of_a_nested_strategy_is_the_cell_built_alone(store: SampleStore,
 
 
 def test_the_model_behind_a_cell_is_ready_for_queries(store: SampleStore) -> None:
-    enrichment = cell("online-supremizers", None).assembly.enrichment
+    enrichment = cell("online-supremizers", None).built.enrichment
     model, basis = enrichment.reduction(store).projection, value_of(store, enrichment.pod).basis
     prepared = value_of(store, enrichment.cone).prepared
     assert model.kind is Kind.PER_PARAMETER
@@ -184,9 +182,9 @@ def test_rows_of_a_cell(store: SampleStore, primal: str, tolerance: float | None
     assert rows.cell["hf_setup_s"] == pytest.approx(setup)
     assert rows.cell["hf_s"] == pytest.approx(mean(seconds.cpu for seconds in validation.seconds))
     assert [row["hf_s"] for row in rows.queries] == [seconds.cpu for seconds in validation.seconds]
-    enrichment = store.get(cell(primal, tolerance).assembly.enrichment.key)
+    enrichment = store.get(cell(primal, tolerance).built.enrichment.key)
     assert rows.cell["offline_enrichment_s"] == enrichment.seconds.cpu
-    chi = value_of(store, cell(primal, tolerance).assembly.enrichment.cone).cone.generators
+    chi = value_of(store, cell(primal, tolerance).built.enrichment.cone).cone.generators
     gram = chi.T @ (PROBLEM.create().W.matrix @ chi)
     assert rows.cell["gram_condition"] == pytest.approx(np.linalg.cond(gram), rel=1e-6)
     expected = {"none": 0, "per-parameter": rows.cell["rank"]}

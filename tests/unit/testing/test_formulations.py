@@ -35,7 +35,7 @@ FAULTS: Mapping[str, tuple[str, list[str]]] = {
     "Rolls": ("determinism", ["a second call gives different values of x: entry "]),
     "StepsOn": ("no mutation", ["solve changes its argument mu: entry "]),
     "WrongSide": ("errors", ["a training parameter, the error of u is 2 of it: zero would be nearer"]),
-    "NoProgram": ("axes in use", ["uses declares 'solvers', but no query calls `asked.solve_qp`"]),
+    "NoProgram": ("axes in use", ["uses declares 'solvers', but no query calls `settings.solve_qp`"]),
     "Unpicklable": ("pickling", ["cannot be pickled", "attribute weight"]),
 }
 

@@ -14,14 +14,14 @@ from typing import Any, TypeVar
 import numpy as np
 import pandas as pd
 
-from vibench.interfaces.formulations import MIXED
+from vibench.plugins.registry import default_formulation
 from vibench.qp.status import Status
 from vibench.report.figures.style import Series
 from vibench.results import pictures
 from vibench.results.ranking import too_loose
 from vibench.results.read import in_order, read_table
 from vibench.results.schema import KEYS
-from vibench.study.cells import COMPILED, NO_SUCH_AXIS
+from vibench.study.cells import NO_SUCH_AXIS
 from vibench.text import json_object
 
 TABLES = ("cells", "queries", "histories", "thresholds", "outputs")
@@ -164,7 +164,7 @@ def _tell_apart(axis: str, cells: pd.DataFrame, frames: list[pd.DataFrame]) -> N
 
 def _name_formulations(frame: pd.DataFrame) -> None:
     """Name other formulations than the mixed one with their primal strategies, which curves and points are told by."""
-    if "formulation" not in frame or not (other := frame["formulation"] != MIXED).any():
+    if "formulation" not in frame or not (other := frame["formulation"] != default_formulation()).any():
         return
     for column in ("primal", "primal_b"):
         if column in frame:
@@ -410,5 +410,5 @@ def common_programs(queries: pd.DataFrame) -> pd.DataFrame:
 
 
 def of_solvers(queries: pd.DataFrame) -> pd.DataFrame:
-    """Rows of the queries that a QP solver answered, and no compiled program, which a solver lends its name."""
-    return queries[queries["assembly"] != COMPILED]
+    """Rows of the queries that a QP solver answered."""
+    return queries[queries["solver"] != NO_SUCH_AXIS]

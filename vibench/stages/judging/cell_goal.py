@@ -61,6 +61,8 @@ class CellGoal(ItemwiseStage):
 
     solver: str | None
     """The QP solver, `None` where there is none."""
+    validation_set: ParameterSet
+    """The validation set, whose parameters are those of the queries."""
 
     @property
     @abstractmethod
@@ -71,11 +73,6 @@ class CellGoal(ItemwiseStage):
     @abstractmethod
     def training_set(self) -> ParameterSet:
         """The training set."""
-
-    @property
-    @abstractmethod
-    def validation_set(self) -> ParameterSet:
-        """The validation set, whose parameters are those of the queries."""
 
     @property
     @abstractmethod

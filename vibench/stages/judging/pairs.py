@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from vibench.arrays import Array
 from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.strategies import Kind
+from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineBound
 from vibench.model.error_bounds import ErrorBounds, error_bounds
@@ -22,8 +24,12 @@ from vibench.model.errors import (
     of_stiffness,
     output_errors,
 )
+from vibench.model.galerkin import ReducedModel
 from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
+from vibench.model.hyperreduced import AnyReducedModel
 from vibench.offline.assemblies import assemblies
+from vibench.offline.correction import Answer, Corrector
+from vibench.qp.exact import ExactSolution
 from vibench.qp.scaling import ratio
 from vibench.stability.coercivity import Stability
 from vibench.stages.base import Row
@@ -110,3 +116,101 @@ def online_columns(bound: OnlineBound, error: Row) -> Row:
 def _measured(relative: float | None, scaled: float) -> float:
     """An error relative to its solution, or where that is zero to the largest training solution."""
     return scaled if relative is None else relative
+
+
+def error_columns(
+    corrector: Corrector,
+    mus: Array,
+    solutions: Sequence[tuple[Array, Array]],
+    reference: ReferenceSolutions,
+    constants: Sequence[Stability],
+    exact: Sequence[ExactSolution | None],
+    projected: Sequence[ExactSolution | None] = (),
+) -> list[Row]:
+    """Errors of answers to solutions (x, α), one per parameter of `mus` (P×d), their error bounds and effectivities.
+
+    `exact` are the same programs solved to round-off: what the solver contributes to the errors. `projected` are the
+    programs assembled in full, solved to round-off, where those of the queries are not: what reduced assembly
+    contributes. A `corrector` with a certificate gives bounds at online cost, too.
+    """
+    if not solutions:
+        return []
+    model = corrector.model
+    problem = model.problem
+    vis = [assemblies(problem).at(mu) for mu in mus]
+    u, lam = _reconstructed(model, mus, vis, solutions)
+    queries = zip(mus, solutions, u.T, lam.T, strict=True)
+    answers = [corrector.answer(mu, *solution, *pair) for mu, solution, *pair in queries]
+    if any(answer.is_corrected for answer in answers):
+        u, lam = (np.column_stack([getattr(answer, name) for answer in answers]) for name in ("u", "lam"))
+    rows = pair_columns(problem, mus, vis, u, lam, reference, constants)
+    for row, answer in zip(rows, answers, strict=True):
+        if corrector.mode is not CorrectionMode.NONE:
+            row["corrected"], row["correction_share"] = int(answer.is_corrected), answer.share
+            row["correction_note"] = answer.note
+        if answer.bound is not None:
+            row.update(online_columns(answer.bound, row))
+    contributions = _Contributions(corrector, problem.V.norm(reference.u), problem.W.norm(reference.lam))
+    full = projected or [None] * len(rows)
+    for k, (row, (x, alpha), own, galerkin) in enumerate(zip(rows, solutions, exact, full, strict=True)):
+        if own is None:
+            continue
+        given = k, mus[k], answers[k].is_corrected, row
+        row.update(contributions.of("solver", *given, ExactSolution(x, alpha, unique=True), own))
+        if galerkin is not None:
+            row.update(contributions.of("assembly", *given, own, galerkin))
+    return rows
+
+
+def _reconstructed(
+    model: AnyReducedModel, mus: Array, vis: Sequence[VariationalInequality], solutions: Sequence[tuple[Array, Array]]
+) -> tuple[Array, Array]:
+    """The columns u_N (n×P) and λ_N (m×P) of solutions (x, α)."""
+    lam = model.generators @ np.column_stack([alpha for _, alpha in solutions])
+    if model.kind is Kind.PER_PARAMETER:
+        if isinstance(model, ReducedModel):
+            return model.reconstruct_all(vis, [x for x, _ in solutions]), lam
+        queries = zip(mus, vis, solutions, strict=True)
+        return np.hstack([model.reconstruct(mu, vi, x[:, None]) for mu, vi, (x, _) in queries]), lam
+    # a fixed basis: all solutions are reconstructed at once
+    return model.reconstruct(mus[0], vis[0], np.column_stack([x for x, _ in solutions])), lam
+
+
+@dataclass(frozen=True)
+class _Contributions:
+    """What sources of differences contribute to the relative errors of queries; `u` and `lam` (P,) are ‖u‖ and ‖λ‖."""
+
+    corrector: Corrector
+    u: Array
+    lam: Array
+
+    def of(
+        self, source: str, number: int, mu: Array, corrected: bool, row: Row, one: ExactSolution, other: ExactSolution
+    ) -> Row:
+        """What makes the difference of two solutions of the query contributes, to those of their corrected pairs."""
+        parts: Row = {}
+        problem, unique = self.corrector.model.problem, one.unique and other.unique
+        if corrected:
+            pairs = [self._corrected(mu, solution) for solution in (one, other)]
+            if not all(pair.is_corrected for pair in pairs):
+                return parts
+            of_u = float(problem.V.norm(pairs[0].u - pairs[1].u))
+            of_lam = float(problem.W.norm(pairs[0].lam - pairs[1].lam))
+        else:
+            of_u = float(np.linalg.norm(one.x - other.x))  # the basis is orthonormal in V
+            of_lam = float(problem.W.norm(self.corrector.model.generators @ (one.alpha - other.alpha)))
+        if row["error_u"] is not None:
+            parts["u"] = ratio(of_u, self.u[number])
+        if row["error_lambda"] is not None and unique:
+            parts["lambda"] = ratio(of_lam, self.lam[number])
+        names = [name for name in ("u", "lambda") if (row[f"error_{name}"] or 0.0) > UNMEASURABLE]
+        share = max((parts.get(name, 0.0) / row[f"error_{name}"] for name in names), default=None)
+        return {f"{source}_error_{name}": part for name, part in parts.items()} | {f"{source}_share": share}
+
+    def _corrected(self, mu: Array, solution: ExactSolution) -> Answer:
+        """The corrected pair of a solution, whatever its ω and ρ are."""
+        corrector = replace(self.corrector, mode=CorrectionMode.FEASIBLE)
+        model, vi = corrector.model, assemblies(corrector.model.problem).at(mu)
+        u = np.asarray(model.reconstruct(mu, vi, solution.x[:, None])[:, 0])
+        alpha = np.maximum(solution.alpha, 0.0)
+        return corrector.answer(mu, solution.x, alpha, u, model.generators @ alpha)

@@ -7,22 +7,80 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+from vibench.arrays import Array
 from vibench.interfaces.formulations import Formulation
-from vibench.model.affine import AffineMember
-from vibench.model.hyperreduced import ReducedOperators
-from vibench.offline.formulated import ACCURACY, Formulated, check_built
+from vibench.interfaces.problem import Problem
+from vibench.linalg.cholesky import PartialCholesky, SparseCholesky
+from vibench.linalg.definite import BlockDiagonal
+from vibench.linalg.inner_product import InnerProduct
+from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
+from vibench.model.hyperreduced import ProjectedMember, ReducedOperators
+from vibench.offline.models import ACCURACY, Model, check_built
 from vibench.offline.reduction import Reduction
 from vibench.offline.sweep import Snapshots
 from vibench.plugins.plugin import Plugin
-from vibench.stages.assembly import AffineDecomposition, HyperReduction
+from vibench.reduction.supremizers import ContactCoordinates, LoadCoordinates, SpannedCoordinates
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.offline import ConeStage, PODStage, ReducedCone
 from vibench.stages.snapshots import gather, solution_stages
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
-from vibench.study.parameter_sets import ParameterSet
+from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.timing import timed
+
+for _kind in (
+    AffineMember, Evaluation, ReducedOperators, ProjectedMember, ContactCoordinates, LoadCoordinates,
+    SpannedCoordinates, InnerProduct, SparseCholesky, PartialCholesky, BlockDiagonal,
+):  # fmt: skip
+    storable(_kind)
+
+
+@dataclass(frozen=True)
+class AffineDecomposition(Stage):
+    """Affine decomposition of A, f, B and g over the training set, for their evaluation at reduced cost.
+
+    The training matrices are not stored, they are assembled again.
+    """
+
+    label = "affine decomposition"
+
+    problem: Plugin
+    tolerance: float
+    training: ParameterSet = OWN_TRAINING
+
+    def run(self, store: Store) -> Result:  # noqa: ARG002
+        """An `AffineMember` by name."""
+        problem = build_problem(self.problem)
+        mus = self.parameters(problem)
+        return Result(*timed(lambda: affine_decomposition(problem, mus, self.tolerance)))
+
+    def parameters(self, problem: Problem) -> Array:
+        """Parameters (P×d) at which members are assembled: the training set, or the problem's own.
+
+        That needs no solutions, and an adaptive training has too few parameters for it.
+        """
+        return (OWN_TRAINING if self.training.is_adaptive else self.training).of(problem)
+
+
+@dataclass(frozen=True)
+class HyperReduction(Stage):
+    """Projection of the decomposed members on the space of a reduced model."""
+
+    label = "hyper-reduction"
+
+    enrichment: EnrichmentStage
+    decomposition: AffineDecomposition
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """The reduced model and the members."""
+        return (*self.enrichment.model_inputs, self.decomposition)
+
+    def run(self, store: Store) -> Result:
+        """The `ReducedOperators` of a reduced model, or why there are none and queries are assembled in full."""
+        reduction = self.enrichment.reduction(store).given(members=value_of(store, self.decomposition))
+        reduction.projection  # noqa: B018  the clock begins after it
+        return Result(*timed(lambda: reduction.operators))
 
 
 @storable
@@ -89,15 +147,28 @@ class FormulationStage(Stage):
         enriched = () if self.enrichment is None else self.enrichment.model_inputs
         return tuple(dict.fromkeys(stage for stage in (self.pod, self.cone, *enriched) if stage is not None))
 
+    @cached_property
+    def kind(self) -> type[Formulation]:
+        """The class of the formulation, which declares its axes and capabilities."""
+        kind: type[Formulation] = self.formulation.registered.load()
+        return kind
+
+    @property
+    def builds(self) -> bool:
+        """Whether the stage is run: a formulation without `build` whose queries are programs needs spaces alone."""
+        return self.kind.build is not Formulation.build or not self.kind.has_program
+
     @property
     def model_inputs(self) -> tuple[Stage, ...]:
-        """The stages whose artefacts `formulated` reads: snapshots and members among them, if the model needs these."""
-        made = (stage for stage in (self.decomposition, self.reduction) if stage is not None)
-        return (*solution_stages(self.problem, self.training), *self.phases, *made)
+        """The stages whose artefacts `model` reads."""
+        if self.builds:
+            return (*self.inputs(), self)
+        return self.phases if self.reduction is None else (*self.phases, self.reduction)
 
     def inputs(self) -> tuple[Stage, ...]:
-        """The offline phase."""
-        return self.model_inputs
+        """The offline phase: snapshots and members among it, if a formulation asks for these."""
+        made = (stage for stage in (self.decomposition, self.reduction) if stage is not None)
+        return (*solution_stages(self.problem, self.training), *self.phases, *made)
 
     def run(self, store: Store) -> Result:
         """Build the formulation and make its model, timed: a model may have something to compute, too.
@@ -111,7 +182,7 @@ class FormulationStage(Stage):
 
         def work() -> Mapping[str, Any]:
             built = check_built(formulation.build(offline))
-            self.of(formulation, offline, built, None, ACCURACY).model  # noqa: B018  is made, and dropped
+            Model(formulation, offline, built, None, ACCURACY).online  # noqa: B018  is made, and dropped
             return built
 
         with faults_of(self.formulation):
@@ -125,7 +196,7 @@ class FormulationStage(Stage):
         assert isinstance(made, Formulation)  # `RegisteredPlugin.load` refuses anything else
         return made
 
-    def offline(self, store: Store) -> Reduction:
+    def offline(self, store: Store, accuracy: float = ACCURACY) -> Reduction:
         """The offline phase, whose steps are stored."""
         pod, cone, enrichment = self.pod, self.cone, self.enrichment
         snapshots = solution_stages(self.problem, self.training)
@@ -152,20 +223,17 @@ class FormulationStage(Stage):
             training=self.training.strategy(),
             assembly="full" if self.interpolation is None else "reduced",
             interpolation=self.interpolation or Reduction.interpolation,
+            accuracy=accuracy,
             read=read,
         ).given(**steps)
 
-    @staticmethod
-    def of(
-        formulation: Formulation, offline: Reduction, built: Mapping[str, Any], solver: str | None, accuracy: float
-    ) -> Formulated:
-        """The model of a formulation for a solver."""
-        return Formulated(formulation, offline, built, solver, accuracy)
-
-    def formulated(self, store: Store, solver: str | None, accuracy: float | None) -> Formulated:
-        """The model, once the stage has been run."""
-        stored: BuiltFormulation = value_of(store, self)
-        offline = self.offline(store)
-        if stored.operators is not None:
-            offline = offline.given(operators=stored.operators)
-        return self.of(self.create(), offline, stored.built, solver, ACCURACY if accuracy is None else accuracy)
+    def model(self, store: Store, solver: str | None = None, accuracy: float | None = None) -> Model:
+        """The model for a solver and an accuracy, once the stages of `model_inputs` have been run."""
+        accuracy = ACCURACY if accuracy is None else accuracy
+        offline, built = self.offline(store, accuracy), dict[str, Any]()
+        if self.builds:
+            stored: BuiltFormulation = value_of(store, self)
+            built = dict(stored.built)
+            if stored.operators is not None:
+                offline = offline.given(operators=stored.operators)
+        return Model(self.create(), offline, built, solver, accuracy)
