@@ -24,25 +24,6 @@ from vibench.qp.solve import solve_qp
 ACCURACY = 1e-10
 """Largest natural residual of a snapshot (`vibench.qp.verification`)."""
 
-ROUND_OFF = 5e-11
-"""Largest entry of a residual, relative to those of its terms, that is left as it is."""
-
-REFINEMENTS = 3
-"""Steps of iterative refinement of a solution whose residuals are above `ACCURACY`."""
-
-SIGNIFICANT = 4.0
-"""A constraint is violated by more than this multiple of the bound of its own round-off."""
-
-NO_ROOM = 1e-14
-"""Opposite rows whose bounds differ by less than this share of them are an equality."""
-
-FEW_ROWS = 1000
-"""Of so many constraints the multipliers are the last unknowns of a sparse factorisation, which is dense there, if they
-are no more than `FEW_PER_UNKNOWN`, too."""
-
-MAX_ITERATIONS = 100
-"""Largest number of iterations, or the number of constraints if larger: the contact set may move node by node."""
-
 FALLBACK_SOLVER = "piqp"
 
 
@@ -144,7 +125,7 @@ class HighFidelitySolver:
         self._active.append(solution.lam > 0.0)
 
     def forget(self) -> None:
-        """Let no later solution start from those that are remembered; factorisations stay."""
+        """Forget all solutions, so that no later one starts from them; factorisations stay."""
         self._solved.clear()
         self._active.clear()
 
@@ -163,14 +144,14 @@ class HighFidelitySolver:
         (self._stiffness or self.condensed(vi)).check_definite(name)
 
     def _start(self, mu: Array) -> Mask | None:
-        """The initial active set: what the problem makes of the contact set of the nearest parameter."""
+        """The initial active set, which the problem derives from the contact set of the nearest parameter."""
         start, m = self._problem.start(mu.copy(), self._nearest_contact_set(mu)), self._problem.W.dim
         if isinstance(start, NestedStart):
             if self._coarse is None or self._coarse._problem is not start.coarse:
                 self._coarse = HighFidelitySolver(start.coarse)
-            # nothing is remembered there: the start depends on the parameter alone
-            found = self._coarse.solve_assembled(mu, checked_assembly(start.coarse, mu))
-            return np.asarray((found.lam > 0.0)[start.nearest])
+            # Remember nothing there: the start must depend on the parameter alone.
+            coarse = self._coarse.solve_assembled(mu, checked_assembly(start.coarse, mu))
+            return np.asarray((coarse.lam > 0.0)[start.nearest])
         if start is not None and (np.shape(start) != (m,) or np.asarray(start).dtype != bool):
             got = f"the shape {np.shape(start)} and the type {np.asarray(start).dtype}"
             raise NumericalError(f"start returns an array of {got}; expected ({m},) and bool, a NestedStart, or None")
@@ -201,13 +182,14 @@ class HighFidelitySolver:
         return self._stiffness
 
     def _elimination(self, vi: VariationalInequality) -> EliminationPattern:
-        """Which unknowns to eliminate: none where A varies, few rows constrain, and no dense matrix would be left.
+        """The unknowns to eliminate: none where A varies, few rows constrain, and no dense matrix would be left.
 
-        One factorisation per parameter serves all then: the first system, its borders and the verification.
+        One factorisation per parameter is then enough for the first system, its borders and the verification.
         """
         factorisation = self._problem.factorisation
         pattern = EliminationPattern.of(vi.A, self._constrained, factorisation)
-        few = len(vi.g) <= min(FEW_ROWS, FEW_PER_UNKNOWN * len(vi.f))
+        # The multipliers are the last unknowns of this sparse factorisation, which is dense there.
+        few = len(vi.g) <= min(1000, FEW_PER_UNKNOWN * len(vi.f))
         if self._condensing or "A" in self._problem.constant or pattern.is_dense or not few:
             return pattern
         return EliminationPattern.of_none(vi.A, factorisation)
@@ -239,14 +221,15 @@ def solve_high_fidelity(
 def solve_unverified(
     vi: VariationalInequality, stiffness: CondensedStiffness, start: Mask | None = None
 ) -> ActiveSetSolution:
-    """The solution of one variational inequality, up to round-off; arguments are those of `solve_high_fidelity`.
+    """Solve one variational inequality up to round-off; arguments are those of `solve_high_fidelity`.
 
     Raises
     ------
     NumericalError
-        If neither the active set method nor what replaces it finds one.
+        If neither the active set method nor its fallback finds a solution.
     """
-    reading = rows_that_matter(vi.B, vi.g, NO_ROOM * np.abs(vi.g))
+    # Opposite rows whose bounds differ by round-off are an equality.
+    reading = rows_that_matter(vi.B, vi.g, 1e-14 * np.abs(vi.g))
     program = reading.program(vi)
     system = stiffness.active_set_system(program)
     starts = [] if start is None else [start[reading.kept]]
@@ -258,9 +241,10 @@ def solve_unverified(
     else:
         (u, forces, iterations), fallback = _without_cycling(program, reading.equal, system)
     lam = reading.multipliers(forces, len(vi.g))
-    if _backward_error(vi, u, lam) > ROUND_OFF:  # a large rigid displacement amplifies it in the eliminated unknowns
+    # A large rigid displacement amplifies round-off in the eliminated unknowns; a stiff problem does so everywhere.
+    if _is_inaccurate(vi, u, lam):
         u = u + system.correct_eliminated(vi.f - vi.A @ u - vi.B.T @ lam)
-        if _backward_error(vi, u, lam) > ROUND_OFF:  # a stiff problem
+        if _is_inaccurate(vi, u, lam):
             u, lam = _refined(vi, stiffness, u, lam)
     return ActiveSetSolution(u, lam, fallback, iterations)
 
@@ -276,7 +260,8 @@ def verified(
         If they are still above it then.
     """
     solution = _refined_to_accuracy(vi, stiffness, found)
-    if not solution.residuals.worst <= ACCURACY:  # condensation may lose more digits than refinement wins
+    if not solution.residuals.worst <= ACCURACY:
+        # Condensation may lose more digits than refinement wins back.
         plain = CondensedStiffness(vi.A)
         again = solve_unverified(vi, plain, solution.lam > 0.0)
         fallback = "; ".join(filter(None, (found.fallback, "solved without condensation")))
@@ -291,11 +276,10 @@ def verified(
 def _refined_to_accuracy(
     vi: VariationalInequality, stiffness: CondensedStiffness, found: ActiveSetSolution
 ) -> HighFidelitySolution:
-    """The solution after the refinements that `ACCURACY` takes, or after all of them."""
+    """The solution after as many steps of iterative refinement as `ACCURACY` takes, at most three."""
     u, lam = found.u, found.lam
-
     residuals = verification.kkt_residuals(vi, u, lam, stiffness.dual_norms)
-    for _ in range(REFINEMENTS):
+    for _ in range(3):
         if residuals.worst <= ACCURACY:
             break
         u, lam = _refined(vi, stiffness, u, lam)
@@ -306,7 +290,7 @@ def _refined_to_accuracy(
 def _without_cycling(
     vi: VariationalInequality, equal: Mask, system: ActiveSetSystem
 ) -> tuple[tuple[Array, Array, int], str]:
-    """The solution where active sets cycle, or are linearly dependent, and what it is due to."""
+    """The solution where active sets cycle, or are linearly dependent, and the name of the fallback."""
     answer, guess = solve_qp(vi, FALLBACK_SOLVER, ACCURACY), np.zeros(len(vi.g), bool)
     if not equal.any() and answer.alpha is not None and np.all(np.isfinite(answer.alpha)):
         weights = answer.alpha * row_norms(vi.B)
@@ -320,10 +304,10 @@ def _without_cycling(
     return (*exact, 0), "the active set cycled; solved as a least distance problem"
 
 
-def _backward_error(vi: VariationalInequality, u: Array, lam: Array) -> float:
-    """Largest entry of the residual over those of its terms."""
+def _is_inaccurate(vi: VariationalInequality, u: Array, lam: Array) -> bool:
+    """Whether the largest entry of the residual, relative to those of its terms, is more than round-off."""
     Au, force = vi.A @ u, vi.B.T @ lam
-    return ratio(peak(Au - vi.f + force), max(peak(Au), peak(vi.f), peak(force)))
+    return ratio(peak(Au - vi.f + force), max(peak(Au), peak(vi.f), peak(force))) > 5e-11
 
 
 def _refined(vi: VariationalInequality, stiffness: CondensedStiffness, u: Array, lam: Array) -> tuple[Array, Array]:
@@ -341,9 +325,9 @@ def _refined(vi: VariationalInequality, stiffness: CondensedStiffness, u: Array,
 def _solution_everywhere(
     system: ActiveSetSystem, active: Mask, equal: Mask | None = None
 ) -> tuple[Array, Array, int] | None:
-    """U (n,), λ (m,) and iterations of the active set method; `None` where it finds none.
+    """The u (n,), λ (m,) and iterations of the active set method; `None` where it finds no solution.
 
-    Rows beyond the zone of the system are looked at when those in it are settled; what they violate enlarges it.
+    Rows beyond the zone of the system are checked when those in it are settled, and enlarge it where they are violated.
     """
     iterations = 0
     while True:
@@ -363,7 +347,8 @@ def _solution_everywhere(
 
 def _unit(B: SparseMatrix) -> Array:
     """Round-off (m,) of B u − g, relative to the sum of its terms, that counts as no violation."""
-    return np.asarray(SIGNIFICANT * EPS * (np.diff(B.indptr) + 2.0))
+    # A violation is at least four times the bound of the round-off of its row.
+    return np.asarray(4.0 * EPS * (np.diff(B.indptr) + 2.0))
 
 
 def active_set_iterations(
@@ -371,18 +356,16 @@ def active_set_iterations(
 ) -> tuple[Array, Array, int] | None:
     """Run the primal–dual active set method from an initial active set (m,): u (c,), λ (m,) and iterations.
 
-    Constraints that are `equal` (m,) stay active, whatever the sign of their multiplier.
-
-    `None` if the sets cycle or one of them has linearly dependent constraints. Signs are decided row by row, against
-    the round-off of the row itself, and multipliers as the forces that they are: no result depends on the scaling of a
-    row, or on a far one.
+    Constraints that are `equal` (m,) stay active, whatever the sign of their multiplier. The result is `None` if the
+    sets cycle or one of them has linearly dependent constraints. Signs are decided row by row, against the round-off of
+    the row itself, and multipliers are compared as forces: no result depends on the scaling of a row, or on a far one.
     """
     seen: set[bytes] = set()
     always = np.zeros_like(active) if equal is None else equal
     active = active | always
     B, g, weights = system.B, system.g, row_norms(system.B)
     sizes, unit = abs(B), _unit(B)
-    for iteration in range(1, max(MAX_ITERATIONS, len(active)) + 1):
+    for iteration in range(1, max(100, len(active)) + 1):  # the contact set may move node by node
         try:
             u, lam = system.solve_active(np.flatnonzero(active))
         except (RuntimeError, np.linalg.LinAlgError):  # an exactly singular system
@@ -391,6 +374,7 @@ def active_set_iterations(
         violated = ~active & (B @ u - g > unit * (sizes @ np.abs(u) + np.abs(g)))
         if system.beyond is not None:
             violated &= system.beyond.watched
+        # A force that is round-off does not hold a row in contact.
         in_contact = active & (forces > 1e-14 * np.max(np.abs(forces), initial=0.0))
         following = violated | in_contact | always
         if np.array_equal(following, active):

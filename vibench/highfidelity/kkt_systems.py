@@ -1,4 +1,10 @@
-"""KKT systems of the active set method: a condensed stiffness with the active constraints as equalities."""
+"""KKT systems of the active set method: a condensed stiffness with the active constraints as equalities.
+
+Dense work on all candidates of contact grows with the cube of their number, and most of them are never pressed. For
+many candidates the system is that of the zone which contact reaches, found from a coarse problem whose multipliers are
+constant on groups of neighbouring rows. Solutions do not depend on it: rows that touch other unknowns are checked by
+products with every solution, and enlarge it where they are violated (`vibench.highfidelity.active_set`).
+"""
 
 from __future__ import annotations
 
@@ -23,18 +29,12 @@ from vibench.linalg.schur_complement import EliminationPattern, PrincipalSubmatr
 from vibench.qp.scaling import row_norms
 from vibench.qp.verification import norms_by_solutions
 
-GROUPS = 64
-"""Multipliers of the coarse problem; each takes one solution with A."""
-
-GROWTH = 1.15
-"""A zone has, or is enlarged to, at least so many times the rows that it has to have, so that the next parameters find
-their contact in it."""
-
 
 def zone_of(B: SparseMatrix, rows: Mask) -> Indices:
-    """Unknowns that some rows (m,) of B (m×n) and their neighbours touch: `GROWTH` times as many rows, rising."""
+    """Unknowns that some rows (m,) of B (m×n) and their neighbours touch, rising."""
     B = sp.csr_array(B)
-    wanted = min(len(rows), int(np.ceil(GROWTH * np.sum(rows))))
+    # With 15 % more rows the next parameters usually find their contact in the zone.
+    wanted = min(len(rows), int(np.ceil(1.15 * np.sum(rows))))
     touching, reached = sp.csc_array(B), rows.copy()
     while True:
         unknowns: Indices = np.unique(B[reached].indices)
@@ -60,9 +60,10 @@ def coarse_contact(solve: Callable[[Array], Array], vi: VariationalInequality) -
     B, m = sp.csr_array(vi.B), len(vi.g)
     order = reverse_cuthill_mckee(sp.csr_array(abs(B) @ abs(B).T), symmetric_mode=True)
     group = np.empty(m, np.intp)
-    group[order] = np.arange(m) * GROUPS // m
+    # Each of 64 groups takes one solution with A.
+    group[order] = np.arange(m) * 64 // m
     finite = np.isfinite(vi.g)
-    members = sp.csr_array((finite.astype(float), (group, np.arange(m))), shape=(GROUPS, m))
+    members = sp.csr_array((finite.astype(float), (group, np.arange(m))), shape=(64, m))
     coarse, bounds = members @ B, members @ np.where(finite, vi.g, 0.0)
     displacements = solve(np.column_stack([coarse.toarray().T, vi.f]))
     K, excess = coarse @ displacements[:, :-1], coarse @ displacements[:, -1] - bounds
@@ -71,13 +72,11 @@ def coarse_contact(solve: Callable[[Array], Array], vi: VariationalInequality) -
     root = np.sqrt(values[kept])
     try:
         forces, _ = nnls(root[:, None] * vectors[:, kept].T, (vectors[:, kept].T @ excess) / root)
-    except RuntimeError:  # it has not converged, and the rows that are violated without forces are a larger guess
+    except RuntimeError:
+        # Without convergence the rows that are violated without forces are a larger guess.
         forces = np.maximum(excess, 0.0)
     return np.asarray(forces[group] > 0.0)
 
-
-MAX_RETAINED_SHARE = 0.5
-"""Systems are condensed on the constrained unknowns where these are at most this share of all."""
 
 MAX_BORDER = 16
 """A factorisation is bordered and reused for active sets that differ from its own in at most so many constraints."""
@@ -85,15 +84,8 @@ MAX_BORDER = 16
 ROUND_OFF = 1e-12
 """Entries of a bordered system below this, relative to their terms, may consist of round-off alone."""
 
-
-FEW_RETAINED = 1024
-"""Unknowns up to which liftings of half as many rows or more come from a dense inverse of a sparse Ŝ."""
-
-MOST = 4
-"""The compliance of all rows serves active sets of more than this part of them."""
-
+# From the active constraints to u (c,) and λ (m,): these are equalities, all other multipliers vanish.
 ActiveSolver = Callable[[Indices], tuple[Array, Array]]
-"""From the active constraints to u (c,) and λ (m,): these are equalities, all other multipliers vanish."""
 
 
 class CondensedStiffness:
@@ -106,13 +98,15 @@ class CondensedStiffness:
     pattern
         Retains at least all unknowns that B touches; by default every unknown is retained.
     factorisation
-        Who eliminates the others (`vibench.linalg.factorisations`); the sparse systems of active sets are SuperLU's.
+        Implementation that eliminates the others (`vibench.linalg.factorisations`); the sparse systems of active sets
+        are SuperLU's.
     """
 
     def __init__(
         self, A: SparseMatrix, pattern: EliminationPattern | None = None, factorisation: str = DEFAULT
     ) -> None:
-        if pattern is None or (pattern.whole is None and len(pattern.retained) > MAX_RETAINED_SHARE * A.shape[0]):
+        # Condensation does not pay where most unknowns are retained.
+        if pattern is None or (pattern.whole is None and 2 * len(pattern.retained) > A.shape[0]):
             pattern = EliminationPattern(np.arange(A.shape[0]), np.zeros(0, np.intp), np.zeros(0, np.intp))
         self._A, self._pattern, self._factorisation = A, pattern, factorisation
         self._saddle: SaddlePointSolver | None = None
@@ -121,8 +115,7 @@ class CondensedStiffness:
         self._condense()
 
     def _condense(self) -> None:
-        """Eliminate what is not retained, which refuses a block that is not definite."""
-        self._condensed  # noqa: B018
+        self._condensed  # noqa: B018  eliminates now, which refuses a block that is not definite
 
     @cached_property
     def _condensed(self) -> StaticCondensation:
@@ -151,7 +144,7 @@ class CondensedStiffness:
         return self._condensed.recover(self.compliance(load), particular)
 
     def dual_norms(self, functionals: Array) -> Array:
-        """‖ℓ‖ in A⁻¹ of functionals (n, k)."""
+        """Norms ‖ℓ‖ (k,) in A⁻¹ of functionals (n, k)."""
         if self._saddle is not None and self._saddle.is_definite:
             return self._saddle.dual_norms(functionals)
         if self.dense:
@@ -190,22 +183,23 @@ class CondensedStiffness:
         self._by_inverse = self._inverts_for(rows)
 
     def _inverts_for(self, rows: int) -> bool:
-        """Whether the liftings of so many rows come from Ŝ⁻¹: LAPACK inverts in less time than systems take."""
-        return self.dense or len(self.retained) <= min(FEW_RETAINED, 2 * rows)
+        """Whether the liftings of so many rows come from Ŝ⁻¹."""
+        # LAPACK inverts up to 1024 unknowns in less time than solutions for half as many rows take.
+        return self.dense or len(self.retained) <= min(1024, 2 * rows)
 
     def compliance(self, load: Array) -> Array:
-        """Ŝ⁻¹ times loads (c,) or (c, k) of the retained unknowns."""
+        """Product of Ŝ⁻¹ and loads (c,) or (c, k) of the retained unknowns."""
         if self._by_inverse:
             return self._blocks.times_sparse(load)
         return self._schur_factor.solve(load)
 
     def load(self, retained: Array) -> Array:
-        """Ŝ times retained unknowns (c,), where it is sparse."""
+        """Product of a sparse Ŝ and retained unknowns (c,)."""
         return np.asarray(self._condensed.schur @ retained)
 
     @property
     def has_known_round_off(self) -> bool:
-        """Whether there is a `schur_with_round_off`: nothing is known of factors that are not SuperLU's."""
+        """Whether there is a `schur_with_round_off`: only factors of SuperLU are known."""
         return self._factorisation == DEFAULT
 
     def schur_with_round_off(self, squares: Array) -> tuple[BlockDiagonal | SparseMatrix, float]:
@@ -214,7 +208,7 @@ class CondensedStiffness:
         return condensed.dense_blocks if condensed.dense else condensed.schur, condensed.round_off(squares)
 
     def liftings(self, B: SparseMatrix) -> Array:
-        """B Ŝ⁻¹ (m×c) for rows B (m×c) of the retained unknowns."""
+        """Product B Ŝ⁻¹ (m×c) for rows B (m×c) of the retained unknowns."""
         if self._inverts_for(B.shape[0]):
             return times_dense(B, self.inverse)
         return np.ascontiguousarray(self._schur_factor.solve(B.toarray().T).T)
@@ -228,24 +222,17 @@ class CondensedStiffness:
         """The vectors (n,) or (n, k) with these retained unknowns (c,) or (c, k) and no forces on the others."""
         return self._condensed.recover(retained, np.zeros((0, *retained.shape[1:])))
 
-    def _unconstrained(self, load: Array) -> Array:
-        """Ŝ⁻¹ f̂ (c,) of a condensed load, which is remembered until another one comes."""
-        if self._last is None or self._last[0] is not load:
-            self._last = load, self._blocks @ load
-        return self._last[1]
-
     @cached_property
     def _schur_factor(self) -> SparseCholesky:
         return SparseCholesky(self._condensed.schur, "A")
 
     @cached_property
     def inverse(self) -> Array:
-        """Ŝ⁻¹ (c×c), of which liftings are products where Ŝ is dense or small."""
+        """The inverse Ŝ⁻¹ (c×c), for liftings where Ŝ is dense or small."""
         return self._blocks.toarray()
 
     @cached_property
     def _blocks(self) -> BlockDiagonal:
-        """Ŝ⁻¹, body by body."""
         return self._condensed.dense_blocks.inverse("A")
 
     def active_set_system(self, vi: VariationalInequality) -> ActiveSetSystem:
@@ -256,7 +243,9 @@ class CondensedStiffness:
         B = sp.csr_array(vi.B) if whole else self._pattern.on_retained(vi.B)
         solve_active: ActiveSolver
         if condensed.dense:
-            solve_active = ComplianceSolver(self._blocks, self._unconstrained(load), B, vi.g)
+            if self._last is None or self._last[0] is not load:  # cached until the load changes
+                self._last = load, self._blocks @ load
+            solve_active = ComplianceSolver(self._blocks, self._last[1], B, vi.g)
         else:
             solve_active = SaddlePointSolver(condensed.schur, load, B, vi.g, whole)
             self._saddle = solve_active if whole else None
@@ -267,8 +256,8 @@ class CondensedStiffness:
 class ZoneStiffness(CondensedStiffness):
     """A stiffness matrix A, condensed on the zone that contact reaches, which is found and enlarged as needed.
 
-    Programs are solved on the zone, right-hand sides with a factor of A. What others ask of all retained unknowns is
-    computed where they ask for it.
+    Programs are solved on the zone, right-hand sides with a factor of A. All retained unknowns are condensed only where
+    they are asked for.
 
     Parameters
     ----------
@@ -285,15 +274,13 @@ class ZoneStiffness(CondensedStiffness):
         super().__init__(A, pattern, factorisation)
 
     def _condense(self) -> None:
-        """Eliminate nothing before it is asked for."""
+        pass  # nothing is eliminated before it is asked for
 
     def check_definite(self, name: str) -> None:
-        """Raise a `NumericalError` that calls A by `name` if A is not positive definite."""
         if "_solver" not in vars(self):
             self._solver = implementation(self._factorisation).factorise(self._A, name)
 
     def solve(self, right: Array) -> Array:
-        """A⁻¹ r for right-hand sides (n, k)."""
         return self._solver.solve(right)
 
     @cached_property
@@ -301,17 +288,15 @@ class ZoneStiffness(CondensedStiffness):
         return implementation(self._factorisation).factorise(self._A, "A")
 
     def dual_norms(self, functionals: Array) -> Array:
-        """‖ℓ‖ in A⁻¹ of functionals (n, k)."""
         return norms_by_solutions(functionals, self.solve(functionals))
 
     @cached_property
     def factor(self) -> SparseCholesky:
-        """The Cholesky factor of all of A: that of solutions, where this is one."""
         return self._solver if isinstance(self._solver, SparseCholesky) else SparseCholesky(self._A, "A")
 
     @cached_property
     def _on_zone(self) -> tuple[StaticCondensation, BlockDiagonal]:
-        """A condensed on the zone, and its inverse there; others are eliminated in their order in the factor of A."""
+        """The stiffness condensed on the zone, and its inverse there."""
         assert self.zone is not None
         order = self._solver.order if isinstance(self._solver, SparseCholesky) else np.arange(self._A.shape[0])
         rest, positions = order[~np.isin(order, self.zone)], np.arange(len(self.zone))
@@ -341,9 +326,9 @@ class ZoneStiffness(CondensedStiffness):
 def condensed_stiffness(
     A: SparseMatrix, pattern: EliminationPattern, factorisation: str, before: CondensedStiffness | None = None
 ) -> CondensedStiffness:
-    """A condensed on the unknowns that constraints involve, or on the zone of them that contact reaches.
+    """Condense A on the unknowns that constraints involve, or on the zone of them that contact reaches.
 
-    `before` is that of another parameter of the problem, whose zone is the first one of this.
+    `before` is the stiffness of another parameter of the problem, whose zone is the first one of this.
     """
     if not pattern.is_dense or len(pattern.interface) <= MANY_UNKNOWNS:
         return CondensedStiffness(A, pattern, factorisation)
@@ -352,7 +337,7 @@ def condensed_stiffness(
 
 @dataclass(frozen=True)
 class Beyond:
-    """What is beyond the zone of a system.
+    """Constraints beyond the zone of a system.
 
     Attributes
     ----------
@@ -384,13 +369,13 @@ class ActiveSetSystem:
     beyond: Beyond | None = None
 
     def watching(self, rows: Mask) -> ActiveSetSystem:
-        """The same, or one of a larger zone in which some rows (m,) are watched, too."""
+        """Return this system, or one of a larger zone in which some rows (m,) are watched, too."""
         if self.beyond is None or not np.any(rows & ~self.beyond.watched):
             return self
         return self.beyond.enlarged(rows)
 
     def holding(self, active: Indices) -> tuple[Array, Array]:
-        """U (n,) and λ (m,) with these constraints as equalities and no other multiplier; raises as solvers do."""
+        """The u (n,) and λ (m,) with these constraints as equalities and no other multiplier; raises as solvers do."""
         rows = np.zeros(len(self.g), bool)
         rows[active] = True
         system = self.watching(rows)
@@ -426,7 +411,7 @@ class SaddlePointSolver:
             B = sp.csr_array((B.data, ordered.places[B.indices], B.indptr), shape=B.shape)
         self._ordered = ordered is not None
         stiffness = np.abs(A.diagonal())
-        # Jacobi scaling: displacements and forces of steel in metres differ by 1e11, and `ROUND_OFF` compares them
+        # Scale unknowns and rows: displacements and forces of steel in metres differ by 1e11, and are compared.
         self._displacement = 1.0 / np.sqrt(np.where(stiffness > 0.0, stiffness, 1.0))
         B = _in_units(np.ones(len(g)), B, self._displacement)
         self._force = 1.0 / row_norms(B)
@@ -448,9 +433,9 @@ class SaddlePointSolver:
         if self._factorisation is not None and np.count_nonzero(is_active != self._is_factorised) <= MAX_BORDER:
             solution = self._solve_bordered(self._factorisation, active, is_active)
         if solution is None:
-            # in this order: the set must stay that of the last factorisation where this one fails
+            # Keep this order: the set must stay that of the last factorisation where this one fails.
             B = self._B[active]
-            zero = sp.csr_array((len(active), len(active)))  # SciPy stacks blocks that are all CSR without triplets
+            zero = sp.csr_array((len(active), len(active)))  # blocks that are all CSR are stacked without triplets
             saddle = sp.block_array([[self._A, sp.csr_array(B.T)], [B, zero]], format="csr").T
             self._factorisation = _BorderedFactorisation(saddle, len(active) if self._ordered else None)
             self._factorised_set, self._is_factorised = active, is_active
@@ -564,9 +549,8 @@ def _definite_pivots(factor: SuperLU, last: int) -> Array | None:
     """The pivots of a saddle point system in natural order; `None` unless all have their signs beyond round-off."""
     pivots = np.asarray(factor.U.diagonal())
     size = len(pivots) - last
-    regular = np.all(pivots[:size] > 0.0) and np.all(
-        pivots[size:] < -ROUND_OFF
-    )  # of rows of length 1, A with diagonal 1
+    # Rows have length 1 and A the diagonal 1.
+    regular = np.all(pivots[:size] > 0.0) and np.all(pivots[size:] < -ROUND_OFF)
     natural = np.array_equal(factor.perm_r, np.arange(len(pivots)))
     return pivots if regular and natural else None
 
@@ -604,10 +588,7 @@ class ComplianceSolver:
         self._contact: Array | None = None
 
     def __call__(self, active: Indices) -> tuple[Array, Array]:
-        """U (c,) and λ (m,).
-
-        Raises a `LinAlgError` where the rows are dependent.
-        """
+        """The u (c,) and λ (m,); raises a `LinAlgError` where the rows are dependent."""
         lam, rows = np.zeros(len(self._g)), self._B[active]
         if not len(active):
             return self._unconstrained, lam
@@ -620,8 +601,9 @@ class ComplianceSolver:
         return self._unconstrained - self._compliance @ (rows.T @ forces), lam
 
     def _contact_of(self, active: Indices) -> Array:
-        """B_a C B_aᵀ: of the matrix of all rows, which successive active sets share, where most of them are active."""
-        if self._contact is None and MOST * len(active) < len(self._rows):
+        """The compliance B_a C B_aᵀ of active rows."""
+        # Successive active sets share the matrix of all rows, which pays once a quarter of them are active.
+        if self._contact is None and 4 * len(active) < len(self._rows):
             return self._compliance.congruent(self._B[active])
         if self._contact is None:
             self._contact = self._compliance.congruent(self._B[self._rows])

@@ -103,7 +103,7 @@ def test_a_contact_set_that_moves_node_by_node_is_followed_to_its_end() -> None:
     lumped = sp.diags_array(np.full(nodes, step)).tocsr()
     vi = VariationalInequality(0.05 * left + 0.15 * right, np.full(nodes, -step), -lumped, -step * obstacle)
     found = active_set.solve_high_fidelity(vi)
-    assert found.iterations > active_set.MAX_ITERATIONS
+    assert found.iterations > 100
     assert found.fallback == ""
     assert np.all(found.u >= obstacle - 1e-12)
 
