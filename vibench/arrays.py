@@ -22,15 +22,13 @@ SparseMatrix: TypeAlias = Any
 
 
 def digest(matrix: SparseMatrix) -> bytes:
-    """What two sparse matrices (CSR or CSC) of one format have in common exactly if their arrays are equal."""
+    """Digest that two sparse matrices (CSR or CSC) of one format share exactly if their arrays are equal."""
     return sha256(b"".join(array.tobytes() for array in (matrix.indptr, matrix.indices, matrix.data))).digest()
 
 
 def times_dense(sparse: SparseMatrix, dense: Array) -> Array:
-    """The product of a sparse M (m×c) and a dense matrix (c×k).
-
-    Rows (CSR) with one entry, such as those of nodal constraints, scale rows, which SciPy would add to zeros.
-    """
+    """The product of a sparse M (m×c) and a dense matrix (c×k)."""
+    # Rows with one entry, such as those of nodal constraints, scale rows, which SciPy would add to zeros.
     if sparse.format != "csr" or not np.array_equal(sparse.indptr, np.arange(sparse.shape[0] + 1)):
         return np.asarray(sparse @ dense)
     rows = sparse.indices

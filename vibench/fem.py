@@ -1,4 +1,4 @@
-"""What problems discretised with scikit-fem share: Gram matrices, masses, unilateral constraints, Dirichlet data."""
+"""Building blocks of problems with scikit-fem: Gram matrices, masses, unilateral constraints, Dirichlet data."""
 
 from __future__ import annotations
 
@@ -22,24 +22,14 @@ __all__ = ["Unilateral", "eliminate", "h1_gram", "lumped_mass", "mass", "normal_
 Sense = Literal["<=", ">="]
 
 
-PRODUCTS = {False: BilinearForm(lambda u, v, _: u * v), True: BilinearForm(lambda u, v, _: dot(u, v))}
-GRADIENTS = {
-    False: BilinearForm(lambda u, v, _: dot(grad(u), grad(v))),
-    True: BilinearForm(lambda u, v, _: ddot(grad(u), grad(v))),
-}
-"""∫ v·w and ∫ ∇v : ∇w, of scalar and of vector bases."""
-
-ROUND_OFF = 1e-14
-"""Entries of a constraint below this, relative to the largest, are components of a normal that vanish."""
-
-
 def mass(basis: Basis) -> SparseMatrix:
-    """∫ v·w (N×N) over the elements or facets of a scalar or vector basis; zero for functions that vanish there."""
-    return sp.csr_array(PRODUCTS[_is_vector(basis)].assemble(basis))
+    """Matrix of ∫ v·w (N×N) over the elements or facets of a scalar or vector basis."""
+    form = BilinearForm(lambda u, v, _: dot(u, v) if _is_vector(basis) else u * v)
+    return sp.csr_array(form.assemble(basis))
 
 
 def lumped_mass(basis: Basis) -> Array:
-    """∫ φ_i (N,) over the elements or facets of a scalar basis: the row sums of its mass matrix."""
+    """Integrals ∫ φ_i (N,) over the elements or facets of a scalar basis: the row sums of its mass matrix."""
     return np.asarray(LinearForm(lambda v, _: v).assemble(basis))
 
 
@@ -55,8 +45,8 @@ def h1_gram(basis: Basis, free: Indices | None = None, length: float = 1.0) -> S
     length
         ℓ, in the unit of length of the mesh.
     """
-    gradients = sp.csr_array(GRADIENTS[_is_vector(basis)].assemble(basis))
-    gram = sp.csr_array(mass(basis) + length**2 * gradients)
+    form = BilinearForm(lambda u, v, _: (ddot if _is_vector(basis) else dot)(grad(u), grad(v)))
+    gram = sp.csr_array(mass(basis) + length**2 * sp.csr_array(form.assemble(basis)))
     return gram if free is None else sp.csr_array(gram[free][:, free])
 
 
@@ -64,8 +54,8 @@ def h1_gram(basis: Basis, free: Indices | None = None, length: float = 1.0) -> S
 class Unilateral:
     """A constraint in weak form with nodal multipliers: ∫ c(u) η ≤ ∫ bound η for every nonnegative η, or with ≥.
 
-    c(u) is a scalar field or a component of a displacement field. Signs are those of B u ≤ g: for ≥ both sides change
-    theirs.
+    Here c(u) is a scalar field or a component of a displacement field. Signs are those of B u ≤ g: for ≥ both sides
+    change theirs.
 
     Attributes
     ----------
@@ -178,7 +168,8 @@ def normal_constraint(
         part = sp.diags_array(part.sum(axis=1)) if lumped else part
         places = (np.arange(len(vertices)), unknowns[vertices])
         B = B + part @ sp.csr_array((np.ones(len(vertices)), places), shape=B.shape)
-    B.data[np.abs(B.data) <= ROUND_OFF * np.max(np.abs(B.data), initial=0.0)] = 0.0
+    # Entries below round-off are components of a normal that vanish.
+    B.data[np.abs(B.data) <= 1e-14 * np.max(np.abs(B.data), initial=0.0)] = 0.0
     B.eliminate_zeros()
     kept = np.arange(len(vertices)) if free is None else np.flatnonzero(abs(B[:, free]).sum(axis=1) > 0.0)
     B, vertices = sp.csr_array(B[kept]), vertices[kept]
@@ -190,7 +181,7 @@ def normal_constraint(
 
 
 def eliminate(vi: VariationalInequality, free: Indices, dirichlet_lift: Array | None = None) -> VariationalInequality:
-    """The variational inequality in the free unknowns, from that in all N.
+    """Restrict a variational inequality in all N unknowns to the free ones.
 
     Parameters
     ----------
@@ -209,7 +200,7 @@ def eliminate(vi: VariationalInequality, free: Indices, dirichlet_lift: Array | 
 
 
 def _integrals(basis: Basis, dofs: Indices, values: Callable[[Array], Array]) -> Array:
-    """∫ bound η for chosen functions η of a scalar basis, by its quadrature."""
+    """Integrals ∫ bound η for chosen functions η of a scalar basis, by its quadrature."""
     return np.asarray(LinearForm(lambda v, w: values(np.asarray(w.x)) * v).assemble(basis))[dofs]
 
 
@@ -227,7 +218,7 @@ def _vertices(basis: Basis) -> Indices:
 def _positive(integrals: Array, dofs: Indices) -> Array:
     """The integrals (m,) of chosen functions; refused unless all are positive."""
     weights = integrals[dofs]
-    if np.min(weights, initial=np.inf) <= ROUND_OFF * np.max(integrals, initial=0.0):
+    if np.min(weights, initial=np.inf) <= 1e-14 * np.max(integrals, initial=0.0):
         raise NumericalError(
             f"a basis function has the integral {weights.min():.1e}; multipliers need nonnegative functions: linear or "
             "bilinear elements"

@@ -164,11 +164,6 @@ class CondensedStiffness:
         return self._pattern.retained
 
     @property
-    def eliminated(self) -> Indices:
-        """All others, in the order of their elimination."""
-        return self._pattern.order[: len(self._pattern.order) - len(self._pattern.interface)]
-
-    @property
     def order(self) -> Indices:
         """All unknowns (n,) in an order of little fill-in."""
         return np.concatenate([self._pattern.order, np.setdiff1d(self.retained, self._pattern.order)])

@@ -60,7 +60,7 @@ def test_parameters_with_the_same_stiffness_share_its_constants_of_v(monkeypatch
 def test_constants_are_those_of_the_default_whoever_factorises(name: str) -> None:
     plain, other, mu = Varying(n=90), Varying(n=90), np.array([0.4])
     other.factorised_by(name)
-    assert len(Assemblies(other).energy_at(mu).stiffness.eliminated)
+    assert len(Assemblies(other).energy_at(mu).stiffness.retained) < 90
     for constant in ("coercivity_at", "continuity_at", "energy_inf_sup_at"):
         expected, found = (getattr(Assemblies(problem), constant)(mu) for problem in (plain, other))
         assert expected.proved
