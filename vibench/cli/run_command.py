@@ -20,7 +20,7 @@ from vibench.qp.status import Status
 from vibench.text import unbroken
 
 if TYPE_CHECKING:
-    from vibench.execution.run import Outcome
+    from vibench.execution.run import RunResult
     from vibench.study.spec import Study
 
 Names = list[str] | None
@@ -94,7 +94,7 @@ def run_study_command(
     _conclude(loaded.name, outcome, folder, draw=options.workers if draw else None, fresh=fresh, strict=strict)
 
 
-def _conclude(name: str, outcome: Outcome, folder: Path, *, draw: int | None, fresh: bool, strict: bool) -> None:
+def _conclude(name: str, outcome: RunResult, folder: Path, *, draw: int | None, fresh: bool, strict: bool) -> None:
     """Export, print and draw what a run found, on as many processes as `draw` says; exit as its statuses ask for."""
     from vibench.results import show
     from vibench.results.read import results_file

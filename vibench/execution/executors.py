@@ -42,10 +42,7 @@ class Executor(ABC):
     def check(self) -> None:  # noqa: B027  nothing to check where jobs run in our own threads
         """Check that submitted jobs can still finish.
 
-        Raises
-        ------
-        ExecutorError
-            If the processes that run them were lost.
+        Raises an `ExecutorError` if the processes that run them were lost.
         """
 
     @abstractmethod
@@ -54,15 +51,7 @@ class Executor(ABC):
 
 
 class Local(Executor):
-    """Worker processes on this machine.
-
-    Parameters
-    ----------
-    slots
-        Number of worker processes.
-    log
-        File for the output of plugins.
-    """
+    """Worker processes on this machine; the output of plugins goes to the file `log`."""
 
     def __init__(self, slots: int, log: Path) -> None:
         self.slots, self.machines = slots, frozenset({machine()})
@@ -103,21 +92,12 @@ class Dask(Executor):
     They must have the same vibench installed and see the folder of the artefacts under the same path. Another worker
     repeats the job of a worker that dies, which is safe because stages are pure functions.
 
-    Parameters
-    ----------
-    scheduler
-        Address of the scheduler; `None` for a cluster of processes on this machine, which use TLS with temporary
-        credentials. The credentials for a scheduler tls://… come from the configuration of dask.
-    slots
-        Number of workers of a cluster on this machine.
-    store
-        Folder of the artefacts.
+    Without a `scheduler`, a cluster of `slots` processes on this machine is started, which use TLS with temporary
+    credentials. The credentials for a scheduler tls://… come from the configuration of dask. `store` is the folder of
+    the artefacts.
 
-    Raises
-    ------
-    RequestError
-        If dask.distributed is not installed, this process may not open enough files, the scheduler does not answer, or
-        a worker cannot run the jobs.
+    Raises a `RequestError` if dask.distributed is not installed, this process may not open enough files, the scheduler
+    does not answer, or a worker cannot run the jobs.
     """
 
     def __init__(self, scheduler: str | None, slots: int, store: Path) -> None:
@@ -131,7 +111,8 @@ class Dask(Executor):
             raise RequestError(
                 "the executor 'dask' needs dask.distributed and cryptography: install vibench with its extra 'cluster'"
             ) from None
-        if scheduler is not None and is_authenticated(scheduler) and not _has_credentials():
+        credentials = Security().get_connection_args("client")
+        if scheduler is not None and is_authenticated(scheduler) and credentials["ssl_context"] is None:
             raise RequestError(f"the scheduler '{scheduler}' asks for credentials: set distributed.comm.tls of dask")
         _allow_open_files(slots if scheduler is None else 0)
         if scheduler is not None:
@@ -187,7 +168,6 @@ class Dask(Executor):
             raise ExecutorError("the dask scheduler is not connected any more; run the same command again to continue")
 
     def close(self) -> None:
-        """End the jobs and their processes, and the cluster if this run started it."""
         with contextlib.suppress(Exception):  # a cluster that was lost has no jobs to end
             if self._client.status == "running":
                 self._client.run(_dismiss, self._token)
@@ -233,14 +213,7 @@ def _allow_open_files(workers: int) -> None:
 
 
 def is_authenticated(scheduler: str) -> bool:
-    """Whether both sides of a connection to the address of a scheduler are authenticated."""
     return scheduler.startswith(("tls://", "wss://"))
-
-
-def _has_credentials() -> bool:
-    from distributed.security import Security  # noqa: PLC0415
-
-    return Security().get_connection_args("client")["ssl_context"] is not None
 
 
 def _hand_over(theirs: Any, ours: Future[StageOutcome]) -> None:
@@ -278,12 +251,10 @@ _supervisors: dict[tuple[str, int], Supervisor] = {}
 
 
 def _run_for(token: str, job: Job) -> StageOutcome:
-    """Run a job in a dask worker, with the supervisor of its run in this thread."""
     return _supervisors.setdefault((token, threading.get_ident()), Supervisor()).run(job)
 
 
 def _dismiss(token: str) -> None:
-    """End the supervisors of a run on a dask worker."""
     for key in [key for key in _supervisors if key[0] == token]:
         _supervisors.pop(key).close()
 

@@ -75,10 +75,7 @@ class Graph:
     def lost(self, stage: Stage) -> list[Stage]:
         """Drop the stages that depend on a failed one, and those that no remaining goal needs.
 
-        Returns
-        -------
-        list
-            The goals that are lost, the stage itself among them if it is one, in the order of the plan.
+        Returns the goals that are lost in the order of the plan, the failed stage among them if it is a goal.
         """
         gone, ahead = {stage.key}, [stage.key]
         while ahead:
@@ -90,7 +87,6 @@ class Graph:
         return [self.stages[key] for key in sorted(gone & self._goals, key=self._numbers.__getitem__)]
 
     def _drop(self, keys: set[str]) -> None:
-        """Drop stages that wait, and those that nothing else needs."""
         ahead = list(keys)
         while ahead:
             key = ahead.pop()

@@ -1,4 +1,4 @@
-"""Work of plugins outside studies, in a process of its own: whatever ends that process costs the current item alone."""
+"""Work of plugins outside studies, in another process: whatever ends that process costs the current item alone."""
 
 from __future__ import annotations
 
@@ -67,16 +67,8 @@ class IsolatedCall(ItemwiseStage, Items):
 def call_isolated(function: Callable[..., Any], *arguments: Any, seconds: float, supervisor: Supervisor) -> Any:
     """Call a function in the process of a supervisor, for some wall seconds at most.
 
-    Returns
-    -------
-    Any
-        The value; a `Failed` if the call raised, took longer or ended the process; a `NotImportableError` if the
-        process cannot import the function or its arguments.
-
-    Raises
-    ------
-    NotImportableError
-        If they cannot be pickled.
+    The value is a `Failed` if the call raised, took longer or ended the process, and a `NotImportableError` if the
+    process cannot import the function or its arguments. Raises a `NotImportableError` if they cannot be pickled.
     """
     try:
         pickled = pickle.dumps((function, arguments))

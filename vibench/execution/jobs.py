@@ -24,10 +24,7 @@ def code_here() -> str:
 class Job:
     """A stage to be run: the folder of artefacts, the limits of a query and of the stage, and the code expected.
 
-    Attributes
-    ----------
-    lost
-        Dispensable stages that failed, by key.
+    `lost` are dispensable stages that failed, by key.
     """
 
     store: str
@@ -41,18 +38,10 @@ class Job:
 
 @dataclass(frozen=True)
 class Batch:
-    """Work that one process does in succession: items of a stage, or a stage without items.
+    """Work that one process does in succession: items of a stage by their numbers, or a stage without items.
 
-    Packages of third parties share no process, and the items of a stage may need several.
-
-    Attributes
-    ----------
-    packages
-        Packages whose code it runs.
-    numbers
-        The items.
-    ends
-        Whether the stage ends with it.
+    Third-party packages share no process: the items of a stage may need several. `ends` is true if the stage ends with
+    the batch.
     """
 
     packages: frozenset[str]

@@ -34,16 +34,9 @@ from vibench.study.spec import Study
 
 @dataclass(frozen=True)
 class RecordedCell:
-    """One row of the cells table, and the reduced model that it was computed with.
+    """One row of the cells table of a results file, and the reduced model that it was computed with.
 
-    Attributes
-    ----------
-    path
-        The results file.
-    row
-        The row.
-    places
-        Where files and folders of its plugins are now, by the names under which results know them.
+    `places` are the paths of files and folders of its plugins, by their names in results, where these were moved.
     """
 
     path: Path
@@ -52,17 +45,13 @@ class RecordedCell:
 
     @cached_property
     def cell(self) -> Cell:
-        """The cell of the study."""
         return Cell.from_definition(self.row["definition"], self.places)
 
     @cached_property
     def model(self) -> Model:
         """The model, with its bounds; stages whose artefacts are missing are run again.
 
-        Raises
-        ------
-        RequestError
-            If other code computed the row, so that its model cannot be reproduced.
+        Raises a `RequestError` if other code computed the row, so that its model cannot be reproduced.
         """
         if self.cell.code != self.row["code"]:
             raise RequestError(
@@ -83,7 +72,6 @@ class RecordedCell:
 
     @cached_property
     def parameters(self) -> Array:
-        """The validation parameters (queries×d)."""
         return self.cell.validation.of(self.model.problem)
 
     def program(self, query: int) -> VariationalInequality:
@@ -91,7 +79,6 @@ class RecordedCell:
         return self.model.reduced.assemble(self.parameters[query]).program
 
     def rows(self, table: str) -> dict[int, dict[str, Any]]:
-        """The cell's rows of the queries or the solutions table, by query."""
         names, rows = read_rows(self.path, table, (self.row["cell"],))
         named = [dict(zip(names, row, strict=True)) for row in rows]
         return {int(row["query"]): row for row in named}
@@ -100,10 +87,7 @@ class RecordedCell:
 def _provide(stages: Iterable[Stage], store: Store) -> None:
     """Run the stages whose artefacts are missing, and the inputs they need; in a supervised process, as in a run.
 
-    Raises
-    ------
-    RequestError
-        If one of them fails.
+    Raises a `RequestError` if one of them fails.
     """
     graph = Graph()
     for stage in stages:
@@ -117,7 +101,6 @@ def _provide(stages: Iterable[Stage], store: Store) -> None:
 
 
 def _rows(run: str) -> tuple[Path, list[dict[str, Any]]]:
-    """Results file of a run, and the rows of its cells."""
     path = results_file(run)
     rows = [{str(name): value for name, value in row.items()} for row in read_table(path, "cells").to_dict("records")]
     for row in rows:
@@ -130,10 +113,7 @@ def _rows(run: str) -> tuple[Path, list[dict[str, Any]]]:
 def recorded_cells(run: str, places: Mapping[str, str] = NOT_MOVED) -> list[RecordedCell]:
     """All cells of a run that have a model with quadratic programs.
 
-    Raises
-    ------
-    RequestError
-        If there is no such run.
+    Raises a `RequestError` if there is no such run.
     """
     path, rows = _rows(run)
     return [RecordedCell(path, row, places) for row in rows if row["model"] and _has_program(row["definition"])]
@@ -151,10 +131,7 @@ def _has_program(definition: str) -> bool:
 def recorded_cell(run: str, cell: str, places: Mapping[str, str] = NOT_MOVED) -> RecordedCell:
     """One cell of a run, by its key or a unique prefix of it.
 
-    Raises
-    ------
-    RequestError
-        If the prefix fits no cell or several, or the cell failed before it had a reduced model.
+    Raises a `RequestError` if the prefix fits no cell or several, or the cell failed before it had a reduced model.
     """
     recorded = _matching(run, cell, places)
     if not recorded.row["model"]:
@@ -165,10 +142,8 @@ def recorded_cell(run: str, cell: str, places: Mapping[str, str] = NOT_MOVED) ->
 def recorded_study(run: str, cell: str, places: Mapping[str, str] = NOT_MOVED) -> Study:
     """The study that makes one row of a run again: it has this cell alone.
 
-    Raises
-    ------
-    RequestError
-        If the prefix fits no cell or several, or the cell cannot be run here: its plugins or options are others.
+    Raises a `RequestError` if the prefix fits no cell or several, or the cell cannot be run here: its plugins or
+    options are others.
     """
     recorded = _matching(run, cell, places)
     name = str(study_of(recorded.path, read_meta(recorded.path)).get("name"))

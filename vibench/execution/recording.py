@@ -39,18 +39,13 @@ from vibench.study.spec import Limits, Study
 LOCK, LOG, REPORT = ".lock", "workers.log", "report.html"
 """Files of a run folder: held during a run, output of plugins and solvers, and what `vibench report` writes."""
 
-LIMITS = "limits of "
-"""Prefix of the keys of `meta` under which the limits of studies are stored, by the hash of the study."""
-
 
 @contextlib.contextmanager
 def claimed(folder: Path) -> Iterator[None]:
     """Lock a run folder, which is created if it does not exist.
 
-    Raises
-    ------
-    RequestError
-        If the folder is a file, holds files but no results file, cannot be written, or is locked by another run.
+    Raises a `RequestError` if the folder is a file, holds files but no results file, cannot be written, or is locked by
+    another run.
     """
     try:
         if folder.exists() and not folder.is_dir():
@@ -71,10 +66,7 @@ def clear(folder: Path, study: str, note: Callable[[str], None]) -> None:
     Other files stay: a user may keep notes there, and figures are removed when they are drawn anew. A results file that
     cannot be read is kept under another name, which is passed to `note`.
 
-    Raises
-    ------
-    RequestError
-        If the folder holds results of another study.
+    Raises a `RequestError` if the folder holds results of another study.
     """
     path = folder / FILE
     try:
@@ -95,7 +87,7 @@ def ended_by_smaller_limits(database: ResultsDatabase, limits: Limits) -> set[st
 
     Rows name their study by its hash; limits of an unknown hash count as unchanged.
     """
-    known = {study: json.loads(text) for study, text in database.kept(LIMITS).items()}
+    known = {study: json.loads(text) for study, text in database.kept("limits of ").items()}
     ended = set()
     for cell, study, status, reason in database.ends():
         raised = {name for name, value in limits.model_dump().items() if value > known.get(study, {}).get(name, value)}
@@ -106,8 +98,7 @@ def ended_by_smaller_limits(database: ResultsDatabase, limits: Limits) -> set[st
 
 
 def keep_limits(database: ResultsDatabase, study: str, limits: Limits) -> None:
-    """Store the limits of the study with this hash in its results file."""
-    database.keep(LIMITS + study, limits.model_dump_json())
+    database.keep(f"limits of {study}", limits.model_dump_json())
 
 
 @dataclass(frozen=True)
@@ -120,7 +111,6 @@ class ResultWriter:
 
     @cached_property
     def study_hash(self) -> str:
-        """Name of the study in its rows."""
         return digest(self.study.model_dump(mode="json"))
 
     def cell(self, cell: Cell, rows: CellRows) -> Row:
@@ -187,7 +177,6 @@ class ResultWriter:
 
 
 def cell_columns(cell: Cell) -> dict[str, Any]:
-    """The key columns of a cell."""
     without: dict[str, Any] = {}
     for name, plugin in (("dual", cell.dual), ("primal", cell.primal)):
         without |= {name: NO_SUCH_AXIS, f"{name}_options": "{}"} if plugin is None else {}

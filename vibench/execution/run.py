@@ -60,7 +60,7 @@ class Agenda:
 
 
 class Observer:
-    """Callbacks of a run; these do nothing."""
+    """Callbacks of a run, which do nothing here; `wall` are the wall seconds of a stage."""
 
     def note(self, line: str) -> None:
         """Show a line that the user should know."""
@@ -75,7 +75,7 @@ class Observer:
         """Called often, with the running stages and the fractions of them that are known to be done."""
 
     def stage(self, stage: Stage, wall: float) -> None:
-        """Called when a stage is done, with its wall seconds."""
+        """Called when a stage is done."""
 
     def plan(self, stage: Stage) -> None:
         """Called when a stage is added to the agenda."""
@@ -85,7 +85,7 @@ class Observer:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RunResult:
     """Rows of all cells after a run, how many are missing, whether it was interrupted, and cells with damaged rows."""
 
     rows: tuple[dict[str, Any], ...]
@@ -107,25 +107,12 @@ def identity(study: Study) -> dict[str, Any]:
 class Options:
     """How a study is run; only times depend on it.
 
-    Attributes
-    ----------
-    jobs
-        Worker processes; 0 for one per core.
-    fresh
-        Remove earlier results of this study and compute all artefacts again.
-    retry
-        Also redo cells that did not end ok.
-    executor
-        "local" or "dask".
-    scheduler
-        Address of a dask scheduler; `None` for a cluster on this machine.
-    repeats
-        Minimal number of cold processes in which seconds are measured; 0 for as many as decide the comparisons.
+    `jobs` are worker processes, 0 for one per core. `fresh` removes earlier results and computes all artefacts again,
+    `retry` repeats cells that did not end ok. The `executor` is "local" or "dask", the `scheduler` the address of one
+    of dask, `None` for a cluster on this machine. `repeats` is the minimal number of cold processes in which seconds
+    are measured, 0 for as many as decide the comparisons.
 
-    Raises
-    ------
-    RequestError
-        If there would be too many worker processes for this machine.
+    Raises a `RequestError` for too many worker processes or repeats.
     """
 
     jobs: int = 0
@@ -150,26 +137,11 @@ class Options:
         return self.jobs or provenance.cores()
 
 
-def run_study(study: Study, folder: Path, observer: Observer, options: Options = Options()) -> Outcome:
-    """Run the missing cells of a study and write every result into its folder.
+def run_study(study: Study, folder: Path, observer: Observer, options: Options = Options()) -> RunResult:
+    """Run the missing cells of a study and write every result into its folder, beside earlier ones of the same study.
 
-    Parameters
-    ----------
-    study
-        The checked study.
-    folder
-        Run folder; earlier results of the same study are continued.
-    observer
-        Shows the progress.
-    options
-        How to run it.
-
-    Raises
-    ------
-    RequestError
-        If the folder, the store of artefacts or the executor cannot be used.
-    StorageError
-        If something cannot be written; what was written before is kept.
+    Raises a `RequestError` if the folder, the store of artefacts or the executor cannot be used, and a `StorageError`
+    if something cannot be written; earlier results are kept.
     """
     cells, store = expand(study), usable_store()
     with claimed(folder), store.used():
@@ -190,7 +162,7 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
             database.close()
     keys = {cell.key for cell in cells}
     rows = tuple(row for row in everything if row["cell"] in keys)
-    return Outcome(rows, len(cells) - len(rows), interrupted, database.damaged)
+    return RunResult(rows, len(cells) - len(rows), interrupted, database.damaged)
 
 
 def _to_do(cell: Cell, finished: Mapping[str, tuple[str, str]], retry: bool) -> bool:
@@ -334,7 +306,6 @@ class _Run:
             self._ended(cell)
 
     def _ended(self, cell: Cell) -> None:
-        """Plan the timing of a group after the last of its cells."""
         group = self.timing.ended(cell)
         if group is not None:
             self._time(group)
@@ -349,7 +320,6 @@ class _Run:
                 self.observer.plan(stage)
 
     def _timed(self, stage: Stage, outcome: Any) -> None:
-        """Record the rounds of a group, and plan its next block."""
         following = self.timing.record(stage, outcome)
         if following is not None:
             self.graph.add_goal(following, self._is_available)

@@ -140,16 +140,12 @@ class Supervisor:
     Every set of third-party packages has a process of its own: whatever they do to it concerns no others. Items of one
     stage that need several processes are done by these in turn.
 
-    Parameters
-    ----------
-    log
-        File for the output of plugins; `None` to discard it.
-    environment
-        Environment variables of the worker process, beside those of this one.
+    The output of plugins goes to the file `log`, if any. `environment` has variables of worker processes beside those
+    of this one.
     """
 
     def __init__(self, log: Path | None = None, environment: Mapping[str, str] | None = None) -> None:
-        self._log, self._environment = log, dict(environment or {})
+        self._log, self._environment = log, environment or {}
         self._workers: OrderedDict[frozenset[str], _Worker] = OrderedDict()  # the most recently used comes last
         self._session = 0
         self._state: _JobState | None = None
@@ -158,11 +154,9 @@ class Supervisor:
     def run(self, job: Job, observe: Callable[[Any], None] = lambda _: None) -> Done | Failed | Unstored:
         """Run a stage until it ends or exceeds its limits; `observe` is called with the value of every item done.
 
-        Raises
-        ------
-        StoppedError
-            If `stop` is called meanwhile.
+        Raises a `StoppedError` if `stop` is called meanwhile.
         """
+        # A session is timed in cold processes: caches of earlier ones must not make it faster.
         if job.stage.session > self._session:
             self._kill()
             self._session = job.stage.session
@@ -204,16 +198,17 @@ class Supervisor:
                     lost[state.item] = error.failed
                 if not isinstance(job.stage, ItemwiseStage) or not (done or lost) or limit > job.cell_seconds:
                     return error.failed
-                if state.seconds > job.cell_seconds:  # another process may finish with these items
+                if state.seconds > job.cell_seconds:
+                    # Give up the remaining items, and let another process collect what is done within a second limit.
                     limit += state.seconds
                     for late in set(range(job.stage.items)) - done.keys():
                         lost.setdefault(late, _beyond("cell_seconds", job.cell_seconds))
-                elif state.item is None and retried:  # died outside any item for the second time
+                elif state.item is None and retried:
+                    # Outside any item a process may die by chance once, the second time it is the stage.
                     return error.failed
                 retried = retried or state.item is None
 
     def _attempt(self, state: _JobState, limit: float) -> Done | Failed | Unstored:
-        """Run the rest of a stage, batch by batch."""
         for batch in batches(state.job.stage, state.progress.done.keys() | state.progress.lost.keys()):
             outcome = self._attempt_batch(state, limit, batch)
             if not isinstance(outcome, BatchDone):
@@ -221,7 +216,6 @@ class Supervisor:
         raise AssertionError("the last batch ends the stage")
 
     def _attempt_batch(self, state: _JobState, limit: float, batch: Batch) -> Done | Failed | Unstored | BatchDone:
-        """Run a batch of a stage in one process."""
         try:
             connection, process, _, current = self._worker(batch.packages)
         except OSError as error:
@@ -233,7 +227,8 @@ class Supervisor:
                     outcome = state.update(connection.recv())
                     if outcome is not None:
                         return outcome
-                elif process.poll() is not None:  # a child process of it may hold the socket open
+                elif process.poll() is not None:
+                    # It is dead, although a child process of it may hold the socket open.
                     raise EOFError
                 state.tick(limit)
         except (EOFError, OSError):  # the other end of the socket is closed
@@ -256,7 +251,6 @@ class Supervisor:
         return self._workers[packages]
 
     def _kill(self, *sets: frozenset[str]) -> None:
-        """End the worker processes of some sets of packages, or all."""
         for packages in sets or tuple(self._workers):
             if (worker := self._workers.pop(packages, None)) is None:
                 continue
@@ -291,7 +285,6 @@ def _cause_of_death(process: subprocess.Popen[bytes]) -> str:
 
 
 def manner_of_death(code: int) -> str:
-    """A return code of `subprocess` in words: an exit code, or the name of a signal."""
     if code >= 0:
         return f"exit code {code}"
     names = {number.value: number.name for number in signal.Signals}

@@ -21,14 +21,8 @@ from vibench.timing import Seconds
 class OfflinePlan:
     """Repeats of the offline stages of a run: of short ones within a budget, or of all as often as requested.
 
-    Parameters
-    ----------
-    store
-        The store with their artefacts.
-    writer
-        Writes the offline columns of cells that have rows.
-    requested
-        Repeats of every stage at any cost; 0 for two repeats of short stages, within the budget.
+    `requested` is the number of repeats of every stage at any cost; 0 for two repeats of short stages, within the
+    budget.
     """
 
     def __init__(self, store: Store, writer: ResultWriter, requested: int) -> None:
@@ -72,7 +66,6 @@ class OfflinePlan:
         return True
 
     def finish(self) -> None:
-        """Write the offline columns of the cells whose repeats were planned."""
         stages = {one.key: one for goal in self._cells.values() for some in goal.offline.values() for one in some}
         runs = {key: self._runs(stage) for key, stage in stages.items()}
         known = {key: some for key, some in runs.items() if some}
@@ -113,16 +106,8 @@ class TimingPlan:
     is timed in blocks of rounds; each block is planned when the previous one has ended. A cell whose comparisons are
     decided takes no part any more.
 
-    Parameters
-    ----------
-    goals
-        The last stages of the cells that can be timed here, by cell.
-    rounds
-        Upper limit of rounds.
-    writer
-        Knows which cells have rows and seconds.
-    fewest
-        Rounds of every cell, if the limit allows them.
+    `goals` are the last stages of the cells that can be timed here. `rounds` is the upper limit of rounds, `fewest` the
+    number of rounds of every cell if the limit allows them.
     """
 
     def __init__(self, goals: Mapping[Cell, CellQueries], rounds: int, writer: ResultWriter, fewest: int) -> None:
@@ -137,10 +122,7 @@ class TimingPlan:
     def start(self, todo: Iterable[Cell]) -> list[TimingRounds]:
         """Register the cells that will get new rows.
 
-        Returns
-        -------
-        list
-            The stages of the groups that wait for none of them, and have cells without seconds.
+        Returns the stages of the groups that wait for none of them, and have cells without seconds.
         """
         waiting = set(todo)
         for cell in self._goals:
@@ -156,7 +138,6 @@ class TimingPlan:
         return None if self._open[group] else self._begin(group)
 
     def members(self, stage: TimingRounds) -> Iterable[tuple[Cell, CellQueries]]:
-        """The cells of the group of a planned stage, with their goals."""
         return self._planned[stage.key].members.items()
 
     def _begin(self, group: tuple[object, ...]) -> TimingRounds | None:
@@ -168,7 +149,6 @@ class TimingPlan:
         return self._block(_Group(members, fine), self._session, members.values())
 
     def _block(self, group: _Group, session: int, goals: Iterable[CellQueries]) -> TimingRounds:
-        """The next block of a group, of some of its goals."""
         # Cells that differ only in their labels share one goal.
         mine = tuple({goal.key: goal for goal in goals}.values())
         rounds = block_sizes(self._rounds)[group.blocks]

@@ -186,7 +186,6 @@ def _done(job: Job, items: Items, batch: Batch, send: Send, enter: Enter) -> dic
 
 
 def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:
-    """The value of `work()`, or the reason of its failure."""
     try:
         with _memory_limit(memory_gib):
             return work()

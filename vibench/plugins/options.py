@@ -119,7 +119,6 @@ def checked_arguments(plugin: type, what: str, given: Mapping[str, Any]) -> dict
 
 
 def options_as_json(options: Mapping[str, Any]) -> str:
-    """Checked options as canonical JSON."""
     return json.dumps(TypeAdapter(dict[str, Any]).dump_python(dict(options), mode="json"), sort_keys=True)
 
 

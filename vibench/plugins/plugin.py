@@ -68,7 +68,6 @@ class Plugin:
 
     @property
     def is_given(self) -> bool:
-        """Whether it is a class or an object passed in Python."""
         return self.code.startswith("object ")
 
     @property

@@ -89,11 +89,6 @@ class RegisteredPlugin:
         return "" if owner == "vibench" else owner
 
     @property
-    def reference(self) -> str:
-        """Location, "module:attribute"."""
-        return f"{self._entry.module}:{self._entry.attr}"
-
-    @property
     def _entry(self) -> EntryPoint:
         if not self.entries:
             raise unknown_name(self.kind, self.name, registered(self.kind))
@@ -113,7 +108,6 @@ class RegisteredPlugin:
 
     @property
     def names_of_options(self) -> list[str]:
-        """Names of its options, read from the source."""
         return [option for entry in self.entries for option in names_of_options(entry.module, entry.attr)]
 
     def load(self) -> Any:
@@ -157,12 +151,10 @@ class RegisteredPlugin:
 
     @property
     def missing(self) -> list[str]:
-        """Requirements that are not installed."""
         return [one for one in self.requirements if not distribution_version(one)]
 
     @property
     def options(self) -> Mapping[str, Option]:
-        """Its options by name, read from its constructor."""
         from vibench.plugins.options import options_of
 
         return options_of(self.load())
@@ -232,7 +224,6 @@ class RegisteredPlugin:
 
 
 def find(kind: PluginKind, name: str) -> RegisteredPlugin:
-    """The entry points of a name, possibly none."""
     return registered(kind).get(name) or RegisteredPlugin(kind, name)
 
 
