@@ -32,13 +32,13 @@ UNCORRECTED, FEASIBLE = "none", "feasible"
 
 
 NOT_MOVED: Mapping[str, str] = {}
-"""Files and folders of a cell are where they were."""
+"""New places of files and folders of a cell: none."""
 
 PLUGINS = ("problem", "dual", "primal", "formulation", "training", "validation_sampling")
 """Names of plugins in the definition of a cell; all but the first may be `None`."""
 
 NO_SUCH_AXIS = "–"
-"""What tables show of an axis that the formulation of a cell does not have."""
+"""Entry of tables on an axis that the formulation of a cell does not have."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Axes:
 
 @dataclass(frozen=True)
 class Cell:
-    """One cell: a problem, strategies, tolerances, a QP solver, and how queries are assembled and corrected.
+    """A problem, strategies, tolerances, a QP solver, and how queries are assembled and corrected.
 
     `interpolation` is the tolerance of reduced assembly, `None` for full assembly; certified queries are assembled as
     reduced ones. What the `formulation` does not use is `None`. `labels` of problem, dual and primal strategy are no
@@ -85,7 +85,7 @@ class Cell:
 
     @cached_property
     def key(self) -> str:
-        """Hash of everything but the code that determines the cell's numbers."""
+        """Hash of everything that determines the numbers of the cell except for the code."""
         content = self._content()
         del content["labels"], content["nested_tolerances"], content["set_labels"]
         content.pop("formulation_label", None)
@@ -102,7 +102,7 @@ class Cell:
         return json.dumps(self._content(), sort_keys=True, ensure_ascii=False)
 
     def _content(self) -> dict[str, Any]:
-        """The cell as results files hold it: its parameter sets lie in five entries beside the others."""
+        """The cell as stored in results files, where five entries describe its parameter sets."""
         content = asdict(self)
         training, validation = content.pop("training"), content.pop("validation")
         if self.correction == UNCORRECTED:  # as before there was a choice
@@ -119,10 +119,10 @@ class Cell:
     def from_definition(cls, text: str, places: Mapping[str, str] = NOT_MOVED) -> Cell:
         """The cell of a definition, with the code of its plugins as installed.
 
-        `places` are where files and folders of its plugins are now, by the names under which results know them.
+        `places` are new paths of files and folders of its plugins, by their names in results.
 
-        Raises a `RequestError` if a plugin is not installed, a file that its options name cannot be read, or `places`
-        has a name that is none of them.
+        Raises a `RequestError` if a plugin is not installed, a file in its options cannot be read, or a name in
+        `places` is unknown.
         """
         content = json.loads(text)
         plugins = {name: Plugin(**content[name]) for name in PLUGINS if content.get(name)}  # not all in older ones
@@ -134,7 +134,7 @@ class Cell:
             plugins["formulation"] = Plugin.of(find(FORMULATION, name), {}, {})
             content["formulation_label"] = name
         for name in PLUGINS:
-            content[name] = _found(plugins[name].moved(places)) if name in plugins else None
+            content[name] = _installed(plugins[name].moved(places)) if name in plugins else None
         for axis in ("pod", "cone"):
             content[axis] = None if content[axis] is None else Stop(**content[axis])
         for name in ("labels", "nested_tolerances"):
@@ -148,19 +148,18 @@ class Cell:
 
     @property
     def axes(self) -> Axes:
-        """The axes of the cell, without solver, assembly and correction."""
         return Axes(self.problem, self.dual, self.primal, self.pod, self.cone, self.primal_tol, self.training)
 
     @property
     def plugins(self) -> tuple[Plugin, ...]:
-        """Its plugins, the solver aside."""
+        """All plugins but the solver."""
         samplings = (one.sampling for one in (self.training, self.validation) if one.sampling is not None)
         chosen = (one for one in (self.dual, self.primal) if one is not None)
         return (self.problem, *chosen, self.formulation, *samplings)
 
     @property
     def code(self) -> str:
-        """Hash of the code that computes the cell: that of vibench, of its plugins and of its solver."""
+        """Hash of the code that computes the cell: of vibench, its plugins and its solver."""
         codes = [plugin.code for plugin in self.plugins]
         codes += [] if self.solver is None else [find(SOLVER, self.solver).code]
         return digest([numerical_code(), *codes])
@@ -188,8 +187,8 @@ class Cell:
         return " · ".join(filter(None, chosen)) + way
 
 
-def _found(plugin: Plugin) -> Plugin:
-    """A recorded plugin with the code that is installed; an error about its files says how to tell where they are."""
+def _installed(plugin: Plugin) -> Plugin:
+    """A recorded plugin with the installed code; an error about its files names the option for their new place."""
     try:
         return plugin.as_installed()
     except RequestError as error:

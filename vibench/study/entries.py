@@ -31,7 +31,7 @@ Name: TypeAlias = Annotated[str, MinLen(1)]
 
 
 def as_list(value: Any) -> Any:
-    """A value that may stand for a list of one."""
+    """A list, or a single value as a list of one."""
     return value if isinstance(value, list) else [value]
 
 
@@ -39,13 +39,13 @@ STRICT = ConfigDict(extra="forbid", strict=True, frozen=True)
 """Configuration of the tables of a study file: unknown keys are refused, and no type is converted."""
 
 
-def is_text_of_a_file(value: Any) -> bool:
-    """Whether a value may stand in a study file, or is an entry already; what may not is a class or an object."""
+def _is_plain(value: Any) -> bool:
+    """Whether a value may occur in a study file, or is an entry already; others are classes or objects."""
     return value is None or isinstance(value, str | int | float | list | dict | date | time | BaseModel)
 
 
 class Entry(BaseModel):
-    """One entry of an axis of plugins; from Python its name may be a class or an object, too, or the entry be one."""
+    """One entry of an axis of plugins; in Python a class or an object may replace the name or the whole entry."""
 
     model_config = STRICT
 
@@ -59,9 +59,8 @@ class Entry(BaseModel):
     @model_validator(mode="wrap")
     @classmethod
     def _from_python(cls, value: Any, build: ModelWrapValidatorHandler[Self]) -> Self:
-        """An entry whose name is a class or an object."""
         given = value.get("name") if isinstance(value, dict) else value
-        if is_text_of_a_file(given):
+        if _is_plain(given):
             return build(value)
         name = (given if isinstance(given, type) else type(given)).__name__
         entry = build((value if isinstance(value, dict) else {}) | {"name": name})
@@ -75,13 +74,13 @@ class Entry(BaseModel):
 
     @property
     def is_registered(self) -> bool:
-        """Whether it names a plugin, and is no class or object."""
+        """Whether it names a plugin, and does not hold a class or an object."""
         return self._given is None
 
     def registered(self, kind: PluginKind) -> RegisteredPlugin:
-        """What is registered under its name, or the class or object that it was given, as it was at first.
+        """The registry entry of its name, or its class or object in the state of the first call.
 
-        Raises a `RequestError` if what it was given is none of the kind, or cannot be sent to worker processes.
+        Raises a `RequestError` if this is not of the kind, or cannot be sent to worker processes.
         """
         if self.is_registered:
             return find(kind, self.name)
@@ -90,22 +89,20 @@ class Entry(BaseModel):
         return self._given
 
     def plugin(self, kind: PluginKind) -> Plugin:
-        """The plugin with its options."""
         return Plugin.of(self.registered(kind), self.options, self.places)
 
     @property
     def places(self) -> Mapping[str, str]:
-        """Where files and folders are that its options name, by option, if these do not say it."""
+        """Paths of files and folders, by option, where the options have only their names."""
         return self._places
 
     def at(self, places: Mapping[str, str]) -> Self:
-        """The entry, whose files and folders are at these places, by option."""
+        """The entry with files and folders at these places, by option."""
         self._places = places
         return self
 
     @property
     def title(self) -> str:
-        """Label, or name."""
         return self.label or self.name
 
 
@@ -157,7 +154,7 @@ class SamplingEntry(Entry):
 
 
 def _number_or_table(value: Any) -> str:
-    return "<number>" if is_text_of_a_file(value) and not isinstance(value, dict | str | SamplingEntry) else "<table>"
+    return "<number>" if _is_plain(value) and not isinstance(value, dict | str | SamplingEntry) else "<table>"
 
 
 def _drawn(entry: SamplingEntry) -> SamplingEntry:

@@ -1,4 +1,4 @@
-"""A study and its cells: the file read, the cells that its axes and tolerances make, and the study that one makes."""
+"""Reading studies, expanding them into cells, and the study of a single cell."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def find_study(request: str) -> Path:
     Raises a `RequestError` if there is no such file or registered study.
     """
     path = Path(request)
-    # os.path, since methods of Path raise OSError for names too long for a file.
+    # Methods of Path raise an OSError if a name is too long for a file.
     is_file, exists = os.path.isfile(path), os.path.exists(path)  # noqa: PTH110, PTH113
     if path.suffix != ".toml" and not is_file:
         if exists and request not in registered(STUDY):
@@ -66,7 +66,7 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
         raise RequestError(f"{path}: cannot be read as text: {error}") from None
     try:
         content = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # beside syntax errors: numbers too long, nesting too deep
+    except (ValueError, RecursionError) as error:  # syntax errors, numbers too long, nesting too deep
         raise RequestError(f"{path}: not valid TOML: {error}") from None
     given = {key: list(values) for key, values in (overrides or {}).items() if values}
     source = str(path) if path == Path(request) else f"study '{request}'"
@@ -80,7 +80,7 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
 
 
 def _anchor(content: dict[str, Any], folder: Path) -> None:
-    """Take the paths among the options of problems and sampling strategies, in unchecked content, from a folder."""
+    """Make paths in the options of problems and sampling strategies relative to a folder, in unchecked content."""
     problems = _tables(content.get("problem"))
     for entry in problems:
         _anchor_options(PROBLEM, entry, folder)
@@ -91,7 +91,6 @@ def _anchor(content: dict[str, Any], folder: Path) -> None:
 
 
 def _tables(entries: Any) -> list[dict[str, Any]]:
-    """The entries of an unchecked axis that are tables."""
     return [entry for entry in (entries if isinstance(entries, list) else [entries]) if isinstance(entry, dict)]
 
 
@@ -105,11 +104,12 @@ def _anchor_options(kind: PluginKind, entry: dict[str, Any], folder: Path) -> No
 
 
 def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> dict[str, Any]:
-    """The content of a study file, not checked yet, with the axes and tolerances given on the command line."""
+    """Unchecked content of a study file with the axes and tolerances of the command line."""
     for axis in ("problem", "formulation", "dual", "primal", "solvers"):
         if axis in given:
             content[axis] = [entry for name in given[axis] for entry in _entries_in(content.get(axis), name)]
-    content |= {axis: given[axis] for axis in ("correction",) if axis in given}
+    if "correction" in given:
+        content["correction"] = given["correction"]
     tables = content.get("tolerances")
     if isinstance(tables, list) and all(isinstance(table, dict) for table in tables):
         primal = content.get("primal")
@@ -137,7 +137,7 @@ def _takes_tolerance(entry: Any) -> bool:
 
 
 def _entries_in(axis: Any, name: str) -> list[Any]:
-    """The entries of an unchecked axis that have this name or label; the name itself if there are none."""
+    """Entries of an unchecked axis with this name or label; the name itself if there are none."""
     tables = [entry for entry in axis if isinstance(entry, dict)] if isinstance(axis, list) else []
     return [entry for entry in tables if name in (entry.get("name"), entry.get("label"))] or [name]
 
@@ -196,7 +196,7 @@ _Made: TypeAlias = tuple[EntryT, Plugin]
 
 
 def _made(kind: PluginKind, entries: Sequence[EntryT]) -> list[_Made[EntryT]]:
-    """The entries of an axis, each with its plugin: titles need not tell them apart."""
+    """The entries of an axis, each with its plugin, since titles may coincide."""
     return [(entry, entry.plugin(kind)) for entry in entries]
 
 
@@ -217,7 +217,7 @@ _Offline: TypeAlias = tuple[_Made[Entry] | None, Stop | None, Stop | None, _Made
 def _combinations(
     duals: Sequence[_Made[Entry]], primals: Sequence[_Made[Entry]], table: ToleranceTable, uses: Sequence[str]
 ) -> list[_Offline]:
-    """Strategies and tolerances of the offline phase; one `None` on each axis that a formulation does not use."""
+    """Strategies and tolerances of the offline phase, with `None` on each axis that a formulation does not use."""
     pods = [Stop(tolerance=value) for value in table.pod or []] + [Stop(size=value) for value in table.N or []]
     chosen = product(
         pods if "pod" in uses else [None], duals if "dual" in uses else [None], primals if "primal" in uses else [None]
@@ -231,7 +231,7 @@ def _combinations(
 
 
 def _solved(study: Study, entry: FormulationEntry) -> list[tuple[str, str, str | None, float | None]]:
-    """Assembly, correction, solver and accuracy of the queries of a formulation, as far as it has these axes."""
+    """Assembly, correction, solver and accuracy of the queries of a formulation, on the axes that it has."""
     kind, assemblies, corrections = entry.kind, list[str](study.assembly), list[str](study.correction)
     if "assembly" not in entry.uses:
         assemblies = [kind.assembled]
@@ -245,11 +245,11 @@ def _solved(study: Study, entry: FormulationEntry) -> list[tuple[str, str, str |
 
 
 def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
-    """The study that has one cell, whose key is that of the cell given.
+    """The study of a single cell, with the same key.
 
-    Other settings are those that do not determine its numbers: `timing_rounds`, `timing_rounds_min`, `limits`.
+    `settings` do not determine its numbers: `timing_rounds`, `timing_rounds_min`, `limits`.
 
-    Raises a `RequestError` if a plugin of the cell is not installed, or the name is none of a study.
+    Raises a `RequestError` if a plugin of the cell is not installed, or the name is not one of a study.
     """
     axes = {"problem": cell.problem, "dual": cell.dual, "primal": cell.primal}
     chosen = {
@@ -290,25 +290,19 @@ def _plugin_entry(plugin: Plugin, label: str) -> Any:
 
 
 def _entry_of_set(parameters: ParameterSet) -> Any:
-    """The entry of a sampling strategy; `None` of a set of the problem itself."""
+    """The entry of a sampling strategy; `None` for the problem's own set."""
     return None if parameters.sampling is None else _plugin_entry(parameters.sampling, parameters.label)
 
 
 def _stop(tolerance: str, size: str, stop: Stop | None) -> tuple[str, list[float] | list[int]]:
-    """Key and value of a grid of tolerances for a basis that stops at a tolerance or at a size.
-
-    A grid needs one; where there is no basis it is any.
-    """
-    if stop is None:
+    """Key and value in a grid of tolerances for a basis that stops at a tolerance or at a size."""
+    if stop is None:  # there is no basis, but the grid needs a value
         return size, [1]
     return (tolerance, [stop.tolerance]) if stop.tolerance is not None else (size, [stop.size or 0])
 
 
 def only_cell(cells: Sequence[Cell], key: str, where: str) -> Cell:
-    """The cell whose key begins so.
-
-    Raises a `RequestError` if there is none, or several.
-    """
+    """The cell whose key begins with `key`; raises a `RequestError` if there is none, or several."""
     matching = [cell for cell in cells if cell.key.startswith(key)]
     if len(matching) != 1:
         raise RequestError(f"{len(matching)} cells of {where} begin with '{key}', expected one")

@@ -115,7 +115,7 @@ class ToleranceTable(_Model):
     def of_primal(self, entry: Entry) -> list[float | None]:
         """Tolerances of one primal strategy; [`None`] for a strategy that takes none."""
         plugin = entry.registered(PRIMAL)
-        if plugin.conflict:  # whether it takes one or not, its cells cannot be run
+        if plugin.conflict:  # its cells cannot be run, whether it takes a tolerance or not
             return list(self.primal.get(entry.title, self.primal.get(entry.name, [None])))
         if not plugin.load().takes_tolerance:
             return [None]
@@ -123,7 +123,7 @@ class ToleranceTable(_Model):
 
 
 def _meant_for(values: Any, entry: Entry, key: str) -> list[Any]:
-    """The values for one entry: of a table those under its label or name, of a list all."""
+    """The values for one entry: of a table those under its label or name, otherwise all."""
     if not isinstance(values, dict):
         return list(values)
     own = values.get(entry.title, values.get(entry.name))
@@ -237,19 +237,17 @@ class Study(_Model):
         return study
 
     def training_sets(self, problem: ProblemEntry) -> list[ParameterSet]:
-        """The training sets of a problem."""
         entries = problem.training or self.training
         return [ParameterSet("training", sampling=_sampling(entry), label=entry.title) for entry in entries]
 
     def validation_set(self, problem: ProblemEntry) -> ParameterSet:
-        """The validation set of a problem; the size of one of a sampling strategy is not known yet."""
-        asked = self.validation if problem.validation is None else problem.validation
-        if isinstance(asked, int):
-            return ParameterSet("validation", asked, self.seed)
-        return ParameterSet("validation", 0, self.seed, _sampling(asked), asked.title)
+        """The validation set of a problem; that of a sampling strategy has no size yet."""
+        entry = self.validation if problem.validation is None else problem.validation
+        if isinstance(entry, int):
+            return ParameterSet("validation", entry, self.seed)
+        return ParameterSet("validation", 0, self.seed, _sampling(entry), entry.title)
 
     def solver_names(self) -> list[str]:
-        """Solvers to run: those named, or all that are installed."""
         return installed_solvers(registered(SOLVER)) if self.solvers == "available" else list(self.solvers)
 
 
@@ -277,7 +275,7 @@ def _factorised(entry: ProblemEntry, factorisation: str) -> ProblemEntry:
 
 
 def _check_names(study: Study) -> None:
-    """Check names and options of plugins, and that exactly the strategies which take a tolerance have one."""
+    """Check names and options of plugins, and that exactly the strategies that take a tolerance have one."""
     axes: tuple[tuple[PluginKind, Sequence[Entry]], ...] = (
         (PROBLEM, study.problem), (DUAL, study.dual), (PRIMAL, study.primal),
         (FORMULATION, study.formulation),
@@ -301,7 +299,6 @@ def _check_names(study: Study) -> None:
 
 
 def _check_axes(study: Study) -> None:
-    """Refuse an empty axis that a formulation uses."""
     for formulation in study.formulation:
         for axis in formulation.uses:
             if not getattr(study, axis, True):
@@ -309,7 +306,7 @@ def _check_axes(study: Study) -> None:
 
 
 def _check_given(kind: PluginKind, axis: Sequence[Entry]) -> None:
-    """Refuse a class or an object that has the name of another plugin of its axis."""
+    """Refuse a class or an object with the name of another plugin of its axis."""
     if all(entry.is_registered for entry in axis):
         return
     plugins = {entry.plugin(kind) for entry in axis}
@@ -323,12 +320,12 @@ def _check_given(kind: PluginKind, axis: Sequence[Entry]) -> None:
 
 
 def _check_sets(study: Study, entry: ProblemEntry) -> None:
-    """Check the parameter sets of a problem, for which it is built if it reads files or a strategy samples its box.
+    """Check the parameter sets of a problem before a run, so that a fault does not appear in each of its cells.
 
-    What is wrong with them is found before a run, and not in all of its cells.
+    The problem is built only if it reads files or a strategy samples its box.
     """
-    asked = [*(entry.training or study.training), entry.validation or study.validation]
-    samplings = [one for one in asked if isinstance(one, SamplingEntry) and one.name != OWN]
+    entries = [*(entry.training or study.training), entry.validation or study.validation]
+    samplings = [one for one in entries if isinstance(one, SamplingEntry) and one.name != OWN]
     for sampling in samplings:
         sampling.registered(SAMPLING).check_options(sampling.options)
     if not samplings and not entry.registered(PROBLEM).data_digest({**entry.options, **entry.places}):
@@ -346,7 +343,7 @@ def _check_tolerances(study: Study, table: ToleranceTable) -> None:
         (DUAL, study.dual, table.R),
         (PRIMAL, study.primal, table.primal),
     ):
-        # A tolerance may name a plugin that an option of the command line removed from the axis.
+        # A tolerance may name a plugin that an option of the command line has removed from the axis.
         names = {name for entry in axis for name in (entry.name, entry.title)}
         for name in tolerances if isinstance(tolerances, dict) else ():
             if name not in names and name not in registered(kind):
