@@ -90,11 +90,8 @@ class HighFidelitySolver:
     def solve(self, mu: Array) -> HighFidelitySolution:
         """Assemble and solve at mu (d,).
 
-        Raises
-        ------
-        NumericalError
-            If the assembly is invalid, the solution does not reach `ACCURACY`, the problem refuses it, or B touches
-            unknowns outside the declared `contact_dofs`.
+        Raises a `NumericalError` if the assembly is invalid, the solution does not reach `ACCURACY`, the problem
+        refuses it, or B touches unknowns outside the declared `contact_dofs`.
         """
         vi = checked_assembly(self._problem, mu)
         found = self.verify(mu, vi, self.solve_assembled(mu, vi))
@@ -108,10 +105,7 @@ class HighFidelitySolver:
     def verify(self, mu: Array, vi: VariationalInequality, found: ActiveSetSolution) -> HighFidelitySolution:
         """The solution of `vi`, which has to be the variational inequality solved last, at mu (d,), verified.
 
-        Raises
-        ------
-        NumericalError
-            If its residuals are above `ACCURACY`, or the problem refuses it.
+        Raises a `NumericalError` if its residuals are above `ACCURACY`, or the problem refuses it.
         """
         solution = verified(vi, self._stiffness or self.condensed(vi), found)
         reason = self._problem.refuse(mu, solution.u, solution.lam)
@@ -134,10 +128,7 @@ class HighFidelitySolver:
 
         The factorisation is reused: `vi` has to be the variational inequality solved last, at mu (d,).
 
-        Raises
-        ------
-        NumericalError
-            Naming mu and the missing property.
+        Raises a `NumericalError` naming mu and the missing property.
         """
         name = f"A at mu = {mu.tolist()}"
         check_symmetric(vi.A, name)
@@ -209,10 +200,7 @@ def solve_high_fidelity(
     start
         Initial active set (m,); empty by default.
 
-    Raises
-    ------
-    NumericalError
-        If neither the active set method nor its fallback reaches `ACCURACY`.
+    Raises a `NumericalError` if neither the active set method nor its fallback reaches `ACCURACY`.
     """
     stiffness = stiffness or CondensedStiffness(vi.A)
     return verified(vi, stiffness, solve_unverified(vi, stiffness, start))
@@ -223,10 +211,7 @@ def solve_unverified(
 ) -> ActiveSetSolution:
     """Solve one variational inequality up to round-off; arguments are those of `solve_high_fidelity`.
 
-    Raises
-    ------
-    NumericalError
-        If neither the active set method nor its fallback finds a solution.
+    Raises a `NumericalError` if neither the active set method nor its fallback finds a solution.
     """
     # Opposite rows whose bounds differ by round-off are an equality.
     reading = rows_that_matter(vi.B, vi.g, 1e-14 * np.abs(vi.g))
@@ -254,10 +239,7 @@ def verified(
 ) -> HighFidelitySolution:
     """A solution with its natural residuals, refined where these are above `ACCURACY`.
 
-    Raises
-    ------
-    NumericalError
-        If they are still above it then.
+    Raises a `NumericalError` if they are still above it then.
     """
     solution = _refined_to_accuracy(vi, stiffness, found)
     if not solution.residuals.worst <= ACCURACY:

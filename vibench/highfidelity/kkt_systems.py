@@ -418,10 +418,7 @@ class SaddlePointSolver:
     def __call__(self, active: Indices) -> tuple[Array, Array]:
         """The solution u (c,), λ (m,) with the active constraints as equalities and no other multiplier.
 
-        Raises
-        ------
-        RuntimeError
-            If the system is exactly singular.
+        Raises a `RuntimeError` if the system is exactly singular.
         """
         solution, is_active = None, np.zeros(len(self._g), bool)
         is_active[active] = True
@@ -488,11 +485,8 @@ def _in_units(rows: Array, matrix: SparseMatrix, columns: Array) -> SparseMatrix
 class _BorderedFactorisation:
     """The LU factorisation of a symmetric system K (k×k), solved with borders of a few rows and columns.
 
-    Raises
-    ------
-    RuntimeError
-        If it is exactly singular. A system that is singular up to round-off may still be consistent; its solution is
-        verified by the active set method.
+    Raises a `RuntimeError` if it is exactly singular. A system that is singular up to round-off may still be
+    consistent; its solution is verified by the active set method.
     """
 
     def __init__(self, matrix: SparseMatrix, last: int | None = None) -> None:

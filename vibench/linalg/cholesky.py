@@ -58,10 +58,7 @@ class SparseCholesky(Factor):
     order
         Unknowns in elimination order, in which F is upper triangular.
 
-    Raises
-    ------
-    NumericalError
-        If X is not positive definite.
+    Raises a `NumericalError` if X is not positive definite.
     """
 
     def __init__(self, matrix: SparseMatrix, name: str = "the matrix") -> None:
@@ -132,10 +129,7 @@ class PartialCholesky(FactoredElimination):
     name
         X in error messages.
 
-    Raises
-    ------
-    NumericalError
-        If X_ii is not positive definite; an indefinite S is detected where it is factorised.
+    Raises a `NumericalError` if X_ii is not positive definite; an indefinite S is detected where it is factorised.
     """
 
     def __init__(self, matrix: SparseMatrix, order: Indices, last: int, name: str = "the matrix") -> None:

@@ -106,10 +106,7 @@ def kkt_residuals(program: VariationalInequality, x: Array, alpha: Array, norms:
     norms
         Norms in A⁻¹ where A is factorised already.
 
-    Raises
-    ------
-    NumericalError
-        If A is not positive definite.
+    Raises a `NumericalError` if A is not positive definite.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # a diverging solver returns infinite residuals
         return _residuals(program, x, alpha, norms or dual_norms(program.A))
@@ -161,10 +158,7 @@ def _energy(program: VariationalInequality, x: Array, force: float) -> float:
 def dual_norms(A: SparseMatrix | Array) -> DualNorms:
     """The `DualNorms` of a symmetric positive definite A (n×n), which is factorised here.
 
-    Raises
-    ------
-    NumericalError
-        If it is not positive definite.
+    Raises a `NumericalError` if it is not positive definite.
     """
     if not isinstance(A, np.ndarray):
         factor = SparseCholesky(A, "A")
@@ -229,10 +223,7 @@ RECOGNISED = 30.0
 def check_answer(program: VariationalInequality, answer: QPSolution, accuracy: float) -> None:
     """Refuse the answer of a timed repetition that does not solve its program to `RECOGNISED` times the accuracy.
 
-    Raises
-    ------
-    NumericalError
-        Naming the residual.
+    Raises a `NumericalError` naming the residual.
     """
     status, reason, _ = verify(program, answer, RECOGNISED * accuracy)
     if status is not Status.OK:

@@ -146,10 +146,7 @@ class GrowingCone:
     error
         Its distance, relative to the largest norm of a snapshot.
 
-    Raises
-    ------
-    NumericalError
-        If a snapshot has a negative coefficient: it would not be in W⁺.
+    Raises a `NumericalError` if a snapshot has a negative coefficient: it would not be in W⁺.
     """
 
     def __init__(self, snapshots: Array, W: InnerProduct) -> None:

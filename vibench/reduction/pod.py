@@ -34,10 +34,7 @@ def pod(snapshots: Array, V: InnerProduct, stop: Stop) -> POD:
     The eigenvalues of the correlation matrix UᵀX_V U, the method of snapshots, have a floor of 1e-8 in relative terms.
     The number of modes is given by `stop`: a relative tail, or a size.
 
-    Raises
-    ------
-    NumericalError
-        If more modes are requested than the numerical rank of the snapshots.
+    Raises a `NumericalError` if more modes are requested than the numerical rank of the snapshots.
     """
     if not snapshots.shape[1]:
         return POD(np.zeros((V.dim, 0)), np.zeros(1))

@@ -168,10 +168,7 @@ class LoadCoordinates:
     def supremizers(self, varying: Array) -> Array:
         """Coordinates (d'×k) of the supremizers with `varying` (j×k) added to the fixed loads; those after d' are zero.
 
-        Raises
-        ------
-        NumericalError
-            If the loads reach unknowns that they were not said to.
+        Raises a `NumericalError` if the loads reach unknowns that they were not said to.
         """
         j = len(varying)
         if j > self._reached.shape[1]:
