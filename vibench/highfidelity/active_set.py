@@ -149,7 +149,6 @@ class HighFidelitySolver:
         return start
 
     def _nearest_contact_set(self, mu: Array) -> Mask | None:
-        """Contact set of the nearest parameter solved so far; distances are relative to the widths of the box."""
         if not self._active:
             return None
         distances = np.linalg.norm((np.array(self._solved) - mu) / self._width, axis=1)

@@ -139,7 +139,7 @@ class CondensedStiffness:
             SparseCholesky(self._condensed.schur, name)  # its message has this name
 
     def solve(self, right: Array) -> Array:
-        """A⁻¹ r for right-hand sides (n, k)."""
+        """The solution A⁻¹ r for right-hand sides (n, k)."""
         load, particular = self._condensed.eliminate(right)
         return self._condensed.recover(self.compliance(load), particular)
 
@@ -178,7 +178,6 @@ class CondensedStiffness:
         self._by_inverse = self._inverts_for(rows)
 
     def _inverts_for(self, rows: int) -> bool:
-        """Whether the liftings of so many rows come from Ŝ⁻¹."""
         # LAPACK inverts up to 1024 unknowns in less time than solutions for half as many rows take.
         return self.dense or len(self.retained) <= min(1024, 2 * rows)
 
@@ -300,7 +299,6 @@ class ZoneStiffness(CondensedStiffness):
         return condensed, condensed.dense_blocks.inverse("A")
 
     def active_set_system(self, vi: VariationalInequality) -> ActiveSetSystem:
-        """The KKT systems of the active sets of `vi`, whose stiffness must be this one."""
         if self.zone is None:
             self.zone = zone_of(vi.B, coarse_contact(self.solve, vi))
         zone, inside = self.zone, watched(vi.B, self.zone)
@@ -477,7 +475,6 @@ class SaddlePointSolver:
 
 
 def _in_units(rows: Array, matrix: SparseMatrix, columns: Array) -> SparseMatrix:
-    """A matrix (CSR) with its rows and columns multiplied by factors."""
     data = np.repeat(rows, np.diff(matrix.indptr)) * matrix.data * columns[matrix.indices]
     return sp.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
 
@@ -490,7 +487,6 @@ class _BorderedFactorisation:
     """
 
     def __init__(self, matrix: SparseMatrix, last: int | None = None) -> None:
-        """Of ordered systems `last` is the number of multipliers, at the end."""
         self._matrix, self.pivots = matrix, None
         self._unbordered: Array | None = None
         self._columns = dict[int, Array]()
@@ -501,7 +497,7 @@ class _BorderedFactorisation:
             self._factor = splu(matrix)
 
     def split(self, functionals: Array) -> tuple[Array, Array]:
-        """For ℓ (n×k), x (n×k) of the solution with ℓ and zero on the right, and yᵀ(B_a A⁻¹B_aᵀ)y (k,)."""
+        """The x (n×k) of the solution with ℓ (n×k) and zero on the right, and yᵀ(B_a A⁻¹B_aᵀ)y (k,)."""
         assert self.pivots is not None  # of an ordered system
         n = len(functionals)
         right = np.zeros((self._matrix.shape[0], functionals.shape[1]))
@@ -590,7 +586,6 @@ class ComplianceSolver:
         return self._unconstrained - self._compliance @ (rows.T @ forces), lam
 
     def _contact_of(self, active: Indices) -> Array:
-        """The compliance B_a C B_aᵀ of active rows."""
         # Successive active sets share the matrix of all rows, which pays once a quarter of them are active.
         if self._contact is None and 4 * len(active) < len(self._rows):
             return self._compliance.congruent(self._B[active])

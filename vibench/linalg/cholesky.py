@@ -76,7 +76,6 @@ class SparseCholesky(Factor):
 
     @property
     def nbytes(self) -> int:
-        """Memory of the factors: a value of 8 bytes and an index of 4 per entry."""
         return 12 * int(self._lu.nnz)
 
     @cached_property
@@ -87,15 +86,14 @@ class SparseCholesky(Factor):
         return lower
 
     def solve(self, right: Array) -> Array:
-        """X⁻¹ r for right-hand sides (n,) or (n, k)."""
         return few_at_once(self._lu.solve, np.ascontiguousarray(right))
 
     def apply_factor(self, u: Array) -> Array:
-        """F u, for u (n,) or (n, k)."""
+        """The product F u for u (n,) or (n, k)."""
         return _scale_rows(self._root, self._lower.T @ u[self.order])
 
     def solve_factor(self, y: Array) -> Array:
-        """F⁻¹ y, for y (n,) or (n, k)."""
+        """The solution F⁻¹ y for y (n,) or (n, k)."""
         u = np.empty_like(y, dtype=float)
         if y.size:
             scaled = _scale_rows(1.0 / self._root, y)
@@ -103,7 +101,7 @@ class SparseCholesky(Factor):
         return u
 
     def solve_factor_transposed(self, right: Array) -> Array:
-        """F⁻ᵀ r, for r (n,) or (n, k)."""
+        """The solution F⁻ᵀ r for r (n,) or (n, k)."""
         permuted = np.ascontiguousarray(right[self.order])
         if not permuted.size:
             return permuted
@@ -155,7 +153,6 @@ class PartialCholesky(FactoredElimination):
 
     @cached_property
     def _columns(self) -> SparseMatrix:
-        """The columns [L_ii; L_ci] of the unit lower factor."""
         lower = sp.csc_array(self._lu.L)[:, : self._split]
         lower.sort_indices()
         return lower
@@ -217,7 +214,6 @@ class PartialCholesky(FactoredElimination):
         return np.concatenate([first, self.trailing_factor @ u[self._split :]])
 
     def solve_factor(self, y: Array) -> Array:
-        """F⁻¹ y, for y (n,) or (n, k)."""
         split, u = self._split, np.empty_like(y, dtype=float)
         last = y[split:]
         if last.size:
@@ -315,7 +311,7 @@ def round_off_of_factors(lu: SuperLU, split: int, corner: SparseMatrix, weights:
 
 
 def have_one_pattern(first: SparseMatrix, second: SparseMatrix) -> bool:
-    """Whether two matrices of one format have their entries, in sorted order, at the same places."""
+    """Check whether two matrices of one format have their entries, in sorted order, at the same places."""
     return all(map(np.array_equal, _pattern(first), _pattern(second)))
 
 
@@ -339,7 +335,6 @@ def _rows_of(matrix: SparseMatrix, rows: slice, columns: int) -> SparseMatrix:
 
 
 def _triangular_solutions(factor: SparseMatrix, right: Array, *, lower: bool) -> Array:
-    """Solve with a factor of unit diagonal (n×n) for right-hand sides (n,) or (n, k)."""
     return few_at_once(lambda r: spsolve_triangular(factor, r, lower=lower, unit_diagonal=True), right)
 
 

@@ -57,7 +57,7 @@ class BlockDiagonal:
         return product
 
     def times_sparse(self, values: Array) -> Array:
-        """X v for a symmetric X and values (c,) or (c, k), most rows of which may be zero."""
+        """The product X v for a symmetric X and values (c,) or (c, k), most rows of which may be zero."""
         product = np.zeros((self.size, *values.shape[1:]))
         for unknowns, block in self.blocks:
             part = values[unknowns]
@@ -76,7 +76,7 @@ class BlockDiagonal:
         return matrix
 
     def congruent(self, rows: SparseMatrix) -> Array:
-        """R X Rᵀ (k×k) for a sparse R (k×c)."""
+        """The product R X Rᵀ (k×k) for a sparse R (k×c)."""
         total, rows = np.zeros((rows.shape[0], rows.shape[0])), sp.csr_array(rows)
         for unknowns, block in self.blocks:
             part, compliance = rows if len(self.blocks) == 1 else rows[:, unknowns], block
@@ -100,11 +100,11 @@ class BlockDiagonal:
         return self._by_blocks(name, lambda block: np.asarray(scipy.linalg.cholesky(block)))
 
     def inverse(self, name: str, overwrite: bool = False) -> BlockDiagonal:
-        """X⁻¹ for a symmetric positive definite X, which may be overwritten; raises as `cholesky` does."""
+        """The inverse X⁻¹ of a definite X, which may be overwritten; raises as `cholesky` does."""
         return self._by_blocks(name, partial(_inverse, overwrite=overwrite))
 
     def solve_triangular(self, right: Array, transposed: bool = False) -> Array:
-        """F⁻¹ r, or F⁻ᵀ r, for an upper triangular F and r (c,) or (c, k)."""
+        """The solution F⁻¹ r, or F⁻ᵀ r, for an upper triangular F and r (c,) or (c, k)."""
         solution, trans = np.empty_like(right, dtype=float), "T" if transposed else "N"
         for unknowns, block in self.blocks:
             part = right[unknowns]
@@ -163,7 +163,7 @@ class Factor(ABC):
 
     @abstractmethod
     def solve(self, right: Array) -> Array:
-        """X⁻¹ r for right-hand sides (n,) or (n, k)."""
+        """The solution X⁻¹ r for right-hand sides (n,) or (n, k)."""
 
     def entries(self, n: int) -> float:
         """Upper bound of the number of entries of the triangular factor of a matrix (n×n)."""
@@ -184,7 +184,7 @@ class Elimination(ABC):
 
     @abstractmethod
     def eliminate(self, right: Array) -> tuple[Array, Array]:
-        """For r (n,) or (n, k), X_ii⁻¹ r_i and the load of the Schur complement, r_c − X_ci X_ii⁻¹ r_i."""
+        """The solution X_ii⁻¹ r_i and the load of the Schur complement, r_c − X_ci X_ii⁻¹ r_i, for r (n,) or (n, k)."""
 
     @abstractmethod
     def extend(self, last: Array) -> Array:
@@ -204,11 +204,11 @@ class FactoredElimination(Elimination):
 
     @abstractmethod
     def apply_factor(self, u: Array) -> Array:
-        """F u, for u (n,) or (n, k): first the entries of i."""
+        """The product F u for u (n,) or (n, k): first the entries of i."""
 
     @abstractmethod
     def solve_factor_transposed(self, right: Array) -> Array:
-        """F⁻ᵀ r, for r (n,) or (n, k); a functional on the last unknowns has nonzeros only in the last entries."""
+        """The solution F⁻ᵀ r for r (n,) or (n, k); a load on the last unknowns has nonzeros only there."""
 
 
 def checked(matrix: SparseMatrix, name: str) -> SparseMatrix:

@@ -97,7 +97,7 @@ class InnerProduct:
 
     @cached_property
     def dense(self) -> Array:
-        """X as an array."""
+        """The matrix X as an array."""
         return np.asarray(self.matrix.toarray())
 
     def factorised_by(self, name: str) -> None:
@@ -126,7 +126,7 @@ class InnerProduct:
             raise RequestError(f"{what} is not of a space of dimension {self.dim}, expected the shape {right}")
 
     def apply(self, u: Array) -> Array:
-        """X u, for u (n,) or (n, k)."""
+        """The product X u for u (n,) or (n, k)."""
         self._refuse_others(u)
         return np.asarray(self.matrix @ u)
 
@@ -145,17 +145,17 @@ class InnerProduct:
         return self._solver.solve(functional)
 
     def whiten(self, u: Array) -> Array:
-        """F u: coordinates in which the inner product is Euclidean; u (n,) or (n, k)."""
+        """Coordinates F u, in which the inner product is Euclidean; u (n,) or (n, k)."""
         self._refuse_others(u)
         return self._factor.apply_factor(u)
 
     def unwhiten(self, y: Array) -> Array:
-        """F⁻¹ y, the inverse of `whiten`; y (n,) or (n, k)."""
+        """The vector F⁻¹ y, the inverse of `whiten`; y (n,) or (n, k)."""
         self._refuse_others(y)
         return self._factor.solve_factor(y)
 
     def whiten_functional(self, functional: Array) -> Array:
-        """F⁻ᵀ ℓ: whitened coordinates of the Riesz representer of ℓ (n,) or (n, k); Euclidean norms are dual norms."""
+        """Coordinates F⁻ᵀ ℓ of the Riesz representer of ℓ (n,) or (n, k); Euclidean norms are dual norms."""
         self._refuse_others(functional)
         return self._factor.solve_factor_transposed(functional)
 
@@ -241,7 +241,7 @@ def orthonormal_range(y: Array, against: Array | None = None) -> Array:
 
 
 def project_out(space: Array, y: Array) -> Array:
-    """(I − Π)y for orthonormal columns `space` (n×l) and y (n,) or (n×k); applied twice against round-off."""
+    """The part (I − Π)y of y (n,) or (n×k) for orthonormal columns `space` (n×l); applied twice against round-off."""
     for _ in range(2):
         y = y - space @ (space.T @ y)
     return y

@@ -65,7 +65,7 @@ class Lanczos:
         self._norm = float(np.sqrt(square)) if square >= 0.0 else float("nan")
 
     def _iterate(self, accuracy: float, smallest: bool) -> tuple[float, float, Array]:
-        """|θ|, its estimated error, and the coefficients of its Ritz vector, once it is accurate or the basis full."""
+        """Value |θ|, its estimated error and the coefficients of its Ritz vector, once accurate or the basis full."""
         ritz = self._ritz(smallest)
         while ritz[1] > accuracy * ritz[0] and self._size < self._count:
             if not (np.isfinite(self._norm) and self._norm > 0.0):
@@ -93,7 +93,7 @@ class Lanczos:
         self._beside[k], self._size = self._norm, k + 1
 
     def _ritz(self, smallest: bool) -> tuple[float, float, Array]:
-        """|θ| of the smallest or of the largest Ritz value, its estimated error, and its vector in the basis."""
+        """Value |θ| of the smallest or the largest Ritz value, its estimated error, and its vector in the basis."""
         k = self._size
         if not k:
             return 0.0, float("inf"), np.zeros(0)

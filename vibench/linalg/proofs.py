@@ -170,7 +170,7 @@ def proved_positive(parts: Sequence[SparseMatrix], scale: Array, order: Indices 
 
 
 def _absolute_sums(part: SparseMatrix, weights: Array) -> Array:
-    """½(|Q| + |Q|ᵀ)w (n,) for Q (n×n, CSC) and w (n,), without a matrix that costs more to make than to multiply."""
+    """Sums ½(|Q| + |Q|ᵀ)w (n,) for Q (n×n, CSC) and w (n,), without forming a matrix."""
     n, sizes = part.shape[0], np.abs(part.data)
     columns = np.repeat(np.arange(n), np.diff(part.indptr))
     of_rows = np.bincount(part.indices, sizes * weights[columns], n)
@@ -178,7 +178,6 @@ def _absolute_sums(part: SparseMatrix, weights: Array) -> Array:
 
 
 def _symmetric_part(matrix: SparseMatrix) -> SparseMatrix:
-    """½(M + Mᵀ) of M (n×n)."""
     mirrored = sp.csc_array(sp.csr_array(matrix))  # sorted
     transposed = sp.csc_array(mirrored.T)
     if not have_one_pattern(mirrored, transposed):
@@ -188,7 +187,7 @@ def _symmetric_part(matrix: SparseMatrix) -> SparseMatrix:
 
 
 def _less_diagonal(matrix: SparseMatrix, squares: Array) -> SparseMatrix:
-    """M − diag(s²) (n×n, CSC) for a sorted M."""
+    """Difference M − diag(s²) (n×n, CSC) for a sorted M."""
     places = np.flatnonzero(matrix.indices == np.repeat(np.arange(len(squares)), np.diff(matrix.indptr)))
     if len(places) < len(squares):
         return sp.csc_array(matrix - sp.diags_array(squares, format="csc"))
@@ -198,7 +197,6 @@ def _less_diagonal(matrix: SparseMatrix, squares: Array) -> SparseMatrix:
 
 
 def _first_shift(matrix: SparseMatrix) -> float:
-    """τ of the first attempt for a matrix (n×n)."""
     # This is well above the round-off of factors of a few thousand unknowns. Factors of meshes in space, with more than
     # 16 entries in a row, have longer sums.
     return 1e-11 * max(1.0, int(matrix.nnz) / (16.0 * max(int(matrix.shape[0]), 1)))

@@ -103,7 +103,7 @@ class PrincipalSubmatrix:
 
     @cached_property
     def places(self) -> Indices:
-        """Where the unknowns are in the submatrix, if all of them are chosen."""
+        """Positions of the unknowns in the submatrix, if all of them are chosen."""
         return np.argsort(self.chosen)
 
     def of(self, A: SparseMatrix) -> SparseMatrix:
@@ -159,14 +159,12 @@ class StaticCondensation:
 
     @property
     def dense_blocks(self) -> BlockDiagonal:
-        """Ŝ body by body."""
         if self._factor is not None and len(self._pattern.interface) == len(self._pattern.retained):
             return self._factor.schur_blocks()
         return BlockDiagonal.of(self.dense_schur)
 
     @property
     def dense_schur(self) -> Array:
-        """Ŝ as an array."""
         if not self.dense:
             # The sparse one is needed and cached there; CSC columns would be written across the rows of the array.
             return np.asarray(sp.csr_array(self.schur).toarray())

@@ -59,13 +59,13 @@ class Rows:
         return self.kept[self.equal]
 
     def program(self, vi: VariationalInequality) -> VariationalInequality:
-        """`vi` with these rows alone."""
+        """The program `vi` with these rows alone."""
         if len(self.kept) == len(vi.g):
             return vi
         return replace(vi, B=sp.csr_array(vi.B)[self.kept], g=vi.g[self.kept])
 
     def multipliers(self, forces: Array, count: int) -> Array:
-        """λ ≥ 0 (m,) from multipliers (k,) of the rows that matter, of any sign on equalities."""
+        """Multipliers λ ≥ 0 (m,) from those (k,) of the rows that matter, of any sign on equalities."""
         lam = np.zeros(count)
         lam[self.kept] = np.where(self.equal, np.maximum(forces, 0.0), forces)
         lam[self.opposite[self.equal]] = (self.ratio * np.maximum(-forces, 0.0))[self.equal]

@@ -211,7 +211,7 @@ def _solve_dual(
 
 
 def _solve_factor(L: Array, right: Array, *, transposed: bool = False) -> Array:
-    """L⁻¹ or L⁻ᵀ times right-hand sides (n,) or (n×k), which may be overwritten, without a copy of L."""
+    """The solution L⁻¹ r or L⁻ᵀ r for r (n,) or (n×k), which may be overwritten, without a copy of L."""
     by_column = L.flags.f_contiguous
     solution, _ = dtrtrs(
         L if by_column else L.T, right, lower=by_column, trans=transposed is by_column, overwrite_b=True
@@ -268,5 +268,4 @@ def _call(
 
 
 def _as_csc(matrix: Any) -> Any:
-    """A dense array as it is, a sparse one as the CSC matrix that qpsolvers expects."""
     return matrix if isinstance(matrix, np.ndarray) else sp.csc_matrix(matrix)

@@ -140,7 +140,6 @@ def accurate_residuals(program: VariationalInequality, x: Array, alpha: Array) -
 
 
 def _extended(array: Any) -> Any:
-    """A vector or a matrix in extended precision; a sparse one shares its indices."""
     if not sp.issparse(array) or array.format not in ("csr", "csc"):
         return array.astype(np.longdouble)
     return type(array)((array.data.astype(np.longdouble), array.indices, array.indptr), shape=array.shape)
@@ -231,7 +230,7 @@ def check_answer(program: VariationalInequality, answer: QPSolution, accuracy: f
 
 
 def infeasibility_certificate(program: VariationalInequality, tolerance: float = 1e-10) -> Array | None:
-    """α ≥ 0 with Bᵀα = 0 and gᵀα = −1 (Farkas), or `None` if no such α is found; dense programs only."""
+    """Multipliers α ≥ 0 with Bᵀα = 0 and gᵀα = −1 (Farkas), or `None` if none are found; dense programs only."""
     if not isinstance(program.B, np.ndarray):
         return None
     kept = np.isfinite(program.g)

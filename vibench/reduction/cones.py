@@ -106,7 +106,6 @@ def project_on_orthant(functional: Array, W: InnerProduct) -> Array:
 
 
 def _solve_block(W: InnerProduct, support: Indices, right: Array) -> Array:
-    """The solution (k,) with the block of X_W of some unknowns (k,)."""
     # Below 128 unknowns a dense system costs less than a sparse one; a dense X_W is stored for small spaces.
     if len(support) > 128:
         return SparseCholesky(W.matrix[support][:, support], "a block of X_W").solve(right)

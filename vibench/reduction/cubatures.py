@@ -65,7 +65,6 @@ def cubature(conditions: Array, tolerance: float) -> tuple[Indices, Array]:
 
 
 def _with_column(Q: Array, R: Array, column: Array) -> tuple[Array, Array]:
-    """The economic QR decomposition of a matrix with one more column."""
     if not R.size:
         return column[:, None] / np.linalg.norm(column), np.array([[np.linalg.norm(column)]])
     extended: tuple[Array, Array] = scipy.linalg.qr_insert(Q, R, column, R.shape[1], which="col")

@@ -18,7 +18,7 @@ from vibench.linalg.inner_product import InnerProduct, orthogonal_factorisation
 
 
 def supremizers(V: InnerProduct, B: SparseMatrix, eta: Array) -> Array:
-    """T(mu)η = X_V⁻¹ Bᵀη (n×k) for B (m×n) and multipliers η (m×k)."""
+    """Supremizers T(mu)η = X_V⁻¹ Bᵀη (n×k) for B (m×n) and multipliers η (m×k)."""
     return V.riesz(np.asarray(B.T @ eta))
 
 
@@ -129,7 +129,6 @@ class ContactCoordinates:
         return np.vstack([np.zeros((self._off_contact.shape[1], loads.shape[1])), on_contact])
 
     def vectors(self, coordinates: Array) -> Array:
-        """Vectors (n×k) with these coordinates (d×k)."""
         k = self._off_contact.shape[1]
         last = self._tail.solve_triangular(coordinates[k:])
         return np.asarray(self._off_contact @ coordinates[:k] + self._factor.extend(last))
@@ -177,7 +176,6 @@ class LoadCoordinates:
         return np.asarray(self._fixed[:used] + self._reached[:used, :j] @ varying)
 
     def vectors(self, coordinates: Array) -> Array:
-        """Vectors (n×k) with these first coordinates (d'×k)."""
         return self._contact.vectors(self._axes[:, : len(coordinates)] @ coordinates)
 
 
@@ -196,7 +194,7 @@ def _beside(basis: Array, vectors: Array) -> tuple[Array, Array]:
 # declared ones.
 @lru_cache(maxsize=3)
 def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[Elimination, BlockDiagonal]:
-    """X_V with all unknowns but some E eliminated, and the factor F_EE (|E|×|E|) of its Schur complement."""
+    """The elimination of all unknowns of X_V but some E, and the factor F_EE (|E|×|E|) of its Schur complement."""
     last = np.frombuffer(dofs, np.intp)
     chosen = implementation(V.factorisation)
     factor = chosen.eliminate(V.matrix, chosen.order(V.matrix, last), len(last), "X_V")
@@ -236,7 +234,6 @@ def projected_supremizers(Z: Array, B: SparseMatrix, eta: Array) -> Array:
 
 
 def _loads(B: SparseMatrix, dofs: Indices, eta: Array) -> Array:
-    """Rows of Bᵀη (|E|×k) at some unknowns E."""
     return np.asarray(sp.csr_array(B)[:, dofs].T @ eta)
 
 

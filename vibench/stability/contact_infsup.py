@@ -173,7 +173,6 @@ class ContactInfSup:
         return compliance, lifted, residuals + _gamma(self._terms + 4) * (self._forces(B) + self._norm * lifted)
 
     def _forces(self, B: SparseMatrix) -> Array:
-        """The norms (m,) of the columns of S⁻¹Bᵀ."""
         return np.asarray(sp.linalg.norm(sp.csr_array(B / self._scale), axis=1))
 
     def _left_out(self, B: SparseMatrix, lifted: Array, residuals: Array, sizes: Array) -> float:

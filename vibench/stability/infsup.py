@@ -142,7 +142,6 @@ def inf_sup(on_span: Array, on_generators: Array, cone: ConeBasis) -> InfSup:
 
 
 def _with_few_rows(projected: Array) -> Array:
-    """An isometric image of the columns (k×R) with no more rows than columns."""
     return projected if projected.shape[0] <= projected.shape[1] else np.asarray(np.linalg.qr(projected, mode="r"))
 
 
@@ -214,7 +213,7 @@ class ProjectedSupremizers:
         return ProjectedSupremizers([projected[:count] for projected in self.of_classes], self.classes)
 
     def beta_span(self) -> Array:
-        """β_span at every parameter (P,)."""
+        """The constant β_span at every parameter (P,)."""
         return self.classes.expand_classes([beta_span(projected) for projected in self.of_classes])
 
     def over_steps(self, first: int) -> Array:
@@ -361,7 +360,6 @@ def _positive_semidefinite_part(a: Array) -> Array:
 
 
 def _rounded_quotient(X: Array, M: Array, G: Array) -> float:
-    """The quotient at the nonnegative part of the leading eigenvector of X."""
     leading = np.linalg.eigh(X)[1][:, -1]
     alpha = np.maximum(leading if leading.sum() >= 0.0 else -leading, 0.0)
     return float(alpha @ M @ alpha) / float(alpha @ G @ alpha)
