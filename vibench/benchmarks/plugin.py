@@ -87,21 +87,23 @@ class Passes:
         metafunc.parametrize(["number", "case", *axes], values, ids=ids)
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        """Sort by passes, and leave out benchmarks that none of the plugins takes part in."""
-        items[:] = sorted((one for one in items if isinstance(_pass(one), int)), key=_pass)
+        """Sort by passes, and leave out benchmarks that none of the plugins takes part in, and other tests."""
+        chosen = [item for item in items if isinstance(_pass(item), int)]
+        self._config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
+        items[:] = sorted(chosen, key=_pass)
 
     @pytest.fixture
     def inputs(self, case: Any) -> StageInputs:
-        """What the stages of a problem need, made once for all benchmarks."""
+        """The inputs of the stages of a problem, made once for all benchmarks."""
         return self._inputs.setdefault(case, StageInputs(case, self._plan.setting))
 
     @pytest.fixture
     def timing(self, benchmark: Any, inputs: StageInputs, number: int) -> Timing:
-        """Function that times some work.
+        """A function that times some work.
 
-        It has the group of the benchmark, the work, what a result has reached, and, where the work takes one, what
-        gives a new argument of it for every round; `together` calls in succession make a round, because each does
-        something else. If the judgement raises, nothing is timed. The first pass judges, later ones only time.
+        It takes the group of the benchmark, the work, and a function that judges a result; if that raises, nothing is
+        timed. `fresh` gives a new argument of the work for every round, where it takes one. A round has `together`
+        calls, where each does something else. The first pass judges, later ones only time.
         """
 
         def measure(
@@ -120,10 +122,11 @@ class Passes:
             if not number:
                 reached = judge(result)
                 benchmark.extra_info |= _plain({**inputs.about(), **reached})
-                if spent.cpu < 3.0 * budget:  # the first call may have imported something
+                # The first call may have imported something.
+                if spent.cpu < 3.0 * budget:
                     spent = once()[1]
                     seconds = min(seconds, spent.wall)
-                # One pass is all that slow work takes.
+                # Slow work is timed in one pass.
                 benchmark.extra_info["slow"] = spent.cpu >= 3.0 * budget
             rounds, calls = how_often(seconds, budget / PASSES, together)
             benchmark.group = group

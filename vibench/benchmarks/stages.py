@@ -6,7 +6,6 @@ they claim.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
@@ -38,7 +37,7 @@ from vibench.model.errors import ReferenceSolutions, errors
 from vibench.model.galerkin import ReducedModel, ReducedProblem, project
 from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel, ReducedOperators, hyper_reduce
 from vibench.offline.assemblies import assemblies
-from vibench.offline.models import Model
+from vibench.offline.models import Model, Solution
 from vibench.offline.reduction import Reduction
 from vibench.offline.sweep import Snapshots, high_fidelity_sweep
 from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM
@@ -194,16 +193,11 @@ def test_high_fidelity_sweep(timing: Timing, inputs: StageInputs) -> None:
 
 
 def _judge_solutions(solutions: Sequence[HighFidelitySolution]) -> Info:
-    return {
-        "solutions": len(solutions),
-        "iterations": sum(s.iterations for s in solutions),
-        "fallbacks": sum(bool(s.fallback) for s in solutions),
-        "accuracy": largest_figures(residual_figures(s.residuals) for s in solutions),
-    }
+    figures = largest_figures(residual_figures(s.residuals) for s in solutions)
+    return {"fallbacks": sum(bool(s.fallback) for s in solutions), "accuracy": figures}
 
 
 def residual_figures(residuals: Residuals) -> dict[str, float]:
-    """Relative KKT residuals by their names in the file."""
     return {"primal_residual": residuals.primal, "dual_residual": residuals.dual, "gap": residuals.gap}
 
 
@@ -247,14 +241,9 @@ def test_enrichment(timing: Timing, inputs: StageInputs, primal: PrimalChoice) -
         check_enrichment(enrichment, offline.problem.V, offline.basis)
         model = reduction.given(enrichment=enrichment).projection
         some = np.unique(np.linspace(0, len(offline.training) - 1, 9).round().astype(int))
-        return {
-            "N": offline.basis.shape[1],
-            "R": model.generators.shape[1],
-            "enrichment": 0 if enrichment.vectors is None else enrichment.vectors.shape[1],
-            "kind": enrichment.kind.value,
-            "fallbacks": len(enrichment.fallbacks),
-            "accuracy": {"sigma": max(_sigma(model, offline.training[k]) for k in some)},
-        }
+        figures = {"sigma": max(_sigma(model, offline.training[k]) for k in some)}
+        size = 0 if enrichment.vectors is None else enrichment.vectors.shape[1]
+        return {"enrichment": size, "fallbacks": len(enrichment.fallbacks), "accuracy": figures}
 
     timing("enrichment", lambda: strategy.build(offline, primal.tolerance), judge)
 
@@ -271,9 +260,7 @@ def test_separation(timing: Timing, inputs: StageInputs) -> None:
     problem, training = inputs.problem, inputs.training
 
     def judge(members: Mapping[str, AffineMember]) -> Info:
-        ways = {f"way_{name}": member.way.value for name, member in members.items()}
-        terms = {f"terms_{name}": len(member.terms) for name, member in members.items()}
-        return {**ways, **terms, "accuracy": {"interpolation_error": _interpolation_error(inputs, members)}}
+        return {"accuracy": {"interpolation_error": _interpolation_error(inputs, members)}}
 
     timing("separation", lambda: affine_decomposition(problem, training, inputs.interpolation), judge)
 
@@ -307,13 +294,10 @@ def test_projection_of_members(timing: Timing, inputs: StageInputs, primal: Prim
     _check_reduced(inputs, primal)
     reduction, members = inputs.reduction(inputs.usual, primal), inputs.members
 
-    def judge(operators: ReducedOperators) -> Info:
-        return _judge_programs(inputs, HyperReducedModel(reduction.given().projection, operators))
-
     timing(
         "projection of members",
         lambda model: hyper_reduce(model, members),
-        judge,
+        lambda operators: _judge_programs(inputs, HyperReducedModel(reduction.given().projection, operators)),
         lambda: reduction.given().projection,
     )
 
@@ -356,34 +340,32 @@ def _judge_programs(inputs: StageInputs, model: AnyReducedModel) -> Info:
 
 def test_query(timing: Timing, inputs: StageInputs, primal: PrimalChoice) -> None:
     """Assembly in the quickest way there is, and solution; reached are errors against high-fidelity solutions."""
-    reduction = inputs.online(inputs.usual, primal).given()
-    model, why = reduction.model, reduction.operators
-    mus = _in_turn(inputs)
+    reduction, mus = inputs.online(inputs.usual, primal).given(), _in_turn(inputs)
+    model = reduction.model
 
     def query() -> QPSolution:
         reduced = model.reduced.assemble(next(mus))
         return solve_qp(reduced.program, reduction.solver, model.accuracy, factor=reduced.factor)
 
     def judge(_: QPSolution) -> Info:
-        answers = [model.solve(query.mu) for query in inputs.queries]
-        worst = max(answers, key=lambda answer: answer.status.severity)
-        figures = [
-            residual_figures(answer.residuals) | errors_of(inputs, query, answer.u, answer.lam)
-            for query, answer in zip(inputs.queries, answers, strict=True)
-            if answer.residuals is not None
-        ]
-        return {
-            **_shape(model.reduced.assemble(inputs.queries[0].mu)), "solver": model.solver,
-            "status": worst.status.value, "reason": worst.reason,
-            "assembly": f"full: {why}" if isinstance(why, str) else "reduced",
-            "accuracy": largest_figures(figures) if len(figures) == len(answers) else {},
-        }  # fmt: skip
+        return _judge_answers(inputs, model, lambda answer: answer.residuals)
 
     timing("query", query, judge, together=len(inputs.queries))
 
 
+def _judge_answers(inputs: StageInputs, model: Model, residuals: Callable[[Solution], Residuals | None]) -> Info:
+    """The worst status, and the largest residuals and errors of answers at the validation parameters."""
+    answers = [model.solve(query.mu) for query in inputs.queries]
+    worst = max(answers, key=lambda answer: answer.status.severity)
+    figures = []
+    for query, answer in zip(inputs.queries, answers, strict=True):
+        if (known := residuals(answer)) is not None:
+            figures.append(residual_figures(known) | errors_of(inputs, query, answer.u, answer.lam))
+    accuracy = largest_figures(figures) if len(figures) == len(answers) else {}
+    return {"status": worst.status.value, "reason": worst.reason, "accuracy": accuracy}
+
+
 def _in_turn(inputs: StageInputs) -> Iterator[Array]:
-    """The validation parameters, again and again."""
     return cycle([query.mu for query in inputs.queries])
 
 
@@ -408,11 +390,8 @@ def test_solver(timing: Timing, inputs: StageInputs, size: Size, solver: str, ac
 
     def judge(answer: QPSolution) -> Info:
         status, reason, residuals = verify(reduced.program, answer, accuracy)
-        return {
-            "solver": solver, "asked": accuracy, "N": N, **_shape(reduced),
-            "status": status.value, "reason": reason, "solver_status": answer.solver_status,
-            "iterations": answer.iterations, "accuracy": {} if residuals is None else residual_figures(residuals),
-        }  # fmt: skip
+        figures = {} if residuals is None else residual_figures(residuals)
+        return {**_shape(reduced), "N": N, "status": status.value, "reason": reason, "accuracy": figures}
 
     timing(
         f"QP of N = {N}, R = {R}",
@@ -438,11 +417,7 @@ def test_formulation(timing: Timing, inputs: StageInputs, formulation: str) -> N
     made: Formulation = find(FORMULATION, formulation).create({})
     offline = _phase(inputs, made)
     _built(made, offline)
-
-    def judge(built: Model) -> Info:
-        return _judge(inputs, built)
-
-    timing("formulation", lambda: _built(made, offline), judge)
+    timing("formulation", lambda: _built(made, offline), lambda built: _judge_formulation(inputs, built))
 
 
 def test_formulated_query(timing: Timing, inputs: StageInputs, formulation: str) -> None:
@@ -453,7 +428,17 @@ def test_formulated_query(timing: Timing, inputs: StageInputs, formulation: str)
     def query() -> FormulationAnswer:
         return built.online.solve(next(mus), built.settings()[0])
 
-    timing("query of a formulation", query, lambda _: _judge(inputs, built), together=len(inputs.queries))
+    timing("query of a formulation", query, lambda _: _judge_formulation(inputs, built), together=len(inputs.queries))
+
+
+def _judge_formulation(inputs: StageInputs, model: Model) -> Info:
+    """Judge with the residuals of the high-fidelity problem, where a pair is there."""
+
+    def residuals(answer: Solution) -> Residuals | None:
+        known = answer.x is not None and answer.status is not Status.NONFINITE
+        return answer.high_fidelity_residuals if known else None
+
+    return _judge_answers(inputs, model, residuals)
 
 
 def _phase(inputs: StageInputs, formulation: Formulation) -> Reduction:
@@ -482,25 +467,10 @@ def _built(formulation: Formulation, offline: Reduction) -> Model:
     return built
 
 
-def _judge(inputs: StageInputs, built: Model) -> Info:
-    """Status, residuals and errors of its answers at the validation parameters."""
-    answers = [built.solve(query.mu) for query in inputs.queries]
-    worst = max(answers, key=lambda answer: answer.status.severity)
-    figures: list[Mapping[str, float]] = [
-        residual_figures(answer.high_fidelity_residuals) | errors_of(inputs, query, answer.u, answer.lam)
-        for query, answer in zip(inputs.queries, answers, strict=True)
-        if answer.x is not None and answer.status is not Status.NONFINITE
-    ]
-    return {
-        "N": built.online.dimension, "R": built.online.generators, "status": worst.status.value, "reason": worst.reason,
-        "accuracy": largest_figures(figures) if len(figures) == len(answers) else {},
-    }  # fmt: skip
-
-
 def largest_figures(several: Iterable[Mapping[str, float]]) -> dict[str, float]:
     """Return the largest of every figure, NaN where one is."""
-    largest: dict[str, float] = {}
+    values: dict[str, list[float]] = {}
     for figures in several:
         for name, value in figures.items():
-            largest[name] = value if math.isnan(value) else max(largest.get(name, value), value)
-    return largest
+            values.setdefault(name, []).append(value)
+    return {name: float(np.max(one)) for name, one in values.items()}

@@ -165,7 +165,6 @@ def test_a_fault_of_a_strategy_is_found_by_its_check_alone(name: str) -> None:
 BUILT_IN = [
     (word, entry.name)
     for word, kind in CHECKED.items()
-    if word != "figure"
     for entry in importlib.metadata.distribution("vibench").entry_points.select(group=kind.entry_points)
 ]
 
