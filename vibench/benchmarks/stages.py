@@ -35,7 +35,7 @@ from vibench.linalg.inner_product import InnerProduct, project_out, singular_val
 from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
 from vibench.model.errors import ReferenceSolutions, errors
 from vibench.model.galerkin import ReducedModel, ReducedProblem, project
-from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel, ReducedOperators, hyper_reduce
+from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel, hyper_reduce
 from vibench.offline.assemblies import assemblies
 from vibench.offline.models import Model, Solution
 from vibench.offline.reduction import Reduction
