@@ -12,7 +12,7 @@ from typing import Any
 
 from vibench.packs.manifest import Manifest
 from vibench.plugins.options import keys, places
-from vibench.results.ranking import ADDED
+from vibench.results.ranking import added_columns
 from vibench.results.schema import STORED, Column, column_of, shown_columns
 from vibench.study.spec import Study
 
@@ -88,7 +88,7 @@ def benefits() -> str:
 
 def best() -> str:
     """What the table of the cheapest models has beside columns of the cells."""
-    return _for_reading(ADDED)
+    return _for_reading(added_columns())
 
 
 def _for_reading(table: Mapping[str, Column]) -> str:

@@ -96,7 +96,7 @@ def cheapest(cells: pd.DataFrame) -> pd.DataFrame:
     fastest = ranking.fastest(cells, ranking.errors_of_solution(cells, "lambda"))
     fastest["query [ms]"] = 1e3 * fastest["online_s"]
     names = [*MODEL, "assembly", "correction", "N", "R", "error_u_mean", "error_lambda_mean", "query [ms]"]
-    return fastest[["problem", ranking.BAND, *names[1:]]]
+    return fastest[["problem", "error_below", *names[1:]]]
 
 
 def trainings(cells: pd.DataFrame) -> pd.DataFrame:

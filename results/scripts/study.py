@@ -15,7 +15,7 @@ from page import SECONDS, Page, alternative, escaped, made_by, origin, read, sta
 from vibench.report import figures
 from vibench.report.figures.style import caption_of, styled
 from vibench.results import formats
-from vibench.results.ranking import CERTIFIED_BOUNDS, relative_bounds
+from vibench.results.ranking import relative_bounds
 from vibench.results.read import read_table, results_file
 from vibench.study.cells import CERTIFIED
 from vibench_problems.paper.evidence import SOLVER, Evidence
@@ -76,8 +76,8 @@ def bounds(cells: pd.DataFrame, queries: pd.DataFrame) -> pd.DataFrame:
     """Of every certified model the mean relative errors and bounds at online cost over its ok queries; violations."""
     fine = queries[(queries["status"] == "ok") & queries["cell"].isin(cells["cell"][cells["assembly"] == CERTIFIED])]
     relative = relative_bounds(fine)
-    columns = {f"bound_{name}_mean": relative[name] for name in CERTIFIED_BOUNDS}
-    columns |= {f"error_{name}_mean": fine[f"error_{name}"] for name in CERTIFIED_BOUNDS}
+    columns = {f"bound_{name}_mean": relative[name] for name in relative}
+    columns |= {f"error_{name}_mean": fine[f"error_{name}"] for name in relative}
     found = pd.DataFrame(columns).groupby(fine["cell"]).mean()
     of_cell = fine.groupby("cell")
     found["queries"], found["violations"] = of_cell.size(), of_cell["bound_online_violated"].sum()

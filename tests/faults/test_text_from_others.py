@@ -15,10 +15,9 @@ from running import Vibench, rows
 from samples import install, wire_study, write_study
 
 from vibench.results import formats, pictures
-from vibench.results.database import LONGEST_TEXT
 from vibench.results.schema import TABLES
 from vibench.results.sqlite import FILE
-from vibench.text import printable
+from vibench.text import LONGEST, printable
 
 PLUGINS = {
     "vibench.problems": {"odd-wire": "OddWire"},
@@ -85,10 +84,10 @@ def test_the_run_ends_with_a_row_for_every_cell(ended: tuple[Path, str]) -> None
                 "odd-gives-up": ("failed", "3 of 3 queries, first mu="),
             }.get(solver, ("ok", ""))
         assert (row["status"], row["reason"][: len(expected[1])]) == expected, (dual, primal, solver)
-        assert len(row["reason"]) <= LONGEST_TEXT
+        assert len(row["reason"]) <= 2 * LONGEST
         if row["status"] == "ok" and primal == own:
             assert row["fallbacks"].startswith(printable(ODD))
-            assert len(row["fallbacks"]) == LONGEST_TEXT
+            assert len(row["fallbacks"]) == 2 * LONGEST
     unreadable = cells[cpg, "decorrelated", "odd-unreadable"]
     assert unreadable["reason"].endswith("UnreadableError: its message cannot be read")
 

@@ -22,7 +22,8 @@ from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import kkt_residuals, verify
 from vibench.reduction.cones import orthogonality, project_on_cone
-from vibench.results.consistency import EFFECTIVITIES, violations
+from vibench.results.consistency import violations
+from vibench.results.schema import STORED
 from vibench.stability.infsup import cone_basis, inf_sup
 from vibench.stages.base import value_of
 from vibench.stages.enrichment import SingleEnrichment
@@ -149,4 +150,6 @@ def test_rows_of_a_negative_control_are_ok_and_keep_the_invariants(
 
 def _complete(queries: pd.DataFrame) -> pd.DataFrame:
     """With the columns of certified bounds, which no row has where λ is not in W⁺."""
-    return queries.reindex(columns=queries.columns.union(EFFECTIVITIES))
+    return queries.reindex(
+        columns=queries.columns.union([name for name in STORED["queries"] if name.startswith("effectivity_")])
+    )

@@ -168,9 +168,9 @@ def _runs() -> Iterable[str]:
 
 
 def _error_measures() -> Iterable[str]:
-    from vibench.results.ranking import OF_SOLUTION, OUTPUT
+    from vibench.results.ranking import columns_of_measures
 
-    return [*OF_SOLUTION, OUTPUT]
+    return [*columns_of_measures(), "output:"]
 
 
 formulations, solvers, runs, error_measures = map(words, (_formulations, _solvers, _runs, _error_measures))
@@ -224,7 +224,7 @@ def column_names(context: typer.Context, incomplete: str) -> list[str]:
 
     table = str(context.params.get("table") or "summary")
     source = {"summary": "cells", "best": "cells", "benefits": "thresholds"}.get(table, table)
-    computed = {"best": [ranking.BAND], "benefits": ranking.ERROR_COLUMNS}.get(table, ())
+    computed = {"best": ["error_below"], "benefits": ranking.error_columns()}.get(table, ())
     before, comma, last = incomplete.rpartition(",")
     sign = "-" * last.startswith("-")
     return [

@@ -152,12 +152,12 @@ def _keys() -> Explained:
 
 def _columns() -> Explained:
     """Columns by their names and headings, with and without units."""
-    from vibench.results.ranking import ADDED
+    from vibench.results.ranking import added_columns
     from vibench.results.schema import STORED
 
     # Tables share columns: a meaning is said once, with the tables in which it holds.
     tables = defaultdict[tuple[str, str, str, str], list[str]](list)
-    for table, columns in {**STORED, "best": ADDED}.items():
+    for table, columns in {**STORED, "best": added_columns()}.items():
         for name, column in columns.items():
             tables[name, column.heading, column.unit, column.meaning].append(table)
     for (name, heading, unit, meaning), holders in tables.items():

@@ -183,7 +183,7 @@ def print_summary(study: str, path: Path, rows: Rows) -> bool:
         echo(f"invariant: {len(violations) - REASONS} more like these")
     if queries and not violations:
         echo(f"invariants of the constants and the error bounds hold in all {queries} queries")
-    if agreement := consistency.sentence(read_table(path, "disagreements"), cells["solver"].nunique()):
+    if agreement := consistency.agreement_sentence(read_table(path, "disagreements"), cells["solver"].nunique()):
         echo(agreement)
     return whole
 

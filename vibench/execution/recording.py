@@ -18,11 +18,10 @@ from vibench.plugins.plugin import Plugin
 from vibench.qp.status import Status
 from vibench.results.database import ResultsDatabase
 from vibench.results.schema import KEYS
-from vibench.results.show import EXPORTED
+from vibench.results.show import exported_files
 from vibench.results.sqlite import (
     DAMAGED,
     FILE,
-    WRITE_AHEAD_LOG,
     DamagedResultsError,
     read_meta,
     set_aside,
@@ -50,7 +49,7 @@ def claimed(folder: Path) -> Iterator[None]:
     try:
         if folder.exists() and not folder.is_dir():
             raise RequestError(f"output folder '{folder}' is a file")
-        ours = {LOCK, FILE + DAMAGED, FILE + DAMAGED + WRITE_AHEAD_LOG}
+        ours = {LOCK, FILE + DAMAGED, f"{FILE}{DAMAGED}-wal"}
         if folder.is_dir() and not (folder / FILE).exists() and {path.name for path in folder.iterdir()} - ours:
             raise RequestError(f"output folder '{folder}' is not empty and holds no {FILE}; choose another with --out")
         folder.mkdir(parents=True, exist_ok=True)
@@ -78,7 +77,7 @@ def clear(folder: Path, study: str, note: Callable[[str], None]) -> None:
     there = study_of(path, meta).get("name") if meta else study
     if there != study:
         raise RequestError(f"'{folder}' holds results of the study '{there}'; --fresh removes only '{study}'")
-    for name in (LOG, REPORT, *(f"tables/{file}" for file in EXPORTED)):
+    for name in (LOG, REPORT, *(f"tables/{file}" for file in exported_files())):
         (folder / name).unlink(missing_ok=True)
 
 

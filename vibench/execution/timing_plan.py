@@ -6,8 +6,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 
 from vibench.execution.recording import ResultWriter
-from vibench.results.break_even import FEWEST_ROUNDS, Comparison, Meaning, compared
-from vibench.results.paired_timing import FEWEST_BLOCKS, PairedTiming
+from vibench.results.break_even import FEWEST_ROUNDS, BreakEvenComparison, Meaning, compared
+from vibench.results.paired_timing import PairedTiming
 from vibench.rounds.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
 from vibench.rounds.timed_seconds import TimedCell, TimedRound
 from vibench.rounds.timing_rounds import SHARE, TimingRounds, block_rows
@@ -198,7 +198,7 @@ class TimingPlan:
 
     def _undecided(self, group: _Group) -> list[CellQueries]:
         """The goals with a comparison that further rounds may decide."""
-        if group.first < min(max(self._fewest, FEWEST_ROUNDS), self._rounds) or group.blocks < FEWEST_BLOCKS:
+        if group.first < min(max(self._fewest, FEWEST_ROUNDS), self._rounds) or group.blocks < 2:
             return list(group.members.values())
         cells = {cell.key: goal for cell, goal in group.members.items()}
         rows = [row for key in cells if (row := self._writer.database.cell(key)) is not None]
@@ -210,7 +210,7 @@ class TimingPlan:
                 undecided |= {key: cells[key] for key in both}
         return list(undecided.values())
 
-    def _would_help(self, one: Comparison, done: int) -> bool:
+    def _would_help(self, one: BreakEvenComparison, done: int) -> bool:
         """Whether more rounds may decide a comparison, since it is the seconds of queries that leave it undecided."""
         more = one.result.rounds  # an estimate, which twice the limit allows for
         return one.gain is None or (more is not None and done + more <= 2.0 * self._rounds)
@@ -218,7 +218,7 @@ class TimingPlan:
 
 def block_sizes(rounds: int) -> list[int]:
     """Numbers of rounds of the blocks of `rounds`: a pass over all queries, or less where rounds are few."""
-    blocks = 1 if rounds < FEWEST_ROUNDS else max(FEWEST_BLOCKS, rounds // SHARE)
+    blocks = 1 if rounds < FEWEST_ROUNDS else max(2, rounds // SHARE)
     return [rounds // blocks + (k < rounds % blocks) for k in range(blocks)]
 
 

@@ -89,7 +89,7 @@ class Run:
         return self.table("thresholds")
 
     @requested
-    def break_even(self, error: str = ranking.SOLUTION, within: float | None = None) -> pd.DataFrame:
+    def break_even(self, error: str = "solution", within: float | None = None) -> pd.DataFrame:
         """The thresholds with the errors of both models, `error_a` and `error_b`; 0 of the high-fidelity model.
 
         Parameters
@@ -109,9 +109,7 @@ class Run:
         return rows if within is None else ranking.within(rows, within).reset_index(drop=True)
 
     @requested
-    def best(
-        self, queries: float | None = None, error: float | None = None, measure: str = ranking.SOLUTION
-    ) -> pd.DataFrame:
+    def best(self, queries: float | None = None, error: float | None = None, measure: str = "solution") -> pd.DataFrame:
         """The best model of every problem: at every level of error that is reached, or within one.
 
         Parameters
@@ -130,7 +128,7 @@ class Run:
         RequestError
             If a number is not positive, there is an error without a number of queries, or no such measure.
         """
-        of_solution = "" if measure == ranking.SOLUTION else measure
+        of_solution = "" if measure == "solution" else measure
         return show.look_up(self.path, "best", error=of_solution, largest=error, queries=queries).rows
 
     @property

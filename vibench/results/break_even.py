@@ -18,21 +18,24 @@ from vibench.results.paired_timing import CONDITIONS, PairedTiming
 from vibench.results.schema import KEYS, STORED
 from vibench.study.cells import CERTIFIED, NO_SUCH_AXIS
 
+# Draws of seconds that other runs might measure, from which intervals are taken.
 DRAWS = 2000
-"""Draws of what other runs might measure, from which an interval is taken."""
 
+# Probability left out on each side of a 95 % interval.
 TAIL = 0.025
-"""Probability left out on each side of an interval."""
 
+# Rounds of two blocks; fewer do not show the scatter between blocks, so that nothing is decided.
 FEWEST_ROUNDS = 6
-"""Rounds of two blocks; with fewer nothing is known of the scatter between blocks, and nothing is decided."""
 
+# Queries whose seconds differ by less than this factor are "as fast": other load of a machine changes their ratio by
+# about as much, and another run would not find a threshold that rests on it.
+MARGIN = 1.25
 
-MOST_ROUNDS = 1e6
-"""Rounds beyond which it is not worth saying how many would decide a comparison."""
-
+# Standard deviation of the logarithm of offline seconds measured once, where a run repeats no stage.
 SCATTER = 0.2
-"""Standard deviation of the logarithm of offline seconds that were measured once, where a run repeats no stage."""
+
+# Value of `primal_a` where a is the high-fidelity model.
+HIGH_FIDELITY = "high-fidelity"
 
 
 class Meaning(StrEnum):
@@ -76,9 +79,9 @@ class BreakEven:
 def break_even(offline_a: float, online_a: float, offline_b: float, online_b: float) -> BreakEven:
     """Break-even of b against a, from their offline seconds and their seconds per query.
 
-    n* = (offline_b − offline_a) / (online_a − online_b). If b costs more offline, it is cheaper from n* queries on if
-    its queries are faster, never otherwise. If b costs less offline, it is cheaper until n* queries if its queries are
-    slower, at once otherwise.
+    The number is n* = (offline_b − offline_a) / (online_a − online_b). If b costs more offline, it is cheaper from n*
+    queries on if its queries are faster, never otherwise. If b costs less offline, it is cheaper until n* queries if
+    its queries are slower, at once otherwise.
     """
     dearer, faster = offline_b - offline_a, online_a - online_b
     if dearer <= 0.0 and faster >= 0.0:
@@ -115,56 +118,17 @@ def drawn_break_even(a: Costs, b: Costs, tail: float = TAIL) -> BreakEven:
     return measured if measured.number is None else BreakEven(measured.number, measured.meaning, low, high)
 
 
-UNDECIDED = BreakEven(None, Meaning.UNDECIDED)
+class BreakEvenComparison(NamedTuple):
+    """The break-even of a cell b against a cell a, or against the high-fidelity model where that is `None`.
 
-STRATEGY = ("primal", "primal_options", "primal_tol")
-
-HIGH_FIDELITY = "high-fidelity"
-"""Value of `primal_a` where a is the high-fidelity model."""
-
-SHARED_PHASES = (
-    "offline_snapshots_s", "offline_pod_s", "offline_cone_s", "offline_enrichment_s", "offline_assembly_s",
-)  # fmt: skip
-"""Offline phases that cells may have in common: equal seconds were measured once for both, and do not differ."""
-
-NORMAL_95 = 1.96
-"""Half the width of the 95 % interval of a normal distribution, in standard deviations."""
-
-STUDENT_95 = 2.1
-"""The same of Student's distribution, with the degrees of freedom that further rounds would lead to."""
-
-MARGIN = 1.25
-"""Queries whose seconds differ by less than this factor are as fast: what else uses a machine changes their ratio by
-about as much, and no threshold that rests on it would be found again."""
-
-VALIDATION = ("validation", "validation_options")
-"""Columns that name the validation set: seconds of a query are means over its queries."""
-
-_SHARED = tuple(name for name in STORED["thresholds"] if name in KEYS)
-
-FORMULATION = ("formulation", "formulation_options")
-
-AXES = (
-    ("dual", "dual_options", "dual_tol", "dual_size"), STRATEGY, ("pod_tol", "pod_size"), ("solver",), ("accuracy",),
-)  # fmt: skip
-"""Columns of the axes that a formulation may lack."""
-
-BLANK = (None, NO_SUCH_AXIS, "{}")
-"""Values in the columns of an axis that a cell does not have."""
-
-_OF_SIDES = ("cell", "formulation", "primal", "primal_tol", "assembly")
-
-
-class Comparison(NamedTuple):
-    """The break-even of a cell b against a cell a, or against the high-fidelity model where that is `None`."""
+    `online` are the seconds of a query of both in the blocks that they share, `gain` the 95 % interval of a over b.
+    """
 
     a: Mapping[str, Any] | None
     b: Mapping[str, Any]
     result: BreakEven
     online: tuple[float, float]
-    """Seconds of a query of both, in the blocks of rounds that they share."""
     gain: tuple[float, float] | None
-    """95 % interval of their quotient, of a over b."""
 
 
 def break_even_rows(
@@ -174,7 +138,9 @@ def break_even_rows(
     return (_row(one) for one in compared(cells, PairedTiming(timings)))
 
 
-def compared(cells: Iterable[Mapping[str, Any]], paired: PairedTiming, tail: float = TAIL) -> Iterator[Comparison]:
+def compared(
+    cells: Iterable[Mapping[str, Any]], paired: PairedTiming, tail: float = TAIL
+) -> Iterator[BreakEvenComparison]:
     """Break-even of the models that are compared, undecided where more than `tail` of the draws deny it.
 
     It is "as fast" where it would be undecided, but the seconds of both queries differ by less than `MARGIN`, with the
@@ -190,22 +156,25 @@ def compared(cells: Iterable[Mapping[str, Any]], paired: PairedTiming, tail: flo
     alike = _Groups(timed)
     usual = default_formulation()
     default = _Groups([cell for cell in timed if cell["formulation"] == usual])
-    everything = (*_SHARED, *FORMULATION, *VALIDATION, "machine")
+    # Seconds of a query are means over the queries of a validation set, and of a machine.
+    measured = ("validation", "validation_options", "machine")
+    everything = (*_shared_axes(), "formulation", "formulation_options", *measured)
     for b in timed:
         yield _comparison(paired, None, b, tail)
-        yield from (_comparison(paired, a, b, tail) for a in alike.of(b, everything) if _compared(a, b))
+        yield from (_comparison(paired, a, b, tail) for a in alike.equal_to(b, everything) if _compared(a, b))
         if b["formulation"] != usual:
-            yield from (_comparison(paired, a, b, tail) for a in default.of(b, _axes(b)) if _as_certified(a, b))
+            axes = (*_axes(b), *measured)
+            yield from (_comparison(paired, a, b, tail) for a in default.equal_to(b, axes) if _as_certified(a, b))
 
 
 class _Groups:
-    """Cells by what they have in some columns: a cell finds those like it without looking at all others."""
+    """Cells indexed by their values in some columns: comparing every cell with all others would be quadratic."""
 
     def __init__(self, cells: Iterable[Mapping[str, Any]]) -> None:
         self._cells = list(cells)
         self._groups: dict[tuple[str, ...], dict[tuple[Any, ...], list[Mapping[str, Any]]]] = {}
 
-    def of(self, cell: Mapping[str, Any], columns: tuple[str, ...]) -> Iterable[Mapping[str, Any]]:
+    def equal_to(self, cell: Mapping[str, Any], columns: tuple[str, ...]) -> Iterable[Mapping[str, Any]]:
         """The cells with the same values in these columns."""
         groups = self._groups.get(columns)
         if groups is None:
@@ -215,17 +184,32 @@ class _Groups:
         return groups.get(tuple(cell[name] for name in columns), [])
 
 
+def _shared_axes() -> tuple[str, ...]:
+    """Columns of a cell that both models of a comparison have in common."""
+    return tuple(name for name in STORED["thresholds"] if name in KEYS)
+
+
+def _is_blank(value: object) -> bool:
+    """Whether a column of an axis has the value of a cell without this axis."""
+    return value in (None, NO_SUCH_AXIS, "{}")
+
+
 def _axes(cell: Mapping[str, Any]) -> tuple[str, ...]:
-    """The columns by which a cell and the mixed program that it is an alternative to agree."""
-    lacking = {name for axis in AXES if all(cell[column] in BLANK for column in axis) for name in axis}
-    return tuple(name for name in (*_SHARED, *STRATEGY, *VALIDATION, "machine") if name not in lacking)
+    """The columns in which the mixed programs agree with a cell of another formulation that replaces them."""
+    # A formulation may lack these axes; what it lacks may be anything in the mixed program.
+    axes = (
+        ("dual", "dual_options", "dual_tol", "dual_size"), ("primal", "primal_options", "primal_tol"),
+        ("pod_tol", "pod_size"), ("solver",), ("accuracy",),
+    )  # fmt: skip
+    lacking = {name for axis in axes if all(_is_blank(cell[column]) for column in axis) for name in axis}
+    return tuple(name for name in (*_shared_axes(), *axes[1]) if name not in lacking)
 
 
 def _compared(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
-    """Whether b is an alternative to a: fixed to per-parameter enrichment, or the same with certificates to without."""
+    """Whether b replaces a: fixed enrichment a per-parameter one, or a certified query the same without certificate."""
     if _as_certified(a, b):
         return bool(a["enrichment_kind"] == Kind.PER_PARAMETER and b["enrichment_kind"] == Kind.FIXED)
-    return a["assembly"] == "reduced" and all(a[name] == b[name] for name in STRATEGY)
+    return a["assembly"] == "reduced" and all(a[name] == b[name] for name in ("primal", "primal_options", "primal_tol"))
 
 
 def _as_certified(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
@@ -233,13 +217,15 @@ def _as_certified(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     return bool((a["assembly"] == CERTIFIED) == (b["assembly"] == CERTIFIED))
 
 
-def _comparison(paired: PairedTiming, a: Mapping[str, Any] | None, b: Mapping[str, Any], tail: float) -> Comparison:
+def _comparison(
+    paired: PairedTiming, a: Mapping[str, Any] | None, b: Mapping[str, Any], tail: float
+) -> BreakEvenComparison:
     """Break-even of b against a; what both have in common, offline phases or the set-up, does not differ."""
     key, offline_a = (None, b["hf_setup_s"]) if a is None else (a["cell"], a["offline_s"])
     ratio, level = paired.ratio(key, b["cell"]), paired.level(key, b["cell"])
     if ratio is None or level is None:
         online = (b["hf_s"] if a is None else a["online_s"]), b["online_s"]
-        return Comparison(a, b, UNDECIDED, online, None)
+        return BreakEvenComparison(a, b, BreakEven(None, Meaning.UNDECIDED), online, None)
     rng = np.random.default_rng(0)
     shared = b["hf_setup_s"] if a is None else shared_offline(a, b)
     seconds, quotients = paired.draws(key, b["cell"], rng, DRAWS)
@@ -254,7 +240,7 @@ def _comparison(paired: PairedTiming, a: Mapping[str, Any] | None, b: Mapping[st
         elif tail < faster < 1.0 - tail:
             result = replace(result, rounds=_rounds_missing(paired, key, b["cell"]))
     low, high = ratio.interval(TAIL)
-    return Comparison(a, b, result, (online_a, online_a * quotient), (math.exp(-high), math.exp(-low)))
+    return BreakEvenComparison(a, b, result, (online_a, online_a * quotient), (math.exp(-high), math.exp(-low)))
 
 
 def _rounds_missing(paired: PairedTiming, a: str | None, b: str) -> int | None:
@@ -263,28 +249,38 @@ def _rounds_missing(paired: PairedTiming, a: str | None, b: str) -> int | None:
     if within is None:
         return None
     distance = max(abs(within.mean), math.log(MARGIN) - abs(within.mean))
-    allowed = (distance / STUDENT_95) ** 2 - CONDITIONS**2
+    # Student's quantile for 95 % with the degrees of freedom that further rounds would lead to.
+    allowed = (distance / 2.1) ** 2 - CONDITIONS**2
     needed = done * within.error**2 / allowed if allowed > 0.0 else math.inf
-    return max(1, math.ceil(min(needed, MOST_ROUNDS) - done))
+    # Nobody runs a million rounds: beyond, the number says only that it is hopeless.
+    return max(1, math.ceil(min(needed, 1e6) - done))
 
 
 def shared_offline(a: Mapping[str, Any], b: Mapping[str, Any]) -> float:
     """Offline seconds of the phases that two cells have in common."""
-    return float(sum(a[name] for name in SHARED_PHASES if a[name] == b[name]))
+    # Equal seconds were measured once for both cells, since their stage is the same.
+    phases = ("snapshots", "pod", "cone", "enrichment", "assembly")
+    return float(sum(a[name] for name in (f"offline_{phase}_s" for phase in phases) if a[name] == b[name]))
+
+
+def offline_factor(deviation: float) -> float:
+    """Factor from offline seconds to the end of their 95 % interval; `deviation` is that of their logarithm."""
+    return math.exp(1.96 * deviation)
 
 
 def offline_draws(cell: Mapping[str, Any], shared: float, rng: np.random.Generator) -> Array:
-    """Offline seconds of a cell as other runs might measure them (`DRAWS`,), but for those that are `shared`."""
+    """Offline seconds (`DRAWS`,) of a cell that other runs might measure; those that are `shared` do not vary."""
     low, high = cell["offline_low_s"], cell["offline_high_s"]
-    spread = SCATTER if low is None or math.isnan(low) else math.log(high / low) / (2.0 * NORMAL_95)
+    # The deviation from its 95 % interval, see `offline_factor`.
+    spread = SCATTER if low is None or math.isnan(low) else math.log(high / low) / (2.0 * 1.96)
     return np.asarray(shared + (cell["offline_s"] - shared) * np.exp(spread * rng.standard_normal(DRAWS)))
 
 
-def _row(one: Comparison) -> dict[str, Any]:
+def _row(one: BreakEvenComparison) -> dict[str, Any]:
     a, b, result = one.a or _high_fidelity(one.b), one.b, one.result
-    row = {name: a[name] if b[name] in BLANK else b[name] for name in _SHARED}
+    row = {name: a[name] if _is_blank(b[name]) else b[name] for name in _shared_axes()}
     for side, cell, online in zip("ab", (a, b), one.online, strict=True):
-        row |= {f"{name}_{side}": cell[name] for name in _OF_SIDES}
+        row |= {f"{name}_{side}": cell[name] for name in ("cell", "formulation", "primal", "primal_tol", "assembly")}
         row |= {f"offline_{side}_s": cell["offline_s"], f"online_{side}_s": online}
     numbers = {"benefit_threshold": result.number, "threshold_low": result.low, "threshold_high": result.high}
     low, high = one.gain or (None, None)

@@ -1,11 +1,13 @@
-"""Inequalities that hold in every row of `queries`; a violation is a bug in the linear algebra of vibench.
+"""Consistency of recorded results: inequalities in every row of `queries`, and agreement of QP solvers.
 
-Inf-sup constants grow with the primal space: V_N ≤ enriched V_N ≤ V, with equality of the last two for per-parameter
-enrichments; that of V is at least that of the high-fidelity pair, and that over the cone at least that over the span.
-Error bounds are at least the errors, whatever the formulation. Of intervals over the cone, the upper end of the larger
-constant is compared with the lower end of the smaller. A cone with free generators is not in W⁺, and compared with the
-high-fidelity pair over the span alone. The tolerance for round-off is relative to the constant of V, at most the norm
-of the form.
+A violated inequality is a bug in the linear algebra of vibench. Inf-sup constants grow with the primal space: V_N ≤
+enriched V_N ≤ V, with equality of the last two for per-parameter enrichments. The constant of V is at least that of the
+high-fidelity pair, and a constant over the cone at least that over the span. Error bounds are at least the errors,
+whatever the formulation. Of intervals over the cone, the upper end of the larger constant is compared with the lower
+end of the smaller. A cone with free generators is not in W⁺, and compared with the high-fidelity pair over the span
+alone. The tolerance for round-off is relative to the constant of V, at most the norm of the form.
+
+Solvers agree where ok solutions of the same program are no further apart than their accuracy allows.
 """
 
 from __future__ import annotations
@@ -27,15 +29,6 @@ from vibench.study.cells import NO_SUCH_AXIS
 
 if TYPE_CHECKING:  # worker processes, which start often, have no use for pandas
     import pandas as pd
-
-EFFECTIVITIES = tuple(name for name in STORED["queries"] if name.startswith("effectivity_"))
-"""Error bound over error, at least 1."""
-
-ROUND_OFF = 1e-10
-"""An effectivity may be below 1 by this: a bound that is the error itself is so in exact arithmetic."""
-
-ORDER = (("full_", ""), ("", "plain_"), ("full_", "hf_"))
-"""Pairs of inf-sup constants, the larger one first."""
 
 
 @dataclass(frozen=True)
@@ -60,21 +53,23 @@ def added_up(parts: Iterable[Violation]) -> list[Violation]:
     found: dict[str, Violation] = {}
     for one in parts:
         before = found.get(one.invariant, Violation(one.invariant, 0, one.worst))
-        worst = float(np.fmax(before.worst, one.worst))  # NaN where every difference is one
+        worst = float(np.fmax(before.worst, one.worst))
         found[one.invariant] = Violation(one.invariant, before.rows + one.rows, worst)
     return list(found.values())
 
 
 def _violations(rows: pd.DataFrame, kinds: pd.Series) -> Iterator[Violation]:
-    for name in EFFECTIVITIES:
-        below = rows[name].astype(float) < 1.0 - ROUND_OFF
+    for name in (name for name in STORED["queries"] if name.startswith("effectivity_")):
+        # A bound that is the error itself in exact arithmetic may be below it by round-off.
+        below = rows[name].astype(float) < 1.0 - 1e-10
         if below.any():
             yield Violation(f"{name} ≥ 1", int(below.sum()), float(1.0 - rows[name].min()))
-    rows = rows[rows["bounds"].notna()]  # other formulations than the mixed one have no constants
+    # Other formulations than the mixed one have no constants.
+    rows = rows[rows["bounds"].notna()]
     queries, kind = rows.filter(regex="^beta_(full_|plain_|hf_)?(span|cone_)").astype(float), rows["cell"].map(kinds)
     signed = ~rows["bounds"].str.startswith("span/")
     scale = queries["beta_full_cone_upper"]
-    for larger, smaller in ORDER:
+    for larger, smaller in (("full_", ""), ("", "plain_"), ("full_", "hf_")):
         inside = signed if smaller == "hf_" else signed | True
         yield from _at_least(queries, f"beta_{larger}span", f"beta_{smaller}span", scale)
         yield from _at_least(queries[inside], f"beta_{larger}cone_upper", f"beta_{smaller}cone_lower", scale[inside])
@@ -88,7 +83,8 @@ def _violations(rows: pd.DataFrame, kinds: pd.Series) -> Iterator[Violation]:
 
 def _at_least(rows: pd.DataFrame, larger: str, smaller: str, scale: pd.Series) -> Iterator[Violation]:
     missing = rows[smaller] * (1.0 - RELATIVE) - ABSOLUTE * scale - rows[larger]
-    broken = ~(missing <= 0.0) & np.isfinite(rows[smaller])  # NaN violates it too
+    # Negated, so that NaN violates it too.
+    broken = ~(missing <= 0.0) & np.isfinite(rows[smaller])
     if broken.any():
         yield Violation(f"{larger} ≥ {smaller}", int(broken.sum()), float(missing[broken].max()))
 
@@ -145,7 +141,7 @@ def _recorded(cell: Mapping[str, Any], row: Mapping[str, Any]) -> Recorded:
     return Recorded(cell["solver"], row["query"], vectors(row)[0], left_open)
 
 
-def sentence(disagreements: pd.DataFrame, solvers: int) -> str:
+def agreement_sentence(disagreements: pd.DataFrame, solvers: int) -> str:
     """The disagreements table in one sentence; "" for a run of fewer than two solvers, which leaves nothing to say."""
     if solvers < 2:
         return ""

@@ -20,10 +20,8 @@ from vibench.qp.status import Status
 from vibench.results.schema import KEYS, STORED, VERSION, Column, SqlType, column_of
 from vibench.results.sqlite import (
     BUSY_SECONDS,
-    CREATE,
     DAMAGED,
     FILE,
-    PARAMETERS,
     DamagedResultsError,
     DigestError,
     Digests,
@@ -34,28 +32,6 @@ from vibench.results.sqlite import (
     text_reader,
 )
 from vibench.text import LONGEST, brief, printable
-
-LONGEST_TEXT = 2 * LONGEST
-"""Characters of a text in a column: a reason quotes what a plugin said, and adds to it."""
-
-REMEMBERED = 256
-"""Texts whose stored form is remembered: what names a cell is in all of its rows."""
-
-IDENTITY = (
-    "cell",
-    *KEYS,
-    "queries",
-    "seed",
-    "validation",
-    "validation_options",
-    "study_hash",
-    "code",
-    "machine",
-    "threads",
-    "versions",
-    "definition",
-)
-"""Columns of a cell that do not depend on what its stages compute."""
 
 
 class UnstorableError(VibenchError):
@@ -81,17 +57,21 @@ def storable(table: str, row: Mapping[str, Any]) -> dict[str, Any]:
     return values
 
 
-@lru_cache(maxsize=REMEMBERED)
+# Cached: the texts that name a cell are in all of its rows.
+@lru_cache(maxsize=256)
 def _stored_text(column: Column, value: str) -> Any:
-    """The same of a short text."""
     return stored(column, value)
 
 
 def error_row(cell: Mapping[str, Any], reason: str) -> dict[str, Any]:
     """The row of a cell whose own rows cannot be stored: what identifies it, and the reason."""
-    kept = {name: cell[name] for name in IDENTITY if name in cell}
-    reason = f"the results cannot be stored: {reason}"
-    return kept | {"status": Status.ERROR.value, "reason": reason, "queries_ok": 0}
+    # Columns that do not depend on what the stages of the cell compute.
+    identity = (
+        "cell", *KEYS, "queries", "seed", "validation", "validation_options", "study_hash", "code", "machine",
+        "threads", "versions", "definition",
+    )  # fmt: skip
+    row = {name: cell[name] for name in identity if name in cell}
+    return row | {"status": Status.ERROR.value, "reason": f"the results cannot be stored: {reason}", "queries_ok": 0}
 
 
 def stored(column: Column, value: Any) -> Any:
@@ -104,7 +84,8 @@ def stored(column: Column, value: Any) -> Any:
             raise TypeError("a value is missing")
         return None
     if kind == SqlType.TEXT and isinstance(value, str):
-        return printable(value) if column.is_json else brief(value, LONGEST_TEXT)
+        # A reason quotes what a plugin said, and adds to it: twice the length of other texts.
+        return printable(value) if column.is_json else brief(value, 2 * LONGEST)
     if kind == SqlType.BLOB and isinstance(value, bytes):
         return value
     if kind == SqlType.REAL and isinstance(value, int | float):
@@ -116,24 +97,9 @@ def stored(column: Column, value: Any) -> Any:
     raise TypeError(f"a value of the type {type(value).__name__} is no {kind}")
 
 
-NAMED = tuple(name for name in STORED["histories"] if name not in ("artefact", "step", "value"))
-"""Columns that identify a history."""
-
-OF_CELLS = tuple(table for table, columns in STORED.items() if "cell" in columns)
-"""Tables whose rows belong to a cell."""
-
-DERIVED = ("thresholds", "disagreements")
-"""Tables that every run makes anew from the others."""
-
-UNWRITABLE = {
-    sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_BUSY,
-    sqlite3.SQLITE_CORRUPT,
-}  # fmt: skip
-"""SQLite's error codes of a full, lost or read-only disk, and of a file locked or damaged by another program."""
-
-
-FEW_FILES = 64
-"""Open files below which a results file may be missing some."""
+def _history_axes() -> list[str]:
+    """Columns that identify a history."""
+    return [name for name in STORED["histories"] if name not in ("artefact", "step", "value")]
 
 
 class ResultsDatabase:
@@ -154,7 +120,8 @@ class ResultsDatabase:
                 _refuse_other(path, study)
             folder.mkdir(parents=True, exist_ok=True)
             refuse_pipes(path)
-            self._path = path.absolute()  # SQLite may take a name that begins with "file:" for a URI
+            # Absolute, since SQLite may take a name that begins with "file:" for a URI.
+            self._path = path.absolute()
             self._db = sqlite3.connect(self._path, timeout=BUSY_SECONDS)
             self._db.text_factory = text_reader()
             self._digests = Digests(self._db)
@@ -171,8 +138,9 @@ class ResultsDatabase:
         except DigestError as error:
             raise DamagedResultsError(f"'{path}' is damaged: {error}; use another --out, or --fresh") from None
         except (OSError, sqlite3.Error) as error:
-            few = resource.getrlimit(resource.RLIMIT_NOFILE)[0]  # SQLite does not say that they are too few
-            hint = f"; this process may open only {few} files (`ulimit -n`)" * (0 <= few < FEW_FILES)
+            # SQLite does not say that it lacked a file descriptor.
+            few = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+            hint = f"; this process may open only {few} files (`ulimit -n`)" * (0 <= few < 64)
             raise RequestError(f"output folder '{folder}' cannot be written: {error}{hint}") from None
 
     def _create(self, study: Mapping[str, Any], anew: bool) -> None:
@@ -185,9 +153,9 @@ class ResultsDatabase:
             self._db.execute(f"CREATE TABLE IF NOT EXISTS {table} ({declared})")
         for table in ("queries", "solutions", "timings", "outputs"):
             self._db.execute(f"CREATE INDEX IF NOT EXISTS {table}_of_cell ON {table}(cell)")
-        self._db.execute(f"CREATE INDEX IF NOT EXISTS histories_named ON histories({', '.join(NAMED)})")
+        self._db.execute(f"CREATE INDEX IF NOT EXISTS histories_named ON histories({', '.join(_history_axes())})")
         entries = {"schema": str(VERSION), "study": json.dumps(study, sort_keys=True)}
-        self._db.execute(CREATE)
+        self._digests.create()
         self._db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", entries.items())
         self._digests.forget(name="meta")
         self._digests.count("meta")
@@ -199,9 +167,11 @@ class ResultsDatabase:
         """
         sound = self._is_sound()
         if not sound:
-            self._db.execute("REINDEX")  # an index holds nothing that its table does not
+            # An index holds nothing that its table does not.
+            self._db.execute("REINDEX")
         changed = {table: self._digests.changed(table) for table in STORED}
-        for table in DERIVED:
+        # Every run makes these anew from the others.
+        for table in ("thresholds", "disagreements"):
             if changed.pop(table):
                 self._replace(table, {}, ())
         for table, cells in changed.items():
@@ -220,7 +190,7 @@ class ResultsDatabase:
 
     def _remove(self, cell: str) -> None:
         """Remove all rows of a cell."""
-        for table in OF_CELLS:
+        for table in (name for name, columns in STORED.items() if "cell" in columns):
             self._db.execute(f"DELETE FROM {table} WHERE cell = ?", (cell,))
         self._digests.forget(cell=cell)
 
@@ -258,15 +228,11 @@ class ResultsDatabase:
         Returns the row of the cell as it is stored. Raises a `StorageError` if the file cannot be written.
         """
         try:
-            self._name_parameters(str(cell.get("problem")), parameters)
+            if parameters:
+                self.keep(f"parameters of {cell.get('problem')}", json.dumps(parameters))
             return self._write_cell(cell, queries=queries, solutions=solutions, outputs=outputs)
         except (UnstorableError, sqlite3.Error) as error:
             return self._write_cell(error_row(cell, str(error)))
-
-    def _name_parameters(self, problem: str, parameters: Sequence[tuple[str, str]]) -> None:
-        """Keep what mu_1, mu_2, … of a problem are, where it is not known yet."""
-        if parameters:
-            self.keep(PARAMETERS + problem, json.dumps(parameters))
 
     def keep(self, key: str, value: str) -> None:
         """Keep a text in the table `meta`, in place of an earlier one with the same key."""
@@ -305,7 +271,7 @@ class ResultsDatabase:
         changed = ("cells", "queries") if queries else ("cells",)
         with self._writing():
             for table in changed:
-                self._digests.count(table, "cell = ?", (cell,), sign=-1)
+                self._digests.count(table, "cell = ?", (cell,), remove=True)
             self._update("cells", own, cell=cell)
             for number, columns in queries.items():
                 self._update("queries", columns, cell=cell, query=number)
@@ -316,7 +282,7 @@ class ResultsDatabase:
     def write_columns(self, cell: str, columns: Mapping[str, Any]) -> None:
         """Write some columns of a cell that has its row."""
         with self._writing():
-            self._digests.count("cells", "cell = ?", (cell,), sign=-1)
+            self._digests.count("cells", "cell = ?", (cell,), remove=True)
             self._update("cells", columns, cell=cell)
             self._digests.count("cells", "cell = ?", (cell,))
 
@@ -344,7 +310,7 @@ class ResultsDatabase:
             for rows in filter(None, histories):
                 steps = [row["step"] for row in rows]
                 within = f" AND step BETWEEN {min(steps)} AND {max(steps)}" if partial else ""
-                self._replace("histories", {name: rows[0].get(name) for name in NAMED}, rows, within)
+                self._replace("histories", {name: rows[0].get(name) for name in _history_axes()}, rows, within)
 
     def replace(self, table: str, rows: Iterable[Mapping[str, Any]], **keys: Any) -> None:
         """Replace all rows of a table, or those with these values in the columns `keys`."""
@@ -357,7 +323,7 @@ class ResultsDatabase:
         same = " AND ".join(["TRUE", *(f'"{name}" IS ?' for name in keys)]) + within
         values = tuple(storable(table, keys).values())
         if keys:
-            self._digests.count(table, same, values, sign=-1)
+            self._digests.count(table, same, values, remove=True)
         else:
             self._digests.forget(name=table)
         self._db.execute(f"DELETE FROM {table} WHERE {same}", values)
@@ -380,7 +346,7 @@ class ResultsDatabase:
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
-        """One transaction, rolled back if it cannot be written, or is written into a file that nobody will find."""
+        """Context of one transaction, rolled back if it cannot be written, or the file is no longer in its place."""
         try:
             with self._db:
                 self._db.execute("BEGIN IMMEDIATE")
@@ -388,13 +354,17 @@ class ResultsDatabase:
                 self._check_place()
         except sqlite3.DatabaseError as error:
             code = code_of(error)
-            if code not in UNWRITABLE:
+            # A full, lost or read-only disk, or a file locked or damaged by another program; the rest is a bug.
+            if code not in (
+                sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN,
+                sqlite3.SQLITE_BUSY, sqlite3.SQLITE_CORRUPT,
+            ):  # fmt: skip
                 raise
             waited = f" by another program for {BUSY_SECONDS:g} s" if code == sqlite3.SQLITE_BUSY else ""
             raise StorageError(f"results cannot be written: {error}{waited}") from None
 
     def _check_place(self) -> None:
-        """Refuse to go on where the results file was removed, or another one has its name, since it was opened."""
+        """Refuse to continue if the results file was removed or replaced since it was opened."""
         try:
             there = os.path.samestat(self._path.stat(), self._opened)
         except OSError:
@@ -419,7 +389,7 @@ class ResultsDatabase:
 
 @lru_cache(maxsize=32)
 def _insertion(table: str, names: tuple[str, ...]) -> str:
-    """The command that inserts a row with these columns: consecutive rows of a table have the same ones."""
+    """Command that inserts a row with these columns, cached: consecutive rows of a table have the same ones."""
     quoted, marks = ", ".join(f'"{name}"' for name in names), ", ".join("?" * len(names))
     return f"INSERT INTO {table} ({quoted}) VALUES ({marks})"
 

@@ -25,98 +25,83 @@ from scipy.special import digamma, polygamma, stdtrit
 
 from vibench.arrays import Array
 
-FEWEST_BLOCKS = 2
-"""A scatter takes two blocks."""
-
-CELLS_PER_DEGREE = 4
-"""Cells that stand for one degree of freedom of the common variance: cells of a group share much of their scatter."""
-
-CERTAIN = 1e3
-"""Degrees of freedom of a variance that is as good as known."""
-
-FAR = 50.0
-"""Deviations of logarithms beyond which exponentials overflow."""
-
+# Standard deviation of the logarithm of a ratio between cold runs beyond the scatter of their blocks, measured in runs
+# under different loads (docs/measurement.md).
 CONDITIONS = 0.05
-"""Standard deviation of the logarithm of a ratio from one cold run to another beyond what their blocks show, measured
-in runs under different loads (docs/measurement.md)."""
 
-ROUND_OFF = 1e-18
-"""Variances below this are those of equal numbers."""
+# Degrees of freedom above which a variance counts as known; infinitely many would be NaN in differences.
+_CERTAIN = 1e3
 
 
-class Estimate(NamedTuple):
-    """A mean, its standard error, and the degrees of freedom of that."""
+class MeanEstimate(NamedTuple):
+    """A mean with its standard error and the degrees of freedom of that error."""
 
     mean: float
     error: float
     freedom: float
 
     def interval(self, tail: float) -> tuple[float, float]:
-        """The interval that leaves out the probability `tail` on each side."""
+        """Interval of Student's distribution without the probability `tail` on each side."""
         half = self.error * float(stdtrit(self.freedom, 1.0 - tail))
         return self.mean - half, self.mean + half
 
     def draws(self, rng: np.random.Generator, count: int) -> Array:
-        """Means as other runs might have them (`count`,); of logarithms, none that is no number any more."""
-        return self.mean + np.clip(self.error * rng.standard_t(self.freedom, count), -FAR, FAR)
+        """Means (`count`,) that other runs might measure."""
+        # These are logarithms, and with one degree of freedom some draws lie where exponentials overflow.
+        return self.mean + np.clip(self.error * rng.standard_t(self.freedom, count), -50.0, 50.0)
 
-    def minus(self, other: Estimate) -> Estimate:
-        """The difference of independent means, its degrees of freedom those of Welch and Satterthwaite."""
+    def minus(self, other: MeanEstimate) -> MeanEstimate:
+        """Difference of independent means with the degrees of freedom of Welch and Satterthwaite."""
         mine, others = self.error**2, other.error**2
         spread = mine**2 / self.freedom + others**2 / other.freedom
-        freedom = (mine + others) ** 2 / spread if spread else CERTAIN
-        return Estimate(self.mean - other.mean, math.sqrt(mine + others), min(freedom, CERTAIN))
+        freedom = (mine + others) ** 2 / spread if spread else _CERTAIN
+        return MeanEstimate(self.mean - other.mean, math.sqrt(mine + others), min(freedom, _CERTAIN))
 
-    def of_other_runs(self) -> Estimate:
-        """The same with what differs between cold runs but not between blocks."""
-        return self.minus(Estimate(0.0, CONDITIONS, CERTAIN))
-
-
-class _Scatter(NamedTuple):
-    """The logarithm of a variance over blocks, unbiased, and the variance of that."""
-
-    log: float
-    noise: float
+    def of_other_runs(self) -> MeanEstimate:
+        """The estimate for other cold runs, which differ by `CONDITIONS` beyond their blocks."""
+        return self.minus(MeanEstimate(0.0, CONDITIONS, _CERTAIN))
 
 
 @dataclass
 class CommonVariance:
-    """The distribution of the variances of many models, from those of few blocks each; added to one by one."""
+    """The distribution of the variances of many models, each measured in a few blocks (Smyth 2004, section 6)."""
 
-    _of: dict[str, _Scatter] = field(default_factory=dict)
+    # by model: the unbiased logarithm of its variance over blocks, its square, and the variance of that logarithm
+    _scatters: dict[str, Array] = field(default_factory=dict)
     _sums: Array = field(default_factory=lambda: np.zeros(3))
-    """Sums of logarithms, of their squares, and of their noise."""
 
     def add(self, name: str, values: Sequence[float]) -> None:
-        """Take note of a model's values, one for each of its blocks; earlier ones of that name are replaced."""
-        if name in self._of:
-            self._count(self._of.pop(name), -1.0)
-        if len(values) >= FEWEST_BLOCKS:
+        """Add a model's values, one for each of its blocks, in place of earlier ones of that name."""
+        if name in self._scatters:
+            self._sums -= self._scatters.pop(name)
+        if len(values) >= 2:
             half = (len(values) - 1.0) / 2.0
-            log = math.log(max(float(np.var(values, ddof=1)), ROUND_OFF)) - float(digamma(half)) + math.log(half)
-            self._of[name] = _Scatter(log, float(polygamma(1, half)))
-            self._count(self._of[name], 1.0)
-
-    def _count(self, one: _Scatter, sign: float) -> None:
-        self._sums += sign * np.array([one.log, one.log**2, one.noise])
+            log = math.log(_variance(values)) - float(digamma(half)) + math.log(half)
+            self._scatters[name] = np.array([log, log**2, float(polygamma(1, half))])
+            self._sums += self._scatters[name]
 
     def prior(self, blocks: int) -> tuple[float, float]:
-        """A typical variance, and its degrees of freedom: at most as many as there are independent `blocks`, or 0."""
-        count = len(self._of)
-        most = min(float(blocks), count / CELLS_PER_DEGREE)
+        """A typical variance and its degrees of freedom: at most as many as there are independent `blocks`, or 0."""
+        count = len(self._scatters)
+        # Cells of a group share much of their scatter: four of them count as one degree of freedom.
+        most = min(float(blocks), count / 4.0)
         if most < 1.0:
             return 0.0, 0.0
         mean, squares, noise = self._sums / count
         excess = (squares - mean**2) * count / (count - 1.0) - noise
-        if excess <= polygamma(1, CERTAIN / 2.0):
-            return math.exp(mean), min(most, CERTAIN)
+        if excess <= polygamma(1, _CERTAIN / 2.0):
+            return math.exp(mean), min(most, _CERTAIN)
         half = _inverse_trigamma(excess)
         return math.exp(mean + float(digamma(half)) - math.log(half)), min(most, 2.0 * half)
 
 
+def _variance(values: Sequence[float]) -> float:
+    # Equal numbers have a variance of round-off, whose logarithm must exist.
+    return max(float(np.var(values, ddof=1)), 1e-18)
+
+
 def _inverse_trigamma(value: float) -> float:
-    """Where the trigamma function has a positive value: Newton's method for its reciprocal (Smyth 2004, appendix)."""
+    """Argument at which the trigamma function has a positive value, by Newton's method (Smyth 2004, appendix)."""
     x = 0.5 + 1.0 / value
     for _ in range(50):
         trigamma = float(polygamma(1, x))
@@ -128,9 +113,9 @@ def _inverse_trigamma(value: float) -> float:
 
 
 def paces(seconds: Array) -> Array:
-    """How much slower a block's rounds were than its typical one (R,), from seconds (C×R) of all who were timed.
+    """Factors (R,) by which the rounds of a block were slower than its typical one, from seconds (C×R) of its models.
 
-    It is the median over them of the deviation from their own median over the rounds; NaN where a round is missing.
+    The factor is the median over the models of the deviation from their own median; NaN where a round is missing.
     """
     with np.errstate(all="ignore"):
         logarithms = np.log(seconds)
@@ -139,7 +124,7 @@ def paces(seconds: Array) -> Array:
 
 
 def beside(seconds: Array, pace: Array) -> float:
-    """Seconds of a high-fidelity solution in a block, at its typical pace; NaN of none.
+    """Seconds of a high-fidelity solution in a block, at its typical pace; NaN without any.
 
     `seconds` (C×R) are those beside the queries of every model in every round, NaN where there are none.
     """
@@ -149,7 +134,7 @@ def beside(seconds: Array, pace: Array) -> float:
 
 
 def _median(values: Array) -> float:
-    """Median of the values that there are; NaN of none."""
+    """Median of the finite values; NaN without any."""
     there = values[np.isfinite(values)]
     return float(np.median(there)) if len(there) else math.nan
 
@@ -162,12 +147,12 @@ class Block(NamedTuple):
 
     @property
     def high_fidelity(self) -> float:
-        """Logarithm of the seconds of a high-fidelity solution that belong to the ratio."""
+        """Logarithm of the seconds of the high-fidelity solution in the ratio."""
         return self.online - self.ratio
 
 
+# block of a round, seconds of a query in it at its pace, and their ratio to those of a high-fidelity solution
 Measured = tuple[str, float, float]
-"""The block of a round, the seconds of a query in it, at its pace, and their ratio to a high-fidelity solution's."""
 
 
 def _measured(row: Mapping[str, Any]) -> Measured:
@@ -189,7 +174,7 @@ def _blocks(rounds: Iterable[Measured]) -> dict[str, Block]:
 
 
 def mean_seconds(blocks: Iterable[Block]) -> tuple[float, float | None]:
-    """Seconds of a query and of a high-fidelity solution: geometric means over blocks; of the latter `None` if unknown.
+    """Seconds of a query and of a high-fidelity solution, `None` if unknown: geometric means over blocks.
 
     Only blocks with both count, if there are any.
     """
@@ -206,6 +191,7 @@ class PairedTiming:
         self._blocks: dict[str, dict[str, Block]] = {}
         self._rounds: dict[str, Counter[str]] = {}
         self._ratios, self._levels = CommonVariance(), CommonVariance()
+        # Every group has a first block; the others are the independent ones that a common variance rests on.
         self._names: set[str] = set()
         self._first: set[str] = set()
         by_cell: dict[str, list[Measured]] = {}
@@ -215,7 +201,7 @@ class PairedTiming:
             self._add(cell, measured)
 
     def add(self, cell: str, rounds: Iterable[Mapping[str, Any]]) -> None:
-        """Take note of all rounds of a cell, rows of the timings table; earlier ones are replaced."""
+        """Add all rounds of a cell, rows of the timings table, in place of earlier ones."""
         self._add(cell, list(map(_measured, rounds)))
 
     def _add(self, cell: str, rounds: Sequence[Measured]) -> None:
@@ -234,7 +220,7 @@ class PairedTiming:
         mine = self._blocks.get(b, {})
         return sum(self._rounds[b][name] for name in mine.keys() & self._blocks.get(a or b, {}) or mine)
 
-    def ratio(self, a: str | None, b: str) -> Estimate | None:
+    def ratio(self, a: str | None, b: str) -> MeanEstimate | None:
         """The logarithm of the seconds of a query of b over those of a, or of the high-fidelity model without a.
 
         Cells of different groups are compared by their ratios to the high-fidelity model. `None` with fewer than two
@@ -243,8 +229,8 @@ class PairedTiming:
         within = self.ratio_within(a, b)
         return None if within is None else within.of_other_runs()
 
-    def ratio_within(self, a: str | None, b: str) -> Estimate | None:
-        """The same as further blocks of this run would have it."""
+    def ratio_within(self, a: str | None, b: str) -> MeanEstimate | None:
+        """`ratio` as further blocks of this run would measure it."""
         mine = self._blocks.get(b, {})
         if a is None:
             return self._estimate(self._ratios, [x.ratio for x in mine.values() if math.isfinite(x.ratio)])
@@ -255,11 +241,11 @@ class PairedTiming:
         apart = self.ratio_within(None, b), self.ratio_within(None, a)
         return None if apart[0] is None or apart[1] is None else apart[0].minus(apart[1])
 
-    def level(self, a: str | None, b: str) -> Estimate | None:
-        """The logarithm of the seconds of a query of a, or of the high-fidelity model, in the blocks shared with b.
+    def level(self, a: str | None, b: str) -> MeanEstimate | None:
+        """Logarithm of the seconds of a query of a, or of the high-fidelity model, in the blocks shared with b.
 
-        Where a shares none with b, in all of its own. It is what further blocks of this run would have; offline seconds
-        come from other moments, so that what differs between cold runs has to be added beside them.
+        If they share none, all blocks of a count. The estimate is for further blocks of this run: offline seconds come
+        from other moments, so that callers add `CONDITIONS` where they compare both.
         """
         mine = self._blocks.get(b, {})
         if a is None:
@@ -270,22 +256,22 @@ class PairedTiming:
         return self._estimate(self._levels, values)
 
     def draws(self, a: str | None, b: str, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
-        """Seconds of a query of a, and those of b over them, as other runs might have them (`count`,).
+        """Seconds (`count`,) of a query of a, and their quotients b over a, that other runs might measure.
 
-        They are NaN where they were not measured in two blocks. What slows down a in another run makes the seconds of b
-        smaller beside its own.
+        They are NaN where they were not measured in two blocks.
         """
         level, ratio = self.level(a, b), self.ratio_within(a, b)
         if level is None or ratio is None:
             return np.full(count, np.nan), np.full(count, np.nan)
+        # One draw for both: conditions that slow down a make the quotient b over a smaller.
         conditions = CONDITIONS * rng.standard_normal(count)
         return np.exp(level.draws(rng, count) + conditions), np.exp(ratio.draws(rng, count) - conditions)
 
-    def _estimate(self, common: CommonVariance, values: Sequence[float]) -> Estimate | None:
+    def _estimate(self, common: CommonVariance, values: Sequence[float]) -> MeanEstimate | None:
         count = len(values)
-        if count < FEWEST_BLOCKS:
+        if count < 2:
             return None
         typical, degrees = common.prior(len(self._names) - len(self._first))
         own = count - 1.0
-        variance = (degrees * typical + own * max(float(np.var(values, ddof=1)), ROUND_OFF)) / (degrees + own)
-        return Estimate(float(np.mean(values)), math.sqrt(variance / count), degrees + own)
+        variance = (degrees * typical + own * _variance(values)) / (degrees + own)
+        return MeanEstimate(float(np.mean(values)), math.sqrt(variance / count), degrees + own)

@@ -15,15 +15,21 @@ from vibench.interfaces.pictures import Picture
 from vibench.results.sqlite import read_rows
 from vibench.text import printable
 
-ARRAYS = tuple(field.name for field in fields(Picture) if field.type in {"Array", "Indices"})
-TEXTS = tuple(field.name for field in fields(Picture) if field.name not in ARRAYS)
-"""Members of a picture that hold arrays, and those that are texts."""
+
+def members(arrays: bool) -> list[str]:
+    """Members of a picture that hold arrays, or those that are texts."""
+    return [field.name for field in fields(Picture) if (field.type in {"Array", "Indices"}) is arrays]
 
 
 def picture_rows(drawn: Iterable[tuple[str, Picture]]) -> list[dict[str, Any]]:
     """Rows of the pictures table, one for every title and picture, without the columns that identify the problem."""
     return [
-        {"number": k, "title": title, "names": json.dumps([getattr(one, text) for text in TEXTS]), "data": _packed(one)}
+        {
+            "number": k,
+            "title": title,
+            "names": json.dumps([getattr(one, text) for text in members(arrays=False)]),
+            "data": _packed(one),
+        }
         for k, (title, one) in enumerate(drawn)
     ]
 
@@ -54,16 +60,16 @@ def read(path: Path) -> Iterator[Shown]:
 def _packed(picture: Picture) -> bytes:
     """The arrays, in single precision, compressed."""
     stream = io.BytesIO()
-    precision = {name: np.int32 if name == "triangles" else np.float32 for name in ARRAYS}
+    precision = {name: np.int32 if name == "triangles" else np.float32 for name in members(arrays=True)}
     np.savez_compressed(stream, **{name: getattr(picture, name).astype(kind) for name, kind in precision.items()})
     return stream.getvalue()
 
 
 def _unpacked(data: bytes, names: str) -> Picture:
     with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        members: dict[str, Any] = {
-            name: arrays[name].astype(np.intp if name == "triangles" else float) for name in ARRAYS
+        values: dict[str, Any] = {
+            name: arrays[name].astype(np.intp if name == "triangles" else float) for name in members(arrays=True)
         }
-    # a file of an earlier version has no unit of length
-    members |= zip(TEXTS, (printable(str(text)) for text in json.loads(names)), strict=False)
-    return Picture(**members)
+    # A file of an earlier version has no unit of length.
+    values |= zip(members(arrays=False), (printable(str(text)) for text in json.loads(names)), strict=False)
+    return Picture(**values)

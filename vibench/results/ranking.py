@@ -15,34 +15,67 @@ from vibench.arrays import Array
 from vibench.errors import RequestError, unknown_name
 from vibench.qp.status import Status
 from vibench.results.break_even import DRAWS, HIGH_FIDELITY, TAIL, offline_draws, shared_offline
-from vibench.results.paired_timing import Estimate, PairedTiming
+from vibench.results.paired_timing import MeanEstimate, PairedTiming
 from vibench.results.schema import STORED, Column, integer, real
 from vibench.stability.infsup import VANISHES
 
-SOLUTION = "solution"
-"""The larger of the mean relative errors of u and λ; the other one where one is missing."""
 
-OF_SOLUTION: Mapping[str, tuple[str, ...]] = {
-    SOLUTION: ("error_u_mean", "error_lambda_mean"), "u": ("error_u_mean",), "lambda": ("error_lambda_mean",),
-}  # fmt: skip
-"""Columns of the cells table whose maximum is the measure."""
-
-OUTPUT = "output:"
-"""Before the name of a quantity of interest."""
-
-ERROR_COLUMNS: Mapping[str, Column] = {
-    "error_a": real("1", "Error of model a by the chosen measure; 0 of the high-fidelity one.", "error a", 22),
-    "error_b": real("1", "Error of model b by the chosen measure.", "error b", 23),
-}
-"""What a measure adds to a table of break-even points."""
+def columns_of_measures() -> dict[str, tuple[str, ...]]:
+    """Measures of the error of the solution, each with the columns of the cells table whose maximum it is."""
+    return {
+        "solution": ("error_u_mean", "error_lambda_mean"), "u": ("error_u_mean",), "lambda": ("error_lambda_mean",),
+    }  # fmt: skip
 
 
 def measures(outputs: pd.DataFrame) -> list[str]:
-    """The measures that a run has, from its table of outputs."""
-    return [*OF_SOLUTION, *(f"{OUTPUT}{name}" for name in outputs["output"].unique())]
+    """Error measures of a run, from its table of outputs."""
+    return [*columns_of_measures(), *(f"output:{name}" for name in outputs["output"].unique())]
 
 
-def errors_of(cells: pd.DataFrame, outputs: pd.DataFrame, measure: str = SOLUTION) -> pd.Series:
+def error_columns() -> dict[str, Column]:
+    """Columns that an error measure adds to a table of break-even points."""
+    return {
+        "error_a": real("1", "Error of model a by the chosen measure; 0 of the high-fidelity one.", "error a", 22),
+        "error_b": real("1", "Error of model b by the chosen measure.", "error b", 23),
+    }
+
+
+def fastest_columns() -> dict[str, Column]:
+    """Columns of the table of the fastest queries: those of the cells, the accuracy and the ties."""
+    return {
+        **STORED["cells"],
+        "error_below": real(
+            "1", "Power of ten that the mean errors, of u and λ unless told, do not exceed.", "error ≤", 1
+        ),
+        "ties": integer("Other models whose query may be as fast: the interval of the ratio contains 1.", "ties", 24),
+    }  # fmt: skip
+
+
+def cheapest_columns() -> dict[str, Column]:
+    """Columns of the table of the cheapest models: those of the fastest ones, and what a number of queries adds."""
+    return fastest_columns() | {
+        "total_s": real("s", "Offline seconds and those of the queries.", "total [s]", 24),
+        "total_low_s": real("s", "Lower end of the 95 % interval of this sum, in seconds of a high-fidelity solution "
+            "as this run measured it; the sum of the high-fidelity model has none."),
+        "total_high_s": real("s", "Upper end of the interval of the total; a table shows both.", "interval [s]", 25),
+        "certified_error": real("1", "Mean over the queries of the larger bound of the relative errors of u and λ, in "
+            "energy, at online cost, of this model; empty if no cell of the run has its certificate.",
+            "certified error", 22),
+        "cheapest_from": real("1", "Number of queries from which it is the cheapest.", "cheapest from", 26),
+        "cheapest_until": real("1", "Number of queries until which it is; infinite if for ever.", "until", 27),
+        "probability": real("1", "Share of draws of what other runs may measure in which it is the cheapest.",
+            "sure", 28),
+        "ties": integer("Other models that may be as cheap: the 95 % interval of the difference to this one contains "
+            "0.", "ties", 29),
+    }  # fmt: skip
+
+
+def added_columns() -> dict[str, Column]:
+    """Columns of the table of the cheapest models that the cells table does not have."""
+    return {name: column for name, column in cheapest_columns().items() if name not in STORED["cells"]}
+
+
+def errors_of(cells: pd.DataFrame, outputs: pd.DataFrame, measure: str = "solution") -> pd.Series:
     """Mean relative errors, one for each row of the cells table; missing where none is known.
 
     A quantity of interest is measured by its mean relative error over the ok queries where it is not zero.
@@ -51,15 +84,15 @@ def errors_of(cells: pd.DataFrame, outputs: pd.DataFrame, measure: str = SOLUTIO
     """
     if measure not in measures(outputs):
         raise unknown_name("error measure", measure, measures(outputs))
-    if measure in OF_SOLUTION:
+    if measure in columns_of_measures():
         return errors_of_solution(cells, measure)
-    of_output = outputs[outputs["output"] == measure.removeprefix(OUTPUT)]
+    of_output = outputs[outputs["output"] == measure.removeprefix("output:")]
     return cells["cell"].map(of_output.set_index("cell")["error_mean"]).astype(float)
 
 
-def errors_of_solution(cells: pd.DataFrame, measure: str = SOLUTION) -> pd.Series:
+def errors_of_solution(cells: pd.DataFrame, measure: str = "solution") -> pd.Series:
     """Mean relative errors of u, of λ, or the larger one of these; the other one where one is missing."""
-    return cells[list(OF_SOLUTION[measure])].astype(float).max(axis=1, skipna=True)
+    return cells[list(columns_of_measures()[measure])].astype(float).max(axis=1, skipna=True)
 
 
 def with_errors(thresholds: pd.DataFrame, cells: pd.DataFrame, errors: pd.Series) -> pd.DataFrame:
@@ -79,27 +112,16 @@ def within(thresholds: pd.DataFrame, largest: float) -> pd.DataFrame:
     return thresholds[(thresholds["error_a"] <= largest) & (thresholds["error_b"] <= largest)]
 
 
+# Mean errors above this are no answer: such cells win nothing, however fast they are.
 LARGEST_BAND = 0.1
-"""Mean errors above this are no answer: such cells win nothing, however fast they are."""
 
-LARGEST_SHARE = 0.1
-"""Cells where the QP solver or reduced assembly, not the strategies, makes this share of an error are not compared."""
 
-NO_BEST_CELL = (
-    f"no cell takes part in the comparison: one that does has every query ok, mean errors of at most "
-    f"{100.0 * LARGEST_BAND:g} %, and less than {100.0 * LARGEST_SHARE:g} % of an error made by the QP solver, and by "
-    "reduced assembly"
-)
-"""Why a run may have no best cell."""
-
-BAND = "error_below"
-"""Column of the accuracy: a power of ten that the mean errors of u and λ do not exceed."""
-
-HEADINGS: Mapping[str, Column] = {
-    **STORED["cells"],
-    BAND: real("1", "Power of ten that the mean errors, of u and λ unless told, do not exceed.", "error ≤", 1),
-    "ties": integer("Other models whose query may be as fast: the interval of the ratio contains 1.", "ties", 24),
-}
+def no_best_cell() -> str:
+    """Reason why a run may have no best cell."""
+    return (
+        f"no cell takes part in the comparison: one that does has every query ok, mean errors of at most "
+        f"{100.0 * LARGEST_BAND:g} %, and less than 10 % of an error made by the QP solver, and by reduced assembly"
+    )
 
 
 def excluded(cells: pd.DataFrame, errors: pd.Series | None = None) -> pd.DataFrame:
@@ -134,11 +156,8 @@ def eligible(cells: pd.DataFrame) -> pd.Series:
 
 def too_loose(cells: pd.DataFrame, source: Literal["solver", "assembly"]) -> pd.Series:
     """Which cells are left out where strategies are compared, since the source makes too large a share of an error."""
-    return cells[f"{source}_share_mean"].astype(float) >= LARGEST_SHARE
-
-
-TIES = "ties"
-"""Column of the number of other models whose query may be as fast."""
+    # At a tenth of an error the solver or the assembly, not the strategies, would decide who is more accurate.
+    return cells[f"{source}_share_mean"].astype(float) >= 0.1
 
 
 def fastest(cells: pd.DataFrame, errors: pd.Series | None = None, paired: PairedTiming | None = None) -> pd.DataFrame:
@@ -146,7 +165,7 @@ def fastest(cells: pd.DataFrame, errors: pd.Series | None = None, paired: Paired
 
     The high-fidelity model competes. Cells that are not `eligible` take no part, as in the leaderboard of a report. A
     band whose model is that of the next smaller one is left out. `errors` are those of the cells by another measure, in
-    their rows or in more; with the rounds of the cells, others that may be as fast are counted in `TIES`.
+    their rows or in more; with the rounds of the cells, others that may be as fast are counted as ties.
     """
     measured = errors_of_solution(cells) if errors is None else errors.reindex(cells.index)
     fine = ~excluded(cells, measured).any(axis=1) & cells["online_s"].notna()
@@ -154,8 +173,8 @@ def fastest(cells: pd.DataFrame, errors: pd.Series | None = None, paired: Paired
     for _, mine in cells[fine].groupby(["problem", "problem_options"], dropna=False):
         for error, within, smallest in bands(mine, measured[mine.index], ["online_s"]):
             winner = _fastest(within, smallest["online_s"], paired)
-            rows.append(pd.Series({**winner.cell, BAND: error, TIES: len(winner.ties)}))
-    columns = ["problem", BAND, TIES, *cells.columns.drop("problem")]
+            rows.append(pd.Series({**winner.cell, "error_below": error, "ties": len(winner.ties)}))
+    columns = ["problem", "error_below", "ties", *cells.columns.drop("problem")]
     return pd.DataFrame(rows, columns=columns).reset_index(drop=True)
 
 
@@ -197,73 +216,83 @@ def _compared(cells: pd.DataFrame, column: str) -> pd.Series:
     Both are timed in the same rounds; those of other cells may have come when the machine was slower.
     """
     values = cells[column].astype(float)
-    return values / cells["hf_s"].astype(float) if column == COMPARED[Criterion.QUERY] else values
+    return values / cells["hf_s"].astype(float) if column == Criterion.QUERY.column else values
 
 
 class Criterion(StrEnum):
-    """What is the smallest of the winner; its column of the cells table, but for the error, stands in `COMPARED`."""
+    """Quantity that is smallest for the winner."""
 
     QUERY = "fastest query"
     OFFLINE = "fewest offline seconds"
     ERROR = "smallest error"
 
-
-COMPARED: Mapping[Criterion, str] = {
-    Criterion.QUERY: "online_s",
-    Criterion.OFFLINE: "offline_s",
-    Criterion.ERROR: "largest_mean_error",
-}
-"""What is compared: CPU seconds of a query, CPU seconds offline, the larger of the mean relative errors of u and λ."""
+    @property
+    def column(self) -> str:
+        """Column with the quantity: CPU seconds, or the larger one of the mean relative errors of u and λ."""
+        columns = {Criterion.QUERY: "online_s", Criterion.OFFLINE: "offline_s"}
+        return columns.get(self, "largest_mean_error")
 
 
 @dataclass(frozen=True)
 class Winner:
-    """A cell with the smallest value among the cells of its problem whose mean errors are within a band."""
+    """A cell with the smallest value among the cells of its problem whose mean errors are within a band.
+
+    Attributes
+    ----------
+    criterion, value
+        The quantity that is compared, and its value: seconds, or a relative error.
+    cell
+        The whole row of the cells table. The high-fidelity model has the empty key "".
+    ties
+        Other cells that share the place: the 95 % interval of the difference contains 0, or there is no difference.
+    """
 
     criterion: Criterion
     value: float
-    """What is compared, as `COMPARED` says: seconds, or a relative error."""
     cell: Mapping[str, Any]
-    """The whole row of the cells table, its key under "cell"; that is empty of the high-fidelity model."""
     ties: tuple[str, ...] = ()
-    """Other cells that share the place: the 95 % interval of the difference contains 0, or there is no difference."""
 
 
 @dataclass(frozen=True)
 class Band:
-    """The winners among the cells whose mean errors of u and λ are both at most `error`, a power of ten."""
+    """The winners among the `cells` cells whose mean errors of u and λ are both at most `error`, a power of ten."""
 
     error: float
     cells: int
-    """Number of cells that the band has."""
     winners: tuple[Winner, ...]
 
     def winner(self, criterion: Criterion) -> Winner | None:
-        """Who wins by a criterion; `None` where no cell of the band has a value of it."""
+        """The winner by a criterion; `None` where no cell of the band has a value of it."""
         return next((one for one in self.winners if one.criterion is criterion), None)
 
 
 @dataclass(frozen=True)
 class Standings:
-    """The leaderboard of one problem, and the numbers of its cells: of all, and of those that take no part."""
+    """The leaderboard of one problem.
+
+    Attributes
+    ----------
+    problem, options
+        Label of the problem, and its options as JSON, as in the table of cells.
+    bands
+        Bands of accuracy, from the largest error to the smallest that is reached.
+    cells
+        Number of all cells.
+    unstable
+        Number of cells that take part although β over the span vanishes at a parameter.
+    incomplete, loose, interpolated, inexact
+        Numbers of cells that take no part, by the reason that `excluded` explains.
+    """
 
     problem: str
-    """Label of the problem in the table of cells."""
     options: str
-    """Options of the problem as JSON, as the table of cells has them."""
     bands: tuple[Band, ...]
-    """Its bands, from the largest error to the smallest that is reached."""
     cells: int
     incomplete: int
-    """A query is not ok."""
     unstable: int
-    """The inf-sup constant β over the span vanishes at a parameter: such cells do take part."""
     loose: int
-    """The QP solver makes too large a share of the error."""
     interpolated: int
-    """Reduced assembly makes too large a share of the error."""
     inexact: int
-    """A mean error is above `LARGEST_BAND` or unknown."""
 
 
 def leaderboard(cells: pd.DataFrame, paired: PairedTiming | None = None) -> tuple[Standings, ...]:
@@ -280,10 +309,10 @@ def leaderboard(cells: pd.DataFrame, paired: PairedTiming | None = None) -> tupl
 
 def _standings(problem: str, options: str, cells: pd.DataFrame, paired: PairedTiming | None) -> Standings:
     without, errors = excluded(cells), errors_of_solution(cells)
-    rows = cells.assign(**{COMPARED[Criterion.ERROR]: errors})[~without.any(axis=1)]
+    rows = cells.assign(**{Criterion.ERROR.column: errors})[~without.any(axis=1)]
     reached = tuple(
         Band(error, len(mine), tuple(_winners(cells, mine, smallest, paired)))
-        for error, mine, smallest in bands(rows, errors[rows.index], COMPARED.values())
+        for error, mine, smallest in bands(rows, errors[rows.index], [criterion.column for criterion in Criterion])
     )
     counts = {str(reason): int(count) for reason, count in without.sum().items()}
     return Standings(problem, options, reached, len(cells), unstable=int(unstable(rows).sum()), **counts)
@@ -292,11 +321,12 @@ def _standings(problem: str, options: str, cells: pd.DataFrame, paired: PairedTi
 def _winners(
     cells: pd.DataFrame, rows: pd.DataFrame, smallest: Mapping[str, Any], paired: PairedTiming | None
 ) -> Iterator[Winner]:
-    for criterion, column in COMPARED.items():
+    for criterion in Criterion:
+        column = criterion.column
         if column not in smallest:
             continue
         if criterion is Criterion.QUERY:
-            yield _fastest(rows.drop(columns=COMPARED[Criterion.ERROR]), smallest[column], paired)
+            yield _fastest(rows.drop(columns=Criterion.ERROR.column), smallest[column], paired)
             continue
         first = rows.loc[smallest[column]]
         others = rows.drop(index=smallest[column])
@@ -310,7 +340,7 @@ def _as_good(criterion: Criterion, first: pd.Series, other: pd.Series) -> bool:
         rng, shared = np.random.default_rng(0), shared_offline(first, other)
         more = offline_draws(other, shared, rng) - offline_draws(first, shared, rng)
         return float(np.mean(more <= 0.0)) > TAIL
-    column, names = COMPARED[Criterion.ERROR], ("solver_error_u_max", "solver_error_lambda_max")
+    column, names = Criterion.ERROR.column, ("solver_error_u_max", "solver_error_lambda_max")
     parts = [[float(one[name]) for name in names if pd.notna(one[name])] for one in (first, other)]
     allowed = sum(max(some, default=0.0) for some in parts)
     return bool(other[column] - first[column] <= allowed)
@@ -346,38 +376,6 @@ def _may_be_as_fast(paired: PairedTiming, first: str | None, other: str) -> bool
     """Whether the 95 % interval of the ratio of the seconds of two queries contains 1; where none is known it does."""
     ratio = paired.ratio(first, other)
     return ratio is None or ratio.interval(TAIL)[0] <= 0.0
-
-
-CERTIFIED_BOUNDS: Mapping[str, str] = {"u_energy": "u", "lambda_natural": "λ"}
-"""Errors that have bounds at online cost."""
-
-COLUMNS: Mapping[str, Column] = {
-    **HEADINGS,
-    "total_s": real("s", "Offline seconds and those of the queries.", "total [s]", 24),
-    "total_low_s": real(
-        "s", "Lower end of the 95 % interval of this sum, in seconds of a high-fidelity solution as this run measured "
-        "it; the sum of the high-fidelity model has none."
-    ),
-    "total_high_s": real("s", "Upper end of the interval of the total; a table shows both.", "interval [s]", 25),
-    "certified_error": real(
-        "1", "Mean over the queries of the larger bound of the relative errors of u and λ, in energy, at online cost, "
-        "of this model; empty if no cell of the run has its certificate.", "certified error", 22,
-    ),
-    "cheapest_from": real("1", "Number of queries from which it is the cheapest.", "cheapest from", 26),
-    "cheapest_until": real("1", "Number of queries until which it is; infinite if for ever.", "until", 27),
-    "probability": real("1", "Share of draws of what other runs may measure in which it is the cheapest.", "sure", 28),
-    "ties": integer(
-        "Other models that may be as cheap: the 95 % interval of the difference to this one contains 0.", "ties", 29
-    ),
-}  # fmt: skip
-"""Columns of the table: those of the cells, and what a number of queries adds to them."""
-
-ADDED: Mapping[str, Column] = {name: column for name, column in COLUMNS.items() if name not in STORED["cells"]}
-"""What it has beside those of the cells."""
-
-
-OF_ONE_MODEL = ("model", "correction", "solver", "accuracy")
-"""What cells have in common whose queries have the same solutions, with certificates or without."""
 
 
 class Candidate(NamedTuple):
@@ -437,19 +435,21 @@ def cheapest(
         for level in levels:
             allowed = {None, *mine["cell"][measured[mine.index] <= level * (1.0 + 1e-12)]}
             row = _winner([one for one in every if one.key in allowed], paired, queries)
-            bound = bounds.get(tuple(row[name] for name in OF_ONE_MODEL))
-            rows.append(row | {BAND: level, "certified_error": bound})
-    return pd.DataFrame(_without_repeats(rows), columns=["problem", BAND, *_other_columns(cells)])
+            bound = bounds.get(tuple(row[name] for name in _model_axes()))
+            rows.append(row | {"error_below": level, "certified_error": bound})
+    others = [*cells.columns.drop("problem"), *(name for name in added_columns() if name != "error_below")]
+    return pd.DataFrame(_without_repeats(rows), columns=["problem", "error_below", *others])
 
 
-def _other_columns(cells: pd.DataFrame) -> list[str]:
-    return [*cells.columns.drop("problem"), *(name for name in ADDED if name != BAND)]
+def _model_axes() -> tuple[str, ...]:
+    """Columns that are equal in cells whose queries have the same solutions, with certificates or without."""
+    return "model", "correction", "solver", "accuracy"
 
 
 def _of_models(cells: pd.DataFrame, certified: pd.Series | None) -> Iterator[tuple[tuple[Any, ...], float]]:
-    """Bounds of mean errors by `OF_ONE_MODEL`: the fastest cell of a model is seldom the one with certificates."""
+    """Bounds of mean errors by `_model_axes`: the fastest cell of a model is seldom the one with certificates."""
     known = {} if certified is None else certified.dropna()
-    for cell, *key in cells[["cell", *OF_ONE_MODEL]].itertuples(index=False):
+    for cell, *key in cells[["cell", *_model_axes()]].itertuples(index=False):
         if cell in known:
             yield tuple(key), float(known[cell])
 
@@ -475,13 +475,13 @@ def candidates(cells: pd.DataFrame, paired: PairedTiming) -> Iterator[Candidate]
         model_row(rows[0], setup, solution), setup, solution, np.full(DRAWS, setup), np.full(DRAWS, solution)
     )
     for row in rows:
-        ratio = paired.ratio(None, row["cell"]) or Estimate(math.log(row["online_s"] / row["hf_s"]), 0.0, 1.0)
+        ratio = paired.ratio(None, row["cell"]) or MeanEstimate(math.log(row["online_s"] / row["hf_s"]), 0.0, 1.0)
         online = solution * np.exp(ratio.draws(rng, DRAWS))
         yield Candidate(row, row["offline_s"], solution * math.exp(ratio.mean), offline_draws(row, setup, rng), online)
 
 
 def _winner(every: Sequence[Candidate], paired: PairedTiming, queries: float) -> dict[str, Any]:
-    """The row of the cheapest model, with what `COLUMNS` adds."""
+    """The row of the cheapest model, with what `cheapest_columns` adds."""
     totals = np.array([one.offline + queries * one.online for one in every])
     drawn = np.array([one.offline_draws + queries * one.online_draws for one in every])
     first = int(np.argmin(totals))
@@ -514,7 +514,7 @@ def _ties(best: Candidate, other: Candidate, paired: PairedTiming, queries: floa
     else:
         rng = np.random.default_rng(0)
         shared = shared_offline(best.row, other.row)
-        ratio = paired.ratio(best.key, other.key) or Estimate(math.log(other.online / best.online), 0.0, 1.0)
+        ratio = paired.ratio(best.key, other.key) or MeanEstimate(math.log(other.online / best.online), 0.0, 1.0)
         more = offline_draws(other.row, shared, rng) - offline_draws(best.row, shared, rng)
         difference = more + queries * best.online * (np.exp(ratio.draws(rng, DRAWS)) - 1.0)
     return float(np.mean(difference <= 0.0)) > TAIL
@@ -527,11 +527,13 @@ def certified_errors(queries: pd.DataFrame) -> pd.Series:
 
 
 def relative_bounds(queries: pd.DataFrame) -> pd.DataFrame:
-    """Relative bounds of u and λ at online cost, by the names of `CERTIFIED_BOUNDS`, of every query.
+    """Relative bounds of u and λ at online cost, "u_energy" and "lambda_natural", of every query.
 
     A query without a relative error, where the solution is zero, has no relative bound.
     """
-    sizes = {name: queries[f"error_{name}_absolute"] / queries[f"error_{name}"] for name in CERTIFIED_BOUNDS}
+    sizes = {
+        name: queries[f"error_{name}_absolute"] / queries[f"error_{name}"] for name in ("u_energy", "lambda_natural")
+    }
     return pd.DataFrame(
         {name: queries[f"bound_online_{name}"].astype(float) / size.astype(float) for name, size in sizes.items()}
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from types import NoneType
 
@@ -12,16 +12,10 @@ import pandas as pd
 from vibench.errors import RequestError
 from vibench.results import ranking
 from vibench.results.break_even import Meaning
-from vibench.results.schema import KEYS, STORED, TABLES, VERSION, SqlType, column_of
+from vibench.results.schema import KEYS, STORED, TABLES, VERSION, Column, SqlType, column_of
 from vibench.results.sqlite import FILE, Part, read_meta, read_parts, read_rows
 from vibench.study.cells import UNCORRECTED
 from vibench.text import brief, json_object
-
-ORDER = (
-    *KEYS, "formulation_a", "formulation_b", "primal_a", "primal_b", "primal_tol_a", "primal_tol_b", "assembly_a",
-    "assembly_b", "stage", "quantity", "query", "step",
-)  # fmt: skip
-"""Columns by which rows are sorted, where a table has them."""
 
 
 def results_file(run: str) -> Path:
@@ -69,11 +63,12 @@ def checked(path: Path, table: str, part: Part) -> Part:
     """Rows as they are; a `RequestError` if one has a value that is none of its column."""
     names, rows = part
     for name, values in zip(names, zip(*rows, strict=True), strict=False):  # no values where there are no rows
-        kind = column_of(table, name).kind
+        column = column_of(table, name)
+        kind = column.kind
         types = set(map(type, values)) - {NoneType}
         if kind == SqlType.BLOB or (types <= {int, float} and kind.is_number):
             continue
-        is_right, right = A_NUMBER if kind.is_number else RIGHT.get(name, A_TEXT)
+        is_right, right = _expected(column, name)
         for value in dict.fromkeys(values):
             if value is not None and not is_right(value):
                 strange = f"{brief(repr(value), 60)} in the column '{name}' of '{table}'"
@@ -81,16 +76,18 @@ def checked(path: Path, table: str, part: Part) -> Part:
     return part
 
 
-A_NUMBER = (lambda value: isinstance(value, float | int)), "a number"
-A_TEXT = (lambda value: isinstance(value, str)), "a text"
-RIGHT: Mapping[str, tuple[Callable[[object], bool], str]] = {
-    "meaning": (set(Meaning).__contains__, f"one of {', '.join(Meaning)}"),
-    "versions": (lambda value: json_object(value) is not None, "a JSON object"),
-}
-"""What the values of some columns of texts have to be, and how it is said."""
+def _expected(column: Column, name: str) -> tuple[Callable[[object], bool], str]:
+    """Check of the values of a column, and its description."""
+    if column.kind.is_number:
+        return lambda value: isinstance(value, float | int), "a number"
+    if name == "meaning":
+        return set(Meaning).__contains__, f"one of {', '.join(Meaning)}"
+    if name == "versions":
+        return lambda value: json_object(value) is not None, "a JSON object"
+    return lambda value: isinstance(value, str), "a text"
 
 
-def cells_with_errors(path: Path, measure: str = ranking.SOLUTION) -> tuple[pd.DataFrame, pd.Series]:
+def cells_with_errors(path: Path, measure: str = "solution") -> tuple[pd.DataFrame, pd.Series]:
     """The recorded cells of a results file, and the error of each by a measure.
 
     Raises a `RequestError` if there is no such measure, or the file cannot be read.
@@ -99,9 +96,18 @@ def cells_with_errors(path: Path, measure: str = ranking.SOLUTION) -> tuple[pd.D
     return cells, ranking.errors_of(cells, read_table(path, "outputs"), measure)
 
 
+def _order(names: Collection[str]) -> list[str]:
+    """Those of the columns with these names by which rows are sorted."""
+    order = (
+        *KEYS, "formulation_a", "formulation_b", "primal_a", "primal_b", "primal_tol_a", "primal_tol_b", "assembly_a",
+        "assembly_b", "stage", "quantity", "query", "step",
+    )  # fmt: skip
+    return [name for name in order if name in names]
+
+
 def in_order(frame: pd.DataFrame) -> pd.DataFrame:
     """Rows sorted by the columns that identify them, loose tolerances first, whatever order cells finished in."""
-    by = [name for name in ORDER if name in frame.columns]
+    by = _order(frame.columns)
     ascending = [_rises(name) for name in by]
     return frame.sort_values(
         by, ascending=ascending, kind="stable", na_position="first", ignore_index=True, key=_without_correction_first
@@ -110,10 +116,15 @@ def in_order(frame: pd.DataFrame) -> pd.DataFrame:
 
 def terms_in_order(names: Collection[str]) -> list[str]:
     """The order of `in_order` as terms of SQL, for a table with columns of these names."""
-    by = [name for name in ORDER if name in names and name != "correction"]
-    terms = {name: f'"{name}" IS NOT NULL, "{name}" {"ASC" if _rises(name) else "DESC"}' for name in by}
-    terms |= {"correction": f"correction IS NOT '{UNCORRECTED}'"} if "correction" in names else {}
-    return [*(terms[name] for name in ORDER if name in terms), "rowid"]
+    return [
+        *(
+            f"correction IS NOT '{UNCORRECTED}'"
+            if name == "correction"
+            else f'"{name}" IS NOT NULL, "{name}" {"ASC" if _rises(name) else "DESC"}'
+            for name in _order(names)
+        ),
+        "rowid",
+    ]
 
 
 def _rises(name: str) -> bool:
@@ -126,10 +137,7 @@ def _without_correction_first(column: pd.Series) -> pd.Series:
 
 
 def whole_numbers(frame: pd.DataFrame) -> pd.DataFrame:
-    """A table of the results file with whole numbers where its columns hold them: a missing one makes them floats."""
-    whole = {name: "Int64" for name in frame.columns if name in WHOLE and frame[name].dtype.kind in "if"}
-    return frame.astype(whole)
-
-
-WHOLE = {name for table in TABLES for name, column in STORED[table].items() if column.kind == SqlType.INTEGER}
-"""Columns of whole numbers; no name is a column of whole numbers in one table and of others in another."""
+    """A table with integers in columns of integers: pandas makes them floats where one is missing."""
+    # No name is a column of integers in one table and of others in another.
+    whole = {name for table in TABLES for name, column in STORED[table].items() if column.kind == SqlType.INTEGER}
+    return frame.astype({name: "Int64" for name in frame.columns if name in whole and frame[name].dtype.kind in "if"})

@@ -19,16 +19,6 @@ from vibench.results.schema import STORED, Column, column_of
 from vibench.results.sqlite import of_cells, open_read_only
 from vibench.text import printable
 
-LONGEST = 1000
-"""Characters of an expression."""
-
-OPERATORS = {"like", "glob"}
-"""Operators that SQLite runs as functions; all other functions are refused."""
-
-QUOTED = re.compile(r"'(?:[^']|'')*'")
-
-EXAMPLE = "solver = 'piqp' and beta_span_min < 1e-3"
-
 
 def matching(
     path: Path,
@@ -39,7 +29,7 @@ def matching(
     made: Collection[str] = (),
     cells: Sequence[str] = (),
 ) -> Array:
-    """Which rows of a table satisfy an expression of SQLite over its columns, in the order they are read in.
+    """Mask of the rows of a table that satisfy an expression of SQLite over its columns, in the order of the file.
 
     The expression may use columns, numbers, texts in single quotes and operators. It runs on a connection that cannot
     write, under an authoriser that refuses functions, subqueries and other tables.
@@ -78,18 +68,20 @@ def _answers(
     columns: Iterable[str],
     made: Collection[str],
 ) -> list[tuple[Any, ...]]:
-    """What a query with an expression and its values gives, if the expression is one that may run."""
+    """Rows of a query whose expression is checked first."""
     outside = _text_free(expression)
-    if len(expression) > LONGEST:
-        raise RequestError(f"--where has {len(expression)} characters, at most {LONGEST} are read")
+    if len(expression) > 1000:
+        raise RequestError(f"--where has {len(expression)} characters, at most 1000 are read")
     if re.search(r'["`;\[\]\'?@$#:\0]|--|/\*', outside.replace("''", "")):
         raise _wrong(expression, "it may hold columns, numbers, operators and texts in single quotes")
     _refuse_unbalanced(expression, outside)
 
+    # An authoriser, since the expression may come from anybody: SQLite runs LIKE and GLOB as functions, and all others
+    # are refused.
     def allowed(action: int, first: str | None, second: str | None, *_: str | None) -> int:
         fine = (
             (action == sqlite3.SQLITE_READ and first == table)
-            or (action == sqlite3.SQLITE_FUNCTION and second in OPERATORS)
+            or (action == sqlite3.SQLITE_FUNCTION and second in ("like", "glob"))
             or (action == sqlite3.SQLITE_SELECT and next(selects, None) is not None)
         )
         return sqlite3.SQLITE_OK if fine else sqlite3.SQLITE_DENY
@@ -110,8 +102,8 @@ def _answers(
 
 
 def _text_free(expression: str) -> str:
-    """An expression without what its texts in quotes say."""
-    return QUOTED.sub("''", expression)
+    """An expression with its quoted texts emptied."""
+    return re.sub(r"'(?:[^']|'')*'", "''", expression)
 
 
 @contextlib.contextmanager
@@ -145,14 +137,15 @@ def _refuse_unbalanced(expression: str, outside: str) -> None:
 
 
 def _in_words(error: sqlite3.Error) -> str:
-    """What SQLite says, or that something is refused."""
+    """The message of SQLite, or that something is refused."""
     if any(word in str(error) for word in ("prohibited", "authorized")):
         return "functions, subqueries and other tables are refused"
     return printable(str(error))
 
 
 def _wrong(expression: str, why: str) -> RequestError:
-    return RequestError(f'--where {printable(expression)!r} is no condition on a row: {why}, as in "{EXAMPLE}"')
+    example = "solver = 'piqp' and beta_span_min < 1e-3"
+    return RequestError(f'--where {printable(expression)!r} is no condition on a row: {why}, as in "{example}"')
 
 
 def parts(text: str) -> list[str]:
@@ -182,8 +175,9 @@ def key_of(cell: str, keys: Iterable[str], run: str) -> str:
     return matching[0]
 
 
-def short_keys(keys: Iterable[str], least: int = 4) -> int:
-    """Number of characters that tell the keys of cells apart, at least `least`."""
+def short_keys(keys: Iterable[str]) -> int:
+    """Number of characters that distinguish the keys of cells, at least four."""
+    least = 4
     different = set(keys)
     longest = max(map(len, different), default=least)
     with contextlib.suppress(StopIteration):

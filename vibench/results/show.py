@@ -16,7 +16,6 @@ from vibench.files import write_atomically
 from vibench.results import formats, ranking, selection
 from vibench.results.formats import cell_text, csv_lines, summary, to_markdown
 from vibench.results.paired_timing import PairedTiming
-from vibench.results.ranking import BAND
 from vibench.results.read import (
     cells_with_errors,
     checked,
@@ -29,101 +28,106 @@ from vibench.results.schema import STORED, TABLES, Column
 from vibench.results.sqlite import parameters_of, read_parts
 from vibench.text import json_object
 
+# Columns that distinguish rows; where all rows have one value, it stands in the title and takes no room.
 AXES = (
     "problem", "training", "formulation", "dual", "primal", "primal_tol", "solver", "pod_tol", "dual_tol", "accuracy",
     "assembly", "correction",
-)  # fmt: skip
-"""Columns that tell rows apart; where all rows have one value, it stands in the title and takes no room."""
-
-OF_CELLS = (
-    *AXES, "cell", "error_lambda_mean", "online_s", "error_u_mean", "offline_s", "beta_cone_lower_min",
-    "queries_ok", "N", "R", "status", "beta_span_min", "enrichment",
-)  # fmt: skip
-
-OF_BENEFITS = (
-    "problem", "formulation_a", "formulation_b", "dual", "primal_a", "primal_b", "benefit_threshold", "primal_tol_b",
-    "solver", "assembly_a", "assembly_b", "correction", "threshold_high", "gain", "rounds_missing", "pod_tol",
-    "dual_tol", "accuracy", "online_b_s", "online_a_s",
-    "offline_b_s", "offline_a_s",
-)  # fmt: skip
-
-
-OF_TOTALS = (
-    "problem", ranking.BAND, "formulation", "primal", "primal_tol", "dual", "total_s", "probability", "cheapest_from",
-    "ties", "cell", "error_lambda_mean", "certified_error", "error_u_mean", "assembly", "total_high_s",
-    "cheapest_until", "solver", "N", "R", "correction", "offline_s", "online_s", "training", "accuracy",
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class View:
-    """A table for reading."""
+    """A table for reading.
+
+    Attributes
+    ----------
+    source
+        The table of the results file that it is made of.
+    columns
+        Its columns, those that matter most first: on a narrow terminal the last ones are left out.
+    headings
+        Columns with headings and places of their own; `None` where names are headings.
+    rows
+        Function from the rows of the source to its rows, in their order.
+    empty
+        Reason why it may have no rows where the source has some.
+    """
 
     source: str
-    """Table of the results file that it is made of."""
     columns: tuple[str, ...]
-    """Its columns by their names there, those that matter most first: on a narrow terminal the last ones are left
-    out."""
     headings: Mapping[str, Column] | None = None
-    """Columns with headings and places of their own; empty where names are headings."""
     rows: Callable[[pd.DataFrame], pd.DataFrame] = in_order
-    """Its rows, in their order, from those of the source."""
     empty: str = ""
-    """Why it may have no rows where the source has some."""
 
 
-VIEWS: Mapping[str, View] = {
-    "summary": View("cells", (*OF_CELLS, *(n for n, c in STORED["cells"].items() if c.heading)), STORED["cells"]),
-    "best": View(
-        "cells", ("problem", BAND, *OF_CELLS[:14], "ties", *OF_CELLS[14:]), ranking.HEADINGS, ranking.fastest,
-        ranking.NO_BEST_CELL,
-    ),
-    "benefits": View(
-        "thresholds", (*OF_BENEFITS, *(n for n, c in STORED["thresholds"].items() if c.heading)), STORED["thresholds"],
-    ),
-    "cells": View("cells", (*OF_CELLS, "reason")),
-    "queries": View(
-        "queries",
-        (*AXES, "cell", "query", "status", "error_u", "error_lambda", "total_s", "mu_1", "mu_2", "mu_3",
-         "beta_cone_lower", "beta_span", "primal_residual", "dual_residual", "gap", "iterations", "reason"),
-    ),
-    "histories": View(
-        "histories",
-        ("stage", "quantity", "step", "value", "problem", "dual", "primal", "primal_tol", "pod_tol", "dual_tol"),
-    ),
-    "timings": View(
-        "timings", (*AXES, "cell", "round", "total_s", "assemble_s", "solve_s", "queries", "slowdown"),
-    ),
-    "thresholds": View("thresholds", OF_BENEFITS),
-    "outputs": View(
-        "outputs",
-        ("problem", "training", "formulation", "dual", "primal", "primal_tol", "solver", "assembly", "correction",
-         "output", "unit",
-         "error_mean", "error_max", "error_scaled_mean", "scale", "queries_ok", "queries_zero", "pod_tol", "dual_tol",
-         "accuracy", "cell"),
-    ),
-    "disagreements": View(
-        "disagreements",
-        ("solver_a", "solver_b", "problem", "dual", "primal", "primal_tol", "pod_tol", "dual_tol", "accuracy",
-         "assembly", "difference_max", "flagged", "queries", "allowed_worst", "query_flagged"),
-    ),
-}  # fmt: skip
-"""Tables that `vibench show` prints, by name: three for reading, and those of the results file."""
+def _views() -> dict[str, View]:
+    of_cells = (
+        *AXES, "cell", "error_lambda_mean", "online_s", "error_u_mean", "offline_s", "beta_cone_lower_min",
+        "queries_ok", "N", "R", "status", "beta_span_min", "enrichment",
+    )  # fmt: skip
+    of_break_even = (
+        "problem", "formulation_a", "formulation_b", "dual", "primal_a", "primal_b", "benefit_threshold",
+        "primal_tol_b", "solver", "assembly_a", "assembly_b", "correction", "threshold_high", "gain", "rounds_missing",
+        "pod_tol", "dual_tol", "accuracy", "online_b_s", "online_a_s", "offline_b_s", "offline_a_s",
+    )  # fmt: skip
+    of_queries = (
+        *AXES, "cell", "query", "status", "error_u", "error_lambda", "total_s", "mu_1", "mu_2", "mu_3",
+        "beta_cone_lower", "beta_span", "primal_residual", "dual_residual", "gap", "iterations", "reason",
+    )  # fmt: skip
+    of_outputs = (
+        "problem", "training", "formulation", "dual", "primal", "primal_tol", "solver", "assembly", "correction",
+        "output", "unit", "error_mean", "error_max", "error_scaled_mean", "scale", "queries_ok", "queries_zero",
+        "pod_tol", "dual_tol", "accuracy", "cell",
+    )  # fmt: skip
+    of_disagreements = (
+        "solver_a", "solver_b", "problem", "dual", "primal", "primal_tol", "pod_tol", "dual_tol", "accuracy",
+        "assembly", "difference_max", "flagged", "queries", "allowed_worst", "query_flagged",
+    )  # fmt: skip
+    of_histories = (
+        "stage", "quantity", "step", "value", "problem", "dual", "primal", "primal_tol", "pod_tol", "dual_tol",
+    )  # fmt: skip
+    of_timings = (*AXES, "cell", "round", "total_s", "assemble_s", "solve_s", "queries", "slowdown")
+    cells, thresholds = STORED["cells"], STORED["thresholds"]
+    of_best = ("problem", "error_below", *of_cells[:14], "ties", *of_cells[14:])
+    return {
+        "summary": View("cells", (*of_cells, *(name for name in cells if cells[name].heading)), cells),
+        "best": View("cells", of_best, ranking.fastest_columns(), ranking.fastest, ranking.no_best_cell()),
+        "benefits": View(
+            "thresholds", (*of_break_even, *(name for name in thresholds if thresholds[name].heading)), thresholds
+        ),
+        "cells": View("cells", (*of_cells, "reason")),
+        "queries": View("queries", of_queries),
+        "histories": View("histories", of_histories),
+        "timings": View("timings", of_timings),
+        "thresholds": View("thresholds", of_break_even),
+        "outputs": View("outputs", of_outputs),
+        "disagreements": View("disagreements", of_disagreements),
+    }
 
-OF_ONE_CELL = [name for name, view in VIEWS.items() if "cell" in STORED[view.source]]
-"""Tables whose rows belong to one cell each."""
 
-TOGETHER: Mapping[str, tuple[str, ...]] = {
-    "pod_tol": ("pod_size",), "dual_tol": ("dual_size",), "queries_ok": ("queries",),
-    "benefit_threshold": ("meaning",), "threshold_high": ("threshold_low",), "total_high_s": ("total_low_s",),
-    "gain": ("gain_low", "gain_high"),
-}  # fmt: skip
-"""What a column of a table for reading shows beside its own value."""
+# Tables that `vibench show` prints, by name: three for reading, and those of the results file.
+VIEWS: Mapping[str, View] = _views()
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table as it was asked for: its rows with the columns of the results file, and how to show them."""
+    """Selected rows and columns of a table.
+
+    Attributes
+    ----------
+    rows
+        The rows, with the columns of the results file.
+    columns, chosen
+        The columns to show, and whether the user chose them.
+    view
+        The view of the whole table.
+    key_length
+        Number of characters that distinguish the keys of the cells of the run.
+    varying
+        Options that distinguish plugins of one name, by the column of the name and the name.
+    parameters
+        Names of the parameters of the problems by their columns, mu_1, mu_2, …
+    """
 
     rows: pd.DataFrame
     columns: tuple[str, ...]
@@ -131,21 +135,24 @@ class Table:
     chosen: bool
     key_length: int
     varying: Mapping[tuple[str, str], tuple[str, ...]]
-    """Options that tell plugins of one name apart, by the column of the name and the name."""
     parameters: Mapping[str, str] = field(default_factory=dict)
-    """Names of the parameters of the problems by their columns, mu_1, mu_2, …"""
 
     @property
     def exact(self) -> pd.DataFrame:
-        """Every value as it is recorded, under the column's name: for programs."""
+        """Every recorded value under the name of its column, for programs."""
         if not self.view.headings and not self.chosen:
             return whole_numbers(self.rows)
-        more = {name: () if self.chosen else TOGETHER.get(name, ()) for name in self.columns}
-        return whole_numbers(self.rows[[part for name in self._placed for part in (name, *more[name])]])
+        # Columns that a table for reading shows in the place of another one.
+        together = {} if self.chosen else {
+            "pod_tol": ("pod_size",), "dual_tol": ("dual_size",), "queries_ok": ("queries",),
+            "benefit_threshold": ("meaning",), "threshold_high": ("threshold_low",), "total_high_s": ("total_low_s",),
+            "gain": ("gain_low", "gain_high"),
+        }  # fmt: skip
+        return whole_numbers(self.rows[[part for name in self._placed for part in (name, *together.get(name, ()))]])
 
     @property
     def readable(self) -> pd.DataFrame:
-        """The values as people read them, under headings; keys of cells are shortened, and names have their options."""
+        """Values for people, under headings: with shortened keys of cells, and options beside names of plugins."""
         told = {axis for axis, _ in self.varying}
         names = [n for n in self._placed if self.chosen or n in told or formats.says_something(self.rows, n)]
         rows = self.rows.assign(cell=self.rows["cell"].str[: self.key_length]) if "cell" in self.rows else self.rows
@@ -170,7 +177,9 @@ class Table:
         """The columns in their places, or in the order in which they were asked for."""
         headings = self.view.headings
         order = list(headings or self.rows.columns)
-        by_place = sorted(self.columns, key=lambda name: (headings[name].place if headings else 0, order.index(name)))
+        by_place = sorted(
+            self.columns, key=lambda name: (headings[name].place or 0 if headings else 0, order.index(name))
+        )
         return list(self.columns) if self.chosen else by_place
 
     @property
@@ -180,7 +189,7 @@ class Table:
 
     @property
     def axes(self) -> set[str]:
-        """Headings of the columns that tell rows apart."""
+        """Headings of the columns that distinguish rows."""
         return {self._heading(name) for name in (*AXES, "primal_tol_b")}
 
     def _heading(self, name: str) -> str:
@@ -218,14 +227,16 @@ def look_up(
     everything = read_table(path, "cells") if needed else frame
     keys = everything.get("cell", [])
     if where:
-        added = {name: ranking.ERROR_COLUMNS[name] for name in ranking.ERROR_COLUMNS if name in frame}
+        added = {name: ranking.error_columns()[name] for name in ranking.error_columns() if name in frame}
         made = set(view.headings or {}) - set(frame.columns)
         frame = frame[selection.matching(path, view.source, where, frame, added, made, needed)]
-        if frame.empty:  # what keeps rows out of the table is not why there are none
+        # The condition, not the reason of the view, is why there are no rows.
+        if frame.empty:
             view = replace(view, empty="")
     if cell:
         if "cell" not in frame:
-            raise RequestError(f"the table {name} has no rows of one cell; expected {', '.join(OF_ONE_CELL)}")
+            of_cells = [name for name, each in VIEWS.items() if "cell" in STORED[each.source]]
+            raise RequestError(f"the table {name} has no rows of one cell; expected {', '.join(of_cells)}")
         frame = frame[frame["cell"] == _key_of(path, cell)]
     rows = view.rows(frame if largest is None or name == "best" else ranking.within(frame, largest))
     named = _parameters(path, rows)
@@ -248,7 +259,7 @@ def look_up(
 
 def _parameters(path: Path, rows: pd.DataFrame) -> dict[str, str]:
     """Headings, "radius [m]", of the columns mu_1, mu_2, … of rows; those of several problems side by side."""
-    columns = [name for name in rows.columns if PARAMETER_NAME.fullmatch(name)]
+    columns = [name for name in rows.columns if re.fullmatch("mu_[1-9][0-9]*", name)]
     if not columns:
         return {}
     of, headings = parameters_of(path), dict[str, list[str]]()
@@ -266,19 +277,11 @@ def _parameters_by_name(named: Mapping[str, str], rows: pd.DataFrame) -> dict[st
     return {text: key for text, key in both if text not in rows}
 
 
-PARAMETER_NAME = re.compile("mu_[1-9][0-9]*")
-
-LARGE = ("queries", "timings", "outputs")
-"""Tables with many rows of each cell, in which whatever tells cells apart is that of their row in the table cells."""
-
-FEW = 100
-"""Cells up to which only their rows are read."""
-
-
 def _cells_needed(path: Path, view: View, cell: str, where: str, sort: Sequence[str], limit: int) -> Sequence[str]:
     """Cells of all rows of a large table that are asked for, where they are few; none where all rows are read."""
     named = [key.removeprefix("-") for key in sort]
-    if view.source not in LARGE or not (cell or limit):
+    # These have many rows of each cell, and their cells are distinguished by columns of the table of cells.
+    if view.source not in ("queries", "timings", "outputs") or not (cell or limit):
         return ()
     if cell:
         return (_key_of(path, cell),)
@@ -290,7 +293,8 @@ def _cells_needed(path: Path, view: View, cell: str, where: str, sort: Sequence[
     ]
     order = [*first, *terms_in_order(STORED[view.source])]
     cells = selection.cells_of_first(path, view.source, where, order, limit)
-    return cells if len(cells) <= FEW else ()
+    # Reading rows by their cells pays only for few of them.
+    return cells if len(cells) <= 100 else ()
 
 
 def _key_of(path: Path, cell: str) -> str:
@@ -300,7 +304,7 @@ def _key_of(path: Path, cell: str) -> str:
 def _varying_options(frame: pd.DataFrame) -> dict[tuple[str, str], tuple[str, ...]]:
     """Options that differ between plugins of one name, by the column of the name and the name."""
     varying = {}
-    for axis in PLUGINS:
+    for axis in ("problem", "training", "dual", "primal"):
         if f"{axis}_options" not in frame:
             continue
         for name, texts in frame.groupby(axis)[f"{axis}_options"]:
@@ -312,12 +316,8 @@ def _varying_options(frame: pd.DataFrame) -> dict[tuple[str, str], tuple[str, ..
     return varying
 
 
-PLUGINS = ("problem", "training", "dual", "primal")
-"""Columns of names of plugins, whose options are in columns of their own."""
-
-
 def _options(text: str | None) -> dict[str, str]:
-    """Options as they are recorded, their values as texts; a text that is no JSON object is one of them."""
+    """Recorded options with their values as texts; a text that is no JSON object is one option."""
     if not isinstance(text, str):
         return {}
     options = json_object(text)
@@ -349,11 +349,12 @@ def _measured(
     if not error and largest is None:
         return view, frame
     if view.source != "thresholds":
-        raise RequestError(f"the table {name} compares no models by an error; expected {', '.join(COMPARING)}")
-    recorded, errors = cells_with_errors(path, error or ranking.SOLUTION)
+        comparing = ["best", *(other for other, each in VIEWS.items() if each.source == "thresholds")]
+        raise RequestError(f"the table {name} compares no models by an error; expected {', '.join(comparing)}")
+    recorded, errors = cells_with_errors(path, error or "solution")
     first = ("problem", "dual", "primal_a", "primal_b", "benefit_threshold", "error_b", "error_a")
-    columns = tuple(dict.fromkeys((*first, *view.columns, *ranking.ERROR_COLUMNS)))
-    headings = None if view.headings is None else {**view.headings, **ranking.ERROR_COLUMNS}
+    columns = tuple(dict.fromkeys((*first, *view.columns, *ranking.error_columns())))
+    headings = None if view.headings is None else {**view.headings, **ranking.error_columns()}
     return replace(view, columns=columns, headings=headings), ranking.with_errors(frame, recorded, errors)
 
 
@@ -368,18 +369,18 @@ def _best(path: Path, view: View, error: str, largest: float | None, queries: fl
     certified = ranking.certified_errors(read_table(path, "queries"))
     asked = {"queries": queries, "errors": errors, "within": largest, "certified": certified}
     rows = partial(ranking.cheapest, paired=paired, **asked)
-    return replace(view, rows=rows, columns=OF_TOTALS, headings=ranking.COLUMNS)
+    columns = (
+        "problem", "error_below", "formulation", "primal", "primal_tol", "dual", "total_s", "probability",
+        "cheapest_from", "ties", "cell", "error_lambda_mean", "certified_error", "error_u_mean", "assembly",
+        "total_high_s", "cheapest_until", "solver", "N", "R", "correction", "offline_s", "online_s", "training",
+        "accuracy",
+    )  # fmt: skip
+    return replace(view, rows=rows, columns=columns, headings=ranking.cheapest_columns())
 
 
-COMPARING = ("best", *(name for name, view in VIEWS.items() if view.source == "thresholds"))
-"""Tables that compare models, for which an error measure can be asked."""
-
-
-SUMMARY = "summary.md"
-
-
-EXPORTED = (*(f"{table}.csv" for table in TABLES), SUMMARY)
-"""Names of the files that `export` writes."""
+def exported_files() -> list[str]:
+    """Names of the files that `export` writes."""
+    return [*(f"{table}.csv" for table in TABLES), "summary.md"]
 
 
 def export(path: Path, folder: Path) -> list[Path]:
@@ -387,7 +388,7 @@ def export(path: Path, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     # Tables are written as they are read: queries may be more than memory holds.
     texts: dict[str, Iterable[str]] = {f"{name}.csv": _csv_parts(path, name) for name in TABLES}
-    texts[SUMMARY] = [to_markdown(summary(read_table(path, "cells")))]
+    texts["summary.md"] = [to_markdown(summary(read_table(path, "cells")))]
     for name, parts in texts.items():
         write_atomically(folder / name, (part.encode("utf-8") for part in parts))
     return [folder / name for name in texts]

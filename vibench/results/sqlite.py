@@ -23,43 +23,35 @@ from vibench.qp.status import Status
 from vibench.results.schema import STORED, VERSION
 from vibench.text import brief, json_object, one_line, printable
 
-META = ("key", "value")
-"""Columns of the meta table."""
-
-NONE = "0"
-"""Digest of no rows."""
-
-CREATE = "CREATE TABLE IF NOT EXISTS digests (name TEXT, cell TEXT, total TEXT, PRIMARY KEY (name, cell))"
-"""The table of the digests: one for each cell in each table, or for a whole table that has no cells."""
-
-FORMAT = 2
-"""Format of marshal for the rows: its later ones depend on how often an object is used."""
-
-
+# Rows read at a time: a large table has more than memory should hold.
 PART = 4096
-"""Rows that are read at a time: a large table has more than memory should hold."""
 
 
 class DigestError(Exception):
-    """Rows that are not those that were written; the message names the table, and a cell if it has some."""
+    """Rows differ from those that were written; the message names the table, and the cell if it has cells."""
 
 
 class Digests:
     """The digests in a results file: sums over rows, which follow a change of few rows without reading the others.
 
-    A row counts 2¹²⁸ and its digest of 128 bits (BLAKE2b). The order of the rows does not matter, nor do columns that
-    were added after them.
+    SQLite notices pages whose structure is broken, but no changed numbers. A row counts 2¹²⁸ and its digest of 128
+    bits (BLAKE2b). The order of the rows does not matter, nor do columns that were added after them.
     """
 
     def __init__(self, db: sqlite3.Connection) -> None:
         self._db = db
 
-    def count(self, table: str, same: str = "TRUE", values: Sequence[Any] = (), *, sign: int = 1) -> None:
-        """Add the rows of a table under a condition, before they are changed with `sign` −1."""
+    def create(self) -> None:
+        """Create the table of digests: one for each cell in each table, or for a whole table without cells."""
+        columns = "name TEXT, cell TEXT, total TEXT, PRIMARY KEY (name, cell)"
+        self._db.execute(f"CREATE TABLE IF NOT EXISTS digests ({columns})")
+
+    def count(self, table: str, same: str = "TRUE", values: Sequence[Any] = (), *, remove: bool = False) -> None:
+        """Add the rows of a table under a condition to the digests, or remove them before they are changed."""
         cursor = self._db.execute(f'SELECT * FROM "{table}" WHERE {same}', values)
         for cell, total in _totals([column[0] for column in cursor.description], cursor).items():
             stored = self._db.execute("SELECT total FROM digests WHERE name = ? AND cell = ?", (table, cell)).fetchone()
-            now = int(stored[0] if stored else NONE, 16) + sign * total
+            now = int(stored[0] if stored else "0", 16) + (-total if remove else total)
             self._db.execute("INSERT OR REPLACE INTO digests VALUES (?, ?, ?)", (table, cell, f"{now:x}"))
 
     def forget(self, **keys: str) -> None:
@@ -68,14 +60,14 @@ class Digests:
         self._db.execute(f"DELETE FROM digests WHERE {same}", tuple(keys.values()))
 
     def changed(self, table: str) -> tuple[str, ...]:
-        """Cells whose rows are not those that were written; "" for a table without cells."""
+        """Cells whose rows differ from those that were written; "" for a table without cells."""
         names, rows = self._opened(table)
         return self._compared(table, _totals(names, rows))
 
     def verified(
         self, table: str, cells: Sequence[str] = (), order: Sequence[str] = ()
     ) -> Iterator[tuple[list[str], list[tuple[Any, ...]]]]:
-        """Columns and rows of a table, or those of some cells, in parts of at most `PART` rows: at least one part.
+        """Columns and rows of a table, or those of some cells, in parts of some thousand rows: at least one part.
 
         `order` are terms of SQL; without, rows come in the order in which they were written.
 
@@ -102,7 +94,7 @@ class Digests:
         except UnicodeDecodeError:  # of the name of a column
             raise DigestError(f"the columns of the table '{table}' are not those that were written") from None
         names = [column[0] for column in cursor.description]
-        declared = META if table == "meta" else tuple(STORED[table])
+        declared = ("key", "value") if table == "meta" else tuple(STORED[table])
         if names != [*declared, *(f"mu_{k + 1}" for k in range(len(names) - len(declared)))]:
             raise DigestError(f"the columns of the table '{table}' are not those that were written")
         return names, cursor
@@ -112,11 +104,11 @@ class Digests:
         written = dict(self._db.execute(query, (table, *cells)))
         now = {str(key): f"{total:x}" for key, total in totals.items()}
         either = sorted(map(str, written.keys() | now.keys()))
-        return tuple(key for key in either if written.get(key, NONE) != now.get(key, NONE))
+        return tuple(key for key in either if written.get(key, "0") != now.get(key, "0"))
 
 
 def of_cells(cells: Sequence[str]) -> str:
-    """The condition that a row belongs to one of some cells, which are its values; no cells stand for all."""
+    """SQL condition that a row belongs to one of some cells, given as values; without cells, to any."""
     return f"cell IN ({', '.join('?' * len(cells))})" if cells else "TRUE"
 
 
@@ -132,7 +124,8 @@ def _digest(row: tuple[Any, ...]) -> int:
     count = len(row)
     while count and row[count - 1] is None:
         count -= 1
-    code = hashlib.blake2b(marshal.dumps(row[:count], FORMAT), digest_size=16)
+    # Later formats of marshal than 2 depend on how often an object is used.
+    code = hashlib.blake2b(marshal.dumps(row[:count], 2), digest_size=16)
     return (1 << 128) + int.from_bytes(code.digest())
 
 
@@ -143,21 +136,15 @@ class DamagedResultsError(RequestError):
     """A results file that cannot be read: cut off, overwritten, or from a disk that failed."""
 
 
-BUSY_SECONDS = 60.0
-"""Longest wait for a lock that another program holds."""
-
-DAMAGE = {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}
-"""SQLite's error codes of a damaged file."""
-
+# Suffix of a damaged database that is kept.
 DAMAGED = ".damaged"
-"""What `set_aside` adds to the name of a file."""
 
-WRITE_AHEAD_LOG, INDEX, JOURNAL = "-wal", "-shm", "-journal"
-"""What SQLite adds to the name of a database for its write-ahead log, the index of that, and a log for going back."""
+# Longest wait in seconds for a lock that another program holds.
+BUSY_SECONDS = 60.0
 
 
 def code_of(error: sqlite3.Error) -> int:
-    """SQLite's error code, without the bits that tell variants of an error apart; 0 for errors of Python's own."""
+    """Primary error code of SQLite; 0 for errors of Python's own."""
     return getattr(error, "sqlite_errorcode", 0) & 0xFF
 
 
@@ -172,7 +159,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
         connection = stack.enter_context(contextlib.closing(_connection(path)))
         if not _has_index(connection) and path.is_file():
             copy = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=TEMPORARY))) / path.name
-            for end in ("", WRITE_AHEAD_LOG):
+            for end in ("", "-wal"):
                 with contextlib.suppress(FileNotFoundError):
                     shutil.copyfile(f"{path}{end}", f"{copy}{end}")
             connection = stack.enter_context(contextlib.closing(_connection(copy)))
@@ -186,7 +173,7 @@ def refuse_pipes(path: Path) -> None:
 
     Raises a `RequestError` that names what is no regular file.
     """
-    for beside in (f"{path}{end}" for end in ("", WRITE_AHEAD_LOG, INDEX, JOURNAL)):
+    for beside in (f"{path}{end}" for end in ("", "-wal", "-shm", "-journal")):
         if os.path.exists(beside) and not os.path.isfile(beside):  # noqa: PTH110, PTH113
             raise RequestError(f"'{beside}' is no regular file; remove it")
 
@@ -197,22 +184,24 @@ def _connection(path: Path) -> sqlite3.Connection:
 
 
 def _has_index(connection: sqlite3.Connection) -> bool:
-    """Whether a database needs no index of a write-ahead log, or one can be made beside it."""
+    """Whether the database can be read where it is: it needs no index of a write-ahead log, or one can be made."""
     try:
         connection.execute("PRAGMA schema_version").fetchone()
     except sqlite3.OperationalError as error:
         return code_of(error) not in (sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
-    except sqlite3.DatabaseError:  # damaged: the reader will be told
+    except sqlite3.DatabaseError:
+        # Damaged, which reading it reports.
         return True
     return True
 
 
 def set_aside(path: Path) -> None:
-    """Rename a database and its write-ahead log by `DAMAGED`; earlier ones of that name are replaced."""
-    for end in (WRITE_AHEAD_LOG, ""):  # the log first: a new database must not find it
+    """Rename a database and its write-ahead log to "….damaged", in place of earlier ones."""
+    # The log first: a new database must not find it.
+    for end in ("-wal", ""):
         with contextlib.suppress(FileNotFoundError):
             Path(f"{path}{end}").replace(f"{path}{DAMAGED}{end}")
-    Path(f"{path}{INDEX}").unlink(missing_ok=True)
+    Path(f"{path}-shm").unlink(missing_ok=True)
 
 
 def read_text(stored: bytes) -> str:
@@ -220,26 +209,18 @@ def read_text(stored: bytes) -> str:
     return printable(stored.decode("utf-8", errors="replace"))
 
 
-REMEMBERED = 1 << 16
-"""Texts that a connection remembers."""
-
-
 def text_reader() -> Callable[[bytes], str]:
-    """`read_text` for one connection: a text that most rows of a table have is read, and kept in memory, once."""
-    return lru_cache(maxsize=REMEMBERED)(read_text)
-
-
-PARAMETERS = "parameters of "
-"""Beginning of the keys of `meta` under which names and units of the parameters of a problem are, by its label."""
+    """`read_text` for one connection, cached: most rows of a table have the same texts."""
+    return lru_cache(maxsize=1 << 16)(read_text)
 
 
 def parameters_of(path: Path) -> dict[str, list[tuple[str, str]]]:
     """Names and units of mu_1, mu_2, … by the label of the problem, as far as a results file has them."""
-    texts = {key: value for key, value in read_meta(path).items() if key.startswith(PARAMETERS)}
+    texts = {key: value for key, value in read_meta(path).items() if key.startswith("parameters of ")}
     found = {}
     for key, text in texts.items():
         try:
-            found[key.removeprefix(PARAMETERS)] = [(str(name), str(unit)) for name, unit in json.loads(text)]
+            found[key.removeprefix("parameters of ")] = [(str(name), str(unit)) for name, unit in json.loads(text)]
         except (TypeError, ValueError):
             raise DamagedResultsError(
                 f"'{path}' has {brief(repr(text), 60)} as the {key}, expected pairs of texts"
@@ -268,11 +249,10 @@ def read_meta(path: Path) -> dict[str, str]:
     except DigestError as error:
         raise DamagedResultsError(f"'{path}' is damaged: {error}") from None
     except sqlite3.Error as error:
-        sort = DamagedResultsError if code_of(error) in DAMAGE else RequestError
-        raise sort(f"'{path}' is not a results file of vibench: {error}") from None
-
-
-STATUSES = tuple(status.value for status in Status)
+        damaged = code_of(error) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+        raise (DamagedResultsError if damaged else RequestError)(
+            f"'{path}' is not a results file of vibench: {error}"
+        ) from None
 
 
 Part: TypeAlias = tuple[list[str], list[tuple[Any, ...]]]
@@ -288,15 +268,15 @@ def read_rows(path: Path, table: str, cells: Sequence[str] = ()) -> Part:
     for names, part in read_parts(path, table, cells):  # noqa: B007  there is at least one part
         rows += part
     if "status" in names:
-        strange = {row[names.index("status")] for row in rows}.difference(STATUSES)
+        strange = {row[names.index("status")] for row in rows}.difference(status.value for status in Status)
         if strange:
-            expected = f"expected one of {', '.join(STATUSES)}"
+            expected = f"expected one of {', '.join(Status)}"
             raise RequestError(f"'{path}' has the status {str(min(strange, key=str))[:60]!a} in '{table}', {expected}")
     return names, rows
 
 
 def read_parts(path: Path, table: str, cells: Sequence[str] = (), order: Sequence[str] = ()) -> Iterator[Part]:
-    """The same in parts of some thousand rows, at least one, whatever their status; `order` are terms of SQL.
+    """`read_rows` in parts of some thousand rows, at least one, whatever their status; `order` are terms of SQL.
 
     Raises a `RequestError` after the last part if they are damaged.
     """

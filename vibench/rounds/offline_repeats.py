@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vibench.results.break_even import NORMAL_95, SCATTER
+from vibench.results.break_even import SCATTER, offline_factor
 from vibench.stages.base import Result, Row, Stage
 from vibench.stages.cell_queries import CellQueries
 from vibench.storage.artefacts import Store
@@ -71,7 +71,7 @@ def offline_columns(cell: CellQueries, setup: float, runs: Mapping[str, Sequence
     total = sum(columns.values())
     # As often as the seconds were measured, weighed by themselves.
     often = float(np.average(times, weights=seconds)) if sum(seconds) else 1.0
-    factor = float(np.exp(NORMAL_95 * deviation / np.sqrt(often)))
+    factor = offline_factor(deviation / float(np.sqrt(often)))
     repeats = sum(count > 1 and spent >= NOTICEABLE for count, spent in zip(times, seconds, strict=True))
     ends = {"offline_low_s": total / factor, "offline_high_s": total * factor}
     return columns | {"offline_s": total, **ends, "offline_repeats": repeats}

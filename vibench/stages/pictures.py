@@ -13,7 +13,7 @@ from vibench.errors import NumericalError
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.pictures import Picture
 from vibench.plugins.plugin import Plugin
-from vibench.results.pictures import ARRAYS, TEXTS, failure_rows, picture_rows
+from vibench.results.pictures import failure_rows, members, picture_rows
 from vibench.stages.base import Result, Row, Stage, build_problem
 from vibench.stages.snapshots import gather, solution_stages
 from vibench.storage.artefacts import Store
@@ -82,8 +82,8 @@ def _checked(picture: Picture) -> Picture:
 
     Raises a `NumericalError` that names the member that does not.
     """
-    mistyped = [name for name in ARRAYS if getattr(picture, name).dtype.kind not in "fiu"]
-    mistyped += [name for name in TEXTS if not isinstance(getattr(picture, name), str)]
+    mistyped = [name for name in members(arrays=True) if getattr(picture, name).dtype.kind not in "fiu"]
+    mistyped += [name for name in members(arrays=False) if not isinstance(getattr(picture, name), str)]
     if mistyped:
         raise NumericalError(f"the problem's picture has {' and '.join(mistyped)} of the wrong type")
     count, places = picture.points.shape[-1], picture.positions.shape[-1]
@@ -100,6 +100,6 @@ def _checked(picture: Picture) -> Picture:
     if wrong:
         raise NumericalError(f"the problem's picture has {' and '.join(wrong)} of the wrong shape")
     own: dict[str, Any] = {
-        name: getattr(picture, name).copy() for name in ARRAYS
+        name: getattr(picture, name).copy() for name in members(arrays=True)
     }  # the next picture may use the same arrays
-    return replace(picture, **own | {name: one_line(getattr(picture, name)) for name in TEXTS})
+    return replace(picture, **own | {name: one_line(getattr(picture, name)) for name in members(arrays=False)})

@@ -24,7 +24,7 @@ from vibench.qp.settings import SETTINGS
 from vibench.qp.status import Status
 from vibench.report.differences import ChangeKind
 from vibench.results.break_even import Meaning
-from vibench.results.ranking import ADDED
+from vibench.results.ranking import added_columns
 from vibench.results.read import read_table
 from vibench.results.schema import STORED, TABLES
 from vibench.results.sqlite import FILE
@@ -440,8 +440,8 @@ def test_help_on_a_column_of_a_computed_table_is_its_meaning_there(name: str, ma
     assert code == 0
     names = {"total [s]": "total_s", "total": "total_s", "until": "cheapest_until", "sure": "probability"}
     column = names.get(name, name.replace(" ", "_"))
-    unit = f" [{ADDED[column].unit}]" * bool(ADDED[column].unit)
-    assert f"{column}{unit}, in best: {ADDED[column].meaning}" in out.splitlines()
+    unit = f" [{added_columns()[column].unit}]" * bool(added_columns()[column].unit)
+    assert f"{column}{unit}, in best: {added_columns()[column].meaning}" in out.splitlines()
 
 
 def test_help_on_a_key_of_study_files_is_what_it_means_wherever_it_stands(main: Main) -> None:

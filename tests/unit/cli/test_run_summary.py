@@ -15,7 +15,7 @@ from vibench.cli.console import run_argument
 from vibench.cli.main import app
 from vibench.cli.run_command import REASONS, failures, next_steps, print_summary
 from vibench.results.database import ResultsDatabase
-from vibench.results.ranking import NO_BEST_CELL
+from vibench.results.ranking import no_best_cell
 from vibench.results.sqlite import FILE
 
 
@@ -75,10 +75,10 @@ def test_a_run_of_which_no_cell_is_the_best_says_why(
         made.write_cell(one, [])
     made.close()
     assert not print_summary("sample", tmp_path / "run" / FILE, rows)
-    assert NO_BEST_CELL in capsys.readouterr().out.splitlines()
+    assert no_best_cell() in capsys.readouterr().out.splitlines()
     code, out, _ = main("show", str(tmp_path / "run"), "--table", "best")
     assert code == 0
-    assert out.splitlines() == ["run: best: no rows", NO_BEST_CELL]
+    assert out.splitlines() == ["run: best: no rows", no_best_cell()]
     for table in ("summary", "best"):
         _, out, _ = main("show", str(tmp_path / "run"), "--table", table, "--where", "problem = 'none'")
         assert out.splitlines() == [f"run: {table}: no rows"]

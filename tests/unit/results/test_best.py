@@ -5,14 +5,14 @@ from __future__ import annotations
 from samples import cells_of, row_of
 
 from vibench.results import formats
-from vibench.results.ranking import BAND, HEADINGS, fastest
+from vibench.results.ranking import fastest, fastest_columns
 
 
 def test_every_error_that_is_reached_has_its_fastest_cell() -> None:
     found = fastest(
         cells_of(row_of("a", 0.05, 0.1), row_of("b", 0.06, 0.2), row_of("c", 0.004, 0.3), row_of("d", 0.003, 0.25))
     )
-    assert list(zip(found["cell"], found[BAND], strict=True)) == [("a", 0.1), ("d", 0.01)]
+    assert list(zip(found["cell"], found["error_below"], strict=True)) == [("a", 0.1), ("d", 0.01)]
 
 
 def test_an_exact_cell_that_is_the_fastest_stands_alone() -> None:
@@ -33,4 +33,4 @@ def test_cells_that_no_leaderboard_names_take_no_part() -> None:
 def test_problems_are_apart_and_an_error_of_zero_is_one() -> None:
     found = fastest(cells_of(row_of("a", 0.05, 0.1), row_of("b", 0.0, 0.2, problem="zero", error_u_mean=0.0)))
     assert list(found["cell"]) == ["a", "b"]
-    assert "error ≤" in formats.under_headings(found, ["problem", BAND], HEADINGS)
+    assert "error ≤" in formats.under_headings(found, ["problem", "error_below"], fastest_columns())

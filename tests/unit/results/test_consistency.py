@@ -13,7 +13,7 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.qp import verification
 from vibench.qp.solve import solve_qp
 from vibench.qp.verification import Slack, allowed, slack
-from vibench.results.consistency import Recorded, compare, disagreement_rows, sentence, solution_row
+from vibench.results.consistency import Recorded, agreement_sentence, compare, disagreement_rows, solution_row
 from vibench.results.schema import KEYS
 
 
@@ -89,11 +89,13 @@ def test_only_ok_answers_of_the_same_reduced_model_are_compared() -> None:
 
 
 def test_of_one_solver_nothing_is_said() -> None:
-    assert sentence(pd.DataFrame(), 1) == ""
+    assert agreement_sentence(pd.DataFrame(), 1) == ""
 
 
 def test_the_audit_in_a_line() -> None:
     row = {"queries": 5, "difference_max": 1e-4, "solver_a": "x", "solver_b": "y", "flagged": 0}
-    assert "no two solvers" in sentence(pd.DataFrame(), 2)
-    assert "agree in all 5 comparisons: u differs by at most 1.0e-04 (x and y)" in sentence(pd.DataFrame([row]), 2)
-    assert "more than the accuracy allows in 2 of 5" in sentence(pd.DataFrame([row | {"flagged": 2}]), 2)
+    assert "no two solvers" in agreement_sentence(pd.DataFrame(), 2)
+    assert "agree in all 5 comparisons: u differs by at most 1.0e-04 (x and y)" in agreement_sentence(
+        pd.DataFrame([row]), 2
+    )
+    assert "more than the accuracy allows in 2 of 5" in agreement_sentence(pd.DataFrame([row | {"flagged": 2}]), 2)

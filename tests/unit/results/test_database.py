@@ -19,9 +19,10 @@ from samples import RECORDED, cell_row, query_rows
 
 from vibench.errors import RequestError, StorageError
 from vibench.results import database as module
-from vibench.results.database import LONGEST_TEXT, ResultsDatabase
+from vibench.results.database import ResultsDatabase
 from vibench.results.schema import STORED, TABLES, VERSION
 from vibench.results.sqlite import FILE, read_meta, read_rows
+from vibench.text import LONGEST
 
 
 def seen(folder: Path, table: str) -> list[tuple[Any, ...]]:
@@ -160,7 +161,7 @@ def test_a_long_text_is_cut_and_json_is_not(journal: ResultsDatabase) -> None:
     (row,) = journal.rows("cells")
     assert (row["problem_options"], row["definition"]) == (whole, whole)
     assert row["reason"].endswith("x… (50000000 characters)")
-    assert len(row["reason"]) == LONGEST_TEXT
+    assert len(row["reason"]) == 2 * LONGEST
 
 
 def test_a_name_that_looks_like_a_uri_is_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,15 @@ import pytest
 from scipy.stats import t as student
 
 from vibench.results.break_even import TAIL, compared
-from vibench.results.paired_timing import CONDITIONS, CommonVariance, Estimate, PairedTiming, beside, blocks_of, paces
+from vibench.results.paired_timing import (
+    CONDITIONS,
+    CommonVariance,
+    MeanEstimate,
+    PairedTiming,
+    beside,
+    blocks_of,
+    paces,
+)
 
 GROUPS, CELLS, ROUNDS, SECONDS = 3, 6, 3, 0.08
 """Groups, cells of each, rounds of a block, and seconds of a cell's part of a round."""
@@ -67,7 +75,7 @@ def measured(
     return rows, {f"{g}-{c}": truth[g, c] for g in range(groups) for c in range(CELLS)}
 
 
-def covered(found: Estimate | None, true: float) -> bool:
+def covered(found: MeanEstimate | None, true: float) -> bool:
     assert found is not None
     low, high = found.interval(TAIL)
     return low <= true <= high

@@ -22,7 +22,7 @@ from samples import cells_of, row_of
 import vibench
 from vibench.errors import RequestError
 from vibench.results.paired_timing import PairedTiming
-from vibench.results.ranking import BAND, Criterion, certified_errors, cheapest, leaderboard
+from vibench.results.ranking import Criterion, certified_errors, cheapest, leaderboard
 
 TOO_MUCH = 0.1
 """Errors, and shares of the solver and of assembly in them, from which a model wins nothing."""
@@ -153,7 +153,7 @@ def test_the_lower_envelope_of_total_costs() -> None:
         assert row["probability"] == 1.0
         assert row["ties"] == 0
     rows = cheapest(cells, timed(cells), 500)
-    assert list(zip(rows[BAND], rows["cell"], strict=True)) == [(0.1, "c"), (1e-3, "b")]
+    assert list(zip(rows["error_below"], rows["cell"], strict=True)) == [(0.1, "c"), (1e-3, "b")]
 
 
 def test_models_that_may_be_as_cheap_are_ties_and_nothing_is_sure() -> None:

@@ -170,7 +170,7 @@ def break_even(data: ProblemTables) -> Pages:
     errors = {
         measure: ranking.errors_of(decided, data.outputs, measure).dropna()
         for measure in ranking.measures(data.outputs)
-        if measure != ranking.SOLUTION
+        if measure != "solution"
     }
     panels = [(measure, decided.loc[error.index], error) for measure, error in errors.items() if len(error)]
     without = len(models) - len(decided)
@@ -186,7 +186,7 @@ def break_even(data: ProblemTables) -> Pages:
             panel.vlines(error, low, high, color="0.6", lw=0.8, zorder=0)
             best = mine.iloc[_front(error.to_numpy(float), number.to_numpy(float))]
             _name_points(sheet, panel, best, error, number)
-            title = measure.removeprefix(ranking.OUTPUT).replace("lambda", "λ")
+            title = measure.removeprefix("output:").replace("lambda", "λ")
             panel.set(xlabel="mean relative error", ylabel="break-even [queries]", title=title)
             panel.set(xscale="log", yscale="log")
         yield sheet.finish(
