@@ -9,8 +9,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
-from functools import wraps
+from dataclasses import dataclass
+from functools import partial, wraps
 from itertools import cycle
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
@@ -21,7 +21,7 @@ from vibench.arrays import Array
 from vibench.benchmarks import PrimalChoice, ReducedSpaces, Setting, Size, TimedProblem, Timing
 from vibench.errors import UnsupportedError
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
-from vibench.interfaces.formulations import Formulation, FormulationAnswer, axes_of
+from vibench.interfaces.formulations import FormulationAnswer
 from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment, Stop
 from vibench.interfaces.validation import (
@@ -97,10 +97,6 @@ class StageInputs:
         self.made: dict[Hashable, Future[Any]] = {}
         self.sizes: dict[tuple[int, int], Size] = {}
 
-    def about(self) -> dict[str, object]:
-        case, problem = self.case, self.problem
-        return {"problem": case.problem, "resolution": case.resolution, "n": problem.V.dim, "m": problem.W.dim}
-
     @property
     @_once
     def problem(self) -> Problem:
@@ -163,10 +159,6 @@ class StageInputs:
     @_once
     def modes(self, stop: Stop) -> int:
         return len(pod(self.snapshots.u, self.problem.V, stop).basis.T)
-
-    def dimensions(self, spaces: ReducedSpaces) -> tuple[int, int]:
-        reduction = self.reduction(spaces)
-        return reduction.pod.basis.shape[1], reduction.cone.size
 
 
 def solve_all(problem: Problem, mus: Array) -> list[HighFidelitySolution]:
@@ -381,8 +373,10 @@ def errors_of(inputs: StageInputs, query: ValidationQuery, u: Array, lam: Array)
 
 def test_solver(timing: Timing, inputs: StageInputs, size: Size, solver: str, accuracy: float) -> None:
     """One reduced program, solved to an accuracy."""
-    registered, spaces = qp_solver(solver), _spaces(inputs, size)
-    N, R = inputs.dimensions(spaces)
+    # The spaces of this size, as far as the snapshots give them.
+    modes = Stop(size=min(size.N, inputs.modes(Stop(tolerance=1e-8))))
+    spaces = ReducedSpaces(modes, Stop(size=size.R), inputs.usual.dual)
+    N, R = inputs.reduction(spaces).pod.basis.shape[1], inputs.reduction(spaces).cone.size
     # The snapshots of a problem give so many dimensions; larger programs would be the same.
     if inputs.sizes.setdefault((N, R), size) != size:
         pytest.skip(f"the snapshots of {inputs.case} give N = {N} and R = {R} at most")
@@ -393,17 +387,9 @@ def test_solver(timing: Timing, inputs: StageInputs, size: Size, solver: str, ac
         figures = {} if residuals is None else residual_figures(residuals)
         return {**_shape(reduced), "N": N, "status": status.value, "reason": reason, "accuracy": figures}
 
-    timing(
-        f"QP of N = {N}, R = {R}",
-        lambda: solve_qp(reduced.program, solver, accuracy, registered, reduced.factor),
-        judge,
-    )
-
-
-def _spaces(inputs: StageInputs, size: Size) -> ReducedSpaces:
-    """ReducedSpaces of this size, as far as the snapshots give them."""
-    modes = min(size.N, inputs.modes(Stop(tolerance=1e-8)))
-    return ReducedSpaces(Stop(size=modes), Stop(size=size.R), inputs.usual.dual)
+    registered = qp_solver(solver)
+    solve = partial(solve_qp, reduced.program, solver, accuracy, registered, reduced.factor)
+    timing(f"QP of N = {N}, R = {R}", solve, judge)
 
 
 def _shape(reduced: ReducedProblem) -> dict[str, int | str]:
@@ -413,58 +399,42 @@ def _shape(reduced: ReducedProblem) -> dict[str, int | str]:
 
 
 def test_formulation(timing: Timing, inputs: StageInputs, formulation: str) -> None:
-    """What a formulation builds, and its model."""
-    made: Formulation = find(FORMULATION, formulation).create({})
-    offline = _phase(inputs, made)
-    _built(made, offline)
-    timing("formulation", lambda: _built(made, offline), lambda built: _judge_formulation(inputs, built))
+    """The offline part of a formulation, and its model."""
+    build = _formulated(inputs, formulation)
+    timing("formulation", build, lambda model: _judge_answers(inputs, model, _high_fidelity_residuals))
 
 
 def test_formulated_query(timing: Timing, inputs: StageInputs, formulation: str) -> None:
     """A query of a formulation; reached are errors, and residuals of the high-fidelity problem."""
-    made: Formulation = find(FORMULATION, formulation).create({})
-    built, mus = _built(made, _phase(inputs, made)), _in_turn(inputs)
+    model, mus = _formulated(inputs, formulation)(), _in_turn(inputs)
 
     def query() -> FormulationAnswer:
-        return built.online.solve(next(mus), built.settings()[0])
+        return model.online.solve(next(mus), model.settings()[0])
 
-    timing("query of a formulation", query, lambda _: _judge_formulation(inputs, built), together=len(inputs.queries))
+    def judge(_: FormulationAnswer) -> Info:
+        return _judge_answers(inputs, model, _high_fidelity_residuals)
 
-
-def _judge_formulation(inputs: StageInputs, model: Model) -> Info:
-    """Judge with the residuals of the high-fidelity problem, where a pair is there."""
-
-    def residuals(answer: Solution) -> Residuals | None:
-        known = answer.x is not None and answer.status is not Status.NONFINITE
-        return answer.high_fidelity_residuals if known else None
-
-    return _judge_answers(inputs, model, residuals)
+    timing("query of a formulation", query, judge, together=len(inputs.queries))
 
 
-def _phase(inputs: StageInputs, formulation: Formulation) -> Reduction:
-    """The offline phase with the steps that a formulation uses, assembled in the quickest way there is."""
-    uses = axes_of(formulation, f"formulation {type(formulation).__qualname__}")
-    whole = inputs.online(inputs.usual, inputs.primal)
-    given: dict[str, Any] = {"snapshots": whole.snapshots, "parameters": whole.parameters}
-    given |= {"pod": whole.pod} if "pod" in uses else {}
-    given |= {"cone": whole.cone, "multipliers": whole.multipliers} if "dual" in uses else {}
-    given |= {"enrichment": whole.enrichment, "operators": whole.operators} if "primal" in uses else {}
-    given |= {"members": whole.members} if "assembly" in uses else {}
-    without: dict[str, Any] = {} if "primal" in uses else {"primal": None, "tolerance": None}
-    without |= {} if "dual" in uses else {"dual": None, "generators": None}
-    without |= {} if "pod" in uses else {"modes": None}
-    without |= {} if "assembly" in uses else {"assembly": "full"}
-    return replace(whole, **without).given(**given)
+def _formulated(inputs: StageInputs, formulation: str) -> Callable[[], Model]:
+    """Return a function that builds a formulation on the offline phase of the setting, where it can be built."""
+    offline, made = inputs.online(inputs.usual, inputs.primal), find(FORMULATION, formulation).create({})
 
+    def build() -> Model:
+        model = offline.with_formulation(made).model
+        model.online  # noqa: B018  is made
+        return model
 
-def _built(formulation: Formulation, offline: Reduction) -> Model:
-    """The formulation on an offline phase, its model made."""
     try:
-        built = offline.with_formulation(formulation).model
+        build()
     except UnsupportedError as error:
         pytest.skip(str(error))
-    built.online  # noqa: B018  is made
-    return built
+    return build
+
+
+def _high_fidelity_residuals(answer: Solution) -> Residuals | None:
+    return None if answer.x is None or answer.status is Status.NONFINITE else answer.high_fidelity_residuals
 
 
 def largest_figures(several: Iterable[Mapping[str, float]]) -> dict[str, float]:
