@@ -84,12 +84,14 @@ def requested(function: Callable[P, T]) -> Callable[P, T]:
 def _fits(function: Callable[..., Any], name: str, value: Any) -> bool:
     from pydantic import ValidationError  # noqa: PLC0415  slow to import
 
+    # In strict mode pydantic refuses scalars of NumPy.
     value = value.item() if type(value).__module__ == "numpy" and getattr(value, "shape", None) == () else value
     try:
         _adapters(function)[name].validate_python(value)
     except ValidationError:
         return False
-    return not (isinstance(value, str) and "\0" in value)  # no path and no name holds this character
+    # No path and no name holds this character.
+    return not (isinstance(value, str) and "\0" in value)
 
 
 @functools.cache
@@ -113,7 +115,8 @@ def unknown_name(kind: str, name: str, choices: Iterable[str]) -> RequestError:
     choices = sorted(choices)
     near = difflib.get_close_matches(name, choices, n=5)
     hint = f"; did you mean '{near[0]}'?" if near else ""
-    if len(choices) > 30:  # a longer list helps nobody
+    # A longer list helps nobody.
+    if len(choices) > 30:
         listed = f"{len(choices)} are known{', such as ' * bool(near[1:])}{', '.join(near[1:])}"
     else:
         listed = f"known: {', '.join(choices) or 'none'}"

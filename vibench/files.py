@@ -72,7 +72,8 @@ def locked(path: Path, *, busy: str, shared: bool = False) -> Iterator[None]:
     cannot be written.
     """
     try:
-        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC  # symbolic links are refused
+        # Refuse symbolic links, which would lock, and overwrite, the file of somebody else.
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
         file = os.fdopen(os.open(path, flags, 0o666), "r+", encoding="utf-8")
     except OSError as error:
         if path.is_symlink():

@@ -68,7 +68,8 @@ def held() -> Iterator[None]:
     """Block Ctrl-C: processes that are started inside inherit this and never receive it."""
     from multiprocessing import resource_tracker  # noqa: PLC0415  most commands start no processes
 
-    resource_tracker.ensure_running()  # its start would unblock SIGINT
+    # Start the tracker now: its start would unblock SIGINT.
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -97,4 +98,5 @@ def _set(handler: Handler) -> None:
 def _leave(number: int, frame: FrameType | None) -> None:  # noqa: ARG001  the signature of a handler
     sys.stdout.flush()
     os.write(2, b"vibench: interrupted\n")
+    # No handlers at exit: the interpreter may be in the middle of an import.
     os._exit(INTERRUPTED)

@@ -65,7 +65,8 @@ def memory(groups: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/
         inside = PurePosixPath(name.lstrip("/"))
         # Groups above limit it, too; "." is the top group, as seen in a container.
         for group in (inside, *inside.parents):
-            with contextlib.suppress(OSError, ValueError):  # no such file, or "max"
+            # There may be no such file, or it says "max".
+            with contextlib.suppress(OSError, ValueError):
                 amounts.append(int((top / group / limit).read_text()))
     return min(amounts)
 

@@ -75,6 +75,7 @@ def _cut(shown: str, length: int, longest: int) -> str:
     """Cut the printable form of a text whose `length` is noted; it was made of its `longest` first characters only."""
     if max(length, len(shown)) <= longest:
         return shown
+    # The note must fit in, so that a text that was cut is not cut again.
     note = f"… ({length} characters)"
     return shown[: longest - len(note)] + note
 

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from functools import cache, partial
 from itertools import repeat
 from resource import RUSAGE_CHILDREN, getrusage
-from time import perf_counter, process_time  # bound before plugins are imported, which may replace those of `time`
+
+# Bound before plugins are imported, which may replace the functions of `time`.
+from time import perf_counter, process_time
 from typing import Any, TypeVar
 
 import numpy as np
@@ -90,6 +92,7 @@ def median_seconds(
         return timed(partial(work, *next(each)))
 
     result, first = once()
+    # Slow work has no warm-up to speak of.
     if first.wall > enough:
         return result, first
     runs: list[Seconds] = []

@@ -159,6 +159,7 @@ class Dask(Executor):
 
     def submit(self, job: Job) -> Future[StageOutcome]:
         result: Future[StageOutcome] = Future()
+        # Not pure: dask would return an earlier result for an equal job.
         theirs = self._client.submit(_run_for, self._token, job, pure=False)
         theirs.add_done_callback(lambda done: _hand_over(done, result))
         return result
@@ -168,7 +169,8 @@ class Dask(Executor):
             raise ExecutorError("the dask scheduler is not connected any more; run the same command again to continue")
 
     def close(self) -> None:
-        with contextlib.suppress(Exception):  # a cluster that was lost has no jobs to end
+        # A cluster that was lost has no jobs to end.
+        with contextlib.suppress(Exception):
             if self._client.status == "running":
                 self._client.run(_dismiss, self._token)
         self._client.close()
@@ -189,7 +191,8 @@ def _greet(scheduler: str, seconds: float) -> None:
         comm = await asyncio.wait_for(connect(scheduler, timeout=seconds, **credentials), seconds)
         comm.abort()
 
-    with ThreadPoolExecutor(1) as other:  # a notebook has an event loop in this thread
+    # In another thread: a notebook has an event loop in this one.
+    with ThreadPoolExecutor(1) as other:
         try:
             other.submit(lambda: asyncio.run(greet())).result()
         except Exception as error:  # noqa: BLE001  whatever answers may say anything
@@ -222,6 +225,7 @@ def _hand_over(theirs: Any, ours: Future[StageOutcome]) -> None:
         ours.set_result(_result(theirs))
     except BaseException as error:  # noqa: BLE001  this thread is dask's: pass it to the waiting thread
         line = in_a_line(error)
+        # The job has killed several workers in turn: it fails, and the run goes on.
         if type(error).__name__ == "KilledWorker":
             ours.set_result(Failed(Status.CRASHED, f"dask does not repeat the job again: {line}"))
         else:

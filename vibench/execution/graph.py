@@ -43,6 +43,7 @@ class Graph:
             return False
         if stage.key in self.stages:
             return True
+        # Available stages hide their inputs: these need not be computed for them.
         if is_available(stage):
             self._available.add(stage.key)
             return False
@@ -59,6 +60,7 @@ class Graph:
     def begin(self, count: int) -> Iterator[Stage]:
         """Take at most `count` stages whose inputs are done, in the order of the plan; they count as begun."""
         while count > 0 and self._ready:
+            # A stage that was dropped after it became ready is not waiting any more.
             _, key = heappop(self._ready)
             if self.waiting.pop(key, None) is not None:
                 count -= 1

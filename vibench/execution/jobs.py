@@ -90,6 +90,7 @@ class CurrentItem:
 
     def enter(self, number: int, *, limited: bool) -> None:
         """Set the item; `limited` inside an operation that has a time limit of its own."""
+        # The supervisor sees from the count that an operation has ended, although the next one looks the same.
         changes = (self._memory[0] >> 32) % 2**30 + 1
         self._memory[0] = changes << 32 | number << 1 | limited
 

@@ -93,7 +93,8 @@ def _provide(stages: Iterable[Stage], store: Store) -> None:
     for stage in stages:
         graph.add_goal(stage, lambda needed: store.get(needed.key) is not None)
     with closing(Supervisor()) as supervisor, store.used():
-        for stage in graph.stages.values():  # inputs come first
+        # In the order of the plan inputs come first.
+        for stage in graph.stages.values():
             # The stages succeeded before: these limits (seconds, seconds, GiB) only need to be large.
             outcome = supervisor.run(Job(str(store.folder), stage, 1e6, 1e6, 1e6))
             if not isinstance(outcome, Done):
@@ -151,7 +152,8 @@ def recorded_study(run: str, cell: str, places: Mapping[str, str] = NOT_MOVED) -
     settings = {} if pd.isna(rounds) else {"timing_rounds": int(rounds)}
     try:
         definition = recorded.cell
-    except (ValueError, TypeError, KeyError, AttributeError) as error:  # the file may come from a stranger
+    # The file may come from a stranger, who may have written anything.
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
         what = f"the definition of cell {recorded.row['cell']} cannot be read"
         raise RequestError(f"'{recorded.path}': {what}") from error
     return study_of_cell(definition, name, **settings)

@@ -140,7 +140,8 @@ class ResultWriter:
     ) -> None:
         """Write the seconds of a cell that has its rows; more may follow until `timed` is called."""
         row = self.database.cell(cell.key)
-        assert row is not None  # cells are timed when they have their rows
+        # Cells are timed only when they have their rows.
+        assert row is not None
         own = seconds_of_cell(rows) | {"timing_rounds": None, "timed_rounds": len(rows), "timing_reason": lost}
         if rows:
             own["machine"] = "; ".join(sorted({*row["machine"].split("; "), *machines}))
@@ -162,7 +163,8 @@ class ResultWriter:
             rows.append([named | {"step": history.first_step + k, "value": v} for k, v in enumerate(history.values)])
         if rows:
             self.database.write_histories(rows, partial=stage.partial)
-        if type(stage).rows is not Stage.rows:  # artefacts are large: read only if rows are made of them
+        # Artefacts are large: read them only if rows are made of them.
+        if type(stage).rows is not Stage.rows:
             self._tables(stage, stage.rows(value_of(store, stage)))
 
     def failure(self, stage: Stage, reason: str) -> None:

@@ -156,6 +156,7 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
             run = _Run(study, folder, store, writer, observer, options)
             interrupted = run.execute(cells, todo)
             everything = list(database.rows("cells"))
+            # Both tables compare cells of the whole file, those of earlier runs included.
             database.replace("thresholds", break_even_rows(everything, database.rows("timings")))
             database.replace("disagreements", disagreement_rows(everything, database.fine_solutions))
         finally:
@@ -211,7 +212,8 @@ class _Run:
         try:
             workers = self._workers() if runnable or untimed else None
             self.machines = self.machines if workers is None else workers.machines
-            pictured: dict[Plugin, Stage] = {}  # of the first training set of a problem
+            # One training set of a problem is drawn, the first one.
+            pictured: dict[Plugin, Stage] = {}
             for cell in cells:
                 pictured.setdefault(cell.problem, PictureStage(cell.problem, cell.training))
             for cell in runnable:
@@ -229,7 +231,8 @@ class _Run:
             if workers is not None:
                 self._loop(workers)
         except KeyboardInterrupt:
-            interrupts.ignore()  # another Ctrl-C must not leave the results incomplete
+            # Another Ctrl-C must not leave the results incomplete.
+            interrupts.ignore()
             interrupted = True
         finally:
             if workers is not None:
@@ -286,6 +289,7 @@ class _Run:
             self.graph.done(stage)
             return
         if isinstance(outcome, Failed):
+            # The last stage of a cell has no name that a user knows.
             reason = outcome.reason if stage.key in self.cells else f"in {stage.label}: {outcome.reason}"
             self.writer.failure(stage, outcome.reason)
             self._timed(stage, outcome)

@@ -105,7 +105,8 @@ class _JobState:
             return
         self.seconds += step
         changes, _, limited = (0, None, False) if self._current is None else self._current.read()
-        if changes != self._changes:  # an operation has begun or ended since the last call
+        # An operation has begun or ended since the last call.
+        if changes != self._changes:
             self._changes = changes
             self._item_limit = self.seconds + self.job.query_seconds + self.grace if limited else float("inf")
         if self.seconds > limit:
@@ -146,7 +147,8 @@ class Supervisor:
 
     def __init__(self, log: Path | None = None, environment: Mapping[str, str] | None = None) -> None:
         self._log, self._environment = log, environment or {}
-        self._workers: OrderedDict[frozenset[str], _Worker] = OrderedDict()  # the most recently used comes last
+        # The most recently used worker comes last.
+        self._workers: OrderedDict[frozenset[str], _Worker] = OrderedDict()
         self._session = 0
         self._state: _JobState | None = None
         self._stop = threading.Event()
@@ -185,7 +187,8 @@ class Supervisor:
         state, limit, retried = _JobState(job, observe), job.cell_seconds, False
         self._state = state
         done, lost = state.progress.done, state.progress.lost
-        while len(self._workers) > 4:  # idle processes hold memory, each with the imports of its packages
+        # Idle processes hold memory, each with the imports of its packages: keep the last four.
+        while len(self._workers) > 4:
             self._kill(next(iter(self._workers)))
         while True:
             try:
@@ -231,7 +234,8 @@ class Supervisor:
                     # It is dead, although a child process of it may hold the socket open.
                     raise EOFError
                 state.tick(limit)
-        except (EOFError, OSError):  # the other end of the socket is closed
+        # The other end of the socket is closed.
+        except (EOFError, OSError):
             if not self._stop.is_set():
                 raise _WorkerLostError(Failed(Status.CRASHED, _cause_of_death(process))) from None
         raise StoppedError
@@ -309,7 +313,8 @@ def kill_marked(mark: str) -> None:
     A process that became a daemon is in no group or session of the worker, and after the worker's death not among its
     children. On systems without /proc only the process group ends with a worker.
     """
-    for _ in range(100):  # processes may be started during a search; no more, in case one multiplies for ever
+    # Processes may be started during a search. The number is bounded in case one multiplies for ever.
+    for _ in range(100):
         processes = list(_marked(mark))
         if not processes:
             return
@@ -323,5 +328,6 @@ def _marked(mark: str) -> Iterator[int]:
     for folder in Path("/proc").glob("[0-9]*"):
         # Processes of others cannot be read; those that have just ended are not there, or have no environment.
         with contextlib.suppress(OSError):
+            # Compare whole entries: the mark could be a part of another variable.
             if int(folder.name) != os.getpid() and entry in (folder / "environ").read_bytes().split(b"\0"):
                 yield int(folder.name)

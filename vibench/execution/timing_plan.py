@@ -28,8 +28,9 @@ class OfflinePlan:
     def __init__(self, store: Store, writer: ResultWriter, requested: int) -> None:
         self._store, self._writer, self._requested = store, writer, requested
         self._numbers = range(1, (requested or 2) + 1)
-        self._seconds: dict[str, Seconds] = {}  # of the first run of a stage, by its key
-        self._costs: dict[str, float] = {}  # of a repeat of a stage, by its key
+        # Seconds of the first run of a stage, and what a repeat costs, by its key.
+        self._seconds: dict[str, Seconds] = {}
+        self._costs: dict[str, float] = {}
         # Only offline stages pay for repeats: the assessment of queries takes many times their seconds.
         self._sources: set[str] = set()
         self._planned: set[str] = set()
@@ -47,6 +48,7 @@ class OfflinePlan:
         self._cells |= mine
         stages = {stage.key: stage for goal in mine.values() for stage in sources(goal)}
         self._sources |= stages.keys() & self._costs.keys()
+        # Begin with the cheapest: the same budget then repeats most stages.
         known = sorted((key for key in stages if key in self._costs), key=self._costs.__getitem__)
         planned = []
         for number in self._numbers:
@@ -95,8 +97,10 @@ class _Group:
         self.rows: dict[str, list[Row]] = defaultdict(list)
         self.rounds: dict[str, list[TimedRound]] = defaultdict(list)
         self.machines: dict[str, set[str]] = defaultdict(set)
-        self.lost: dict[str, tuple[int, str]] = defaultdict(lambda: (0, ""))  # rounds, and the reason of the first
-        self.blocks = self.first = 0  # numbers of the next block and of the next round
+        # Number of the rounds that are missing, and the reason of the first.
+        self.lost: dict[str, tuple[int, str]] = defaultdict(lambda: (0, ""))
+        # Numbers of the next block and of the next round.
+        self.blocks = self.first = 0
 
 
 class TimingPlan:
@@ -177,7 +181,8 @@ class TimingPlan:
         group.first += stage.rounds
         timed_here = {goal.key for goal in stage.cells}
         for cell, goal in group.members.items():
-            if goal.key in timed_here:  # other cells have no new seconds
+            # Other cells have no new seconds.
+            if goal.key in timed_here:
                 self._write(group, cell, goal)
                 self._paired.add(cell.key, group.rows[goal.key])
         # A goal without a single round in this block would fail again.
@@ -212,7 +217,8 @@ class TimingPlan:
 
     def _would_help(self, one: BreakEvenComparison, done: int) -> bool:
         """Whether more rounds may decide a comparison, since it is the seconds of queries that leave it undecided."""
-        more = one.result.rounds  # an estimate, which twice the limit allows for
+        # The number of rounds still needed is an estimate, for which twice the limit allows.
+        more = one.result.rounds
         return one.gain is None or (more is not None and done + more <= 2.0 * self._rounds)
 
 

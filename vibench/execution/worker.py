@@ -55,7 +55,8 @@ def main() -> None:
     """Serve the supervisor at the other end of a socket until it closes the connection."""
     log = os.open(sys.argv[2], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
     ours = socket.socket(fileno=int(sys.argv[1]))
-    ours.set_inheritable(False)  # children of plugins must not hold it open
+    # Children of plugins must not hold the socket open.
+    ours.set_inheritable(False)
     _, (shared,), *_ = socket.recv_fds(ours, 1, 1)
     current = CurrentItem(shared)
     os.close(shared)
@@ -65,14 +66,18 @@ def main() -> None:
         os.dup2(log, stream)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(line_buffering=True)
+    # A crash leaves its traceback in the log.
     faulthandler.enable()
+    # Ctrl-C is for the command, which ends its workers itself.
     interrupts.ignore()
+    # Seconds are those of one thread.
     threadpool_limits(1)
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     own, first = os.getpid(), True
 
     def end_in_child() -> None:
-        if os.getpid() != own:  # a plugin forked: the child must not talk to the supervisor
+        # A plugin has forked: the child must not talk to the supervisor.
+        if os.getpid() != own:
             os._exit(0)
 
     def send(message: Any) -> None:
@@ -189,6 +194,7 @@ def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:
     try:
         with _memory_limit(memory_gib):
             return work()
+    # This process may hold garbage of the failed work: it is replaced.
     except MemoryError:
         raise _NoMemoryError from None
     except (StorageError, _NoMemoryError):

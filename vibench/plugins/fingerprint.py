@@ -35,11 +35,13 @@ def _hash_of(value: Any, seen: dict[int, tuple[int, Any]]) -> str:
     if type(value) in (type(None), bool, int, float, complex, str, bytes):
         words = [repr(value)]
     elif type(value) in (set, frozenset):
+        # The order of a set differs between processes, so that its members must not number each other.
         words = sorted(_hash_of(one, dict(seen)) for one in value)
     elif not isinstance(value, tuple) and id(value) in seen:
         words = [f"again {seen[id(value)][0]}"]
     else:
-        seen[id(value)] = len(seen), value  # the value, too: identities of values that are gone are reused
+        # Keep the value, too: the identity of a value that is gone is reused.
+        seen[id(value)] = len(seen), value
         if type(value) is dict:
             keys = {_hash_of(key, dict(seen)): key for key in value}
             words = [word for name in sorted(keys) for word in (name, _hash_of(value[keys[name]], seen))]
@@ -98,6 +100,7 @@ def _globals(function: FunctionType) -> dict[str, Any]:
     code = [function.__code__]
     for part in code:
         code += [one for one in part.co_consts if isinstance(one, CodeType)]
+    # Names in nested functions and comprehensions count as well.
     loads = (one for part in code for one in dis.get_instructions(part) if one.opname.startswith("LOAD_"))
     names = {str(one.argval) for one in loads if one.opname.endswith(("GLOBAL", "GLOBALS", "NAME"))}
     return {name: function.__globals__[name] for name in names if name in function.__globals__}
@@ -129,6 +132,7 @@ def module_version(module: ModuleType) -> str:
     source, top = getattr(module, "__file__", None), module.__name__.partition(".")[0]
     if source is None or top in ("vibench", *sys.stdlib_module_names):
         return ""
+    # A released package is identified by its version, one in development only by its sources.
     installed = {"site-packages", "dist-packages"} & {*Path(source).parts}
     released = getattr(sys.modules.get(top), "__version__", "") if installed else ""
     return str(released or package_hash(module.__name__))

@@ -75,6 +75,7 @@ def named_path(path: Any) -> tuple[Any, Any]:
         return path, path
     relative = os.path.normpath(path.rpartition(BESIDE)[2])
     absolute = os.path.abspath(path)  # noqa: PTH100  links stay
+    # A path out of the folder of the study would reveal where that is.
     elsewhere = Path(relative).parts[:1] in ((), ("/",), ("..",))
     return Path(absolute).name if elsewhere else relative, absolute
 
@@ -92,7 +93,8 @@ def options_of(plugin: Any) -> Mapping[str, Option]:
         hints = get_type_hints(constructor, include_extras=True)
     except Exception as error:  # noqa: BLE001  evaluating annotations runs third-party code
         raise RequestError(f"the options of {plugin.__name__} have annotations that fail: {in_a_line(error)}") from None
-    parameters = list(inspect.signature(constructor).parameters.values())[1:]  # without self
+    # The first parameter is self.
+    parameters = list(inspect.signature(constructor).parameters.values())[1:]
     named = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
     return {p.name: Option(p.name, hints.get(p.name, Any), p.default) for p in named}
 
@@ -103,6 +105,7 @@ def checked_arguments(plugin: type, what: str, given: Mapping[str, Any]) -> dict
     Raises a `RequestError` if an option is unknown, missing, or not of its type.
     """
     options, checked = options_of(plugin), {}
+    # Unknown names first: a misspelt option would otherwise be reported as missing.
     for name in given:
         if name not in options:
             raise unknown_name(f"option of {what}", name, options)
@@ -173,7 +176,8 @@ def places(schema: Mapping[str, Any], model: str) -> list[str]:
 def _preset(value: Any) -> str:
     if value in (None, "", {}) or (isinstance(value, dict) and "query_seconds" in value):
         return ""
-    if isinstance(value, list) and value and isinstance(value[0], dict):  # a name may stand for an entry
+    # A name may stand for an entry.
+    if isinstance(value, list) and value and isinstance(value[0], dict):
         value = [entry["name"] for entry in value]
     return json.dumps(value)
 

@@ -46,7 +46,8 @@ class Plugin:
     places: str = field(default="{}", compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "kind", PluginKind(self.kind))  # it is a text in a results file
+        # The kind is a text in a results file.
+        object.__setattr__(self, "kind", PluginKind(self.kind))
 
     def __str__(self) -> str:
         return f"{self.kind} '{self.name}'"
@@ -197,13 +198,15 @@ def give(kind: PluginKind, name: str, given: Any) -> GivenPlugin:
     Raises a `RequestError` if it is not of the kind, or cannot be sent to worker processes.
     """
     cls, base = given if isinstance(given, type) else type(given), kind.base
-    assert base is not None  # plugins of the axes are classes
+    # Plugins of the axes are classes.
+    assert base is not None
     if not issubclass(cls, base):
         instead = f"the class {cls.__name__}" if given is cls else f"a {cls.__name__}"
         raise RequestError(
             f"{kind}: expected a name, or a class or an object of vibench.{base.__name__}, found {instead}"
         )
     try:
+        # The study is of the present state of the object, even if the user changes it before the run.
         snapshot = given if given is cls else copy.deepcopy(_without_cache(given))
         _Pickler(file := io.BytesIO()).dump(snapshot)
         needs = {one: distribution_version(one) for one in getattr(cls, "requires", ())}
@@ -214,7 +217,8 @@ def give(kind: PluginKind, name: str, given: Any) -> GivenPlugin:
             "attributes and global names, or make them where they are used"
         ) from None
     plugin = GivenPlugin(kind, name, (), f"object {code}", file.getvalue(), modules)
-    plugin.__dict__["given"] = snapshot  # unpickled here, a class of a notebook would lose its global names
+    # Keep the original: unpickled here, a class of a notebook would lose its global names.
+    plugin.__dict__["given"] = snapshot
     return _given.setdefault((kind, name, plugin.fingerprint), plugin)
 
 
@@ -231,9 +235,11 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
     """Cloudpickle for functions and properties that `functools.cache` and `cached_property` decorate, too."""
 
     def reducer_override(self, obj: Any) -> Any:
+        # Cloudpickle takes functions of scripts by value, but not their caches.
         if isinstance(obj, functools._lru_cache_wrapper) and not is_importable(obj):
             return _cached, (obj.__wrapped__, obj.cache_parameters())
-        if isinstance(obj, cached_property):  # it has a lock in Python 3.11
+        # In Python 3.11 it has a lock, which cannot be pickled.
+        if isinstance(obj, cached_property):
             return _computed_once, (obj.func, obj.attrname)
         return super().reducer_override(obj)
 

@@ -84,7 +84,8 @@ class RegisteredPlugin:
         """Third-party distribution that provides it; "" for plugins of vibench and solvers of qpsolvers."""
         if not self.entries:
             return ""
-        entry = self.entries[0]  # the metadata of a distribution are read again at each access
+        # Look at the entry once: the metadata of a distribution are read again at each access.
+        entry = self.entries[0]
         owner = entry.module.partition(".")[0] if entry.dist is None else entry.dist.name
         return "" if owner == "vibench" else owner
 
@@ -217,6 +218,7 @@ class RegisteredPlugin:
             return self.load()(**own)
         from vibench.linalg.inner_product import factorised_later
 
+        # The constructor must not factorise X_V with the default first, which may take longest of all.
         with factorised_later():
             made = self.load()(**own)
             made.factorised_by(chosen[FACTORISATION])
@@ -232,6 +234,7 @@ def registered(kind: PluginKind) -> dict[str, RegisteredPlugin]:
     """The plugins of a kind by their names, sorted."""
     named: dict[str, dict[str, EntryPoint]] = {}
     for entry in entry_points(group=kind.entry_points):
+        # One entry point that is found in two folders is no conflict.
         named.setdefault(entry.name, {}).setdefault(entry.value, entry)
     return {name: RegisteredPlugin(kind, name, tuple(entries.values())) for name, entries in sorted(named.items())}
 

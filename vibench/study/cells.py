@@ -23,6 +23,7 @@ CERTIFIED = "certified"
 
 def digest(content: Any) -> str:
     """Short hash of JSON content, independent of the order of keys."""
+    # Canonical: no order of keys, no blanks, no characters that depend on an encoding.
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -88,6 +89,7 @@ class Cell:
         """Hash of everything that determines the numbers of the cell except for the code."""
         content = self._content()
         del content["labels"], content["nested_tolerances"], content["set_labels"]
+        # Labels and places change no number, and the code is compared by itself.
         content.pop("formulation_label", None)
         for name in PLUGINS:
             if content.get(name) is None:
@@ -105,7 +107,8 @@ class Cell:
         """The cell as stored in results files, where five entries describe its parameter sets."""
         content = asdict(self)
         training, validation = content.pop("training"), content.pop("validation")
-        if self.correction == UNCORRECTED:  # as before there was a choice
+        # Keys of cells without correction are those from before there was a choice.
+        if self.correction == UNCORRECTED:
             del content["correction"]
         return content | {
             "seed": validation["seed"],
@@ -125,11 +128,13 @@ class Cell:
         `places` is unknown.
         """
         content = json.loads(text)
-        plugins = {name: Plugin(**content[name]) for name in PLUGINS if content.get(name)}  # not all in older ones
+        # Older definitions do not have all of them.
+        plugins = {name: Plugin(**content[name]) for name in PLUGINS if content.get(name)}
         known = {name for one in plugins.values() if places for name in one.paths.values()}
         for name in places.keys() - known:
             raise unknown_name("file or folder of the cell", name, known)
-        if content.get("formulation") is None:  # as before all formulations were plugins
+        # In older files `mixed` and `compiled` were no plugins.
+        if content.get("formulation") is None:
             name = "compiled" if content["assembly"] == "compiled" else default_formulation()
             plugins["formulation"] = Plugin.of(find(FORMULATION, name), {}, {})
             content["formulation_label"] = name

@@ -62,6 +62,7 @@ class Entry(BaseModel):
         given = value.get("name") if isinstance(value, dict) else value
         if _is_plain(given):
             return build(value)
+        # The name of the class is that of the entry, and its label in tables.
         name = (given if isinstance(given, type) else type(given)).__name__
         entry = build((value if isinstance(value, dict) else {}) | {"name": name})
         entry._given = given

@@ -32,6 +32,7 @@ def find_study(request: str) -> Path:
     path = Path(request)
     # Methods of Path raise an OSError if a name is too long for a file.
     is_file, exists = os.path.isfile(path), os.path.exists(path)  # noqa: PTH110, PTH113
+    # A registered name wins over a folder, such as the one of a run of that study.
     if path.suffix != ".toml" and not is_file:
         if exists and request not in registered(STUDY):
             raise RequestError(f"study '{request}' is not a file")
@@ -66,7 +67,8 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
         raise RequestError(f"{path}: cannot be read as text: {error}") from None
     try:
         content = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # syntax errors, numbers too long, nesting too deep
+    # Syntax errors, but also numbers too long, and nesting too deep.
+    except (ValueError, RecursionError) as error:
         raise RequestError(f"{path}: not valid TOML: {error}") from None
     given = {key: list(values) for key, values in (overrides or {}).items() if values}
     source = str(path) if path == Path(request) else f"study '{request}'"
@@ -181,6 +183,7 @@ def expand(study: Study) -> list[Cell]:
                     formulation=formulation,
                     formulation_label=entry.title,
                 )
+                # Files are known by their names: two of one name would be one cell.
                 if (same := cells.setdefault(cell.key, cell)) is not cell and same.code != cell.code:
                     raise RequestError(
                         f"study '{study.name}': two cells are called '{cell}', but have files of one name in different "
@@ -296,7 +299,8 @@ def _entry_of_set(parameters: ParameterSet) -> Any:
 
 def _stop(tolerance: str, size: str, stop: Stop | None) -> tuple[str, list[float] | list[int]]:
     """Key and value in a grid of tolerances for a basis that stops at a tolerance or at a size."""
-    if stop is None:  # there is no basis, but the grid needs a value
+    # There is no basis, but the grid needs a value.
+    if stop is None:
         return size, [1]
     return (tolerance, [stop.tolerance]) if stop.tolerance is not None else (size, [stop.size or 0])
 

@@ -65,7 +65,8 @@ class ParameterSet:
     def strategy(self) -> Sampling | None:
         """A new instance of the sampling strategy; `None` for the problem's own set."""
         strategy = None if self.sampling is None else self.sampling.create()
-        assert strategy is None or isinstance(strategy, Sampling)  # `RegisteredPlugin.load` refuses anything else
+        # `RegisteredPlugin.load` refuses anything else.
+        assert strategy is None or isinstance(strategy, Sampling)
         return strategy
 
     def of(self, problem: Problem) -> Array:
@@ -100,7 +101,8 @@ def _problem(plugin: Plugin) -> Problem:
         problem = plugin.create()
     except NumericalError as error:
         raise RequestError(f"problem '{plugin.name}': {error}") from None
-    assert isinstance(problem, Problem)  # as above
+    # `RegisteredPlugin.load` refuses anything else.
+    assert isinstance(problem, Problem)
     return problem
 
 

@@ -115,7 +115,8 @@ class ToleranceTable(_Model):
     def of_primal(self, entry: Entry) -> list[float | None]:
         """Tolerances of one primal strategy; [`None`] for a strategy that takes none."""
         plugin = entry.registered(PRIMAL)
-        if plugin.conflict:  # its cells cannot be run, whether it takes a tolerance or not
+        # The cells of an ambiguous name cannot be run, whether it takes a tolerance or not.
+        if plugin.conflict:
             return list(self.primal.get(entry.title, self.primal.get(entry.name, [None])))
         if not plugin.load().takes_tolerance:
             return [None]
@@ -289,7 +290,8 @@ def _check_names(study: Study) -> None:
         _check_sets(study, problem)
     solvers = {*SETTINGS, *registered(SOLVER)}
     for solver in study.solver_names():
-        if solver not in solvers:  # installed or not
+        # A known solver need not be installed: its cells are unavailable then.
+        if solver not in solvers:
             raise unknown_name(SOLVER, solver, solvers)
         plugin = find(SOLVER, solver)
         if plugin.entries and not plugin.conflict:
@@ -307,6 +309,7 @@ def _check_axes(study: Study) -> None:
 
 def _check_given(kind: PluginKind, axis: Sequence[Entry]) -> None:
     """Refuse a class or an object with the name of another plugin of its axis."""
+    # Registered plugins are told apart by their names and options.
     if all(entry.is_registered for entry in axis):
         return
     plugins = {entry.plugin(kind) for entry in axis}
