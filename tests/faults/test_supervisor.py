@@ -122,8 +122,8 @@ def test_beyond_the_limit_of_the_cell_the_items_done_are_kept(run: Run) -> None:
     assert found.value[3][1] == Failed(Status.TIMEOUT, "stopped after cell_seconds = 4 s")
 
 
-def test_an_item_that_dies_before_it_is_watched_costs_itself(run: Run) -> None:
-    found = run(InItems(("fine", "fine", "fine"), unwatched=("", "exit", "")))
+def test_an_item_that_dies_before_its_limit_begins_costs_itself(run: Run) -> None:
+    found = run(InItems(("fine", "fine", "fine"), unlimited=("", "exit", "")))
     assert isinstance(found, Done)
     assert [isinstance(value, Failed) for _, value in found.value] == [False, True, False]
 

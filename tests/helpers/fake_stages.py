@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import numpy as np
 from forking import SUPERVISOR
 
 from vibench.plugins.plugin import Plugin
-from vibench.stages.base import SHARE, Failed, Items, ItemwiseStage, Result, Stage
+from vibench.stages.base import SHARE, Failed, Items, ItemwiseStage, Result, Stage, TimeLimit
 from vibench.storage.artefacts import Store
 from vibench.timing import Seconds
 
@@ -129,14 +129,14 @@ class KillsItsSupervisor(Stage):
 
 @dataclass(frozen=True)
 class InItems(ItemwiseStage):
-    """Every item does what its word says, and what the one in `unwatched` says before the supervisor is told."""
+    """Every item does what its word says, and what the one in `unlimited` says before the supervisor is told."""
 
     label = "in items"
 
     hows: tuple[str, ...]
     at_begin: str = ""
     at_end: str = ""
-    unwatched: tuple[str, ...] = ()
+    unlimited: tuple[str, ...] = ()
 
     @property
     def items(self) -> int:
@@ -154,11 +154,10 @@ class Work(Items):
     def __init__(self, stage: InItems) -> None:
         self.stage = stage
 
-    def item(self, number: int, watch: Callable[[bool], None]) -> Any:
-        misbehave(self.stage.unwatched[number] if self.stage.unwatched else "")
-        watch(True)
-        misbehave(self.stage.hows[number])
-        watch(False)
+    def item(self, number: int, time_limit: TimeLimit) -> Any:
+        misbehave(self.stage.unlimited[number] if self.stage.unlimited else "")
+        with time_limit():
+            misbehave(self.stage.hows[number])
         return number, os.getpid()
 
     def lost(self, number: int, failed: Failed) -> Any:

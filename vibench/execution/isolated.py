@@ -21,7 +21,7 @@ from vibench.qp.scaling import in_units, random_units
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, verify
-from vibench.stages.base import Done, Failed, Items, ItemwiseStage, Stage
+from vibench.stages.base import Done, Failed, Items, ItemwiseStage, Stage, TimeLimit
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import dumps, loads, storable
 from vibench.study.spec import Limits
@@ -47,15 +47,15 @@ class IsolatedCall(ItemwiseStage, Items):
     def begin(self, store: Store) -> Items:  # noqa: ARG002
         return self
 
-    def item(self, number: int, watch: Callable[[bool], None]) -> Any:  # noqa: ARG002
+    def item(self, number: int, time_limit: TimeLimit) -> Any:  # noqa: ARG002
         """Value of the function; a `NotImportableError` if this process cannot import what was pickled."""
-        watch(True)
-        sys.path += [folder for folder in self.path if folder not in sys.path]
-        try:
-            function, arguments = pickle.loads(self.pickled)
-        except (ImportError, AttributeError) as error:
-            return NotImportableError(in_a_line(error))
-        return function(*arguments)
+        with time_limit():
+            sys.path += [folder for folder in self.path if folder not in sys.path]
+            try:
+                function, arguments = pickle.loads(self.pickled)
+            except (ImportError, AttributeError) as error:
+                return NotImportableError(in_a_line(error))
+            return function(*arguments)
 
     def lost(self, number: int, failed: Failed) -> Failed:  # noqa: ARG002
         return failed
@@ -121,10 +121,13 @@ class SolverTrials(ItemwiseStage, Items):
     def begin(self, store: Store) -> Items:  # noqa: ARG002
         return self
 
-    def item(self, number: int, watch: Callable[[bool], None]) -> Trial:
+    def item(self, number: int, time_limit: TimeLimit) -> Trial:
         """Solve the program with one solver and verify its solution; the time limit includes loading a plugin."""
-        watch(True)
-        name, program, accuracy = self.solvers[number], loads(self.program), self.accuracy
+        with time_limit():
+            return self._trial(self.solvers[number])
+
+    def _trial(self, name: str) -> Trial:
+        program, accuracy = loads(self.program), self.accuracy
         solve = partial(solve_qp, solver=name, accuracy=accuracy, extra=registry.qp_solver(name))
         # Repeats are in other units, so that a solver that caches solutions cannot be timed on a cache hit.
         repeats = (in_units(program, random_units(len(program.f), accuracy, repeat)) for repeat in count())

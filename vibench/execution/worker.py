@@ -179,12 +179,16 @@ def _done(job: Job, items: Items, batch: Batch, send: Send, enter: Enter) -> dic
     done = {}
     for number in batch.numbers:
 
-        def watch(on: bool, number: int = number) -> None:
-            enter(number, on)
+        @contextmanager
+        def time_limit(number: int = number) -> Iterator[None]:
+            enter(number, True)
+            try:
+                yield
+            finally:
+                enter(number, False)
 
-        watch(False)
-        value = _guarded(job.memory_gib, partial(items.item, number, watch))
-        watch(False)  # an item that raised may not have done so
+        enter(number, False)
+        value = _guarded(job.memory_gib, partial(items.item, number, time_limit))
         done[number] = items.lost(number, value) if isinstance(value, Failed) else value
         send(ItemDone(number, done[number]))
     return done

@@ -25,7 +25,7 @@ from vibench.rounds.marginal_solutions import (
     parts_alike,
 )
 from vibench.rounds.timed_seconds import TimedCell, TimedRound, round_columns
-from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, Watch, build_problem
+from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, TimeLimit, build_problem
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.query import ModelQuery, Queries
 from vibench.stages.snapshots import TimedSnapshots, gather
@@ -130,19 +130,19 @@ class _Rounds(Items):
     def _beside(self) -> SolutionsBeside:
         return SolutionsBeside(self._marginal, [seconds.cpu for seconds in self._reference.seconds])
 
-    def item(self, number: int, watch: Watch) -> TimedRound:
+    def item(self, number: int, time_limit: TimeLimit) -> TimedRound:
         """One round of one cell, after a warm-up if it is the cell's first one in this process."""
         within, cell = self._stage.place(number)
         at, before = self._stage.first + within, self._slowdown
         if cell not in self._warm:
-            self._queries_of(watch, self._warming_up(cell, at), at, cell, 1)
+            self._queries_of(time_limit, self._warming_up(cell, at), at, cell, 1)
             self._warm.add(cell)
             before = None
         before = calibration().slowdown() if before is None else before
         part = self._parts[at % SHARE] or self._parts[0]
         solutions: list[MarginalSolution] = []
         alternated = self._beside.alternated(self._order(cell, at, part), solutions, at, cell)
-        assemble, solve, certify = self._queries_of(watch, alternated, at, cell, 0)
+        assemble, solve, certify = self._queries_of(time_limit, alternated, at, cell, 0)
         self._slowdown = calibration().slowdown()
         return TimedRound(assemble, solve, max(before, self._slowdown), certify, self._beside.seconds(solutions, part))
 
@@ -162,7 +162,12 @@ class _Rounds(Items):
         yield k, self._marginal.assemble(k, at, cell) if self._warm else self._marginal.solve(k, at, cell, 1)
 
     def _queries_of(
-        self, watch: Watch, alternated: Iterator[tuple[int, MarginalSolution | None]], at: int, cell: int, warm_up: int
+        self,
+        time_limit: TimeLimit,
+        alternated: Iterator[tuple[int, MarginalSolution | None]],
+        at: int,
+        cell: int,
+        warm_up: int,
     ) -> tuple[dict[int, Seconds], dict[int, Seconds], dict[int, Seconds]]:
         """Seconds of assembly, solution, certificate and correction of queries, each with the solution before it.
 
@@ -184,7 +189,7 @@ class _Rounds(Items):
                 seconds = _assembly(queries.model.reduced, near, solution, further, assemble)
                 assemble |= {} if seconds is None else {k: seconds}
                 query = query.repeated(stage.validation_set.seed, k, *seed)
-            answer, solve[k] = query.prepare(watch)()
+            answer, solve[k] = query.prepare(time_limit)()
             query.check(answer)  # type: ignore[arg-type]  # what `prepare` has made
             if certified and answer.x is not None and answer.alpha is not None:
                 certify[k] = self._certified(stage, queries, near, (query.in_model(answer.x), answer.alpha))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, cached_property, lru_cache
@@ -205,8 +205,8 @@ def _described(value: Any) -> Any:
     return value
 
 
-Watch = Callable[[bool], None]
-"""Called with True before an operation that has a time limit of its own, and with False after it."""
+TimeLimit = Callable[[], AbstractContextManager[None]]
+"""Context of an operation that has a time limit of its own."""
 
 
 class Items(ABC):
@@ -216,8 +216,8 @@ class Items(ABC):
         """Take note of the values of items that another process did, or lost; by default nothing."""
 
     @abstractmethod
-    def item(self, number: int, watch: Watch) -> Any:
-        """Do one item; `watch(True)` is called before an operation with its own time limit, `watch(False)` after."""
+    def item(self, number: int, time_limit: TimeLimit) -> Any:
+        """Do one item, and the operations of it that have a limit of their own `with time_limit():`."""
 
     @abstractmethod
     def lost(self, number: int, failed: Failed) -> Any:
@@ -249,7 +249,7 @@ class ItemwiseStage(Stage):
     def run(self, store: Store) -> Result:
         """All items in this process, in their order."""
         work = self.begin(store)
-        return Result(work.finish([work.item(number, lambda _: None) for number in range(self.items)]))
+        return Result(work.finish([work.item(number, nullcontext) for number in range(self.items)]))
 
 
 def value_of(store: Store, stage: Stage) -> Any:

@@ -21,7 +21,7 @@ from vibench.qp.exact import ExactSolution
 from vibench.results.consistency import vectors
 from vibench.stability.infsup import stability_ratio
 from vibench.stages.assembly import AssemblyStage, ExactSolutions, ReducedPrograms
-from vibench.stages.base import Row, Stage, Watch, value_of
+from vibench.stages.base import Row, Stage, TimeLimit, value_of
 from vibench.stages.certification import CertificateStage
 from vibench.stages.enrichment import EnrichmentStage, spaces_of
 from vibench.stages.formulation import FormulationStage
@@ -152,9 +152,9 @@ class _Queries(CellItems):
         self._constants = [value_of(store, one) for one in stage.constants]
         self._exact: list[ExactSolution | None] = [one for exact in stage.exact for one in value_of(store, exact)]
 
-    def answer(self, number: int, watch: Watch) -> QueryRows:
+    def answer(self, number: int, time_limit: TimeLimit) -> QueryRows:
         """The rows of one query; u and λ of a formulation are reconstructed here, where a broken answer costs one."""
-        row, solution = run_query(self._stage.query(self._queries, number), self._stage.query_seconds, watch)
+        row, solution = run_query(self._stage.query(self._queries, number), self._stage.query_seconds, time_limit)
         return self.known(number) | row, solution and {"query": number} | solution
 
     def assess(self, solutions: Mapping[int, Row]) -> list[Row]:

@@ -23,7 +23,7 @@ from vibench.qp.status import Status
 from vibench.qp.verification import RECOGNISED, QPSolution, check_answer, slack, verify
 from vibench.results.consistency import solution_row
 from vibench.stages.assembly import AssemblyStage, ReducedPrograms
-from vibench.stages.base import Row, Watch, value_of
+from vibench.stages.base import Row, TimeLimit, value_of
 from vibench.stages.formulation import FormulationStage
 from vibench.storage.artefacts import Store
 from vibench.study.parameter_sets import ParameterSet
@@ -82,21 +82,18 @@ class ProgramQuery:
             units=d,
         )
 
-    def prepare(self, watch: Watch) -> Callable[[], tuple[QPSolution, Seconds]]:
+    def prepare(self, time_limit: TimeLimit) -> Callable[[], tuple[QPSolution, Seconds]]:
         """Solve the query to start from, whose seconds are not those of this one; returns the timed solution itself."""
         extra = registry.qp_solver(self.solver)
         solve = partial(solve_qp, solver=self.solver, accuracy=self.accuracy, extra=extra, factor=self.factor)
         start: QPSolution | None = None
         if self.start is not None:
-            watch(True)
-            start = solve(self.start[1])
-            watch(False)
+            with time_limit():
+                start = solve(self.start[1])
 
         def solution() -> tuple[QPSolution, Seconds]:
-            watch(True)
-            solved = timed(lambda: solve(self.program, start=start))
-            watch(False)
-            return solved
+            with time_limit():
+                return timed(lambda: solve(self.program, start=start))
 
         return solution
 
@@ -104,7 +101,7 @@ class ProgramQuery:
         """Refuse the answer of a timed repetition that is none; raises a `NumericalError`."""
         check_answer(self.program, answer, self.accuracy)
 
-    def judge(self, answer: QPSolution, watch: Watch) -> tuple[QueryStatus, Row, Row | None]:  # noqa: ARG002
+    def judge(self, answer: QPSolution, time_limit: TimeLimit) -> tuple[QueryStatus, Row, Row | None]:  # noqa: ARG002
         """The status of an answer, and its columns in the tables of queries and of solutions."""
         status, reason, residuals = verify(self.program, answer, self.accuracy)
         row: Row = {"solver_status": answer.solver_status, "iterations": answer.iterations}
@@ -143,19 +140,17 @@ class ModelQuery:
         mu = self.near(*seed)
         return replace(self, mu=mu, program=self.program and self.model.online.program(mu).program)
 
-    def prepare(self, watch: Watch) -> Callable[[], tuple[Answered, Seconds]]:
+    def prepare(self, time_limit: TimeLimit) -> Callable[[], tuple[Answered, Seconds]]:
         """Answer the query to start from, whose seconds are not of this one; returns the timed solution itself."""
         model, start = self.model, None
         if self.start is not None:
-            watch(True)
-            start = model.online.solve(self.start[1], model.settings()[0])
-            watch(False)
+            with time_limit():
+                start = model.online.solve(self.start[1], model.settings()[0])
 
         def solution() -> tuple[Answered, Seconds]:
             settings, solver = model.settings(start)
-            watch(True)
-            answer, seconds = timed(lambda: model.online.solve(self.mu, settings))
-            watch(False)
+            with time_limit():
+                answer, seconds = timed(lambda: model.online.solve(self.mu, settings))
             return Answered(answer, solver), seconds
 
         return solution
@@ -166,12 +161,11 @@ class ModelQuery:
         if found.status is not Status.OK:
             raise NumericalError(f"timed at a parameter next to its own, {found.status.value}: {found.reason}")
 
-    def judge(self, answered: Answered, watch: Watch) -> tuple[QueryStatus, Row, Row | None]:
+    def judge(self, answered: Answered, time_limit: TimeLimit) -> tuple[QueryStatus, Row, Row | None]:
         """The status of an answer, and its columns in the tables of queries and of solutions."""
         answer, solver = answered
-        watch(True)
-        found = self.model.status_of(self.mu, answer, solver, program=self.program)
-        watch(False)
+        with time_limit():
+            found = self.model.status_of(self.mu, answer, solver, program=self.program)
         words = answer.reason if self.program is not None else solver.last[1].solver_status if solver.last else ""
         row: Row = {"solver_status": words, "iterations": answer.iterations, "error_u_predicted": answer.uncertainty}
         x, alpha = answer.x, answer.alpha
@@ -257,7 +251,7 @@ def path_before(mus: Array, box: ParameterBox) -> list[int | None]:
     return before
 
 
-def run_query(query: ProgramQuery | ModelQuery, query_seconds: float, watch: Watch) -> tuple[Row, Row | None]:
+def run_query(query: ProgramQuery | ModelQuery, query_seconds: float, time_limit: TimeLimit) -> tuple[Row, Row | None]:
     """The columns of a query, and those of its solution if there is one.
 
     A solver that takes more than `query_seconds` has the status timeout. What is ok and took less than `SLOW` is
@@ -267,9 +261,9 @@ def run_query(query: ProgramQuery | ModelQuery, query_seconds: float, watch: Wat
     if query.start is not None:
         row["started_from"] = query.start[0]
     try:
-        solve = query.prepare(watch)
+        solve = query.prepare(time_limit)
         answer, seconds = solve()
-        judged, columns, solution = query.judge(answer, watch)  # type: ignore[arg-type]  # what `prepare` has made
+        judged, columns, solution = query.judge(answer, time_limit)  # type: ignore[arg-type]  # what `prepare` has made
         again = solve()[0] if judged.status is Status.OK and seconds.wall <= SLOW else None
     except MemoryError:
         raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -179,7 +180,7 @@ def test_repetitions_are_posed_at_parameters_near_by() -> None:
     other = query.repeated(3, 1)
     assert other.mu[1] == other.program[0][1] == 0.5 + 3e-10  # type: ignore[index]
     for one, limit in ((query, 0.25), (other, 0.25 * (1.0 + 1.2e-10))):
-        answer, seconds = one.prepare(lambda _: None)()
+        answer, seconds = one.prepare(nullcontext)()
         assert answer.x is not None
         assert answer.x[0] == pytest.approx(limit, rel=1e-14)
         assert seconds.cpu > 0.0

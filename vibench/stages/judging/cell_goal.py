@@ -24,7 +24,7 @@ from vibench.provenance import machine
 from vibench.qp.status import Status
 from vibench.stability.coercivity import Stability
 from vibench.stability.infsup import InfSup
-from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, Watch, build_problem
+from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, TimeLimit, build_problem
 from vibench.stages.infsup_constants import ReferenceConstants
 from vibench.stages.judging.cell_summary import summarise
 from vibench.stages.offline import ConstraintMatrices
@@ -137,13 +137,13 @@ class CellItems(Items):
         self._zeros = zeros(self._problem, self._compared)
         self._stability = stage.reference.gather(store)
 
-    def item(self, number: int, watch: Watch) -> QueryRows:
+    def item(self, number: int, time_limit: TimeLimit) -> QueryRows:
         """The rows of one query; of one without constants the reason."""
         constants = self._stability[number]
-        return self.lost(number, constants) if isinstance(constants, Failed) else self.answer(number, watch)
+        return self.lost(number, constants) if isinstance(constants, Failed) else self.answer(number, time_limit)
 
     @abstractmethod
-    def answer(self, number: int, watch: Watch) -> QueryRows:
+    def answer(self, number: int, time_limit: TimeLimit) -> QueryRows:
         """The rows of one query at a parameter that has all constants."""
 
     def constants(self, numbers: Iterable[int]) -> list[Stability]:
