@@ -52,7 +52,7 @@ class Run:
 
     @cached_property
     def study(self) -> dict[str, Any]:
-        """What all rows have in common: name and seed of the study, and the number of validation parameters."""
+        """Facts common to all rows: name and seed of the study, and the number of validation parameters."""
         return study_of(self.path, read_meta(self.path))
 
     @requested
@@ -95,8 +95,8 @@ class Run:
         Parameters
         ----------
         error
-            What errors are of: "u", "lambda", "solution" for the larger one of these, or "output:NAME" for a quantity
-            of interest. They are mean relative errors.
+            Measure of the mean relative error: "u", "lambda", "solution" for the larger one of these, or "output:NAME"
+            for a quantity of interest.
         within
             Largest error that both models may have; by default all rows are kept.
 
@@ -116,12 +116,12 @@ class Run:
         ----------
         queries
             Number of queries: the model with the smallest total costs for so many, with the interval of these, the
-            numbers of queries between which it is the cheapest, the share of draws in which it is, and the number of
+            numbers of queries between which it is the cheapest, the fraction of draws in which it is, and the number of
             others that may be as cheap. By default the model with the fastest query.
         error
             Largest error that is allowed; needs `queries`. By default there is a row for every power of ten.
         measure
-            What errors are of, as in `break_even`.
+            Measure of the error, as in `break_even`.
 
         Raises
         ------
@@ -150,7 +150,7 @@ class Run:
         Parameters
         ----------
         kind
-            What it shows: "inf-sup", "errors", "total-cost", …; the documentation shows them all.
+            Kind of the figure: "inf-sup", "errors", "total-cost", …; the documentation shows them all.
         problem, dual
             Label of a problem and, for figures of a cone, of a dual strategy; not needed where the run has one.
 
@@ -206,15 +206,6 @@ class Run:
             If there is no such cell, it failed before it had a model, or other code computed it.
         """
         return recorded_cell(str(self.path), cell, self._at).model
-
-
-def _following(observer: Observer | None, progress: bool) -> AbstractContextManager[Observer]:
-    """Who follows a run."""
-    if observer is not None or not progress:
-        return nullcontext(observer or Observer())
-    from vibench.library.progress import ProgressDisplay  # noqa: PLC0415  loads rich
-
-    return ProgressDisplay()
 
 
 @requested
@@ -273,7 +264,7 @@ def run(
         Cold processes in which seconds are measured, at least, and how often offline stages are; by default what
         decides the comparisons of the study.
     observer
-        Follows the run, in place of the progress display.
+        Receives the events of the run, in place of the progress display.
     progress
         Whether to show the progress, in a terminal or a notebook.
 
@@ -288,9 +279,14 @@ def run(
     """
     folder = Path("runs") / study.name if out is None else Path(out)
     options = Options(jobs, fresh, retry, executor, scheduler, repeats)
-    # A run that Ctrl-C ends ignores any other until all is written.
-    with _following(observer, progress) as following, interrupts.restored():
-        outcome = run_study(study, folder, following, options)
+    following: AbstractContextManager[Observer] = nullcontext(observer or Observer())
+    if observer is None and progress:
+        from vibench.library.progress import ProgressDisplay  # noqa: PLC0415  loads rich
+
+        following = ProgressDisplay()
+    # After the first Ctrl-C a run ignores all others until everything is written.
+    with following as follower, interrupts.restored():
+        outcome = run_study(study, folder, follower, options)
     if outcome.interrupted:
         raise KeyboardInterrupt(f"{outcome.missing} cells have no row yet; the same call continues the run")
     return open_run(folder)

@@ -16,9 +16,6 @@ from vibench.files import write_atomically, writing
 from vibench.interfaces.pictures import MeshFields
 from vibench.offline.models import Model, Parameters
 
-KINDS = ("high fidelity", "reduced", "error")
-"""What every field is written of; the error is reduced minus high fidelity."""
-
 
 @requested
 def export_vtu(model: Model, mu: Parameters, file: Path | str) -> Path:
@@ -51,10 +48,7 @@ def export_vtu(model: Model, mu: Parameters, file: Path | str) -> Path:
         if file.exists():
             raise RequestError(f"'{file}' exists; choose another name, or remove it")
     answer, reference = model.solve(mu), model.high_fidelity(mu)
-    found = [
-        model.problem.mesh_fields(answer.mu, *each) for each in ((reference.u, reference.lam), (answer.u, answer.lam))
-    ]
-    exact, reduced = found
+    exact, reduced = (model.problem.mesh_fields(answer.mu, one.u, one.lam) for one in (reference, answer))
     name = type(model.problem).__name__
     if exact is None or reduced is None:
         raise RequestError(f"the problem '{name}' has neither mesh_fields nor a picture")
@@ -69,7 +63,7 @@ def export_vtu(model: Model, mu: Parameters, file: Path | str) -> Path:
 
 
 def _shapes(fields: MeshFields) -> tuple[dict[str, tuple[int, ...]], dict[str, list[str]]]:
-    """What fields have in common if one can be subtracted from the other."""
+    """Shapes and names of fields: equal if the fields can be subtracted."""
     arrays = {"points": fields.points, **fields.cells, **fields.at_points}
     return {name: array.shape for name, array in arrays.items()}, {k: sorted(v) for k, v in fields.in_cells.items()}
 
@@ -88,12 +82,14 @@ def _written(exact: MeshFields, reduced: MeshFields) -> bytes:
         for name, first in exact.in_cells.get(owner, {}).items():
             for kind, values in _compared(first, reduced.in_cells[owner][name]):
                 in_cells[f"{name}, {kind}"][place] = values
-    cells = [(owner, corners.astype(np.int64)) for owner, corners in exact.cells.items()]  # VTK has no other integers
+    # VTK has no other integers than these.
+    cells = [(owner, corners.astype(np.int64)) for owner, corners in exact.cells.items()]
     mesh = meshio.Mesh(exact.points, cells, point_data=at_points, cell_data=in_cells)
-    with tempfile.TemporaryDirectory() as scratch:  # meshio writes to names of files alone
+    # meshio writes only to named files; a scratch file keeps the final one complete or absent.
+    with tempfile.TemporaryDirectory() as scratch:
         mesh.write(Path(scratch) / "fields.vtu")
         return (Path(scratch) / "fields.vtu").read_bytes()
 
 
 def _compared(exact: Array, reduced: Array) -> list[tuple[str, Array]]:
-    return list(zip(KINDS, (exact, reduced, reduced - exact), strict=True))
+    return [("high fidelity", exact), ("reduced", reduced), ("error", reduced - exact)]
