@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from statistics import median
+from typing import Annotated, Any
 
 import typer
 from typer import Argument, Exit, Option
 
-from vibench.cli.completion import cells, runs
+from vibench.cli.completion import cells
 from vibench.cli.console import echo, run_argument
-from vibench.cli.result_commands import At, RunArgument, places_of
+from vibench.cli.result_commands import At, RunArgument, RunsArgument, places_of
 from vibench.errors import RequestError
 
 
@@ -28,9 +30,7 @@ class FigureFormat(StrEnum):
 def write_report(
     run: RunArgument,
     out: Annotated[Path | None, Option(help="HTML file; RUN/report.html by default.")] = None,
-    figures: Annotated[
-        bool, Option("--figures/--no-figures", help="Add pictures of the figures, which take most of the time.")
-    ] = True,
+    figures: Annotated[bool, Option("--figures/--no-figures", help="Add pictures, which take most time.")] = True,
 ) -> None:
     """Write the report of a run as one HTML page."""
     from vibench import provenance
@@ -44,20 +44,16 @@ def write_report(
 
 
 def draw_figures(
-    names: Annotated[
-        list[str], Argument(metavar="RUN", help="A run folder, or its name in runs/ (several).", autocompletion=runs)
-    ],
+    names: RunsArgument,
     out: Annotated[Path | None, Option(metavar="DIR", help="Folder; RUN/figures by default.")] = None,
-    formats: Annotated[
-        list[FigureFormat] | None,
-        Option("--format", help="Format (repeatable); png and svg by default."),
-    ] = None,
+    formats: Annotated[list[FigureFormat] | None, Option("--format", help="Default: png and svg (repeatable).")] = None,
     jobs: Annotated[int, Option("--jobs", "-j", min=0, help="Processes; 0 for one per core.")] = 0,
 ) -> None:
     """Draw the figures of runs, with captions."""
     from vibench.report.figures.style import FORMATS
     from vibench.results.read import results_file
 
+    # A run may be named twice: as a folder and by its name.
     paths = list({results_file(name).resolve(): results_file(name) for name in names}.values())
     forms = tuple(dict.fromkeys(map(str, formats or FORMATS)))
     if out is not None and len(paths) > 1:
@@ -86,14 +82,10 @@ def draw_run(path: Path, folder: Path, jobs: int, formats: tuple[str, ...] = ("p
 
 
 def publish_runs(
-    run: Annotated[
-        list[str], Argument(metavar="RUN", help="Run folders, results files, or names in runs/.", autocompletion=runs)
-    ],
+    run: RunsArgument,
     site: Annotated[Path, Argument(metavar="SITE", help="A new folder, or one that this command wrote.")],
     title: Annotated[str, Option(help="Title of the site.")] = "Benchmark results",
-    author: Annotated[
-        list[str] | None, Option(metavar="NAME", help='"Family, Given", or a group (repeatable).')
-    ] = None,
+    author: Annotated[list[str] | None, Option(metavar="NAME", help='"Family, Given" or a group (repeatable).')] = None,
     doi: Annotated[str, Option(help="DOI of the deposit, such as 10.5281/zenodo.1234567.")] = "",
     url: Annotated[str, Option(help="Address of the site.")] = "",
     date: Annotated[str, Option(help="Date or year of publication, such as 2026-11-26.")] = "",
@@ -114,6 +106,7 @@ def publish_runs(
     if not yes and not sys.stdin.isatty():
         raise RequestError("nothing was published: answer the question on a terminal, or say --yes")
 
+    # The site is complete in a scratch folder when this asks, so that no answer leaves anything.
     def ask(lines: Iterator[str]) -> None:
         if not yes:
             echo("what could identify somebody:", *(f"  {line}" for line in lines))
@@ -137,13 +130,10 @@ def export(
     ],
     mu: Annotated[str, Option(help="Parameter of NAME.vtu: its components, separated by commas.")] = "",
     tolerance: Annotated[
-        float | None,
-        Option(metavar="TOL", help="Error of the polynomials that replace members of a model; 1e-11 by default."),
+        float | None, Option(metavar="TOL", help="Error of polynomials that replace members; 1e-11 by default.")
     ] = None,
     bases: Annotated[bool, Option("--bases/--no-bases", help="Include the bases that reconstruct u and λ.")] = True,
-    sequence: Annotated[
-        bool, Option("--sequence", help="Only programs of ordered validation sets, as sequences for qpbenchmark.")
-    ] = False,
+    sequence: Annotated[bool, Option("--sequence", help="Only programs along paths, for qpbenchmark.")] = False,
     at: At = None,
 ) -> None:
     """Export programs, a reduced model, or a solution for ParaView.
@@ -155,10 +145,8 @@ def export(
     if len(cell) > 1 or bool(cell) != (kind in {".npz", ".c", ".vtu"}):
         raise RequestError("expected DIR, a folder for programs, or CELL FILE, whose name ends in .npz, .c or .vtu")
     others: dict[str, object] = {"--mu": mu and kind != ".vtu", "--sequence": sequence and cell}
-    others |= {
-        "--tolerance": tolerance and kind not in {".npz", ".c"},
-        "--no-bases": not bases and kind not in {".npz", ".c"},
-    }
+    if kind not in {".npz", ".c"}:
+        others |= {"--tolerance": tolerance, "--no-bases": not bases}
     if wrong := [option for option, is_wrong in others.items() if is_wrong]:
         raise RequestError(f"{', '.join(wrong)} has no meaning for '{last}'")
     if not cell:
@@ -176,11 +164,12 @@ def _export_model(
     run: str, cell: str, target: Path, tolerance: float | None, bases: bool, places: Mapping[str, str]
 ) -> None:
     """Export a model, and say which errors its polynomials have, what it bounds and how long its queries take."""
-    from vibench.library import exported_seconds
+    from vibench.library import reduced_model
     from vibench.library.export import RUNTIME, export_model
     from vibench.library.runs import open_run
     from vibench.model.chebyshev import MEASURED
     from vibench.offline.polynomials import TOLERANCE
+    from vibench.timing import timed
 
     model, file = open_run(run, at=places).model(cell), target.with_suffix(".npz")
     exported = export_model(
@@ -199,7 +188,13 @@ def _export_model(
     held, others = ", ".join(output["name"] for output in outputs["linear"]), ", ".join(outputs["left_out"])
     if held or others:
         echo(f"outputs: {held or 'none'}{f'; code that the file cannot hold computes {others}' * bool(others)}")
-    echo(exported_seconds.in_words(model, file))
+    # The script and the high-fidelity model take turns, so that a change of the machine's pace concerns both.
+    mus = model.parameters.sample(5, seed=0)
+    calls: list[Callable[..., Any]] = [reduced_model.Model(file).solve, model.high_fidelity]
+    seconds = [[timed(partial(call, mu))[1].cpu for call in calls] for mu in (mus[0], *mus)]
+    # The first query of both is longer than the others, as caches are cold.
+    query, solution = (f"{1e3 * median(column):.2g} ms" for column in zip(*seconds[1:], strict=True))
+    echo(f"a query takes {query}; the high-fidelity solution {solution}")
     sources = [file.with_suffix(end) for end in (".c", ".h") if target.suffix == ".c"]
     written = ", ".join(map(str, [file, file.with_name(RUNTIME), *sources]))
     echo(f"{written}: `from {Path(RUNTIME).stem} import Model`, then `Model({str(file)!r}).solve(mu)`")

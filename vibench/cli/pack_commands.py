@@ -25,7 +25,7 @@ def pack(
         list[str],
         Argument(
             metavar="[PROBLEM] FOLDER",
-            help="FOLDER alone is a pack to check. With a registered PROBLEM it is a new folder, for a pack of that.",
+            help="FOLDER alone is a pack to check; with a registered PROBLEM it is the new pack of that.",
             autocompletion=names(PROBLEM),
         ),
     ],
@@ -34,9 +34,7 @@ def pack(
     seed: Annotated[int, Option(min=0, help="Seed of the validation parameters, as in a study.")] = 0,
     solutions: Annotated[bool, Option("--solutions", help="Add the high-fidelity solutions, as references.")] = False,
     cones: Annotated[bool, Option("--cones", help="Build cones from the multipliers of the pack.")] = False,
-    dual: Annotated[
-        list[str] | None, Option(help="Dual strategies of --cones; all by default.", autocompletion=names(DUAL))
-    ] = None,
+    dual: Annotated[list[str] | None, Option(help="Dual strategies; default: all.", autocompletion=names(DUAL))] = None,
     dual_tol: Annotated[float, Option(min=1e-12, max=1.0, help="Tolerance of --cones.")] = 1e-2,
     out: Annotated[Path, Option(metavar="DIR", help="Folder of the table and the figure of --cones.")] = Path("cones"),
 ) -> None:

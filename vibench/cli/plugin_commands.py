@@ -31,16 +31,8 @@ else:
 
 
 def list_plugins(
-    what: Annotated[
-        str | None,
-        Argument(
-            help=f"{', '.join([*LISTS][:-1])} or {[*LISTS][-1]}; all of them by default.",
-            autocompletion=lists,
-        ),
-    ] = None,
-    sizes: Annotated[
-        bool, Option("--sizes", help="Build every problem with its default options, and say how large it is.")
-    ] = False,
+    what: Annotated[str | None, Argument(help=f"{', '.join(LISTS)}; default: all.", autocompletion=lists)] = None,
+    sizes: Annotated[bool, Option("--sizes", help="Build every problem by default, and print its size.")] = False,
 ) -> None:
     """List problems, strategies, studies and QP solvers.
 
@@ -68,15 +60,10 @@ def list_plugins(
 def check_plugin(
     plugin: Annotated[
         str,
-        Argument(
-            metavar="PLUGIN",
-            help=f"A name, {'|'.join(CHECKED)}:NAME, or MODULE:NAME.",
-            autocompletion=plugins,
-        ),
+        Argument(metavar="PLUGIN", help=f"A name, {'|'.join(CHECKED)}:NAME, or MODULE:NAME.", autocompletion=plugins),
     ],
     option: Annotated[
-        list[str] | None,
-        Option(metavar="KEY=VALUE", help="Option of the plugin (repeatable).", autocompletion=plugin_options),
+        list[str] | None, Option(metavar="KEY=VALUE", help="Option (repeatable).", autocompletion=plugin_options)
     ] = None,
     # The default is that of `vibench.testing`, which is too slow to import for a help text.
     seconds: Annotated[float, Option(min=0.0, help="Time limit for all checks; a slow plugin gets fewer.")] = 120.0,

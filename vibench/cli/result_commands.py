@@ -20,10 +20,7 @@ if TYPE_CHECKING:
 
 Form = Literal["terminal", "markdown", "csv", "latex", "json"]
 FormOption = Annotated[Form, Option("--format", help="Output format.")]
-At = Annotated[
-    list[str] | None,
-    Option(metavar="NAME=PATH", help="Where a file or folder of the study, such as a pack, is now (repeatable)."),
-]
+At = Annotated[list[str] | None, Option(metavar="NAME=PATH", help="Present place of a moved pack (repeatable).")]
 
 
 def places_of(at: list[str] | None) -> dict[str, str]:
@@ -36,17 +33,15 @@ def places_of(at: list[str] | None) -> dict[str, str]:
 
 
 RunArgument = Annotated[str, Argument(metavar="RUN", help="A run folder, or its name in runs/.", autocompletion=runs)]
+RunsArgument = Annotated[
+    list[str], Argument(metavar="RUN", help="Run folders, results files, or names in runs/.", autocompletion=runs)
+]
 
 
 def show(
     run: RunArgument,
     cell: Annotated[
-        str,
-        Argument(
-            metavar="CELL",
-            help="Key of a cell, or its beginning: all of its columns, or its rows in another table.",
-            autocompletion=cells,
-        ),
+        str, Argument(metavar="CELL", help="Key of a cell, or its beginning: all of its columns.", autocompletion=cells)
     ] = "",
     table: Annotated[str, Option(help=f"{', '.join(SHOWN)}.", autocompletion=table_names)] = "summary",
     columns: Annotated[
@@ -56,25 +51,15 @@ def show(
         str, Option(metavar="CONDITION", help="Rows to print: \"solver = 'piqp' and beta_span_min < 1e-3\".")
     ] = "",
     sort: Annotated[
-        str,
-        Option(metavar="NAME,…", help="Columns to sort by; -NAME for the largest first.", autocompletion=column_names),
+        str, Option(metavar="NAME,…", help="Columns to sort by; -NAME: largest first.", autocompletion=column_names)
     ] = "",
     limit: Annotated[int, Option(min=0, metavar="N", help="Print the first N rows; 0 for all.")] = 0,
     error: Annotated[
         str,
-        Option(
-            metavar="MEASURE",
-            help="Compare models by the error of solution, u, lambda or output:NAME.",
-            autocompletion=error_measures,
-        ),
+        Option(help="Compare models by solution, u, lambda, output:NAME.", autocompletion=error_measures),
     ] = "",
-    within: Annotated[
-        float | None,
-        Option(metavar="ERROR", help="Break-even, or with --queries best, of models with this error at most: 0.01."),
-    ] = None,
-    queries: Annotated[
-        float | None, Option(metavar="N", help="In the table best: the cheapest model in total for N queries.")
-    ] = None,
+    within: Annotated[float | None, Option(metavar="ERROR", help="Largest error in best and benefits.")] = None,
+    queries: Annotated[float | None, Option(metavar="N", help="Best: the cheapest model for N queries.")] = None,
     form: FormOption = "terminal",
 ) -> None:
     """Print a table of a run, or one cell of it.
@@ -89,6 +74,7 @@ def show(
     path = results_file(run)
     measured = partial(show.look_up, path, table, cell=cell, error=error, largest=within, queries=queries)
     view = measured(columns=parts(columns), where=where, sort=parts(sort), limit=limit)
+    # A cell alone is a list of all its columns: no table is as wide.
     if form == "terminal" and cell and table == "summary" and not columns and len(view.rows):
         (key,) = view.rows["cell"]
         described, empty = view.described
@@ -102,18 +88,16 @@ def show(
         if view.rows.empty and view.view.empty:
             echo(view.view.empty)
     else:
+        # Programs read csv and json, people the other forms, with headings and rounded numbers.
         sys.stdout.write(formats.FORMS[form](view.exact if form in {"csv", "json"} else view.readable))
 
 
 def compare_runs(
-    run: Annotated[
-        list[str],
-        Argument(metavar="RUN", help="Run folders or results files; the first is the reference.", autocompletion=runs),
-    ],
+    run: RunsArgument,
     limit: Annotated[float, Option(min=1.0, help="Factor by which a number may get worse.")] = 1.25,
     table: Annotated[
         Literal["changes", "columns", "runs", "cells"] | None,
-        Option(help="Print one table: changes, what moved by column, the runs, or cells that only some runs have."),
+        Option(help="Print one table: the changes, their numbers by column, the runs, or cells that runs lack."),
     ] = None,
     column: Annotated[
         str, Option(metavar="NAME", help="Print a column of the cells in every run.", autocompletion=cell_columns)
@@ -123,7 +107,7 @@ def compare_runs(
 ) -> None:
     """Compare runs: what is equal, what moved, and by how much.
 
-    Numbers are compared with the first run, seconds with the first run of the same machine.
+    The first run is the reference for numbers, the first run of the same machine for seconds.
     """
     from vibench.report.comparison import compare
     from vibench.results import formats

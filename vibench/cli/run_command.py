@@ -29,43 +29,33 @@ Tolerances = list[float] | None
 
 def run_study_command(
     study: Annotated[
-        str,
-        Argument(help="A registered study, or a TOML file; with --cell a results file, too.", autocompletion=studies),
+        str, Argument(help="A study, or a TOML file; with --cell a results file, too.", autocompletion=studies)
     ] = "quick",
     cell: Annotated[str, Option(metavar="KEY", help="Run one cell alone, by its key or the beginning of that.")] = "",
-    problem: Annotated[
-        Names, Option(help="Replace the problems of the study (repeatable).", autocompletion=names(PROBLEM))
-    ] = None,
+    problem: Annotated[Names, Option(help="Replace the problems (repeatable).", autocompletion=names(PROBLEM))] = None,
     formulation: Annotated[Names, Option(help="Replace the formulations.", autocompletion=formulations)] = None,
     dual: Annotated[Names, Option(help="Replace the dual strategies.", autocompletion=names(DUAL))] = None,
     primal: Annotated[Names, Option(help="Replace the primal strategies.", autocompletion=names(PRIMAL))] = None,
     solver: Annotated[Names, Option(help="Replace the QP solvers.", autocompletion=solvers)] = None,
-    correction: Annotated[
-        Names, Option(help="Replace the corrections of solutions.", autocompletion=corrections)
-    ] = None,
+    correction: Annotated[Names, Option(help="Replace the corrections.", autocompletion=corrections)] = None,
     pod_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the POD.")] = None,
     dual_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the dual strategies.")] = None,
     primal_tol: Annotated[Tolerances, Option(help="Replace the tolerances of the primal strategies.")] = None,
     at: At = None,
     out: Annotated[Path | None, Option(help="Results folder; runs/STUDY by default.")] = None,
-    jobs: Annotated[
-        int, Option("--jobs", "-j", min=0, help="Worker processes; 0 for one per core. Does not affect results.")
-    ] = 0,
-    repeats: Annotated[
-        int, Option(min=0, metavar="K", help="Measure seconds in at least K cold processes, offline stages K times.")
-    ] = 0,
+    jobs: Annotated[int, Option("--jobs", "-j", min=0, help="Worker processes; 0 for one per core.")] = 0,
+    repeats: Annotated[int, Option(min=0, metavar="K", help="Cold processes that measure seconds, at least.")] = 0,
     dry_run: Annotated[bool, Option("--dry-run", help="List the cells of the matrix and stop.")] = False,
     fresh: Annotated[bool, Option("--fresh", help="Remove earlier results and recompute everything.")] = False,
     retry: Annotated[bool, Option("--retry", help="Also rerun cells that did not end ok.")] = False,
     strict: Annotated[bool, Option("--strict", help="Exit with 1 if a cell is neither ok nor unavailable.")] = False,
     draw: Annotated[bool, Option("--figures/--no-figures", help="Draw the figures at the end.")] = True,
     executor: Annotated[Literal["local", "dask"], Option(help="Local processes, or a dask cluster.")] = "local",
-    scheduler: Annotated[
-        str | None, Option(metavar="ADDRESS", help="A dask scheduler; a new cluster on this machine by default.")
-    ] = None,
+    scheduler: Annotated[str | None, Option(metavar="ADDRESS", help="A dask scheduler; a new one by default.")] = None,
 ) -> None:
     """Run a study. An interrupted run resumes where it stopped."""
-    with interrupted_at_once():  # the libraries and plugins of a study take a second to import
+    # The libraries and plugins of a study take a second to import; Ctrl-C ends the command meanwhile.
+    with interrupted_at_once():
         from vibench.execution.run import Options, run_study
         from vibench.library.progress import ProgressDisplay
         from vibench.study.matrix import expand
@@ -95,7 +85,7 @@ def run_study_command(
 
 
 def _conclude(name: str, outcome: RunResult, folder: Path, *, draw: int | None, fresh: bool, strict: bool) -> None:
-    """Export, print and draw what a run found, on as many processes as `draw` says; exit as its statuses ask for."""
+    """Write the tables, print the summary and draw the figures of a run on `draw` processes; exit by its statuses."""
     from vibench.results import show
     from vibench.results.read import results_file
 
@@ -112,6 +102,7 @@ def _conclude(name: str, outcome: RunResult, folder: Path, *, draw: int | None, 
     nothing_ran = set(statuses) == {Status.UNAVAILABLE}
     whole = not nothing_ran and print_summary(name, path, outcome.rows)
     echo(f"results: {path}, tables: {folder / 'tables'}")
+    # Figures of an earlier run would show other numbers.
     if (fresh or draw is not None) and (folder / "figures").is_dir():
         from vibench.report import figures
 
@@ -127,7 +118,7 @@ def _conclude(name: str, outcome: RunResult, folder: Path, *, draw: int | None, 
 
 
 def _study(request: str, key: str, overrides: dict[str, list[Any]], at: list[str] | None) -> Study:
-    """The study that is asked for, or what it has, or a results file, of one cell."""
+    """The study of a name or file, or of one cell of it or of a results file."""
     from vibench.execution.recorded_cell import recorded_study
     from vibench.study.matrix import expand, only_cell, read_study, study_of_cell
 

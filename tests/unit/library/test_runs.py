@@ -15,7 +15,7 @@ from rich import jupyter
 
 import vibench
 from vibench.execution.run import Agenda, Observer
-from vibench.library.runs import _following
+from vibench.library.progress import ProgressDisplay
 from vibench.report import figures
 from vibench.results import formats, show
 
@@ -114,7 +114,7 @@ def test_progress_in_a_notebook_is_lines(monkeypatch: pytest.MonkeyPatch, capsys
     monkeypatch.setattr(builtins, "get_ipython", shell, raising=False)
     shown: list[str] = []
     monkeypatch.setattr(jupyter, "display", lambda segments, text: shown.append(text))
-    with _following(None, progress=True) as display:
+    with ProgressDisplay() as display:
         display.start(Agenda(cells=2, to_run=2, unavailable=0, stages=(), workers=1))
         display.note("a line with <b> and [red]")
     assert [line.rstrip() for line in shown] == ["2 cells, 2 to run, 0 stages on 1 worker", "a line with <b> and [red]"]
