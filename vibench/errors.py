@@ -96,7 +96,9 @@ def _fits(function: Callable[..., Any], name: str, value: Any) -> bool:
 
 @functools.cache
 def _adapters(function: Callable[..., Any]) -> dict[str, TypeAdapter[Any]]:
-    """Validators of the arguments of a function, by name; an instance of a model passes as it is."""
+    """Validators of the arguments of a function, by name; an instance of a model or dataclass passes as it is."""
+    from dataclasses import is_dataclass  # noqa: PLC0415
+
     from pydantic import BaseModel, ConfigDict, InstanceOf, TypeAdapter  # noqa: PLC0415
 
     given = SimpleNamespace(__annotations__={k: v for k, v in function.__annotations__.items() if k != "return"})
@@ -104,7 +106,7 @@ def _adapters(function: Callable[..., Any]) -> dict[str, TypeAdapter[Any]]:
     config = ConfigDict(strict=True, arbitrary_types_allowed=True)
     return {
         name: TypeAdapter(InstanceOf[hint])  # type: ignore[misc,valid-type]
-        if isinstance(hint, type) and issubclass(hint, BaseModel)
+        if isinstance(hint, type) and (issubclass(hint, BaseModel) or is_dataclass(hint))
         else TypeAdapter(hint, config=config)
         for name, hint in hints.items()
     }
