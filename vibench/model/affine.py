@@ -20,21 +20,11 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct, svd
 from vibench.qp.scaling import ratio
 
-CONSTANT_RTOL = 1e-13
-"""A member is constant where its entries, in the units of `decomposed`, vary by less over the training set, relative to
-the largest one."""
-
-AFFINE_RTOL = 1e-9
-"""Largest difference of a declared affine sum from the assembled member, relative to its largest entry."""
-
 INTERPOLATION_RTOL = 1e-6
 """Tolerance of empirical interpolation where none is given."""
 
 MISSED = 10.0
 """Interpolation errors at parameters outside the training set above this multiple of the tolerance are reported."""
-
-MAX_TERMS_SHARE = 0.75
-"""Interpolation is used where it needs no more terms than this share of the training parameters."""
 
 
 class Evaluation(StrEnum):
@@ -54,7 +44,7 @@ class AffineMember:
     Attributes
     ----------
     way
-        How it is evaluated.
+        Its evaluation at a parameter.
     terms
         Matrices or vectors; one for a constant member, none where there is no decomposition.
     rows, columns
@@ -63,7 +53,7 @@ class AffineMember:
     error
         Largest relative error over the training set.
     reason
-        Why it has to be assembled in full; "" otherwise.
+        Reason why it has to be assembled in full; "" otherwise.
     """
 
     way: Evaluation
@@ -74,7 +64,7 @@ class AffineMember:
     reason: str = ""
 
     def interpolated(self, value: Any) -> Any:
-        """What the terms of a constant or an interpolated member make of its value at a parameter."""
+        """The sum of the terms of a constant or an interpolated member for its value at a parameter."""
         if self.way is Evaluation.CONSTANT:
             return self.terms[0]
         theta = entries_of(value, self.rows, self.columns)
@@ -161,7 +151,8 @@ def check_affine(problem: Problem, training: Array) -> None:
             if name == "g":  # absent rows would hide all others
                 exact, summed = (np.where(is_absent(exact) & is_absent(summed), 0.0, each) for each in (exact, summed))
             away, size = float(abs(summed - exact).max()), float(abs(exact).max())
-            if not away <= AFFINE_RTOL * size:
+            # 1e-9: sums and assemblies differ by round-off, wrong declarations by much more
+            if not away <= 1e-9 * size:
                 what = f"by {away:.1e} at mu = {mu.tolist()}, where its largest entry is {size:.1e}"
                 raise NumericalError(f"the affine sum declared for {name} differs from the assembled {name} {what}")
 
@@ -176,7 +167,8 @@ def assembled_members(problem: Problem, mus: Iterable[Array], names: Sequence[st
             vi = checked_assembly(problem, mu)
             values = {name: getattr(vi, name) for name in names}
         for name in names:
-            assembled[name].append(values[name].copy())  # the next ones may be written into the same arrays
+            # copy: the problem may reuse its arrays for the next parameter
+            assembled[name].append(values[name].copy())
     return assembled
 
 
@@ -210,7 +202,8 @@ def decomposed(
     if entrywise and len(values) > 1:
         interpolation = interpolate(weights[:, None] * entries.values, tolerance)
         points = interpolation.points
-        if len(points) <= max(1.0, MAX_TERMS_SHARE * len(values)):
+        # as many terms as parameters would only repeat the training set: more than three quarters prove nothing
+        if len(points) <= max(1.0, 0.75 * len(values)):
             modes = interpolation.modes * weights[points] / weights[:, None]
             terms = tuple(entries.assembled(mode) for mode in modes.T)
             rows, columns = entries.rows[points], entries.columns[points]
@@ -277,11 +270,11 @@ class _Entries:
         return weights
 
     def is_constant(self, weights: Array) -> bool:
-        """Whether no entry varies by more than `CONSTANT_RTOL` of the largest one, with weights (k,)."""
+        """Whether no entry varies by more than the round-off of the largest one, with weights (k,)."""
         spread = weights * np.ptp(self.values, axis=1)
-        several = self.values.shape[1] > 1  # one parameter cannot show what varies
         largest = float((weights * np.abs(self.values).max(axis=1, initial=0.0)).max(initial=0.0))
-        return several and float(spread.max(initial=0.0)) <= CONSTANT_RTOL * largest
+        # one parameter cannot show what varies
+        return self.values.shape[1] > 1 and float(spread.max(initial=0.0)) <= 1e-13 * largest
 
     def _of_matrices(self, matrices: Sequence[SparseMatrix]) -> Array:
         rows = [sp.csr_array(sp.triu(matrix) if self._symmetric else matrix) for matrix in matrices]
@@ -341,7 +334,8 @@ def interpolate(snapshots: Array, tolerance: float) -> Interpolation:
     squares = np.cumsum(((sigma[:, None] * right) ** 2)[::-1], axis=0)[::-1]
     projection = np.append(np.sqrt(squares.max(axis=1)), 0.0) / scale
     rank = max(1, int(np.count_nonzero(sigma > np.finfo(float).eps * sigma[0])))
-    low = min(rank, max(1, int(np.argmax(projection <= tolerance))))  # interpolation is never better than projection
+    # interpolation is never better than projection
+    low = min(rank, max(1, int(np.argmax(projection <= tolerance))))
 
     def with_terms(count: int) -> Interpolation:
         modes = q @ left[:, :count]
@@ -351,7 +345,8 @@ def interpolate(snapshots: Array, tolerance: float) -> Interpolation:
         errors = np.linalg.norm(snapshots - cardinal @ snapshots[points], axis=0)
         return Interpolation(points, cardinal, float(errors.max()) / scale)
 
-    best, step, high = with_terms(low), 1, low  # gallop upwards, since the projection error is a close guess
+    # gallop upwards, since the projection error is a close guess
+    best, step, high = with_terms(low), 1, low
     while best.error > tolerance and high < rank:
         low, high, step = high + 1, min(high + step, rank), 2 * step
         best = with_terms(high)

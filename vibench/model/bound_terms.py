@@ -1,15 +1,13 @@
-"""Terms of the error bounds (ii) of MATH.md §10, and what their corrections have in common at any cost.
+"""Terms of the error bounds (ii), and what their corrections have in common at any cost.
 
-`vibench.model.error_bounds` derives the bounds. A *correction* is any w with B w ≥ s, s = B u_N − g. In floating-point
+`vibench.model.error_bounds` states the bounds. A *correction* is any w with B w ≥ s, s = B u_N − g. In floating-point
 arithmetic margins show that: s is raised above its round-off, and w is accepted if it satisfies the rows by more than
-the round-off of B w and s. Equalities, a row and its opposite, leave no room for a margin. There w misses B_E w = s_E
-by δ = s_E − B_E w. As s_E is in the range of B_E if the problem has a solution, w' = w + d holds it, with the smallest
-d such that B_E d = δ. With K = F⁻ᵀB_Eᵀ = Q R for the inner product X = FᵀF,
+the round-off of B w and s. Equalities leave no room for a margin. There w misses B_E w = s_E by δ, and w' = w + d holds
+it, with the smallest d such that B_E d = δ. With K = F⁻ᵀB_Eᵀ = Q R for the inner product X = FᵀF,
 
-    d = M R⁻ᵀδ,    M = F⁻¹Q,    ‖d‖_X ≤ η = ‖δ‖ / σ_min(R),    |b d| ≤ ‖b M‖ η    for any row b.
+    d = M R⁻ᵀδ,    M = F⁻¹Q,    ‖d‖_X ≤ η = ‖δ‖ / σ_min(R),    |b d| ≤ ‖b M‖ η    for any row b,
 
-So w' satisfies all rows if w satisfies the others by a margin of ‖b M‖ η, and the bounds hold for w', with ω + η. The
-computed w is moved by its computed d, so that η is of the size of round-off.
+so that w' satisfies all rows if w satisfies the others by ‖b M‖ η, and the bounds hold for it with ω + η.
 """
 
 from __future__ import annotations
@@ -61,7 +59,7 @@ def in_dual_set(lam: Array) -> bool:
 
 
 def dual_gap(lam: Array, slack: Array) -> float:
-    """The term κ = σ_K(s − B w) − λᵀ(s − B w) of λ ∈ K from B w − s (m,), see MATH.md §13.
+    """The term κ = σ_K(s − B w) − λᵀ(s − B w) of λ ∈ K from B w − s (m,).
 
     The support function σ_K of rays is zero where B w ≥ s. All uses of K in the bounds are here and in `in_dual_set`.
     """

@@ -17,12 +17,6 @@ from vibench.linalg.inner_product import svd
 Evaluate = Callable[[Array], Mapping[str, Array]]
 """From a parameter mu (d,) to flat arrays (size,) by name, of the same sizes everywhere."""
 
-LINES = 3
-"""Lines through random points, in every direction, along which degrees are chosen."""
-
-TRIALS = 3
-"""Grids that are tried, each with a quarter more points per direction than the last."""
-
 MEASURED = 100
 """Random points at which the error is measured."""
 
@@ -56,7 +50,7 @@ class AffinePolynomial:
         """Degree in every parameter."""
         return tuple(int(degree) for degree in self.indices.max(axis=0))
 
-    def at(self, unit: Array) -> Array:
+    def evaluate(self, unit: Array) -> Array:
         """Values (P×size) at points (P×d) of the unit box."""
         return products(self.indices, unit) @ self.coefficients @ self.terms
 
@@ -76,7 +70,6 @@ def interpolate_on_box(
     upper: Array,
     tolerance: float,
     budget: int,
-    seed: int = 0,
     terms: Mapping[str, Array] = MappingProxyType({}),
     alike: Sequence[str] = (),
 ) -> dict[str, AffinePolynomial]:
@@ -99,15 +92,14 @@ def interpolate_on_box(
         the result say so.
     budget
         Largest number of points of a grid.
-    seed
-        Seed of the random points.
     terms
         Flat terms (Q×size) of those arrays for which `evaluate` returns the coefficients θ (Q,) instead.
     alike
         Names of arrays with terms whose θ are the same: so are their polynomials, which serve the most demanding one.
     """
-    random = np.random.default_rng(seed)
-    anchors, corners = random.random((LINES, len(lower))), np.array(np.meshgrid(*[[0.0, 1.0]] * len(lower)))
+    random = np.random.default_rng(0)
+    # degrees are chosen along three random lines in every direction: one alone may miss an oscillation
+    anchors, corners = random.random((3, len(lower))), np.array(np.meshgrid(*[[0.0, 1.0]] * len(lower)))
     anchors = anchors if len(lower) > 1 else anchors[:1]
     unit = np.vstack([random.random((MEASURED, len(lower))), corners.reshape(len(lower), -1).T])
     points = lower + unit * (upper - lower)
@@ -124,17 +116,18 @@ def interpolate_on_box(
     counts = [max(along.degree(k, at, 0.1 * tolerance, limit) for at in anchors) + 1 for k in range(len(lower))]
 
     def measured(name: str, polynomial: AffinePolynomial) -> AffinePolynomial:
-        error = float(np.linalg.norm(polynomial.at(unit) - values[name], axis=-1).max()) / scale[name]
+        error = float(np.linalg.norm(polynomial.evaluate(unit) - values[name], axis=-1).max()) / scale[name]
         return replace(polynomial, error=error, scale=scale[name])
 
-    for _ in range(TRIALS):
+    # three grids, each with a quarter more points per direction than the last: the lines may have missed some
+    for _ in range(3):
         counts = _within(counts, budget)
         kept = {name: _needed(c, 0.1 * tolerance) for name, c in along.coefficients(counts).items()}
         polynomials = {name: _with_terms(*kept[name], units[name], terms[name], 0.1 * tolerance) for name in terms}
         polynomials |= {name: _plain(*kept[name], units[name]) for name in kept if name not in terms}
         polynomials = {name: measured(name, polynomials[name]) for name in kept}
         if max(p.error for p in polynomials.values()) <= tolerance:
-            # not before: the decomposition of a large array takes minutes
+            # only now: the decomposition of a large array takes minutes
             for name in kept.keys() - terms.keys():
                 polynomials[name] = measured(name, _factorised(*kept[name], units[name], 0.1 * tolerance))
         if max(p.error for p in polynomials.values()) <= tolerance or prod(counts) >= 0.7 * budget:

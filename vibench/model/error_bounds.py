@@ -1,50 +1,24 @@
 """A-posteriori error bounds from an exact identity, without inf-sup, coercivity or continuity constants.
 
-At one parameter let (u, λ) solve (7), let u_N be any vector and λ_N ≥ 0 any multiplier. With e = u − u_N, ε = λ − λ_N,
-the residual r = f − A u_N − Bᵀλ_N and s = B u_N − g, subtracting the equations gives A e + Bᵀε = r. Hence
-
-    ρ² := ‖r‖²_{A⁻¹} = ‖e‖²_A + ‖Bᵀε‖²_{A⁻¹} + 2 (B e)ᵀε,
-
-and B e = (B u − g) − s with λᵀ(B u − g) = 0 makes (B e)ᵀε = λ_Nᵀ(g − B u) − λᵀs + λ_Nᵀs. This is the identity
+Let (u, λ) solve (7), u_N be any vector and λ_N ≥ 0 any multiplier; e = u − u_N, ε = λ − λ_N, r = f − A u_N − Bᵀλ_N and
+s = B u_N − g. For any w with B w ≥ s, with ρ = ‖r‖_{A⁻¹}, ω = ‖w‖_A and κ = λ_Nᵀ(B w − s),
 
     ‖e‖²_A + ‖Bᵀε‖²_{A⁻¹} + 2 λ_Nᵀ(g − B u) = ρ² + 2 λᵀs − 2 λ_Nᵀs,                                        (i)
+    ‖e‖_A ≤ Δ_A = √(ρ² + ω² + 2κ),        ‖Bᵀε‖_{A⁻¹} ≤ min(√(Δ_A² + 2 rᵀw), ω + Δ_A)                     (ii)
 
-all of whose terms on the left are nonnegative. Only λᵀs on the right is unknown. Let B w ≥ s, and let
-
-    ω = ‖w‖_A,    κ = λ_Nᵀ(B w − s) ≥ 0.
-
-As λ ≥ 0, λᵀs ≤ λᵀB w = λ_NᵀB w + (Bᵀε)ᵀw, and (i) becomes ‖e‖²_A + ‖Bᵀε‖²_{A⁻¹} ≤ ρ² + 2κ + 2 (Bᵀε)ᵀw, where
-2 (Bᵀε)ᵀw ≤ ‖Bᵀε‖²_{A⁻¹} + ω² gives the first of the bounds
-
-    ‖e‖_A ≤ Δ_A = √(ρ² + ω² + 2κ),        ‖Bᵀε‖_{A⁻¹} ≤ min(√(Δ_A² + 2 rᵀw), ω + Δ_A).                   (ii)
-
-Completing the square instead, ‖e‖²_A + (‖Bᵀε‖_{A⁻¹} − ω)² ≤ Δ_A², the last one. The second is twice the duality gap
-of λ_N and the feasible v = u_N − w, which bounds ‖u − v‖²_A + ‖Bᵀε‖²_{A⁻¹}: (i) at v has the residual r + A w and the
-excess B v − g = s − B w ≤ 0, for which λᵀ(B v − g) ≤ 0. It is evaluated as ‖r + A w‖²_{A⁻¹} + 2κ: Δ_A² + 2 rᵀw loses
-half of the digits, and all of them where λ is small beside the error of u_N.
-
-Only the part of r in the range of Bᵀ concerns λ. In the inner product of A⁻¹ the rest is A d with B d = 0, hence
-
-    r = r_B + A d,    r_B = Bᵀξ,    ρ_B := ‖r_B‖_{A⁻¹} ≤ ρ,
-
-and u_N + d has the same violation s as u_N, and the residual r_B beside λ_N. (ii) for this pair bounds the same ε with
-ρ_B in the place of ρ. It leaves the bound of e as it is: e − d = A⁻¹(r_B − Bᵀε) is orthogonal to d in A, so that
-‖e‖²_A = ‖d‖²_A + ‖e − d‖²_A and ρ² = ‖d‖²_A + ρ_B². Constants enter in the norms of V and W alone:
+(docs/mathematics.md, "Error bounds"). The second bound is twice the duality gap of λ_N and
+the feasible u_N − w. It is evaluated as ‖r + A w‖²_{A⁻¹} + 2κ: Δ_A² + 2 rᵀw loses half of the digits, and all of them
+where λ is small beside the error of u_N. It holds for u_N + d, too, where A d + Bᵀξ = r and B d = 0: the same ε is
+bounded with ρ_B = ‖Bᵀξ‖_{A⁻¹} ≤ ρ in the place of ρ, by any d for which w is feasible. d = 0 where w is not, or where
+constraints are dependent and d is lost in round-off. Constants enter in the norms of V and W alone,
 
     ‖e‖_V ≤ Δ_A / √α,        ‖ε‖_W ≤ ‖Bᵀε‖_{A⁻¹} / β_A.
 
-Δ_A is smallest for w = argmin ½‖w‖²_A + λ_NᵀB w subject to B w ≥ s, which has the structure of (7): stiffness A, load
-−Bᵀλ_N, constraints −B w ≤ −s. The active set method starts from supp λ_N, where B w = s makes κ = 0. Any w with B w ≥ s
-is valid, however it was found: optimality is not verified, feasibility is. s is raised by a margin above the round-off
-of B u_N − g and of B w, and the w that is used satisfies the constraints by more than the bound of that round-off. Any
-d for which w is feasible at u_N + d, too, gives a bound of ε; d = 0 where w is not feasible, or where constraints are
-dependent and d is lost in round-off. The norms ρ, ρ_B and ω and the product κ are evaluated in floating-point
-arithmetic without such a bound.
-
-Equalities, a row and its opposite, leave no room for a margin. A w' that holds them is within η of the computed w (see
-`Equalities`), and satisfies the other rows where w does by a margin. (ii) holds for w', with ω + η, with
-‖r + A w‖_{A⁻¹} + η in the duality gap, and with 2 λ_Nᵀ|B(w' − w)| added to 2κ. λ is not unique there, nor is it where
-other rows are dependent: β_A is zero, and its error is bounded in the norm ‖Bᵀε‖_{A⁻¹} alone.
+Δ_A is smallest for w = argmin ½‖w‖²_A + λ_NᵀB w subject to B w ≥ s, which has the structure of (7): the active set
+method starts from supp λ_N, where B w = s makes κ = 0. Any w with B w ≥ s is valid: optimality is not verified,
+feasibility is (`vibench.model.bound_terms`). The norms ρ, ρ_B and ω and the product κ are evaluated in floating-point
+arithmetic without a bound of their round-off. Where there are equalities (ii) holds for w', with ω + η, with
+‖r + A w‖_{A⁻¹} + η in the duality gap, and with 2 λ_Nᵀ|B(w' − w)| added to 2κ. λ is not unique there: β_A is zero.
 """
 
 from __future__ import annotations

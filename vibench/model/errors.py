@@ -1,9 +1,7 @@
-"""Errors of reduced solutions and of their quantities of interest against high-fidelity ones, and the energy norm.
+"""Errors and residuals of pairs u_N and λ_N: against high-fidelity solutions, and of the high-fidelity problem itself.
 
-How well a pair solves the high-fidelity problem: its natural KKT residuals, in matrices of contact size.
-
-They are those of `vibench.qp.verification` of the high-fidelity program, whatever the model was that found the pair: a
-quadratic program, a penalty or a regression. With S² = ‖u‖²_A + ‖Bᵀλ‖²_{A⁻¹} and s = B u − g,
+The natural residuals are those of `vibench.qp.verification` for the high-fidelity program, whatever model found the
+pair, in matrices of contact size. With S² = ‖u‖²_A + ‖Bᵀλ‖²_{A⁻¹} and s = B u − g,
 
     primal max_i (s_i)₊ / ‖B_i‖_{A⁻¹} / S,    dual ‖f − A u − Bᵀλ‖_{A⁻¹} / S,    gap |λᵀs| / S².
 """
@@ -30,8 +28,9 @@ from vibench.qp.verification import Residuals, accurate_residuals, round_off_of_
 T = TypeVar("T")
 
 UNMEASURABLE = 1e-8
-"""Nothing is measured below this: not by an error relative to its solution, nor by a solution relative to the largest
-training solution. High-fidelity solutions have residuals up to 1e-10, so that either may be an error of theirs."""
+"""Relative errors below, and solutions below this fraction of the largest training solution, are treated as zero.
+
+High-fidelity solutions have residuals up to 1e-10, so that either may be an error of theirs."""
 
 
 @dataclass(frozen=True)
@@ -44,29 +43,30 @@ class EnergyNorm:
         Sparse SPD (n×n).
     stiffness
         A condensed on the unknowns that constraints involve, for programs with this A and these constraints.
+    shared
+        Whether the errors of many solutions are measured with it: data that they share is worth more work then.
     """
 
     A: SparseMatrix
     stiffness: CondensedStiffness
     shared: bool = False
-    """Whether the errors of many solutions are measured with it: what they have in common is worth more work then."""
-    _on_contact: list[ContactForm] = field(default_factory=list, repr=False, compare=False)
+    _contact_forms: list[ContactForm] = field(default_factory=list, repr=False, compare=False)
 
     @property
     def nbytes(self) -> int:
-        """Memory, about, once everything is computed."""
+        """Approximate memory once everything is computed."""
         return self.stiffness.nbytes + self.contact_nbytes
 
     @property
     def contact_nbytes(self) -> int:
-        """Memory of what belongs to the constraints, once everything is computed."""
-        return sum(one.nbytes for one in self._on_contact)
+        """Approximate memory of the constraints' part of it."""
+        return sum(one.nbytes for one in self._contact_forms)
 
     def contact_form(self, vi: VariationalInequality) -> ContactForm:
-        """The constraints of `vi`, whose A this is, on contact; those of the last inequality are kept."""
-        if not self._on_contact or self._on_contact[0].vi is not vi:
-            self._on_contact[:] = [ContactForm(vi, self.stiffness, shared=self.shared)]
-        return self._on_contact[0]
+        """The constraints of `vi`, whose A this is, on contact; the last one is cached."""
+        if not self._contact_forms or self._contact_forms[0].vi is not vi:
+            self._contact_forms[:] = [ContactForm(vi, self.stiffness, shared=self.shared)]
+        return self._contact_forms[0]
 
     def norm(self, v: Array) -> float:
         """‖v‖_A of v (n,)."""
@@ -124,11 +124,11 @@ class ReferenceSolutions:
     scale_u: float
     scale_lam: float
     scale_outputs: tuple[float, ...] = ()
-    _known: dict[Any, Any] = field(init=False, default_factory=dict, repr=False, compare=False)
-    """What was computed of them: many models are compared with the same solutions."""
+    # many models are compared with the same solutions: their norms, energies and outputs are cached
+    _cache: dict[Any, Any] = field(init=False, default_factory=dict, repr=False, compare=False)
 
-    def at(self, numbers: Sequence[int]) -> ReferenceSolutions:
-        """The solutions at some of the parameters; of all of them the same object, with what is known of it."""
+    def restrict(self, numbers: Sequence[int]) -> ReferenceSolutions:
+        """The solutions at some of the parameters; of all of them the same object, with its cache."""
         if list(numbers) == list(range(self.u.shape[1])):
             return self
         return replace(self, u=self.u[:, numbers], lam=self.lam[:, numbers])
@@ -147,9 +147,9 @@ class ReferenceSolutions:
         return self._once("outputs", lambda: [output.values(mus, self.u, self.lam) for output in outputs])
 
     def _once(self, name: str | int, compute: Callable[[], T]) -> T:
-        if name not in self._known:
-            self._known[name] = compute()
-        found: T = self._known[name]
+        if name not in self._cache:
+            self._cache[name] = compute()
+        found: T = self._cache[name]
         return found
 
 
@@ -285,10 +285,6 @@ def summarise_outputs(
     return rows
 
 
-BLOCK = 8
-"""Rows whose norms in A⁻¹ are computed at once where there is no compliance of all."""
-
-
 def high_fidelity_residuals(
     vi: VariationalInequality,
     energy: EnergyNorm,
@@ -327,8 +323,9 @@ def _largest_step(on: ContactForm, energy: EnergyNorm, rows: Indices, excess: Ar
         return float(np.max(excess / np.sqrt(on.squares[rows]), initial=0.0))
     bounds = excess * np.sqrt(on.stiffnesses[rows])
     largest, order = 0.0, np.argsort(-bounds, kind="stable")
-    for start in range(0, len(order), BLOCK):
-        block = order[start : start + BLOCK]
+    # eight solutions at once: usually the first block has the largest step
+    for start in range(0, len(order), 8):
+        block = order[start : start + 8]
         if bounds[block[0]] <= largest:
             break
         loads = sp.csr_array(on.B)[rows[block]].toarray().T

@@ -18,13 +18,10 @@ from vibench.interfaces.validation import checked_assembly, training_parameters
 from vibench.linalg.inner_product import orthonormal_range
 from vibench.reduction.supremizers import ContactCoordinates, projected_supremizers, proportionality
 
-ROUND_OFF = 1e-12
-"""Orthonormal coordinates of supremizers of proportional B differ by less than this."""
-
 
 @dataclass(frozen=True)
 class Evaluated:
-    """What a hyper-reduced assembly evaluates at one parameter; nothing for an assembly in full.
+    """Data that a hyper-reduced assembly evaluates at one parameter; none for an assembly in full.
 
     Attributes
     ----------
@@ -67,7 +64,7 @@ class ReducedProblem:
     factor
         Cholesky factor (lower, N'×N') of A, where it was computed offline.
     evaluated
-        What a hyper-reduced assembly evaluated at the parameter.
+        Data that a hyper-reduced assembly evaluated at the parameter.
     """
 
     program: VariationalInequality
@@ -91,7 +88,7 @@ class ReducedModel:
     basis
         V-orthonormal basis of V_N (n×N).
     enrichment
-        What the primal strategy adds.
+        The enrichment of the primal strategy.
     generators
         χ (m×R), unit norm in W, all with nonnegative coefficients: a free generator appears with both signs
         (`Cone.rays`), and its two inequalities are an equality.
@@ -103,7 +100,7 @@ class ReducedModel:
     fixed_basis
         The part of the primal basis that does not depend on the parameter (n×(N+S)).
     kind
-        How the enrichment depends on the parameter.
+        Dependence of the enrichment on the parameter.
     """
 
     def __init__(self, problem: Problem, basis: Array, enrichment: Enrichment, generators: Array, span: Array) -> None:
@@ -217,7 +214,8 @@ def contact_at(problem: Problem, mu: Array) -> Contact:
 
 def _agree(one: Array, other: Array) -> bool:
     """Whether orthonormal columns are the same but for round-off."""
-    return one.shape == other.shape and float(np.max(np.abs(one - other), initial=0.0)) <= ROUND_OFF
+    # coordinates of supremizers of proportional B differ by less than 1e-12
+    return one.shape == other.shape and float(np.max(np.abs(one - other), initial=0.0)) <= 1e-12
 
 
 def projections(Z: Array, chi: Array) -> dict[str, Callable[[Any], Array]]:

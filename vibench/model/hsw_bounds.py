@@ -1,26 +1,14 @@
 """A-posteriori error bounds (Haasdonk, Salomon and Wohlmuth, 2012), derived for inexact reduced solutions.
 
 Recorded for comparison with those of `vibench.model.error_bounds`. β is computed to round-off by a dense singular value
-decomposition, which proves nothing: the bounds are estimates as far as β is.
+decomposition, which proves nothing: the bounds are estimates as far as β is. With the W-projection π of the representer
+of s = B u_N − g on W⁺ and the residual r, let
 
-Let (u, λ) solve (7), and let u_N be any vector and λ_N any element of W⁺. With e = u − u_N, ε = λ − λ_N, the residual
-r = f − A u_N − Bᵀλ_N and s = B u_N − g, subtracting the equations gives A e + Bᵀε = r. Tested with e,
+    δ_r = ‖r‖_V',    δ_s1 = ‖π‖_W,    δ_s2 = ⟨π, λ_N⟩_W + max(0, −sᵀλ_N),
+    c₁ = (δ_r + δ_s1 γ_a/β)/(2α),    c₂ = (δ_s1 δ_r/β + δ_s2)/α.
 
-    α‖e‖_V² ≤ eᵀA e = rᵀe − (B e)ᵀε.
-
-Since (Bu − g)ᵀλ = 0 and (Bu − g)ᵀλ_N ≤ 0, the last term is at most sᵀλ − sᵀλ_N. Let ŝ = X_W⁻¹s and π its W-projection
-on W⁺. What is left of ŝ lies in the polar cone, so sᵀλ ≤ ⟨π, λ⟩ = ⟨π, ε⟩ + ⟨π, λ_N⟩. With
-
-    δ_r = ‖r‖_V',    δ_s1 = ‖π‖_W,    δ_s2 = ⟨π, λ_N⟩_W + max(0, −sᵀλ_N)
-
-(the last term vanishes where λ_N and u_N are exactly complementary, which an inexact QP solution is not):
-
-    α‖e‖² ≤ δ_r‖e‖ + δ_s1‖ε‖ + δ_s2.
-
-The inf-sup condition over the span and Bᵀε = r − A e give β‖ε‖ ≤ δ_r + γ_a‖e‖. Together, with
-c₁ = (δ_r + δ_s1 γ_a/β)/(2α) and c₂ = (δ_s1 δ_r/β + δ_s2)/α,
-
-    ‖e‖_V ≤ Δ_u = c₁ + √(c₁² + c₂),        ‖ε‖_W ≤ Δ_λ = (δ_r + γ_a Δ_u)/β.
+Then ‖u − u_N‖_V ≤ Δ_u = c₁ + √(c₁² + c₂) and ‖λ − λ_N‖_W ≤ (δ_r + γ_a Δ_u)/β, see docs/mathematics.md, "Error bounds".
+The last term of δ_s2 vanishes where λ_N and u_N are exactly complementary, which an inexact QP solution is not.
 """
 
 from __future__ import annotations

@@ -160,7 +160,11 @@ class _Queries(CellItems):
     def assess(self, solutions: Mapping[int, Row]) -> list[Row]:
         """Error columns of some queries."""
         numbers, mus = list(solutions), self._queries.mus[list(solutions)]
-        compared, constants, programs = self._compared.at(numbers), self.constants(numbers), self._queries.programs
+        compared, constants, programs = (
+            self._compared.restrict(numbers),
+            self.constants(numbers),
+            self._queries.programs,
+        )
         if programs is not None:
             return error_columns(
                 self._corrector,

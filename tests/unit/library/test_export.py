@@ -529,7 +529,7 @@ def test_a_constant_member_is_not_sampled(run: vibench.Run, monkeypatch: pytest.
     for name in reduced.problem.constant:
         expected = np.asarray(getattr(program, name))
         packed = expected[np.triu_indices(len(expected))] if name == "A" else expected.ravel()
-        assert found[name].at(unit)[0] == pytest.approx(packed, abs=1e-12 * np.abs(packed).max())
+        assert found[name].evaluate(unit)[0] == pytest.approx(packed, abs=1e-12 * np.abs(packed).max())
 
 
 def test_the_command(run: vibench.Run, main: Main, tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ def test_polynomials_are_found_with_their_degrees_and_terms() -> None:
     assert len(found["p"].indices) < 12  # products that do not occur are left out
     for name, p in found.items():
         expected = np.array([evaluate(mu)[name] for mu in POINTS])
-        assert np.abs(p.at(UNIT) - expected).max() <= 1e-12 * np.abs(first).max() * 30.0
+        assert np.abs(p.evaluate(UNIT) - expected).max() <= 1e-12 * np.abs(first).max() * 30.0
         assert p.error <= 1e-12
 
 
@@ -40,7 +40,7 @@ def test_degrees_follow_the_decay_in_every_direction() -> None:
     assert found.error <= 1e-9
     assert found.degrees[0] < 12 < found.degrees[1]  # the poles ±i are near
     expected = np.array([[np.exp(x) / (1.0 + y**2), x] for x, y in POINTS])
-    assert np.linalg.norm(found.at(UNIT) - expected, axis=1).max() <= 2e-9 * np.exp(1.5)
+    assert np.linalg.norm(found.evaluate(UNIT) - expected, axis=1).max() <= 2e-9 * np.exp(1.5)
 
 
 @pytest.mark.parametrize("dimension", [1, 2])
@@ -62,10 +62,10 @@ def test_what_is_not_smooth_misses_the_tolerance_and_says_by_how_much(
     assert found["b"].error <= 1e-12
     unit = np.random.default_rng(2).random((400, dimension))
     expected = np.abs(lower[0] + unit[:, 0] * (upper[0] - lower[0]) - 1.03)
-    true = np.abs(found["a"].at(unit)[:, 0] - expected).max() / expected.max()
+    true = np.abs(found["a"].evaluate(unit)[:, 0] - expected).max() / expected.max()
     assert 0.2 * true <= found["a"].error <= 5.0 * true
     assert found["a"].error > 1e-4
-    assert np.allclose(found["c"].at(unit), np.outer(found["a"].at(unit)[:, 0], MANY), atol=1e-9)
+    assert np.allclose(found["c"].evaluate(unit), np.outer(found["a"].evaluate(unit)[:, 0], MANY), atol=1e-9)
     assert np.prod(np.array(found["a"].degrees) + 1) <= budget
     assert len(evaluated) <= 12 * budget
 
@@ -111,6 +111,6 @@ def test_given_terms_are_kept_and_their_coefficients_interpolated() -> None:
     found = interpolate_on_box(evaluate, LOWER, UPPER, 1e-11, 2000, terms={"a": terms})
     assert np.array_equal(found["a"].terms, terms)
     expected = np.array([evaluate(mu)["a"] @ terms for mu in POINTS])
-    assert np.abs(found["a"].at(UNIT) - expected).max() <= 1e-11 * np.linalg.norm(expected, axis=1).max()
+    assert np.abs(found["a"].evaluate(UNIT) - expected).max() <= 1e-11 * np.linalg.norm(expected, axis=1).max()
     assert found["a"].error <= 1e-11
     assert found["b"].degrees == (1, 0)

@@ -117,7 +117,7 @@ def test_errors_and_bounds_of_many_queries_are_those_of_each() -> None:
     for k, vi in enumerate(vis):
         own = [energies[k]], u[:, [k]], lam[:, [k]]
         alone = (
-            errors(problem, [vi], own[0], reference.at([k]), *own[1:])[0],
+            errors(problem, [vi], own[0], reference.restrict([k]), *own[1:])[0],
             error_bounds([vi], own[0], [known[k]], *own[1:])[0],
             hsw_bounds(problem, [vi], [known[k]], *own[1:])[0],
         )

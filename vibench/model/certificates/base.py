@@ -1,23 +1,17 @@
 """Offline data shared by the certificates of all reduced models of a problem: X, A against it, B₀, β_A and outputs.
 
-**β_A.** β_A(µ)² is the smallest eigenvalue of B A⁻¹Bᵀ against X_W. With A ≼ γ X it is at least that of B X⁻¹Bᵀ/γ, and
+**β_A.** With A ≼ γ X, β_A(µ)² is at least the smallest eigenvalue of B X⁻¹Bᵀ/γ against X_W. Hence β_A ≥ |θ| β₀/√γ
+where B(µ) = θ(µ) B₀ is declared, and β_A ≥ β₀/√γ where X couples no two of several bodies and B(µ) is B₀ on some of
+them, which is verified at the parameter. β₀² is the smallest eigenvalue of B₀X⁻¹B₀ᵀ against X_W, see
+`vibench.stability.coercivity` for its proof.
 
-- where B(µ) = θ(µ) B₀ is declared, β_A ≥ |θ| β₀/√γ;
-- where X has a block for every one of several bodies and B(µ) = B₀ + B₁(µ), B₀ on some of the bodies and B₁ on the
-  others, B X⁻¹Bᵀ = B₀X⁻¹B₀ᵀ + B₁X⁻¹B₁ᵀ, hence β_A ≥ β₀/√γ. That B is B₀ on these bodies is verified at the parameter.
-
-Here β₀² is the smallest eigenvalue of B₀X⁻¹B₀ᵀ against X_W, see `vibench.stability.coercivity` for its proof.
-
-**Outputs.** An output s(u, λ) = l(u) + m(λ) has the error l(e) + m(ε), e = u − u_N and ε = λ − λ_N. With
-α X ≼ A(µ) ≼ γ X,
+**Outputs.** An output s(u, λ) = l(u) + m(λ) has the error l(e) + m(ε), e = u − u_N and ε = λ − λ_N, with
 
     |l(e)| ≤ ‖l‖_{A⁻¹} ‖e‖_A ≤ ‖l‖_{X⁻¹} ‖e‖_A / √α,
-
-and where B(µ) = θ B₀, or B₀ on the bodies on which it is constant with θ = 1, for any z and with S = B₀ X⁻¹B₀ᵀ,
-
     |m(ε)| ≤ c ‖B₀ᵀε‖_{X⁻¹} ≤ c √γ/|θ| ‖Bᵀε‖_{A⁻¹},    c = √(zᵀS z) + ‖m − S z‖_{W⁻¹}/β₀,
 
-since β₀ ‖ε‖_W ≤ ‖B₀ᵀε‖_{X⁻¹}. z = S⁻¹m makes c small even if β₀ is, which the modes of ε on single elements decide.
+for any z and S = B₀ X⁻¹B₀ᵀ, since β₀ ‖ε‖_W ≤ ‖B₀ᵀε‖_{X⁻¹}; θ = 1 where B₀ is B on some bodies. z = S⁻¹m makes c small
+even if β₀ is, which the modes of ε on single elements decide.
 """
 
 from __future__ import annotations
@@ -172,7 +166,7 @@ class CertificateBase:
 
     def coefficients(self, samples: Mapping[str, Array]) -> dict[str, Array]:
         """θ of f, A and B from those that a query evaluated; those of A rotated, one for a constant member."""
-        theta = {name: samples.get(name, np.ones(1)) for name in ("f", "A", "B")}
+        theta = {name: samples[name] if name in samples else np.ones(1) for name in ("f", "A", "B")}
         if self.rotation is not None:
             theta["A"] = self.rotation @ theta["A"]
         return theta

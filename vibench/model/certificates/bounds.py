@@ -2,37 +2,21 @@
 
 With an inner product X that does not depend on the parameter, bounds α X ≼ A(µ) ≼ γ X, and w ∈ V with B w ≥ s,
 
-    ‖e‖²_A ≤ Δ² = ρ²/α + γ ω² + 2κ,    ‖Bᵀε‖_{A⁻¹} ≤ min(√(Δ² + 2 rᵀw), ω √γ + Δ),    ρ = ‖r‖_{X⁻¹}, ω = ‖w‖_X,
+    ‖e‖²_A ≤ Δ² = ρ²/α + γ ω² + 2κ,    ‖Bᵀε‖_{A⁻¹} ≤ min(√(Δ² + 2 rᵀw), ω √γ + Δ),    ρ = ‖r‖_{X⁻¹}, ω = ‖w‖_X.
 
-follow from the bounds (ii) there, as ‖r‖²_{A⁻¹} ≤ ρ²/α and ‖w‖²_A ≤ γ ω². Where A does not depend on the parameter X is
-A, α = γ = 1, and nothing is lost. Elsewhere X is A at the centre of the parameter box. In W, ‖ε‖_W ≤ ‖Bᵀε‖_{A⁻¹}/β_A
-if there is a lower bound of β_A (`vibench.model.certificates.base`).
+Where A is constant X is A, α = γ = 1, and nothing is lost. See docs/mathematics.md, "Bounds at online cost".
 
-- ρ comes from coordinates of the residual in an orthonormal basis (`vibench.model.certificates.residual`). Its terms
-  are those of f, of A times the basis of the reduced space, and of Bᵀ times the generators. Where B is assembled on
-  the contact the last ones are B₀ᵀ times the generators, with the part B₀ of B that is the same at all training
-  parameters, and the functionals on the contact unknowns, with the values of (B − B₀)ᵀλ_N at the parameter.
-- s = B u_N − g is evaluated on all rows with the B and g of the parameter, which involve the contact unknowns alone.
-- w is one of `vibench.model.certificates.prepared_correction`, or that of
-  `vibench.model.certificates.contact_correction`, with the compliance C = Eᵀ X⁻¹ E of the contact unknowns E.
-- α and γ are those of `vibench.model.certificates.spectral`.
+- ρ comes from coordinates of the residual in an orthonormal basis (`residual`). If B is assembled on the contact, the
+  terms of Bᵀλ_N are B₀ᵀ times the generators, with the part B₀ of B that is the same at all training parameters, and
+  the functionals on the contact unknowns, with the values of (B − B₀)ᵀλ_N at the parameter.
+- w is one of `prepared_correction` or of `contact_correction`, α and γ are those of `spectral`.
+- Members that are not declared to be constant or affine sums have errors: with A = Ã + D and f = f̃ + d the residual
+  lacks d − D u_N, and ρ grows by ‖d‖ and ‖D‖ ‖u_N‖_X. These are measured (`base`), which proves nothing, even if they
+  are zero: the bounds are verified then, not certified, and there are none outside the parameter box.
 
-Members that the problem declares to be constant or affine sums are exact. All others are not, also those that did not
-vary over the training set. With A = Ã + D and f = f̃ + d, the residual of Ã and f̃ lacks d − D u_N, and ρ grows by the
-largest ‖d‖ and ‖D‖ ‖u_N‖_X. These are measured at random parameters and doubled, which proves nothing, even if they are
-zero: the bounds are then called verified instead of certified. They are certified where α, γ and the norms in them are
-proved, too. Outside the parameter box, where nothing was measured, there are none with such members.
-
-A correction w that is the best one for c X in place of A comes with a multiplier ν ≥ 0, c X w = Bᵀ(ν − λ_N). The pair
-v = u_N − w and ν has the residual f − A v − Bᵀν = r − (c X − A) w and no violation. For it the identity (i) gives
-
-    ‖u − v‖²_A + ‖Bᵀ(λ − ν)‖²_{A⁻¹} ≤ ‖r − (c X − A) w‖²_{A⁻¹} + 2 νᵀ(B w − s),
-
-the first norm at most ρ/√α + ½ (γ − α)/√α ‖w‖_X for c = ½ (α + γ), where |c X − A| ≼ ½ (γ − α) X. Where A is constant
-the residual alone is left. This *corrected pair* is better where ω > ρ.
-
-Δ bounds both errors together. Where A varies and corrections are not prepared, which is where programs of contact size
-are solved in any case, `vibench.model.certificates.contact_correction` has bounds of each; the smaller ones are taken.
+The best correction w for c X in place of A comes with ν ≥ 0, c X w = Bᵀ(ν − λ_N). The *corrected pair* v = u_N − w, ν
+has the residual r − (c X − A) w and violates nothing, so that both of its errors are at most the root of
+‖r − (c X − A) w‖²_{A⁻¹} + 2 νᵀ(B w − s). The norm is at most ρ/√α + ½ (γ − α)/√α ‖w‖_X for c = ½ (α + γ).
 
 Round-off is bounded where it decides whether w is feasible, and in the coordinates of the residual: it may be all that
 is left of Δ² + 2 rᵀw, in which these are multiplied with those of X w.
@@ -139,7 +123,7 @@ class OnlineCorrection:
 
 
 class _Query:
-    """One reduced solution, and the data that its bounds and its correction evaluate, each at most once."""
+    """One reduced solution, and what its bounds and its correction share; the constraint is evaluated at most once."""
 
     def __init__(
         self,
@@ -154,6 +138,7 @@ class _Query:
         self.problem, self.mu, self.program, self.x, self.alpha = problem, mu, reduced.program, x, alpha
         self.lam, self.y = certificate.generators @ alpha, reduced.evaluated.in_space(x)
         self.theta = certificate.base.coefficients(reduced.evaluated.samples)
+        self.spectrum = certificate.base.spectrum(mu, self.theta["A"])  # α and γ
 
     @cached_property
     def contact(self) -> Contact:
@@ -161,24 +146,20 @@ class _Query:
         return self._evaluated.contact or contact_at(self.problem, self.mu)
 
     @cached_property
-    def spectrum(self) -> tuple[float, float]:
-        """α and γ."""
-        return self._certificate.base.spectrum(self.mu, self.theta["A"])
-
-    @cached_property
     def on_contact(self) -> tuple[Array, Array]:
         """u_N (k,) on the contact unknowns, and a bound of its round-off."""
         certificate = self._certificate
         return certificate.contact_basis @ self.y, float(np.linalg.norm(self.y)) * certificate.unit_round_off
 
-    @cached_property
+    @property
     def constraint(self) -> tuple[float | SparseMatrix, Array, Array]:
         """B and g as prepared corrections take them, and a bound of the terms of g."""
         terms = self._certificate.base.bound_terms
         if terms is None:
             return self.contact.B, self.contact.g, np.abs(self.contact.g)
-        theta, of_g = (self._evaluated.samples.get(name, np.ones(1)) for name in ("B", "g"))
-        return float(theta[0]), terms @ of_g, self._certificate.bound_sizes @ np.abs(of_g)
+        samples = self._evaluated.samples
+        of_g = samples["g"] if "g" in samples else np.ones(1)
+        return float(self.theta["B"][0]), terms @ of_g, self._certificate.bound_sizes @ np.abs(of_g)
 
 
 @dataclass(frozen=True)

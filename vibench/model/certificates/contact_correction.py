@@ -1,48 +1,30 @@
 """Corrections of constraint violations that are known by their values on the contact unknowns, at the cost of those.
 
 Of all w with given values w_E on the contact unknowns E, w = X⁻¹ E c with c = C⁻¹ w_E, C = Eᵀ X⁻¹ E, has the smallest
-norm ‖w‖² = cᵀ C c. As B w depends on w_E alone, the minimiser of
-
-    ½ γ ‖w‖² + λᵀ B w    subject to    B w ≥ s
-
-is of this form with γ c = Bᵀ(ν − λ), multipliers ν ≥ 0 and complementarity. Let S = B C Bᵀ / γ and v = B w − s. Let I
-be the rows with λ_i > 0 in which releasing λ_i alone violates the constraint, λ_i S_ii > −s_i, and those that other w
-violate; on the other rows, J, ν = 0. Then ν = λ + S_II⁻¹(s + v + S_IJ λ_J) on I: a linear complementarity problem for
-v ≥ 0 and ν ≥ 0, solved from v = 0, where λ > 0 costs nothing. Few rows leave v = 0, so that one factorisation of S_II
-serves all steps.
-
-Any w with B w ≥ s is as good as another for a bound to hold. Optimality is not verified, feasibility is: s is raised by
-a margin above its round-off. Rows far from the contact are skipped if |B w| ≤ Σ_j |B_ij| √C_jj ‖w‖, the inequality of
-Cauchy and Schwarz, suffices.
+norm ‖w‖² = cᵀ C c. As B w depends on w_E alone, the minimiser of ½ γ ‖w‖² + λᵀ B w subject to B w ≥ s is of this form
+with γ c = Bᵀ(ν − λ), multipliers ν ≥ 0 and complementarity. Let S = B C Bᵀ / γ and v = B w − s. Let I be the rows with
+λ_i > 0 in which releasing λ_i alone violates the constraint, λ_i S_ii > −s_i, and those that other w violate; on the
+other rows, J, ν = 0. Then ν = λ + S_II⁻¹(s + v + S_IJ λ_J) on I, with v ≥ 0 and ν ≥ 0. Few rows leave v = 0, so that
+one factorisation of S_II serves all steps. Optimality of w is not verified, feasibility is. Rows far from the contact
+are skipped if |B w| ≤ Σ_j |B_ij| √C_jj ‖w‖, the inequality of Cauchy and Schwarz, suffices.
 
 **Complementarity.** ν = ν₀ + M v ≥ 0, v ≥ 0, νᵀv = 0, with M symmetric positive definite, has one solution. The
-primal-dual active set method (Hintermüller, Ito and Kunisch, 2002) exchanges all unknowns with the wrong sign at once
-and takes few steps, but it may cycle where M is no M-matrix. Then v is found as the minimiser of ½ vᵀM v + ν₀ᵀv over
-v ≥ 0 by the method of Lawson and Hanson (Solving Least Squares Problems, 1974, chapter 23). Its objective falls in
-every step, so that it meets no set twice and ends. Round-off decides where ν and v are both zero: ν counts as negative
-beyond its round-off alone, and an unknown that would not become positive is skipped. SciPy's own method, which has no
-such bounds, returns wrong solutions in such cases (1.17.1).
+primal-dual active set method (Hintermüller, Ito and Kunisch, 2002) takes few steps, but it may cycle where M is no
+M-matrix. Then v is found as the minimiser of ½ vᵀM v + ν₀ᵀv over v ≥ 0 by the method of Lawson and Hanson (Solving
+Least Squares Problems, 1974, chapter 23), whose objective falls in every step. Round-off decides where ν and v are both
+zero: SciPy's own method, which does not bound it, returns wrong solutions in such cases (1.17.1).
 
-**Equalities.** No margin covers an equality, and the rows of a row and its opposite are dependent. The program is then
-solved as a least distance problem in y, w_E = L y, with C = L Lᵀ and ‖w‖ = |y|. The w' that holds the equalities is
-within η of w (`vibench.model.bound_terms`).
+**Equalities.** The rows of a row and its opposite are dependent. The program is then solved as a least distance problem
+in y, w_E = L y, with C = L Lᵀ and ‖w‖ = |y|. The w' that holds them is within η of w (`vibench.model.bound_terms`).
 
-**Bounds of u and λ apart.** The identity (i) of `vibench.model.error_bounds` bounds the sum of both errors by the
-residual. If one error is much smaller than the other, its bound is that of the larger one. A better pair separates
-them. It solves the inequality with c X in place of A(µ), c > 0, for the residual r = f − A u_N − Bᵀλ_N,
+**Bounds of u and λ apart.** If one error is much smaller than the other, its bound (ii) is that of the larger one. A
+step of defect correction (docs/mathematics.md, "Bounds at online cost") separates them: û = u_N + z/c − w with
+z = X⁻¹r, c X w = Bᵀ(ν − λ_N) and c = ½ (α + γ) gives
 
-    c X (û − u_N) + Bᵀ(ν − λ_N) = r,     B û ≤ g,    ν ≥ 0,    νᵀ(B û − g) = 0.
+    ‖u − u_N‖_A ≤ √γ ‖û − u_N‖_X + δ,         ‖Bᵀ(λ − λ_N)‖_{A⁻¹} ≤ ‖Bᵀ(ν − λ_N)‖_{X⁻¹}/√α + δ,
 
-Its residual is f − A û − Bᵀν = (c X − A)(û − u_N), it violates nothing, and (i) gives, with c = ½ (α + γ) and
-α X ≼ A ≼ γ X, hence |c X − A| ≼ ½ (γ − α) X,
-
-    max(‖u − û‖_A, ‖Bᵀ(λ − ν)‖_{A⁻¹}) ≤ δ = ½ (γ − α)/√α ‖û − u_N‖_X,
-    ‖u − u_N‖_A ≤ √γ ‖û − u_N‖_X + δ,         ‖Bᵀ(λ − λ_N)‖_{A⁻¹} ≤ ‖Bᵀ(ν − λ_N)‖_{X⁻¹}/√α + δ.
-
-The part of r that is orthogonal to all Bᵀη moves û alone. With z = X⁻¹r, û = u_N + z/c − w and c X w = Bᵀ(ν − λ_N): w
-is the correction of u_N + z/c in place of u_N. Only the part r_U of r in the span of the basis of residuals is used;
-the rest, and what is not known of r, adds its norm to that of the residual. Then z has the coordinates of r_U, and its
-values on the contact unknowns are the products of these with the coordinates of the functionals of one unknown each.
+δ = ½ (γ − α)/√α ‖û − u_N‖_X. w is the correction of u_N + z/c in place of u_N. Only the part of r in the span of the
+basis of residuals is used; the rest, and what is not known of r, adds its norm to that of the residual.
 """
 
 from __future__ import annotations

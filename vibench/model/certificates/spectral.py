@@ -1,19 +1,15 @@
 """Bounds α(µ) X ≼ A(µ) ≼ γ(µ) X against one inner product X, without matrices of mesh size at the parameter.
 
-Let A(µ) = Σ_q θ_q(µ) A_q + D(µ) with ‖D(µ)‖ ≤ η in the operator norm of X, and α_i X ≼ A(µ_i) ≼ γ_i X with proved
-constants at a few anchors µ_i. For any weights c ≥ 0 and δ = θ(µ) − Σ_i c_i θ(µ_i),
-
-    A(µ) = Σ_i c_i A(µ_i) + Σ_q δ_q A_q + D(µ) − Σ_i c_i D(µ_i),
-
-so that, with ‖A_q‖ ≤ s_q,
+Let A(µ) = Σ_q θ_q(µ) A_q + D(µ) with ‖D(µ)‖ ≤ η in the operator norm of X, ‖A_q‖ ≤ s_q, and α_i X ≼ A(µ_i) ≼ γ_i X
+with proved constants at a few anchors µ_i. For any weights c ≥ 0 and δ = θ(µ) − Σ_i c_i θ(µ_i),
 
     α(µ) = Σ_i c_i α_i − Σ_q |δ_q| s_q − (1 + Σ_i c_i) η,     γ(µ) = Σ_i c_i γ_i + Σ_q |δ_q| s_q + (1 + Σ_i c_i) η
 
-are bounds whatever c is: each c is a feasible point of the dual of the linear program that the successive constraint
-method solves (Huynh, Rozza, Sen and Patera, C. R. Math. 345, 2007). Anchors form a grid of the parameter box, and c are
-the weights of multilinear interpolation on it, which leave a small δ and take no optimisation. The A_q are rotated to
-the principal directions of A over the parameters first, so that the sum is close to the norm of Σ_q δ_q A_q. Where A is
-interpolated, and η has been measured, the last directions hardly matter: they are left out of the sum, and D has them.
+are bounds: each c is a feasible point of the dual of the linear program that the successive constraint method solves
+(Huynh, Rozza, Sen and Patera, C. R. Math. 345, 2007). Anchors form a grid of the parameter box, and c are the weights
+of multilinear interpolation on it, which leave a small δ and take no optimisation. The A_q are rotated to the principal
+directions of A over the parameters first, so that the sum is close to the norm of Σ_q δ_q A_q. If A is interpolated,
+its last directions hardly matter: they are left to D.
 """
 
 from __future__ import annotations
@@ -84,8 +80,8 @@ class SpectralBounds:
             return where, c
         # Few numbers: loops over them take less time than calls of NumPy.
         for value, low, high in zip(mu.tolist(), self.lower.tolist(), self.upper.tolist(), strict=True):
-            width = max(high - low, np.finfo(float).tiny)  # a box may be flat
-            place = min(max((value - low) / width, 0.0), 1.0) * (self.count - 1)
+            # a box may be flat: any place will do then
+            place = min(max((value - low) / (high - low or 1.0), 0.0), 1.0) * (self.count - 1)
             first = min(int(place), self.count - 2)
             where = [k * self.count + first + end for k in where for end in (0, 1)]
             c = [weight * factor for weight in c for factor in (first + 1.0 - place, place - first)]
