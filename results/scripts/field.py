@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from page import SECONDS, Page, made_by, origin, read, start
 
 from vibench.report.figures.data import label
-from vibench.report.figures.style import MARKERS, Looks, Series, Sheet, look_of, plot, styled
+from vibench.report.figures.style import Looks, Series, Sheet, look_of, plot, styled
 
 SHARES = (0.3, 0.5, 0.7, 0.9)
 REFERENCE = "mcpg"
@@ -177,21 +177,21 @@ def scatter(field: Field, cost: Callable[[pd.DataFrame], pd.Series], xlabel: str
     """Errors of λ over a cost: one colour per cone, one marker per enrichment, the Pareto front as a line."""
     cells = field.cells[(field.cells["assembly"] == "reduced") & field.cells["error_lambda_mean"].notna()]
     duals, primals = list(dict.fromkeys(cells["dual"])), list(dict.fromkeys(cells["primal"]))
-    names = list(dict.fromkeys(cells["problem"]))
+    names, markers = list(dict.fromkeys(cells["problem"])), "os^vDPX*dph"
     sheet = Sheet(1, len(names), title)
     for panel, problem in zip(sheet.panels, names, strict=True):
         mine = cells[cells["problem"] == problem]
         for dual in duals:
             panel.plot([], [], color=look_of(dual.partition(" ")[0]).colour, linewidth=3, label=dual)
         for k, primal in enumerate(primals):
-            panel.plot([], [], color="0.3", linestyle="none", marker=MARKERS[k % len(MARKERS)], label=primal)
+            panel.plot([], [], color="0.3", linestyle="none", marker=markers[k % len(markers)], label=primal)
         for (dual, primal), group in mine.groupby(["dual", "primal"], sort=False):
             panel.plot(
                 cost(group),
                 group["error_lambda_mean"],
                 linestyle="none",
                 color=look_of(dual.partition(" ")[0]).colour,
-                marker=MARKERS[primals.index(primal) % len(MARKERS)],
+                marker=markers[primals.index(primal) % len(markers)],
                 markersize=4,
             )
         best = front(mine, cost(mine), "error_lambda_mean")

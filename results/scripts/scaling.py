@@ -22,7 +22,6 @@ if __name__ == "__main__":  # before NumPy is imported
 
     os.environ.update(ONE_THREAD)
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
@@ -30,7 +29,7 @@ from page import SECONDS, Page, made_by, start
 
 from vibench import Reduction, Stop, create, provenance, solve_qp
 from vibench.linalg.factorisations import IMPLEMENTATIONS
-from vibench.report.figures.style import STYLE, CaptionedFigure, set_ticks
+from vibench.report.figures.style import CaptionedFigure, set_ticks, styled
 from vibench.timing import median_seconds, timed
 
 ACCURACY = 1e-10
@@ -208,7 +207,7 @@ def write_page(rows: pd.DataFrame, target: str) -> None:
     for over, size in (("mesh", "n"), ("R", "R")):
         chosen = rows[rows["over"] == over]
         page.section(f"Over {size}")
-        with mpl.rc_context(STYLE):
+        with styled():
             page.draw(f"over-{size}", draw(chosen, size))
         for name, group in chosen.groupby("problem", sort=False):
             offline = group[group["stage"].isin(OFFLINE)]

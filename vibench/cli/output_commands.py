@@ -50,12 +50,11 @@ def draw_figures(
     jobs: Annotated[int, Option("--jobs", "-j", min=0, help="Processes; 0 for one per core.")] = 0,
 ) -> None:
     """Draw the figures of runs, with captions."""
-    from vibench.report.figures.style import FORMATS
     from vibench.results.read import results_file
 
     # A run may be named twice: as a folder and by its name.
     paths = list({results_file(name).resolve(): results_file(name) for name in names}.values())
-    forms = tuple(dict.fromkeys(map(str, formats or FORMATS)))
+    forms = tuple(dict.fromkeys(map(str, formats or ("png", "svg"))))
     if out is not None and len(paths) > 1:
         raise RequestError("--out is for the figures of one run; those of several go into their folders")
     for path in paths:
@@ -153,7 +152,7 @@ def export(
         from vibench.report import replay
 
         count = replay.export(run, target, places_of(at), sequence=sequence)
-        echo(f"{count} programs in {target / 'programs'}; `python {target / replay.CHECKER}` rechecks every solution")
+        echo(f"{count} programs in {target / 'programs'}; `python {target / 'check.py'}` rechecks every solution")
     elif kind == ".vtu":
         _export_fields(run, cell[0], mu, target, places_of(at))
     else:

@@ -189,7 +189,8 @@ class Run:
         """
         from vibench.report import html  # noqa: PLC0415  loads matplotlib
 
-        return html.write(self.path, self.path.parent / REPORT if path is None else Path(path), figures=figures)
+        target = self.path.parent / REPORT if path is None else Path(path)
+        return html.write(self.path, target, jobs=1, figures=figures)
 
     @requested
     def model(self, cell: str) -> Model:

@@ -1,4 +1,4 @@
-"""What cites a site and what installs the versions of a run: CITATION.cff, BibTeX, and a file of requirements."""
+"""Citation of a site as CITATION.cff and BibTeX, and the file of requirements that installs the versions of a run."""
 
 from __future__ import annotations
 
@@ -14,40 +14,37 @@ from vibench.qp.settings import SETTINGS
 from vibench.results.formats import to_latex_text
 from vibench.text import unbroken
 
-DOI = re.compile(r"10\.\d{4,9}/[!-~]+")
-"""A DOI without a resolver before it (DOI Handbook, section 2.2)."""
-
-DATE = re.compile(r"\d{4}(-\d{2}-\d{2})?")
-"""A year, or a date (ISO 8601)."""
-
-SOFTWARE = "vibench: a benchmark framework for reduced-order models of parametrised variational inequalities"
-
-NAME, VERSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*"), re.compile(r"[A-Za-z0-9.!+_-]+")
-"""A distribution and its version, as a file of requirements names them: anything else could be an option of pip."""
-
-NO_DISTRIBUTION = frozenset({"protocol", "python"})
-"""Names in the versions of a cell that pip does not install."""
-
 
 @dataclass(frozen=True)
 class Citation:
-    """What a site is called, by whom it is, and where it is deposited.
+    """Citation of a site.
 
-    Raises a `RequestError` if the DOI or the date is none.
+    Attributes
+    ----------
+    authors
+        Names, "Family, Given" for persons; without a comma the name of a group.
+    doi
+        DOI of the deposit, "" if there is none yet.
+    url
+        Address of the site, "" if it has none yet.
+    date
+        Date of publication, "2026-11-26" or only the year; "" if it is unknown.
+
+    Raises
+    ------
+    RequestError
+        If the DOI or the date is none.
     """
 
     title: str
     authors: tuple[str, ...] = ()
-    """Names, "Family, Given" for persons; without a comma the name of a group."""
     doi: str = ""
-    """DOI of the deposit, "" where there is none yet."""
     url: str = ""
-    """Address of the site, "" where it has none yet."""
     date: str = ""
-    """When it was or will be published, "2026-11-26" or only the year; "" where nobody says."""
 
     def __post_init__(self) -> None:
-        if self.doi and (not DOI.fullmatch(self.doi) or set("{}") & {*self.doi}):  # braces would end a field of BibTeX
+        # Without a resolver before it (DOI Handbook, section 2.2); braces would end a field of BibTeX.
+        if self.doi and (not re.fullmatch(r"10\.\d{4,9}/[!-~]+", self.doi) or set("{}") & {*self.doi}):
             raise RequestError(f"'{unbroken(self.doi)}' is no DOI, expected such as 10.5281/zenodo.1234567")
         if self.date and not _is_date(self.date):
             raise RequestError(f"'{unbroken(self.date)}' is no date, expected a year or such as 2026-11-26")
@@ -66,7 +63,8 @@ class Citation:
             *([f"date-released: {_yaml(self.date)}"] if "-" in self.date else []),
             "references:",
             "  - type: software",
-            f"    title: {_yaml(SOFTWARE)}",
+            '    title: "vibench: a benchmark framework for reduced-order models of parametrised variational '
+            'inequalities"',
             "    authors:",
             '      - name: "The vibench developers"',
             f"    version: {_yaml(distribution_version('vibench'))}",
@@ -74,7 +72,7 @@ class Citation:
         return "\n".join(lines) + "\n"
 
     def bibtex(self) -> str:
-        """The same as an entry of BibTeX, with the fields that there is something for."""
+        """An entry of BibTeX, without empty fields."""
         names = [_in_braces(author) for author in self.authors or ("unnamed",)]
         fields = {
             "title": f"{{{_in_braces(self.title)}}}",
@@ -89,8 +87,8 @@ class Citation:
 
 
 def _is_date(text: str) -> bool:
-    """Whether a text is a year, or a day that the calendar has."""
-    if not DATE.fullmatch(text) or not text.isascii():
+    """Whether a text is a year, or a day of the calendar (ISO 8601)."""
+    if not re.fullmatch(r"\d{4}(-\d{2}-\d{2})?", text) or not text.isascii():
         return False
     try:
         date.fromisoformat(text if "-" in text else f"{text}-01-01")
@@ -100,7 +98,8 @@ def _is_date(text: str) -> bool:
 
 
 def _in_braces(text: str) -> str:
-    """A text in a field of BibTeX, which counts escaped braces, too, so that they are commands there."""
+    """A text in a field of BibTeX."""
+    # BibTeX counts escaped braces, too: they become commands.
     escaped = to_latex_text(unbroken(text))
     return escaped.replace("\\{", "\\textbraceleft{}").replace("\\}", "\\textbraceright{}")
 
@@ -125,22 +124,23 @@ def _cff_author(author: str) -> list[str]:
 def requirements(versions: Mapping[str, str], code: str) -> str:
     """The file of requirements with which pip installs the versions that a run was computed with.
 
-    Versions are by name of distribution or solver, as the cells record them; of several, separated by ", ", where cells
-    differ, none is required. The hashes of the code are a comment: a vibench under development has no release.
-    Distributions that are neither installed here nor those of a solver are left out: whoever wrote a results file could
-    make others install anything.
+    Versions are by name of distribution or solver, as the cells record them; several versions of one, separated by
+    ", ", become a comment, and so do the hashes of the code: a vibench under development has no release.
     """
+    # Without distributions that are unknown here: the author of a results file could make others install anything.
+    uninstalled = {"protocol", "python"}
     lines = [f"# versions recorded in the results file; code of the cells: {unbroken(code)}"]
-    known = {name: one for name in versions if name in NO_DISTRIBUTION or is_known(one := solver_distribution(name))}
+    known = {name: one for name in versions if name in uninstalled or is_known(one := solver_distribution(name))}
     if unknown := len(versions) - len(known):
         lines.append(f"# left out: {unknown} that the machine which published this does not know")
     for name, distribution in sorted(known.items()):
         version = versions[name]
-        if name in NO_DISTRIBUTION:
+        if name in uninstalled:
             lines.append(f"# {name} {unbroken(version)}")
         elif not version:
             lines.append(f"# {unbroken(distribution)} was not installed")
-        elif NAME.fullmatch(distribution) and VERSION.fullmatch(version):
+        # Anything else could be an option of pip.
+        elif re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", distribution) and re.fullmatch(r"[A-Za-z0-9.!+_-]+", version):
             lines.append(f"{distribution}=={version}")
         else:
             lines.append(f"# {unbroken(distribution)}: {unbroken(version)}")

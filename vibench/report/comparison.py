@@ -18,7 +18,6 @@ from vibench.report.differences import (
     ERRORS,
     MOVED,
     UNKNOWN,
-    WHATS,
     Agreement,
     ChangeKind,
     ComparedRun,
@@ -32,12 +31,6 @@ from vibench.results import formats
 from vibench.results.break_even import FEWEST_ROUNDS
 from vibench.results.schema import STORED
 from vibench.timing import median_interval
-
-COLUMNS = [
-    "run", "against", "problem", "formulation", "dual", "primal", "asked", "solver", "accuracy", "assembly",
-    "correction", "what", "before", "after", "ratio", "ratio_low", "ratio_high", "verdict", "cell",
-]  # fmt: skip
-"""Columns of the changes."""
 
 
 class RunPair(NamedTuple):
@@ -62,9 +55,10 @@ class Comparison:
 
     @cached_property
     def changes(self) -> pd.DataFrame:
-        """What moved, a row per column of a cell, in the order of the cells."""
+        """Changes for better or worse, a row per column of a cell, in the order of the cells."""
+        columns = ["run", "against", *AXES, "what", "before", "after", "ratio", "ratio_low", "ratio_high", "verdict"]
         rows = [_row(pair, one) for pair in self.pairs for one in pair.differences if one.verdict in MOVED]
-        return pd.DataFrame(rows, columns=COLUMNS)
+        return pd.DataFrame(rows, columns=[*columns, "cell"])
 
     @property
     def regressions(self) -> int:
@@ -253,7 +247,9 @@ def _named(cell: Mapping[str, Any]) -> dict[str, Any]:
 
 def _places(whats: pd.Series) -> pd.Series:
     """Places of columns in the table by column: the order in which they are compared, break-even last."""
-    return whats.map(lambda what: WHATS.index(what) if what in WHATS else len(WHATS))
+    order = ["cell", "queries_ok", "status", "N", "R", "rank", "enrichment", "beta_span_min", "beta_cone_lower_min"]
+    order += [*ERRORS, "error_u_zero_max", "error_lambda_zero_max", "offline_s", "online_s"]
+    return whats.map(lambda what: order.index(what) if what in order else len(order))
 
 
 def _differing(versions: Sequence[Mapping[str, str]]) -> list[str]:

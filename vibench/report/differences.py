@@ -20,8 +20,8 @@ from vibench.results.schema import STORED
 from vibench.results.sqlite import FILE, read_meta, study_of
 from vibench.stability.infsup import VANISHES
 
+# Columns that identify cells in a comparison; "asked" has all tolerances, or sizes.
 AXES = ("problem", "formulation", "dual", "primal", "asked", "solver", "accuracy", "assembly", "correction")
-"""Columns that tell cells apart in a comparison; "asked" has all tolerances, or sizes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,40 +122,24 @@ def run_names(paths: Sequence[Path]) -> list[str]:
         if len(set(names)) == len(set(parts)):
             break
     seen: dict[str, int] = {}
-    for k, name in enumerate(names):  # one run may be named twice
+    # One run may be named twice.
+    for k, name in enumerate(names):
         seen[name] = seen.get(name, 0) + 1
         names[k] = name if seen[name] == 1 else f"{name} ({seen[name]})"
     return names
 
 
-ERROR_FLOOR = 1e-10
-"""Errors below this are round-off, and their ratio is meaningless."""
-
-CONSTANTS = ("beta_span_min", "beta_cone_lower_min")
+# Columns of a cell that are means or maxima over its ok queries: the column of a query, and which of the two.
 ERRORS = {
     **{f"error_{name}_{how}": (f"error_{name}", how) for name in ("u", "lambda") for how in ("mean", "max")},
     "violation_max": ("violation", "max"),
 }
-"""Columns of a cell that are means or maxima over its ok queries: of which column, and which of the two."""
-
-ZERO_ERRORS = ("error_u_zero_max", "error_lambda_zero_max")
-
-DIMENSIONS = ("N", "R", "rank", "enrichment")
-
-SECONDS = ("offline_s", "online_s")
-
-NUMBERS = ("benefit_threshold", "threshold_low", "threshold_high")
-
-WHATS = ("cell", "queries_ok", "status", *DIMENSIONS, *CONSTANTS, *ERRORS, *ZERO_ERRORS, *SECONDS)
-"""What is compared, in its order; break-even comes last."""
-
 Interval = tuple[float, float]
 UNKNOWN: Interval = (float("nan"), float("nan"))
-"""The interval of a ratio that has none."""
 
 
 class ChangeKind(StrEnum):
-    """What a difference between two numbers means."""
+    """Verdict on a difference between two numbers."""
 
     EQUAL = "equal"
     WITHIN_ACCURACY = "within accuracy"
@@ -166,8 +150,8 @@ class ChangeKind(StrEnum):
     WORSE = "worse"
 
 
+# Verdicts that are listed as changes, those first that matter most.
 MOVED = (ChangeKind.WORSE, ChangeKind.BETTER, ChangeKind.CHANGED)
-"""Verdicts on what is listed as a change, those first that matter most."""
 
 
 class Difference(NamedTuple):
@@ -188,44 +172,55 @@ class Difference(NamedTuple):
 
 
 def of_numbers(one: Mapping[str, Any], two: Mapping[str, Any], limit: float) -> Iterator[Difference]:
-    """Differences of a cell in what does not depend on the machine; nothing of columns that are empty in both runs."""
+    """Differences of a cell that do not depend on the machine; none in columns that are empty in both runs."""
     severities = (Status(one["status"]).severity, Status(two["status"]).severity)
     verdicts: dict[str, ChangeKind | None] = {
         "queries_ok": _verdict(one["queries_ok"], two["queries_ok"], 1.0, more_is_better=True),
         "status": _verdict(*severities, 1.0),
     }
-    for name in DIMENSIONS:
+    for name in ("N", "R", "rank", "enrichment"):
         verdict = _verdict(one[name], two[name], limit)
         verdicts[name] = ChangeKind.CHANGED if verdict is ChangeKind.WITHIN_LIMIT else verdict
-    for name in CONSTANTS:
+    for name in ("beta_span_min", "beta_cone_lower_min"):
         verdicts[name] = _verdict(one[name], two[name], limit, floor=VANISHES, more_is_better=True)
-    for name in (*ERRORS, *ZERO_ERRORS):
+    for name in (*ERRORS, "error_u_zero_max", "error_lambda_zero_max"):
         allowed = _solvers_part(one, name) + _solvers_part(two, name)
-        verdicts[name] = _verdict(one[name], two[name], limit, floor=ERROR_FLOOR, allowed=allowed)
+        # Errors below 1e-10 are round-off, and their ratio is meaningless.
+        verdicts[name] = _verdict(one[name], two[name], limit, floor=1e-10, allowed=allowed)
     for name, verdict in verdicts.items():
         if verdict is not None:
             yield Difference(one, name, one[name], two[name], verdict)
 
 
 def _solvers_part(cell: Mapping[str, Any], error: str) -> float:
-    """What the QP solver contributed to an error at most: by the triangle inequality a mean moves by no more."""
+    """Largest contribution of the QP solver to an error; by the triangle inequality a mean moves by no more."""
     largest = cell.get(f"solver_{error.rpartition('_')[0]}_max") if error in ERRORS else None
     return 0.0 if largest is None or pd.isna(largest) else float(largest)
 
 
 def _verdict(
-    before: Any, after: Any, limit: float, *, floor: float = 0.0, allowed: float = 0.0, more_is_better: bool = False
+    before: Any,
+    after: Any,
+    limit: float,
+    *,
+    floor: float | None = None,
+    allowed: float | None = None,
+    more_is_better: bool = False,
 ) -> ChangeKind | None:
-    """ChangeKind on a number that should be small, or large, `None` where there is none; one that is gone is worse."""
-    if pd.isna(before) or pd.isna(after):
-        return (
-            None if pd.isna(before) and pd.isna(after) else ChangeKind.WORSE if pd.isna(after) else ChangeKind.CHANGED
-        )
+    """Verdict on a number that should be small, or large; `None` if neither run has it.
+
+    `floor` replaces smaller numbers in the ratio; a difference `allowed` is within the accuracy.
+    """
+    if pd.isna(after):
+        # A number that is gone is worse than any other.
+        return None if pd.isna(before) else ChangeKind.WORSE
+    if pd.isna(before):
+        return ChangeKind.CHANGED
     if before == after:
         return ChangeKind.EQUAL
-    if abs(after - before) <= allowed:
+    if allowed is not None and abs(after - before) <= allowed:
         return ChangeKind.WITHIN_ACCURACY
-    small, large = (max(before, floor), max(after, floor))
+    small, large = (before, after) if floor is None else (max(before, floor), max(after, floor))
     if more_is_better:
         small, large = large, small
     if large > limit * small:
@@ -236,8 +231,9 @@ def _verdict(
 def of_seconds(one: ComparedRun, two: ComparedRun, shared: Sequence[str], limit: float) -> Iterator[Difference]:
     """Differences in seconds and break-even of cells that one machine measured in both runs.
 
-    They are undecided where a row is marked as disturbed: other work on the machine slowed down what it measured.
+    They are undecided if a row is marked as disturbed.
     """
+    # Other work on the machine slowed down what a disturbed row measured.
     disturbed = {key for key in shared if one.cells[key]["disturbed"] == 1 or two.cells[key]["disturbed"] == 1}
     for key in shared:
         before, after = one.cells[key], two.cells[key]
@@ -245,7 +241,7 @@ def of_seconds(one: ComparedRun, two: ComparedRun, shared: Sequence[str], limit:
             "offline_s": lambda b=before, a=after: _offline_interval(b, a),  # type: ignore[misc]
             "online_s": lambda k=key: _online_interval(one.rounds(k), two.rounds(k)),  # type: ignore[misc]
         }
-        for name in SECONDS:
+        for name in ("offline_s", "online_s"):
             verdict, interval = _verdict(before[name], after[name], limit), UNKNOWN
             if verdict in (ChangeKind.WORSE, ChangeKind.BETTER) and pd.notna(after[name]):
                 interval = intervals[name]()
@@ -258,13 +254,13 @@ def of_seconds(one: ComparedRun, two: ComparedRun, shared: Sequence[str], limit:
 
 
 def _offline_interval(before: Mapping[str, Any], after: Mapping[str, Any]) -> Interval:
-    """Interval of the ratio of offline seconds, which are measured once: from the slowdowns during the two runs."""
+    """Interval of the ratio of offline seconds from the slowdowns of the two runs; these seconds are measured once."""
     low, high = (float(after[f"offline_{end}_s"]) for end in ("low", "high"))
     return low / float(before["offline_high_s"]), high / float(before["offline_low_s"])
 
 
 def _online_interval(before: Sequence[float], after: Sequence[float]) -> Interval:
-    """Interval of the ratio of medians over rounds, which are drawn again with replacement in each of the runs."""
+    """Bootstrap interval of the ratio of medians over rounds, resampled in each of the runs."""
     if min(len(before), len(after)) < FEWEST_ROUNDS:
         return UNKNOWN
     rng = np.random.default_rng(0)
@@ -275,7 +271,8 @@ def _online_interval(before: Sequence[float], after: Sequence[float]) -> Interva
 
 
 def _break_evens(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator[Difference]:
-    keys = [name for name in STORED["thresholds"] if not name.endswith(("_s", *NUMBERS, "meaning"))]
+    results = ("_s", "benefit_threshold", "threshold_low", "threshold_high", "meaning")
+    keys = [name for name in STORED["thresholds"] if not name.endswith(results)]
     for row in one.merge(two, on=keys, suffixes=("_one", "_two")).to_dict("records"):
         before, after = (_break_even(row, k) for k in ("one", "two"))
         verdict: ChangeKind | None = ChangeKind.CHANGED
@@ -286,9 +283,8 @@ def _break_evens(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator
         elif before.meaning == after.meaning:
             verdict = _verdict(before.number, after.number, limit, more_is_better=before.meaning == Meaning.UNTIL)
         own = [_verdict(row[f"{phase}_b_s_one"], row[f"{phase}_b_s_two"], limit) for phase in ("offline", "online")]
-        if (
-            ChangeKind.WORSE not in own and verdict is ChangeKind.WORSE
-        ):  # because the model it is compared with became faster
+        if ChangeKind.WORSE not in own and verdict is ChangeKind.WORSE:
+            # The model that it is compared with became faster.
             verdict = ChangeKind.CHANGED
         elif ChangeKind.WORSE in own and verdict is ChangeKind.CHANGED and after.meaning == Meaning.NEVER:
             verdict = ChangeKind.WORSE
@@ -299,20 +295,24 @@ def _break_evens(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator
 
 
 class Agreement(NamedTuple):
-    """How break-evens of two runs agree, of those that both have."""
+    """Agreement of the break-evens that two runs have.
+
+    Attributes
+    ----------
+    both, overlapping
+        Numbers with an interval in both runs, and those whose intervals have a number in common.
+    opposite, decided
+        Contradictions among the comparisons that both runs decide, and the number of all of these.
+    """
 
     both: int
-    """Numbers with an interval in both runs."""
     overlapping: int
-    """Those whose intervals have a number in common."""
     opposite: int
-    """Comparisons that are decided in both runs, of which at most one is right."""
     decided: int
-    """Comparisons that are decided in both."""
 
 
 def agreement(one: pd.DataFrame, two: pd.DataFrame) -> Agreement:
-    """How break-evens of two runs, rows of their thresholds, agree; whatever the machines were."""
+    """Agreement of the break-evens of two runs, rows of their thresholds, on any machines."""
     rows = one.merge(two, on=["cell_a", "cell_b"], suffixes=("_one", "_two")).to_dict("records")
     pairs = [(row, _break_even(row, "one"), _break_even(row, "two")) for row in rows]
     decided = [pair for pair in pairs if Meaning.UNDECIDED not in (pair[1].meaning, pair[2].meaning)]
@@ -322,7 +322,8 @@ def agreement(one: pd.DataFrame, two: pd.DataFrame) -> Agreement:
 
 
 def _opposite(row: Mapping[Any, Any], a: BreakEven, b: BreakEven) -> bool:
-    """Whether one contradicts the other; "as fast" and a small difference do not unless the gains are apart."""
+    """Whether one break-even contradicts the other."""
+    # "As fast" and a small difference only do if the intervals of the gains are disjoint.
     if Meaning.AS_FAST not in (a.meaning, b.meaning):
         return a.meaning != b.meaning
     apart = row["gain_high_one"] < row["gain_low_two"] or row["gain_high_two"] < row["gain_low_one"]
@@ -330,5 +331,6 @@ def _opposite(row: Mapping[Any, Any], a: BreakEven, b: BreakEven) -> bool:
 
 
 def _break_even(row: Mapping[Any, Any], run: str) -> BreakEven:
-    number, low, high = (None if pd.isna(n := row[f"{name}_{run}"]) else float(n) for name in NUMBERS)
+    names = (f"{name}_{run}" for name in ("benefit_threshold", "threshold_low", "threshold_high"))
+    number, low, high = (None if pd.isna(row[name]) else float(row[name]) for name in names)
     return BreakEven(number, Meaning(row[f"meaning_{run}"]), low, high)

@@ -1,11 +1,11 @@
-"""What a run found: sentences computed from its results file, none without data that support it."""
+"""Sentences on the results of a run, computed from its results file; none without data that support it."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import IntEnum, auto
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,11 +16,7 @@ from vibench.interfaces.strategies import Kind
 from vibench.model.errors import UNMEASURABLE
 from vibench.qp.status import Status
 from vibench.report.figures.data import (
-    FEWEST,
-    MEANS,
     PRIMAL,
-    TABLES,
-    WAY,
     Comparable,
     ProblemTables,
     best_solver,
@@ -35,29 +31,32 @@ from vibench.report.figures.data import (
 from vibench.results import consistency, formats
 from vibench.results.consistency import agreement_sentence
 from vibench.results.paired_timing import PairedTiming
-from vibench.results.ranking import LARGEST_BAND, Criterion, Standings, eligible, leaderboard, too_loose
+from vibench.results.ranking import (
+    LARGEST_BAND,
+    Criterion,
+    eligible,
+    leaderboard,
+    too_loose,
+)
 from vibench.results.read import read_table
-from vibench.results.schema import KEYS
+from vibench.results.schema import KEYS, TABLES
 from vibench.stability.infsup import VANISHES
 from vibench.study.cells import FEASIBLE, UNCORRECTED
 
-SHARE_ATOL = 1e-8
-"""Shares of an inf-sup constant that differ by less are equal up to round-off."""
-
 
 class Weight(IntEnum):
-    """How much a finding says of a run: where only a few are shown, smaller ones come first."""
+    """Importance of a finding: if only a few are shown, smaller weights come first."""
 
-    ALARM = 0
-    WHOLE_RUN = 1
-    ANSWER = 2
-    COMPARISON = 3
-    DETAIL = 4
+    ALARM = auto()
+    WHOLE_RUN = auto()
+    ANSWER = auto()
+    COMPARISON = auto()
+    DETAIL = auto()
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A sentence, what it is about ("" for the whole run), and its weight."""
+    """A sentence, its subject ("" for the whole run), and its weight."""
 
     subject: str
     text: str
@@ -67,24 +66,16 @@ class Finding:
 def findings(path: Path) -> dict[str, list[str]]:
     """Sentences on completeness, stability, errors, costs and solvers by subject, "" for the whole run."""
     by_subject = defaultdict[str, list[str]](list)
-    # as recorded: no finding is on a column of a plugin
-    read = {name: read_table(path, name) for name in dict.fromkeys((*READ, *TABLES))}
+    read = {name: read_table(path, name) for name in TABLES}
     for one in all_findings(read, problem_tables(path, read)):
         by_subject[one.subject].append(one.text)
     return dict(by_subject)
 
 
-READ = ("cells", "queries", "disagreements", "timings")
-"""Tables that findings on the whole run are made from."""
-
-
 def all_findings(
     read: Mapping[str, pd.DataFrame], by_problem: Iterable[tuple[str, ProblemTables]]
 ) -> Iterator[Finding]:
-    """Every finding of a run, by subject: the whole run, then problem by problem.
-
-    They are made from the tables `READ` of the run and from its `problem_tables`.
-    """
+    """Findings from the tables of a run and from its `problem_tables`: on the whole run, then problem by problem."""
     paired = PairedTiming(read["timings"].to_dict("records"))
     for weight, text in _whole_run(read):
         yield Finding("", text, weight)
@@ -105,12 +96,8 @@ def _about(subject: str, weight: Weight, sentences: Iterable[str]) -> Iterator[F
     return (Finding(subject, text, weight) for text in sentences)
 
 
-MOST = 10
-"""Findings that a report begins with; the others are folded."""
-
-
-def leading(findings: Iterable[Finding], most: int = MOST) -> list[Finding]:
-    """The findings that say most, by weight; of equal weight, every subject has its first one before its second."""
+def leading(findings: Iterable[Finding], most: int) -> list[Finding]:
+    """The `most` findings by weight; of equal weight, every subject has its first one before its second."""
     before = defaultdict[tuple[Weight, str], int](int)
     ranked = list[tuple[Weight, int, Finding]]()
     for one in findings:
@@ -158,7 +145,7 @@ def _whole_run(read: Mapping[str, pd.DataFrame]) -> Iterator[tuple[Weight, str]]
                 f"{_number(len(loose), 'cell')} {_are(loose)} not compared with others: {what} "
                 f"10 % or more of an error there (column {source}_share_mean). {remedy}",
             )
-    few = cells[cells["queries_ok"] < FEWEST * cells["queries"]]
+    few = cells[cells["queries_ok"] < 0.5 * cells["queries"]]
     if len(few):
         yield (
             Weight.WHOLE_RUN,
@@ -186,41 +173,28 @@ def _answer(data: ProblemTables, paired: PairedTiming) -> Iterator[str]:
     """The fastest query of a problem in the widest and in the narrowest band of the leaderboard."""
     for standings in leaderboard(data.cells, paired):
         if not standings.bands:
-            yield _no_winner(standings)
+            none = f"None of {_number(standings.cells, 'cell')} has every query ok and mean errors of at most"
+            yield f"{none} {_percent(LARGEST_BAND)}."
         for band in standings.bands[:1] + standings.bands[1:][-1:]:
             winner = band.winner(Criterion.QUERY)
             if winner is None:
                 continue
             cell, ties = winner.cell, len(winner.ties)
             shared = f"; {_number(ties, 'other model')} may be as fast" if ties else ""
-            of_these = f"Of {_number(band.cells, 'cell')} with mean errors of at most {_share(band.error)}"
+            of_these = f"Of {_number(band.cells, 'cell')} with mean errors of at most {_percent(band.error)}"
             if not cell["cell"]:
                 solution = f"a high-fidelity solution, which takes {_milliseconds(winner.value)}"
                 yield f"{of_these}, none has a query faster than {solution}{shared}."
                 continue
+            sizes = f"(N, R) = ({whole(cell['N'])}, {whole(cell['R'])}), {cell['solver']}"
             yield (
-                f"{of_these}, the fastest query is that of {_way(cell)}, {_sizes(cell)}: "
+                f"{of_these}, the fastest query is that of {label_of(cell)} on the cone of {cell['dual']}, {sizes}: "
                 f"{_milliseconds(winner.value)}, with mean errors of {_errors(cell)}; a high-fidelity solution takes "
                 f"{_milliseconds(cell['hf_s'])}{shared}."
             )
 
 
-def _no_winner(standings: Standings) -> str:
-    return (
-        f"None of {_number(standings.cells, 'cell')} has every query ok and mean errors of at most "
-        f"{_share(LARGEST_BAND)}."
-    )
-
-
-def _way(cell: Any) -> str:
-    return f"{label_of(cell)} on the cone of {cell['dual']}"
-
-
-def _sizes(cell: Any) -> str:
-    return f"(N, R) = ({whole(cell['N'])}, {whole(cell['R'])}), {cell['solver']}"
-
-
-def _share(error: float) -> str:
+def _percent(error: float) -> str:
     return f"{100.0 * error:g} %"
 
 
@@ -255,7 +229,7 @@ def _stability(cells: pd.DataFrame, compared: Comparable) -> Iterator[str]:
 
 
 def _corrections(data: ProblemTables) -> Iterator[str]:
-    """What the correction of all solutions changes: errors and seconds against those of the same models without."""
+    """Effect of the correction of all solutions on errors and seconds, against the same models without it."""
     model = [name for name in KEYS if name != "correction"]
     both = data.cells.merge(data.cells[data.cells["correction"] == UNCORRECTED], on=model, suffixes=("", "_without"))
     for assembly, cells in both[both["correction"] == FEASIBLE].groupby("assembly", sort=False):
@@ -274,7 +248,7 @@ def _corrections(data: ProblemTables) -> Iterator[str]:
 
 
 def _training(cells: pd.DataFrame) -> Iterator[str]:
-    """Which training sets took longer to choose than to solve: as many solutions again would have cost less."""
+    """Training sets that took longer to choose than to solve: as many solutions again would have cost less."""
     chosen = cells[(cells["offline_selection_s"] > 0.0) & (cells["hf_s"] > 0.0)]
     for (training, _), group in chosen.groupby(["training", "training_options"], sort=False):
         row = group.loc[group["snapshots"].idxmax()]
@@ -287,24 +261,26 @@ def _training(cells: pd.DataFrame) -> Iterator[str]:
 
 
 def _mean_error(error: float | None, over: str) -> str:
-    """The mean error of λ of a cell over the queries that the cells it is compared with solved, too; "" without one."""
+    """The mean error of λ of a cell over the common queries; "" without one."""
     return "" if error is None or pd.isna(error) else f"; the mean error of λ is {error:.3g}{over}"
 
 
 def _off_training(data: ProblemTables) -> Iterator[str]:
-    """Whether the share of the inf-sup constant that holds on the training set holds off it."""
+    """Stability of fixed enrichments at validation parameters against that at training parameters."""
+    # Ratios that differ by less are equal up to round-off.
+    margin = 1e-8
     fixed = data.cells[data.cells["share_training"].notna()].drop_duplicates([*PRIMAL, "dual", "pair"])
     lost = fixed["share_training"] - fixed["share_validation"]
-    if lost.max() > SHARE_ATOL:
+    if lost.max() > margin:
         worst = fixed.loc[lost.idxmax()]
         yield (
             f"The share of β over the span in that of the whole of V is smaller at validation parameters than at "
-            f"training parameters in {(lost > SHARE_ATOL).sum()} of {len(fixed)} fixed enrichments, at worst "
+            f"training parameters in {(lost > margin).sum()} of {len(fixed)} fixed enrichments, at worst "
             f"{worst['share_validation']:.3f} against {worst['share_training']:.3f} "
             f"({label(worst['primal'], worst['primal_tol'])}, {worst['dual']})."
         )
     bounded = fixed[fixed["share_guaranteed"].notna()]
-    broken = bounded[bounded["share_validation"] < bounded["share_guaranteed"] - SHARE_ATOL]
+    broken = bounded[bounded["share_validation"] < bounded["share_guaranteed"] - margin]
     if len(bounded):
         yield (
             f"√(1 − σ²), which bounds this share at training parameters, is not reached at a validation parameter in "
@@ -313,7 +289,7 @@ def _off_training(data: ProblemTables) -> Iterator[str]:
 
 
 def _zero_solutions(data: ProblemTables) -> Iterator[str]:
-    """Queries that have no relative error since the high-fidelity u or λ is zero, and how large the reduced one is."""
+    """Queries without relative error, since the high-fidelity u or λ is zero, and the size of the reduced one."""
     for name, symbol in (("u", "u"), ("lambda", "λ")):
         zero = data.queries[data.queries[f"zero_{name}"] == 1]
         if zero.empty:
@@ -335,14 +311,14 @@ def _zero_solutions(data: ProblemTables) -> Iterator[str]:
 
 
 def _costs(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Iterator[str]:
-    """The fastest query among cells of one pair that can win on the leaderboard, and the break-even of its cell."""
+    """The fastest query of the eligible cells of one pair, and the break-even of its cell."""
     timed = cells[eligible(cells) & cells["online_s"].notna()]
     if timed.empty:
         return
     row = timed.loc[timed["online_s"].idxmin()]
     name = label_of(row)
     yield (
-        f"The fastest query with mean errors of at most {_share(LARGEST_BAND)} is that of {name}: "
+        f"The fastest query with mean errors of at most {_percent(LARGEST_BAND)} is that of {name}: "
         f"{_milliseconds(row['online_s'])}, of which the QP solver takes {_milliseconds(row['online_solve_s'])}, with "
         f"mean errors of {_errors(row)}; a high-fidelity solution takes {_milliseconds(row['hf_s'])} after a set-up of "
         f"{_milliseconds(row['hf_setup_s'])}."
@@ -357,18 +333,19 @@ def _costs(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Iterator[str]:
 
 
 def _solvers(data: ProblemTables) -> Iterator[str]:
-    """Number of the programs that each solver solved, at each accuracy; median time and mean errors on common ones."""
-    several = data.cells["accuracy"].nunique() > 1
-    solved = data.queries[data.queries["status"] == Status.OK].groupby(WAY).size()
-    shared = dict(iter(common_programs(data.queries).groupby(WAY)))
+    """Programs solved by each solver at each accuracy; median time and mean errors on the common ones."""
+    several, by = data.cells["accuracy"].nunique() > 1, ["solver", "accuracy"]
+    solved = data.queries[data.queries["status"] == Status.OK].groupby(by).size()
+    shared = dict(iter(common_programs(data.queries).groupby(by)))
     common, errors = max(map(len, shared.values()), default=0), list[str]()
-    for way, cells in data.cells.groupby(WAY, sort=False):
+    for way, cells in data.cells.groupby(by, sort=False):
         solver = "{} at {:g}".format(*way) if several else way[0]
         asked, median = int(cells["queries"].fillna(0).sum()), ""
         if way in shared:
             over = f" over the {common} programs that all solved" if common < asked else ""
             median = f", with a median of {1e3 * shared[way]['solve_s'].median():.3g} ms{over}"
-            errors.append(f"{solver} {' and '.join(f'{shared[way][name].mean():.3g}' for name in MEANS.values())}")
+            means = shared[way][["error_u", "error_lambda"]].mean()
+            errors.append(f"{solver} {means.iloc[0]:.3g} and {means.iloc[1]:.3g}")
         yield f"{solver} solved {solved.get(way, 0)} of {asked} programs{median}."
     if len(errors) > 1 and common < solved.max():
         yield f"Mean errors of u and λ over these {common} programs: {'; '.join(errors)}."

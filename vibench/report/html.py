@@ -21,74 +21,73 @@ from vibench.files import write_atomically
 from vibench.qp.status import Status
 from vibench.report import findings, plots
 from vibench.report.figures import FigureTask, figures_of, processes, render
-from vibench.report.figures.data import TABLES, Extent, ProblemTables, label_of, problem_tables, whole
+from vibench.report.figures.data import Extent, ProblemTables, label_of, problem_tables, whole
 from vibench.report.plots import image_of, script_safe, short
 from vibench.results import formats, pictures, ranking, show
 from vibench.results.break_even import MARGIN
 from vibench.results.paired_timing import PairedTiming
 from vibench.results.ranking import LARGEST_BAND, Criterion, Winner, leaderboard
 from vibench.results.read import in_order, read_table
-from vibench.results.schema import STORED, Column
+from vibench.results.schema import STORED, TABLES, Column
 from vibench.results.selection import short_keys
 from vibench.results.sqlite import read_meta, study_of
 from vibench.stability.infsup import VANISHES
 from vibench.text import printable
 
-FIRST = 50
-"""Rows of a table that a page has without its script."""
-
-FEW = 60
-"""Texts of a column up to which it can be filtered by a list of them."""
-
+# Columns of the table of cells, those that matter most first.
 OF_CELLS = (
     "cell", *show.AXES, "status", "queries_ok", "error_lambda_mean", "error_u_mean", "online_s", "offline_s",
     "beta_span_min", "beta_cone_lower_min", "N", "R", "enrichment", "queries_zero_u", "error_u_zero_max",
     "queries_zero_lambda", "error_lambda_zero_max",
 )  # fmt: skip
-"""Columns of the table of cells, those that matter most first."""
-
+# Columns that are offered besides, and not shown at first.
 MORE_OF_CELLS = (
     "hf_s", "online_q1_s", "online_q3_s", "share_validation", "violation_max", "solver_share_mean", "residual_max",
     "peak_memory_mib", "slowdown", "reason", "fallbacks", "machine",
 )  # fmt: skip
-"""Columns that are offered besides, and not shown at first."""
 
 
 @dataclass(frozen=True)
 class TableGrid:
-    """A table of the report."""
+    """A table of the report.
+
+    Attributes
+    ----------
+    name
+        Its identifier in the page.
+    title, caption
+        Heading, and the text below it.
+    frame
+        Its rows as they are shown, under their headings; the first column names a row.
+    axes, hidden
+        Headings that rows can be filtered by, and those that are not shown at first.
+    disturbed
+        Numbers of the rows whose seconds were measured on a disturbed machine.
+    """
 
     name: str
-    """Its identifier in the page."""
     title: str
     caption: str
-    """What stands below the heading."""
     frame: pd.DataFrame
-    """Its rows as they are shown, under their headings; the first column names a row."""
     axes: tuple[str, ...] = ()
-    """Headings that rows can be filtered by."""
     hidden: tuple[str, ...] = ()
-    """Headings that are not shown at first."""
     disturbed: tuple[int, ...] = ()
-    """Numbers of the rows whose seconds were measured on a disturbed machine."""
 
     def meaning(self, heading: str) -> str:
-        """What stands under a heading, and its unit; "" where nobody says."""
-        for name, column in RECORDED:
-            if heading in (name, column.heading):
-                return printable(f"{column.meaning} [{column.unit}]" if column.unit else column.meaning)
+        """Meaning and unit of the column with a heading; "" if it is no recorded one."""
+        for table in (STORED["cells"], STORED["thresholds"], *STORED.values()):
+            for name, column in table.items():
+                if heading in (name, column.heading):
+                    return printable(f"{column.meaning} [{column.unit}]" if column.unit else column.meaning)
         return ""
 
     @property
     def first(self) -> tuple[list[str], list[list[str]]]:
         """The headings that are shown at first, and the texts of the first rows under them."""
         shown = [str(name) for name in self.frame.columns if name not in self.hidden]
-        rows = self.frame[shown].head(FIRST).itertuples(index=False)
+        # Without its script a page has 50 rows of a table.
+        rows = self.frame[shown].head(50).itertuples(index=False)
         return shown, [[formats.cell_text(value) for value in row] for row in rows]
-
-
-RECORDED = [pair for table in (STORED["cells"], STORED["thresholds"], *STORED.values()) for pair in table.items()]
-"""Columns of all tables, those of cells first."""
 
 
 def grid_of_cells(cells: pd.DataFrame, caption: str) -> TableGrid:
@@ -113,13 +112,13 @@ def grid_of_thresholds(name: str, title: str, caption: str, rows: pd.DataFrame, 
     texts = [heading for heading in frame.columns if not pd.api.types.is_numeric_dtype(frame[heading])]
     axes = tuple(heading for heading in texts if heading not in results)
     disturbed = {*_disturbed(ordered["cell_a"], cells), *_disturbed(ordered["cell_b"], cells)}
-    # Where all answers are undecided that is said: an interval alone would read like a result.
+    # Results stay even if all are undecided: an interval alone would read like a result.
     hidden = tuple(heading for heading in _constant(frame) if heading not in results)
     return TableGrid(name, title, caption, frame, axes, hidden, tuple(sorted(disturbed)))
 
 
 def grid_of(name: str, title: str, caption: str, frame: pd.DataFrame, axes: Sequence[str], keys: int) -> TableGrid:
-    """Any other table, without columns that are empty, and with so many characters of the keys of cells."""
+    """Any other table, without empty columns, and with `keys` characters of the keys of cells."""
     shown = frame.dropna(axis=1, how="all")
     shown = shown.assign(cell=shown["cell"].str[:keys]) if "cell" in shown else shown
     return TableGrid(name, title, caption, shown, tuple(one for one in axes if one in shown), tuple(_constant(shown)))
@@ -130,7 +129,7 @@ def _heading(table: dict[str, Column] | Any, name: str) -> str:
 
 
 def _constant(frame: pd.DataFrame) -> list[str]:
-    """Columns with one value in all rows, but for the first one."""
+    """Columns after the first one with the same value in all rows."""
     return [str(name) for name in frame.columns[1:] if len(frame) > 1 and frame[name].nunique(dropna=False) == 1]
 
 
@@ -150,17 +149,15 @@ def _columnar(grid: TableGrid) -> dict[str, Any]:
         "columns": [
             {"meaning": grid.meaning(str(name))} | _column(str(name), grid.frame[name]) for name in grid.frame.columns
         ],
-        "axes": [name for name in grid.axes if 1 < grid.frame[name].nunique() <= FEW],
+        # A list of more than 60 texts is no convenient filter.
+        "axes": [name for name in grid.axes if 1 < grid.frame[name].nunique() <= 60],
         "hidden": sorted(set(grid.hidden)),
         "disturbed": list(grid.disturbed),
     }
 
 
 def _column(name: str, values: pd.Series) -> dict[str, Any]:
-    """A column of numbers, of texts, or of numbers of texts where most of them occur often.
-
-    A value that all rows have stands there once.
-    """
+    """A column as numbers, as texts, or as codes of texts if most of them recur; a constant value is written once."""
     heading = printable(name)
     if pd.api.types.is_numeric_dtype(values) or _numbers_in_text(values):
         numbers = [short(value, 6) for value in values]
@@ -176,71 +173,46 @@ def _column(name: str, values: pd.Series) -> dict[str, Any]:
 
 
 def _numbers_in_text(values: pd.Series) -> bool:
-    """Whether a column of texts has numbers alone: tolerances are texts since a dimension may take their place."""
+    """Whether a column of texts has only numbers: tolerances are texts, since a dimension may replace them."""
     if not len(values) or not all(isinstance(value, str) for value in values):
         return False
     return bool(pd.to_numeric(values.drop_duplicates(), errors="coerce").notna().all()) and values.name != "cell"
 
 
-ERRORS = (
-    "Errors are relative; they are means over the ok queries whose high-fidelity solution is not zero. Where a run has "
-    "others, columns u = 0 and λ = 0 have their number and their largest error over the largest training norm. Means "
-    "over other queries are not comparable: findings and figures take those over queries that all solved."
-)
-
-READ = tuple(dict.fromkeys((*TABLES, *findings.READ)))
-"""Tables from which findings, tables and figures are all made: they are read once."""
-
+# Findings that can be unfolded; nobody would read the thousands of a large study.
 FOLDED = 300
-"""Findings that can be unfolded; thousands of a large study would be read by nobody."""
-
-IDENTITY = [
-    "problem",
-    "formulation",
-    "dual",
-    "primal",
-    "primal_tol",
-    "solver",
-    "accuracy",
-    "assembly",
-    "correction",
-    "status",
-]
-"""Columns that cells and queries share in the tables of failures."""
 
 
-def write(path: Path, target: Path, jobs: int = 1, *, figures: bool = True) -> Path:
+def write(path: Path, target: Path, jobs: int, *, figures: bool = True) -> Path:
     """Write the page of a results file as `target`; an interrupted call leaves no incomplete file under its name.
 
-    As many processes as `jobs` draw its pictures, this one included; pictures of the figures take most of the time. The
-    other processes import the main module: with more than one, a script that calls this has to guard what it does by
-    ``if __name__ == "__main__"``.
+    `jobs` processes draw its pictures, which take most of the time, this one included. The others import the main
+    module: a script that calls this with more than one needs the guard ``if __name__ == "__main__"``.
 
     Raises a `RequestError` if `target` is the results file, or cannot be written.
     """
-    if os.path.realpath(target) == os.path.realpath(path):  # of links in a circle, too
+    # `os.path`, since `Path.resolve` raises for links in a circle.
+    if os.path.realpath(target) == os.path.realpath(path):
         raise RequestError(f"'{target}' is the results file itself; choose another file for the report")
     try:
-        write_atomically(target, page(path, jobs, figures=figures).encode("utf-8"))
+        with processes(jobs if figures else 1) as pool:
+            text = page(path, pool, figures=figures)
+        write_atomically(target, text.encode("utf-8"))
     except OSError as error:
         raise RequestError(f"'{target}' cannot be written: {error.strerror}") from None
     return target
 
 
-def page(path: Path, jobs: int = 1, *, figures: bool = True) -> str:
-    """The page of a results file, its pictures drawn by so many processes, or without pictures."""
-    with processes(jobs if figures else 1) as pool:
-        return _page(path, pool, figures=figures)
-
-
-def _page(path: Path, pool: ProcessPoolExecutor | None, *, figures: bool) -> str:
-    study, read = study_of(path, read_meta(path)), {name: read_table(path, name) for name in READ}
+def page(path: Path, pool: ProcessPoolExecutor | None = None, *, figures: bool = True) -> str:
+    """The page of a results file; processes of a pool draw its pictures, too."""
+    study, read = study_of(path, read_meta(path)), {name: read_table(path, name) for name in TABLES}
     cells, data_of = in_order(read["cells"]), dict(problem_tables(path, read))
-    del read["histories"]  # of a large study millions of rows, which `data_of` has in order
+    # Histories may have millions of rows, and `data_of` has them.
+    del read["histories"]
     grids = list(_grids({**read, "cells": cells}))
     everything = list(findings.all_findings(read, data_of.items()))
-    first, kept = findings.leading(everything), set(findings.leading(everything, findings.MOST + FOLDED))
-    rest = [one for one in everything if one in kept and one not in first]
+    first, listed = (findings.leading(everything, most) for most in (10, 10 + FOLDED))
+    rest = [one for one in everything if one in set(listed) - set(first)]
     key_length = short_keys(cells["cell"])
     rows = {str(cell): k for k, cell in enumerate(cells["cell"])}
     live = [plot for name, data in data_of.items() for plot in plots.plots(name, data, rows)]
@@ -269,7 +241,7 @@ def _page(path: Path, pool: ProcessPoolExecutor | None, *, figures: bool) -> str
         grids=grids,
         drawn=figures,
         images=images,
-        cut=any(image.cut for image in images) or any(len(data.duals) > MOST_DUALS for data in data_of.values()),
+        cut=any(image.cut for image in images) or any(len(data.duals) > 1 for data in data_of.values()),
         plots={plot.name: plot for plot in live},
         overviews=first_plots,
         plots_alone=[plot for plot in live if plot.name not in {image.name for image in images}],
@@ -297,28 +269,25 @@ def _asset(name: str) -> str:
 
 
 def _printable(value: Any) -> Any:
-    """A text that a template shows; what it has rendered itself stays as it is."""
+    """Any text in a template made printable; markup stays as it is."""
     return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
-MOST_DUALS = 1
-"""Dual strategies of a problem that have pictures of their own: those of the leaderboard first, then the others."""
-
-
 def tasks_of(name: str, data: ProblemTables) -> Iterator[FigureTask]:
-    """The figures of a problem of which the page has pictures: of long ones the beginning."""
+    """The figures of a problem on the page: the beginning of long ones, and of the leading dual strategy alone."""
     winners = (winner for one in leaderboard(data.cells) for band in one.bands for winner in band.winners)
     ranked = dict.fromkeys([*filter(None, (str(winner.cell["dual"]) for winner in winners)), *data.duals])
-    return figures_of(name, replace(data, extent=Extent.BEGINNING), list(ranked)[:MOST_DUALS])
+    return figures_of(name, replace(data, extent=Extent.BEGINNING), list(ranked)[:1])
 
 
 def way(winner: Winner) -> str:
-    """The model of a cell that wins: its enrichment, cone, dimensions and, where that has a part in it, solver."""
+    """The model of a cell that wins: its enrichment, cone, dimensions and solver."""
     cell = winner.cell
     if not cell["cell"]:
         return "the high-fidelity model"
     size = f"N = {whole(cell['N'])}, R = {whole(cell['R'])}"
-    solver = "" if winner.criterion is Criterion.OFFLINE else f"; {cell['solver']}"  # no solver has a part in it
+    # The offline phase involves no QP solver.
+    solver = "" if winner.criterion is Criterion.OFFLINE else f"; {cell['solver']}"
     return f"{label_of(cell)}; {cell['dual']}, {size}{solver}"
 
 
@@ -339,13 +308,21 @@ def _grids(read: Mapping[str, pd.DataFrame]) -> Iterator[TableGrid]:
     """The tables of the page, those of failures first; a table without rows is none."""
     cells, thresholds = read["cells"], read["thresholds"]
     keys = short_keys(cells["cell"])
-    failed = cells[cells["status"] != Status.OK][["cell", *IDENTITY, "queries_ok", "queries", "reason"]]
+    identity = ["problem", "formulation", "dual", "primal", "primal_tol", "solver", "accuracy", "assembly"]
+    identity += ["correction", "status"]
+    failed = cells[cells["status"] != Status.OK][["cell", *identity, "queries_ok", "queries", "reason"]]
     queries = read["queries"]
-    failed_queries = queries[queries["status"] != Status.OK][["cell", "query", *IDENTITY, "reason"]]
+    failed_queries = queries[queries["status"] != Status.OK][["cell", "query", *identity, "reason"]]
     grids = [
-        grid_of("failed", "Cells that are not ok", "", failed, IDENTITY, keys),
-        grid_of("failed-queries", "Queries that are not ok", "", failed_queries, IDENTITY, keys),
-        grid_of_cells(cells, ERRORS),
+        grid_of("failed", "Cells that are not ok", "", failed, identity, keys),
+        grid_of("failed-queries", "Queries that are not ok", "", failed_queries, identity, keys),
+        grid_of_cells(
+            cells,
+            "Errors are relative; they are means over the ok queries whose high-fidelity solution is not zero. Where a "
+            "run has others, columns u = 0 and λ = 0 have their number and their largest error over the largest "
+            "training norm. Means over other queries are not comparable: findings and figures take those over queries "
+            "that all solved.",
+        ),
     ]
     model = thresholds["cell_a"].isna()
     formulations = formats.between_formulations(thresholds)

@@ -1,4 +1,4 @@
-"""Who made results that are published: paths, user and host are taken out of a copy, and what is left is said."""
+"""Removal of paths, user and host from results that are published, and a list of what could still identify somebody."""
 
 from __future__ import annotations
 
@@ -17,28 +17,12 @@ from vibench.results.schema import KEYS, STORED, SqlType
 from vibench.results.sqlite import Digests, open_read_only, read_meta, read_rows, text_reader
 from vibench.text import brief, json_object, unbroken
 
-LEFT_OUT = "…"
-"""What stands where something was taken out."""
-
-PATH = re.compile(r"""(?<![\w./])(?:/[^/\s'"`\\:;,<>|()\[\]{}]+){2,}/?""")
-"""An absolute path of two parts at least, in a text or in JSON."""
-
-SHOWN = {
-    "machines": ("machine",),
-    "labels": ("problem", "training", "formulation", "dual", "primal", "validation"),
-    "options": (*(name for name in KEYS if name.endswith("_options")), "validation_options"),
-}
-"""Columns that are said, by what they are called."""
-
-NAMES = frozenset({*KEYS, "cell", "solver_a", "solver_b", "status"})
-"""Columns whose values tell rows apart: of these only paths are taken out."""
-
 
 def cleaned(path: Path, copy: Path) -> None:
-    """Write a copy of a results file without absolute paths, the user's name, home directory and the host's name.
+    """Write a copy of a results file without absolute paths, the names of user and host, and the home directory.
 
-    Of a path the name of its file is kept, if it has an ending. Where packs and files of points were is left out; their
-    paths beside the study are kept, and the hashes of their content are part of those of the code.
+    The name of a file at the end of a path stays, if it has an ending. Places of packs and files of points are removed;
+    their paths beside the study stay, and the hashes of their content are part of those of the code.
 
     Raises a `RequestError` if the file is damaged, or the copy cannot be written.
     """
@@ -56,27 +40,38 @@ def _write_cleaned(path: Path, copy: Path) -> None:
     parents = {Path(place).parent for place in _places(path)}
     folders = sorted((str(one) for one in parents if len(one.parts) > 2), key=len, reverse=True)
     inside = [re.compile(rf"(?<!\w){re.escape(folder)}(?![\w-])") for folder in folders]
+    texts = {
+        table: [name for name, column in columns.items() if column.kind == SqlType.TEXT]
+        for table, columns in STORED.items()
+    }
     with closing(sqlite3.connect(copy)) as db, db:
         db.text_factory = text_reader()
-        for table, columns in {"meta": ("value",), **{name: _texts(name) for name in STORED}}.items():
+        for table, columns in {"meta": ("value",), **texts}.items():
             if table != "meta":
-                read_rows(path, table)  # refuses damage, which new digests would hide
+                # Refuses damage, which new digests would hide.
+                read_rows(path, table)
             if sum(_clean(db, table, column, inside) for column in columns):
                 digests = Digests(db)
                 digests.forget(name=table)
                 digests.count(table)
     with closing(sqlite3.connect(copy)) as db:
-        db.execute("VACUUM")  # what was replaced is no longer in free pages
+        # Free pages still have the replaced values.
+        db.execute("VACUUM")
 
 
 def left(paths: Sequence[Path], names: Sequence[str], authors: Sequence[str]) -> Iterator[str]:
-    """What of cleaned results could still identify somebody, a line each."""
+    """Lines on what could still identify somebody in cleaned results."""
     yield f"names of runs: {', '.join(names)}"
     if authors:
         yield f"authors: {'; '.join(authors)}"
     tables = [read_rows(path, "cells") for path in paths]
     rows = [dict(zip(columns, row, strict=True)) for columns, found in tables for row in found]
-    for title, columns in SHOWN.items():
+    shown = {
+        "machines": ("machine",),
+        "labels": ("problem", "training", "formulation", "dual", "primal", "validation"),
+        "options": (*(name for name in KEYS if name.endswith("_options")), "validation_options"),
+    }
+    for title, columns in shown.items():
         values = {str(row[column]) for row in rows for column in columns} - {"{}", "None"}
         if values:
             yield f"{title}: {brief('; '.join(sorted(map(unbroken, values))), 500)}"
@@ -87,7 +82,7 @@ def left(paths: Sequence[Path], names: Sequence[str], authors: Sequence[str]) ->
 
 
 def _identities() -> list[tuple[str, str]]:
-    """What identifies the user and the machine; the longest first."""
+    """Kind and text of the names of user and machine, the longest first."""
     found = [("name of the host", platform.node())]
     with contextlib.suppress(RuntimeError):
         found.append(("home directory", str(Path.home())))
@@ -101,7 +96,7 @@ def _word(name: str) -> re.Pattern[str]:
 
 
 def _places(path: Path) -> Iterator[str]:
-    """Where the cells of a results file found files and folders."""
+    """Absolute places of the files and folders that cells read."""
     names, rows = read_rows(path, "cells")
     for definition in {row[names.index("definition")] for row in rows}:
         for plugin in (json_object(definition) or {}).values():
@@ -109,25 +104,25 @@ def _places(path: Path) -> Iterator[str]:
             yield from (str(place) for place in (recorded or {}).values() if str(place).startswith("/"))
 
 
-def _texts(table: str) -> list[str]:
-    return [name for name, column in STORED[table].items() if column.kind == SqlType.TEXT]
-
-
 def _clean(db: sqlite3.Connection, table: str, column: str, folders: Sequence[re.Pattern[str]]) -> int:
-    """Clean the values of a column; returns how many were changed."""
+    """Clean the values of a column; returns the number of changed ones."""
+    # An absolute path of two parts at least, in a text or in JSON.
+    path = re.compile(r"""(?<![\w./])(?:/[^/\s'"`\\:;,<>|()\[\]{}]+){2,}/?""")
     values = db.execute(
         f'SELECT DISTINCT CAST("{column}" AS BLOB) FROM "{table}" WHERE "{column}" IS NOT NULL'
     ).fetchall()
-    names = [_word(name) for _, name in _identities()] if column not in NAMES else []
+    # Values that identify rows must stay different, so that names in them stay.
+    identifies = column in {*KEYS, "cell", "solver_a", "solver_b", "status"}
+    names = [] if identifies else [_word(name) for _, name in _identities()]
     changed = 0
     for (value,) in values:
         text = value.decode(errors="surrogateescape")
         new = _without_places(text) if column == "definition" else text
         for folder in folders:
-            new = folder.sub(LEFT_OUT, new)
-        new = PATH.sub(_file, new)
+            new = folder.sub("…", new)
+        new = path.sub(_file, new)
         for name in names:
-            new = name.sub(LEFT_OUT, new)
+            new = name.sub("…", new)
         if new != text:
             changed += 1
             db.execute(
@@ -146,6 +141,6 @@ def _without_places(definition: str) -> str:
 
 
 def _file(match: re.Match[str]) -> str:
-    """What is kept of a path: the name of a file, if it has an ending."""
+    """The name of the file of a path, if it has an ending."""
     name = match[0].rsplit("/", 1)[-1]
-    return f"{LEFT_OUT}/{name}" if Path(name).suffix else LEFT_OUT
+    return f"…/{name}" if Path(name).suffix else "…"

@@ -29,32 +29,26 @@ from vibench.results.break_even import HIGH_FIDELITY, TAIL
 from vibench.results.paired_timing import PairedTiming
 from vibench.text import printable, unbroken
 
-MARKERS = {
-    "o": "circle", "s": "square", "^": "triangle", "v": "inverted_triangle", "D": "diamond", "P": "plus",
-    "X": "square_x", "*": "star", "d": "diamond_dot", "p": "hex_dot", "h": "hex",
-}  # fmt: skip
-"""Markers of the pictures and those of BokehJS that stand for them."""
-
-FILLS = (0.85, 0.0, 0.4)
-"""Opacity of the points of the first, second and third dual strategy, and so on."""
-
-DIGITS = 4
-"""Significant digits of coordinates: more than a screen shows, or the text that a point has."""
-
-LIBRARY = ("bokeh.min.js", "bokeh-api.min.js")
-"""BokehJS and its interface for plots, in the distribution of Bokeh."""
-
 
 @cache
 def library() -> str:
     """The JavaScript that draws the plots, with its licence."""
     folder = files("bokeh") / "server" / "static" / "js"
-    return "\n".join((folder / name).read_text(encoding="utf-8").strip() for name in LIBRARY)
+    names = ("bokeh.min.js", "bokeh-api.min.js")
+    return "\n".join((folder / name).read_text(encoding="utf-8").strip() for name in names)
 
 
 @dataclass(frozen=True)
 class PlotPanel:
-    """A panel of a plot: columns of its rows, what they are called, and whether its axes are logarithmic."""
+    """A panel of a plot: its columns and their labels.
+
+    Attributes
+    ----------
+    logarithmic
+        Whether both axes are.
+    line
+        Abscissa of the high-fidelity model, which has no error.
+    """
 
     x: str
     y: str
@@ -62,15 +56,14 @@ class PlotPanel:
     y_label: str
     logarithmic: bool = True
     line: float | None = None
-    """Abscissa of the high-fidelity model, which has no error."""
 
 
 @dataclass(frozen=True)
 class Plot:
-    """A plot of one problem: its name, which is that of the picture whose place it takes, its title, and its data.
+    """A plot of one problem: its name, which is that of the picture that it replaces, its title, and its data.
 
-    `data` has the names, colours and markers of the series, row in the table of cells, series and filling of every
-    point, and the panels, with the coordinates of the points; a point that a panel does not have is null there.
+    `data` has the names, colours and markers of the series; the row in the table of cells, the series and the filling
+    of every point; and the panels with the coordinates of the points, null for a point that a panel does not have.
     """
 
     name: str
@@ -104,16 +97,6 @@ def plots(name: str, data: ProblemTables, rows: Mapping[str, int]) -> Iterator[P
     yield from _plot(f"{name}-shares", f"{data.problem}: {title}", fixed, panels, rows)
 
 
-OVERVIEW = "overview"
-"""End of the name of the plot that a report begins with."""
-
-MOST_CURVES = 6
-"""Reduced models whose total costs are drawn: those that are the cheapest at some error for some number of queries."""
-
-QUERIES = np.logspace(0.0, 6.0, 61)
-"""Numbers of queries."""
-
-
 def overview(
     name: str, data: ProblemTables, rows: Mapping[str, int], paired: PairedTiming, certified: pd.Series
 ) -> Iterator[Plot]:
@@ -134,7 +117,7 @@ def overview(
         PlotPanel("online_ms", column, "time of a query [ms]", label_, line=solution)
         for column, label_ in (("error", "larger mean error of u and λ"), ("certified", "certified error, in energy"))
     ]
-    for plot in _plot(f"{name}-{OVERVIEW}", f"{data.problem}: which model, for how many queries", shown, panels, rows):
+    for plot in _plot(f"{name}-overview", f"{data.problem}: which model, for how many queries", shown, panels, rows):
         looks = Looks([Series(*way) for way in zip(cells["primal"], cells["way"], strict=True)])
         yield replace(plot, data=plot.data | {"costs": _costs(cells, errors, paired, rows, looks)})
 
@@ -143,17 +126,19 @@ def _costs(
     cells: pd.DataFrame, errors: pd.Series, paired: PairedTiming, rows: Mapping[str, int], looks: Looks
 ) -> dict[str, Any]:
     """Total costs over the number of queries with their 95 % bands, of the high-fidelity model and of the cheapest."""
+    numbers = np.logspace(0.0, 6.0, 61)
     ways = dict(zip(cells["cell"], (Series(*w) for w in zip(cells["primal"], cells["way"], strict=True)), strict=True))
     every = {one.key: one for one in ranking.candidates(cells, paired)}
     winners: dict[str | None, None] = {None: None}
     for level in ranking.reached_errors(errors):
         allowed = [every[None], *(every[cell] for cell in cells["cell"][errors <= level * (1.0 + 1e-12)])]
-        totals = np.array([one.offline + QUERIES * one.online for one in allowed])
+        totals = np.array([one.offline + numbers * one.online for one in allowed])
         winners |= dict.fromkeys(allowed[k].key for k in dict.fromkeys(totals.argmin(axis=0)))
     curves = []
-    for key in list(winners)[: MOST_CURVES + 1]:
+    # The high-fidelity model and at most six others, each the cheapest at some error for some number of queries.
+    for key in list(winners)[:7]:
         one = every[key]
-        drawn = one.offline_draws[:, None] + one.online_draws[:, None] * QUERIES
+        drawn = one.offline_draws[:, None] + one.online_draws[:, None] * numbers
         low, high = np.quantile(drawn, (TAIL, 1.0 - TAIL), axis=0)
         look = None if key is None else looks[ways[key]]
         name = HIGH_FIDELITY if key is None else label(one.row["primal"], one.row["primal_tol"], str(one.row["way"]))
@@ -161,11 +146,11 @@ def _costs(
             {"name": printable(name), "row": None if key is None else rows[key]}
             | {"colour": "#000000" if look is None else look.colour, "dashed": key is None}
             | {
-                side: [short(value, DIGITS) for value in values]
-                for side, values in (("y", one.offline + QUERIES * one.online), ("low", low), ("high", high))
+                side: [short(value, 4) for value in values]
+                for side, values in (("y", one.offline + numbers * one.online), ("low", low), ("high", high))
             }
         )
-    return {"x": [short(value, DIGITS) for value in QUERIES], "curves": curves}
+    return {"x": [short(value, 4) for value in numbers], "curves": curves}
 
 
 def _plot(
@@ -182,20 +167,26 @@ def _plot(
         "series": [_series(way, looks[way]) for way in places],
         "rows": [rows[cell] for cell in cells["cell"]],
         "of": [places.index(way) for way in ways],
-        "fills": [FILLS[duals.index(dual) % len(FILLS)] for dual in cells["dual"]],
+        # Opacity distinguishes the dual strategies.
+        "fills": [(0.85, 0.0, 0.4)[duals.index(dual) % 3] for dual in cells["dual"]],
         "panels": [_panel(panel, points) for panel, points in drawn],
     }
     yield Plot(name, printable(title), data)
 
 
 def _series(way: Series, look: Look) -> dict[str, Any]:
-    """A series: its name, and how its points look; what shares colour and marker differs in the width of the edge."""
+    """Name and look of a series; those with the same colour and marker differ in the width of the edge."""
+    # Markers of BokehJS for those of Matplotlib.
+    markers = {
+        "o": "circle", "s": "square", "^": "triangle", "v": "inverted_triangle", "D": "diamond", "P": "plus",
+        "X": "square_x", "*": "star", "d": "diamond_dot", "p": "hex_dot", "h": "hex",
+    }  # fmt: skip
     name = printable(label(way.name, None, str(way.variant)))
-    return {"name": name, "colour": look.colour, "marker": MARKERS[look.marker], "edge": 1.0 + 1.4 * look.rank}
+    return {"name": name, "colour": look.colour, "marker": markers[look.marker], "edge": 1.0 + 1.4 * look.rank}
 
 
 def _coordinates(cells: pd.DataFrame, panel: PlotPanel) -> pd.DataFrame:
-    """Both values of every cell, missing where one of them is, or is not above zero on a logarithmic axis."""
+    """Both values of every cell; missing if one of them is, or is not positive on a logarithmic axis."""
     values = cells[[panel.x, panel.y]].astype(float)
     fine = np.isfinite(values).all(axis=1) & ((values > 0.0).all(axis=1) | (not panel.logarithmic))
     return values.where(fine)
@@ -206,51 +197,51 @@ def _panel(panel: PlotPanel, points: pd.DataFrame) -> dict[str, Any]:
         "x_label": panel.x_label,
         "y_label": panel.y_label,
         "scale": "log" if panel.logarithmic else "linear",
-        "line": None if panel.line is None else short(panel.line, DIGITS),
-        "x": [short(value, DIGITS) for value in points[panel.x]],
-        "y": [short(value, DIGITS) for value in points[panel.y]],
+        # Four digits are more than a screen shows.
+        "line": None if panel.line is None else short(panel.line, 4),
+        "x": [short(value, 4) for value in points[panel.x]],
+        "y": [short(value, 4) for value in points[panel.y]],
     }
-
-
-DPI = 110
-"""Dots per inch: sharp enough at the width of a page, and a tenth of the bytes of a vector picture of many lines."""
-
-EFFORT = {"method": 1, "quality": 0}
-"""Options of the compression: a third of the time of more thorough ones, for a quarter more bytes."""
-
-NAMED = 6
-"""Series of a panel that an alternative text describes one by one."""
 
 
 @dataclass(frozen=True)
 class FigureImage:
-    """The picture of a figure."""
+    """The picture of a figure.
+
+    Attributes
+    ----------
+    cut
+        Whether it is only the beginning of the figure.
+    alternative
+        Alternative text.
+    source
+        Its data URI.
+    width, height
+        Size in pixels.
+    """
 
     name: str
     caption: str
     cut: bool
-    """Whether it is only the beginning of the figure."""
     alternative: str
-    """What is seen."""
     source: str
-    """Its data URI."""
     width: int
-    """Pixels in a row."""
     height: int
-    """Rows of pixels."""
 
 
 def image_of(name: str, figure: Figure) -> FigureImage:
     """The picture of a figure."""
     dots, stream = _dots(figure), io.BytesIO()
-    dots.save(stream, "webp", lossless=True, **EFFORT)
+    # A third of the time of more thorough compression, for a quarter more bytes.
+    dots.save(stream, "webp", lossless=True, method=1, quality=0)
     source = "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
     return FigureImage(name, caption_of(figure), bool(getattr(figure, "part", "")), seen(figure), source, *dots.size)
 
 
 def _dots(figure: Figure) -> Image.Image:
-    """The dots of a figure in a palette of 256 colours, of which line drawings need fewer."""
-    figure.set_dpi(DPI)
+    """The pixels of a figure in a palette of 256 colours; line drawings need fewer."""
+    # Sharp enough at the width of a page, and a tenth of the bytes of a vector picture of many lines.
+    figure.set_dpi(110)
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()
     whole = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
@@ -258,7 +249,7 @@ def _dots(figure: Figure) -> Image.Image:
 
 
 def seen(figure: Figure) -> str:
-    """What a figure shows, for those who do not see it: panel by panel what is drawn, and its range."""
+    """Alternative text of a figure: panel by panel the series and their ranges."""
     panels = [text for panel in figure.axes if (text := _panel_text(panel))]
     title = unbroken(figure.get_suptitle())
     count = f"{len(panels)} panels. " if len(panels) > 1 else ""
@@ -277,9 +268,9 @@ def _panel_text(panel: Axes) -> str:
 
 
 def _series_text(panel: Axes) -> Iterator[str]:
-    """Each labelled line with its range; of many, the number of them and the range of all."""
+    """Lines with their ranges; of more than six, their number and the range of all."""
     lines = [line for line in panel.lines if _values(line).size]
-    if len(lines) <= NAMED:
+    if len(lines) <= 6:
         for line in lines:
             yield _line(line)
         return
@@ -328,7 +319,7 @@ def script_safe(value: Any) -> str:
 
 
 def short(value: Any, digits: int) -> float | int | str | None:
-    """A number with few digits; an infinite one is a text, since JSON has none."""
+    """A number with some significant digits; an infinite one is a text, since JSON has none."""
     if pd.isna(value):
         return None
     number = float(value)

@@ -20,9 +20,6 @@ from pathlib import Path
 
 import numpy as np
 
-ROUND_OFF = 1e-12
-"""Allowed difference between two computations of a residual."""
-
 
 def residuals(P: np.ndarray, q: np.ndarray, G: np.ndarray, h: np.ndarray, x: np.ndarray, z: np.ndarray) -> list[float]:
     """Primal and dual residual and gap, as defined above."""
@@ -49,14 +46,17 @@ def main(folder: Path) -> int:
             x, z = solution[f"x_{row['cell']}"], solution[f"z_{row['cell']}"]
             finite = bool(np.all(np.isfinite(x)) and np.all(np.isfinite(z)))
             recomputed = residuals(program["P"], program["q"], program["G"], program["h"], x, z)
+            # Two computations of a residual may differ by round-off.
+            margin = 1e-12
             claimed = [float(row[name] or "nan") for name in ("primal_residual", "dual_residual", "gap")]
-            honest = all(abs(a - b) <= ROUND_OFF + 1e-6 * abs(b) for a, b in zip(recomputed, claimed, strict=True))
-            good = finite and z.min(initial=0.0) >= 0.0 and max(recomputed) <= float(row["accuracy"]) + ROUND_OFF
+            honest = all(abs(a - b) <= margin + 1e-6 * abs(b) for a, b in zip(recomputed, claimed, strict=True))
+            good = finite and z.min(initial=0.0) >= 0.0 and max(recomputed) <= float(row["accuracy"]) + margin
             fine += row["status"] == "ok"
             if not honest or (row["status"] == "ok" and not good):
                 wrong += 1
                 about = f"{row['program']} {row['solver']} at {row['accuracy']}: {row['status']}"
-                print(f"{about!r}, claimed {claimed}, found {recomputed}")  # the rows may be those of others
+                # `repr`, since the rows may be those of others.
+                print(f"{about!r}, claimed {claimed}, found {recomputed}")
     print(f"{count} solutions, {fine} claimed ok, {wrong} wrong")
     return wrong
 

@@ -30,15 +30,6 @@ from vibench.results.consistency import vectors
 from vibench.results.formats import to_csv
 from vibench.study.cells import NOT_MOVED
 
-CHECKER = "check.py"
-"""Script in an exported test set that recomputes its residuals; it needs only NumPy."""
-
-SEQUENCES = "sequences"
-"""Name of the table of the sequences in an exported test set, and of the Python file that reads it."""
-
-KEPT = ("status", "primal_residual", "dual_residual", "gap", "solver_status")
-"""Columns of a query that an exported test set repeats."""
-
 
 def worst_query(recorded: RecordedCell) -> int:
     """The query of a cell with the most severe status, the first of several."""
@@ -60,7 +51,8 @@ def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
     if query not in rows:
         raise RequestError(f"cell {recorded.row['cell']} has no query {query}; it has 0 to {len(rows) - 1}")
     program, accuracy = recorded.program(query), recorded.cell.accuracy
-    assert accuracy is not None  # it has a quadratic program
+    # A cell with a quadratic program has an accuracy.
+    assert accuracy is not None
     with writing(file):
         write_program(program, file)
     recorded_x: Array | None = None
@@ -96,7 +88,8 @@ def write_program(program: VariationalInequality, file: Path) -> None:
 
     Raises an `OSError` if it cannot be written; nothing is left behind.
     """
-    content = io.BytesIO()  # zipfile itself leaves half a file on a full disk, and a traceback when that is closed
+    # In memory: on a full disk zipfile leaves half a file, and a traceback when that is closed.
+    content = io.BytesIO()
     qpsolvers.Problem(program.A, -program.f, program.B, program.g).save(content)  # type: ignore[arg-type]  # a file will do
     file.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(file, content.getvalue())
@@ -141,7 +134,7 @@ def _write_set(models: Sequence[list[RecordedCell]], folder: Path) -> int:
     programs = [rows for cells in models for rows in _exported(cells, folder)]
     table = to_csv(pd.DataFrame(chain.from_iterable(programs)))
     (folder / "rows.csv").write_text(table, encoding="utf-8")
-    (folder / CHECKER).write_bytes((files("vibench.report") / "qps_checker.py").read_bytes())
+    (folder / "check.py").write_bytes((files("vibench.report") / "qps_checker.py").read_bytes())
     return len(programs)
 
 
@@ -153,9 +146,9 @@ def _write_sequences(models: Sequence[RecordedCell], folder: Path) -> None:
         for model in models
         for query, mu in enumerate(model.parameters)
     ]
-    (folder / f"{SEQUENCES}.csv").write_text(to_csv(pd.DataFrame(rows)), encoding="utf-8")
-    template = files("vibench.report") / "templates" / f"{SEQUENCES}.py.template"
-    (folder / f"{SEQUENCES}.py").write_bytes(template.read_bytes())
+    (folder / "sequences.csv").write_text(to_csv(pd.DataFrame(rows)), encoding="utf-8")
+    template = files("vibench.report") / "templates" / "sequences.py.template"
+    (folder / "sequences.py").write_bytes(template.read_bytes())
 
 
 def _name(model: RecordedCell, query: int) -> str:
@@ -169,6 +162,7 @@ def _exported(cells: list[RecordedCell], folder: Path) -> Iterator[list[dict[str
     for query in sorted(set().union(*(queries for _, queries, _ in tables))):
         name = _name(cells[0], query)
         write_program(cells[0].program(query), folder / "programs" / f"{name}.npz")
+        repeated = ("status", "primal_residual", "dual_residual", "gap", "solver_status")
         rows: list[dict[str, Any]] = []
         arrays: dict[str, Any] = {}
         for recorded, queries, solutions in tables:
@@ -176,7 +170,7 @@ def _exported(cells: list[RecordedCell], folder: Path) -> Iterator[list[dict[str
                 cell, row = recorded.row["cell"], queries[query]
                 arrays[f"x_{cell}"], arrays[f"z_{cell}"] = vectors(solutions[query])
                 about = {"program": name, "solver": recorded.cell.solver, "cell": cell}
-                rows.append(about | {"accuracy": recorded.cell.accuracy} | {key: row[key] for key in KEPT})
+                rows.append(about | {"accuracy": recorded.cell.accuracy} | {key: row[key] for key in repeated})
         content = io.BytesIO()
         np.savez(content, **arrays)
         (folder / "solutions").mkdir(exist_ok=True)

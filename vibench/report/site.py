@@ -35,10 +35,8 @@ from vibench.results.read import in_order, read_table, whole_numbers
 from vibench.results.sqlite import FILE, open_read_only
 from vibench.text import parsed_json
 
+# File that lists the files of a site with their digests: a later `vibench publish` may replace these.
 CATALOGUE = "vibench-site.json"
-"""File of a site that lists its files with their digests: what a later `vibench publish` may replace."""
-
-FIRST_PAGE = "index.html"
 
 
 def check(site: Path) -> None:
@@ -87,11 +85,11 @@ def _replace_files(site: Path, new: Path, files: Mapping[str, str]) -> None:
     for name in files:
         if (site / name).exists() and _digest(site / name) not in (*before.get(name, ()), files[name]):
             raise RequestError(f"'{site / name}' was not written by vibench, or changed since; move it elsewhere")
-    # Whatever interrupts the next steps: all files that they have written by then are in the catalogue.
+    # An interruption of the next steps leaves no file that is not in the catalogue.
     both = {name: [*before.get(name, ()), *([files[name]] if name in files else [])] for name in {**before, **files}}
     _write_catalogue(new, both)
     (new / CATALOGUE).replace(site / CATALOGUE)
-    for name in sorted(files, key=lambda name: name == FIRST_PAGE):
+    for name in sorted(files, key=lambda name: name == "index.html"):
         (site / name).parent.mkdir(parents=True, exist_ok=True)
         (new / name).replace(site / name)
     for name, digests in before.items():
@@ -143,26 +141,29 @@ def _written(site: Path) -> dict[str, list[str]]:
         raise RequestError(f"'{catalogue}' cannot be read as the list of the files of a site") from None
 
 
-FILTERED = ("study", "problem", "dual", "primal", "solver", "machine", "vibench")
-"""What the list of runs is filtered by."""
-
+# Columns of the cells on the page of a run, beside those that name a cell.
 SHOWN_CELLS = ("N", "R", "enrichment", "error_u_mean", "error_lambda_mean", "online_s", "offline_s")
-"""Columns of the cells on the page of a run, beside those that name a cell."""
 
 
 @dataclass(frozen=True, eq=False)
 class PublishedRun:
-    """A run and the folder of the site that is about it."""
+    """A run on the site.
+
+    Attributes
+    ----------
+    folder
+        Name of its folder below `runs/`: letters, digits, "-", "_" and "." only.
+    note
+        A remark on the origin of the file.
+    """
 
     run: ComparedRun
     folder: str
-    """Name of its folder below `runs/`: letters, digits, "-", "_" and "." only."""
     note: str = ""
-    """A remark on where the file comes from, "" where there is none."""
 
     @cached_property
     def values(self) -> dict[str, list[str]]:
-        """What the run is found by: all values that its cells have of each of `FILTERED`."""
+        """Values by which the list of runs is filtered."""
         axes = {
             axis: sorted({str(row[axis]) for row in self.run.cells.values()})
             for axis in ("problem", "dual", "primal", "solver")
@@ -178,7 +179,7 @@ class PublishedRun:
 
     @property
     def facts(self) -> Iterator[tuple[str, str]]:
-        """Where the numbers come from."""
+        """Origin of the numbers, in lines of a name and a text."""
         rows = self.run.cells.values()
         yield "study", "{study}, seed {seed}, validation parameters: {validation}".format(**self.run.identity)
         for axis in ("problem", "dual", "primal", "solver"):
@@ -199,7 +200,7 @@ class PublishedRun:
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """The same for programs."""
+        """Origin of the numbers as JSON."""
         return {
             **self.run.identity,
             "cells": len(self.run.cells),
@@ -213,7 +214,7 @@ class PublishedRun:
 
     @property
     def commands(self) -> list[tuple[str, str]]:
-        """Commands on the run as a whole, and what they do; they are meant for the folder of the results file."""
+        """Commands in the folder of the results file, each with its effect."""
         study = str(self.run.identity["study"])
         commands = [("pip install -r requirements.txt", "the versions that computed it")]
         if study in registered(STUDY):
@@ -222,12 +223,12 @@ class PublishedRun:
         return commands
 
     def cells(self) -> list[dict[str, Any]]:
-        """The cells of the run with the command that makes each of them again, in the order of the axes."""
+        """The cells of the run, each with the command that computes it again, in the order of the axes."""
         return [
             {
                 "key": key,
                 "axes": [
-                    str(row["problem"]), str(row["dual"]), f"{_formulation(row)}{row['primal']}{_tolerance(row)}",
+                    str(row["problem"]), str(row["dual"]), _model(row),
                     f"{asked(row, 'pod')}, {asked(row, 'dual')}", solver_text(row),
                     way(row["assembly"], row["correction"]) or "full",
                 ],
@@ -239,16 +240,13 @@ class PublishedRun:
         ]  # fmt: skip
 
 
-def _formulation(row: Mapping[str, Any]) -> str:
-    return "" if row["formulation"] == default_formulation() else f"{row['formulation']}: "
-
-
-def _tolerance(row: Mapping[str, Any]) -> str:
-    return "" if pd.isna(row["primal_tol"]) else f" {row['primal_tol']:g}"
+def _model(row: Mapping[str, Any]) -> str:
+    formulation = "" if row["formulation"] == default_formulation() else f"{row['formulation']}: "
+    return f"{formulation}{row['primal']}" + ("" if pd.isna(row["primal_tol"]) else f" {row['primal_tol']:g}")
 
 
 def folder_names(names: Sequence[str]) -> list[str]:
-    """Names of folders for runs of these names: what a link needs no escapes for, all different in any case."""
+    """Names of folders for runs of these names: they need no escapes in links, and differ in more than case."""
     folders: list[str] = []
     for name in names:
         plain = re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "run"
@@ -256,16 +254,6 @@ def folder_names(names: Sequence[str]) -> list[str]:
         same = (plain if k == 1 else f"{plain}-{k}" for k in range(1, len(names) + 2))
         folders.append(next(one for one in same if one.lower() not in taken))
     return folders
-
-
-TABLES = ("cells", "thresholds", "disagreements")
-"""Tables that are published as CSV, too; all of them are in the results file."""
-
-LIMIT = 1.25
-"""Factor of the comparisons on a site."""
-
-MOST_CHANGES = 500
-"""Changes that a page lists; the CSV beside it has all."""
 
 
 def publish(
@@ -279,10 +267,9 @@ def publish(
 ) -> Path:
     """Write the site of some results files; the same files give the same site.
 
-    The folder is new, empty, or one that was written by this function, whose files are replaced. Notes are remarks on
-    results files, which stand on the pages of their runs; with `figures` reports have pictures. Paths, the user's name
-    and that of the host are taken out; `ask` gets lines on what could still identify somebody, before anything is
-    written.
+    The folder is new, empty, or was written by this function: then its files are replaced. Notes are remarks on results
+    files for the pages of their runs; with `figures` reports have pictures. Paths and the names of user and host are
+    removed; `ask` gets lines on what could still identify somebody, before anything is written.
 
     Returns the first page. Raises a `RequestError` if a results file cannot be read, or the folder holds files of
     others or cannot be written.
@@ -300,11 +287,11 @@ def publish(
             for run, path, own in zip(runs, paths, folder_names(names), strict=True)
         ]
         write(site, lambda new: _fill(new, published, citation, figures=figures))
-    return site / FIRST_PAGE
+    return site / "index.html"
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Names of runs, all different: the last folder or the file, without the folders before it, which could tell."""
+    """Different names of runs: the last folder or the file alone, since other folders could identify somebody."""
     names: list[str] = []
     for path in paths:
         name = path.absolute().parent.name if path.name == FILE else path.stem
@@ -316,35 +303,38 @@ def _names(paths: Sequence[Path]) -> list[str]:
 def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation, *, figures: bool) -> None:
     """Write all files of the site."""
     pages = _Pages(citation)
-    comparisons = {study: compare([run.run.path for run in group], LIMIT) for study, group in _comparable(runs)}
+    limit = 1.25
+    comparisons = {study: compare([run.run.path for run in group], limit) for study, group in _comparable(runs)}
     for run in runs:
         _write_run(site / "runs" / run.folder, run, pages, figures)
     links = {run.run.name: f"runs/{run.folder}/index.html" for run in runs}
     pages.write(site / "leaderboard.html", "leaderboard", "", boards=list(_boards(runs)), links=links, way=html.way)
     sections = [_section(site, number, *item) for number, item in enumerate(comparisons.items(), start=1)]
-    pages.write(site / "comparison.html", "comparison", "", sections=sections, limit=LIMIT)
-    filters = {name: sorted({value for run in runs for value in run.values[name]}) for name in FILTERED}
-    pages.write(site / FIRST_PAGE, "index", "", runs=runs, filters=filters)
+    pages.write(site / "comparison.html", "comparison", "", sections=sections, limit=limit)
+    filters = {name: sorted({value for run in runs for value in run.values[name]}) for name in runs[0].values}
+    pages.write(site / "index.html", "index", "", runs=runs, filters=filters)
     _write(site / "CITATION.cff", citation.cff())
     _write(site / "citation.bib", citation.bibtex())
 
 
 def _write_run(own: Path, run: PublishedRun, pages: _Pages, figures: bool) -> None:
-    """Write the folder of one run: its page and report, its data, and what installs its versions."""
+    """Write the folder of one run: its page and report, its data, and a file of requirements."""
     (own / "tables").mkdir(parents=True)
     with open_read_only(run.run.path) as db:
         db.execute("VACUUM INTO ?", (str((own / FILE).absolute()),))
     _write(own / "report.html", html.page(run.run.path, figures=figures))
-    for name in TABLES:
+    # The results file has all tables; these are the ones that people read.
+    published = ("cells", "thresholds", "disagreements")
+    for name in published:
         rows = whole_numbers(in_order(read_table(run.run.path, name)))
         _write(own / "tables" / f"{name}.csv", formats.to_csv(rows))
     _write(own / "requirements.txt", requirements(run.run.versions, run.code))
     _write(own / "provenance.json", json.dumps(run.provenance, indent=1, ensure_ascii=True, sort_keys=True) + "\n")
-    pages.write(own / "index.html", "run", "../../", run=run, cells=run.cells(), columns=SHOWN_CELLS, tables=TABLES)
+    pages.write(own / "index.html", "run", "../../", run=run, cells=run.cells(), columns=SHOWN_CELLS, tables=published)
 
 
 def _comparable(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, list[PublishedRun]]]:
-    """Runs that have cells in common with the first one of their study, by the study's name."""
+    """Runs that have cells in common with the first one of their study, by the name of the study."""
     by_study: dict[str, list[PublishedRun]] = {}
     for run in runs:
         by_study.setdefault(str(run.run.identity["study"]), []).append(run)
@@ -356,20 +346,20 @@ def _comparable(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, list[Publis
 
 
 def _boards(runs: Sequence[PublishedRun]) -> Iterator[tuple[PublishedRun, tuple[Standings, ...]]]:
-    """The leaderboard of every run: seconds of other runs may have come from a busier machine, or other parameters."""
+    """The leaderboard of every run; seconds of different runs are not ranked together."""
     for run in runs:
         cells, timings = (read_table(run.run.path, name) for name in ("cells", "timings"))
         yield run, leaderboard(in_order(cells), PairedTiming(timings.to_dict("records")))
 
 
 def _section(site: Path, number: int, study: str, comparison: Comparison) -> dict[str, Any]:
-    """What the page of comparisons says of the runs of one study; their changes are a file, too."""
+    """Section of the page of comparisons on the runs of one study; writes their changes to a file, too."""
     file = f"comparison-{number}.csv"
     _write(site / file, formats.to_csv(comparison.changes))
     frames = {
         "runs": comparison.by_run,
         "cells by column": comparison.by_column,
-        "changes": comparison.changes.head(MOST_CHANGES),
+        "changes": comparison.changes.head(500),
     }
     return {"study": study, "file": file, "notes": comparison.notes, "count": len(comparison.changes), "tables": frames}
 
@@ -379,7 +369,7 @@ def _write(path: Path, text: str) -> None:
 
 
 class _Pages:
-    """The templates, with what all pages show."""
+    """Writes pages from templates, with the content that they share."""
 
     def __init__(self, citation: Citation) -> None:
         self._environment = html.environment("templates/site")

@@ -21,7 +21,7 @@ from PIL import Image
 from running import DECIDED, Changed, execute
 
 from vibench.report import figures
-from vibench.report.figures import FORMATS, OF_DUAL, OF_HISTORIES, OF_PROBLEM, constants, convergence, costs, draw_all
+from vibench.report.figures import OF_DUAL, OF_HISTORIES, OF_PROBLEM, constants, convergence, costs, draw_all
 from vibench.report.figures import problem_tables as of_file
 from vibench.report.figures.data import Extent, _per_combination
 from vibench.report.figures.style import save, styled
@@ -64,8 +64,8 @@ def drawn_from(results: Path, folder: Path, *kinds: str, rendered: bool = False)
             chosen = {kind: draw for kind, draw in getattr(figures, group).items() if not kinds or kind in kinds}
             patch.setattr(figures, group, chosen)
         files = draw_all(results, folder)
-    assert [path.stem for path in files] == [name for name in kept for _ in FORMATS]
-    captions = [figures.CAPTIONS] * bool(files)
+    assert [path.stem for path in files] == [name for name in kept for _ in ("png", "svg")]
+    captions = ["captions.json"] * bool(files)
     assert sorted([path.name for path in files] + captions) == sorted(path.name for path in folder.glob("*"))
     return kept
 

@@ -14,11 +14,10 @@ from running import Changed, Main
 
 from vibench.report import html
 from vibench.report.figures.data import problem_tables
-from vibench.report.findings import MOST, findings
-from vibench.report.html import FIRST
+from vibench.report.findings import findings
 from vibench.results.ranking import leaderboard
 from vibench.results.read import in_order, read_table
-from vibench.results.schema import STORED
+from vibench.results.schema import STORED, TABLES
 from vibench.results.sqlite import FILE
 from vibench.text import brief
 
@@ -57,9 +56,9 @@ def test_without_javascript_tables_have_their_first_rows(made: Path, reported: P
     page = made.read_text(encoding="utf-8")
     (table,) = re.findall(r'data-table="summary"></div>\n<noscript>(.*?)</noscript>', page, re.DOTALL)
     cells = read_table(reported / FILE, "cells")
-    assert table.count("<tr>") == 1 + min(len(cells), FIRST)
+    assert table.count("<tr>") == 1 + min(len(cells), 50)
     assert "error λ</th>" in table
-    assert all(f"<td>{value:.3g}</td>" in table for value in cells["error_lambda_mean"][:FIRST])
+    assert all(f"<td>{value:.3g}</td>" in table for value in cells["error_lambda_mean"][:50])
     assert len(re.findall("<noscript>.*?<table>.*?</noscript>", page, re.DOTALL)) == page.count("data-table=")
 
 
@@ -68,7 +67,7 @@ def test_findings_tables_and_facts_are_in_it(made: Path, reported: Path) -> None
     texts = [text for found in findings(reported / FILE).values() for text in found]
     assert [text for text in texts if text not in page] == []
     first = page.split('<section id="findings">')[1].split("<details>")[0]
-    assert first.count("<li>") == MOST < len(texts)
+    assert first.count("<li>") == 10 < len(texts)
     assert page.index('id="leaderboard"') < page.index('id="findings"') < page.index('id="summary"')
     cells = read_table(reported / FILE, "cells")
     assert cells["machine"].iloc[0] in page
@@ -105,9 +104,9 @@ def test_of_thousands_of_findings_those_that_say_most_are_in_it(
     monkeypatch.setattr(html, "FOLDED", 5)
     count = sum(map(len, findings(quick_run / FILE).values()))
     section = html.page(quick_run / FILE, figures=False).split('<section id="findings">')[1].split("</section>")[0]
-    assert section.count("<li>") == MOST + 5 < count
+    assert section.count("<li>") == 10 + 5 < count
     assert "<summary>5 more</summary>" in section
-    assert f"{count - MOST - 5} findings on single cells and pairs are left out" in section
+    assert f"{count - 10 - 5} findings on single cells and pairs are left out" in section
 
 
 def test_every_failure_has_its_reason_and_nothing_is_markup(changed: Changed) -> None:
@@ -170,7 +169,7 @@ def test_a_run_without_any_query_has_a_report(changed: Changed) -> None:
 
 def test_a_strategy_that_is_labelled_high_fidelity_is_no_high_fidelity_model(changed: Changed) -> None:
     path = changed("UPDATE thresholds SET primal_a = 'high-fidelity'")
-    read = {name: read_table(path, name) for name in html.READ}
+    read = {name: read_table(path, name) for name in TABLES}
     thresholds = read["thresholds"]
     found = {grid.name: len(grid.frame) for grid in html._grids(read)}
     assert found["enrichments"] == thresholds["cell_a"].notna().sum() > 0
@@ -178,7 +177,6 @@ def test_a_strategy_that_is_labelled_high_fidelity_is_no_high_fidelity_model(cha
 
 
 def test_a_large_study_has_pictures_of_the_cones_that_win(changed: Changed, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(html, "MOST_DUALS", 1)
     path = changed("UPDATE cells SET error_lambda_mean = 0.05, error_u_mean = 0.01")
     (hertz, _) = leaderboard(in_order(read_table(path, "cells")))
     (winner, *_) = hertz.bands[0].winners

@@ -106,7 +106,7 @@ def test_the_exported_set_is_rechecked_by_a_script_that_knows_nothing_of_vibench
     done = CliRunner().invoke(app, ["export", str(run), str(tmp_path / "set")])
     assert done.exit_code == 0, done.output
     assert "6 programs" in done.output  # two reduced models, three queries
-    script = tmp_path / "set" / replay.CHECKER
+    script = tmp_path / "set" / "check.py"
     assert "import vibench" not in script.read_text()
     assert "from vibench" not in script.read_text()
 

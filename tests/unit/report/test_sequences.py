@@ -78,9 +78,9 @@ def exported(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def loaded(exported: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """The test set as qpbenchmark loads it: the class whose name is that of the file."""
     monkeypatch.syspath_prepend(str(exported))
-    monkeypatch.delitem(sys.modules, replay.SEQUENCES, raising=False)  # a script of the results has the same name
-    yield importlib.import_module(replay.SEQUENCES).Sequences()
-    sys.modules.pop(replay.SEQUENCES, None)
+    monkeypatch.delitem(sys.modules, "sequences", raising=False)  # a script of the results has the same name
+    yield importlib.import_module("sequences").Sequences()
+    sys.modules.pop("sequences", None)
 
 
 @pytest.fixture
@@ -126,19 +126,19 @@ def test_an_exported_sequence_is_a_test_set_of_what_qpbenchmark_offers(
 
 def test_the_released_qpbenchmark_loads_and_solves_it(run: Path, exported: Path, tmp_path: Path) -> None:
     benchmark = pytest.importorskip("qpbenchmark.benchmark")
-    test_set = benchmark.load_test_set(str(exported / f"{replay.SEQUENCES}.py"))
+    test_set = benchmark.load_test_set(str(exported / "sequences.py"))
     examine(test_set, run, exported)
     results = importlib.import_module("qpbenchmark.results").Results(str(tmp_path / "results.csv"), test_set)
     solve = importlib.import_module("qpbenchmark.run").run
     solve(test_set, results, only_settings="high_accuracy", only_solver="piqp")
     assert results.df["found"].all()
     assert results.df["problem"].tolist() == [program.name for program in test_set]
-    sys.modules.pop(replay.SEQUENCES, None)
+    sys.modules.pop("sequences", None)
 
 
 def test_its_solutions_are_rechecked_like_those_of_any_export(exported: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-I", str(exported / replay.CHECKER)], capture_output=True, text=True, check=False
+        [sys.executable, "-I", str(exported / "check.py")], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout.strip()) == (0, "10 solutions, 10 claimed ok, 0 wrong")
 

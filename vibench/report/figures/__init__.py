@@ -26,12 +26,12 @@ from vibench.report.figures.convergence import diagnostics, enrichment, orthogon
 from vibench.report.figures.costs import break_even, dimension, outputs, precision, solvers, total_cost, work_precision
 from vibench.report.figures.data import Extent, ProblemTables, file_names, problem_tables
 from vibench.report.figures.solutions import solutions
-from vibench.report.figures.style import FORMATS, WRITTEN, Pages, caption_of, save, styled
+from vibench.report.figures.style import Pages, caption_of, save, styled
 from vibench.text import json_object
 
 DrawPages = Callable[[ProblemTables], Pages]
-"""Draws the pages of a figure: none where there is nothing to draw."""
 
+# Figures of every problem, by the end of their file names.
 OF_PROBLEM: dict[str, DrawPages] = {
     "solutions": solutions,
     "diagnostics": diagnostics,
@@ -46,23 +46,15 @@ OF_PROBLEM: dict[str, DrawPages] = {
     "outputs": outputs,
     "break-even": break_even,
 }
-"""Figures of every problem, by the end of their file names."""
-
+# Figures of every problem and dual strategy.
 OF_DUAL: dict[str, DrawPages] = {"enrichment": enrichment, "inf-sup": inf_sup}
-"""Figures of every problem and dual strategy."""
 
+# The figures that read the histories; no other one does.
 OF_HISTORIES: frozenset[DrawPages] = frozenset({diagnostics, projection_errors, orthogonality, enrichment})
-"""The figures that read the histories; no other one does."""
-
-CAPTIONS = "captions.json"
-"""File beside the figures: the caption of every figure, by the name of its files."""
-
 
 FigureTask = tuple[str, DrawPages, ProblemTables]
-"""A figure to be drawn: the name of its file, or of the first one, the function that draws its pages, and the data."""
-
+"""A figure to be drawn: name of its first file, function that draws its pages, and their data."""
 Made = TypeVar("Made")
-"""What is made of a page."""
 
 
 def drawings(path: Path) -> Iterator[FigureTask]:
@@ -102,7 +94,6 @@ def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = N
 
 
 def _only(noun: str, by_label: Mapping[str, ProblemTables], label: str | None) -> ProblemTables:
-    """The data under a label, or the only ones."""
     if label is None:
         if len(by_label) != 1:
             hint = f"name one of {', '.join(by_label)}" if by_label else "the run has none with queries"
@@ -115,18 +106,17 @@ def _only(noun: str, by_label: Mapping[str, ProblemTables], label: str | None) -
 
 def remove(folder: Path) -> None:
     """Remove the figures that an earlier call of `draw_all` may have left in a folder; other files stay."""
-    forms = f".({'|'.join(WRITTEN)})"
-    own = re.compile(rf".*-({'|'.join(map(re.escape, (*OF_PROBLEM, *OF_DUAL)))})(-\d+)?\{forms}")
-    captioned = {f"{name}.{form}" for name in read_captions(folder) for form in WRITTEN}
+    own = re.compile(rf".*-({'|'.join(map(re.escape, (*OF_PROBLEM, *OF_DUAL)))})(-\d+)?\.(png|svg|pdf)")
+    captioned = {f"{name}.{form}" for name in read_captions(folder) for form in ("png", "svg", "pdf")}
     for file in folder.glob("*"):
-        if file.is_file() and (file.name in captioned or file.name == CAPTIONS or own.fullmatch(file.name)):
+        if file.is_file() and (file.name in captioned or file.name == "captions.json" or own.fullmatch(file.name)):
             file.unlink()
 
 
 def read_captions(folder: Path) -> dict[str, str]:
     """The captions beside the figures of a folder, by the names of the figures; empty where there are none."""
     try:
-        captions = json_object(read_regular(folder / CAPTIONS).decode())
+        captions = json_object(read_regular(folder / "captions.json").decode())
     except (OSError, UnicodeDecodeError):
         return {}
     return {name: str(text) for name, text in (captions or {}).items()}
@@ -135,15 +125,15 @@ def read_captions(folder: Path) -> dict[str, str]:
 def draw_all(
     path: Path,
     folder: Path,
-    formats: tuple[str, ...] = FORMATS,
+    formats: tuple[str, ...] = ("png", "svg"),
     jobs: int = 1,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> list[Path]:
     """Draw every figure that a results file has data for, in every format; returns the files written to the folder.
 
-    Beside them is `CAPTIONS`, with the caption of every figure.
+    Beside them is `captions.json`, with the caption of every figure by the name of its files.
 
-    Formats are keys of `style.WRITTEN`; `jobs` processes draw, this one included. `progress` is called before a figure
+    Formats are "png", "svg" and "pdf"; `jobs` processes draw, this one included. `progress` is called before a figure
     is drawn here, with its name, the number of those done, and that of all there may be.
     """
     with processes(jobs) as pool:
@@ -152,25 +142,26 @@ def draw_all(
     if pages:
         captions = read_captions(folder) | {name: caption for name, caption, _ in pages}
         text = json.dumps(captions, ensure_ascii=False, indent=1) + "\n"
-        write_atomically(folder / CAPTIONS, text.encode("utf-8"))
+        write_atomically(folder / "captions.json", text.encode("utf-8"))
     return [file for *_, files in pages for file in files]
 
 
 def _save(folder: Path, formats: tuple[str, ...], name: str, figure: Figure) -> tuple[str, str, list[Path]]:
-    """Write a page; returns its name, its caption and its files."""
+    """Write a page; returns its name, caption and files."""
     folder.mkdir(parents=True, exist_ok=True)
     return name, caption_of(figure), save(figure, folder, name, formats)
 
 
 @contextlib.contextmanager
 def processes(jobs: int) -> Iterator[ProcessPoolExecutor | None]:
-    """Context with processes that draw: as many as `jobs`, this one included. They load Matplotlib in the meantime."""
+    """Context with `jobs` processes that draw, this one included; the others load Matplotlib in the meantime."""
     if jobs < 2:
         yield None
         return
     pool = ProcessPoolExecutor(jobs - 1, get_context("spawn"))
     try:
-        with interrupts.held():  # Ctrl-C is for this process to handle
+        # Ctrl-C is for this process to handle.
+        with interrupts.held():
             for _ in range(jobs - 1):
                 pool.submit(_tasks_in, None)
         yield pool
@@ -184,11 +175,11 @@ def render(
     pool: ProcessPoolExecutor | None = None,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> list[list[Made]]:
-    """Draw figures here and in the processes of a pool; `finish` makes something of every page and its name."""
+    """Draw figures here and in the processes of a pool; returns the results of `finish(name, page)` by figure."""
     rendered: dict[int, list[Made]] = {}
     with contextlib.ExitStack() as stack:
         awaited = {} if pool is None else stack.enter_context(_submitted(tasks, finish, pool))
-        # the others draw from the last figure on, this process what only it can and then what they have not begun
+        # The others draw from the last figure on, this process what only it can and then what they have not begun.
         for k in sorted(range(len(tasks)), key=lambda k: k in awaited):
             if k not in awaited or awaited[k].cancel():
                 awaited.pop(k, None)
@@ -205,20 +196,19 @@ def render(
 def _submitted(
     tasks: Sequence[FigureTask], finish: Callable[[str, Figure], Made], pool: ProcessPoolExecutor
 ) -> Iterator[dict[int, Future[list[Made]]]]:
-    """Context with the figures that other processes may draw, by their places.
-
-    Those of histories are not among them: of a large study these are millions of rows, which take longer to send than
-    their few lines to draw.
-    """
+    """Context with the figures that other processes may draw, by place."""
+    # Histories are never sent: a large study has millions of rows, and drawing their few lines takes less time.
     places = [k for k, (_, draw, _) in enumerate(tasks) if draw not in OF_HISTORIES]
-    # None, for a figure that reads histories without being one of OF_HISTORIES would not notice empty ones
+    # None fails in a figure that reads histories without being one of OF_HISTORIES; empty ones would not be noticed.
     none = cast("pd.DataFrame", None)
     sent = [(name, draw, replace(data, histories=none)) for name, draw, data in (tasks[k] for k in places)]
     with contextlib.ExitStack() as stack:
         try:
             file = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=TEMPORARY))) / "tasks"
-            file.write_bytes(pickle.dumps(sent))  # once for all of them: what they have in common is large
-        except OSError:  # no room for it: this process draws them all
+            # Written once for all of them: the tables that they share are large.
+            file.write_bytes(pickle.dumps(sent))
+        except OSError:
+            # Without room for it this process draws them all.
             places.clear()
         yield {
             places[number]: pool.submit(_render_sent, file, number, finish) for number in reversed(range(len(places)))
@@ -226,24 +216,22 @@ def _submitted(
 
 
 def pages_of(task: FigureTask) -> Iterator[tuple[str, Figure]]:
-    """The pages of a figure, one after the other, under the names of their files: after the first with its number."""
+    """The pages of a figure with the names of their files, numbered after the first."""
     name, draw, data = task
     for k, page in enumerate(draw(data), 1):
         yield name + f"-{k}" * (k > 1), page
 
 
 def _render(task: FigureTask, finish: Callable[[str, Figure], Made]) -> list[Made]:
-    """Draw a figure, and make something of its pages."""
     with styled():
         return [finish(name, page) for name, page in pages_of(task)]
 
 
 def _render_sent(file: Path, number: int, finish: Callable[[str, Figure], Made]) -> list[Made]:
-    """Draw a figure of those that another process has written to a file."""
     return _render(_tasks_in(file)[number], finish)
 
 
 @cache
 def _tasks_in(file: Path | None) -> Sequence[FigureTask]:
-    """The figures that another process has written to a file of its own; none without one."""
+    """The figures that another process has written to a file; none without one."""
     return () if file is None else pickle.loads(file.read_bytes())

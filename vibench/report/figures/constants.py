@@ -23,10 +23,7 @@ from vibench.report.figures.data import (
     titled_parts,
 )
 from vibench.report.figures.style import (
-    ABREAST,
-    DEEP,
     HIGH_FIDELITY_LOOK,
-    SERIES,
     Layout,
     Look,
     Looks,
@@ -40,12 +37,6 @@ from vibench.report.figures.style import (
     two_rows,
 )
 from vibench.stability.infsup import VANISHES
-
-MOST_PAIRS = 2 * ABREAST
-"""Panels over the span in a figure; each has one over the cone below it."""
-
-KEPT = ("pair", "query", "cell", "mu_1", "enrichment_kind", *PRIMAL)
-"""What panels are made of beside the constants: a run may have thousands of pairs, each a copy of every column."""
 
 
 class _Panel(NamedTuple):
@@ -67,16 +58,18 @@ def inf_sup(data: ProblemTables) -> Pages:
     First row: over the span; second row: over the cone, with the certified interval as a band. Fixed enrichments are
     shown at the tolerance of the smallest mean, the same in every panel.
     """
-    read = [*KEPT, *(name for name in data.queries if name.startswith("beta_"))]
-    constants = one_solver(data.queries[read], ["pair"])
+    # Without the other columns: a run may have thousands of pairs, each with a copy of its rows.
+    needed = ["pair", "query", "cell", "mu_1", "enrichment_kind", *PRIMAL]
+    needed += [name for name in data.queries if name.startswith("beta_")]
+    constants = one_solver(data.queries[needed], ["pair"])
     shown, axis = loosest(constants), data.parameter
-    for panels, part in data.pages(_panels(data, shown), MOST_PAIRS):
+    for panels, part in data.pages(_panels(data, shown), 6):
         sheet, over, below = two_rows(len(panels), f"{data.problem}, {data.duals[0]}: inf-sup constants")
         looks = Looks(one for panel in panels for one, _, _ in panel.strategies)
         zeros: list[list[str]] = []
         for panel, span, cone in zip(panels, over, below, strict=True):
             reference, both = panel.along(panel.reference), (span, cone)
-            # the parameter, or places in the order
+            # Without a single parameter the abscissae are places in the order.
             x = reference["mu_1"].to_numpy(float) if axis else np.arange(1, len(reference) + 1)
             _draw_constants(both, x, reference, "beta_hf_", HIGH_FIDELITY_LOOK, "high-fidelity")
             named = [(name, panel.along(rows), looks[one]) for one, name, rows in panel.strategies]
@@ -95,7 +88,7 @@ def loosest(constants: pd.DataFrame) -> pd.DataFrame:
     """The rows of fixed enrichments at the tolerance of the smallest mean β, and those of all other strategies."""
     fixed = constants["enrichment_kind"] == Kind.FIXED
     compared = common_tolerances(constants[fixed])
-    # each pair weighs the same, whatever the size of its constants
+    # Each pair weighs the same, whatever the size of its constants.
     means = compared.groupby(["primal", "primal_tol", "pair"])["beta_span"].mean().unstack()
     score = -(means / means.max()).mean(axis=1).astype(float)
     return constants.loc[~fixed | constants.index.isin(at_best_tolerance(compared, score).index)]
@@ -113,7 +106,7 @@ def _panels(data: ProblemTables, shown: pd.DataFrame) -> list[_Panel]:
         strategies = [
             (series(one["primal"].iloc[0], one["primal_tol"].iloc[0]), name, one) for name, one in by_strategy(rows)
         ]
-        groups = titled_parts(dimensions(sizes), strategies, SERIES - 1)
+        groups = titled_parts(dimensions(sizes), strategies, beside_reference=True)
         panels += [_Panel(title, group, strategies[0][2], order) for title, group in groups]
     return panels
 
@@ -168,9 +161,9 @@ def shares(data: ProblemTables) -> Pages:
     panels = [
         (title, rows[rows["primal"].isin(names)])
         for dual, rows in cells.groupby("dual", sort=False)
-        for title, names in titled_parts(str(dual), list(rows["primal"].unique()), SERIES)
+        for title, names in titled_parts(str(dual), list(rows["primal"].unique()))
     ]
-    for shown, part in data.pages(panels, ABREAST * DEEP):
+    for shown, part in data.pages(panels, 12):
         title = f"{data.problem}: shares of the inf-sup constant"
         sheet = Sheet.of(len(shown), title, Layout(width=4.0, height=3.2), "all")
         looks = Looks(Series(str(name)) for _, rows in shown for name in rows["primal"].unique())

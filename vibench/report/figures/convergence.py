@@ -24,42 +24,31 @@ from vibench.report.figures.data import (
     titled_parts,
 )
 from vibench.report.figures.style import (
-    DEEP,
-    SERIES,
     CaptionedFigure,
     Looks,
     Pages,
     Series,
     Sheet,
     counted,
+    look_of,
     plot,
     positive,
     scatter,
 )
 
-ROUND_OFF = 1e-12
-"""The tail of a POD below this is round-off."""
-
-SINE_FLOOR = 1e-14
-"""Sines below this are round-off."""
-
-DIAGNOSED = ("training", "validation")
-GROWTH = {"sigma": "largest σ, training set", "beta_span_min": "min β over span, training set"}
-
-POD = Series("POD")
-
 
 def diagnostics(data: ProblemTables) -> Pages:
     """Quantities that the problem reports at every parameter, such as the largest aspect ratio (paper, Figure 3)."""
-    reported = data.histories[data.histories["stage"].isin(DIAGNOSED)]
+    stages = ("training", "validation")
+    reported = data.histories[data.histories["stage"].isin(stages)]
     if reported.empty:
         return
     quantities = list(reported["quantity"].unique())
     sheet = Sheet.of(len(quantities), f"{data.problem}: diagnostics over the parameters")
-    looks = Looks(map(Series, DIAGNOSED))
+    looks = Looks(map(Series, stages))
     for panel, quantity in zip(sheet.panels, quantities, strict=False):
         first = 1
-        for stage in DIAGNOSED:
+        for stage in stages:
             mine = reported[(reported["stage"] == stage) & (reported["quantity"] == quantity)]
             values = mine.drop_duplicates("step").sort_values("step")["value"].to_numpy()
             scatter(panel, first + np.arange(len(values)), values, looks[Series(stage)], f"{stage} parameters")
@@ -79,8 +68,9 @@ def projection_errors(data: ProblemTables) -> Pages:
     sheet = Sheet.of(1 + len(cones), f"{data.problem}: projection errors over the training set")
     left, *others = sheet.panels
     for _, steps in longest(errors[errors["stage"] == "pod"]):
-        shown = steps[steps["value"] > ROUND_OFF]
-        plot(left, shown["step"], shown["value"], Looks([POD])[POD], POD.name)
+        # A tail below this is round-off.
+        shown = steps[steps["value"] > 1e-12]
+        plot(left, shown["step"], shown["value"], look_of("POD"), "POD")
     left.set(xlabel="number of modes N", ylabel="relative error of the POD", title="primal", yscale="log")
     counted(left)
     for panel, names in zip(others, cones, strict=False):
@@ -110,12 +100,12 @@ def orthogonality(data: ProblemTables) -> Pages:
 
 def cone_errors(title: str, errors: Mapping[str, Array]) -> CaptionedFigure:
     """Relative errors of cones, by dual strategy, against their numbers of generators 0 … R."""
-    groups = parts(sorted(errors), SERIES)
+    groups = parts(sorted(errors))
     sheet = Sheet.of(len(groups), f"{title}: projection errors of the multipliers", share="all")
     looks = Looks(map(Series, errors))
     for panel, names in zip(sheet.panels, groups, strict=False):
         for dual in names:
-            plot(panel, np.arange(len(errors[dual])), positive(errors[dual]), looks[Series(dual)], dual)
+            plot(panel, np.arange(len(errors[dual])), positive(errors[dual], 0.0), looks[Series(dual)], dual)
         panel.set(xlabel="number of generators R", ylabel="largest relative error of the cone", yscale="log")
         counted(panel)
     return sheet.finish(
@@ -127,14 +117,14 @@ def cone_errors(title: str, errors: Mapping[str, Array]) -> CaptionedFigure:
 def _in_panels(histories: pd.DataFrame) -> list[dict[str, pd.DataFrame]]:
     """The longest cone of every dual strategy, in groups of as many as a panel takes."""
     cones = [(str(dual), rows) for dual, rows in longest(histories)]
-    return [dict(group) for group in parts(cones, SERIES)] or [{}]
+    return [dict(group) for group in parts(cones)] or [{}]
 
 
 def _cones(axes: Axes, cones: Mapping[str, pd.DataFrame], xlabel: str, ylabel: str) -> None:
     """A line for every cone."""
     looks = Looks(map(Series, cones))
     for dual, steps in cones.items():
-        plot(axes, steps["step"], positive(steps["value"]), looks[Series(dual)], dual)
+        plot(axes, steps["step"], positive(steps["value"], 0.0), looks[Series(dual)], dual)
     axes.set(xlabel=xlabel, ylabel=ylabel, yscale="log")
     counted(axes)
 
@@ -147,29 +137,33 @@ def enrichment(data: ProblemTables) -> Pages:
     """
     fixed = data.queries[data.queries["enrichment_kind"] == Kind.FIXED]
     strategies = fixed.drop_duplicates(["primal", "primal_tol"])
+    # Sines below this are round-off.
+    floor = 1e-14
     looks = Looks(starmap(series, zip(strategies["primal"], strategies["primal_tol"], strict=True)))
-    for rows, part in data.pages(_enrichment_rows(fixed), DEEP):
+    for rows, part in data.pages(_enrichment_rows(fixed), 4):
         sheet = Sheet(len(rows), 3, f"{data.problem}, {data.duals[0]}: fixed enrichments", sharey="col")
         for row, (title, pair, names) in enumerate(rows):
             histories = data.histories[(data.histories["stage"] == "enrichment") & (data.histories["pair"] == pair)]
             steps = _tightest(histories[histories["primal"].isin({name for name, _ in names})])
-            for column, (quantity, ylabel) in enumerate(GROWTH.items()):
-                panel = sheet.at(row, column)
+            for column, quantity in enumerate(("sigma", "beta_span_min")):
+                panel, name_of = sheet.at(row, column), ("largest σ", "min β over span")[column]
                 for name, one in by_strategy(steps[steps["quantity"] == quantity]):
                     look = looks[series(one["primal"].iloc[0], one["primal_tol"].iloc[0])]
-                    # σ that is round-off is drawn at the floor, so that its curve ends at the last vector
+                    # σ that is round-off is drawn at the floor, so that its curve ends at the last vector.
                     sines = quantity == "sigma"
-                    values = np.maximum(one["value"], SINE_FLOOR) if sines else positive(one["value"], SINE_FLOOR)
+                    values = np.maximum(one["value"], floor) if sines else positive(one["value"], floor)
                     plot(panel, one["step"], values, look, name)
-                panel.set(xlabel="vectors added", ylabel=ylabel, title=title, xlim=(0, None), yscale="log")
+                panel.set(xlabel="vectors added", ylabel=f"{name_of}, training set", title=title)
+                panel.set(xlim=(0, None), yscale="log")
                 counted(panel)
             _validation(sheet.at(row, 2), data, fixed[fixed["pair"] == pair], names, looks)
             sheet.at(row, 2).set_title(title)
-        sheet.at(0, 2).set_ylim(0, None)  # of all rows: they share the axis
-        yield sheet.finish(_enrichment_caption(data, fixed), part)
+        # All rows share this axis.
+        sheet.at(0, 2).set_ylim(0, None)
+        yield sheet.finish(_enrichment_caption(data, fixed, floor), part)
 
 
-def _enrichment_caption(data: ProblemTables, fixed: pd.DataFrame) -> str:
+def _enrichment_caption(data: ProblemTables, fixed: pd.DataFrame, floor: float) -> str:
     tolerances = ", ".join(
         f"{primal} at δ = {some(mine['primal_tol'].dropna())}"
         for primal, mine in fixed.groupby("primal", sort=False)
@@ -178,7 +172,7 @@ def _enrichment_caption(data: ProblemTables, fixed: pd.DataFrame) -> str:
     return (
         f"Fixed enrichments of {data.problem} with the cones of {data.duals[0]}, a row for every pair (N, R). Left, "
         f"the largest σ over the training set against the number of vectors added, for strategies that report it, at "
-        f"{SINE_FLOOR:g} where it is smaller, which is round-off; "
+        f"{floor:g} where it is smaller, which is round-off; "
         "middle, the smallest β over the span on the training set; both for the tolerance that went farthest. Right, "
         f"β over the span at the validation parameters, for every tolerance{f' ({tolerances})' * bool(tolerances)}."
     )
@@ -190,7 +184,7 @@ def _enrichment_rows(fixed: pd.DataFrame) -> list[tuple[str, str, list[tuple[str
     for pair, group in fixed.groupby("pair", sort=False):
         strategies = group.drop_duplicates(["primal", "primal_tol"]).sort_values(["primal", "primal_tol"])
         names = list(zip(strategies["primal"], strategies["primal_tol"], strict=True))
-        rows += [(title, str(pair), some_names) for title, some_names in titled_parts(dimensions(group), names, SERIES)]
+        rows += [(title, str(pair), some_names) for title, some_names in titled_parts(dimensions(group), names)]
     return rows
 
 
@@ -216,5 +210,6 @@ def _validation(
 
 def _tightest(steps: pd.DataFrame) -> pd.DataFrame:
     """The histories of every strategy at the tolerance with the most vectors."""
-    grown = steps[steps["quantity"] == "beta_span_min"]  # this quantity has a value per vector added
+    # This quantity has a value per vector added.
+    grown = steps[steps["quantity"] == "beta_span_min"]
     return at_best_tolerance(steps, grown.groupby(["primal", "primal_tol"])["step"].max())

@@ -11,26 +11,22 @@ from matplotlib.axes import Axes
 
 from vibench.qp.status import Status
 from vibench.report.figures.data import (
-    CORRECTED,
-    PROGRAM,
-    WAY,
     ProblemTables,
     best_solver,
     by_dimensions,
     common_programs,
+    correction_in_words,
     label,
     of_solvers,
     on_common_queries,
     parts,
     point_names,
+    program_columns,
     series,
     titled_parts,
 )
 from vibench.report.figures.style import (
-    ABREAST,
-    DEEP,
     HIGH_FIDELITY_LOOK,
-    SERIES,
     Layout,
     Looks,
     Pages,
@@ -44,14 +40,6 @@ from vibench.results.break_even import HIGH_FIDELITY, Meaning
 from vibench.study.cells import UNCORRECTED
 
 ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
-
-MOST_QUERIES = 1e6
-"""Total cost is drawn up to this number of queries."""
-
-MODEL = ["primal", "primal_options", "way"]
-"""Columns of which total cost has a line for every combination, at one tolerance."""
-
-MARKS = {Meaning.FROM: ">", Meaning.UNTIL: "<"}
 
 
 def dimension(data: ProblemTables) -> Pages:
@@ -81,7 +69,7 @@ def _errors_against(
     rows_of = "dual strategy" + " and way of a query" * (cells["way"].nunique() > 1)
     beyond = "The thin line is the Pareto front: no model is both faster and more accurate." if front else ""
     looks = Looks(Series(str(primal)) for primal in cells["primal"].unique())
-    for rows, part in data.pages(list(_ways(cells)), DEEP):
+    for rows, part in data.pages(list(_ways(cells)), 4):
         heading = f"{data.problem}, {cells['solver'].iloc[0]}: {title}{compared.over}"
         sheet = Sheet(len(rows), 2, heading, Layout(width=4.4, height=3.3), "all", "col")
         for row, (way, mine, names) in enumerate(rows):
@@ -125,8 +113,8 @@ def _ways(cells: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
     """Dual strategies and ways of a query: title, cells, and as many primal strategies as a panel takes."""
     for (dual, assembly, correction), mine in cells.groupby(["dual", "assembly", "correction"], sort=False):
         title = f"{dual}{f', {assembly} assembly' * (assembly != 'full')}"
-        title += f", {CORRECTED.get(correction, correction)}" * (correction != UNCORRECTED)
-        for part, names in titled_parts(title, [str(name) for name in mine["primal"].unique()], SERIES):
+        title += f", {correction_in_words(correction)}" * (correction != UNCORRECTED)
+        for part, names in titled_parts(title, [str(name) for name in mine["primal"].unique()]):
             yield part, mine, names
 
 
@@ -139,11 +127,11 @@ def outputs(data: ProblemTables) -> Pages:
         for name, of_output in models.groupby("output", sort=False)
         for title, rows, names in _ways(of_output)
     ]
-    for shown, part in data.pages(panels, ABREAST * DEEP):
+    for shown, part in data.pages(panels, 12):
         solver = models["solver"].iloc[0]
         sheet = Sheet.of(len(shown), f"{data.problem}, {solver}: quantities of interest")
         looks = Looks(Series(name) for _, _, names in shown for name in names)
-        for panel, (title, mine, names) in zip(sheet.panels, shown, strict=False):  # the last ones may be empty
+        for panel, (title, mine, names) in zip(sheet.panels, shown, strict=False):
             x, y = 1e3 * mine["online_s"], mine["error_scaled_mean"]
             _points(panel, mine, x, y.where(y > 0.0), names, looks)
             _name_points(sheet, panel, mine[mine["primal"].isin(names)], x, y)
@@ -164,8 +152,9 @@ def break_even(data: ProblemTables) -> Pages:
     against = data.thresholds[data.thresholds["cell_a"].isna()].set_index("cell_b")[numbers]
     models = cells.merge(against, "inner", left_on="cell", right_index=True)
     decided = models[models["meaning"] == Meaning.FROM]
-    if (decided["correction"] != UNCORRECTED).any():  # strategies are told apart by their colours alone otherwise
-        named = [label(row.primal, None, CORRECTED.get(row.correction, "")) for row in decided.itertuples()]
+    if (decided["correction"] != UNCORRECTED).any():
+        # Strategies are distinguished by their names: a corrected one needs another.
+        named = [label(row.primal, None, correction_in_words(row.correction)) for row in decided.itertuples()]
         decided = decided.assign(primal=named)
     errors = {
         measure: ranking.errors_of(decided, data.outputs, measure).dropna()
@@ -175,7 +164,7 @@ def break_even(data: ProblemTables) -> Pages:
     panels = [(measure, decided.loc[error.index], error) for measure, error in errors.items() if len(error)]
     without = len(models) - len(decided)
     left_out = f"Models without such a number, or with an undecided one, have no point: {without}." * bool(without)
-    for shown, part in data.pages(panels, ABREAST * DEEP):
+    for shown, part in data.pages(panels, 12):
         solver = decided["solver"].iloc[0]
         sheet = Sheet.of(len(shown), f"{data.problem}, {solver}: break-even and accuracy")
         looks = Looks(Series(str(name)) for _, mine, _ in shown for name in mine["primal"].unique())
@@ -208,26 +197,25 @@ def _front(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def total_cost(data: ProblemTables) -> Pages:
     """Offline and online seconds against the number of queries; triangles mark where two models break even."""
-    cells = best_solver(data.cells)
+    cells, queries = best_solver(data.cells), np.geomspace(1.0, 1e6, 61)
     panels = [
         (part, models.iloc[places])
         for title, mine in by_dimensions(cells)
         for models in [_most_vectors(mine)]
-        for part, places in titled_parts(title, list(range(len(models))), SERIES - 1, "models")
+        for part, places in titled_parts(title, list(range(len(models))), "models", beside_reference=True)
     ]
-    for shown, part in data.pages(panels, DEEP * ABREAST):
+    for shown, part in data.pages(panels, 12):
         sheet = Sheet.of(len(shown), f"{data.problem}, {cells['solver'].iloc[0]}: total cost", share="all")
         looks = Looks(_model(cell) for _, mine in shown for cell in mine.itertuples())
         for panel, (title, mine) in zip(sheet.panels, shown, strict=False):
-            queries = np.geomspace(1.0, MOST_QUERIES, 61)
             model = mine.iloc[0]
             plot(panel, queries, model["hf_setup_s"] + queries * model["hf_s"], HIGH_FIDELITY_LOOK, HIGH_FIDELITY)
             for cell in mine.itertuples():
                 name = label(cell.primal, cell.primal_tol, cell.way)
                 plot(panel, queries, cell.offline_s + queries * cell.online_s, looks[_model(cell)], name)
-            _marks(panel, mine, data.thresholds)
+            _marks(panel, mine, data.thresholds, queries[-1])
             panel.set(xlabel="number of queries", ylabel="offline + online [s]", title=title)
-            panel.set(xlim=(1.0, MOST_QUERIES), xscale="log", yscale="log")
+            panel.set(xlim=(1.0, queries[-1]), xscale="log", yscale="log")
         yield sheet.finish(
             f"CPU seconds offline and online of the models of {data.problem} together against the number of queries; "
             f"solver {cells['solver'].iloc[0]}. A panel for every dual strategy and pair (N, R); every primal strategy "
@@ -244,30 +232,24 @@ def _most_vectors(cells: pd.DataFrame) -> pd.DataFrame:
     added = cells.assign(added=cells["enrichment"].fillna(0)).sort_values(
         ["added", "primal_tol"], ascending=[False, True], kind="stable"
     )
-    return added.drop_duplicates(MODEL).sort_index()
+    return added.drop_duplicates(["primal", "primal_options", "way"]).sort_index()
 
 
 def _model(cell: Any) -> Series:
     return series(cell.primal, cell.primal_tol, cell.way)
 
 
-def _marks(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame) -> None:
+def _marks(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame, most: float) -> None:
     """Break-even points between the lines of a panel, at their cost, with their intervals."""
     drawn, number = cells["cell"], thresholds["benefit_threshold"]
     between = thresholds["cell_a"].isna() | thresholds["cell_a"].isin(drawn)
-    shown = thresholds[thresholds["cell_b"].isin(drawn) & between & number.between(1.0, MOST_QUERIES)]
+    shown = thresholds[thresholds["cell_b"].isin(drawn) & between & number.between(1.0, most)]
     shown = shown.assign(cost=shown["offline_b_s"] + shown["benefit_threshold"] * shown["online_b_s"])
     for meaning, mine in shown.groupby("meaning"):
-        shape, name = MARKS[Meaning(meaning)], f"break-even: cheaper {meaning} here"
+        shape, name = {Meaning.FROM: ">", Meaning.UNTIL: "<"}[Meaning(meaning)], f"break-even: cheaper {meaning} here"
         panel.plot(mine["benefit_threshold"], mine["cost"], shape, c="black", ms=5, mfc="none", label=name, zorder=5)
     bounded = shown[shown[["threshold_low", "threshold_high"]].notna().all(axis=1)]
     panel.hlines(bounded["cost"], bounded["threshold_low"], bounded["threshold_high"], colors="black", lw=0.8, zorder=5)
-
-
-RESIDUALS = ["primal_residual", "dual_residual", "gap"]
-
-EXACT = 1e-16
-"""Residuals and errors are drawn no lower than this."""
 
 
 def solvers(data: ProblemTables) -> Pages:
@@ -281,7 +263,7 @@ def solvers(data: ProblemTables) -> Pages:
     if not queries["solve_s"].notna().any():
         return
     names = [str(name) for name in queries["solver"].unique()]
-    groups = parts(names, SERIES)
+    groups = parts(names)
     compared = len(names) > 1
     sheet = Sheet(len(groups), 1 + compared, f"{data.problem}: QP solvers", sharex="col", sharey="col")
     looks = Looks(map(Series, names))
@@ -312,8 +294,8 @@ def precision(data: ProblemTables) -> Pages:
     shared = common_programs(data.queries)
     if shared["accuracy"].nunique() < 2:
         return
-    count = len(shared) // shared.groupby(WAY).ngroups
-    groups = parts(sorted(map(str, shared["solver"].unique())), SERIES)
+    count = len(shared) // shared.groupby(["solver", "accuracy"]).ngroups
+    groups = parts(sorted(map(str, shared["solver"].unique())))
     title = f"{data.problem}: time and precision of the QP solvers, {count} programs"
     sheet = Sheet(len(groups), 2, title, sharex="all", sharey="col")
     looks = Looks(Series(name) for group in groups for name in group)
@@ -322,8 +304,9 @@ def precision(data: ProblemTables) -> Pages:
             mine = shared[shared["solver"] == solver]
             medians = mine.groupby("accuracy")[["solve_s", "solver_error_u", "solver_error_lambda"]].median()
             for column, name in enumerate(("u", "lambda")):
-                error = np.maximum(medians[f"solver_error_{name}"], EXACT)
-                # a marker per accuracy
+                # A logarithmic axis has no zero.
+                error = np.maximum(medians[f"solver_error_{name}"], 1e-16)
+                # Every point is an accuracy, and has a marker.
                 plot(sheet.at(row, column), 1e3 * medians["solve_s"], error, looks[Series(solver)], solver, markevery=1)
         for column, name in enumerate(("u", "λ")):
             panel = sheet.at(row, column)
@@ -341,10 +324,11 @@ def _accuracy(panel: Axes, queries: pd.DataFrame, names: list[str], looks: Looks
     """A point per cell: median time and largest residual of its queries, relative to its accuracy."""
     for solver in names:
         mine = queries[(queries["solver"] == solver) & queries["solve_s"].notna()]
-        rows = mine.assign(worst=mine[RESIDUALS].max(axis=1) / mine["accuracy"]).groupby("cell")
-        models = rows.agg(time=("solve_s", "median"), worst=("worst", "max"))
-        finite = models[np.isfinite(models["worst"])]  # a query without a solution has no residual
-        scatter(panel, 1e3 * finite["time"], np.maximum(finite["worst"], EXACT), looks[Series(solver)], solver)
+        worst = mine[["primal_residual", "dual_residual", "gap"]].max(axis=1) / mine["accuracy"]
+        models = mine.assign(worst=worst).groupby("cell").agg(time=("solve_s", "median"), worst=("worst", "max"))
+        # A query without a solution has no residual.
+        finite = models[np.isfinite(models["worst"])]
+        scatter(panel, 1e3 * finite["time"], np.maximum(finite["worst"], 1e-16), looks[Series(solver)], solver)
     panel.set(xlabel="median time of a program [ms]", ylabel="largest residual / accuracy")
     panel.set(xscale="log", yscale="log")
 
@@ -352,10 +336,10 @@ def _accuracy(panel: Axes, queries: pd.DataFrame, names: list[str], looks: Looks
 def _profile(panel: Axes, queries: pd.DataFrame, names: list[str], looks: Looks) -> None:
     """The profiles of some solvers, against the fastest of all."""
     solved = queries["solve_s"].where(queries["status"] == Status.OK, np.inf).fillna(np.inf)
-    instances = (
-        queries.assign(time=solved).groupby([*PROGRAM, "accuracy", "solver"], dropna=False)["time"].min().unstack()
-    )
-    fastest = instances.min(axis=1).replace(np.inf, 1.0)  # where nobody solved a program all ratios are infinite
+    by = [*program_columns(), "accuracy", "solver"]
+    instances = queries.assign(time=solved).groupby(by, dropna=False)["time"].min().unstack()
+    # Where nobody solved a program all ratios are infinite.
+    fastest = instances.min(axis=1).replace(np.inf, 1.0)
     ratios = instances.div(fastest, axis=0).fillna(np.inf)
     last = 1.1 * ratios.replace(np.inf, 1.0).to_numpy().max()
     for solver in names:

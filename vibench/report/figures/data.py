@@ -26,14 +26,6 @@ from vibench.text import json_object
 
 TABLES = ("cells", "queries", "histories", "thresholds", "outputs")
 
-PAIR = ["pod_tol", "pod_size", "dual_tol", "dual_size"]
-"""Tolerances or prescribed sizes that determine the dimensions (N, R)."""
-
-PROBLEM = ["problem", "problem_options"]
-
-NO_CONE = "no cone"
-"""What stands for a dual strategy where a formulation has none."""
-
 PRIMAL = ["primal", "primal_options", "primal_tol"]
 
 Panel = TypeVar("Panel")
@@ -51,10 +43,21 @@ class Extent(Enum):
 class ProblemTables:
     """The tables of one problem of a run, and of one training set where it has several.
 
-    Figures and findings are made from them.
+    Each table has a column `pair`, a text of the tolerances or sizes that determine (N, R); queries also have the
+    columns `enrichment_kind`, `N` and `R` of their cells.
 
-    Each has a column `pair`, a text of the values of `PAIR`; queries also have the columns `enrichment_kind`, `N` and
-    `R` of their cells.
+    Attributes
+    ----------
+    problem
+        Label of the problem in the study, with that of the training set where the problem has several.
+    problem_name, problem_options
+        Name of its plugin, and the options that are not at their default.
+    cells, queries, histories, thresholds, outputs
+        Rows of the tables of the results file, in the order of the axes.
+    pictures
+        Its recorded solutions.
+    extent
+        How much is drawn of a long figure.
     """
 
     problem: str
@@ -69,9 +72,9 @@ class ProblemTables:
     extent: Extent = Extent.WHOLE
 
     def pages(self, panels: Sequence[Panel], most: int) -> Iterator[tuple[Sequence[Panel], str]]:
-        """The panels of every page of a figure that is drawn, `most` to a page, and which part of the figure it is.
+        """The panels of every page of a figure, `most` to a page, and which part of the figure it is.
 
-        The part is a sentence, "" where there is one page. Without panels there is no page.
+        A page takes three panels in a row and four rows. The part is a sentence, "" where there is one page.
         """
         if self.extent is Extent.WHOLE:
             most = len(panels)
@@ -93,10 +96,10 @@ class ProblemTables:
 
     @property
     def parameter(self) -> str:
-        """Name of the only parameter with its unit, for an axis; "" if there are several."""
+        """Name and unit of the only parameter, as the label of an axis; "" if there are several."""
         if self.queries.filter(regex=r"^mu_\d+$").notna().any().sum() != 1:
             return ""
-        # the titles of pictures, "radius = 0.7 m", are the one place where a results file has the name and the unit
+        # Only the titles of pictures, "radius = 0.7 m", have the name and the unit in a results file.
         named = (one.title.rpartition(" = ") for one in self.pictures if one.picture is not None)
         name, _, value = next(named, ("", "", ""))
         unit = value.partition(" ")[2]
@@ -111,9 +114,9 @@ class ProblemTables:
 def problem_tables(
     path: Path, known: Mapping[str, pd.DataFrame] = MappingProxyType({})
 ) -> Iterator[tuple[str, ProblemTables]]:
-    """Every problem and training set of a results file that has queries, with the name its files begin with.
+    """Problems and training sets of a results file that have queries, each with the name its files begin with.
 
-    The training set is named where a problem has several. Tables that are `known` are not read again.
+    Tables that are `known` are not read again.
     """
     read = {name: in_order(known[name] if name in known else read_table(path, name)) for name in TABLES}
     if read["queries"].empty:
@@ -123,18 +126,19 @@ def problem_tables(
     for frame in read.values():
         _name_formulations(frame)
     read["queries"] = read["queries"].merge(read["cells"][["cell", "enrichment_kind", "N", "R"]], "left", "cell")
+    sizes, problem_columns = ["pod_tol", "pod_size", "dual_tol", "dual_size"], ["problem", "problem_options"]
     for frame in read.values():
         if "assembly" in frame:
             frame["way"] = _per_combination(frame[["assembly", "correction"]], way)
-        frame["pair"] = _per_combination(frame[PAIR].astype(float), lambda *pair: str(pair))
+        frame["pair"] = _per_combination(frame[sizes].astype(float), lambda *pair: str(pair))
     shown = tuple(pictures.read(path))
-    keys = list(dict.fromkeys(read["queries"][[*PROBLEM, "training"]].itertuples(index=False, name=None)))
+    keys = list(dict.fromkeys(read["queries"][[*problem_columns, "training"]].itertuples(index=False, name=None)))
     several = {key[:2] for key in keys if len({one for one in keys if one[:2] == key[:2]}) > 1}
     labels = [f"{key[0]}, {key[2]}" if key[:2] in several else str(key[0]) for key in keys]
     for name, label, (*problem, training) in zip(file_names(labels), labels, keys, strict=True):
         mine = {
-            # What a problem tells of its validation solutions belongs to no training set.
-            table: frame[(frame[PROBLEM] == problem).all(axis=1) & frame["training"].isin([training, None])]
+            # Diagnostics of validation solutions belong to no training set.
+            table: frame[(frame[problem_columns] == problem).all(axis=1) & frame["training"].isin([training, None])]
             for table, frame in read.items()
         }
         drawn = tuple(one for one in shown if one.key == tuple(problem))
@@ -143,9 +147,9 @@ def problem_tables(
 
 
 def _tell_apart(axis: str, cells: pd.DataFrame, frames: list[pd.DataFrame]) -> None:
-    """Add the options to the labels of strategies, so that a label means the same strategy in every run.
+    """Add options to the labels of strategies, so that a label means the same strategy in every run.
 
-    A label that the study gives stands for the options; they are added where several strategies have the same one.
+    A label chosen by the study replaces the options, unless several strategies have it.
     """
     columns = [axis, f"{axis}_options"]
     strategies = pd.concat([frame[columns].dropna().drop_duplicates() for frame in frames]).drop_duplicates()
@@ -163,14 +167,14 @@ def _tell_apart(axis: str, cells: pd.DataFrame, frames: list[pd.DataFrame]) -> N
 
 
 def _name_formulations(frame: pd.DataFrame) -> None:
-    """Name other formulations than the mixed one with their primal strategies, which curves and points are told by."""
+    """Label plugin formulations, so that curves and markers can be distinguished."""
     if "formulation" not in frame or not (other := frame["formulation"] != default_formulation()).any():
         return
     for column in ("primal", "primal_b"):
         if column in frame:
             made = _per_combination(frame[["formulation", column]], _model_name)
             frame[column] = frame[column].where(~other, made)
-    frame["dual"] = frame["dual"].where(frame["dual"] != NO_SUCH_AXIS, NO_CONE)
+    frame["dual"] = frame["dual"].where(frame["dual"] != NO_SUCH_AXIS, "no cone")
 
 
 def _model_name(formulation: str, primal: str) -> str:
@@ -178,7 +182,7 @@ def _model_name(formulation: str, primal: str) -> str:
 
 
 def _per_combination(frame: pd.DataFrame, value: Callable[..., Any]) -> pd.Series:
-    """A function of the values of a row, called once for every combination of them: millions of rows have few."""
+    """A function of the values of every row, called once for each combination: millions of rows have few."""
     number = frame.groupby(list(frame.columns), dropna=False, sort=False).ngroup().to_numpy()
     _, first = np.unique(number, return_index=True)
     values = np.empty(len(first), dtype=object)
@@ -187,7 +191,7 @@ def _per_combination(frame: pd.DataFrame, value: Callable[..., Any]) -> pd.Serie
 
 
 def _plugin_name(cells: pd.DataFrame, axis: str) -> str:
-    """The name under which the plugin on an axis of some cells is registered; "" where no cell says so."""
+    """Registered name of the plugin on an axis of some cells; "" if no cell records it."""
     for definition in cells["definition"].dropna():
         plugin = (json_object(definition) or {}).get(axis)
         return str(plugin.get("name", "")) if isinstance(plugin, dict) else ""
@@ -215,59 +219,67 @@ def by_strategy(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         yield label(primal, tolerance), group
 
 
-CORRECTED = {"none": "", "feasible": "corrected", "auto": "corrected where ω > ρ"}
+def correction_in_words(correction: Any) -> Any:
+    """A correction in labels; "" for none, and what is no correction as it is."""
+    return {"none": "", "feasible": "corrected", "auto": "corrected where ω > ρ"}.get(correction, correction)
 
 
 def way(assembly: Any, correction: Any) -> str:
-    """How queries are assembled and corrected; "" in full and not at all, or where that is missing."""
-    parts = ("" if assembly == "full" else assembly, CORRECTED.get(correction, correction))
+    """Assembly and correction of queries in labels; "" for full assembly without correction."""
+    parts = ("" if assembly == "full" else assembly, correction_in_words(correction))
     return ", ".join(part for part in parts if isinstance(part, str) and part)
 
 
 def series(name: Any, tolerance: Any = None, way: str = "") -> Series:
-    """A primal strategy, told from itself at other tolerances, assemblies and corrections."""
+    """Legend key: primal strategy with tolerance, assembly and correction."""
     variant = "" if pd.isna(tolerance) else float(tolerance)
     return Series(str(name), f"{way} {variant}" if way else variant)
 
 
-def some(values: Any, most: int = 6) -> str:
-    """Numbers as an enumeration, in their order; the middle of many is left out."""
+def some(values: Any) -> str:
+    """Numbers as an enumeration, in their order; of more than six the middle is left out."""
     texts = [f"{value:g}" for value in np.unique(np.asarray(values, float))]
-    return ", ".join(texts if len(texts) <= most else [*texts[: most - 1], "…", texts[-1]])
+    return ", ".join(texts if len(texts) <= 6 else [*texts[:5], "…", texts[-1]])
 
 
-def parts(items: list[Any], most: int) -> list[list[Any]]:
-    """A list in parts of at most `most` items, of about the same size."""
+def parts(items: list[Any], *, beside_reference: bool = False) -> list[list[Any]]:
+    """Series in groups of about the same size, for panels of at most ten series.
+
+    With `beside_reference`, one of the ten is that of the high-fidelity model.
+    """
+    most = 9 if beside_reference else 10
     count = -(-len(items) // most)
     ends = [round(k * len(items) / count) for k in range(count + 1)] if count else []
     return [items[a:b] for a, b in pairwise(ends)]
 
 
-def titled_parts(title: str, items: list[Any], most: int, noun: str = "strategies") -> Iterator[tuple[str, list[Any]]]:
-    """The parts of a list with the titles of their panels; of several parts, these have the number of theirs."""
-    groups = parts(items, most)
+def titled_parts(
+    title: str, items: list[Any], noun: str = "strategies", *, beside_reference: bool = False
+) -> Iterator[tuple[str, list[Any]]]:
+    """The `parts` of a list with the titles of their panels, which are numbered if there are several."""
+    groups = parts(items, beside_reference=beside_reference)
     for k, group in enumerate(groups, 1):
         yield title + f", {noun} {k} of {len(groups)}" * (len(groups) > 1), group
 
 
 def label(name: Any, tolerance: Any = None, way: str = "") -> str:
-    """A primal strategy with its tolerance, and the `way` of its queries."""
+    """Label of a primal strategy with its tolerance and the `way` of its queries."""
     with_tolerance = str(name) if pd.isna(tolerance) else f"{name}, δ = {tolerance:g}"
     return f"{with_tolerance}, {way}" if way else with_tolerance
 
 
 def whole(number: Any) -> str:
-    """A dimension of a model, "–" where it has none."""
+    """A dimension of a model in a text."""
     return NO_SUCH_AXIS if pd.isna(number) else f"{number:.0f}"
 
 
 def label_of(row: Any) -> str:
-    """The same of a row of the cells or the queries table."""
+    """The `label` of a row of the cells or the queries table."""
     return label(row["primal"], row["primal_tol"], way(row["assembly"], row["correction"]))
 
 
 def point_names(cells: pd.DataFrame) -> dict[Any, str]:
-    """(N, R) and δ of cells, for labels at their points, by index; of several tolerances only the first has (N, R)."""
+    """Labels of the points of cells, (N, R) and δ, by index; of several tolerances only the first has (N, R)."""
     names, named = {}, set()
     for index, cell in cells.iterrows():
         size = f"({whole(cell['N'])}, {whole(cell['R'])})"
@@ -279,7 +291,7 @@ def point_names(cells: pd.DataFrame) -> dict[Any, str]:
 
 
 def one_solver(queries: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFrame:
-    """One row per strategy, tolerance and query, and per value on the `axes`, in the order of these.
+    """One row per strategy, tolerance, query and values on the `axes`, sorted by these.
 
     Inf-sup constants depend on no solver, assembly or correction.
     """
@@ -300,19 +312,15 @@ def best_solver(cells: pd.DataFrame) -> pd.DataFrame:
     return timed[(timed["solver"] == solver) & (timed["accuracy"] == accuracy)]
 
 
-TIED = 1e-6
-"""Scores of tolerances that differ by less, relative to the largest one, are equal."""
-
-
 def at_best_tolerance(rows: pd.DataFrame, score: pd.Series) -> pd.DataFrame:
     """Rows of every primal strategy at the tolerance of its largest score, and all rows without a tolerance.
 
-    `score` has the index (primal, primal_tol). Of tolerances whose scores are equal up to round-off the largest counts,
-    so that a figure does not depend on the last digits of a run.
+    `score` has the index (primal, primal_tol).
     """
     scores = score.dropna().rename("score").reset_index()
     top = scores.groupby("primal")["score"].transform("max")
-    near = scores[scores["score"] >= top - TIED * top.abs()]
+    # The largest tolerance of scores equal up to 1e-6: figures do not depend on the last digits of a run.
+    near = scores[scores["score"] >= top - 1e-6 * top.abs()]
     tolerances = near.groupby("primal")["primal_tol"].max()
     return rows[rows["primal_tol"].isna() | (rows["primal_tol"] == rows["primal"].map(tolerances))]
 
@@ -346,52 +354,54 @@ def file_names(labels: list[str]) -> list[str]:
 
 
 def _file_name(label: str) -> str:
-    """The letters and digits of a label; a file system counts bytes, and two labels are part of one name."""
+    """The letters and digits of a label, cut to 90 bytes: two labels are part of a name of at most 255."""
     plain = re.sub(r"[^\w.=-]+", "-", label).strip("-.")[:60]
     return plain.encode()[:90].decode(errors="ignore") or "unnamed"
 
 
-FEWEST = 0.5
-"""Who solved a smaller share of the queries is not compared: it would leave the others too few of them."""
-
-MEANS: Mapping[str, str] = {"error_u_mean": "error_u", "error_lambda_mean": "error_lambda"}
-"""Columns of a cell that are means over queries, and the column of a query that they are means of."""
-
-WAY = ["solver", "accuracy"]
-
-PROGRAM = [*(name for name in KEYS if name not in ("problem", "problem_options", *WAY)), "query"]
-"""Columns that identify a quadratic program of a problem, which every solver solves at every accuracy."""
+def program_columns() -> list[str]:
+    """Columns that identify a quadratic program of a problem, which every solver solves at every accuracy."""
+    return [*(name for name in KEYS if name not in ("problem", "problem_options", "solver", "accuracy")), "query"]
 
 
 @dataclass(frozen=True)
 class Comparable:
-    """Cells of one problem whose errors can be compared."""
+    """Cells of one problem whose errors can be compared.
+
+    Attributes
+    ----------
+    cells
+        Cells with enough ok queries; their means of errors are over the common ones.
+    common
+        Number of queries that are ok in all of them.
+    asked
+        Number of all queries.
+    """
 
     cells: pd.DataFrame
-    """Cells with enough ok queries; their means of errors are over the common ones."""
     common: int
-    """Number of queries that are ok in all of them."""
     asked: int
 
     @property
     def over(self) -> str:
-        """What the means are over, as the end of a sentence; "" where that is every query."""
+        """The queries that means are over, as the end of a sentence; "" for all of them."""
         return "" if self.common == self.asked else f" over the {self.common} of {self.asked} queries that all solved"
 
 
 def on_common_queries(cells: pd.DataFrame, queries: pd.DataFrame) -> Comparable:
-    """The cells without those that have fewer than half of their queries ok, with means over what is ok in all.
+    """Cells of one problem with means over the queries that are ok in all of them.
 
-    Both are rows of these tables, of one problem; queries of other cells are ignored.
+    Cells with fewer than half of their queries ok are left out; queries of other cells are ignored.
     """
     ok = queries[(queries["status"] == Status.OK) & queries["cell"].isin(cells["cell"])]
     solved = cells["cell"].map(ok.groupby("cell").size()).fillna(0)
-    kept = cells[(solved > 0) & (solved >= FEWEST * cells["queries"])]
+    # A cell that solved fewer than half would leave the others too few common queries.
+    kept = cells[(solved > 0) & (solved >= 0.5 * cells["queries"])]
     ok = ok[ok["cell"].isin(kept["cell"])]
     by = ok.groupby("query")["cell"].nunique()
     common = by.index[by == len(kept)]
-    means = ok[ok["query"].isin(common)].groupby("cell")[list(MEANS.values())].mean()
-    compared = kept.assign(**{column: kept["cell"].map(means[name]) for column, name in MEANS.items()})
+    means = ok[ok["query"].isin(common)].groupby("cell")[["error_u", "error_lambda"]].mean()
+    compared = kept.assign(**{f"{name}_mean": kept["cell"].map(means[name]) for name in means})
     return Comparable(compared, len(common), int(kept["queries"].max()) if len(kept) else 0)
 
 
@@ -400,12 +410,12 @@ def common_programs(queries: pd.DataFrame) -> pd.DataFrame:
 
     Solvers that have fewer than half of their programs ok at an accuracy are left out there.
     """
-    queries = of_solvers(queries)
+    queries, by = of_solvers(queries), ["solver", "accuracy"]
     fine = queries[queries["status"] == Status.OK]
-    solved, asked = fine.groupby(WAY).size(), queries.groupby(WAY).size()
-    compared = solved.index[solved >= FEWEST * asked.reindex(solved.index)]
-    fine = fine[pd.MultiIndex.from_frame(fine[WAY]).isin(compared)]
-    ways = fine.groupby(PROGRAM, dropna=False)["solver"].transform("size")
+    solved, asked = fine.groupby(by).size(), queries.groupby(by).size()
+    compared = solved.index[solved >= 0.5 * asked.reindex(solved.index)]
+    fine = fine[pd.MultiIndex.from_frame(fine[by]).isin(compared)]
+    ways = fine.groupby(program_columns(), dropna=False)["solver"].transform("size")
     return fine[ways == len(compared)]
 
 

@@ -13,21 +13,15 @@ from matplotlib.tri import Triangulation
 from vibench.arrays import Array
 from vibench.interfaces.pictures import Picture
 from vibench.report.figures.data import ProblemTables
-from vibench.report.figures.style import ABREAST, BLACK, COLOURS, CaptionedFigure, Layout, Pages, Sheet
+from vibench.report.figures.style import COLOURS, CaptionedFigure, Layout, Pages, Sheet
 
 Limits = tuple[float, float]
 """Range of the values of a field."""
 
-MAP = "cividis"
-"""A colour map of evenly rising lightness, legible in grey print and to colour-blind readers."""
-
-EDGE = "#D55E00"
-"""Colour of the boundary of the contact."""
-
 
 def solutions(data: ProblemTables) -> Pages:
     """High-fidelity solution above and multiplier below, at some training parameters; one range of values for all."""
-    shown = [(one.title, one.picture) for one in data.pictures if one.picture is not None][:ABREAST]
+    shown = [(one.title, one.picture) for one in data.pictures if one.picture is not None][:3]
     if shown:
         yield draw_solutions(f"{data.problem}: high-fidelity solutions", shown)
 
@@ -105,7 +99,8 @@ def _range(values: Sequence[Array]) -> Limits:
 
 
 def _colours(limits: Limits) -> dict[str, Any]:
-    return {"vmin": limits[0], "vmax": limits[1], "cmap": MAP, "rasterized": True}
+    # This map has evenly rising lightness: it is legible in grey print and to colour-blind readers.
+    return {"vmin": limits[0], "vmax": limits[1], "cmap": "cividis", "rasterized": True}
 
 
 def _ends(limits: Limits) -> str:
@@ -133,7 +128,7 @@ def _contact_boundary(axes: Axes, picture: Picture) -> None:
     part = _on_mesh(picture) if len(picture.positions) == 2 else None
     touching = (picture.multiplier > 0.0).astype(float)
     if part is not None and 0.0 < touching.mean() < 1.0:
-        axes.tricontour(part, touching, levels=[0.5], colors=EDGE, linewidths=1.0)
+        axes.tricontour(part, touching, levels=[0.5], colors="#D55E00", linewidths=1.0)
 
 
 def _ends_of_contact(axes: Axes, picture: Picture) -> None:
@@ -143,7 +138,7 @@ def _ends_of_contact(axes: Axes, picture: Picture) -> None:
     order = np.argsort(picture.positions[0])
     x, touching = picture.positions[0][order], picture.multiplier[order] > 0.0
     for k in np.flatnonzero(touching[1:] != touching[:-1]):
-        axes.axvline(0.5 * (x[k] + x[k + 1]), color=EDGE, linewidth=1.0, linestyle=(0, (1, 1)))
+        axes.axvline(0.5 * (x[k] + x[k + 1]), color="#D55E00", linewidth=1.0, linestyle=(0, (1, 1)))
 
 
 def _graph(axes: Axes, x: Array, values: Array, name: str, limits: Limits, colour: str, drawstyle: str) -> None:
@@ -160,4 +155,4 @@ def _plane(axes: Axes, colours: ScalarMappable, name: str) -> None:
     axes.set(xlabel="x", ylabel="y")
     if name:
         bar = axes.figure.colorbar(colours, cax=axes.inset_axes((1.03, 0.0, 0.04, 1.0)), label=name)
-        bar.outline.set_edgecolor(BLACK)
+        bar.outline.set_edgecolor("black")

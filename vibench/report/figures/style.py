@@ -1,4 +1,4 @@
-"""Style of the figures: looks of strategies and solvers, panels of fixed size, captions, labels, reproducible files."""
+"""Style of the figures: looks of strategies and solvers, panels of fixed size, captions, reproducible files."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, NamedTuple
 
@@ -23,28 +24,17 @@ from matplotlib.figure import Figure
 from vibench.arrays import Array
 from vibench.text import printable
 
+# Equidistant in lightness (CIELAB, 22 to 78 in steps of 8), so that grey print keeps them apart, with the hues that are
+# farthest apart for readers with and without a colour vision deficiency; markers differ, too.
 COLOURS = ("#520186", "#91071B", "#A22174", "#615CDB", "#DF5225", "#2CA980", "#AEA0F2", "#E4BD20")
-"""Equidistant in lightness (CIELAB, 22 to 78 in steps of 8), so that print in grey keeps them apart, with the hues that
-are farthest apart for readers with and without a colour vision deficiency; markers differ, too."""
 
-BLACK = "#000000"
-"""The colour of the high-fidelity model, and of what belongs to no strategy."""
-
-DASHES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
-MARKERS = "os^vDPX*dph"
-"""Triangles to the left and to the right mark break-evens."""
-
-SEED = (120727).to_bytes(8, "big")
-"""Salt of the hash of names; with this number all dual strategies that are shipped have colours of their own, all
-primal ones, too, and no two of these and of the solvers look the same."""
-
-MARKED = 9
-"""Number of markers on a line, to identify it in grey print."""
+Share = Literal["none", "all", "row", "col"]
+Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
 class Look:
-    """How a series is drawn: colour and marker, and what tells it from others that share these.
+    """Colour and marker of a series, and its rank among the series of a figure that share these.
 
     Attributes
     ----------
@@ -56,41 +46,30 @@ class Look:
 
     colour: str
     marker: str
-    rank: int = 0
+    rank: int
 
-    def line(self, count: int = 0) -> dict[str, Any]:
-        """The look as arguments of `Axes.plot`; of `count` points only about `MARKED` carry the marker."""
-        return {
-            "color": self.colour,
-            "linestyle": DASHES[self.rank % len(DASHES)],
-            "marker": self.marker,
-            "markersize": 3.5,
-            "markevery": (self.rank % 3, max(1, count // MARKED)),
-            **self._filling(),
-        }
+    def line(self, count: int) -> dict[str, Any]:
+        """Arguments of `Axes.plot` for a line of `count` points."""
+        dashes = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
+        # About nine markers identify a line in grey print; their offset keeps those of equal curves apart.
+        every = (self.rank % 3, max(1, count // 9))
+        return {"linestyle": dashes[self.rank % len(dashes)], "markevery": every, **self._marker(3.5)}
 
     def point(self) -> dict[str, Any]:
-        """The same for points without a line, which filling and edge alone tell apart."""
-        edge = 1.0 + 0.6 * (self.rank // len(self._faces()))
-        return {"color": self.colour, "marker": self.marker, "linestyle": "none", "markersize": 5} | {
-            **self._filling(),
-            "markeredgewidth": edge,
-        }
+        """Arguments of `Axes.plot` for points without a line, which only filling and edge distinguish."""
+        return {"linestyle": "none", "markeredgewidth": 1.0 + 0.6 * (self.rank // 3), **self._marker(5.0)}
 
-    def _filling(self) -> dict[str, Any]:
-        faces = self._faces()
-        return {"markerfacecolor": faces[self.rank % len(faces)]}
-
-    def _faces(self) -> tuple[str, ...]:
-        return (self.colour, "white", "0.75")
+    def _marker(self, size: float) -> dict[str, Any]:
+        face = (self.colour, "white", "0.75")[self.rank % 3]
+        return {"color": self.colour, "marker": self.marker, "markersize": size, "markerfacecolor": face}
 
 
-HIGH_FIDELITY_LOOK = Look(BLACK, "s", 3)
+HIGH_FIDELITY_LOOK = Look("#000000", "s", 3)
 """The look of the high-fidelity model: dotted black lines."""
 
 
 class Series(NamedTuple):
-    """A series of a figure: the name of its strategy or solver, and what tells it from others of that name."""
+    """A series of a figure: the name of its strategy or solver, and the variant of it, such as a tolerance."""
 
     name: str
     variant: str | float = ""
@@ -98,15 +77,20 @@ class Series(NamedTuple):
 
 def look_of(name: str) -> Look:
     """The look of a strategy or a solver; it depends on the name alone."""
-    number = int.from_bytes(hashlib.blake2b(name.encode(errors="replace"), digest_size=8, salt=SEED).digest(), "big")
-    return Look(COLOURS[number % len(COLOURS)], MARKERS[number // len(COLOURS) % len(MARKERS)])
+    # With this salt the shipped dual strategies have colours of their own, the primal ones, too, and no two of these
+    # and of the solvers look the same.
+    salt = (120727).to_bytes(8, "big")
+    number = int.from_bytes(hashlib.blake2b(name.encode(errors="replace"), digest_size=8, salt=salt).digest(), "big")
+    # Triangles to the left and to the right are missing: they mark break-evens.
+    markers = "os^vDPX*dph"
+    return Look(COLOURS[number % len(COLOURS)], markers[number // len(COLOURS) % len(markers)], 0)
 
 
 class Looks:
     """The looks of the series of one figure.
 
-    Series that share colour and marker, those of one strategy at several tolerances in particular, get ranks in their
-    order, so that no two series of a figure look the same.
+    Series that share colour and marker, such as one strategy at several tolerances, get ranks in their order, so that
+    no two series of a figure look the same.
     """
 
     def __init__(self, series: Iterable[Series]) -> None:
@@ -123,140 +107,18 @@ class Looks:
 
 
 def _order(series: Series) -> tuple[str, bool, float, str]:
-    """The key by which series are sorted: name, then variants, texts before numbers."""
+    """Sort key: name, then variants, texts before numbers."""
     number = isinstance(series.variant, float)
     return series.name, number, float(series.variant) if number else 0.0, str(series.variant)
 
 
-Box = tuple[float, float, float, float]
-"""Left, bottom, right and top, in points (1/72 inch)."""
-
-SIZE = 6.0
-"""Size of the font of labels, in points."""
-
-LABEL_CHARACTER, HEIGHT = 0.62, 1.15
-"""Width of a character and height of a line, in sizes of the font; no text is rendered to measure it."""
-
-MARKER = 3.5
-"""Half the width of what a label keeps clear around a point, in points."""
-
-SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
-"""Sides of a point, in the order in which a label is tried there."""
-
-
-def label_points(axes: Axes, points: list[tuple[float, float, str]]) -> int:
-    """Write a label at every point (x, y, text) where there is room; returns the number of those without room.
-
-    A point without a text is only kept clear. The axes must have their final size and limits.
-    """
-    drawn = [(x, y, text) for x, y, text in points if np.isfinite([x, y]).all()]
-    if not drawn:
-        return 0
-    scale = 72.0 / float(axes.figure.dpi)
-    places = scale * axes.transData.transform([(x, y) for x, y, _ in drawn])
-    left, bottom, right, top = (scale * float(end) for end in axes.bbox.extents)
-    taken: list[Box] = [(x - MARKER, y - MARKER, x + MARKER, y + MARKER) for x, y in places]
-    missing = 0
-    for (x, y, text), place in zip(drawn, places, strict=True):
-        if not text:
-            continue
-        box = _free(place, text, taken, (left, bottom, right, top))
-        if box is None:
-            missing += 1
-            continue
-        taken.append(box)
-        offset = (box[0] - place[0], box[1] - place[1])
-        axes.annotate(
-            text, (x, y), offset, textcoords="offset points", fontsize=SIZE, color="0.25", va="bottom", ha="left"
-        )
-    return missing
-
-
-def _free(place: Array, text: str, taken: list[Box], inside: Box) -> Box | None:
-    """The first box beside a point that is inside the panel and covers nothing."""
-    width, height = LABEL_CHARACTER * SIZE * len(text), HEIGHT * SIZE
-    for across, up in SIDES:
-        x = place[0] + (MARKER + 1.0 if across > 0 else -MARKER - 1.0 - width if across < 0 else -0.5 * width)
-        y = place[1] + (MARKER if up > 0 else -MARKER - height if up < 0 else -0.5 * height)
-        box = (x, y, x + width, y + height)
-        within = box[0] >= inside[0] and box[1] >= inside[1] and box[2] <= inside[2] and box[3] <= inside[3]
-        if within and not any(_overlap(box, other) for other in taken):
-            return box
-    return None
-
-
-def _overlap(one: Box, other: Box) -> bool:
-    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
-
-
-Share = Literal["none", "all", "row", "col"]
-
-WRITTEN: dict[str, dict[str, Any]] = {
-    "png": {"metadata": {"Software": None}, "pil_kwargs": {"compress_level": 3}},
-    "svg": {"metadata": {"Date": None}},
-    "pdf": {"metadata": {"CreationDate": None}},
-}
-"""Options of `savefig`: no date, so that the same results give the same files."""
-
-DESCRIBED = {"png": "Description", "svg": "Description", "pdf": "Subject"}
-"""Where a file of each format has the caption."""
-
-FORMATS = ("png", "svg")
-"""Formats that are written where none is asked for."""
-
-ABREAST = 3
-"""Panels in a row."""
-
-SERIES = 10
-"""Series in a panel, that of the high-fidelity model included."""
-
-DEEP = 4
-"""Rows of panels in a figure; the others are in further figures."""
-
-STYLE: Any = {
-    "font.size": 9,
-    "axes.titlesize": 9,
-    "axes.titley": 1.0,  # no ticks above a panel move its title: where they are need not be measured
-    "axes.grid": True,
-    "axes.grid.which": "major",
-    "grid.alpha": 0.3,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "lines.linewidth": 1.3,
-    "legend.fontsize": 8,
-    "legend.frameon": False,
-    "savefig.dpi": 150,
-    "svg.hashsalt": "vibench",
-    "pdf.fonttype": 42,  # journals refuse the Type 3 fonts of Matplotlib's default
-    # Labels are text of others: a dollar sign in them is no formula, whatever the user's own settings are.
-    "text.parse_math": False,
-    "text.usetex": False,
-    "axes.formatter.use_mathtext": False,
-}
-
-CHARACTER, TITLE_CHARACTER = 0.068, 0.085
-"""Average widths of a character of a legend and of a title, in inches."""
-
-FEW, WIDE, DENSE = 0.6, 1.4, 2.2
-"""Decades below which a logarithmic axis has the ticks of a linear one, ticks at 1, 2 and 5, and at 1 and 3, all as
-plain numbers."""
-
-SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
 @dataclass(frozen=True)
 class Layout:
-    """Size of a panel and of the margins around it for ticks, labels and its title, in inches.
-
-    `tail` is the room right of the last panels, for a colour bar.
-    """
+    """Size of a panel, the margin right of it, and the room right of the last ones for a colour bar, in inches."""
 
     width: float = 3.1
     height: float = 2.5
-    left: float = 0.88
     right: float = 0.16
-    below: float = 0.55
-    above: float = 0.34
     tail: float = 0.0
 
 
@@ -330,13 +192,14 @@ class Sheet:
         made = self.figure.subplots(rows, columns, squeeze=False, sharex=sharex, sharey=sharey)
         self.panels: list[Axes] = list(made.ravel())
         self._labels: dict[int, list[tuple[float, float, str]]] = {}
-        for panel in self.panels:  # numbers at every panel, shared axes or not
+        for panel in self.panels:
+            # Every panel has numbers, whether it shares its axes or not.
             panel.tick_params(labelbottom=True, labelleft=True)
 
     @classmethod
     def of(cls, count: int, title: str = "", layout: Layout = Layout(), share: Share = "none") -> Sheet:
-        """A sheet with at least `count` panels, at most `ABREAST` in a row; those beyond `count` are not shown."""
-        columns = max(1, min(count, ABREAST))
+        """A sheet with at least `count` panels, at most three in a row; those beyond `count` are not shown."""
+        columns = max(1, min(count, 3))
         sheet = cls(-(-count // columns) or 1, columns, title, layout, share, share)
         for panel in sheet.panels[count:]:
             panel.set_axis_off()
@@ -356,33 +219,37 @@ class Sheet:
         The caption says, too, which part of a figure it is, and how many labels of points have no room.
         """
         layout = self._layout
-        column, row = layout.left + layout.width + layout.right, layout.above + layout.height + layout.below
+        # Room in inches left of and below a panel for ticks and labels, and for the title above it.
+        left, below = 0.88, 0.55
+        column, row = left + layout.width + layout.right, below + layout.height + 0.34
         wide = self._columns * column + layout.tail
         legend = self._legend(wide)
-        lines = textwrap.wrap(self._title, int(wide / TITLE_CHARACTER))
+        # A character of the title has an average width of 0.085 inches.
+        lines = textwrap.wrap(self._title, int(wide / 0.085))
         high = self._rows * row + legend + 0.17 * len(lines) + 0.1
         self.figure.set_size_inches(wide, high)
         self.figure.suptitle("\n".join(lines), fontsize=10, x=0.08 / wide, y=1.0 - 0.06 / high, ha="left", va="top")
         for k, panel in enumerate(self.panels):
             down, along = divmod(k, self._columns)
-            left, bottom = along * column + layout.left, legend + (self._rows - 1 - down) * row + layout.below
-            panel.set_position((left / wide, bottom / high, layout.width / wide, layout.height / high))
+            x, y = along * column + left, legend + (self._rows - 1 - down) * row + below
+            panel.set_position((x / wide, y / high, layout.width / wide, layout.height / high))
             set_ticks(panel)
-        missing = sum(label_points(self.panels[k], points) for k, points in self._labels.items())
+        missing = sum(_label_points(self.panels[k], points) for k, points in self._labels.items())
         unlabelled = f"{missing} points have no label, since others are too close." if missing else ""
         self.figure.caption = " ".join(f"{caption} {part} {unlabelled}".split())
         self.figure.part = part
         return self.figure
 
     def _legend(self, wide: float) -> float:
-        """Draw the legend; returns its height."""
+        """Draw the legend; returns its height in inches."""
         named: dict[str, Any] = {}
         for panel in self.panels:
             for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
                 named.setdefault(label, handle)
         if not named:
             return 0.0
-        longest = max(map(len, named)) * CHARACTER + 0.6
+        # A character of a label has an average width of 0.068 inches; its handle and the gap take 0.6.
+        longest = max(map(len, named)) * 0.068 + 0.6
         columns = max(1, min(len(named), int(wide / longest)))
         self.figure.legend(named.values(), named.keys(), loc="lower center", ncols=columns)
         return 0.19 * math.ceil(len(named) / columns) + 0.12
@@ -390,7 +257,7 @@ class Sheet:
 
 def two_rows(count: int, title: str) -> tuple[Sheet, list[Axes], list[Axes]]:
     """A sheet of `count` upper panels with a lower one each; upper panels share their axes, and so do lower ones."""
-    columns = max(1, min(count, ABREAST))
+    columns = max(1, min(count, 3))
     blocks = -(-count // columns) or 1
     sheet = Sheet(2 * blocks, columns, title, sharex="all")
     upper, lower = (
@@ -406,16 +273,16 @@ def two_rows(count: int, title: str) -> tuple[Sheet, list[Axes], list[Axes]]:
 
 def plot(axes: Axes, x: Any, y: Any, look: Look, label: str | None = None, **more: Any) -> None:
     """Draw a line in a look."""
-    axes.plot(x, y, label=legend_label(label), **look.line(len(x)) | more)
+    axes.plot(x, y, label=_legend_label(label), **look.line(len(x)) | more)
 
 
 def scatter(axes: Axes, x: Any, y: Any, look: Look, label: str | None = None, **more: Any) -> None:
     """Draw points in a look."""
-    axes.plot(x, y, label=legend_label(label), **look.point() | more)
+    axes.plot(x, y, label=_legend_label(label), **look.point() | more)
 
 
-def legend_label(text: str | None) -> str | None:
-    """A label for the legend; Matplotlib would leave out one that begins with an underscore."""
+def _legend_label(text: str | None) -> str | None:
+    """A label for the legend; Matplotlib leaves out one that begins with an underscore."""
     return f" {text}" if text is not None and text.startswith("_") else text
 
 
@@ -425,41 +292,104 @@ def set_ticks(axes: Axes) -> None:
         if axis.get_scale() != "log":
             continue
         limits = getattr(axes, f"get_{name}lim")()
-        if not 0.0 < limits[0] < limits[1]:  # no positive value on this axis
+        if not 0.0 < limits[0] < limits[1]:
+            # There is no positive value on this axis.
             limits = (0.1, 1.0)
             getattr(axes, f"set_{name}lim")(limits)
-        axis.set_minor_locator(ticker.NullLocator())  # minor ticks would take most of the time of drawing
+        # Minor ticks would take most of the time of drawing.
+        axis.set_minor_locator(ticker.NullLocator())
         decades = math.log10(limits[1] / limits[0])
-        if decades < FEW:
+        few = decades < 2.2
+        if decades < 0.6:
             axis.set_major_locator(ticker.MaxNLocator(5))
-        elif decades < DENSE:
-            # numbers such as 0.00005 at 2 and 5 of every decade would touch where there are more than about five
-            axis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0) if decades < WIDE else (1.0, 3.0)))
-        axis.set_major_formatter("{x:.3g}" if decades < DENSE else _power)
+        elif few:
+            # Numbers such as 0.00005 at 2 and 5 of every decade would touch where there are more than about five.
+            axis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0) if decades < 1.4 else (1.0, 3.0)))
+        axis.set_major_formatter("{x:.3g}" if few else _power)
 
 
 def _power(value: float, _: float) -> str:
-    return "10" + f"{round(math.log10(value))}".translate(SUPERSCRIPTS)
+    exponent = f"{round(math.log10(value))}".translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return f"10{exponent}"
 
 
 def counted(axes: Axes) -> None:
-    """Whole numbers along x."""
+    """Set whole numbers along x."""
     axes.xaxis.set_major_locator(ticker.MaxNLocator(6, integer=True))
 
 
-def positive(values: Any, floor: float = 0.0) -> np.ndarray[Any, np.dtype[np.float64]]:
+def positive(values: Any, floor: float) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Values for a logarithmic axis; values up to the floor become NaN."""
     numbers = np.asarray(values, float)
     return np.where(numbers > floor, numbers, np.nan)
 
 
+def _label_points(axes: Axes, points: list[tuple[float, float, str]]) -> int:
+    """Write a label at every point (x, y, text) where there is room; returns the number of those without room.
+
+    A point without a text is only kept clear. The axes must have their final size and limits.
+    """
+    drawn = [(x, y, text) for x, y, text in points if np.isfinite([x, y]).all()]
+    if not drawn:
+        return 0
+    scale = 72.0 / float(axes.figure.dpi)
+    places = scale * axes.transData.transform([(x, y) for x, y, _ in drawn])
+    inside = tuple(scale * float(end) for end in axes.bbox.extents)
+    # Lengths are in points (1/72 inch): a label keeps 3.5 clear around every point.
+    clear, missing = 3.5, 0
+    taken: list[Box] = [(x - clear, y - clear, x + clear, y + clear) for x, y in places]
+    for (x, y, text), place in zip(drawn, places, strict=True):
+        if not text:
+            continue
+        box = next(
+            (
+                box
+                for box in _boxes(place, text, clear)
+                if _within(box, inside) and not any(_overlap(box, other) for other in taken)
+            ),
+            None,
+        )
+        if box is None:
+            missing += 1
+            continue
+        taken.append(box)
+        offset = (box[0] - place[0], box[1] - place[1])
+        axes.annotate(
+            text, (x, y), offset, textcoords="offset points", fontsize=6.0, color="0.25", va="bottom", ha="left"
+        )
+    return missing
+
+
+def _boxes(place: Array, text: str, clear: float) -> Iterator[Box]:
+    """Boxes of a text beside a point, those first that are tried first: right, left, above, below, corners."""
+    # In a font of 6 points; no text is rendered to measure it.
+    width, height = 0.62 * 6.0 * len(text), 1.15 * 6.0
+    for across, up in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)):
+        x = place[0] + (clear + 1.0 if across > 0 else -clear - 1.0 - width if across < 0 else -0.5 * width)
+        y = place[1] + (clear if up > 0 else -clear - height if up < 0 else -0.5 * height)
+        yield x, y, x + width, y + height
+
+
+def _within(box: Box, outer: tuple[float, ...]) -> bool:
+    return box[0] >= outer[0] and box[1] >= outer[1] and box[2] <= outer[2] and box[3] <= outer[3]
+
+
+def _overlap(one: Box, other: Box) -> bool:
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+
+
+@cache
+def _style() -> mpl.RcParams:
+    return mpl.rc_params_from_file(Path(__file__).with_name("vibench.mplstyle"), use_default_template=False)
+
+
 def styled() -> AbstractContextManager[None]:
     """Context in which figures are made and written in the common style."""
-    return mpl.rc_context(STYLE)
+    return mpl.rc_context(_style())
 
 
-def save(figure: Figure, folder: Path, name: str, formats: Iterable[str] = FORMATS) -> list[Path]:
-    """Write a figure in every format; returns the files."""
+def save(figure: Figure, folder: Path, name: str, formats: Iterable[str] = ("png", "svg")) -> list[Path]:
+    """Write a figure in every format, "png", "svg" or "pdf"; returns the files."""
     files = {form: folder / f"{name}.{form}" for form in formats}
     for form, file in files.items():
         write_figure(figure, file, form)
@@ -468,9 +398,12 @@ def save(figure: Figure, folder: Path, name: str, formats: Iterable[str] = FORMA
 
 def write_figure(figure: Figure, target: Path | BinaryIO, form: str) -> None:
     """Write a figure in a format, with its caption; a character that the font does not have is a box, no warning."""
-    options = dict(WRITTEN[form])
+    # No date and no version of the software: the same results give the same files.
+    metadata: dict[str, str | None] = {{"png": "Software", "svg": "Date", "pdf": "CreationDate"}[form]: None}
     if caption := caption_of(figure):
-        options["metadata"] = options["metadata"] | {DESCRIBED[form]: printable(caption)}
+        metadata["Subject" if form == "pdf" else "Description"] = printable(caption)
+    # Weak compression: line drawings are small anyway, and there are many of them.
+    more: dict[str, Any] = {"pil_kwargs": {"compress_level": 3}} if form == "png" else {}
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", r"Glyph \d+|Matplotlib currently does not support", UserWarning)
-        figure.savefig(target, format=form, **options)
+        figure.savefig(target, format=form, metadata=metadata, **more)
