@@ -19,7 +19,7 @@ from running import PATIENCE, seal
 from vibench.cli.output_commands import export, write_report
 from vibench.cli.result_commands import replay_query, show
 from vibench.errors import NumericalError, RequestError
-from vibench.execution.recording import LOCK, REPORT, claimed
+from vibench.execution.recording import REPORT, claimed
 from vibench.files import locked, write_atomically
 from vibench.report import figures
 from vibench.results.read import read_table, results_file
@@ -146,8 +146,8 @@ def test_a_link_in_place_of_a_lock_is_not_followed(tmp_path: Path) -> None:
     valuable.write_text("kept")
     folder = tmp_path / "runs"
     folder.mkdir()
-    (folder / LOCK).symlink_to(valuable)
-    with pytest.raises(RequestError, match="is a symbolic link"), locked(folder / LOCK, busy="busy"):
+    (folder / ".lock").symlink_to(valuable)
+    with pytest.raises(RequestError, match="is a symbolic link"), locked(folder / ".lock", busy="busy"):
         pass
     with pytest.raises(RequestError, match="is a symbolic link"), claimed(folder):
         pass

@@ -15,12 +15,7 @@ class Graph:
 
     A stage that begins, ends or is lost costs as many steps as it has neighbours, however many others wait.
 
-    Attributes
-    ----------
-    stages
-        All stages that were planned.
-    waiting
-        For each stage that has not begun, its inputs that are not done.
+    `stages` are all that were planned; `waiting` has the inputs that are not done of each stage that has not begun.
     """
 
     stages: dict[str, Stage] = field(default_factory=dict)

@@ -74,10 +74,7 @@ class CurrentItem:
 
     A message would wake the supervisor before and after every query, which takes longer than a small query.
 
-    Parameters
-    ----------
-    file
-        Descriptor of an open file of 8 bytes.
+    `file` is the descriptor of an open file of 8 bytes.
     """
 
     def __init__(self, file: int) -> None:

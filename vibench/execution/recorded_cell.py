@@ -27,7 +27,7 @@ from vibench.results.sqlite import read_meta, read_rows, study_of
 from vibench.stages.base import Done, Stage
 from vibench.stages.cell_queries import cell_queries
 from vibench.storage.artefacts import Store, usable_store
-from vibench.study.cells import NOT_MOVED, Cell
+from vibench.study.cells import Cell
 from vibench.study.matrix import study_of_cell
 from vibench.study.spec import Study
 
@@ -111,7 +111,7 @@ def _rows(run: str) -> tuple[Path, list[dict[str, Any]]]:
     return path, rows
 
 
-def recorded_cells(run: str, places: Mapping[str, str] = NOT_MOVED) -> list[RecordedCell]:
+def recorded_cells(run: str, places: Mapping[str, str] = {}) -> list[RecordedCell]:
     """All cells of a run that have a model with quadratic programs.
 
     Raises a `RequestError` if there is no such run.
@@ -129,7 +129,7 @@ def _has_program(definition: str) -> bool:
     return bool(plugin.entries and not plugin.conflict and plugin.load().has_program)
 
 
-def recorded_cell(run: str, cell: str, places: Mapping[str, str] = NOT_MOVED) -> RecordedCell:
+def recorded_cell(run: str, cell: str, places: Mapping[str, str] = {}) -> RecordedCell:
     """One cell of a run, by its key or a unique prefix of it.
 
     Raises a `RequestError` if the prefix fits no cell or several, or the cell failed before it had a reduced model.
@@ -140,7 +140,7 @@ def recorded_cell(run: str, cell: str, places: Mapping[str, str] = NOT_MOVED) ->
     return recorded
 
 
-def recorded_study(run: str, cell: str, places: Mapping[str, str] = NOT_MOVED) -> Study:
+def recorded_study(run: str, cell: str, places: Mapping[str, str] = {}) -> Study:
     """The study that makes one row of a run again: it has this cell alone.
 
     Raises a `RequestError` if the prefix fits no cell or several, or the cell cannot be run here: its plugins or

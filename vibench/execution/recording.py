@@ -35,8 +35,8 @@ from vibench.study.cells import NO_SUCH_AXIS, Axes, Cell, digest
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.spec import Limits, Study
 
-LOCK, LOG, REPORT = ".lock", "workers.log", "report.html"
-"""Files of a run folder: held during a run, output of plugins and solvers, and what `vibench report` writes."""
+LOG, REPORT = "workers.log", "report.html"
+"""Files of a run folder: the output of plugins and solvers, and the report of `vibench report`."""
 
 
 @contextlib.contextmanager
@@ -49,13 +49,13 @@ def claimed(folder: Path) -> Iterator[None]:
     try:
         if folder.exists() and not folder.is_dir():
             raise RequestError(f"output folder '{folder}' is a file")
-        ours = {LOCK, FILE + DAMAGED, f"{FILE}{DAMAGED}-wal"}
+        ours = {".lock", FILE + DAMAGED, f"{FILE}{DAMAGED}-wal"}
         if folder.is_dir() and not (folder / FILE).exists() and {path.name for path in folder.iterdir()} - ours:
             raise RequestError(f"output folder '{folder}' is not empty and holds no {FILE}; choose another with --out")
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RequestError(f"output folder '{folder}' cannot be written: {error.strerror}") from None
-    with locked(folder / LOCK, busy=f"another run writes into '{folder}'"):
+    with locked(folder / ".lock", busy=f"another run writes into '{folder}'"):
         yield
 
 

@@ -175,12 +175,8 @@ def _to_do(cell: Cell, finished: Mapping[str, tuple[str, str]], retry: bool) -> 
 class _Run:
     """One execution of a study: the graph of its stages, and the recording of their results.
 
-    Attributes
-    ----------
-    cells
-        The cells that get their rows from a goal, by its key; several cells may share a goal.
-    lost
-        The dispensable stages that failed, by key.
+    `cells` are those that get their rows from a goal, by its key: several cells may share a goal. `lost` are the
+    dispensable stages that failed, by key.
     """
 
     study: Study

@@ -58,12 +58,8 @@ class _WorkerLostError(Exception):
 class _JobState:
     """Reports of workers on a job: finished items, the fraction done, the deadline of the current item.
 
-    Attributes
-    ----------
-    grace
-        Seconds allowed beyond the limit of a query, for the work before and after the solver.
-    start_seconds
-        Time limit of the start of a worker process and its imports; on a busy machine it may exceed that of a job.
+    `grace` are seconds allowed beyond the limit of a query, for the work before and after the solver. `start_seconds`
+    limit the start of a worker process and its imports; on a busy machine that may exceed the limit of a job.
     """
 
     grace = 2.0

@@ -22,7 +22,6 @@ from vibench.results import formats, ranking, show
 from vibench.results.read import cells_with_errors, in_order, read_table, results_file
 from vibench.results.schema import TABLES
 from vibench.results.sqlite import read_meta, study_of
-from vibench.study.cells import NOT_MOVED
 from vibench.study.spec import Study
 
 if TYPE_CHECKING:
@@ -40,7 +39,7 @@ class Run:
         Where files and folders of its study are now, by name; by default where they were.
     """
 
-    def __init__(self, path: Path, at: Mapping[str, str] = NOT_MOVED) -> None:
+    def __init__(self, path: Path, at: Mapping[str, str] = {}) -> None:
         self.path, self._at = path, at
 
     def __repr__(self) -> str:
@@ -210,7 +209,7 @@ class Run:
 
 
 @requested
-def open_run(path: Path | str, *, at: Mapping[str, str] = NOT_MOVED) -> Run:
+def open_run(path: Path | str, *, at: Mapping[str, str] = {}) -> Run:
     """A finished run: its folder, its results file, or the name of a study that was run in this folder.
 
     Parameters

@@ -10,16 +10,8 @@ from pkgutil import resolve_name
 class PluginKind(StrEnum):
     """A kind of plugin; its text, such as "dual strategy", is its name in messages and records.
 
-    Attributes
-    ----------
-    plural
-        Name of the list of `vibench list` that shows it.
-    entry_points
-        Group of entry points.
-    cli_name
-        Prefix on the command line, as in `vibench check NAME:…`; "" where its plugins are not checked.
-    module
-        Module that `vibench new` writes.
+    `plural` names the list of `vibench list`, `cli_name` is the prefix in `vibench check NAME:…`, "" where its plugins
+    are not checked, `module` is the module that `vibench new` writes.
     """
 
     plural: str

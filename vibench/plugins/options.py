@@ -60,8 +60,9 @@ class Option:
         return ""
 
 
-BESIDE = "/./"
-"""Separator between the folder of a study and the path of a file in it, as in the syntax of rsync."""
+def inside(folder: Path, path: str) -> str:
+    """The path of a file in the folder of a study, separated as in the syntax of rsync for `named_path`."""
+    return f"{folder}/./{path}"
 
 
 def named_path(path: Any) -> tuple[Any, Any]:
@@ -73,7 +74,7 @@ def named_path(path: Any) -> tuple[Any, Any]:
     path = os.fspath(path) if isinstance(path, os.PathLike) else path
     if not isinstance(path, str) or not path:
         return path, path
-    relative = os.path.normpath(path.rpartition(BESIDE)[2])
+    relative = os.path.normpath(path.rpartition("/./")[2])
     absolute = os.path.abspath(path)  # noqa: PTH100  links stay
     # A path out of the folder of the study would reveal where that is.
     elsewhere = Path(relative).parts[:1] in ((), ("/",), ("..",))

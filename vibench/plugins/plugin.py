@@ -25,18 +25,10 @@ from vibench.provenance import distribution_version
 
 @dataclass(frozen=True)
 class Plugin:
-    """A plugin with its options.
+    """A plugin with its `options` as canonical JSON.
 
-    Attributes
-    ----------
-    kind, name
-        Kind and name of the plugin.
-    options
-        Its options as canonical JSON.
-    code
-        Version of its code, with a digest of the files that its options name.
-    places
-        Absolute paths of these files and folders, as JSON by option; not part of the identity.
+    `code` is the version of its code, with a digest of the files that its options name. `places` are the absolute paths
+    of these files and folders, as JSON by option; they are not part of the identity.
     """
 
     kind: PluginKind
@@ -121,14 +113,8 @@ class Plugin:
 class GivenPlugin(RegisteredPlugin):
     """A class or an object passed to a study in Python; known only to that process and to its workers.
 
-    Attributes
-    ----------
-    fingerprint
-        "object " and the hash of its code and state.
-    pickled
-        The class or the object by cloudpickle; empty where only another process has it.
-    modules
-        Versions of the modules that it uses, which are imported and not pickled, by name.
+    `fingerprint` is "object " and the hash of its code and state. `pickled` is the class or the object by cloudpickle,
+    empty where only another process has it. `modules` are versions of the modules that it imports, by name.
     """
 
     fingerprint: str = ""

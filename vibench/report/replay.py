@@ -28,7 +28,6 @@ from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, verify
 from vibench.results.consistency import vectors
 from vibench.results.formats import to_csv
-from vibench.study.cells import NOT_MOVED
 
 
 def worst_query(recorded: RecordedCell) -> int:
@@ -95,7 +94,7 @@ def write_program(program: VariationalInequality, file: Path) -> None:
     write_atomically(file, content.getvalue())
 
 
-def export(run: str, folder: Path, places: Mapping[str, str] = NOT_MOVED, *, sequence: bool = False) -> int:
+def export(run: str, folder: Path, places: Mapping[str, str] = {}, *, sequence: bool = False) -> int:
     """Write every reduced program of a run, with its solutions and their verification; returns their number.
 
     The folder holds `programs/NAME.npz` (P, q, G, h), `solutions/NAME.npz` (x_CELL, z_CELL for every cell with a

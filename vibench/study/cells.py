@@ -32,9 +32,6 @@ UNCORRECTED, FEASIBLE = "none", "feasible"
 """Corrections of cells that answer with reduced solutions as they are, and with corrected pairs alone."""
 
 
-NOT_MOVED: Mapping[str, str] = {}
-"""New places of files and folders of a cell: none."""
-
 PLUGINS = ("problem", "dual", "primal", "formulation", "training", "validation_sampling")
 """Names of plugins in the definition of a cell; all but the first may be `None`."""
 
@@ -119,7 +116,7 @@ class Cell:
         }
 
     @classmethod
-    def from_definition(cls, text: str, places: Mapping[str, str] = NOT_MOVED) -> Cell:
+    def from_definition(cls, text: str, places: Mapping[str, str] = {}) -> Cell:
         """The cell of a definition, with the code of its plugins as installed.
 
         `places` are new paths of files and folders of its plugins, by their names in results.

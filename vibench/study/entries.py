@@ -35,10 +35,6 @@ def as_list(value: Any) -> Any:
     return value if isinstance(value, list) else [value]
 
 
-STRICT = ConfigDict(extra="forbid", strict=True, frozen=True)
-"""Configuration of the tables of a study file: unknown keys are refused, and no type is converted."""
-
-
 def _is_plain(value: Any) -> bool:
     """Whether a value may occur in a study file, or is an entry already; others are classes or objects."""
     return value is None or isinstance(value, str | int | float | list | dict | date | time | BaseModel)
@@ -47,7 +43,8 @@ def _is_plain(value: Any) -> bool:
 class Entry(BaseModel):
     """One entry of an axis of plugins; in Python a class or an object may replace the name or the whole entry."""
 
-    model_config = STRICT
+    # Unknown keys are refused, and no type is converted.
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     name: Annotated[Name, Field(description="Name the plugin is registered under.")]
     label: Annotated[str, Field(description="Label in tables; its name by default.")] = ""

@@ -14,7 +14,7 @@ from vibench.errors import RequestError, requested
 from vibench.files import read_regular
 from vibench.interfaces.strategies import Stop
 from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SAMPLING, STUDY, PluginKind
-from vibench.plugins.options import BESIDE
+from vibench.plugins.options import inside
 from vibench.plugins.plugin import GivenPlugin, Plugin
 from vibench.plugins.registry import find, registered
 from vibench.reduction.nested import NestedStrategy
@@ -102,7 +102,7 @@ def _anchor_options(kind: PluginKind, entry: dict[str, Any], folder: Path) -> No
         for name in plugin.path_options if plugin.entries else ():
             value = options.get(name)
             if isinstance(value, str) and value and not value.startswith("/"):
-                options[name] = f"{folder}{BESIDE}{value}"
+                options[name] = inside(folder, value)
 
 
 def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> dict[str, Any]:

@@ -26,18 +26,9 @@ CHUNKS = 4
 class ParameterSet:
     """The training or the validation set of a problem: its own, or that of a sampling strategy.
 
-    Attributes
-    ----------
-    role
-        Purpose of the solutions at its parameters.
-    count
-        Number of parameters of a validation set; 0 for training sets, whose size the problem or the strategy chooses.
-    seed
-        Seed of a problem's own validation set, and of random numbers in timings; 0 for training sets.
-    sampling
-        The sampling strategy; `None` for the problem's own set.
-    label
-        Name in results. Sets that differ only in their labels are the same set.
+    `count` is the number of parameters of a validation set, 0 for training sets, whose size the problem or the strategy
+    chooses. `seed` is that of a problem's own validation set, and of random numbers in timings; 0 for training sets.
+    `sampling` is `None` for the problem's own set. Sets that differ only in their labels are the same set.
     """
 
     role: Literal["training", "validation"]

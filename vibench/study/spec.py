@@ -29,7 +29,6 @@ from vibench.plugins.registry import FACTORISATION, default_formulation, find, r
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.study.entries import (
-    STRICT,
     Entry,
     FormulationEntry,
     Name,
@@ -80,7 +79,7 @@ FileName: TypeAlias = Annotated[Name, AfterValidator(_file_name)]
 
 
 class _Model(BaseModel):
-    model_config = STRICT
+    model_config = Entry.model_config
 
 
 class ToleranceTable(_Model):
