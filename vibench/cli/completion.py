@@ -101,13 +101,15 @@ def whole_words() -> Iterator[None]:
 
     Bash completes only what comes after the last break of such a word, so what is printed begins there.
     """
-    if "_VIBENCH_COMPLETE" in os.environ:  # typer checks words with pydantic, which would look for its own plugins
+    # Typer checks words with pydantic, which would look for plugins of its own.
+    if "_VIBENCH_COMPLETE" in os.environ:
         os.environ["PYDANTIC_DISABLE_PLUGINS"] = "__all__"
     if os.environ.get("_VIBENCH_COMPLETE") != "complete_bash":
         yield
         return
     line, current = os.environ["COMP_WORDS"], int(os.environ["COMP_CWORD"])
     pieces = line.split("\n" if "\n" in line else " ")
+    # Join what bash has broken: a piece belongs to the word before if one of both touches a break.
     joined: list[str] = []
     for k, piece in enumerate(pieces[: current + 1]):
         together = joined and (piece[:1] in (":", "=") or (piece and pieces[k - 1][-1:] in (":", "=")))
@@ -210,6 +212,7 @@ def cells(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:
     """Keys of the cells of the run that the line names, each with a description."""
     from vibench.results.read import read_table, results_file
 
+    # A prompt shows no error; the command will.
     try:
         table = read_table(results_file(str(context.params.get("run"))), "cells")
     except (VibenchError, OSError, sqlite3.Error):
@@ -226,6 +229,7 @@ def column_names(context: typer.Context, incomplete: str) -> list[str]:
     source = {"summary": "cells", "best": "cells", "benefits": "thresholds"}.get(table, table)
     computed = {"best": ["error_below"], "benefits": ranking.error_columns()}.get(table, ())
     before, comma, last = incomplete.rpartition(",")
+    # `--sort -NAME` sorts the largest first; the sign is no part of the name.
     sign = "-" * last.startswith("-")
     return [
         f"{before}{comma}{sign}{name}"

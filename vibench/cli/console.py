@@ -85,9 +85,11 @@ def print_frame(
     from rich import box
     from rich.table import Table
 
+    # Rich is imported only where a table is printed: help and completion do without.
     columns = table if isinstance(table, list) else _columns_of(table)
     console = new_console()
     count = len(columns[0].cells) if columns else 0
+    # A single row would have all of its columns in the title; there only the axes go into it.
     titled = [column for column in columns if not every and (count > 1 or column.heading in axes)]
     alike = [column for column in titled if len(set(column.cells)) == 1]
     shared = [column for column in alike if not column.numeric or column.heading in axes or not column.cells[0]]
@@ -98,6 +100,7 @@ def print_frame(
         return
     own, kept = _arranged([column for column in columns if column not in shared], priority, axes, console.width)
     drawn = [column for column in own if column in kept]
+    # Headings are wrapped between words only if the table is too wide with whole ones.
     whole = sum(max(column.width, cell_len(column.heading)) + 2 for column in drawn) <= console.width + 2
     # The box has a blank between columns; where there is room, a second one makes the table easier to read.
     printed = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, int(whole), 0, 0))
@@ -175,7 +178,8 @@ def _arranged(
 def _fitting(columns: Sequence[PrintedColumn], width: int) -> list[PrintedColumn]:
     """The columns that fit a width one after the other, the first in any case."""
     kept: list[PrintedColumn] = []
-    left = width + 1  # no blank after the last one
+    # No blank follows the last column.
+    left = width + 1
     for column in columns:
         if not kept or column.width + 1 <= left:
             kept.append(column)

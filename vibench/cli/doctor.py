@@ -84,6 +84,7 @@ def check_versions() -> Iterator[Diagnosis]:
     """Versions of Python, vibench and the libraries it requires."""
     yield Diagnosis("Python", f"{platform.python_version()}, {platform.python_implementation()}, {platform.platform()}")
     yield Diagnosis("vibench", provenance.core_code())
+    # Libraries of extras are reported where they are used, as solvers or factorisations.
     required = (name for name, extras in required_distributions().items() if not extras)
     versions = {name: provenance.distribution_version(name) for name in required}
     yield Diagnosis("libraries", ", ".join(f"{name} {version}" for name, version in versions.items() if version))
@@ -190,6 +191,7 @@ def check_machine() -> Iterator[Diagnosis]:
     """Processor, free memory, and the BLAS libraries of NumPy and SciPy."""
     yield Diagnosis("processor", provenance.machine())
     info = Path("/proc/meminfo")
+    # A container may have less memory than the machine: the smaller of both counts.
     available = re.search(r"MemAvailable:\s*(\d+) kB", info.read_text()) if info.is_file() else None
     free = min(int(available[1]) / 2**20 if available else inf, provenance.memory() / 2**30)
     yield Diagnosis("free memory", f"{free:.1f} GiB", _note_if(free < 1.0))
@@ -213,6 +215,7 @@ def check_disk(out: Path) -> Iterator[Diagnosis]:
 
 def _folder(subject: str, folder: Path) -> Diagnosis:
     """Free space of a folder, or of the one it will be created in, and whether locks and databases work there."""
+    # Try out what a run does there: locks, and a database with a write-ahead log, fail on some network drives.
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     try:
         free = shutil.disk_usage(existing).free / 2**30
@@ -235,6 +238,7 @@ def _folder(subject: str, folder: Path) -> Diagnosis:
 def check_timings() -> Iterator[Diagnosis]:
     """Load of other processes, slowdown of a fixed calculation, and whether timings can be trusted."""
     before, watch = _busy_seconds(), Stopwatch()
+    # Other threads of this process would count as the load of others.
     with threadpool_limits(1):
         calibration = Calibration()
         slowdowns = [calibration.slowdown()]
@@ -243,8 +247,10 @@ def check_timings() -> Iterator[Diagnosis]:
             slowdowns.append(calibration.slowdown())
     spent, after = watch.seconds(), _busy_seconds()
     cores = os.cpu_count() or 1
+    # The mean load of the last minute stands in where the system counts no seconds.
     load = (after - before) / spent.wall if after > before else os.getloadavg()[0]
     others = max(load - spent.cpu / spent.wall, 0.0)
+    # The 90 % quantile shows a slowdown that lasts, not a single interruption.
     slowdown, ratio = float(np.quantile(slowdowns, 0.9)), spent.wall / spent.cpu
     doubts = []
     for subject, text, doubtful in (

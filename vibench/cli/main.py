@@ -90,6 +90,7 @@ def clean(
     if dry_run:
         return
     if going and not yes:
+        # A script cannot answer, and must not delete by accident.
         if not sys.stdin.isatty():
             raise RequestError("nothing was deleted: answer the question on a terminal, or say --yes")
         typer.confirm(f"Delete {going} of {len(stored)} files?", abort=True)
@@ -132,8 +133,8 @@ def help_on(
         new_console().print(shown(line))
 
 
+# Words, and the line that explains them.
 Explained = Iterator[tuple[Collection[str], str]]
-"""Words, and the line that explains them."""
 
 
 def _keys() -> Explained:
@@ -175,6 +176,7 @@ def _tables_and_plugins() -> Explained:
         for name, plugin in registered(kind).items():
             about = f"{name}, a {kind} of {plugin.origin}: {plugin.summary.removesuffix('.')}"
             yield [name], f"{about} (`vibench list {kind.plural}`)"
+    # Solvers of qpsolvers are no plugins.
     for name in SETTINGS:
         yield [name], f"{name}, a QP solver (`vibench list solvers`)"
 
@@ -187,6 +189,7 @@ def glossary() -> Explained:
     )
     for title, row, text in entries:
         head = (title or row).replace("`", "")
+        # "Certificate: certified, verified" and "*as fast*" in a text are words that people look up.
         words = [*re.split(r"[,:()]|\band\b", head), *re.findall(r"(?<=\*)[^*]+(?=\*)|(?<=`)[^`]+(?=`)", text)]
         # A terminal shows the text of a link; its target is a page of the documentation.
         plain = re.sub(r"\[([^]]+)\]\([^)]+\)", r"\1", text).replace("*", "").replace("`", "")
@@ -219,6 +222,7 @@ for _name, _command in COMMANDS.items():
 def renamed(arguments: list[str]) -> list[str] | None:
     """What to write in place of a command of version 0.1; `None` for the commands of today."""
     old, *rest = arguments
+    # Each old line is rewritten as text; what it means is checked by the command of today.
     if old == "diff":
         return ["compare", *rest, "--table", "changes", "--strict"]
     if old in ("import", "cones"):
@@ -228,6 +232,7 @@ def renamed(arguments: list[str]) -> list[str] | None:
         words = ("--tolerance" if word == "--interpolate" else word for word in rest if word != "--c")
         return ["export", *(f"{word[:-4]}{ends.get(word[-4:], word[-4:])}" for word in words)]
     if old == "export-vtu":
+        # MU was an argument that may begin with "-", and the file an option with a default.
         file = rest.pop(rest.index("--out") + 1) if "--out" in rest[:-1] else f"{(rest[1:2] or ['CELL'])[0]}.vtu"
         run, cell, mu, *more = [word for word in rest if word != "--out"] + ["RUN", "CELL", "MU"][len(rest) :]
         return ["export", run, cell, file, "--mu", mu, *more]
@@ -239,7 +244,8 @@ def run_command_line() -> None:
 
     An expected error is one line; the exit code is 2 for a wrong request, 1 for anything else.
     """
-    usage_error = typer.BadParameter.__mro__[2]  # click's ClickException, whichever copy of click typer brings
+    # click's ClickException, whichever copy of click typer brings.
+    usage_error = typer.BadParameter.__mro__[2]
     arguments = sys.argv[1:] or ["--help"]
     try:
         _print_any_text()
@@ -257,7 +263,8 @@ def run_command_line() -> None:
         code = _print_error(f"{where}{error.strerror or error}", 1)
     except Interrupted:
         code = _print_error("interrupted", INTERRUPTED)
-    except typer.Abort:  # a question that was answered with no
+    # A question was answered with no.
+    except typer.Abort:
         code = _print_error("stopped; nothing was changed", INTERRUPTED)
     except Exception as error:
         if not isinstance(error, usage_error):
@@ -269,7 +276,8 @@ def run_command_line() -> None:
 def _print_any_text() -> None:
     """Print a question mark for what the encoding of a terminal or a pipe lacks, rather than abort a run."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # tests and notebooks replace the streams by others
+        # Tests and notebooks replace the streams by others, which have no encoding to change.
+        if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
 
 

@@ -68,6 +68,7 @@ def draw_run(path: Path, folder: Path, jobs: int, formats: tuple[str, ...] = ("p
     from vibench.report import figures
 
     cores = provenance.cores()
+    # The run is complete at this point: Ctrl-C costs pictures alone, and says how to get them.
     try:
         with DrawingDisplay() as display:
             drawn = figures.draw_all(path, folder, formats, min(jobs or cores, cores), display.show)
@@ -139,6 +140,7 @@ def export(
 
     A model is used without vibench, in Python or C; the fields for ParaView are u, λ and their errors at a parameter.
     """
+    # The suffix tells what a cell is exported as; programs of a whole run go into a folder, which has none.
     *cell, last = words
     target, kind = Path(last), Path(last).suffix
     if len(cell) > 1 or bool(cell) != (kind in {".npz", ".c", ".vtu"}):
@@ -179,6 +181,7 @@ def _export_model(
         form = f"{terms}, polynomials of degree ({', '.join(map(str, member.degrees))})"
         echo(f"{name}: {form if any(member.degrees) else 'constant'}, relative error {member.error:.1e}")
     echo(f"relative errors are those at {MEASURED} random parameters and at the corners of the box")
+    # The script has fewer solvers than vibench.
     if exported.about["solver"] != model.solver:
         echo(f"the cell's solver is {model.solver}, the script solves by {exported.about['solver']}")
     why = exported.about["no_bounds"]

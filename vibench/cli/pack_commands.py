@@ -89,6 +89,7 @@ def _reduce_cones(folder: Path, dual: list[str], dual_tol: float, out: Path) -> 
     from vibench.results.formats import to_csv
 
     pack = read_model_pack(folder)
+    # A pack without multipliers is refused by name before any strategy runs.
     with naming(folder):
         pack_multipliers(pack)
     wanted = dual or [name for name, plugin in registered(DUAL).items() if not plugin.missing]
@@ -96,6 +97,7 @@ def _reduce_cones(folder: Path, dual: list[str], dual_tol: float, out: Path) -> 
     for name in wanted:
         try:
             cone, other_error = reduce_multipliers(pack, find(DUAL, name).create({}), dual_tol)
+        # One strategy that fails, as some do at small tolerances, leaves the others.
         except NumericalError as error:
             echo(f"failed: {name}: {error}")
             continue
@@ -145,6 +147,7 @@ def _uses(pack: ModelPack, folder: Path) -> Iterator[str]:
         ways += [f"sums the terms of {', '.join(summed)}"] * bool(summed)
         where = "anywhere in the box" if pack.everywhere else "at its listed parameters only"
         yield f"it is evaluated {where}" + f"; reduced assembly {' and '.join(ways)}" * bool(ways)
+        # Members that are interpolated between few listed parameters may be wrong in between.
         for name, error in pack.interpolation_errors(INTERPOLATION_RTOL).items():
             if error > MISSED * INTERPOLATION_RTOL:
                 yield (

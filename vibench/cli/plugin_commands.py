@@ -99,7 +99,8 @@ def _chosen_options(checked: RegisteredPlugin, given: dict[str, Any]) -> tuple[d
             raise RequestError(f"{checked} has no options")
         return {}, ""
     if checked.kind is PROBLEM and "resolution" not in given:
-        with suppress(RequestError):  # the problem has no resolution of that name
+        # A problem without a coarse resolution is checked at its default.
+        with suppress(RequestError):
             options = checked.check_options({"resolution": "coarse", **given})
             return options, ", at resolution coarse (--option resolution=… for another)"
     chosen = {}
@@ -243,6 +244,7 @@ def _find_object(module: str, name: str) -> RegisteredPlugin:
     title = f"'{where}'"
     if not module or not all(part.isidentifier() for part in [*module.split("."), name]):
         raise RequestError(f"{title} is neither KIND:NAME ({', '.join(CHECKED)}) nor MODULE:NAME")
+    # Modules of the current folder count, as with `python -m`.
     if str(Path.cwd()) not in sys.path:
         sys.path.insert(0, str(Path.cwd()))
     try:
@@ -259,6 +261,7 @@ def _find_object(module: str, name: str) -> RegisteredPlugin:
         raise RequestError(f"{title} is no subclass of {names}, and no QP solver")
     if callable(plugin):
         return RegisteredPlugin(SOLVER, where, (EntryPoint(where, where, SOLVER.entry_points),))
+    # Suggest only classes of this module, not those that it imports.
     classes = [value for value in contents.values() if isinstance(value, type)]
     own = [one.__name__ for one in classes if issubclass(one, tuple(bases.values())) and one.__module__ == module]
     raise unknown_name(f"plugin of the module {module}", name, own)
@@ -269,6 +272,7 @@ def key_value(text: str) -> tuple[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key:
         raise RequestError(f"--option '{text}' is not of the form KEY=VALUE")
+    # Numbers, lists and quoted texts are JSON; a bare word is a text.
     try:
         return key, parsed_json(value)
     except ValueError:

@@ -160,6 +160,7 @@ PRIORITY = (
 
 def _print_changes(compared: Comparison, limit: float) -> None:
     """Print what changed between runs, the worst first, and how many changes there are."""
+    # Forty changes are some screens; programs read all of them as CSV.
     changes = readable(_by_weight(compared.changes), len(compared.runs))
     if len(changes):
         names = [run.name for run in compared.runs]
@@ -179,6 +180,7 @@ def _print_overview(compared: Comparison) -> None:
     names = [run.name for run in compared.runs]
     title = f"{names[1]} against {names[0]}" if len(names) == 2 else f"against {names[0]}"
     by_column = compared.by_column
+    # Columns of verdicts that no cell has take room from the others.
     nobody = [verdict.value for verdict in ChangeKind if not by_column[verdict.value].any()]
     print_frame(
         readable(by_column.drop(columns=nobody), len(names)), f"cells by column, {title}", PRIORITY, rest="--format csv"
@@ -203,6 +205,7 @@ def _by_weight(changes: pd.DataFrame) -> pd.DataFrame:
     """The worst changes first: by verdict, then by how far the ratio is from 1."""
     from vibench.report.differences import MOVED
 
+    # A factor of 2 is as far as one of 1/2.
     order = changes["verdict"].map([verdict.value for verdict in MOVED].index)
     far = changes["ratio"].map(lambda ratio: max(ratio, 1.0 / ratio) if ratio > 0.0 else 1.0)
     weighed = changes.assign(order=order, far=-far).sort_values(["order", "far"], kind="stable")

@@ -98,6 +98,7 @@ def _conclude(name: str, outcome: RunResult, folder: Path, *, draw: int | None, 
         again = "the same command without --fresh" if fresh else "the same command"
         echo(f"interrupted: {missing}; {again} resumes the run")
         raise typer.Exit(INTERRUPTED)
+    # A run without any result still has its tables, but no summary and no figures.
     statuses = [row["status"] for row in outcome.rows]
     nothing_ran = set(statuses) == {Status.UNAVAILABLE}
     whole = not nothing_ran and print_summary(name, path, outcome.rows)
@@ -126,12 +127,14 @@ def _study(request: str, key: str, overrides: dict[str, list[Any]], at: list[str
         if overrides:
             raise RequestError(f"a cell of a results file is run as it is recorded: leave out {', '.join(overrides)}")
         return recorded_study(request, key, places_of(at))
+    # The options of a study file's problems name its folders; only recorded cells have places that may have moved.
     if at:
         raise RequestError("--at is for a cell of a results file; a study file says itself where its files are")
     study = read_study(request, overrides)
     if not key:
         return study
     cell = only_cell(expand(study), key, f"'{request}'")
+    # One cell is timed as often as in its study.
     rounds = {name: getattr(study, name) for name in ("timing_rounds", "timing_rounds_min")}
     return study_of_cell(cell, study.name, limits=study.limits, **rounds)
 
@@ -192,6 +195,7 @@ def failures(rows: Rows, run: str) -> Iterator[str]:
     for row in rows:
         if row["status"] != Status.OK:
             groups.setdefault(kind_of_failure(row), []).append(row)
+    # The reason of most cells comes first: it is the one to mend.
     ranked = sorted(groups.values(), key=len, reverse=True)
     for group in ranked[:REASONS]:
         first = group[0]
@@ -208,6 +212,7 @@ def failures(rows: Rows, run: str) -> Iterator[str]:
 
 
 def _remedy(cell: Mapping[str, Any], rows: Rows, run: str) -> str:
+    # Solvers of one model solve the same programs.
     same = [row for row in rows if all(row[name] == cell[name] for name in ("model", "accuracy", "correction"))]
     fine = sorted({row["solver"] for row in same if row["status"] == Status.OK})
     return f"; ok with {', '.join(fine)}" if fine else f"; `vibench replay {run} {cell['cell']}` tries other solvers"

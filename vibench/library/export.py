@@ -31,9 +31,10 @@ from vibench.provenance import distribution_version
 from vibench.qp.settings import SETTINGS
 from vibench.study.cells import Cell
 
+# The script that is written beside exported files.
 RUNTIME = "reduced_model.py"
-"""The runtime, written beside the exported files."""
 
+# Columns of the cell that an exported model repeats.
 RECORDED = (
     "cell", "problem", "problem_options", "training", "training_options", "dual", "dual_options", "primal",
     "primal_options", "pod_tol", "pod_size", "dual_tol", "dual_size", "primal_tol", "solver", "accuracy", "assembly",
@@ -41,7 +42,6 @@ RECORDED = (
     "error_lambda_mean", "error_lambda_max", "assembly_error_max", "seed", "validation", "validation_options", "code",
     "versions", "definition",
 )  # fmt: skip
-"""Columns of the cell that an exported model repeats."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +122,7 @@ def export_model(
     if c:
         texts = c_source.source(found.members, found.arrays, found.about, file.stem, found.thetas, found.exact)
         contents |= {path: text.encode() for path, text in zip(sources, texts, strict=True)}
+    # All contents are computed before the first is written: a failure leaves no file.
     with writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)
         for path, content in contents.items():
@@ -187,7 +188,8 @@ def exact_members(queried: AnyReducedModel, members: Mapping[str, AffinePolynomi
 def _about(model: Model, members: Mapping[str, AffinePolynomial]) -> dict[str, Any]:
     """What the file says in words: parameters, solver, errors, provenance."""
     box, row, accuracy, solver = model.parameters, model.row, model.accuracy, model.solver
-    definition = row.get("definition")  # none of a model that is of no run
+    # A model that belongs to no run has no definition.
+    definition = row.get("definition")
     origin = Cell.from_definition(str(definition)).problem.registered.origin if definition else ""
     return {
         "parameters": {"names": list(box.names), "units": list(box.units)},
@@ -215,7 +217,8 @@ def _licence(distribution: str) -> str:
     """Licence that a distribution declares."""
     try:
         declared = metadata(distribution)
-    except (PackageNotFoundError, ValueError):  # a model of no run has no distribution, whose name is empty
+    # A model of no run has no distribution; importlib refuses its empty name.
+    except (PackageNotFoundError, ValueError):
         return "unknown"
     return next((str(declared[key]) for key in ("License-Expression", "License") if key in declared), "unknown")
 

@@ -93,6 +93,7 @@ class TimeLeft:
 
     def seconds(self) -> float | None:
         """Seconds left, `None` before there is anything to judge by."""
+        # Stages of one sort take about as long; a running one adds its own pace where none is finished.
         means = {sort: self._wall[sort] / count for sort, count in self._done.items()}
         telling = [one for one in self._running.values() if one.last[0]]
         for one in telling:
@@ -103,6 +104,7 @@ class TimeLeft:
         left = 0.0
         for sort, count in self._left.items():
             expected = paces[sort[0]] * self._effort[sort] / max(self._planned[sort], 1)
+            # A stage may be done twice, after a worker was lost.
             left += max(count, 0) * means.get(sort, expected)
         return max(0.0, left - sum(one.last[0] * means[one.sort] for one in telling)) / self._jobs
 
@@ -119,6 +121,7 @@ def _sort(stage: Stage) -> _Sort:
 
 def duration(seconds: float) -> str:
     """A duration in words: "40 s", "3 min", "1 h 20 min"."""
+    # Below two minutes seconds are the clearer unit.
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -127,6 +130,7 @@ def duration(seconds: float) -> str:
 
 def progress_bar(console: Console) -> Progress:
     """A bar that fits 80 columns: what is being done, how much of it is done, and the time left."""
+    # A bar of 16 columns leaves room for the longest label and the time left.
     bar = BarColumn(bar_width=16)
     what, left = (TextColumn(text, markup=False) for text in ("{task.description}", "{task.fields[left]}"))
     return Progress(what, bar, MofNCompleteColumn(), TimeElapsedColumn(), left, console=console)

@@ -127,6 +127,7 @@ class Run:
         RequestError
             If a number is not positive, there is an error without a number of queries, or no such measure.
         """
+        # An empty measure is the default of the table, whose heading then needs no name.
         of_solution = "" if measure == "solution" else measure
         return show.look_up(self.path, "best", error=of_solution, largest=error, queries=queries).rows
 

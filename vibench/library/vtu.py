@@ -44,6 +44,7 @@ def export_vtu(model: Model, mu: Parameters, file: Path | str) -> Path:
         raise RequestError(f"'{file}': the fields are written as a vtu file, whose name must end in .vtu")
     if importlib.util.find_spec("meshio") is None:
         raise RequestError("a vtu file needs meshio: pip install 'vibench[mesh]'")
+    # Refuse an existing file before minutes of solving.
     with writing(file):
         if file.exists():
             raise RequestError(f"'{file}' exists; choose another name, or remove it")
@@ -77,6 +78,7 @@ def _written(exact: MeshFields, reduced: MeshFields) -> bytes:
         for name, first in exact.at_points.items()
         for kind, values in _compared(first, reduced.at_points[name])
     }
+    # Fields of some types of cells are NaN in the others: VTK wants every field in all cells.
     in_cells = defaultdict[str, list[Array]](lambda: [np.full(len(each), np.nan) for each in exact.cells.values()])
     for place, owner in enumerate(exact.cells):
         for name, first in exact.in_cells.get(owner, {}).items():
