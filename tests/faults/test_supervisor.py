@@ -153,12 +153,6 @@ def test_a_process_without_memory_is_replaced(run: Run) -> None:
     assert isinstance(run(Whole("fine")), Done)
 
 
-def test_a_finish_that_dies_is_tried_once_more_with_what_is_there(run: Run) -> None:
-    found = run(InItems(("fine", "fine"), at_end="exit"))
-    assert isinstance(found, Failed)
-    assert found.status is Status.CRASHED
-
-
 @pytest.mark.usefixtures("new_workers")
 @pytest.mark.parametrize("kind", ["child", "daemon"])
 def test_what_a_plugin_started_ends_with_its_process(kind: str, watcher: Supervisor, tmp_path: Path) -> None:
@@ -261,14 +255,12 @@ def test_what_is_not_of_an_item_costs_the_cell(run: Run, where: str, how: str, s
     assert found.status is status
 
 
-@pytest.mark.parametrize(
-    ("how", "status"), [("sleep", Status.TIMEOUT), ("hang", Status.TIMEOUT), ("segfault", Status.CRASHED)]
-)
-def test_a_whole_stage_that_hangs_or_dies_is_said_so(run: Run, how: str, status: Status) -> None:
-    found = run(Whole(how), cell=0.5 if status is Status.TIMEOUT else 30.0)
-    assert isinstance(found, Failed)
-    assert found.status is status
-    assert isinstance(run(Whole("fine")), Done)  # the next one has a new process
+def test_a_whole_stage_that_hangs_or_dies_is_said_so(run: Run) -> None:
+    for how, status in (("sleep", Status.TIMEOUT), ("hang", Status.TIMEOUT), ("segfault", Status.CRASHED)):
+        found = run(Whole(how), cell=0.5 if status is Status.TIMEOUT else 30.0)
+        assert isinstance(found, Failed)
+        assert found.status is status
+        assert isinstance(run(Whole("fine")), Done)  # the next one has a new process
 
 
 def test_a_process_that_forks_answers_once(run: Run) -> None:

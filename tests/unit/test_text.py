@@ -32,23 +32,14 @@ def test_what_is_printable_is_not_touched(text: str) -> None:
     assert printable(text) == unbroken(text) == brief(text) == one_line(text) == text
 
 
-@pytest.mark.parametrize(
-    ("text", "shown"),
-    [
+def test_what_is_not_printable_is_shown_as_an_escape() -> None:
+    for text, shown in (
         ("\x1b[31mred", r"\u001b[31mred"), ("\ud800", r"\ud800"), ("a\r\nb", r"a\r\nb"), ("\u202eabc", r"\u202eabc"),
         ("\x00\x7f\x9b", r"\u0000\u007f\u009b"), ("\U000e0001", r"\udb40\udc01"), ("a\u00a0b", r"a\u00a0b"),
         (r"\u001b", r"\u001b"), ("a b", "a b"),
-    ],
-)  # fmt: skip
-def test_what_is_not_printable_is_shown_as_an_escape(text: str, shown: str) -> None:
-    assert printable(text) == shown
-
-
-def test_lines_stay_lines() -> None:
+    ):  # fmt: skip
+        assert printable(text) == shown
     assert printable_lines("a\n\x1bb\r\n") == "a\n\\u001bb\\r\n"
-
-
-def test_one_line_has_single_spaces() -> None:
     assert one_line("  the wire\n\tsnapped\u2028 twice ") == "the wire snapped twice"
 
 
@@ -57,22 +48,14 @@ def test_json_has_the_same_content_afterwards(content: object) -> None:
     assert json.loads(printable(json.dumps(content, ensure_ascii=False))) == content
 
 
-@pytest.mark.parametrize("clean", [brief, one_line])
-@pytest.mark.parametrize("unit", ["x", "x ", "\x1b", "µ", "\n"])
-def test_a_long_text_is_cut_and_says_how_long_it_was(clean: object, unit: str) -> None:
-    assert callable(clean)
-    text = unit * 50_000
-    shown = clean(text)
-    assert shown.endswith(f"… ({len(text)} characters)")
-    assert len(shown) <= LONGEST
-    assert clean(shown) == shown
-
-
-def test_the_message_of_an_exception_is_one_short_line() -> None:
-    line = in_a_line(RuntimeError("the wire\nsnapped \x1b[2J\ud800" + 50_000_000 * "x"))
-    assert line.startswith(r"RuntimeError: the wire snapped \u001b[2J\ud800xxx")
-    assert line.endswith("… (50000036 characters)")
-    assert len(line) <= LONGEST
+def test_a_long_text_is_cut_and_says_how_long_it_was() -> None:
+    for clean in (brief, one_line):
+        for unit in ("x", "x ", "\x1b", "µ", "\n"):
+            text = unit * 50_000
+            shown = clean(text)
+            assert shown.endswith(f"… ({len(text)} characters)")
+            assert len(shown) <= LONGEST
+            assert clean(shown) == shown
 
 
 class UnreadableError(Exception):
@@ -80,8 +63,12 @@ class UnreadableError(Exception):
         raise ValueError("not to be read")
 
 
-def test_an_exception_without_a_readable_message_has_its_name() -> None:
+def test_the_message_of_an_exception_is_one_short_line() -> None:
     assert in_a_line(UnreadableError()) == "UnreadableError: its message cannot be read"
+    line = in_a_line(RuntimeError("the wire\nsnapped \x1b[2J\ud800" + 50_000_000 * "x"))
+    assert line.startswith(r"RuntimeError: the wire snapped \u001b[2J\ud800xxx")
+    assert line.endswith("… (50000036 characters)")
+    assert len(line) <= LONGEST
 
 
 @given(st.floats(1e-15, 1.0), st.floats(1.0 + 1e-12, 100.0))
