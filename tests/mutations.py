@@ -111,7 +111,7 @@ FAULTS = (
         "vibench/reduction/cones.py",
         "if not len(stale):",
         "if True:",
-        ("tests/unit/reduction/test_lazy_greedy.py",),
+        ("tests/unit/reduction/test_cones.py",),
     ),
     Fault(
         "coefficientwise-constraint-dropped",
@@ -224,7 +224,7 @@ FAULTS = (
         "vibench/stability/infsup.py",
         "return max(0.0, float(np.min(M[positive] / G[positive])) - len(G) * negative)",
         "return max(0.0, float(np.min(M[positive] / G[positive])))",
-        ("tests/unit/stability/test_conic_infsup.py",),
+        ("tests/unit/stability/test_infsup.py",),
     ),
     Fault(
         "bound-without-the-mismatch",
@@ -294,7 +294,7 @@ FAULTS = (
         "vibench/qp/exact.py",
         "np.maximum(-forces, 0.0)",
         "0.0 * forces",
-        ("tests/unit/qp/test_rows.py", "tests/unit/model/test_hard_rows.py"),
+        ("tests/unit/qp/test_exact.py", "tests/unit/model/test_hard_rows.py"),
     ),
     Fault(
         "coordinates-without-their-round-off",
