@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import pandas as pd
 from matplotlib.figure import Figure
-from page import SECONDS, Page, made_by, origin, read, start
+from page import CERTIFIED, SECONDS, Page, made_by, origin, read, start
 
 from vibench.report.figures.style import Sheet, look_of, scatter, styled
 from vibench.results import ranking
-from vibench.study.cells import CERTIFIED, FEASIBLE, UNCORRECTED
+from vibench.study.cells import FEASIBLE, UNCORRECTED
 from vibench.study.parameter_sets import OWN
 from vibench_problems.paper.published import PROBLEMS
 

@@ -46,6 +46,9 @@ LIMITATIONS = {
 NAMED = 6
 """Curves whose names the alternative text of a figure gives."""
 
+CERTIFIED = "certified"
+"""Assembly of queries with bounds, in committed tables."""
+
 SECONDS = "Seconds are CPU seconds on one thread."
 
 
@@ -176,8 +179,20 @@ def made_by(script: str, target: str, *studies: str, options: str = "") -> str:
 
 
 def read(run: str | Path, table: str) -> pd.DataFrame:
-    """A table of a run, its rows in the order of the axes."""
-    return in_order(read_table(results_file(str(run)), table))
+    """A table of a run, its rows in the order of the axes, in the words of the tables that are committed.
+
+    There the assembly of queries with bounds is "certified", and that of the formulation `compiled` is "compiled".
+    """
+    frame = in_order(read_table(results_file(str(run)), table))
+    for side in ("", "_a", "_b"):
+        if (name := f"assembly{side}") not in frame:
+            continue
+        compiled = frame[f"formulation{side}"] == "compiled"
+        ways = frame[name].mask(frame[f"bounds{side}"] == 1, CERTIFIED).mask(compiled, "compiled")
+        frame[name], frame[f"formulation{side}"] = ways, frame[f"formulation{side}"].mask(compiled, "mixed")
+        if not side and compiled.any() and frame["solver"].nunique() == 2:
+            frame["solver"] = frame["solver"].mask(compiled, next(one for one in frame["solver"] if one != "–"))
+    return frame.drop(columns=["bounds", "bounds_a", "bounds_b"], errors="ignore")
 
 
 def origin(*cells: pd.DataFrame) -> str:

@@ -10,14 +10,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pandas as pd
-from page import SECONDS, Page, alternative, escaped, made_by, origin, read, start, write_figure
+from page import CERTIFIED, SECONDS, Page, alternative, escaped, made_by, origin, read, start, write_figure
 
 from vibench.report import figures
 from vibench.report.figures.style import caption_of, styled
 from vibench.results import formats
 from vibench.results.ranking import relative_bounds
 from vibench.results.read import read_table, results_file
-from vibench.study.cells import CERTIFIED
 from vibench_problems.paper.evidence import SOLVER, Evidence
 from vibench_problems.paper.tables import columns
 

@@ -16,13 +16,12 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
-from page import SECONDS, Page, made_by, origin, read, start
+from page import CERTIFIED, SECONDS, Page, made_by, origin, read, start
 
 from vibench import HighFidelitySolver, create
 from vibench.highfidelity.active_set import solve_high_fidelity
 from vibench.report.figures.style import STYLE, CaptionedFigure
 from vibench.results import formats
-from vibench.study.cells import CERTIFIED
 from vibench.study.matrix import read_study
 from vibench.timing import timed
 

@@ -74,7 +74,7 @@ def solved(problem: Problem, count: int) -> str:
 def compared(problem: Problem, mus: Array) -> Iterator[tuple[str, float, float, float]]:
     """Kind of a bound, bound, error, and the size that round-off is relative to, of a certified model at `mus`."""
     dual, primal = create("dual strategy", "mcpg"), create("primal strategy", "offline-pga")
-    reduction = Reduction(problem, dual, primal, Stop(1e-4), Stop(1e-2), tolerance=0.5, assembly="certified")
+    reduction = Reduction(problem, dual, primal, Stop(1e-4), Stop(1e-2), tolerance=0.5, assembly="reduced", bounds=True)
     model, solver, kept, constants = reduction.model, HighFidelitySolver(problem), assemblies(problem), None
     for mu in mus:
         exact, found, corrected = solver.solve(mu), model.solve(mu), model.solve(mu, corrected=True)

@@ -262,5 +262,5 @@ def test_queries_that_went_well_before_the_solver_died_are_kept(vibench: Vibench
     assert [query["status"] for query in lost] == ["crashed", "crashed", "ok"]
     assert lost[2]["error_u"] == pytest.approx(kept[2]["error_u"])
     for query, reference in zip(lost, kept, strict=True):
-        for name in ("mu_1", "hf_s", "beta_span", "beta_full_cone_lower", "beta_hf_span", "bounds"):
+        for name in ("mu_1", "hf_s", "beta_span", "beta_full_cone_lower", "beta_hf_span", "beta_bounds"):
             assert query[name] == reference[name]

@@ -113,7 +113,7 @@ def test_the_signorini_problem_of_freefem_has_a_certified_model(freefem: Path) -
     pack = vibench.create("problem", "pack", {"path": str(freefem / "signorini")})
     dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
     given = vibench.Stop(1e-2), vibench.Stop(1e-2)
-    model = vibench.Reduction(pack, dual, primal, *given, tolerance=0.5, assembly="certified").model
+    model = vibench.Reduction(pack, dual, primal, *given, tolerance=0.5, assembly="reduced", bounds=True).model
     solver, in_contact = vibench.HighFidelitySolver(pack), 0
     for mu in pack.parameters.sample(12, 7):
         exact, A = solver.solve(mu), pack.assemble(mu).A
@@ -143,7 +143,7 @@ def test_a_block_in_space_of_freefem_has_the_pressure_of_uniform_compression(fre
     assert 0 < np.count_nonzero(curved.lam) < len(curved.lam)
     dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
     given = vibench.Stop(1e-2), vibench.Stop(1e-2)
-    model = vibench.Reduction(pack, dual, primal, *given, tolerance=0.5, assembly="certified").model
+    model = vibench.Reduction(pack, dual, primal, *given, tolerance=0.5, assembly="reduced", bounds=True).model
     for mu in pack.parameters.sample(4, 7):
         exact, A, found = solver.solve(mu), pack.assemble(mu).A, model.solve(mu)
         assert found.bound is not None

@@ -143,7 +143,7 @@ def test_rows_of_a_negative_control_are_ok_and_keep_the_invariants(
     control: Array = value_of(store, cone).cone.generators
     assert found.cell["R"] == control.shape[1]
     queries = pd.DataFrame(found.queries).assign(cell="a")
-    assert set(queries["bounds"]) == {"span/span"}
+    assert set(queries["beta_bounds"]) == {"span/span"}
     assert set(queries["form"]) == {"primal"}  # opposite constraints leave the dual singular
     assert violations(_complete(queries), pd.Series({"a": "fixed"})) == []
 

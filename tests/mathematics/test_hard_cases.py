@@ -74,7 +74,8 @@ def test_certified_models_of_hard_problems_have_bounds_that_hold(problem: Affine
         Stop(1e-4),
         Stop(1e-2),
         tolerance=0.5,
-        assembly="certified",
+        assembly="reduced",
+        bounds=True,
     )
     model, solver, kept = reduction.model, HighFidelitySolver(problem), assemblies(problem)
     for mu in problem.parameters.sample(10, 7):

@@ -153,7 +153,8 @@ def replay_query(
 PRIORITY = (
     "run", "what", "verdict", "before", "after", "ratio", "cells", "equal", "worse", "better", "changed", "problem",
     "formulation", "dual", "primal", "solver", "asked", "interval", "within accuracy", "within limit", "undecided",
-    "farthest ratio", "against", "accuracy", "assembly", "correction", "cell", "study", "ok", "only here", "same code",
+    "farthest ratio", "against", "accuracy", "assembly", "bounds", "correction", "cell", "study", "ok",
+    "only here", "same code",
     "in all runs", "machine", "seed", "validation",
 )  # fmt: skip
 

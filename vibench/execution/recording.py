@@ -183,6 +183,7 @@ def cell_columns(cell: Cell) -> dict[str, Any]:
         without |= {name: NO_SUCH_AXIS, f"{name}_options": "{}"} if plugin is None else {}
     how = {"formulation": cell.formulation_label, "formulation_options": cell.formulation.options}
     solved = {"solver": cell.solver or NO_SUCH_AXIS, "accuracy": cell.accuracy, "assembly": cell.assembly}
+    solved["bounds"] = int(cell.bounds)
     columns = axis_columns(cell.axes, labels_of([cell])) | without | how | solved | {"correction": cell.correction}
     return {name: columns.get(name) for name in KEYS}
 

@@ -38,6 +38,7 @@ RUNTIME = "reduced_model.py"
 RECORDED = (
     "cell", "problem", "problem_options", "training", "training_options", "dual", "dual_options", "primal",
     "primal_options", "pod_tol", "pod_size", "dual_tol", "dual_size", "primal_tol", "solver", "accuracy", "assembly",
+    "bounds",
     "correction", "queries", "queries_ok", "snapshots", "N", "R", "enrichment", "error_u_mean", "error_u_max",
     "error_lambda_mean", "error_lambda_max", "assembly_error_max", "seed", "validation", "validation_options", "code",
     "versions", "definition",

@@ -19,7 +19,7 @@ from vibench.offline.models import Model
 def reason_for_none(certificate: OnlineCertificate | None) -> str:
     """Why an exported model cannot bound its errors; "" if it can."""
     if certificate is None:
-        return 'its cell has no bounds, they need assembly = "certified"'
+        return "its cell has no bounds: they need bounds = true"
     if certificate.prepared is None or certificate.base.bound_terms is None:
         return (
             "they need B(mu) and g(mu) on all contact unknowns, which the code of the problem evaluates unless B is "

@@ -46,7 +46,7 @@ from vibench.reduction.pod import POD, pod
 from vibench.stability.infsup import ConeBasis, cone_basis
 from vibench.text import brief
 
-Assembly: TypeAlias = Literal["full", "reduced", "certified"]
+Assembly: TypeAlias = Literal["full", "reduced"]
 """How a model assembles its programs, as in a study."""
 
 
@@ -70,11 +70,13 @@ class Reduction:
     training
         A sampling strategy in place of the problem's own training set.
     assembly, interpolation
-        "full", "reduced" or "certified" as in a study, and the tolerance of empirical interpolation of the latter two.
+        "full" or "reduced" as in a study, and the tolerance of empirical interpolation of the latter.
     solver, accuracy
         QP solver of the model's queries, and the relative accuracy that it has to reach.
     formulation
         The formulation of the model, by default that of studies which name none.
+    bounds
+        Whether the model has error bounds at online cost; that needs reduced assembly.
 
     Raises
     ------
@@ -94,6 +96,7 @@ class Reduction:
     solver: str = "piqp"
     accuracy: float = 1e-9
     formulation: Formulation | None = None
+    bounds: bool = False
 
     def __post_init__(self) -> None:
         classes = {
@@ -110,9 +113,7 @@ class Reduction:
                     f"{name} is {brief(repr(value), 80)}, expected a Stop: Stop(tolerance=…) or Stop(size=…)"
                 )
         if not isinstance(self.assembly, str) or self.assembly not in get_args(Assembly):
-            raise RequestError(
-                f"assembly is {brief(repr(self.assembly), 80)}, expected 'full', 'reduced' or 'certified'"
-            )
+            raise RequestError(f"assembly is {brief(repr(self.assembly), 80)}, expected 'full' or 'reduced'")
         for name in ("interpolation", "accuracy"):
             value = getattr(self, name)
             if not isinstance(value, int | float | np.number) or not 0.0 < value < 1.0:
@@ -262,11 +263,11 @@ class Reduction:
                 raise RequestError(f"{name} uses '{axis}': the offline phase needs {what}")
         built = check_built(formulation.build(self))
         made = Model(formulation, self, built, self.solver if "solvers" in uses else None, self.accuracy)
-        if self.assembly != "certified":
+        if not self.bounds:
             return made
         if not formulation.has_certificate:
             raise RequestError(f"{name} has no certificate: no bounds at online cost")
-        return replace(made, certificate=self.certificate)
+        return replace(made, certificate=made.online.certificate(self))
 
     @cached_property
     def certificate(self) -> OnlineCertificate:

@@ -21,7 +21,7 @@ from vibench.results.sqlite import FILE, read_meta, study_of
 from vibench.stability.infsup import VANISHES
 
 # Columns that identify cells in a comparison; "asked" has all tolerances, or sizes.
-AXES = ("problem", "formulation", "dual", "primal", "asked", "solver", "accuracy", "assembly", "correction")
+AXES = ("problem", "formulation", "dual", "primal", "asked", "solver", "accuracy", "assembly", "bounds", "correction")
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,7 +288,9 @@ def _break_evens(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator
             verdict = ChangeKind.CHANGED
         elif ChangeKind.WORSE in own and verdict is ChangeKind.CHANGED and after.meaning == Meaning.NEVER:
             verdict = ChangeKind.WORSE
-        cell = row | {name: row[f"{name}_b"] for name in ("cell", "formulation", "primal", "assembly", "primal_tol")}
+        cell = row | {
+            name: row[f"{name}_b"] for name in ("cell", "formulation", "primal", "assembly", "bounds", "primal_tol")
+        }
         other = row["primal_a"] if row["formulation_a"] == row["formulation_b"] else row["formulation_a"]
         if verdict is not None:
             yield Difference(cell, f"break-even against {other}", str(before), str(after), verdict)

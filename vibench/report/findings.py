@@ -232,7 +232,8 @@ def _corrections(data: ProblemTables) -> Iterator[str]:
     """Effect of the correction of all solutions on errors and seconds, against the same models without it."""
     model = [name for name in KEYS if name != "correction"]
     both = data.cells.merge(data.cells[data.cells["correction"] == UNCORRECTED], on=model, suffixes=("", "_without"))
-    for assembly, cells in both[both["correction"] == FEASIBLE].groupby("assembly", sort=False):
+    for (how, bounds), cells in both[both["correction"] == FEASIBLE].groupby(["assembly", "bounds"], sort=False):
+        assembly = f"{how} assembly{' and bounds' * bool(bounds)}"
         ratios = {
             name: cells[f"{column}_without"] / cells[column]
             for name, column in (("u", "error_u_mean"), ("λ", "error_lambda_mean"), ("query", "online_s"))
@@ -240,7 +241,7 @@ def _corrections(data: ProblemTables) -> Iterator[str]:
         medians, best = {name: values.median() for name, values in ratios.items()}, ratios["λ"].max()
         if np.isfinite([*medians.values(), best]).all():
             yield (
-                f"Correction of all solutions, with {assembly} assembly, divides the mean error of u by "
+                f"Correction of all solutions, with {assembly}, divides the mean error of u by "
                 f"{medians['u']:.2g} and that of λ by {medians['λ']:.2g} in the median of "
                 f"{_number(len(cells), 'model')}, of λ by at most {best:.2g}; a query takes "
                 f"{1.0 / medians['query']:.2g} times as long."

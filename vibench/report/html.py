@@ -293,7 +293,7 @@ def way(winner: Winner) -> str:
 
 def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, str]]:
     yield "study", ", ".join(f"{key} {value}" for key, value in study.items())
-    for axis in ("problem", "formulation", "dual", "primal", "solver", "accuracy", "assembly", "correction"):
+    for axis in ("problem", "formulation", "dual", "primal", "solver", "accuracy", "assembly", "bounds", "correction"):
         yield axis, ", ".join(str(name) for name in cells[axis].unique())
     yield "cells", f"{len(cells)}, {int(cells['queries'].fillna(0).sum())} queries"
     yield "machine", "; ".join(str(name) for name in cells["machine"].unique())
@@ -308,7 +308,7 @@ def _grids(read: Mapping[str, pd.DataFrame]) -> Iterator[TableGrid]:
     """The tables of the page, those of failures first; a table without rows is none."""
     cells, thresholds = read["cells"], read["thresholds"]
     keys = short_keys(cells["cell"])
-    identity = ["problem", "formulation", "dual", "primal", "primal_tol", "solver", "accuracy", "assembly"]
+    identity = ["problem", "formulation", "dual", "primal", "primal_tol", "solver", "accuracy", "assembly", "bounds"]
     identity += ["correction", "status"]
     failed = cells[cells["status"] != Status.OK][["cell", *identity, "queries_ok", "queries", "reason"]]
     queries = read["queries"]
@@ -341,6 +341,6 @@ def _grids(read: Mapping[str, pd.DataFrame]) -> Iterator[TableGrid]:
     caption = "Any two solvers on one reduced model: relative differences of u in V, and the differences allowed."
     disagreements = in_order(read["disagreements"])
     disagreements = disagreements[["solver_a", *disagreements.columns.drop(["solver_a", "problem_options"])]]
-    axes = ["problem", "dual", "primal", "primal_tol", "accuracy", "assembly", "solver_a", "solver_b"]
+    axes = ["problem", "dual", "primal", "primal_tol", "accuracy", "assembly", "bounds", "solver_a", "solver_b"]
     grids.append(grid_of("disagreements", "Agreement of the solvers", caption, disagreements, axes, keys))
     return (grid for grid in grids if len(grid.frame))

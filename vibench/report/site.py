@@ -230,7 +230,7 @@ class PublishedRun:
                 "axes": [
                     str(row["problem"]), str(row["dual"]), _model(row),
                     f"{asked(row, 'pod')}, {asked(row, 'dual')}", solver_text(row),
-                    way(row["assembly"], row["correction"]) or "full",
+                    way(row["assembly"], row["bounds"], row["correction"]) or "full",
                 ],
                 "status": str(row["status"]),
                 "numbers": [cell_text(row[name]) for name in SHOWN_CELLS],

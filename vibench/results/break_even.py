@@ -16,7 +16,7 @@ from vibench.interfaces.strategies import Kind
 from vibench.plugins.registry import default_formulation
 from vibench.results.paired_timing import CONDITIONS, PairedTiming
 from vibench.results.schema import KEYS, STORED
-from vibench.study.cells import CERTIFIED, NO_SUCH_AXIS
+from vibench.study.cells import NO_SUCH_AXIS
 
 # Draws of seconds that other runs might measure, from which intervals are taken.
 DRAWS = 2000
@@ -209,12 +209,13 @@ def _compared(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     """Whether b replaces a: fixed enrichment a per-parameter one, or a certified query the same without certificate."""
     if _as_certified(a, b):
         return bool(a["enrichment_kind"] == Kind.PER_PARAMETER and b["enrichment_kind"] == Kind.FIXED)
-    return a["assembly"] == "reduced" and all(a[name] == b[name] for name in ("primal", "primal_options", "primal_tol"))
+    same = all(a[name] == b[name] for name in ("primal", "primal_options", "primal_tol"))
+    return a["assembly"] == "reduced" and not a["bounds"] and same
 
 
 def _as_certified(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     """Whether both have certificates or none has."""
-    return bool((a["assembly"] == CERTIFIED) == (b["assembly"] == CERTIFIED))
+    return bool(a["bounds"] == b["bounds"])
 
 
 def _comparison(
@@ -280,7 +281,8 @@ def _row(one: BreakEvenComparison) -> dict[str, Any]:
     a, b, result = one.a or _high_fidelity(one.b), one.b, one.result
     row = {name: a[name] if _is_blank(b[name]) else b[name] for name in _shared_axes()}
     for side, cell, online in zip("ab", (a, b), one.online, strict=True):
-        row |= {f"{name}_{side}": cell[name] for name in ("cell", "formulation", "primal", "primal_tol", "assembly")}
+        own = ("cell", "formulation", "primal", "primal_tol", "assembly", "bounds")
+        row |= {f"{name}_{side}": cell[name] for name in own}
         row |= {f"offline_{side}_s": cell["offline_s"], f"online_{side}_s": online}
     numbers = {"benefit_threshold": result.number, "threshold_low": result.low, "threshold_high": result.high}
     low, high = one.gain or (None, None)
@@ -296,5 +298,6 @@ def _high_fidelity(b: Mapping[str, Any]) -> Mapping[str, Any]:
         "primal": HIGH_FIDELITY,
         "primal_tol": None,
         "assembly": "",
+        "bounds": None,
     }
     return {**b, **model, "offline_s": b["hf_setup_s"]}

@@ -64,10 +64,10 @@ def _violations(rows: pd.DataFrame, kinds: pd.Series) -> Iterator[Violation]:
         below = rows[name].astype(float) < 1.0 - 1e-10
         if below.any():
             yield Violation(f"{name} ≥ 1", int(below.sum()), float(1.0 - rows[name].min()))
-    # Other formulations than the mixed one have no constants.
-    rows = rows[rows["bounds"].notna()]
+    # Formulations without programs have no constants.
+    rows = rows[rows["beta_bounds"].notna()]
     queries, kind = rows.filter(regex="^beta_(full_|plain_|hf_)?(span|cone_)").astype(float), rows["cell"].map(kinds)
-    signed = ~rows["bounds"].str.startswith("span/")
+    signed = ~rows["beta_bounds"].str.startswith("span/")
     scale = queries["beta_full_cone_upper"]
     for larger, smaller in (("full_", ""), ("", "plain_"), ("full_", "hf_")):
         inside = signed if smaller == "hf_" else signed | True

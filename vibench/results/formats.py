@@ -140,7 +140,7 @@ def name_of_cell(row: Mapping[str, Any] | pd.Series) -> str:
     """A cell by all its axes, as `Cell` prints itself."""
     tolerance = "" if pd.isna(row["primal_tol"]) else f" {row['primal_tol']:g}"
     sizes = ", ".join(text for axis in ("pod", "dual") if (text := asked(row, axis)) != NO_SUCH_AXIS)
-    how = "" if row["assembly"] == "full" else f" · {row['assembly']}"
+    how = "" if row["assembly"] == "full" else f" · {row['assembly']}{' with bounds' * bool(row['bounds'])}"
     how += "" if row["correction"] == "none" else f" · corrected: {row['correction']}"
     trained = "" if row["training"] == "own" else f" ({row['training']})"
     formulation = "" if row["formulation"] == default_formulation() else row["formulation"]

@@ -354,7 +354,7 @@ def model_row(cell: Mapping[str, Any], setup: float, solution: float) -> dict[st
     row |= {"formulation": "", "formulation_options": "{}"}
     row |= {"dual_options": "{}", "cell": "", "primal": HIGH_FIDELITY, "dual": "", "training": cell.get("training")}
     row |= {"error_u_mean": 0.0, "error_lambda_mean": 0.0, "offline_s": setup, "online_s": solution, "hf_s": solution}
-    return row | {"solver": "", "assembly": "", "correction": "none", "disturbed": 0}
+    return row | {"solver": "", "assembly": "", "bounds": None, "correction": "none", "disturbed": 0}
 
 
 def _fastest(cells: pd.DataFrame, index: Any, paired: PairedTiming | None) -> Winner:

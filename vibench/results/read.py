@@ -100,7 +100,7 @@ def _order(names: Collection[str]) -> list[str]:
     """Those of the columns with these names by which rows are sorted."""
     order = (
         *KEYS, "formulation_a", "formulation_b", "primal_a", "primal_b", "primal_tol_a", "primal_tol_b", "assembly_a",
-        "assembly_b", "stage", "quantity", "query", "step",
+        "bounds_a", "assembly_b", "bounds_b", "stage", "quantity", "query", "step",
     )  # fmt: skip
     return [name for name in order if name in names]
 

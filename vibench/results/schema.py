@@ -11,7 +11,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 # Increase it with every change of the schema: a results file of another version is refused.
-VERSION = 19
+VERSION = 20
 
 
 class SqlType(StrEnum):
@@ -108,10 +108,11 @@ KEYS: Mapping[str, Column] = {
     "dual_tol": real("1", "Tolerance δ_dual of the cone; empty where the study prescribes R.", "δ_dual", 3),
     "dual_size": integer("Prescribed R; empty where the study gives a tolerance."),
     "primal_tol": real("1", "Tolerance δ of the primal strategy; empty for strategies that take none.", "δ", 6),
-    "solver": text("QP solver; compiled programs use none, and – stands for that of a formulation.", "solver", 7),
+    "solver": text("QP solver; – stands for that of a formulation.", "solver", 7),
     "accuracy": real("1", "Relative accuracy prescribed to the solver; empty for formulations that reach none.",
         "accuracy", 8),
-    "assembly": text("Assembly of queries: full, reduced, certified (reduced with bounds), compiled.", "assembly", 9),
+    "assembly": text("Assembly of queries: full or reduced.", "assembly", 9),
+    "bounds": integer("1 if queries have error bounds at online cost, else 0.", "bounds", 9),
     "correction": text("Which solutions are corrected: none, feasible (all), auto (where ω > ρ); errors are of the "
         "corrected pair.", "correction", 10),
 }  # fmt: skip
@@ -365,7 +366,7 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         **_infsup_constants("beta_full_", "with the whole of V"),
         **_infsup_constants("beta_plain_", "with V_N alone"),
         **_infsup_constants("beta_hf_", "of the high-fidelity pair, whose generators are all basis functions"),
-        "bounds": text("Bounds that determine the interval of the reduced pair, lower/upper."),
+        "beta_bounds": text("Bounds that determine the interval of the reduced pair, lower/upper."),
         "status": text("ok, inaccurate, nonfinite, infeasible, failed, timeout, crashed or error.",
             constraint="NOT NULL"),
         "reason": text("Why the status is not ok."),
@@ -385,7 +386,8 @@ STORED: Mapping[str, Mapping[str, Column]] = {
     "histories": {
         "artefact": text("Hash of the stage it comes from."),
         "stage": text("pod, cone, enrichment or selection; training or validation for diagnostics of the problem."),
-        **_keys_without("formulation", "formulation_options", "solver", "accuracy", "assembly", "correction"),
+        **_keys_without("formulation", "formulation_options", "solver", "accuracy", "assembly", "bounds",
+            "correction"),
         "quantity": text("Name of the quantity."),
         "step": integer("Step of the algorithm, or number of the parameter."),
         "value": real("1", "The value; inf-sup constants are in the unit of β, diagnostics in their own units."),
@@ -410,7 +412,8 @@ STORED: Mapping[str, Mapping[str, Column]] = {
             "that process."),
     },
     "thresholds": {
-        **_keys_without("formulation", "formulation_options", "primal", "primal_options", "primal_tol", "assembly"),
+        **_keys_without("formulation", "formulation_options", "primal", "primal_options", "primal_tol", "assembly",
+            "bounds"),
         "cell_a": text("Cell of model a; empty for the high-fidelity model."),
         "cell_b": text("Cell of model b."),
         "formulation_a": text("Formulation of a; mixed for the high-fidelity model, too, which is the program of V and "
@@ -419,9 +422,11 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "primal_a": text("Model a: its primal strategy, or high-fidelity.", "a", 11),
         "primal_tol_a": real("1", "Tolerance of the primal strategy of a."),
         "assembly_a": text("Assembly of the queries of a.", "assembly a", 12),
+        "bounds_a": integer("1 if the queries of a have bounds.", "bounds a", 12),
         "primal_b": text("Model b: its primal strategy.", "b", 13),
         "primal_tol_b": real("1", "Tolerance of the primal strategy of b.", "δ of b", 15),
         "assembly_b": text("Assembly of the queries of b.", "assembly b", 14),
+        "bounds_b": integer("1 if the queries of b have bounds.", "bounds b", 14),
         "offline_a_s": real("s", "Offline seconds of a.", "offline a [s]", 16),
         "online_a_s": real("s", "Seconds of a query of a, in the blocks of rounds that both share.",
             "online a [ms]", 17),

@@ -31,7 +31,7 @@ from vibench.text import json_object
 # Columns that distinguish rows; where all rows have one value, it stands in the title and takes no room.
 AXES = (
     "problem", "training", "formulation", "dual", "primal", "primal_tol", "solver", "pod_tol", "dual_tol", "accuracy",
-    "assembly", "correction",
+    "assembly", "bounds", "correction",
 )  # fmt: skip
 
 
@@ -67,7 +67,8 @@ def _views() -> dict[str, View]:
     )  # fmt: skip
     of_break_even = (
         "problem", "formulation_a", "formulation_b", "dual", "primal_a", "primal_b", "benefit_threshold",
-        "primal_tol_b", "solver", "assembly_a", "assembly_b", "correction", "threshold_high", "gain", "rounds_missing",
+        "primal_tol_b", "solver", "assembly_a", "bounds_a", "assembly_b", "bounds_b", "correction", "threshold_high",
+        "gain", "rounds_missing",
         "pod_tol", "dual_tol", "accuracy", "online_b_s", "online_a_s", "offline_b_s", "offline_a_s",
     )  # fmt: skip
     of_queries = (
@@ -75,13 +76,13 @@ def _views() -> dict[str, View]:
         "beta_cone_lower", "beta_span", "primal_residual", "dual_residual", "gap", "iterations", "reason",
     )  # fmt: skip
     of_outputs = (
-        "problem", "training", "formulation", "dual", "primal", "primal_tol", "solver", "assembly", "correction",
-        "output", "unit", "error_mean", "error_max", "error_scaled_mean", "scale", "queries_ok", "queries_zero",
-        "pod_tol", "dual_tol", "accuracy", "cell",
+        "problem", "training", "formulation", "dual", "primal", "primal_tol", "solver", "assembly", "bounds",
+        "correction", "output", "unit", "error_mean", "error_max", "error_scaled_mean", "scale", "queries_ok",
+        "queries_zero", "pod_tol", "dual_tol", "accuracy", "cell",
     )  # fmt: skip
     of_disagreements = (
         "solver_a", "solver_b", "problem", "dual", "primal", "primal_tol", "pod_tol", "dual_tol", "accuracy",
-        "assembly", "difference_max", "flagged", "queries", "allowed_worst", "query_flagged",
+        "assembly", "bounds", "difference_max", "flagged", "queries", "allowed_worst", "query_flagged",
     )  # fmt: skip
     of_histories = (
         "stage", "quantity", "step", "value", "problem", "dual", "primal", "primal_tol", "pod_tol", "dual_tol",
@@ -371,7 +372,7 @@ def _best(path: Path, view: View, error: str, largest: float | None, queries: fl
     rows = partial(ranking.cheapest, paired=paired, **asked)
     columns = (
         "problem", "error_below", "formulation", "primal", "primal_tol", "dual", "total_s", "probability",
-        "cheapest_from", "ties", "cell", "error_lambda_mean", "certified_error", "error_u_mean", "assembly",
+        "cheapest_from", "ties", "cell", "error_lambda_mean", "certified_error", "error_u_mean", "assembly", "bounds",
         "total_high_s", "cheapest_until", "solver", "N", "R", "correction", "offline_s", "online_s", "training",
         "accuracy",
     )  # fmt: skip

@@ -31,7 +31,7 @@ from vibench.stages.judging.pairs import error_columns, pair_columns
 from vibench.stages.offline import ReducedCone
 from vibench.stages.query import ModelQuery, ProgramQuery, Queries, run_query
 from vibench.storage.artefacts import Store
-from vibench.study.cells import CERTIFIED, Cell
+from vibench.study.cells import Cell
 from vibench.study.parameter_sets import ParameterSet
 
 
@@ -134,7 +134,7 @@ def cell_queries(cell: Cell, query_seconds: float) -> CellQueries:
     built = FormulationStage(cell.problem, cell.formulation, cell.training, *spaces, cell.interpolation)
     return CellQueries(
         built, cell.validation, cell.solver, cell.accuracy, query_seconds, cell.warm_start,
-        cell.assembly == CERTIFIED, CorrectionMode(cell.correction),
+        cell.bounds, CorrectionMode(cell.correction),
     )  # fmt: skip
 
 
@@ -191,7 +191,7 @@ class _Queries(CellItems):
         for prefix, constants in zip(("beta_", "beta_full_", "beta_plain_"), self._constants, strict=False):
             row |= inf_sup_columns(prefix, constants[number])
         if self._constants:
-            row["bounds"] = self._constants[0][number].sharp
+            row["beta_bounds"] = self._constants[0][number].sharp
         programs = self._queries.programs
         return row if programs is None else row | {"assembly_error": programs.errors[number]}
 

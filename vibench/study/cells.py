@@ -17,9 +17,6 @@ from vibench.plugins.registry import default_formulation, find
 from vibench.provenance import numerical_code
 from vibench.study.parameter_sets import OWN, OWN_TRAINING, ParameterSet
 
-CERTIFIED = "certified"
-"""Assembly of queries that are assembled as reduced ones, and have certificates."""
-
 
 def digest(content: Any) -> str:
     """Short hash of JSON content, independent of the order of keys."""
@@ -56,10 +53,10 @@ class Axes:
 class Cell:
     """A problem, strategies, tolerances, a QP solver, and how queries are assembled and corrected.
 
-    `interpolation` is the tolerance of reduced assembly, `None` for full assembly; certified queries are assembled as
-    reduced ones. What the `formulation` does not use is `None`. `labels` of problem, dual and primal strategy are no
-    part of the identity, nor are those of the parameter sets; nor are `nested_tolerances`, all tolerances of a nested
-    primal strategy in the study, whose enrichments are stages of one.
+    `interpolation` is the tolerance of reduced assembly, `None` for full assembly; `bounds` need the former. What the
+    `formulation` does not use is `None`. `labels` of problem, dual and primal strategy are no part of the identity,
+    nor are those of the parameter sets; nor are `nested_tolerances`, all tolerances of a nested primal strategy in the
+    study, whose enrichments are stages of one.
     """
 
     problem: Plugin
@@ -78,6 +75,7 @@ class Cell:
     formulation: Plugin
     nested_tolerances: tuple[float, ...] = ()
     training: ParameterSet = OWN_TRAINING
+    bounds: bool = False
     correction: str = UNCORRECTED
     formulation_label: str = ""
 
@@ -135,6 +133,8 @@ class Cell:
             name = "compiled" if content["assembly"] == "compiled" else default_formulation()
             plugins["formulation"] = Plugin.of(find(FORMULATION, name), {}, {})
             content["formulation_label"] = name
+        if content["assembly"] in ("certified", "compiled"):  # these were assemblies
+            content["bounds"], content["assembly"] = content["assembly"] == "certified", "reduced"
         for name in PLUGINS:
             content[name] = _installed(plugins[name].moved(places)) if name in plugins else None
         for axis in ("pod", "cone"):
@@ -184,7 +184,7 @@ class Cell:
             stops,
             solver,
         ]
-        way = "" if self.assembly == "full" else f" · {self.assembly}"
+        way = "" if self.assembly == "full" else f" · {self.assembly}{' with bounds' * self.bounds}"
         way += "" if self.correction == UNCORRECTED else f" · corrected: {self.correction}"
         return " · ".join(filter(None, chosen)) + way
 

@@ -162,7 +162,7 @@ def expand(study: Study) -> list[Cell]:
             uses = entry.uses
             offline = _combinations(duals, primals, table, uses)
             for (dual, pod, cone, primal, tolerance), solved in product(offline, _solved(study, entry)):
-                assembly, correction, solver, accuracy = solved
+                (assembly, bounds), correction, solver, accuracy = solved
                 cell = Cell(
                     problem=plugin,
                     dual=None if dual is None else dual[1],
@@ -175,6 +175,7 @@ def expand(study: Study) -> list[Cell]:
                     interpolation=None if assembly == "full" else study.interpolation,
                     warm_start=study.warm_start and entry.kind.takes_start,
                     accuracy=accuracy,
+                    bounds=bounds,
                     correction=correction,
                     training=training,
                     validation=validation,
@@ -233,18 +234,17 @@ def _combinations(
     ]
 
 
-def _solved(study: Study, entry: FormulationEntry) -> list[tuple[str, str, str | None, float | None]]:
-    """Assembly, correction, solver and accuracy of the queries of a formulation, on the axes that it has."""
-    kind, assemblies, corrections = entry.kind, list[str](study.assembly), list[str](study.correction)
-    if "assembly" not in entry.uses:
-        assemblies = [kind.assembled]
-    elif not kind.has_certificate:
-        assemblies = list(dict.fromkeys("reduced" if asked == "certified" else asked for asked in assemblies))
-    if not kind.has_program:
-        corrections = [UNCORRECTED]
-    solvers = study.solver_names() if "solvers" in entry.uses else [None]
-    accuracies = study.accuracy if "accuracy" in entry.uses else [None]
-    return list(product(assemblies, corrections, solvers, accuracies))
+def _solved(study: Study, entry: FormulationEntry) -> list[tuple[tuple[str, bool], str, str | None, float | None]]:
+    """Assembly and bounds, correction, solver and accuracy of queries, as far as a formulation has these axes."""
+    kind, uses = entry.kind, entry.uses
+    assemblies = study.assembly if "assembly" in uses else [kind.assembled]
+    bounded = study.bounds if kind.has_certificate else [False]
+    # Queries in full have no bounds at online cost, whatever is asked for.
+    ways = dict.fromkeys((how, bounds and how == "reduced") for how in assemblies for bounds in bounded)
+    corrections = study.correction if kind.has_program else [UNCORRECTED]
+    solvers = study.solver_names() if "solvers" in uses else [None]
+    accuracies = study.accuracy if "accuracy" in uses else [None]
+    return list(product(ways, corrections, solvers, accuracies))
 
 
 def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
@@ -273,6 +273,7 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
         **({} if cell.solver is None else {"solvers": [cell.solver]}),
         **chosen,
         "assembly": [cell.assembly],
+        "bounds": [cell.bounds],
         "correction": [cell.correction],
         "warm_start": cell.warm_start,
         "tolerances": [tolerances],

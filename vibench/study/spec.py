@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
@@ -181,10 +182,16 @@ class Study(_Model):
     dual: Annotated[list[Entry], MinLen(1), Field(description="Dual strategies. Required by `mixed`.")] = []
     primal: Annotated[list[Entry], MinLen(1), Field(description="Primal strategies. Required by `mixed`.")] = []
     assembly: Annotated[
-        list[Literal["full", "reduced", "certified"]],
+        list[Literal["full", "reduced"]],
         MinLen(1),
         Field(description="How queries are assembled."),
     ] = ["full"]
+    bounds: Annotated[
+        list[bool],
+        MinLen(1),
+        BeforeValidator(as_list),
+        Field(description="Whether queries have error bounds at online cost, with reduced assembly: an axis."),
+    ] = [False]
     correction: Annotated[
         list[Literal["none", "feasible", "auto"]],
         MinLen(1),
@@ -252,17 +259,22 @@ class Study(_Model):
 
 
 def _in_present_words(given: Any) -> Any:
-    """A study in the words of before: `compiled` was an assembly. A warning says what to write now."""
+    """A study in the words of before: "certified" and "compiled" were assemblies. A warning says what to write now."""
     assembly = given.get("assembly") if isinstance(given, dict) else None
-    if not isinstance(assembly, list) or "compiled" not in assembly:
+    if not isinstance(assembly, list) or not (before := {"certified", "compiled"}.intersection(map(str, assembly))):
         return given
-    others = [word for word in assembly if word != "compiled"]
-    formulations = list(given.get("formulation", [default_formulation()])) if others else []
-    formulations += [] if "compiled" in formulations else ["compiled"]
-    written = ", ".join(f'"{name}"' if isinstance(name, str) else str(name) for name in formulations)
-    warnings.warn(f'assembly = "compiled" is a formulation now: write formulation = [{written}]', stacklevel=2)
-    changed = {name: value for name, value in given.items() if name != "assembly"}
-    return changed | ({"assembly": others} if others else {}) | {"formulation": formulations}
+    now = dict(given) | {"assembly": [word for word in assembly if word not in before]}
+    if "certified" in before:
+        now["bounds"] = [False, True] if "reduced" in now["assembly"] else [True]
+        now["assembly"] += [] if "reduced" in now["assembly"] else ["reduced"]
+    if "compiled" in before:
+        named = list(given.get("formulation", [default_formulation()])) if now["assembly"] else []
+        now["formulation"] = [*named, *({"compiled": None}.keys() - {n for n in named if isinstance(n, str)})]
+        now["assembly"] = now["assembly"] or ["reduced"]
+    keys = [key for key in ("formulation", "assembly", "bounds") if key in now and now[key] != given.get(key)]
+    written = "; ".join(f"{key} = {json.dumps(now[key], default=str)}" for key in keys)
+    warnings.warn(f"assembly = {json.dumps(assembly)} is of before; write now: {written}", stacklevel=2)
+    return now
 
 
 def _sampling(entry: SamplingEntry) -> Plugin | None:
@@ -304,6 +316,8 @@ def _check_axes(study: Study) -> None:
         for axis in formulation.uses:
             if not getattr(study, axis, True):
                 raise RequestError(f"{axis}: required, but not given")
+    if any(study.bounds) and "reduced" not in study.assembly:
+        raise RequestError('bounds = true needs assembly = "reduced": without arrays of mesh size there is no other')
 
 
 def _check_given(kind: PluginKind, axis: Sequence[Entry]) -> None:

@@ -60,7 +60,7 @@ def test_a_cell_is_named_by_the_key_columns(cell: Cell) -> None:
         "training_options": "{}", "formulation": "mixed", "formulation_options": "{}", "dual": "widened",
         "dual_options": "{}", "primal": "greedy", "primal_options": "{}", "pod_tol": 1e-2, "pod_size": None,
         "dual_tol": 1e-1, "dual_size": None, "primal_tol": 0.5, "solver": "piqp",
-        "accuracy": cell.accuracy, "assembly": "full", "correction": "none",
+        "accuracy": cell.accuracy, "assembly": "full", "bounds": 0, "correction": "none",
     }  # fmt: skip
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 import scipy.sparse.linalg
-from samples import small_study
+from samples import small_study, with_ways
 
 import vibench
 from vibench.interfaces.affine_problem import AffineProblem
@@ -72,7 +72,7 @@ def model(request: pytest.FixtureRequest, small_run: vibench.Run) -> vibench.Mod
 
 
 def model_of(run: vibench.Run, problem: str, assembly: str) -> vibench.Model:
-    cells = run.cells.set_index(["primal", "problem", "assembly"])
+    cells = with_ways(run.cells).set_index(["primal", "problem", "assembly"])
     return run.model(str(cells.loc[("decorrelated", problem, assembly), "cell"]))
 
 
@@ -133,7 +133,9 @@ def assert_bounded(model: vibench.Model, mu: np.ndarray, u: np.ndarray, lam: np.
 def test_errors_of_polynomials_are_in_the_bounds(tmp_path: Path) -> None:
     """A model whose own error is smaller than what its coarse polynomials miss."""
     problem = [{"name": "obstacle", "options": {"resolution": 150}}]
-    study = small_study("tight", problem, assembly=["certified"], tolerances=[{"pod": [1e-6], "dual": [1e-4]}])
+    study = small_study(
+        "tight", problem, assembly=["reduced"], bounds=[True], tolerances=[{"pod": [1e-6], "dual": [1e-4]}]
+    )
     model = model_of(vibench.run(study, tmp_path / "run", progress=False, jobs=1), "obstacle", "certified")
     certified = certify(model, tmp_path / "model.npz", tolerance=1e-2)
     for mu in model.parameters.sample(20, seed=5):
@@ -173,7 +175,9 @@ def test_expressions_are_exact_in_c_and_bounds_are_certified(tmp_path: Path) -> 
     """The same numbers as those of vibench to round-off, though no polynomial of the file reaches that."""
     dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
     loose = vibench.Stop(tolerance=1e-1)
-    reduction = vibench.Reduction(Expressed(), dual, primal, loose, loose, tolerance=0.3, assembly="certified")
+    reduction = vibench.Reduction(
+        Expressed(), dual, primal, loose, loose, tolerance=0.3, assembly="reduced", bounds=True
+    )
     model = reduction.model
     assert model.certificate is not None
     assert model.certificate.base.guarantee is Guarantee.CERTIFIED

@@ -19,6 +19,7 @@ import scipy.sparse as sp
 from enriching import reduced_from
 from numerics import Varying
 from running import Main, refused
+from samples import with_ways
 
 import vibench
 from vibench.library import exported_certificate, reduced_model
@@ -40,7 +41,7 @@ def run(small_run: vibench.Run) -> vibench.Run:
 
 
 def model_of(run: vibench.Run, problem: str, primal: str = "offline-pga", assembly: str = "reduced") -> vibench.Model:
-    rows = run.cells.set_index(["problem", "primal", "assembly"])
+    rows = with_ways(run.cells).set_index(["problem", "primal", "assembly"])
     return run.model(str(rows.loc[(problem, primal, assembly), "cell"]))
 
 
@@ -561,7 +562,7 @@ def test_one_polynomial_serves_a_and_its_certificate(run: vibench.Run) -> None:
 
 def test_a_file_without_bounds_says_why(run: vibench.Run) -> None:
     for model, c, why in (
-        (model_of(run, "radial-obstacle"), True, 'assembly = "certified"'),
+        (model_of(run, "radial-obstacle"), True, "bounds = true"),
         (certified_model(run), False, "only C programs have them"),
         (certified_model(run), True, ""),
     ):

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from samples import with_ways
 
 import vibench
 from vibench.errors import NumericalError
@@ -16,7 +17,7 @@ from vibench.model.certificates.bounds import OnlineBound, output_error_bound
 
 @pytest.fixture(scope="module")
 def model(small_run: vibench.Run) -> vibench.Model:
-    rows = small_run.cells.set_index(["problem", "primal", "assembly"])
+    rows = with_ways(small_run.cells).set_index(["problem", "primal", "assembly"])
     return small_run.model(str(rows.loc[("obstacle", "decorrelated", "certified"), "cell"]))
 
 

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pandas as pd
 import pytest
-from samples import small_study
+from samples import small_study, with_ways
 
 import vibench
 from vibench.interfaces.validation import validation_parameters
@@ -29,7 +29,8 @@ MODEL = ["problem", "pod_tol", "assembly"]
 @pytest.fixture(scope="module")
 def corrected(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
     study = small_study(
-        "corrected", PROBLEMS, primal=["offline-pga"], assembly=["reduced", "certified"], validation=4, timing_rounds=1,
+        "corrected", PROBLEMS, primal=["offline-pga"], assembly=["reduced"], bounds=[False, True],
+        validation=4, timing_rounds=1,
         correction=["none", "feasible", "auto"],
         tolerances=[{"pod": [1e-2, 1e-4], "dual": [1e-2], "primal": {"offline-pga": [0.5]}}],
     )  # fmt: skip
@@ -37,7 +38,7 @@ def corrected(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
 
 
 def by(run: vibench.Run, correction: str) -> pd.DataFrame:
-    rows = run.queries[run.queries["correction"] == correction]
+    rows = with_ways(run.queries[run.queries["correction"] == correction])
     return rows.set_index([*MODEL, "query"]).sort_index()
 
 
@@ -70,14 +71,14 @@ def test_auto_corrects_where_the_violation_dominates_the_bound_and_leaves_the_ot
     for name in ("error_u", "error_lambda", "violation", "bound_lambda", "bound_online_lambda", "solver_error_lambda"):
         expected = pairs[name].where(rows["corrected"] == 1, plain[name])
         assert np.allclose(rows[name], expected, rtol=1e-12, equal_nan=True), name
-    cells = corrected.cells.set_index([*MODEL, "correction"])
+    cells = with_ways(corrected.cells).set_index([*MODEL, "correction"])
     shares = rows.groupby(MODEL)["corrected"].mean()
     for model, share in shares.items():
         assert cells.loc[(*model, "auto"), "corrected_share"] == share
 
 
 def test_rows_say_what_a_correction_costs_and_its_seconds_are_those_of_the_query(corrected: vibench.Run) -> None:
-    cells = corrected.cells.set_index(["assembly", "correction"]).sort_index()
+    cells = with_ways(corrected.cells).set_index(["assembly", "correction"]).sort_index()
     for assembly, correction in product(("reduced", "certified"), ("none", "feasible", "auto")):
         mine = cells.loc[[(assembly, correction)]]
         asked = {"reduced": "high-fidelity", "certified": "online"}[assembly] if correction != "none" else ""
@@ -92,7 +93,9 @@ def test_rows_say_what_a_correction_costs_and_its_seconds_are_those_of_the_query
 def test_models_answer_as_their_cells_do_and_bounds_hold_at_unseen_parameters(
     corrected: vibench.Run, problem: str
 ) -> None:
-    cells = corrected.cells[corrected.cells["problem"] == problem].set_index(["pod_tol", "assembly", "correction"])
+    cells = with_ways(corrected.cells[corrected.cells["problem"] == problem]).set_index(
+        ["pod_tol", "assembly", "correction"]
+    )
     for tolerance, assembly in product((1e-2, 1e-4), ("reduced", "certified")):
         model = corrected.model(cells.loc[(tolerance, assembly, "feasible"), "cell"])
         V, W = model.problem.V, model.problem.W
@@ -129,7 +132,7 @@ def test_a_query_that_cannot_be_corrected_says_why(corrected: vibench.Run, monke
     )
     monkeypatch.setattr(module, "corrected_pair", lambda *_: None)
     assert corrector.in_full(mu, u, lam).note == BoundNote.NO_CORRECTION
-    model = corrected.model(corrected.cells.set_index("assembly").loc["certified", "cell"].iloc[0])
+    model = corrected.model(with_ways(corrected.cells).set_index("assembly").loc["certified", "cell"].iloc[0])
     solution = model.solve(model.parameters.sample(1, seed=3)[0], corrected=False)
     corrector = Corrector(model.reduced, model.certificate, CorrectionMode.FEASIBLE)
     monkeypatch.setattr(OnlineCertificate, "_corrected_pair", lambda *_: None)

@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from samples import SMALL, small_study
+from samples import SMALL, small_study, with_ways
 
 import vibench
 from vibench.interfaces.problem import MEMBERS
@@ -24,7 +24,7 @@ CELLS = list(product(("online-supremizers", "offline-pga"), ("full", "reduced"))
 
 @pytest.fixture(scope="module", params=CELLS, ids="-".join)
 def model(small_run: vibench.Run, request: pytest.FixtureRequest) -> vibench.Model:
-    rows = small_run.cells.set_index(["problem", "primal", "assembly"])
+    rows = with_ways(small_run.cells).set_index(["problem", "primal", "assembly"])
     return small_run.model(rows.loc[("radial-obstacle", *request.param), "cell"])
 
 
@@ -78,7 +78,7 @@ def test_many_parameters_give_a_table(model: vibench.Model, mus: np.ndarray, cer
         model.solve_all(mus[0])
     with pytest.raises(vibench.RequestError, match="`solve_all` takes an array of parameters"):
         model.solve(mus)
-    bounded = certified.model(str(certified.cells["cell"].iloc[0]))
+    bounded = certified.model(str(certified.cells.set_index("bounds").loc[1, "cell"]))
     table = bounded.solve_all(bounded.parameters.sample(2, seed=0), tolerance=0.5)
     assert {"bound_u_energy", "guarantee", "verdict"} <= set(table)
 
@@ -187,12 +187,12 @@ def test_a_cell_is_named_by_its_beginning(small_run: vibench.Run) -> None:
 @pytest.fixture(scope="module")
 def certified(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
     problem = {"name": "hertz", "options": {"resolution": 300}}
-    study = small_study("certified", [problem], assembly=["reduced", "certified"], validation=3)
+    study = small_study("certified", [problem], assembly=["reduced"], bounds=[False, True], validation=3)
     return vibench.run(study, tmp_path_factory.mktemp("certified") / "run", progress=False, jobs=1)
 
 
 def test_a_certified_model_bounds_its_errors_and_says_whether_they_keep_a_tolerance(certified: vibench.Run) -> None:
-    row = certified.cells.set_index("assembly").loc["certified"]
+    row = with_ways(certified.cells).set_index("assembly").loc["certified"]
     assert (row["certificate"], row["bound_online_violations"]) == ("certified", 0)
     assert row["offline_certificate_s"] > 0.0
     assert row["online_certify_s"] > 0.0
@@ -213,7 +213,7 @@ def test_a_certified_model_bounds_its_errors_and_says_whether_they_keep_a_tolera
 
 
 def test_the_bound_of_the_multiplier_is_in_rows_and_says_what_it_rests_on(certified: vibench.Run) -> None:
-    row = certified.cells.set_index("assembly").loc["certified"]
+    row = with_ways(certified.cells).set_index("assembly").loc["certified"]
     rows = certified.queries[certified.queries["cell"] == row["cell"]]
     assert set(rows["beta_energy_online_note"]) == {BoundNote.ON_BODIES}
     assert (rows["beta_energy_online"] <= rows["beta_energy"] * (1.0 + 1e-2)).all()  # both are moved outwards
@@ -223,7 +223,7 @@ def test_the_bound_of_the_multiplier_is_in_rows_and_says_what_it_rests_on(certif
 
 
 def test_corrected_solutions_satisfy_the_constraints_and_have_bounds_of_their_own(certified: vibench.Run) -> None:
-    model = certified.model(certified.cells.set_index("assembly").loc["certified", "cell"])
+    model = certified.model(with_ways(certified.cells).set_index("assembly").loc["certified", "cell"])
     for mu in model.parameters.sample(5, seed=4):
         plain, corrected, exact = model.solve(mu), model.solve(mu, corrected=True), model.high_fidelity(mu)
         vi, norm = model.problem.assemble(mu), assemblies(model.problem).energy_at(mu)
@@ -240,14 +240,14 @@ def test_corrected_solutions_satisfy_the_constraints_and_have_bounds_of_their_ow
         assert model.problem.W.norm(exact.lam - corrected.lam) <= corrected.bound.lam
         bounds = corrected.error_bounds  # at high-fidelity cost, of the corrected pair
         assert norm.norm(exact.u - corrected.u) <= bounds.u_energy <= corrected.bound.u_energy * (1.0 + 1e-3)
-    uncertified = certified.model(certified.cells.set_index("assembly").loc["reduced", "cell"])
+    uncertified = certified.model(with_ways(certified.cells).set_index("assembly").loc["reduced", "cell"])
     at_mesh_size = uncertified.solve(mu, corrected=True)  # without a certificate: the same, A is constant
     assert (at_mesh_size.bound, at_mesh_size.answer.is_corrected) == (None, True)
     assert model.problem.W.norm(at_mesh_size.lam - corrected.lam) <= 1e-6 * model.problem.W.norm(exact.lam)
 
 
 def test_a_tolerance_needs_a_certificate(certified: vibench.Run) -> None:
-    model = certified.model(certified.cells.set_index("assembly").loc["reduced", "cell"])
+    model = certified.model(with_ways(certified.cells).set_index("assembly").loc["reduced", "cell"])
     assert model.solve([1.0]).bound is None
     with pytest.raises(vibench.RequestError, match="no error bounds"):
         model.solve([1.0], tolerance=1e-2)

@@ -48,6 +48,7 @@ def cell(name: str) -> dict[str, Any]:
         "solver_share_mean": 1e-6,
         "assembly_share_mean": None,
         "definition": "{}",
+        "bounds": 0,
         "disturbed": 0,
     }
     return row | {f"{name}_options": "{}" for name in ("problem", "training", "dual", "primal")}

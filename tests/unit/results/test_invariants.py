@@ -12,7 +12,7 @@ GOOD: dict[str, float | str] = dict.fromkeys(CONSTANTS, 0.1) | dict.fromkeys(
     [name for name in STORED["queries"] if name.startswith("effectivity_")], 1.0
 )
 GOOD |= {f"beta_full_{what}": 0.2 for what in ("span", "cone_lower", "cone_upper")}
-GOOD |= {"bounds": "L0/U0"}
+GOOD |= {"beta_bounds": "L0/U0"}
 KINDS = pd.Series({"a": "fixed", "b": "per-parameter"})
 
 
@@ -65,8 +65,8 @@ def test_per_parameter_enrichments_must_reach_the_whole_space() -> None:
 def test_a_cone_with_free_generators_is_compared_with_the_high_fidelity_pair_over_the_span_alone() -> None:
     above = {"beta_hf_cone_lower": 0.3, "beta_hf_cone_upper": 0.3}
     assert [v.invariant for v in violations(rows(**above), KINDS)] == ["beta_full_cone_upper ≥ beta_hf_cone_lower"]
-    assert violations(rows(**above, bounds="span/span"), KINDS) == []
-    found = violations(rows(**above, bounds="span/U1", beta_hf_span=0.25), KINDS)
+    assert violations(rows(**above, beta_bounds="span/span"), KINDS) == []
+    found = violations(rows(**above, beta_bounds="span/U1", beta_hf_span=0.25), KINDS)
     assert [v.invariant for v in found] == ["beta_full_span ≥ beta_hf_span"]
 
 

@@ -138,7 +138,7 @@ def runs_of_break_even(kind: str, offline_noise: float, rng: np.random.Generator
         offline = 100.0 * np.exp(offline_noise * rng.standard_normal())
         factor = np.exp(1.96 * offline_noise)
         cells.append(
-            dict.fromkeys(keys) | {"cell": cell, "primal": "p", "primal_tol": None, "assembly": "full"}
+            dict.fromkeys(keys) | {"cell": cell, "primal": "p", "primal_tol": None, "assembly": "full", "bounds": 0}
             | {"offline_s": offline, "offline_low_s": offline / factor, "offline_high_s": offline * factor}
             | {"hf_setup_s": 0.0, "hf_s": 1.0, "online_s": 1.0, "enrichment_kind": "fixed"}
         )  # fmt: skip

@@ -40,12 +40,12 @@ TOLERANCES = {
 
 TRAINED = small_study(
     "trained", [{"name": "obstacle", "options": {"resolution": 160}}], training=[RANDOM], validation=2,
-    dual=["mcpg"], tolerances=[TOLERANCES], assembly=["full", "certified"],
+    dual=["mcpg"], tolerances=[TOLERANCES], assembly=["full", "reduced"], bounds=[True],
     primal=["decorrelated", "online-supremizers", "offline-pga", "infsup-greedy", "pod-supremizers"],
 )  # fmt: skip
 ADAPTIVE = small_study(
     "adaptive", [{"name": "radial-obstacle", "options": {"resolution": "coarse"}}], training=[GREEDY], validation=2,
-    dual=["orthant", "enlarged-cpg"], primal=["online-supremizers"], assembly=["full", "certified"],
+    dual=["orthant", "enlarged-cpg"], primal=["online-supremizers"], assembly=["full", "reduced"], bounds=[True],
     formulation=["mixed", *COMPILED],
 )  # fmt: skip
 """Studies that need every sort of stage between them, and most of what plugins can do."""

@@ -166,6 +166,7 @@ OTHER: Mapping[str, Mapping[str, Any]] = {
     "no primal_tol": {"primal_tol": None},
     "solver": {"solver": "osqp"},
     "assembly": {"assembly": "reduced"},
+    "bounds": {"bounds": True},
     "correction": {"correction": "auto"},
     "interpolation": {"interpolation": 1e-6},
     "warm start": {"warm_start": True},

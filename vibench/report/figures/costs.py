@@ -111,8 +111,9 @@ def _of_one_assembly(cells: pd.DataFrame) -> pd.DataFrame:
 
 def _ways(cells: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
     """Dual strategies and ways of a query: title, cells, and as many primal strategies as a panel takes."""
-    for (dual, assembly, correction), mine in cells.groupby(["dual", "assembly", "correction"], sort=False):
-        title = f"{dual}{f', {assembly} assembly' * (assembly != 'full')}"
+    ways = cells.groupby(["dual", "assembly", "bounds", "correction"], sort=False)
+    for (dual, assembly, bounds, correction), mine in ways:
+        title = f"{dual}{f', {assembly} assembly' * (assembly != 'full')}{' with bounds' * bool(bounds)}"
         title += f", {correction_in_words(correction)}" * (correction != UNCORRECTED)
         for part, names in titled_parts(title, [str(name) for name in mine["primal"].unique()]):
             yield part, mine, names

@@ -129,7 +129,7 @@ def problem_tables(
     sizes, problem_columns = ["pod_tol", "pod_size", "dual_tol", "dual_size"], ["problem", "problem_options"]
     for frame in read.values():
         if "assembly" in frame:
-            frame["way"] = _per_combination(frame[["assembly", "correction"]], way)
+            frame["way"] = _per_combination(frame[["assembly", "bounds", "correction"]], way)
         frame["pair"] = _per_combination(frame[sizes].astype(float), lambda *pair: str(pair))
     shown = tuple(pictures.read(path))
     keys = list(dict.fromkeys(read["queries"][[*problem_columns, "training"]].itertuples(index=False, name=None)))
@@ -224,9 +224,10 @@ def correction_in_words(correction: Any) -> Any:
     return {"none": "", "feasible": "corrected", "auto": "corrected where ω > ρ"}.get(correction, correction)
 
 
-def way(assembly: Any, correction: Any) -> str:
-    """Assembly and correction of queries in labels; "" for full assembly without correction."""
-    parts = ("" if assembly == "full" else assembly, correction_in_words(correction))
+def way(assembly: Any, bounds: Any, correction: Any) -> str:
+    """Assembly, bounds and correction of queries in labels; "" for full assembly without correction."""
+    assembled = assembly if isinstance(assembly, str) and assembly != "full" else ""
+    parts = (f"{assembled}{' with bounds' * bool(bounds == 1)}", correction_in_words(correction))
     return ", ".join(part for part in parts if isinstance(part, str) and part)
 
 
@@ -275,7 +276,7 @@ def whole(number: Any) -> str:
 
 def label_of(row: Any) -> str:
     """The `label` of a row of the cells or the queries table."""
-    return label(row["primal"], row["primal_tol"], way(row["assembly"], row["correction"]))
+    return label(row["primal"], row["primal_tol"], way(row["assembly"], row["bounds"], row["correction"]))
 
 
 def point_names(cells: pd.DataFrame) -> dict[Any, str]:
