@@ -21,8 +21,8 @@ from vibench.qp.exact import least_distance_solution, rows_that_matter
 from vibench.qp.scaling import peak, ratio, row_norms
 from vibench.qp.solve import solve_qp
 
+# Largest natural residual of a snapshot (`vibench.qp.verification`).
 ACCURACY = 1e-10
-"""Largest natural residual of a snapshot (`vibench.qp.verification`)."""
 
 FALLBACK_SOLVER = "piqp"
 
@@ -298,7 +298,8 @@ def _refined(vi: VariationalInequality, stiffness: CondensedStiffness, u: Array,
     system = stiffness.active_set_system(VariationalInequality(vi.A, residual, vi.B, -excess))
     try:
         change, forces = system.holding(active)
-    except (RuntimeError, np.linalg.LinAlgError):  # dependent constraints: nothing better is known
+    except (RuntimeError, np.linalg.LinAlgError):
+        # The constraints are dependent, and nothing better is known.
         return u, lam
     return u + change, np.maximum(lam + forces, 0.0)
 

@@ -78,11 +78,11 @@ def coarse_contact(solve: Callable[[Array], Array], vi: VariationalInequality) -
     return np.asarray(forces[group] > 0.0)
 
 
+# A factorisation is bordered and reused for active sets that differ from its own in at most so many constraints.
 MAX_BORDER = 16
-"""A factorisation is bordered and reused for active sets that differ from its own in at most so many constraints."""
 
+# Entries of a bordered system below this, relative to their terms, may consist of round-off alone.
 ROUND_OFF = 1e-12
-"""Entries of a bordered system below this, relative to their terms, may consist of round-off alone."""
 
 # From the active constraints to u (c,) and λ (m,): these are equalities, all other multipliers vanish.
 ActiveSolver = Callable[[Indices], tuple[Array, Array]]

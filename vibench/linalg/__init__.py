@@ -2,7 +2,9 @@
 
 import lazy_loader
 
+# The distance from 1 to the next number, and the largest relative error of one operation, which is half of it: a margin
+# that is proved with one of them is wrong by a factor of two with the other.
 EPS = 2.0**-52
-UNIT_ROUND_OFF = 0.5 * EPS  # the largest relative error of one operation; EPS is the distance from 1 to the next number
+UNIT_ROUND_OFF = 0.5 * EPS
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -137,6 +137,7 @@ class PartialCholesky(FactoredElimination):
             matrix = sp.csr_array(matrix)[order][:, order]
         matrix, split = sp.csc_array(matrix), self._split
         self._coupling, self._corner = matrix[split:, :split], matrix[split:, split:]
+        # With columns of the identity in place of the last ones SuperLU leaves the Schur complement alone.
         unit = sp.eye_array(len(order), last, k=-split)
         self._lu, pivots = _pivots(sp.csc_array(sp.hstack([matrix[:, :split], unit])), "NATURAL", name)
         self._root, self._bodies = np.sqrt(pivots[:split]), connected_components(matrix, directed=False)[1][split:]
@@ -269,6 +270,7 @@ def _pivots(matrix: SparseMatrix, permutation: str, name: str) -> tuple[SuperLU,
     except RuntimeError as error:
         raise NumericalError(f"{name} cannot be factorised: {error}") from None
     pivots = lu.U.diagonal()
+    # SuperLU exchanges rows where a diagonal pivot vanishes, even if it is told not to.
     if not np.array_equal(lu.perm_r, lu.perm_c) or not np.all(pivots > 0.0):
         raise NumericalError(f"{name} is not positive definite")
     if permutation == "NATURAL" and not np.array_equal(lu.perm_c, np.arange(len(pivots))):
@@ -296,7 +298,8 @@ def round_off_of_factors(lu: SuperLU, split: int, corner: SparseMatrix, weights:
         mirrored = _rows_of(upper, few, split).tocsc().tocsr()  # sorted, which is a copy
         if have_one_pattern(mirrored, product):
             missing = sp.csr_array((mirrored.data - product.data, *_pattern(mirrored)), shape=mirrored.shape)
-        else:  # an entry of one of the factors is zero
+        else:
+            # SuperLU drops an entry of one factor that happens to be zero, and the patterns differ.
             missing = mirrored - product
         for part in (mirrored, missing):
             np.abs(part.data, out=part.data)

@@ -18,8 +18,8 @@ from scipy.linalg.lapack import dpotri
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
 
+# Dense work on at most so many unknowns costs less than to determine which of them it can do without.
 MANY_UNKNOWNS = 1500
-"""Dense work on at most so many unknowns costs less than to determine which of them it can do without."""
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from vibench.linalg.definite import Factor
 from vibench.linalg.factorisations import DEFAULT, implementation
 from vibench.text import brief
 
+# Differences of two entries of a symmetric matrix, relative to its largest entry, up to this are round-off.
 SYMMETRY_RTOL = 1e-12
-"""Differences of two entries of a symmetric matrix, relative to its largest entry, up to this are round-off."""
 
 RANK_RTOL = 1e-12
 """Directions below this fraction of the largest one are round-off and are dropped from every orthonormal basis."""
@@ -175,6 +175,7 @@ def orthogonal_factorisation(X: SparseMatrix, y: Array) -> tuple[Array, Array]:
     independent in the norm of X, too, and two passes of Cholesky's factorisation of their Gram matrix make them
     orthonormal to round-off (CholeskyQR2: Fukaya, Nakatsukasa, Yanagisawa and Yamamoto 2014).
     """
+    # Cholesky's factorisation of the Gram matrix needs columns with a condition number below 1e8, which this gives.
     units = np.sqrt(X.diagonal())[:, None]
     q, r = np.linalg.qr(units * y)
     q = q / units
@@ -223,9 +224,9 @@ def singular_values(a: Array) -> Array:
 def orthonormal_range(y: Array, against: Array | None = None) -> Array:
     """Euclidean orthonormal basis of the columns of y (n×k), with orthonormal columns `against` (n×l) projected out.
 
-    Rank-revealing (pivoted QR). The threshold is relative to the norm of each column before `against` is projected out:
-    a short column is not mistaken for a dependent one. The basis is (n×r), r the numerical rank at `RANK_RTOL`.
+    The basis is (n×r), r the numerical rank at `RANK_RTOL` by pivoted QR.
     """
+    # Compare each column with its own norm before the projection: a short column is not a dependent one.
     norms = np.linalg.norm(y, axis=0)
     y = y[:, norms > 0.0] / norms[norms > 0.0]
     if against is not None:

@@ -104,5 +104,6 @@ class Lanczos:
         theta, residual = float(values[first]), float(self._norm * abs(vectors[-1, first]))
         theta = theta if smallest else abs(theta)
         gap = abs(float(values[first] - values[second])) if k > 1 else 0.0
+        # The smaller of both bounds of Parlett, with the nearest Ritz value for the nearest eigenvalue.
         error = residual * min(1.0, residual / gap) if gap > 0.0 else residual
         return theta, 0.0 if k == self._M.shape[0] else error, vectors[:, first]

@@ -63,6 +63,7 @@ def is_proved_definite(parts: Sequence[SparseMatrix], chosen: Implementation, or
             error = 1.01 * (2.0 * UNIT_ROUND_OFF * (factor.entries(matrix.shape[0]) + matrix.shape[0]) + rounded)
             if error <= shift:
                 return True
+            # A larger shift changes the factor, and its number of entries, hardly at all.
             shift = 1.01 * error
     except NumericalError:
         pass
@@ -157,6 +158,7 @@ def proved_positive(parts: Sequence[SparseMatrix], scale: Array, order: Indices 
         except RuntimeError:  # exactly singular
             return 0
         pivots = lu.U.diagonal()
+        # With rows exchanged the factors are not L D Lᵀ, and Sylvester's law says nothing.
         if not np.array_equal(lu.perm_r, lu.perm_c) or not np.all(np.isfinite(pivots)):
             return 0
         added = (2 * len(parts) + 2) * UNIT_ROUND_OFF * (inverse * sizes + shift)
@@ -165,7 +167,8 @@ def proved_positive(parts: Sequence[SparseMatrix], scale: Array, order: Indices 
             return int(np.sum(pivots > 0.0))
         if not np.isfinite(error):
             return 0
-        shift = 2.0 * error  # the next factorisation has about the same round-off
+        # The next factorisation has about the same round-off.
+        shift = 2.0 * error
     return 0
 
 

@@ -14,9 +14,9 @@ from vibench.linalg.cholesky import PartialCholesky
 from vibench.linalg.definite import BlockDiagonal
 from vibench.linalg.factorisations import DEFAULT, implementation
 
+# Constraints per unknown up to which multipliers come last in an elimination: with more of them their dense Schur
+# complement is most of the work.
 FEW_PER_UNKNOWN = 0.25
-"""Constraints per unknown up to which multipliers come last in an elimination: with more of them their dense Schur
-complement is most of the work."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,8 @@ class StaticCondensation:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the factor of the eliminated unknowns, twice: SuperLU allocates more than it fills."""
+        """Memory of the factor of the eliminated unknowns."""
+        # SuperLU allocates more than it fills.
         return 0 if self._factor is None else 2 * self._factor.nbytes
 
     @cached_property

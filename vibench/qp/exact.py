@@ -27,8 +27,8 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import project_out
 from vibench.qp.scaling import row_norms, size
 
+# Residuals below this fraction of their terms are round-off.
 ROUND_OFF = 1e-12
-"""Residuals below this fraction of their terms are round-off."""
 
 
 @dataclass(frozen=True)

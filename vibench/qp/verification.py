@@ -215,8 +215,8 @@ def verify(program: VariationalInequality, answer: QPSolution, accuracy: float) 
     return Status.INACCURATE, reason, residuals
 
 
+# A timed answer with residuals above this multiple of the accuracy does not solve the program that was posed.
 RECOGNISED = 30.0
-"""A timed answer with residuals above this multiple of the accuracy does not solve the program that was posed."""
 
 
 def check_answer(program: VariationalInequality, answer: QPSolution, accuracy: float) -> None:

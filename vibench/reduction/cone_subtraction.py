@@ -10,8 +10,8 @@ from vibench.linalg.inner_product import InnerProduct
 from vibench.qp.scaling import peak, ratio
 from vibench.qp.solve import solve_qp
 
+# A solution of line 9 with a larger residual is recorded as a fallback; Remark 4.1 holds for any feasible one.
 ACCEPTED = 1e-9
-"""A solution of line 9 with a larger residual is recorded as a fallback; Remark 4.1 holds for any feasible one."""
 
 
 def subtract_cone_component(theta: Array, generators: Array, W: InnerProduct) -> tuple[Array, str]:

@@ -55,7 +55,8 @@ class LazyMaximum:
             if not len(stale):
                 return int(candidates[0]), largest
             p = int(stale[0])
-            self._bounds[p] = min(self._bounds[p], evaluate(p))  # round-off must not make an indicator grow
+            # Round-off must not make an indicator grow.
+            self._bounds[p] = min(self._bounds[p], evaluate(p))
             fresh[p] = True
             self.evaluations += 1
 
@@ -174,7 +175,8 @@ class GrowingCone:
             self._fallbacks.append(f"generator {self.generators.shape[1] + 1}: {note}")
         length = float(self._W.norm(direction))
         if length <= REPRODUCED * self._norms[self.farthest]:
-            return False  # normalised, it would be an arbitrary generator
+            # Normalised, round-off would be an arbitrary generator.
+            return False
         self.generators = np.column_stack([self.generators, direction / length])
         # The snapshot is in the cone now (Remark 4.1).
         self._distances.widen(self._W.whiten(self.generators), self.farthest)

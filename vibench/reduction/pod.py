@@ -47,6 +47,6 @@ def pod(snapshots: Array, V: InnerProduct, stop: Stop) -> POD:
     if size is None or size > rank:
         raise NumericalError(f"POD cannot give {stop}: the {snapshots.shape[1]} snapshots have rank {rank}")
     modes = left[:, :size]
-    # the sign of a singular vector is arbitrary: make the largest entry positive
+    # The sign of a singular vector is arbitrary: make the largest entry positive.
     signs = np.where(np.take_along_axis(modes, np.abs(modes).argmax(axis=0)[None], axis=0)[0] < 0.0, -1.0, 1.0)
     return POD(V.unwhiten(modes * signs), errors)

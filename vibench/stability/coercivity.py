@@ -32,11 +32,11 @@ from vibench.linalg.proofs import is_proved_definite, proved_positive
 from vibench.linalg.schur_complement import FEW_PER_UNKNOWN
 from vibench.stability.infsup import InfSup
 
+# Fractions by which constants are moved outwards: the first for which they are proved, or the first if none is.
 MARGINS = (1e-3, 1e-2, 1e-1, 0.5)
-"""Fractions by which constants are moved outwards: the first for which they are proved, or the first if none is."""
 
+# Spaces of at most this dimension have their eigenvalues from a dense matrix; Lanczos needs more than two.
 FEW = 30
-"""Spaces of at most this dimension have their eigenvalues from a dense matrix; Lanczos needs more than two."""
 
 
 @dataclass(frozen=True)

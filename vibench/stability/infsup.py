@@ -31,11 +31,11 @@ from vibench.linalg.inner_product import RANK_RTOL, InnerProduct, singular_value
 from vibench.reduction.cones import LazyMaximum
 from vibench.reduction.supremizers import ConstraintClasses, isometric_supremizers, projected_supremizers
 
+# Constants below this are zero up to round-off.
 VANISHES = 1e-12
-"""Constants below this are zero up to round-off."""
 
+# Round-off of inf-sup constants: relative, and in units of the norm of C.
 RELATIVE, ABSOLUTE = 1e-8, 1e-12
-"""Round-off of inf-sup constants: relative, and in units of the norm of C."""
 
 
 @dataclass(frozen=True)
