@@ -17,7 +17,7 @@ from vibench.offline.models import Model
 
 
 def reason_for_none(certificate: OnlineCertificate | None) -> str:
-    """Why an exported model cannot bound its errors; "" if it can."""
+    """Reason why an exported model cannot bound its errors; "" if it can."""
     if certificate is None:
         return "its cell has no bounds: they need bounds = true"
     if certificate.prepared is None or certificate.base.bound_terms is None:
@@ -29,7 +29,7 @@ def reason_for_none(certificate: OnlineCertificate | None) -> str:
 
 
 def thetas(certificate: OnlineCertificate, samples: Mapping[str, Array]) -> dict[str, Array]:
-    """θ (Q,) of A, f, B and g in the terms of the certificate, from the coefficients that a query evaluates."""
+    """Coefficients θ (Q,) of A, f, B and g in the terms of the certificate, from those that a query evaluates."""
     found = certificate.base.coefficients(samples) | {"g": samples.get("g", np.ones(1))}
     return {f"theta_{name}": value for name, value in found.items()}
 
@@ -120,7 +120,6 @@ def guarantee(certificate: OnlineCertificate, exact: Set[str]) -> Guarantee:
 
 
 def _linear(problem: Problem) -> list[Output]:
-    """The outputs that are exported."""
     return [output for output in problem.outputs if output.linear]
 
 

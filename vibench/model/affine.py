@@ -28,7 +28,7 @@ MISSED = 10.0
 
 
 class Evaluation(StrEnum):
-    """How a member is evaluated at a parameter."""
+    """Way in which a member is evaluated at a parameter."""
 
     CONSTANT = "constant"
     AFFINE = "affine"
@@ -270,7 +270,7 @@ class _Entries:
         return weights
 
     def is_constant(self, weights: Array) -> bool:
-        """Whether no entry varies by more than the round-off of the largest one, with weights (k,)."""
+        """Tell whether no entry varies by more than the round-off of the largest one, with weights (k,)."""
         spread = weights * np.ptp(self.values, axis=1)
         largest = float((weights * np.abs(self.values).max(axis=1, initial=0.0)).max(initial=0.0))
         # one parameter cannot show what varies

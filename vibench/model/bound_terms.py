@@ -49,12 +49,12 @@ class CorrectionMode(StrEnum):
     AUTO = "auto"
 
     def applies(self, omega: float, rho: float) -> bool:
-        """Whether a solution with these ω and ρ is corrected."""
+        """Tell whether a solution with these ω and ρ is corrected."""
         return self is CorrectionMode.FEASIBLE or (self is CorrectionMode.AUTO and omega > rho)
 
 
 def in_dual_set(lam: Array) -> bool:
-    """Whether λ (m,) is in the dual set K; today K has a ray for every row, λ ≥ 0."""
+    """Tell whether λ (m,) is in the dual set K; today K has a ray for every row, λ ≥ 0."""
     return not lam.min(initial=0.0) < 0.0
 
 

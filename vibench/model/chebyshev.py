@@ -245,5 +245,4 @@ def _norms(terms: Array) -> Array:
 
 
 def _stacked(evaluated: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
-    """Arrays (P×size) by name from those at P parameters."""
     return {name: np.stack([arrays[name] for arrays in evaluated]) for name in evaluated[0]}

@@ -123,7 +123,7 @@ class ContactForm:
 
     @cached_property
     def in_extended_precision(self) -> SparseMatrix:
-        """B in extended precision, if the machine has one."""
+        """The matrix B in extended precision, if the machine has one."""
         return self.B.astype(np.longdouble)
 
     @cached_property
@@ -139,13 +139,13 @@ class ContactForm:
         return Representer(values, load, 0.0)
 
     def force_norm(self, multiplier: Array) -> float:
-        """‖Bᵀη‖ in A⁻¹ of a multiplier η (m,): from K alone, where it is computed."""
+        """The norm ‖Bᵀη‖ in A⁻¹ of a multiplier η (m,): from K alone, where it is computed."""
         if not self.is_dense:
             return self.force_representer(multiplier).norm
         return float(np.sqrt(max(float(multiplier @ (self.compliance @ multiplier)), 0.0)))
 
     def _displaced(self, multiplier: Array) -> Array:
-        """D η (c,) of a multiplier η (m,)."""
+        """Displacements D η (c,) of a multiplier η (m,)."""
         pressed = np.flatnonzero(multiplier)
         # Use all rows unless two thirds of η are zero: copying the rows costs more than multiplying them.
         if 3 * len(pressed) > len(multiplier):

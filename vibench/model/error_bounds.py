@@ -236,7 +236,7 @@ class Constraints:
 
 @dataclass(frozen=True)
 class Correction:
-    """A w with B w ≥ s also in exact arithmetic, and ν ≥ 0 (m,) with A w = Bᵀ(ν − λ_N).
+    """Correction w with B w ≥ s also in exact arithmetic, and ν ≥ 0 (m,) with A w = Bᵀ(ν − λ_N).
 
     As A(u_N − w) + Bᵀν = f − r and ν is complementary to B(u_N − w) ≤ g, u_N − w and ν solve (7) with the load f − r:
     up to the residual of (u_N, λ_N), ν is the high-fidelity multiplier. It is only approximate if w is. Where there are
@@ -306,7 +306,7 @@ def _constrained_terms(correction: Correction, u: Array, lam: Array, riesz: Repr
 def find_correction(
     vi: VariationalInequality, energy: EnergyNorm, u: Array, lam: Array, pressed: Mask | None = None
 ) -> Correction | None:
-    """A correction of s = B u − g that is close to the best one; `None` if none was found.
+    """Find a correction of s = B u − g that is close to the best one; `None` if none was found.
 
     Parameters
     ----------
@@ -377,7 +377,7 @@ def _minimisers(
 
 
 def _slack(contact: ContactForm, u: Array, w: Array) -> Array:
-    """B w − s (m,), from retained unknowns (c,)."""
+    """The slack B w − s (m,), from retained unknowns (c,)."""
     return np.asarray(contact.B @ w - (contact.B @ u - contact.vi.g))
 
 

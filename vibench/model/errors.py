@@ -69,7 +69,7 @@ class EnergyNorm:
         return self._contact_forms[0]
 
     def norm(self, v: Array) -> float:
-        """‖v‖_A of v (n,)."""
+        """The norm ‖v‖_A of v (n,)."""
         return float(np.sqrt(max(float(v @ (self.A @ v)), 0.0)))
 
     @property
@@ -78,12 +78,12 @@ class EnergyNorm:
         return self.stiffness.factor
 
     def dual_norm(self, functional: Array) -> float:
-        """‖ℓ‖_{A⁻¹} of a functional (n,)."""
+        """The norm ‖ℓ‖_{A⁻¹} of a functional (n,)."""
         return float(np.sqrt(max(float(functional @ self.factor.solve(functional)), 0.0)))
 
 
 def of_stiffness(energies: Sequence[EnergyNorm], vectors: Array) -> Array:
-    """A v (n×P) of vectors (n×P), each at its own parameter; those of one A are multiplied in one block."""
+    """Products A v (n×P) of vectors (n×P), each at its own parameter; those of one A in one block."""
     product = np.empty_like(vectors)
     for numbers in _with_one_stiffness(energies):
         product[:, numbers] = energies[numbers[0]].A @ vectors[:, numbers]
@@ -91,7 +91,7 @@ def of_stiffness(energies: Sequence[EnergyNorm], vectors: Array) -> Array:
 
 
 def energy_norms(vectors: Array, products: Array) -> Array:
-    """‖v‖_A (P,) of vectors (n×P), from A v (n×P)."""
+    """Norms ‖v‖_A (P,) of vectors (n×P), from A v (n×P)."""
     return np.asarray(np.sqrt(np.maximum(np.einsum("ik,ik->k", vectors, products), 0.0)))
 
 
@@ -134,11 +134,11 @@ class ReferenceSolutions:
         return replace(self, u=self.u[:, numbers], lam=self.lam[:, numbers])
 
     def norms(self, problem: Problem) -> tuple[Array, Array]:
-        """‖u‖_V and ‖λ‖_W (P,)."""
+        """Norms ‖u‖_V and ‖λ‖_W (P,)."""
         return self._once("norms", lambda: (problem.V.norm(self.u), problem.W.norm(self.lam)))
 
     def energies(self, number: int, vi: VariationalInequality, energy: EnergyNorm) -> tuple[float, float]:
-        """‖u‖ in the norm of A and ‖Bᵀλ‖ in that of A⁻¹ of one solution, whose inequality is `vi`."""
+        """Norms of u in A and of Bᵀλ in A⁻¹ of one solution, whose inequality is `vi`."""
         u, lam = self.u[:, number], self.lam[:, number]
         return self._once(number, lambda: (energy.norm(u), energy.contact_form(vi).force_norm(lam)))
 

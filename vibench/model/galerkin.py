@@ -74,7 +74,7 @@ class ReducedProblem:
 
     @property
     def basis(self) -> Array:
-        """Z (n×N')."""
+        """The basis Z (n×N')."""
         return self.reconstruct(np.eye(len(self.program.f)))
 
 
@@ -206,14 +206,13 @@ class ReducedModel:
 
 
 def contact_at(problem: Problem, mu: Array) -> Contact:
-    """B and g at mu (d,) on the contact unknowns of a problem that has them."""
+    """The constraint at mu (d,) on the contact unknowns of a problem that has them."""
     contact = problem.contact(mu)
     assert contact is not None  # implied by `has_contact`
     return contact
 
 
 def _agree(one: Array, other: Array) -> bool:
-    """Whether orthonormal columns are the same but for round-off."""
     # coordinates of supremizers of proportional B differ by less than 1e-12
     return one.shape == other.shape and float(np.max(np.abs(one - other), initial=0.0)) <= 1e-12
 
@@ -247,7 +246,7 @@ def project(
 def projected_members(
     problem: Problem, Z: Array, chi: Array, left_out: Collection[str] = ()
 ) -> Callable[[Array], dict[str, Array]]:
-    """A function of mu (d,) for the projections of members by name, on span Z (n×N') and the cone of χ (m×R).
+    """Return a function of mu (d,) for projections of members by name, on span Z (n×N') and the cone of χ (m×R).
 
     What is constant or declared affine is projected once, other B and g on the contact unknowns where the problem has
     them. A and f have to be constant or affine, or among those left out.

@@ -48,13 +48,13 @@ class ProjectedMember:
 
     @classmethod
     def from_terms(cls, terms: list[Array], member: AffineMember) -> ProjectedMember:
-        """A member from its projected terms."""
+        """Make a member from its projected terms."""
         shape = terms[0].shape
         return cls(np.array([term.ravel() for term in terms]), shape, member.way is Evaluation.CONSTANT)
 
     @classmethod
     def symmetric(cls, terms: list[Array], member: AffineMember) -> ProjectedMember:
-        """A symmetric member from its projected terms (d×d)."""
+        """Make a symmetric member from its projected terms (d×d)."""
         d = terms[0].shape[0]
         upper = np.triu_indices(d)
         where = np.empty((d, d), dtype=np.intp)
@@ -124,7 +124,7 @@ class ReducedOperators:
 
 
 def reason_for_full_assembly(model: ReducedModel, members: Mapping[str, AffineMember]) -> str:
-    """Why the model has to be assembled in full, as the paper does; "" if it can be hyper-reduced."""
+    """Reason why the model has to be assembled in full, as in the paper; "" if it can be hyper-reduced."""
     if model.enrichment.supply is not None:
         return "the enrichment computes its own vectors at every mu"
     return "; ".join(members[name].reason for name in MEMBERS if members[name].way is Evaluation.FULL)
@@ -185,7 +185,7 @@ def _tested(model: ReducedModel, eta: Array) -> tuple[Array, Array | None]:
 
 
 def _combination(model: ReducedModel, eta: Array) -> Array:
-    """C (k×R) for which η C is nearest to the generators χ in W."""
+    """The matrix C (k×R) for which η C is nearest to the generators χ in W."""
     W = model.problem.W
     return np.asarray(np.linalg.lstsq(W.whiten(eta), W.whiten(model.generators), rcond=None)[0])
 
@@ -288,7 +288,7 @@ class HyperReducedModel:
         return {name: getattr(self._operators, name).terms for name in self._operators.affine}
 
     def members(self, mu: Array, samples: Samples) -> VariationalInequality:
-        """A, f, B, g at mu (d,) on Φ, a space that does not depend on mu; B on (η, χ) where Φ has `space`.
+        """Members at mu (d,) on Φ, a space that does not depend on mu; B on (η, χ) where Φ has `space`.
 
         `samples` are the `coefficients` at mu, which callers evaluate for other purposes, too.
         """
@@ -357,7 +357,6 @@ class HyperReducedModel:
 
     @cached_property
     def _constraint_of(self) -> Callable[[Array], Array]:
-        """B (R×d) of varying contact loads."""
         loads, basis = self._loads, self._operators.contact_basis
         assert loads is not None
         assert basis is not None  # set by `hyper_reduce`
@@ -365,7 +364,7 @@ class HyperReducedModel:
 
 
 def _enriched(members: VariationalInequality, plain: Array) -> tuple[Array, Array, Array, Array]:
-    """A (N'×N'), f (N',) and B (R×N') in an orthonormal basis of V_N and what the supremizers of η add, and that basis.
+    """Members A (N'×N'), f (N',), B (R×N') in an orthonormal basis of V_N and the supremizers of η, and that basis.
 
     `members` are on Φ, B on (η, χ) as far as its columns are not zero; V_N has the first coordinates `plain` (d×N). The
     basis has coordinates Y (d'×N'). What supremizers add is orthonormalised as by `orthonormal_range`, for which their

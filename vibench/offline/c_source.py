@@ -135,7 +135,7 @@ def _filled(template: str, values: Mapping[str, Any]) -> str:
 def _of_certificate(
     thetas: Mapping[str, AffinePolynomial | ExactMember], arrays: Mapping[str, Array]
 ) -> dict[str, Any]:
-    """What the templates of a certificate have in place of names: sizes, polynomials and arrays."""
+    """Values for the templates of a certificate: sizes, polynomials and arrays."""
     own: dict[str, Array] = {f"{PREFIX}{name}": np.zeros(1) for name in SPECTRAL}
     own |= {name: array for name, array in arrays.items() if name.startswith(PREFIX) and name != f"{PREFIX}lift"}
     (rows, loads), (directions, kept) = own[f"{PREFIX}responses"].shape, own[f"{PREFIX}factor"].shape

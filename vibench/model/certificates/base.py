@@ -165,19 +165,19 @@ class CertificateBase:
         return Guarantee.CERTIFIED if proved and self.is_exact else Guarantee.VERIFIED
 
     def coefficients(self, samples: Mapping[str, Array]) -> dict[str, Array]:
-        """θ of f, A and B from those that a query evaluated; those of A rotated, one for a constant member."""
+        """Coefficients θ of f, A and B from those that a query evaluated; those of A rotated, one if constant."""
         theta = {name: samples[name] if name in samples else np.ones(1) for name in ("f", "A", "B")}
         if self.rotation is not None:
             theta["A"] = self.rotation @ theta["A"]
         return theta
 
     def spectrum(self, mu: Array, theta: Array) -> tuple[float, float]:
-        """α(µ) and γ(µ) at mu (d,) with the rotated θ of A (Q,)."""
+        """The bounds α(µ) and γ(µ) at mu (d,) with the rotated θ of A (Q,)."""
         return (1.0, 1.0) if self.spectral is None else self.spectral.evaluate(mu, theta)
 
 
 def unsupported(problem: Problem, members: Mapping[str, AffineMember]) -> str:
-    """Why reduced models of a problem cannot be certified at online cost; "" if they can."""
+    """Reason why reduced models of a problem cannot be certified at online cost; "" if they can."""
     if not problem.has_contact:
         return "the problem does not assemble its constraint on its contact unknowns (`contact_dofs` and `contact`)"
     if reason := "; ".join(members[name].reason for name in ("A", "f") if members[name].way is Evaluation.FULL):
@@ -191,7 +191,7 @@ def unsupported(problem: Problem, members: Mapping[str, AffineMember]) -> str:
 
 
 def is_exact(problem: Problem, name: str, member: AffineMember) -> bool:
-    """Whether a member is declared to be constant or an affine sum, and has therefore no interpolation error.
+    """Tell whether a member is declared constant or an affine sum, and has no interpolation error.
 
     One that did not vary over the training set is treated as a constant and may be none.
     """
@@ -242,7 +242,7 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
 def _constant_constraint(
     problem: Problem, members: Mapping[str, AffineMember], X: InnerProduct, compliance: Array, training: Array
 ) -> tuple[SparseMatrix, Array | None, OnlineInfSup]:
-    """B₀, the terms of g, and the bounds of β_A of a `CertificateBase`."""
+    """The matrix B₀, the terms of g, and the bounds of β_A of a `CertificateBase`."""
     B, g, contact = members["B"], members["g"], contact_unknowns(problem)
     multiple = sp.csr_array(B.terms[0])[:, contact] if len(B.terms) == 1 and is_exact(problem, "B", B) else None
     if multiple is not None and is_exact(problem, "g", g):
@@ -312,7 +312,7 @@ def output_coefficients(problem: Problem, output: Output) -> tuple[Array, Array]
 
 
 def output_weights(problem: Problem, base: CertificateBase, output: Output) -> tuple[float, float]:
-    """‖l‖_{X⁻¹} and c of a linear output; c is infinite where no β₀ is proved."""
+    """The weights ‖l‖_{X⁻¹} and c of a linear output; c is infinite where no β₀ is proved."""
     of_u, of_lam = output_coefficients(problem, output)
     beta, B = base.inf_sup.value, base.inf_sup.constraint
     in_u = float(np.linalg.norm(base.X.whiten_functional(of_u)))

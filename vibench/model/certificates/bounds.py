@@ -142,18 +142,18 @@ class _Query:
 
     @cached_property
     def contact(self) -> Contact:
-        """B and g on the contact unknowns; the assembly of the program may have evaluated them."""
+        """The constraint on the contact unknowns; the assembly of the program may have evaluated it."""
         return self._evaluated.contact or contact_at(self.problem, self.mu)
 
     @cached_property
     def on_contact(self) -> tuple[Array, Array]:
-        """u_N (k,) on the contact unknowns, and a bound of its round-off."""
+        """The solution u_N (k,) on the contact unknowns, and a bound of its round-off."""
         certificate = self._certificate
         return certificate.contact_basis @ self.y, float(np.linalg.norm(self.y)) * certificate.unit_round_off
 
     @property
     def constraint(self) -> tuple[float | SparseMatrix, Array, Array]:
-        """B and g as prepared corrections take them, and a bound of the terms of g."""
+        """The constraint as prepared corrections take it, and a bound of the terms of g."""
         terms = self._certificate.base.bound_terms
         if terms is None:
             return self.contact.B, self.contact.g, np.abs(self.contact.g)

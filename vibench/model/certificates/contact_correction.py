@@ -49,7 +49,7 @@ from vibench.qp.scaling import row_norms
 
 
 def complementary(fixed: Array, rows_of: Callable[[Indices], Array], released: Mask) -> Array:
-    """ν (i,) up to round-off; the correction that it belongs to has to be verified in any case.
+    """The multiplier ν (i,) up to round-off; its correction has to be verified in any case.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def complementary(fixed: Array, rows_of: Callable[[Indices], Array], released: M
 
 
 def descent(M: Array, fixed: Array) -> Array:
-    """M v (i,) for the minimiser v ≥ 0 of ½ vᵀM v + ν₀ᵀv, up to round-off.
+    """The product M v (i,) for the minimiser v ≥ 0 of ½ vᵀM v + ν₀ᵀv, up to round-off.
 
     Lawson and Hanson's `w` is −ν here, their `z` is the solution on the set of positive unknowns.
     """
@@ -116,7 +116,7 @@ def descent(M: Array, fixed: Array) -> Array:
 def tied_correction(
     C: Array, contact: Contact, excess: Array, round_off: Array, size: Array, lam: Array, gamma: float
 ) -> tuple[Array, float, float, Array, float, float] | None:
-    """C (k,), ‖w'‖, λᵀ(B w' − s), ν (m,), νᵀ(B w' − s) and η; `None` without equalities, or if no w was found.
+    """Values c (k,), ‖w'‖, κ, ν (m,), νᵀ(B w' − s) and η; `None` without equalities, or if no w was found.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ class ContactCompliance:
 
     @cached_property
     def root(self) -> Array:
-        """√C_jj (k,)."""
+        """Roots √C_jj (k,)."""
         return np.asarray(np.sqrt(np.diag(self.matrix)))
 
     @cached_property
@@ -230,7 +230,7 @@ def held_rows(compliance: ContactCompliance, contact: Contact, on_contact: Array
 def find_contact_correction(
     compliance: ContactCompliance, contact: Contact, on_contact: Array, uncertain: Array, lam: Array, gamma: float
 ) -> ContactCorrection | None:
-    """A w with B w ≥ s = B u_N − g, close to the best one; `None` if none was found.
+    """Find a w with B w ≥ s = B u_N − g, close to the best one; `None` if none was found.
 
     Parameters
     ----------
@@ -319,7 +319,7 @@ class _Program:
             chosen |= violated
 
     def _difference(self, chosen: Mask, excess: Array, size: Array) -> Array:
-        """ν − λ (m,) with ν = 0 on rows that are not chosen, but for those where λ is negligible: there ν = λ."""
+        """The difference ν − λ (m,) with ν = 0 on rows not chosen, or ν = λ where λ is negligible."""
         lam, rows = self.lam, np.flatnonzero(chosen)
         # Multipliers below 1e-6 of the row's slack are kept as they are: they do not change the minimiser.
         difference = np.where(chosen | (lam * size <= 1e-6 * np.abs(excess)), 0.0, -lam)
@@ -351,7 +351,7 @@ def _selected_rows(B: SparseMatrix, chosen: Mask) -> SparseMatrix:
 
 
 def _complementary(factor: Array, excess: Array, lam: Array) -> Array:
-    """ν ≥ 0 (i,) with ν = λ + S⁻¹(s + v), v ≥ 0 and νᵀv = 0, from the Cholesky factor (lower) of S."""
+    """The multiplier ν ≥ 0 (i,) with ν = λ + S⁻¹(s + v), v ≥ 0, νᵀv = 0, from the Cholesky factor of S."""
     fixed: Array = lam + dpotrs(factor, excess, lower=1)[0]
     inverse, computed = np.zeros((len(lam), len(lam))), np.zeros(len(lam), bool)
 

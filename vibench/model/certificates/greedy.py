@@ -105,7 +105,7 @@ class ContactEstimates:
 
     @staticmethod
     def supports(problem: Problem) -> bool:
-        """Whether the problem assembles its constraint on contact unknowns, which are not too many."""
+        """Tell whether the problem assembles its constraint on contact unknowns, which are not too many."""
         dofs = problem.contact_dofs
         # the compliance of 4,000 unknowns is a dense matrix of 128 MB
         return problem.has_contact and dofs is not None and len(dofs) <= 4000
@@ -126,7 +126,7 @@ class ContactEstimates:
             self._compliance = ContactCompliance(self._compliance.matrix, np.flatnonzero(near))
 
     def _grown(self, projected: Array, A: SparseMatrix, f: Array) -> tuple[Array, Array]:
-        """ΦᵀAΦ (d×d), from that on the first vectors of Φ, and Φᵀf (d,)."""
+        """The matrix ΦᵀAΦ (d×d), from that on the first vectors of Φ, and Φᵀf (d,)."""
         size, (n, count) = len(projected), self._basis.shape
         # one product with Φ, which is large, for all
         right = np.empty((n, count - size + 1))

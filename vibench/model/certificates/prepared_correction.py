@@ -94,7 +94,7 @@ class PreparedCorrections:
     def multiplier(
         self, theta: float, g: Array, g_size: Array, y: Array, lam: Array, gamma: float
     ) -> tuple[Array, float, float] | None:
-        """ν ≥ 0 (m,) with γ X w = Bᵀ(ν − λ), ‖w‖, and νᵀ(B w − s), where B(µ) is θ B₀ everywhere; `None` as above.
+        """The multiplier ν ≥ 0 (m,) with γ X w = Bᵀ(ν − λ), ‖w‖, and νᵀ(B w − s), where B(µ) is θ B₀ everywhere.
 
         Elsewhere w is the best of those that deform some bodies alone, and there is no such ν.
         """
@@ -108,7 +108,7 @@ class PreparedCorrections:
     def _feasible(
         self, B: float | SparseMatrix, g: Array, g_size: Array, y: Array, lam: Array, gamma: float
     ) -> tuple[Array, Array, float, Array] | None:
-        """ν on the rows J, a with c = B₀ᵀ a, ‖w‖ and B w − s (m,) of a w that is feasible."""
+        """The ν on the rows J, a with c = B₀ᵀ a, ‖w‖ and B w − s (m,) of a w that is feasible."""
         B = B if isinstance(B, (float, sp.csr_array)) else sp.csr_array(B)
         theta, terms = (B, self.terms) if isinstance(B, float) else (1.0, self.terms + int(np.diff(B.indptr).max()))
         if theta == 0.0:  # B vanishes, and no load on its rows lifts anything

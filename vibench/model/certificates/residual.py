@@ -162,7 +162,7 @@ def residual_basis(
 
 
 def _with_fewer_rows(R: Array, last: int) -> Array:
-    """R (n×p) after an orthogonal transformation of all rows but the last ones, that leaves few of them."""
+    """The matrix R (n×p) after an orthogonal transformation that leaves few of all rows but the last ones."""
     first, last_rows = R[: len(R) - last], R[len(R) - last :]
     entering = np.flatnonzero(first.any(axis=0))
     if 2 * len(entering) >= len(first):

@@ -62,7 +62,7 @@ class SpectralBounds:
     proved: bool
 
     def evaluate(self, mu: Array, theta: Array) -> tuple[float, float]:
-        """α(µ) and γ(µ) at mu (d,) with the rotated θ(µ) (Q,); a negative α(µ) is no bound."""
+        """The bounds α(µ) and γ(µ) at mu (d,) with the rotated θ(µ) (Q,); a negative α(µ) is no bound."""
         where, c = self._weights(mu)
         combined = np.array(c) @ self._rows[where]
         lacking = float(np.abs(theta - combined[2:]) @ self.norms) + 2.0 * self.error
