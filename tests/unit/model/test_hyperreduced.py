@@ -6,8 +6,8 @@ import pickle
 import sys
 import tracemalloc
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -253,26 +253,17 @@ def test_a_loose_tolerance_gives_a_program_that_is_as_inexact() -> None:
     assert 1e-3 < np.linalg.norm(reduced.assemble(mu).program.B - exact) / np.linalg.norm(exact) < 0.5
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("constraint", WAYS)
-def test_operators_travel(constraint: str, kind: str) -> None:
-    problem = rope(constraint)
-    model = reduced_model(problem, kind, 3, 2, problem.training_set()[:5])
-    operators = hyper_reduce(model, separation(problem))
-    here, there = HyperReducedModel(model, operators), HyperReducedModel(model, pickle.loads(pickle.dumps(operators)))
-    for mu in NEW:
-        one, other = here.assemble(mu), there.assemble(mu)
-        for name in MEMBERS:
-            assert np.array_equal(getattr(one.program, name), getattr(other.program, name))
+def test_operators_travel() -> None:
+    """Pickled ones give the same programs, and their factor is still that of A."""
+    for constraint, kind in product(WAYS, KINDS):
+        model = reduced_model(rope(constraint, "constant"), kind, 3, 2, rope(constraint).training_set()[:5])
+        operators = hyper_reduce(model, separation(model.problem))
+        here, there = (HyperReducedModel(model, each) for each in (operators, pickle.loads(pickle.dumps(operators))))
+        one, other = here.assemble(NEW[0]), there.assemble(NEW[0])
+        assert all(np.array_equal(getattr(one.program, name), getattr(other.program, name)) for name in MEMBERS)
         assert np.allclose(one.basis, other.basis, atol=1e-12)
-
-
-def test_an_unpickled_factor_is_still_that_of_a() -> None:
-    problem = rope("contact", "constant")
-    model = reduced_model(problem, "fixed", 3, 2, problem.training_set()[:5])
-    operators = hyper_reduce(model, separation(problem))
-    query = HyperReducedModel(model, pickle.loads(pickle.dumps(operators))).assemble(NEW[0])
-    assert np.allclose(query.factor @ query.factor.T, query.program.A, rtol=1e-12)
+        if other.factor is not None:
+            assert np.allclose(other.factor @ other.factor.T, other.program.A, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -367,23 +358,14 @@ def test_reduced_queries_of_real_problems_are_as_good_as_full_ones(name: str, ki
         assert np.allclose(errors[0], errors[1], rtol=0.01)
 
 
-@dataclass(frozen=True)
-class Step:
-    """The line that adds most to the memory in use while it runs: bytes, and where it is."""
-
-    size: int
-    where: str
-
-
-def largest_step(work: Callable[[], object]) -> Step:
-    """Largest memory that one line adds; what a line calls is a line of its own where it is Python."""
-    largest, last, place = Step(0, ""), 0, ""
+def largest_step(work: Callable[[], object]) -> tuple[int, str]:
+    """Largest memory in bytes that one line adds, and where; calls of Python are lines of their own."""
+    largest, last, place = (0, ""), 0, ""
 
     def trace(frame: Any, event: str, _: object) -> Any:
         nonlocal largest, last, place
         _, peak = tracemalloc.get_traced_memory()
-        if peak - last > largest.size:
-            largest = Step(peak - last, place)
+        largest = max(largest, (peak - last, place))
         tracemalloc.reset_peak()
         last, place = tracemalloc.get_traced_memory()[0], f"{frame.f_code.co_filename}:{frame.f_lineno}"
         return trace
@@ -397,15 +379,6 @@ def largest_step(work: Callable[[], object]) -> Step:
         sys.settrace(before)
         tracemalloc.stop()
     return largest
-
-
-def test_the_instrument_sees_the_largest_of_several_arrays_and_no_sum_of_them() -> None:
-    def work() -> float:
-        kept = [np.ones(1000) for _ in range(5)]
-        brief = float(np.ones(5000).sum())
-        return brief + kept[0][0]
-
-    assert 40_000 <= largest_step(work).size < 48_000
 
 
 @cache
@@ -440,5 +413,5 @@ def test_a_query_makes_no_array_of_mesh_size(name: str, kind: str, dim: int, gen
     reduced, mu = HyperReducedModel(model, hyper_reduce(model, members)), problem.validation_set(1, 0)[0]
     reduced.assemble(mu)  # what is set up once is set up
     found = largest_step(lambda: reduced.assemble(mu))
-    assert 0 < found.size < 8 * dim, found
-    assert largest_step(lambda: model.assemble(mu)).size > 8 * dim
+    assert 0 < found[0] < 8 * dim, found
+    assert largest_step(lambda: model.assemble(mu))[0] > 8 * dim  # the instrument sees arrays of mesh size
