@@ -1,0 +1,215 @@
+"""Every fault of a plugin is found by the check made for it; plugins that are right pass."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from formulations import Nearest, Program
+from other_problems import Block, Put, Torsion
+from samples import SOLVERS_OF_TESTS
+
+from vibench import testing
+from vibench.testing.checks import Verdict
+from vibench.testing.solvers import of_qpsolvers
+
+FAULTS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
+    "broken_problems": {
+        "Asymmetric": ("symmetry of A",
+            "A is not symmetric at mu = [4.0]", "entry (2, 3) is -12.996 against -13 in the transpose"),
+        "Indefinite": ("definiteness of A", "A is not positive definite at mu = [8.0]", "its smallest eigenvalue is -"),
+        "NotFinite": ("assembly", "f is not finite: entry 7 is nan", "at mu = [8.0]"),
+        "WrongShape": ("assembly", "B has shape (12, 11)", "expected (12, 12)"),
+        "IndefiniteNorm": ("construction",
+            "X_V: ", "is not positive definite", "broken_problems.py, line", "self.V = InnerProduct("),
+        "Jumps": ("continuity in mu", "g jumps at mu = [5.432", "entry ", "0.0153846 against 0.0155385"),
+        "Random": ("determinism", "at mu = [", "a second call gives different values of f: entry "),
+        "ChangesTheParameter": ("no mutation",
+            "assemble changes its argument mu: entry (0, 0) is 0 against 4 before", "work on copies"),
+        "FalselyConstant": ("independence of mu",
+            "f is declared `constant` but depends on mu", "entry 0", "at mu = [8.0]"),
+        "PartlyWrong": ("assembly on the contact",
+            "g of `contact` differs from that of `assemble` at mu = [4.0]: entry 0 is"),
+        "InfiniteMatrix": ("assembly", "B is not finite: entry (5, 5) is inf"),
+        "Integers": ("assembly", "g has dtype int64", "expected float64"),
+        "Column": ("assembly", "f has shape (12, 1); expected (12,)"),
+        "Dense": ("assembly", "A is a ndarray", "scipy.sparse.csr_array(A)"),
+        "RowList": ("assembly", "B has the sparse format lil; expected CSR or CSC"),
+        "NoInequality": ("assembly", "assemble returns a tuple", "expected a vibench.VariationalInequality"),
+        "Raises": ("assembly", "assemble fails at mu = [8.0]: ArithmeticError: the wire snapped", "line ", "raise"),
+        "IndefiniteDualNorm": ("construction", "X_W is not positive definite", "self.W = "),
+        "NormChangedLater": ("spaces", "X_V is not positive definite", "changed after"),
+        "NoSpace": ("spaces", "V is a csr_array", "InnerProduct"),
+        "NoConstraint": ("spaces", "W has dimension 0", "no constraint"),
+        "NoMeasure": ("spaces", "multiplier_integrals has the value 0"),
+        "JumpsAtTheCentre": ("continuity in mu", "A jumps at mu = [6"),
+        "Remembers": ("determinism", "a second call gives different values of f"),
+        "CountsInstances": ("determinism", "another instance gives different values of g"),
+        "OneBuffer": ("no mutation", "assemble changes f of an earlier result: entry 0", "return new arrays"),
+        "ConstantOfNothing": ("independence of mu", "`constant` names 'a'; expected A, f, B, g"),
+        "ConstantText": ("independence of mu", "`constant` is the string 'A'", "frozenset({'A'})"),
+        "NoContact": ("assembly on the contact", "contact returns a NoneType at mu = [4.0]"),
+        "LoadsWrong": ("assembly on the contact", "Bᵀη of `contact_loads` differs from that of `assemble`"),
+        "LoadsReachFarther": ("assembly on the contact", "more than `reach` of `contact_loads`"),
+        "ContactOfNothing": ("assembly on the contact", "`contact` is defined but `contact_dofs` is not"),
+        "ContactChangesTheParameter": ("assembly on the contact", "contact changes its argument mu: entry 0 is 5"),
+        "Overlooked": ("assembly on the contact", "B touches 1 unknowns outside `contact_dofs`", "the first is 0"),
+        "Falling": ("assembly on the contact", "`contact_dofs` is not strictly increasing"),
+        "SamplesWrong": ("assembly by entries", "f of `sampler` differs", "at mu = [4.0]: entry 4 is 1 against -0.307"),
+        "SamplesNothing": ("assembly by entries", "NotImplementedError", "has no sampler"),
+        "OneSample": ("training set", "training_set has mu = [5.0] alone", "at least two"),
+        "Outside": ("training set", "leaves the box: parameter 0, at mu = [3.0]", "'force' outside [4, 8]"),
+        "Flat": ("training set", "training_set has shape (6,), expected (P, 1)"),
+        "OtherValidation": ("validation set", "not the same for the same seed", "default_rng(seed)"),
+        "BackwardsBox": ("parameters", "lower bound 8 of the parameter 'force' is above its upper bound 4"),
+        "NamedByText": ("parameters", "the parameters' names are 'force'; expected a tuple"),
+        "Unpicklable": ("pickling", "cannot be pickled", "attribute load"),
+        "WrongSign": ("high-fidelity solution", "no constraint is active at any of 9", "B u ≤ g"),
+        "OutOfReach": ("high-fidelity solution", "no solution at mu = [8.0]", "more than the wire bears"),
+        "PaintsNothing": ("picture and diagnostics",
+            "picture.values has shape (11,); expected (12,)", "points 0 to 12"),
+        "InsideOut": ("picture and diagnostics", "mesh_fields.cells['tetra']: 1 of 1 cells are inside out or flat"),
+        "OutputsOfOneName": ("outputs", "two outputs have the same name: force, force"),
+        "OutputOfNothing": ("outputs", "the output 'peak' fails at mu = [4.0]: ValueError: zero-size array"),
+        "OutputOfAnotherSize": ("outputs", "the output 'force' has coefficients of λ of shape (13,); expected (12,)"),
+        "Unfinished": ("construction", "abstract class Unfinished", "assemble"),
+    },
+    "broken_strategies": {
+        "NegativeGenerators": ("cone",
+            "negative coefficient", "not declared free", "look at coefficient 3 of generator"),
+        "Misses": ("tolerance",
+            "tolerance 0.1 is missed: with 7 generators", "of snapshot 15 is 0.194", "claimed error is 0."),
+        "Boasts": ("errors", "tolerance 0.3: the claimed error e(1) is 0.4139", "error of the snapshots is 0.8278"),
+        "OneErrorTooFew": ("cone", "errors has shape (3,); expected e(0) … e(3), or e(3) alone"),
+        "Long": ("cone", "do not all have unit norm", "generator 0 has norm 2"),
+        "Oversized": ("size", "size 1 was prescribed; the cone has 2 generators"),
+        "Draws": ("determinism", "size 3: a second call gives different values of generators: entry ("),
+        "Normalises": ("no mutation", "reduce changes the snapshots: entry (", "work on copies"),
+        "DividesByZero": ("snapshots without contact", "with a zero snapshot", "not finite, the first in column 0"),
+        "UnpicklableDual": ("pickling", "cannot be pickled", "attribute weight"),
+        "NotOrthogonal": ("enrichment", "not orthonormal in V and orthogonal to V_N: the ", " of vector "),
+        "AsksForATolerance": ("tolerance", "without a tolerance", "TypeError", "set takes_tolerance = True"),
+        "NeedsNone": ("tolerance", "takes_tolerance is True, but build(offline, None) returns an enrichment"),
+        "Fewer": ("tighter tolerances", "tolerance 0.1 gives 0 vectors, fewer than the", "of tolerance 0.5"),
+        "KindOfTwo": ("kind", "the kind depends on the tolerance: none at tolerance 0.9, fixed at"),
+        "DrawsVectors": ("determinism", "a second call gives different values of vectors: entry ("),
+        "ChangesTheBasis": ("no mutation", "build changes offline.basis: entry (", "work on copies"),
+        "NoMultiplier": ("model without contact", "AssertionError: no multiplier", "broken_strategies.py, line"),
+        "SuppliesFunction": ("pickling", "the Enrichment cannot be stored", "is not a function in broken_strategies"),
+        "SuppliesAVector": ("enrichment", "the supply at mu = [-0.1, 0.0] has shape (40,); expected (40, 40)"),
+        "Restarts": ("nested growth", "the vectors of tolerance 0.5 are not the first ones of tolerance 0.1"),
+    },
+    "broken_formulations": {
+        "AxisThatIsNone": ("axes", "uses = ('pod', 'cones')", "expected a tuple of some of pod, dual, primal"),
+        "EnrichesNothing": ("axes", "'primal' needs 'pod' and 'dual'"),
+        "MultiplierInWords": ("axes", "multiplier is 'somehow'", "vibench.Multiplier"),
+        "BuildsAList": ("build", "`build` returned a list, expected a mapping"),
+        "BuildsAFunction": ("build", "what `build` returns as 'tangent' cannot be stored", "function"),
+        "MakesADictionary": ("model", "made a dict, expected a FormulationModel"),
+        "WithoutDimension": ("model", "`dimension` of the model is None, expected a whole number"),
+        "AnswersInATuple": ("answers", "`solve` returns a tuple; expected a vibench.FormulationAnswer"),
+        "NotANumber": ("answers", "at mu = [", "x is not finite: entry 2"),
+        "NeverConverges": ("answers", "no answer at 6 parameters is ok", "inaccurate"),
+        "SaysNotWhy": ("answers", "the outcome is failed, without a reason"),
+        "MoreThanDeclared": ("answers", "alpha has ", " coefficients, more than `generators` of the model, 3"),
+        "SolverOfItsOwnAccord": ("answers", "solves a quadratic program without 'solvers' among its axes"),
+        "OfAnotherSize": ("pairs",
+            "`reconstruct` returned a u of float64 and the shape (39,), expected float64 and (40,)"),
+        "Pulls": ("pairs", "a broken answer: λ has negative coefficients, as -"),
+        "ForgetsTheMultiplier": ("pairs", "`reconstruct` returned no λ, and the formulation declares `solved`"),
+        "RemembersItsScale": ("coefficients", "reconstructed from x and alpha by another model, u differs: entry "),
+        "Rolls": ("determinism", "a second call gives different values of x: entry "),
+        "StepsOn": ("no mutation", "solve changes its argument mu: entry "),
+        "WrongSide": ("errors", "a training parameter, the error of u is 2 of it: zero would be nearer"),
+        "NoProgram": ("axes in use", "uses declares 'solvers', but no query calls `settings.solve_qp`"),
+        "Unpicklable": ("pickling", "cannot be pickled", "attribute weight"),
+    },
+    "broken_variants": {
+        "SkewStiffness": ("symmetry of A", "A is not symmetric at mu = ["),
+        "IndefiniteSomewhere": ("definiteness of A", "A is not positive definite at mu = ["),
+        "WrongSide": ("high-fidelity solution", "check that B u ≤ g is the admissible side"),
+        "NegativeGap": ("high-fidelity solution", "every constraint is active at each of 5 training"),
+        "PermutedNorm": ("coercivity and inf-sup", "X_V has the unknowns in another order than A"),
+        "MassNorm": ("coercivity and inf-sup", "a norm without gradients, such as a mass matrix"),
+        "EuclideanNorm": ("coercivity and inf-sup", "a norm without gradients"),
+        "SingularDualNorm": ("construction", "X_W: "),
+        "RepeatedConstraint": ("coercivity and inf-sup", "1 rows of B depend linearly on the others"),
+        "ConstantStiffness": ("independence of mu", "A is declared `constant` but depends on mu"),
+        "ConstantConstraint": ("independence of mu", "B is declared `constant` but depends on mu"),
+        "RandomMesh": ("determinism", "another instance gives different values of A"),
+        "NamesOfNodes": ("another process", "look for the order of sets"),
+        "NoisyLoad": ("determinism", "a second call gives different values of f"),
+        "OneVector": ("no mutation", "assemble changes f of an earlier result"),
+        "NotANumberInACorner": ("assembly", "g is not finite: entry 0 is nan (at mu = [0.35, 0.08])"),
+        "LoadOnAllNodes": ("assembly", "f has shape (49,); expected (25,)"),
+        "DualNormOfAllNodes": ("assembly", "B has shape (9, 54); expected (27, 54)"),
+        "IgnoresTheParameter": ("independence of mu", "nothing depends on the parameter 'twist'"),
+        "UpsideDownBox": ("parameters", "the lower bound 8 of the parameter 'twist' is above its upper bound 1"),
+        "ComplexStiffness": ("assembly", "A has dtype complex128; expected float64"),
+        "IntegerBound": ("assembly", "f has dtype int64; expected float64"),
+        "OtherSamples": ("assembly by entries", "g of `sampler` differs from that of `assemble`"),
+        "OtherElements": ("assembly by elements", "A of `element_sampler` differs from that of `assemble`"),
+        "AllElements": ("assembly by elements", "A of the element sampler has shape (24, 2, 2); expected (12, 2, 2)"),
+        "OtherContact": ("assembly on the contact", "of `contact` differs from that of `assemble`"),
+        "DependsOnTheCallBefore": ("determinism", "a second call gives different values of f"),
+        "ShiftsTheParameter": ("no mutation", "assemble changes its argument mu"),
+        "Unannotated": ("options", "the option 'depth' has no annotation"),
+        "other_sign": ("signs of multipliers", "multipliers have the other sign"),
+        "ignores_the_accuracy": ("known solutions", "some constraints are active: inaccurate, "),
+        "ignores_the_bounds": ("known solutions", "primal residual"),
+        "overwrites": ("no mutation", "the solver changes g: entry "),
+        "draws": ("determinism", "a second call gives another x"),
+        "raises_where_infeasible": ("infeasible program", "it raises ArithmeticError: no point is admissible"),
+        "one_buffer": ("independent calls", "a later call overwrites x of an earlier solution"),
+        "memoises": ("repeated programs", "solutions are kept, and their times say nothing"),
+        "knows_by_address": ("independent calls", "the solution is that of the program before"),
+        "no_solution": ("answer", "the solver returned a tuple, expected a QPSolution"),
+    },
+}  # fmt: skip
+"""By module and plugin: the check that finds its fault, and parts of the message."""
+
+
+def messages(plugin: object) -> dict[str, str]:
+    """The messages of the checks that fail, or warn, by their names."""
+    results = testing.examine(plugin)
+    return {each.check: each.message for each in results if each.verdict in (Verdict.FAILED, Verdict.WARNING)}
+
+
+@pytest.mark.parametrize(("module", "name"), [(module, name) for module, several in FAULTS.items() for name in several])
+def test_a_fault_is_found_by_its_check(module: str, name: str) -> None:
+    check, *words = FAULTS[module][name]
+    found = messages(getattr(import_module(module), name))
+    assert [word for word in words if word not in found.get(check, "")] == [], found
+    # The variants of strangers' problems may violate more than one requirement.
+    assert module == "broken_variants" or list(found) == [check], found
+
+
+def test_every_broken_plugin_is_tried() -> None:
+    sound = {
+        "Declared", "Changed", "Greedy", "LastErrorAlone", "Supremizing", "Worse", "one_vector",
+        "Bar", "ByElements", "Option", "Cube", "exact", "Misbehaves", "MisbehavingModel",
+    }  # fmt: skip
+    elsewhere = {"PaintsTheEnd": "test_processes.py", "UnknownAnnotation": "test_conformance.py"}
+    for name, file in elsewhere.items():
+        assert name in Path(__file__).with_name(file).read_text(encoding="utf-8")
+    for module, tried in FAULTS.items():
+        contents = vars(import_module(module)).items()
+        own = {name for name, value in contents if getattr(value, "__module__", "") == module and name[0] != "_"}
+        assert own - sound - elsewhere.keys() == tried.keys(), module
+
+
+@pytest.mark.parametrize(
+    "plugin",
+    [
+        partial(Torsion, 6), partial(Put, 24), partial(Block, 2), partial(Block, 2, 2e11, 1e-3), Program, Nearest,
+        *(partial(of_qpsolvers, solver=solver) for solver in SOLVERS_OF_TESTS),
+    ],
+)  # fmt: skip
+def test_what_is_right_passes_without_a_warning(plugin: object) -> None:
+    assert messages(plugin) == {}
+    if isinstance(plugin, partial) and plugin.func is Torsion:
+        constants = next(one.message for one in testing.examine(plugin) if one.check == "coercivity and inf-sup")
+        assert all(symbol in constants for symbol in ("α = ", "γ_a = ", "β_HF = "))
