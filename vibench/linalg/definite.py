@@ -77,18 +77,21 @@ class BlockDiagonal:
 
     def congruent(self, rows: SparseMatrix) -> Array:
         """The product R X Rᵀ (k×k) for a sparse R (k×c)."""
-        total, rows = np.zeros((rows.shape[0], rows.shape[0])), sp.csr_array(rows)
+        rows = rows if rows.format == "csr" else sp.csr_array(rows)
+        total = np.zeros((rows.shape[0], rows.shape[0]))
         for unknowns, block in self.blocks:
-            part, compliance = rows if len(self.blocks) == 1 else rows[:, unknowns], block
-            if not part.nnz:
-                continue
+            # Neighbouring columns, as those of a body, are extracted much faster by a slice.
+            neighbours = len(unknowns) and unknowns[-1] - unknowns[0] + 1 == len(unknowns)
+            columns = slice(unknowns[0], unknowns[-1] + 1) if neighbours else unknowns
+            part, compliance = rows if len(self.blocks) == 1 else rows[:, columns], block
             # Rows touch a short range of unknowns where these are numbered along the contact. SciPy copies slices of
-            # dense matrices, which does not pay for a long range.
-            along = slice(int(part.indices.min()), int(part.indices.max()) + 1)
-            if 2 * (along.stop - along.start) < len(unknowns):
-                shape = part.shape[0], along.stop - along.start
-                part = sp.csr_array((part.data, part.indices - along.start, part.indptr), shape=shape)
-                compliance = block[along, along]
+            # dense matrices, which pays only for a short range of many.
+            if len(unknowns) > 512 and part.nnz:
+                along = slice(int(part.indices.min()), int(part.indices.max()) + 1)
+                if 2 * (along.stop - along.start) < len(unknowns):
+                    shape = part.shape[0], along.stop - along.start
+                    part = sp.csr_array((part.data, part.indices - along.start, part.indptr), shape=shape)
+                    compliance = block[along, along]
             total += part @ np.ascontiguousarray((part @ compliance).T)
         return total
 

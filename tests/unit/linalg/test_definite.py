@@ -53,6 +53,14 @@ def test_values_that_are_mostly_zero_have_the_products_of_others(seed: int, size
         assert np.allclose(matrix.times_sparse(values), X @ values)
 
 
+@pytest.mark.parametrize("last", [200, 600])
+def test_a_congruence_of_rows_on_a_short_range_of_many_unknowns_is_that_of_all(last: int) -> None:
+    rng = np.random.default_rng(last)
+    X, rows = spd(600, rng), np.zeros((4, 600))
+    rows[:, 100:last] = rng.standard_normal((4, last - 100))
+    assert np.allclose(BlockDiagonal.of(X).congruent(sp.csr_array(rows)), rows @ X @ rows.T)
+
+
 def test_unknowns_in_a_chain_are_one_block() -> None:
     assert [block.tolist() for block in connected_blocks(np.eye(4) + np.eye(4, k=1) + np.eye(4, k=-1))] == [
         [0, 1, 2, 3]
