@@ -232,8 +232,8 @@ def _address_space() -> int:
 
 
 @cache
-def _store(folder: str, kept: int) -> Store:
-    return Store(Path(folder), kept)
+def _store(folder: str, cached_bytes: int) -> Store:
+    return Store(Path(folder), cached_bytes)
 
 
 if __name__ == "__main__":

@@ -60,11 +60,9 @@ class RegisteredPlugin:
 
     @property
     def _in_qpsolvers(self) -> bool:
-        if self.kind is not SOLVER:
-            return False
         from vibench.qp.settings import SETTINGS
 
-        return self.name in SETTINGS
+        return self.kind is SOLVER and self.name in SETTINGS
 
     @cached_property
     def conflict(self) -> str:
@@ -247,14 +245,14 @@ def default_formulation() -> str:
 
     Raises a `RequestError` if there are several.
     """
-    found = [
+    names = [
         name
         for name, plugin in registered(FORMULATION).items()
         if not plugin.conflict and _is_default(plugin.entries[0].module, plugin.entries[0].attr)
     ]
-    if len(found) > 1:
-        raise RequestError(f"several formulations say that they are the default: {', '.join(found)}")
-    return found[0] if found else ""
+    if len(names) > 1:
+        raise RequestError(f"several formulations say that they are the default: {', '.join(names)}")
+    return names[0] if names else ""
 
 
 def _is_default(module: str, name: str) -> bool:

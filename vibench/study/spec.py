@@ -239,7 +239,11 @@ class Study(_Model):
                 fault_line(error, cls, named=("problem", "formulation", "dual", "primal", "training", "validation"))
             ) from None
         if study.factorisation != DEFAULT:
-            study.problem[:] = (_factorised(problem, study.factorisation) for problem in study.problem)
+            # A factorisation in the options of a problem wins.
+            study.problem[:] = (
+                one.model_copy(update={"options": {FACTORISATION: study.factorisation} | one.options})
+                for one in study.problem
+            )
         _check_names(study)
         return study
 
@@ -281,11 +285,6 @@ def _sampling(entry: SamplingEntry) -> Plugin | None:
     return None if entry.name == OWN else entry.plugin(SAMPLING)
 
 
-def _factorised(entry: ProblemEntry, factorisation: str) -> ProblemEntry:
-    """A problem whose options name a factorisation, unless they do so already."""
-    return entry.model_copy(update={"options": {FACTORISATION: factorisation} | entry.options})
-
-
 def _check_names(study: Study) -> None:
     """Check names and options of plugins, and that exactly the strategies that take a tolerance have one."""
     axes: tuple[tuple[PluginKind, Sequence[Entry]], ...] = (
@@ -300,11 +299,10 @@ def _check_names(study: Study) -> None:
     for problem in study.problem:
         _check_sets(study, problem)
     solvers = {*SETTINGS, *registered(SOLVER)}
-    for solver in study.solver_names():
+    for plugin in (find(SOLVER, name) for name in study.solver_names()):
         # A known solver need not be installed: its cells are unavailable then.
-        if solver not in solvers:
-            raise unknown_name(SOLVER, solver, solvers)
-        plugin = find(SOLVER, solver)
+        if plugin.name not in solvers:
+            raise unknown_name(SOLVER, plugin.name, solvers)
         if plugin.entries and not plugin.conflict:
             plugin.load()
     for table in study.tolerances:
