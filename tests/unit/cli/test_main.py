@@ -42,76 +42,54 @@ def _nothing_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vibench.execution.run._Run.execute", started)
 
 
-RUN = {
-    "unknown study": (["qick"], ["no study is called 'qick'", "did you mean 'quick'"]),
-    "missing file": (["no.toml"], ["no.toml", "does not exist"]),
-    "unknown option": (["--sovler", "piqp"], ["--sovler"]),
-    "option without value": (["--dual"], ["--dual"]),
-    "one study too many": (["quick", "quick"], ["quick"]),
-    "jobs no number": (["--jobs", "many"], ["--jobs"]),
-    "jobs negative": (["--jobs", "-1"], ["--jobs"]),
-    "jobs no integer": (["--jobs", "1.5"], ["--jobs"]),
-    "tolerance no number": (["--pod-tol", "small"], ["--pod-tol"]),
-    "tolerance zero": (["--pod-tol", "0"], ["pod", "greater than 0"]),
-    "tolerance nan": (["--dual-tol", "nan"], ["dual", "finite"]),
-    "tolerance inf": (["--primal-tol", "inf"], ["primal", "finite"]),
-    "tolerance above one": (["--primal-tol", "2"], ["primal", "less than 1"]),
-    "unknown problem": (["--problem", "obstcale"], ["did you mean 'obstacle'"]),
-    "unknown dual strategy": (["--dual", "mcgp"], ["did you mean 'mcpg'"]),
-    "unknown primal strategy": (["--primal", "decorelated"], ["did you mean 'decorrelated'"]),
-    "unknown solver": (["--solver", "oqsp"], ["did you mean 'osqp'"]),
-}
+WRONG: list[tuple[list[str], list[str]]] = [
+    (["run", "qick"], ["no study is called 'qick'", "did you mean 'quick'"]),
+    (["run", "no.toml"], ["no.toml", "does not exist"]),
+    (["run", "--sovler", "piqp"], ["--sovler"]),
+    (["run", "--dual"], ["--dual"]),
+    (["run", "quick", "quick"], ["quick"]),
+    (["run", "--jobs", "many"], ["--jobs"]),
+    (["run", "--jobs", "-1"], ["--jobs"]),
+    (["run", "--pod-tol", "small"], ["--pod-tol"]),
+    (["run", "--pod-tol", "0"], ["pod", "greater than 0"]),
+    (["run", "--dual-tol", "nan"], ["dual", "finite"]),
+    (["run", "--primal-tol", "2"], ["primal", "less than 1"]),
+    (["run", "--problem", "obstcale"], ["did you mean 'obstacle'"]),
+    (["run", "--dual", "mcgp"], ["did you mean 'mcpg'"]),
+    (["run", "--primal", "decorelated"], ["did you mean 'decorrelated'"]),
+    (["run", "--solver", "oqsp"], ["did you mean 'osqp'"]),
+    (["rnu"], ["rnu"]),
+    (["--colour"], ["--colour"]),
+    (["list", "problem"], ["did you mean 'problems'"]),
+    (["show", "nothing"], ["no results in 'nothing'", FILE]),
+    (["show"], ["RUN"]),
+]
 
 
 @pytest.mark.usefixtures("_nothing_starts")
-@pytest.mark.parametrize("case", RUN)
-def test_a_wrong_run_is_refused_in_one_line(case: str, main: Main) -> None:
-    arguments, words = RUN[case]
-    refused(main("run", *arguments), *words)
-    assert list(Path.cwd().iterdir()) == []
-
-
-OTHER = {
-    "unknown command": (["rnu"], ["rnu"]),
-    "unknown global option": (["--colour"], ["--colour"]),
-    "unknown list": (["list", "problem"], ["did you mean 'problems'"]),
-    "run of nothing": (["show", "nothing"], ["no results in 'nothing'", FILE]),
-    "show without run": (["show"], ["RUN"]),
-}
-
-
-@pytest.mark.parametrize("case", OTHER)
-def test_other_wrong_requests_are_refused_in_one_line(case: str, main: Main) -> None:
-    arguments, words = OTHER[case]
-    refused(main(*arguments), *words)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
+def test_a_wrong_request_is_refused_in_one_line(main: Main, quick_run: Path) -> None:
+    of_show = [
         (["--table", "summray"], ["did you mean 'summary'"]),
         (["--format", "xml"], ["--format", "xml", "markdown"]),
         (["--tabel", "cells"], ["--tabel"]),
-    ],
-)
-def test_a_table_that_is_not_there_is_refused(
-    arguments: list[str], words: list[str], main: Main, quick_run: Path
-) -> None:
-    refused(main("show", str(quick_run), *arguments), *words)
+        (["--columns", "online ms"], ["did you mean 'online [ms]'?"]),
+    ]
+    for arguments, words in [*WRONG, *((["show", str(quick_run), *more], words) for more, words in of_show)]:
+        refused(main(*arguments), *words)
+    assert list(Path.cwd().iterdir()) == []
 
 
-def test_a_wrong_study_file_is_refused(main: Main, tmp_path: Path) -> None:
-    path = write_study(tmp_path, changed(STUDY, "sed", to=3))
-    refused(main("run", path), path, "did you mean 'seed'")
-
-
-def test_a_wrong_key_of_two_lines_is_refused_in_one(main: Main, tmp_path: Path) -> None:
-    refused(main("run", write_study(tmp_path, changed(STUDY, "see\nd", to=3))), "did you mean")
-
-
-def test_a_missing_tolerance_is_refused(main: Main, tmp_path: Path) -> None:
-    path = write_study(tmp_path, changed(STUDY, "tolerances", 0, "primal", to={}))
-    refused(main("run", path), "tolerances.primal", "offline-pga")
+@pytest.mark.usefixtures("_nothing_starts")
+def test_a_wrong_study_file_is_refused_in_one_line(main: Main, tmp_path: Path) -> None:
+    in_place = STUDY | {"tolerances": {"pod": [0.01], "dual": [0.1]}}
+    for content, words in (
+        (changed(STUDY, "sed", to=3), ["did you mean 'seed'"]),
+        (changed(STUDY, "see\nd", to=3), ["did you mean"]),
+        (changed(STUDY, "tolerances", 0, "primal", to={}), ["tolerances.primal", "offline-pga"]),
+        (in_place, ["tolerances: expected a list of tables: write [[tolerances]] in place of"]),
+    ):
+        path = write_study(tmp_path, content)
+        refused(main("run", path), path, *words)
 
 
 @pytest.mark.usefixtures("_nothing_starts")
@@ -201,21 +179,6 @@ def test_without_arguments_the_help_is_printed(main: Main) -> None:
         assert f"\n  {command} " in out + err
 
 
-@pytest.mark.parametrize("command", [[], ["run"], ["list"], ["show"]])
-def test_help_is_no_error(command: list[str], main: Main) -> None:
-    code, out, err = main(*command, "--help")
-    assert (code, err) == (0, "")
-    assert "Usage: " in out
-    assert "--help" in out
-
-
-def test_help_names_every_option_of_run(main: Main) -> None:
-    _, out, _ = main("run", "--help")
-    options = ("problem", "dual", "primal", "solver", "pod-tol", "dual-tol", "primal-tol", "out", "jobs")
-    for option in (*options, "dry-run", "fresh", "retry", "strict"):
-        assert f"--{option}" in out
-
-
 @pytest.mark.usefixtures("_nothing_starts")
 def test_a_dry_run_lists_the_matrix_and_does_nothing_else(main: Main) -> None:
     code, out, err = main("run", "quick", "--dry-run")
@@ -225,43 +188,6 @@ def test_a_dry_run_lists_the_matrix_and_does_nothing_else(main: Main) -> None:
     assert lines == [f"{cell.key}  {cell}" for cell in cells]
     assert last == f"{len(cells)} cells"
     assert list(Path.cwd().iterdir()) == []
-
-
-@pytest.mark.usefixtures("_nothing_starts")
-def test_a_dry_run_leaves_earlier_results_alone(main: Main, quick_run: Path) -> None:
-    before = {path: path.stat().st_mtime_ns for path in quick_run.rglob("*") if path.is_file()}
-    assert main("run", "quick", "--dry-run", "--fresh", "--out", str(quick_run))[0] == 0
-    assert {path: path.stat().st_mtime_ns for path in quick_run.rglob("*") if path.is_file()} == before
-
-
-REPLACED: dict[str, tuple[list[str], Callable[[Any], Any], Any]] = {
-    # what is replaced: (options, what is looked at, its only value)
-    "dual": (["--dual", "cpg"], lambda cell: cell.dual.name, "cpg"),
-    "solver": (["--solver", "daqp"], lambda cell: cell.solver, "daqp"),
-    "primal": (["--primal", "offline-pga", "--primal-tol", "0.3"], lambda cell: cell.primal_tol, 0.3),
-    "pod": (["--pod-tol", "0.01"], lambda cell: cell.pod.tolerance, 0.01),
-    "cone": (["--dual-tol", "0.1"], lambda cell: cell.cone.tolerance, 0.1),
-    "problem": (["--problem", "obstacle"], lambda cell: cell.problem.name, "obstacle"),
-}
-
-
-@pytest.mark.parametrize("axis", REPLACED)
-def test_options_replace_axes(axis: str, main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
-    listed: list[Any] = []
-
-    def recorded(study: Any) -> list[Any]:
-        listed.extend(expand(study))
-        return listed
-
-    monkeypatch.setattr("vibench.study.matrix.expand", recorded)
-    options, look, value = REPLACED[axis]
-    assert main("run", "quick", "--dry-run", *options)[0] == 0
-    assert {look(cell) for cell in listed} == {value}
-
-
-def test_options_may_be_repeated(main: Main) -> None:
-    _, out, _ = main("run", "quick", "--dry-run", "--solver", "piqp", "--solver", "daqp", "--dual", "cpg")
-    assert {line.split(" · ")[-1] for line in out.splitlines()[:-1]} == {"piqp 1e-08", "daqp 1e-08"}
 
 
 def test_list_shows_every_plugin_and_its_options(main: Main) -> None:
@@ -278,13 +204,6 @@ def test_list_shows_every_plugin_and_its_options(main: Main) -> None:
     assert "'coarse', 'medium'" in out
 
 
-@pytest.mark.parametrize("arguments", [["--version"], ["-h"], ["run", "-h"]])
-def test_short_options_and_the_version(arguments: list[str], main: Main) -> None:
-    code, out, err = main(*arguments)
-    assert (code, err) == (0, "")
-    assert out.startswith(f"vibench {importlib.metadata.version('vibench')}" if "-h" not in arguments else "Usage: ")
-
-
 def test_ctrl_c_while_drawing_says_what_is_there(main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
@@ -294,29 +213,6 @@ def test_ctrl_c_while_drawing_says_what_is_there(main: Main, quick_run: Path, mo
     assert code == 130
     assert "interrupted while drawing: results and tables are complete" in out
     assert f"`vibench figures {quick_run}`" in out
-
-
-@pytest.mark.parametrize(("what", "kind"), LISTS.items())
-def test_one_list_shows_only_its_own(what: str, kind: str, main: Main) -> None:
-    code, out, _ = main("list", what)
-    assert code == 0
-    assert out.startswith(what)
-    assert all(name in out for name in registered(kind))
-    others = [title for title in LISTS if title != what]
-    assert [title for title in others if re.search(rf"^{title}(,|$)", out, re.MULTILINE)] == []
-
-
-def test_the_list_of_solvers_says_which_are_installed(main: Main) -> None:
-    _, out, _ = main("list", "solvers")
-    rows = {line.split()[0]: line for line in out.splitlines() if line.split()}
-    assert set(SETTINGS) <= set(rows)
-    for name in ("piqp", "proxqp", "osqp"):
-        assert "not installed" not in rows[name]
-
-
-def test_the_list_of_studies_counts_their_cells(main: Main) -> None:
-    _, out, _ = main("list", "studies")
-    assert f"{len(expand(read_study('quick')))} cells" in out
 
 
 def test_show_prints_the_summary(main: Main, quick_run: Path) -> None:
@@ -336,48 +232,6 @@ def test_a_run_ends_with_the_summary_and_says_where_things_are(quick_run: Path) 
     assert "next:\n  vibench show " in printed
     assert len(printed.splitlines()) < 100
     assert "\x1b" not in printed
-
-
-@pytest.mark.parametrize("form", ["markdown", "latex", "json"])
-def test_a_condition_holds_in_every_format(form: str, main: Main, quick_run: Path) -> None:
-    _, out, _ = main("show", str(quick_run), "--where", "solver = 'osqp'", "--format", form)
-    assert "osqp" in out
-    assert "piqp" not in out
-
-
-@pytest.mark.parametrize("table", ["summary", "benefits", *TABLES])
-def test_show_prints_every_table_as_csv(table: str, main: Main, quick_run: Path) -> None:
-    code, out, err = main("show", str(quick_run), "--table", table, "--format", "csv")
-    assert (code, err) == (0, "")
-    rows = list(csv.DictReader(io.StringIO(out)))
-    source = {"summary": "cells", "benefits": "thresholds"}.get(table, table)
-    assert len(rows) == len(read_table(quick_run / FILE, source)) > 0
-    if table == source:
-        assert [name for name in rows[0] if not name.startswith("mu_")] == list(STORED[table])
-
-
-@pytest.mark.parametrize("table", ["summary", "benefits", "cells"])
-def test_show_prints_markdown(table: str, main: Main, quick_run: Path) -> None:
-    code, out, _ = main("show", str(quick_run), "--table", table, "--format", "markdown")
-    assert code == 0
-    lines = out.splitlines()
-    assert all(line.startswith("|") and line.endswith("|") for line in lines)
-    assert len({line.count("|") for line in lines}) == 1
-
-
-@pytest.mark.parametrize("table", ["summary", "benefits", "histories"])
-def test_show_prints_on_a_terminal(table: str, main: Main, quick_run: Path) -> None:
-    code, out, _ = main("show", str(quick_run), "--table", table)
-    assert code == 0
-    assert out.startswith(f"{quick_run.name}: {table}")
-
-
-def test_show_finds_a_run_by_its_name(main: Main, quick_run: Path) -> None:
-    Path("runs").mkdir()
-    Path("runs/quick").symlink_to(quick_run)
-    code, out, _ = main("show", "quick", "--format", "csv")
-    assert code == 0
-    assert len(out.splitlines()) == 1 + len(read_table(quick_run / FILE, "cells"))
 
 
 @pytest.mark.parametrize("run", ["[/b]", "//x", "//x/y", "file:x", "a\x1b[2J\nb", "\udcff", "x?mode=rwc", ""])
@@ -423,25 +277,6 @@ def test_an_error_that_nobody_foresaw_is_not_hidden(main: Main, monkeypatch: pyt
 def test_help_on_a_command_is_its_own(main: Main) -> None:
     assert main("help", "show") == main("show", "--help")
     assert main("help")[1] == main("--help")[1]
-
-
-@pytest.mark.parametrize("name", ["online_s", "online [ms]"])
-def test_help_on_a_column_is_what_it_means(name: str, main: Main) -> None:
-    code, out, _ = main("help", name)
-    assert code == 0
-    assert f"online_s [s], in cells: {STORED['cells']['online_s'].meaning}" in out.splitlines()
-
-
-@pytest.mark.parametrize(
-    "name", ["total_s", "total [s]", "total", "certified error", "cheapest_until", "until", "sure"]
-)
-def test_help_on_a_column_of_a_computed_table_is_its_meaning_there(name: str, main: Main) -> None:
-    code, out, _ = main("help", name)
-    assert code == 0
-    names = {"total [s]": "total_s", "total": "total_s", "until": "cheapest_until", "sure": "probability"}
-    column = names.get(name, name.replace(" ", "_"))
-    unit = f" [{added_columns()[column].unit}]" * bool(added_columns()[column].unit)
-    assert f"{column}{unit}, in best: {added_columns()[column].meaning}" in out.splitlines()
 
 
 def test_help_on_a_key_of_study_files_is_what_it_means_wherever_it_stands(main: Main) -> None:
@@ -529,10 +364,80 @@ def test_sizes_of_problems_are_said_where_they_are_asked_for(main: Main, monkeyp
     refused(main("list", "solvers", "--sizes"), "--sizes is for `vibench list problems`")
 
 
-def test_a_table_of_tolerances_in_place_of_a_list_is_named(main: Main, tmp_path: Path) -> None:
-    file = write_study(tmp_path, STUDY | {"tolerances": {"pod": [0.01], "dual": [0.1]}})
-    refused(main("run", file), "tolerances: expected a list of tables: write [[tolerances]] in place of")
+@pytest.mark.usefixtures("_nothing_starts")
+def test_options_replace_axes(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+    listed: list[Any] = []
+
+    def recorded(study: Any) -> list[Any]:
+        listed[:] = expand(study)
+        return listed
+
+    monkeypatch.setattr("vibench.study.matrix.expand", recorded)
+    looks: list[tuple[list[str], Callable[[Any], Any], set[Any]]] = [
+        (["--dual", "cpg"], lambda cell: cell.dual.name, {"cpg"}),
+        (["--solver", "piqp", "--solver", "daqp"], lambda cell: cell.solver, {"piqp", "daqp"}),
+        (["--primal", "offline-pga", "--primal-tol", "0.3"], lambda cell: cell.primal_tol, {0.3}),
+        (["--pod-tol", "0.01"], lambda cell: cell.pod.tolerance, {0.01}),
+        (["--dual-tol", "0.1"], lambda cell: cell.cone.tolerance, {0.1}),
+        (["--problem", "obstacle"], lambda cell: cell.problem.name, {"obstacle"}),
+    ]
+    for options, look, values in looks:
+        assert main("run", "quick", "--dry-run", *options)[0] == 0
+        assert {look(cell) for cell in listed} == values
 
 
-def test_a_wrong_column_has_the_heading_that_was_meant(main: Main, quick_run: Path) -> None:
-    refused(main("show", str(quick_run), "--columns", "online ms"), "did you mean 'online [ms]'?")
+def test_short_options_and_the_version(main: Main) -> None:
+    for arguments in (["-h"], ["run", "-h"]):
+        assert main(*arguments)[1].startswith("Usage: ")
+    assert main("--version")[1].startswith(f"vibench {importlib.metadata.version('vibench')}")
+
+
+def test_every_list_shows_only_its_own(main: Main) -> None:
+    for what, kind in LISTS.items():
+        code, out, _ = main("list", what)
+        assert code == 0
+        assert out.startswith(what)
+        assert all(name in out for name in registered(kind))
+        assert [title for title in LISTS if re.search(rf"^{title}(,|$)", out, re.MULTILINE)] == [what]
+        if what == "studies":
+            assert f"{len(expand(read_study('quick')))} cells" in out
+        if what == "solvers":
+            shown = {line.split()[0]: line for line in out.splitlines() if line.split()}
+            assert set(SETTINGS) <= set(shown)
+            assert not any("not installed" in shown[name] for name in ("piqp", "proxqp", "osqp"))
+
+
+def test_show_prints_every_table_in_every_form(main: Main, quick_run: Path) -> None:
+    for table in ("summary", "benefits", *TABLES):
+        code, out, err = main("show", str(quick_run), "--table", table, "--format", "csv")
+        assert (code, err) == (0, "")
+        rows = list(csv.DictReader(io.StringIO(out)))
+        source = {"summary": "cells", "benefits": "thresholds"}.get(table, table)
+        assert len(rows) == len(read_table(quick_run / FILE, source)) > 0
+        if table == source:
+            assert [name for name in rows[0] if not name.startswith("mu_")] == list(STORED[table])
+    for table in ("summary", "benefits", "cells"):
+        lines = main("show", str(quick_run), "--table", table, "--format", "markdown")[1].splitlines()
+        assert all(line.startswith("|") and line.endswith("|") for line in lines)
+        assert len({line.count("|") for line in lines}) == 1
+    for table in ("summary", "benefits", "histories"):
+        assert main("show", str(quick_run), "--table", table)[1].startswith(f"{quick_run.name}: {table}")
+    for form in ("markdown", "latex", "json"):
+        out = main("show", str(quick_run), "--where", "solver = 'osqp'", "--format", form)[1]
+        assert "osqp" in out
+        assert "piqp" not in out
+    Path("runs").mkdir()
+    Path("runs/quick").symlink_to(quick_run)
+    assert len(main("show", "quick", "--format", "csv")[1].splitlines()) == 1 + len(
+        read_table(quick_run / FILE, "cells")
+    )
+
+
+def test_help_on_a_column_is_its_meaning_in_its_table(main: Main) -> None:
+    for name in ("online_s", "online [ms]"):
+        assert f"online_s [s], in cells: {STORED['cells']['online_s'].meaning}" in main("help", name)[1].splitlines()
+    names = {"total_s": "total_s", "total [s]": "total_s", "total": "total_s", "until": "cheapest_until"}
+    for name, column in names.items() | {("certified error", "certified_error"), ("sure", "probability")}:
+        added = added_columns()[column]
+        unit = f" [{added.unit}]" * bool(added.unit)
+        assert f"{column}{unit}, in best: {added.meaning}" in main("help", name)[1].splitlines()

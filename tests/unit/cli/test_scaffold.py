@@ -69,13 +69,11 @@ def test_the_tests_of_new_packages_are_green(written: dict[str, Path], installed
     assert f"{checks + len(NAMES)} passed" in done.stdout  # every package has one more test
 
 
-@pytest.mark.parametrize(("kind", "name"), NAMES.items())
-def test_a_new_plugin_passes_its_checks_as_it_is(
-    kind: str, name: str, vibench: Vibench, site: Path, tmp_path: Path
-) -> None:
-    done = vibench(tmp_path, "check", name, plugins=site)
+def test_a_new_plugin_passes_its_checks_as_it_is(vibench: Vibench, site: Path, tmp_path: Path) -> None:
+    """One by the command; the tests of the packages above run the checks of all of them."""
+    done = vibench(tmp_path, "check", "my-rope", plugins=site)
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
-    assert f"{CHECKED[kind]} '{name}'" in done.stdout
+    assert "problem 'my-rope'" in done.stdout
     assert "passed, 0 failed, 0 skipped" in done.stdout
 
 
@@ -132,9 +130,9 @@ def test_the_command_says_what_to_do_next(main: Main) -> None:
 BAD = ["", "Rope", "1rope", "rope_1", "rope-", "-rope", "my--rope", "ro pe", "../rope", "röpe", "rope\n", "a" * 41]
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_a_name_that_cannot_be_one_is_refused(name: str, main: Main) -> None:
-    refused(main("new", "problem", "--", name), "cannot be the name of a plugin", "such as 'my-problem'")
+def test_a_name_that_cannot_be_one_is_refused(main: Main) -> None:
+    for name in BAD:
+        refused(main("new", "problem", "--", name), "cannot be the name of a plugin", "such as 'my-problem'")
     assert list(Path.cwd().iterdir()) == []
 
 

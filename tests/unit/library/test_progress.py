@@ -43,16 +43,15 @@ def queries(cells: list[Cell]) -> list[Stage]:
     return [cell_queries(cell, 20.0) for cell in cells]
 
 
-def test_nothing_is_known_before_a_stage_is_done() -> None:
-    assert TimeLeft(PODS, 1).seconds() is None
-
-
-def test_stages_of_one_sort_are_taken_to_last_as_long() -> None:
-    left = TimeLeft(PODS, 1)
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_stages_of_one_sort_are_taken_to_last_as_long(jobs: int) -> None:
+    left = TimeLeft(PODS, jobs)
+    assert left.seconds() is None
+    for stage, seconds, expected in zip(PODS, (2.0, 4.0, 3.0, 3.0), (6.0, 6.0, 3.0, 0.0), strict=True):
+        left.done(stage, seconds)
+        assert left.seconds() == pytest.approx(expected / jobs)
     left.done(PODS[0], 2.0)
-    assert left.seconds() == pytest.approx(6.0)
-    left.done(PODS[1], 4.0)
-    assert left.seconds() == pytest.approx(2 * 3.0)
+    assert left.seconds() == 0.0  # done twice, after its worker was lost
 
 
 def test_a_stage_that_tells_its_share_counts_before_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,12 +145,6 @@ def test_a_run_in_space_says_in_its_first_minute_how_long_it_will_take(monkeypat
     assert all(1.0 / 1.5 < ratio < 1.5 for at, ratio in compared if at > 20.0), compared
 
 
-def test_workers_share_what_is_left() -> None:
-    left = TimeLeft(PODS, 3)
-    left.done(PODS[0], 2.0)
-    assert left.seconds() == pytest.approx(2.0)
-
-
 def test_solvers_are_told_apart(queries: list[Stage]) -> None:
     fast = [stage for stage in queries if isinstance(stage, CellQueries) and stage.solver == "piqp"]
     slow = [stage for stage in queries if isinstance(stage, CellQueries) and stage.solver == "osqp"]
@@ -171,24 +164,9 @@ def test_the_time_left_costs_the_same_however_much_is_done() -> None:
     assert estimate(1000) == estimate(10)
 
 
-def test_nothing_is_left_when_all_is_done() -> None:
-    left = TimeLeft(PODS, 1)
-    for stage in PODS:
-        left.done(stage, 2.0)
-    assert left.seconds() == 0.0
-    left.done(PODS[0], 2.0)
-    assert left.seconds() == 0.0
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [
-        (0.0, "0 s"), (40.2, "40 s"), (89.4, "89 s"), (91.0, "2 min"), (180.0, "3 min"), (5300.0, "88 min"),
-        (5400.0, "1 h 30 min"), (4800.0, "80 min"), (7200.0, "2 h 0 min"), (90000.0, "25 h 0 min"),
-    ],
-)  # fmt: skip
-def test_durations_are_said_in_words(seconds: float, words: str) -> None:
-    assert duration(seconds) == words
+def test_durations_are_said_in_words() -> None:
+    said = {40.2: "40 s", 89.4: "89 s", 91.0: "2 min", 5300.0: "88 min", 5400.0: "1 h 30 min", 4800.0: "80 min"}
+    assert {seconds: duration(seconds) for seconds in said} == said
 
 
 @given(st.floats(0.0, 1e7))
@@ -219,22 +197,35 @@ Make = Callable[..., tuple[ProgressDisplay, io.StringIO]]
 OK = {"status": "ok", "reason": ""}
 
 
-def test_the_beginning_says_what_is_to_be_done(report: Make, queries: list[Stage]) -> None:
+@pytest.mark.parametrize(
+    ("workers", "some", "said"),
+    [(2, 4, "4 stages on 2 workers"), (1, 4, "4 stages on 1 worker"), (0, 0, "0 stages")],
+)
+def test_the_beginning_says_what_is_to_be_done(
+    workers: int, some: int, said: str, report: Make, queries: list[Stage]
+) -> None:
+    for terminal in (False, True):
+        made, printed = report(terminal=terminal)
+        with made:
+            made.start(agenda(20, PODS[:some], workers))
+        assert f"20 cells, 0 to run, {said}\n" in printed.getvalue()
+        assert ("0:00:00" in printed.getvalue()) is (terminal and some > 0)
     made, printed = report()
     made.start(agenda(20, [*queries[:3], *PODS], 2))
     assert printed.getvalue() == "20 cells, 3 to run, 7 stages on 2 workers\n"
 
 
-def test_one_worker_is_no_workers(report: Make) -> None:
+@pytest.mark.parametrize(("seconds", "said"), [(20.0, True), (0.02, False)])
+def test_the_time_left_is_said_if_it_is_a_second(
+    seconds: float, said: bool, report: Make, cells: list[Cell], queries: list[Stage]
+) -> None:
     made, printed = report()
-    made.start(agenda(1, PODS, 1))
-    assert printed.getvalue() == "1 cells, 0 to run, 4 stages on 1 worker\n"
-
-
-def test_where_nothing_is_to_be_done_nobody_works(report: Make) -> None:
-    made, printed = report()
-    made.start(agenda(1, [], 0))
-    assert printed.getvalue() == "1 cells, 0 to run, 0 stages\n"
+    made.start(agenda(len(cells), queries, 1))
+    made.stage(queries[0], seconds)
+    made.cell(cells[0], OK)
+    same = sum(isinstance(stage, CellQueries) for stage in queries) - 1
+    assert (f"about {duration(seconds * same)} left" in printed.getvalue()) is said
+    assert ("left" in printed.getvalue()) is said
 
 
 def test_a_long_first_part_says_how_long_the_run_will_take(report: Make, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -255,17 +246,10 @@ def test_high_fidelity_parts_are_reported_four_by_four(report: Make) -> None:
     made.start(agenda(1, CHUNK, 2))
     for chunk in CHUNK[:-1]:
         made.stage(chunk, 0.1)
-    assert "high-fidelity" not in printed.getvalue()
+    made.stage(PODS[0], 0.1)
+    assert len(printed.getvalue().splitlines()) == 1  # neither parts before the fourth nor other stages
     made.stage(CHUNK[-1], 0.1)
     assert f"high-fidelity solutions: {CHUNKS} of {CHUNKS} parts" in printed.getvalue()
-
-
-def test_other_stages_are_not_reported(report: Make) -> None:
-    made, printed = report()
-    made.start(agenda(1, PODS, 2))
-    before = printed.getvalue()
-    made.stage(PODS[0], 0.1)
-    assert printed.getvalue() == before
 
 
 def test_every_cell_has_a_line(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
@@ -273,7 +257,11 @@ def test_every_cell_has_a_line(report: Make, cells: list[Cell], queries: list[St
     made.start(agenda(len(cells), queries, 2))
     made.cell(cells[0], OK)
     made.cell(cells[1], {"status": "timeout", "reason": "took [bold]long"})
+    made.cell(cells[0], {"status": "error", "reason": "word " * 100})
     lines = printed.getvalue().splitlines()
+    assert len(lines) == 4
+    assert "\x1b" not in printed.getvalue()
+    assert "\r" not in printed.getvalue()
     assert lines[1] == f"[1/{len(queries)}] ok: {cells[0]}"
     assert lines[2] == f"[2/{len(queries)}] timeout: {cells[1]} (took [bold]long)"
     assert "[red]membrane" in lines[1]
@@ -292,44 +280,6 @@ def test_a_label_is_no_markup_no_emoji_and_no_escape_sequence(
     (line,) = [line for line in printed.getvalue().splitlines() if "error: " in line]
     assert r"error: [/b] [red]a :warning:\u001b[2J\n[1/1] ok: b · " in line
     assert line.endswith(r"([/i] \u001b[31m:smile:\ud800)")
-
-
-def test_a_long_line_stays_one_line(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
-    made, printed = report()
-    made.start(agenda(1, queries[:1], 2))
-    made.cell(cells[0], {"status": "error", "reason": "word " * 100})
-    assert len(printed.getvalue().splitlines()) == 2
-
-
-def test_the_time_left_is_said_once_known(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
-    made, printed = report()
-    made.start(agenda(len(cells), queries, 1))
-    made.stage(queries[0], 20.0)
-    made.cell(cells[0], OK)
-    same = sum(isinstance(stage, CellQueries) for stage in queries) - 1
-    assert f"about {duration(20.0 * same)} left" in printed.getvalue()
-
-
-def test_less_than_a_second_left_is_not_said(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
-    made, printed = report()
-    made.start(agenda(len(cells), queries[:2], 2))
-    made.stage(queries[0], 0.2)
-    made.cell(cells[0], OK)
-    assert "left" not in printed.getvalue()
-
-
-def test_plain_lines_where_there_is_no_terminal(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
-    made, printed = report()
-    with made:
-        made.start(agenda(len(cells), [*CHUNK, *queries], 2))
-        for stage in (*CHUNK, *queries):
-            made.stage(stage, 3.0)
-        for cell in cells:
-            made.cell(cell, OK)
-    text = printed.getvalue()
-    assert "\x1b" not in text
-    assert "\r" not in text
-    assert len(text.splitlines()) == 1 + 1 + len(cells)
 
 
 def test_a_terminal_gets_a_bar_and_only_what_fell_short(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
@@ -389,11 +339,3 @@ def test_the_figure_that_is_being_drawn_is_named(terminal: bool) -> None:
     assert "description" not in printed.getvalue()
     assert ("[red]hertz-errors" in printed.getvalue()) is terminal
     assert "figures" in printed.getvalue()
-
-
-def test_a_terminal_gets_no_bar_where_nothing_is_to_be_done(report: Make) -> None:
-    made, printed = report(terminal=True)
-    with made:
-        made.start(agenda(3, [], 0))
-    assert "stages" in printed.getvalue()
-    assert "0:00:00" not in printed.getvalue()
