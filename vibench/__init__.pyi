@@ -28,10 +28,10 @@ from .interfaces.formulations import FormulationModel as FormulationModel
 from .interfaces.formulations import Multiplier as Multiplier
 from .interfaces.formulations import Outcome as Outcome
 from .interfaces.formulations import QuerySettings as QuerySettings
+from .interfaces.outputs import MeshFields as MeshFields
 from .interfaces.outputs import Output as Output
+from .interfaces.outputs import Picture as Picture
 from .interfaces.parameters import ParameterBox as ParameterBox
-from .interfaces.pictures import MeshFields as MeshFields
-from .interfaces.pictures import Picture as Picture
 from .interfaces.problem import MEMBERS as MEMBERS
 from .interfaces.problem import Contact as Contact
 from .interfaces.problem import ContactLoads as ContactLoads

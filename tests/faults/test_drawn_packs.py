@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np, scipy.io, scipy.sparse as sp
 from packs import Cable, group, manifest, write_arrays, write_cable, write_manifest, write_mesh
 from vibench.errors import RequestError, in_a_line
-from vibench.packs import mesh_process, meshes, read_model_pack, reader
+from vibench.packs import meshes, read_model_pack, reader
 from vibench.packs.reader import pack_digest
 
 root, count, rng = Path(sys.argv[1]), int(sys.argv[2]), np.random.default_rng(int(sys.argv[3]))
@@ -40,7 +40,7 @@ def read_mesh(path, limit):
     '''In this process, whose files are watched; otherwise in one of its own.'''
     form = meshes.format_of(path)
     try:
-        return mesh_process.triangles_of(form, str(path)).values()
+        return meshes.triangles_of(form, str(path)).values()
     except (Exception, SystemExit) as error:
         raise RequestError(in_a_line(error)) from None
 

@@ -19,12 +19,6 @@ Declaration: TypeAlias = Any | Sequence[tuple[Theta, Any]] | AffineSum
 
 Coefficients: TypeAlias = Callable[[Array], Any]
 
-NOWHERE = np.zeros(0)
-"""Where coefficients that do not depend on the parameter are evaluated."""
-
-MAX_CONTACT_SHARE = 0.5
-"""Unknowns of the constraint are declared where they are at most this share of all; else condensation gains nothing."""
-
 
 class AffineProblem(Problem):
     """A problem whose members A, f, B and g are constant or affine in functions of the parameter.
@@ -97,8 +91,9 @@ class AffineProblem(Problem):
         # Declared by classes of other problems; here by what was declared.
         self.constant = frozenset(constants)  # type: ignore[misc]
         self.affine = {name: sums[name] for name in MEMBERS if name not in self.constant}
+        # Condensation onto the unknowns of the constraint gains nothing where these are more than half of all.
         touched = np.unique(np.concatenate([term.indices for term in sums["B"].terms])).astype(np.intp)
-        self._contact_dofs = touched if 0 < len(touched) <= MAX_CONTACT_SHARE * n else None
+        self._contact_dofs = touched if 0 < len(touched) <= 0.5 * n else None
         if self._contact_dofs is not None:
             on_contact = sums["B"].mapped(lambda term: sp.csr_array(term[:, touched]))
             self._contact_columns = _constant_or_sum(on_contact)
@@ -114,7 +109,7 @@ class AffineProblem(Problem):
 
     @property
     def contact_dofs(self) -> Indices | None:
-        """The unknowns that B touches at some parameter; `None` where these are most of the unknowns."""
+        """Unknowns that B touches at some parameter; `None` where these are most of the unknowns."""
         return self._contact_dofs
 
     def contact(self, mu: Array) -> Contact | None:
@@ -125,7 +120,7 @@ class AffineProblem(Problem):
 
 
 def _of_product(first: Coefficients, second: Coefficients, third: Coefficients, mu: Array) -> Array:
-    """θ of first − second·third at mu: those of the first, then minus the products of those of the others."""
+    """Coefficients θ of first − second·third at mu: the first ones, then minus the products of the others."""
     return np.concatenate([first(mu), -np.outer(second(mu), third(mu)).ravel()])
 
 
@@ -133,9 +128,11 @@ def _minus(total: AffineSum, matrix: AffineSum, vector: AffineSum) -> AffineSum:
     """The sum of total − matrix · vector."""
     products = [A @ v for A in matrix.terms for v in vector.terms]
     thetas = total.thetas, matrix.thetas, vector.thetas
-    if all(isinstance(theta, Thetas) and theta.constant for theta in thetas):  # stays a constant
-        minus = -np.outer(matrix.coefficients(NOWHERE), vector.coefficients(NOWHERE)).ravel()
-        return AffineSum((*total.terms, *products), Thetas((*total.coefficients(NOWHERE), *minus)))
+    # A combination of constants stays a constant; constant coefficients are evaluated at no parameter.
+    if all(isinstance(theta, Thetas) and theta.constant for theta in thetas):
+        nowhere = np.zeros(0)
+        minus = -np.outer(matrix.coefficients(nowhere), vector.coefficients(nowhere)).ravel()
+        return AffineSum((*total.terms, *products), Thetas((*total.coefficients(nowhere), *minus)))
     return AffineSum((*total.terms, *products), partial(_of_product, *thetas))
 
 
@@ -143,9 +140,10 @@ def _constant_or_sum(member: AffineSum) -> Any:
     """The sum, or its value where no coefficient depends on the parameter."""
     if not (isinstance(member.thetas, Thetas) and member.thetas.constant):
         return member
-    if len(member.terms) == 1 and member.coefficients(NOWHERE)[0] == 1.0:
+    nowhere = np.zeros(0)
+    if len(member.terms) == 1 and member.coefficients(nowhere)[0] == 1.0:
         return member.terms[0]
-    return member.at(NOWHERE)
+    return member.at(nowhere)
 
 
 def _at(member: Any, mu: Array) -> Any:

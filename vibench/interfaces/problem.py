@@ -15,18 +15,17 @@ from scipy.spatial import KDTree
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.interfaces.affine import AffineSum
-from vibench.interfaces.outputs import Output
+from vibench.interfaces.outputs import MeshFields, Output, Picture
 from vibench.interfaces.parameters import ParameterBox
-from vibench.interfaces.pictures import MeshFields, Picture
 from vibench.linalg.factorisations import DEFAULT
 from vibench.linalg.inner_product import InnerProduct
 
+# The bound g of a row that constrains nothing: finite, so that no sum with it, and no product with zero, is NaN.
 ABSENT = 1e100
-"""g of a row that constrains nothing: a finite number, so that no sum with it, and no product with zero, is NaN."""
 
 
 def is_absent(g: Array) -> Mask:
-    """Which rows (m,) constrain nothing: those whose g is infinite, or was before something finite was added to it."""
+    """Mask of the rows (m,) that constrain nothing: g is infinite, even with something finite added to it."""
     return np.asarray(g >= 0.5 * ABSENT)
 
 

@@ -48,7 +48,7 @@ class Stop:
                 raise RequestError(f"{name} of Stop is {brief(repr(value), 80)}, expected {right} of at least 0")
 
     def reached(self, size: int, error: float) -> bool:
-        """Whether a construction with `size` vectors and this relative error stops."""
+        """Whether a construction stops with `size` vectors and this relative error."""
         return error <= self.tolerance if self.tolerance is not None else size >= (self.size or 0)
 
     def first_reached(self, errors: Array) -> int | None:
@@ -103,7 +103,7 @@ class DualStrategy(ABC):
 
 
 class Kind(StrEnum):
-    """How an enrichment depends on the parameter; break-even pairs strategies by this, never by name."""
+    """Dependence of an enrichment on the parameter; break-even pairs strategies by this, never by name."""
 
     NONE = "none"
     FIXED = "fixed"
@@ -199,10 +199,6 @@ def no_free(count: int) -> Mask:
     return np.zeros(count, dtype=bool)
 
 
-LISTED_RTOL = 1e-9
-"""Largest distance of a parameter from a listed one, relative to the widths of the box."""
-
-
 class Sampling(ABC):
     """Chooses parameters. Constructor arguments are the plugin's options; every random choice has a seed among them.
 
@@ -231,7 +227,7 @@ class Sampling(ABC):
 
 
 class Trainer(ABC):
-    """What an adaptive sampling strategy trains: a reduced model that grows with every high-fidelity solution."""
+    """Reduced model of an adaptive sampling strategy, which grows with every high-fidelity solution."""
 
     @abstractmethod
     def solve(self, mu: Array, bound: float = float("nan")) -> None:
@@ -275,11 +271,12 @@ def check_sample(box: ParameterBox, returned: object) -> Array:
         bounds = f"[{box.lower[i]:g}, {box.upper[i]:g}]"
         raise RequestError(f"parameter {k} has '{box.names[i]}' = {mus[k, i]:g}, outside the box {bounds}")
     if (listed := box.listed) is not None:
+        # Round-off of decimals and of scaled parameters, relative to the widths of the box.
         away = np.abs(listed[:, None] - mus) / box.widths
-        for k in np.flatnonzero(away.max(axis=2).min(axis=0, initial=np.inf) > LISTED_RTOL)[:1]:
+        for k in np.flatnonzero(away.max(axis=2).min(axis=0, initial=np.inf) > 1e-9)[:1]:
             raise RequestError(
-                f"parameter {k}, {mus[k].tolist()}, is none of the {len(listed)} listed ones, and the problem has "
-                "matrices at these only: name some of them"
+                f"parameter {k} = {mus[k].tolist()} is not available: the problem has matrices only at its "
+                f"{len(listed)} listed parameters; choose among those"
             )
     first = np.unique(mus, axis=0, return_index=True)[1]
     for k in sorted(set(range(len(mus))) - set(first.tolist()))[:1]:

@@ -18,9 +18,6 @@ from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality, 
 from vibench.interfaces.strategies import Cone, Enrichment, Sampling, check_sample
 from vibench.linalg.inner_product import InnerProduct
 
-ROUND_OFF = 1e-8
-"""Largest accepted deviation of norms from 1 and of inner products from 0."""
-
 
 def check_cone(cone: object, W: InnerProduct) -> Cone:
     """Refuse a cone whose generators have the wrong shape, are not finite, of unit norm in W, or in W⁺ unless free.
@@ -35,7 +32,8 @@ def check_cone(cone: object, W: InnerProduct) -> Cone:
     chi = _matrix("generators", cone.generators, W.dim)
     norms = W.norm(chi)
     away = np.abs(norms - 1.0)
-    if away.max(initial=0.0) > ROUND_OFF:
+    # Strategies normalise by norms with round-off of their own: half of the digits are asked for.
+    if away.max(initial=0.0) > 1e-8:
         worst = f"generator {away.argmax()} has norm {norms[away.argmax()]:.6g}"
         raise NumericalError(f"the generators do not all have unit norm in W: {worst}")
     if cone.free.shape != (chi.shape[1],):
@@ -62,7 +60,8 @@ def check_enrichment(enrichment: object, V: InnerProduct, basis: Array) -> Enric
         vectors = _matrix("vectors of the enrichment", enrichment.vectors, V.dim)
         off = V.gram(np.hstack([basis, vectors]), vectors)
         off[basis.shape[1] :] -= np.eye(vectors.shape[1])
-        if np.max(np.abs(off), initial=0.0) > ROUND_OFF:
+        # As for norms of generators: vectors are orthonormal up to round-off.
+        if np.max(np.abs(off), initial=0.0) > 1e-8:
             i, j = (int(k) for k in np.unravel_index(np.abs(off).argmax(), off.shape))
             other = f"mode {i} of V_N" if i < basis.shape[1] else f"vector {i - basis.shape[1]}"
             raise NumericalError(
@@ -105,12 +104,8 @@ def _finite_parameters(problem: Problem, name: str, mus: Array, count: int | Non
     return mus
 
 
-LARGEST = 1e100
-"""Entries beyond this, and matrices below its inverse, are refused: not even their cubes would be numbers."""
-
-
 def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
-    """`problem.assemble(mu)`, refused if shapes are wrong, values not real and finite, or out of range (`LARGEST`).
+    """`problem.assemble(mu)`, refused if shapes are wrong, values not real and finite, or out of range.
 
     Raises
     ------
@@ -130,18 +125,21 @@ def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
         if not np.isfinite(peak):
             infinite = "; +inf, which means that a row constrains nothing, is allowed" if name == "g" else ""
             raise NumericalError(f"{name} has entries that are not finite at mu = {mu.tolist()}{infinite}")
-        too_large = peak > LARGEST and name != "g"  # rows of it may be far
-        too_small = 0.0 < peak < 1.0 / LARGEST and name in ("A", "B")
+        # Not even cubes of entries beyond 1e100, or of inverses of smaller ones, are numbers. Rows of g may be far.
+        largest = 1e100
+        too_large = peak > largest and name != "g"
+        too_small = 0.0 < peak < 1.0 / largest and name in ("A", "B")
         if too_large or too_small:
             raise NumericalError(
                 f"{name} has entries of up to {peak:.0e} at mu = {mu.tolist()}; products of such numbers over- or "
-                f"underflow: choose units in which they are between {1.0 / LARGEST:.0e} and {LARGEST:.0e}"
+                f"underflow: choose units in which they are between {1.0 / largest:.0e} and {largest:.0e}"
             )
     return vi
 
 
+# Assemblies agree up to this difference relative to their largest entry: other processors may round otherwise, and
+# other meshes differ by 1.
 AGREEMENT_RTOL = 1e-9
-"""Largest difference relative to the largest entry; other processors may round otherwise, other meshes differ by 1."""
 
 
 @dataclass(frozen=True)
@@ -169,25 +167,26 @@ class Fingerprint:
 def fingerprint(problem: Problem, vi: VariationalInequality) -> Fingerprint:
     """The fingerprint of `vi`, an assembly of the problem, and of its inner products."""
     arrays = {name: getattr(vi, name) for name in MEMBERS}
-    return _of(arrays | {"X_V": problem.V.matrix, "X_W": problem.W.matrix})
+    return _fingerprint(arrays | {"X_V": problem.V.matrix, "X_W": problem.W.matrix})
 
 
-def _of(arrays: Mapping[str, Any]) -> Fingerprint:
+def _fingerprint(arrays: Mapping[str, Any]) -> Fingerprint:
     products = {name: _probed(array) for name, array in arrays.items()}
     sizes = ((name, array.data if sp.issparse(array) else array) for name, array in arrays.items())
-    sizes = ((name, array[~is_absent(array)] if name == "g" else array) for name, array in sizes)  # they are far
+    # Entries of g of absent rows are far larger than all others.
+    sizes = ((name, array[~is_absent(array)] if name == "g" else array) for name, array in sizes)
     return Fingerprint(products, {name: float(np.max(np.abs(size), initial=0.0)) for name, size in sizes})
 
 
 def _probed(array: Any) -> Array:
-    """A copy of a vector; of a matrix its product with entries in [1, 2) that are the same in every process."""
+    """A copy of a vector, or the product of a matrix with a vector that is the same in every process."""
     if array.ndim == 1:
         return np.array(array)
     return np.asarray(array @ (1.0 + np.random.default_rng(0).random(array.shape[1])))
 
 
 class ReferenceAssembly:
-    """The assembly at one parameter that those at others are compared with; it is kept as the problem returned it."""
+    """Assembly at one parameter, as the problem returned it; assemblies at other parameters are compared with it."""
 
     def __init__(self, problem: Problem, vi: VariationalInequality) -> None:
         self._problem, self._vi = problem, vi
@@ -197,14 +196,14 @@ class ReferenceAssembly:
         """Raise a `NumericalError` if a member declared `constant` is another one in the assembly at mu (d,)."""
         # The same object needs no product; `refuse_rewritten_constants` tells if its entries were replaced.
         names = [name for name in self._problem.constant if getattr(vi, name) is not getattr(self._vi, name)]
-        for deviation in _of({name: getattr(vi, name) for name in names}).deviations(self.fingerprint):
+        for deviation in _fingerprint({name: getattr(vi, name) for name in names}).deviations(self.fingerprint):
             where = f"at mu = {mu.tolist()} from that at the first training parameter"
             raise NumericalError(f"a member declared `constant` depends on mu: {deviation} {where}")
 
     def refuse_rewritten_constants(self) -> None:
         """Raise a `NumericalError` if later assemblies have written other entries into a member declared `constant`."""
         constants = {name: getattr(self._vi, name) for name in self._problem.constant}
-        for deviation in _of(constants).deviations(self.fingerprint):
+        for deviation in _fingerprint(constants).deviations(self.fingerprint):
             raise NumericalError(f"a member declared `constant` is overwritten by later assemblies: {deviation}")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import RequestError, requested
 from vibench.files import write_atomically, writing
-from vibench.interfaces.pictures import MeshFields
+from vibench.interfaces.outputs import MeshFields
 from vibench.offline.models import Model, Parameters
 
 

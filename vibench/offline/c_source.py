@@ -16,8 +16,7 @@ import numpy as np
 
 from vibench.arrays import Array, Indices
 from vibench.errors import RequestError
-from vibench.interfaces.affine import AffineSum, Thetas
-from vibench.interfaces.expressions import CONSTANTS, Expression
+from vibench.interfaces.affine import CONSTANTS, AffineSum, Expression, Thetas
 from vibench.interfaces.problem import MEMBERS
 from vibench.model.chebyshev import AffinePolynomial
 

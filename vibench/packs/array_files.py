@@ -23,20 +23,6 @@ from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import RequestError, message_of, unknown_name
 from vibench.provenance import memory
 
-FORMATS = (".npz", ".npy", ".mtx", ".mtx.gz", ".h5", ".hdf5")
-
-LINE = 128
-"""Most bytes that an entry of a Matrix Market file takes; what is longer holds more than it declares."""
-
-COMMENTS = 2**16
-"""Most bytes of the comments of a Matrix Market file."""
-
-UNREADABLE = (
-    OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, NotImplementedError, RuntimeError, SyntaxError,
-    struct.error, zipfile.BadZipFile, zlib.error, MemoryError,
-)  # fmt: skip
-"""What NumPy, SciPy, zipfile and h5py raise for damaged files."""
-
 
 def safe_path(folder: Path, name: str) -> Path:
     """Path of a file in a folder.
@@ -136,15 +122,20 @@ class ArrayFiles:
             yield
         except RequestError as error:
             raise RequestError(f"{what}: {error}") from None
-        except UNREADABLE as error:
+        # NumPy, SciPy, zipfile and h5py raise these for damaged files.
+        except (
+            OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, NotImplementedError, RuntimeError,
+            SyntaxError, struct.error, zipfile.BadZipFile, zlib.error, MemoryError,
+        ) as error:  # fmt: skip
             raise RequestError(f"{what}: '{reference}' is damaged: {message_of(error)}") from None
 
     def _read(self, reference: str) -> Any:
         """A dense array, or the arrays of a sparse matrix by name, or a matrix."""
         name, _, inner = reference.partition(":")
-        suffix = next((ending for ending in FORMATS if name.endswith(ending)), "")
+        formats = (".npz", ".npy", ".mtx", ".mtx.gz", ".h5", ".hdf5")
+        suffix = next((ending for ending in formats if name.endswith(ending)), "")
         if not suffix:
-            raise RequestError(f"'{name}' has a format that is not read; expected one of {', '.join(FORMATS)}")
+            raise RequestError(f"'{name}' has a format that is not read; expected one of {', '.join(formats)}")
         path = safe_path(self._folder, name)
         match suffix:
             case ".npz":
@@ -191,12 +182,14 @@ class ArrayFiles:
         if count * dtype.itemsize > size:
             raise RequestError(f"the array {size_of(shape)} is larger than its file: it is damaged or cut off")
         self.take(_bytes(count, dtype))
-        flat = np.frombuffer(bytearray(file.read(count * dtype.itemsize)), dtype, count)  # SciPy sorts in place
+        # A bytearray, since SciPy sorts in place.
+        flat = np.frombuffer(bytearray(file.read(count * dtype.itemsize)), dtype, count)
         return flat.reshape(shape, order="F" if fortran else "C")
 
     def _matrix_market(self, path: Path) -> Any:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-            head = file.read(COMMENTS)
+            comments = 2**16
+            head = file.read(comments)
             rows, columns, entries, layout, field, symmetry = scipy.io.mminfo(io.BytesIO(head))
             if field == "pattern":
                 raise RequestError("the Matrix Market file has the field 'pattern', it holds no values")
@@ -204,10 +197,11 @@ class ArrayFiles:
                 raise RequestError("it holds complex numbers; expected real ones")
             if min(rows, columns, entries) < 0:
                 raise RequestError(f"the Matrix Market file declares {entries} entries of {rows}×{columns}")
-            # indices and values as triplets and as rows, and the pointers; what is read as text is given back
+            # Indices and values as triplets and as rows, and the pointers; what is read as text is given back.
             self.take((40 + 40 * (symmetry != "general")) * entries + 8 * min(rows, columns) + 16 * max(rows, columns))
-            text = head + file.read(min(entries * LINE, self._left) + 1)
-            if len(text) > entries * LINE + COMMENTS:
+            # An entry takes at most 128 bytes: a longer file holds more entries than it declares.
+            text = head + file.read(min(entries * 128, self._left) + 1)
+            if len(text) > entries * 128 + comments:
                 raise RequestError(f"the Matrix Market file is longer than the {entries} entries that it declares")
         self.take(len(text))
         matrix = scipy.io.mmread(io.BytesIO(text))
@@ -268,7 +262,8 @@ class ArrayFiles:
         fits = f"the shape {size_of((rows, columns))} and the {len(data)} values"
         if pointers[0] != 0 or np.any(np.diff(pointers) < 0):
             raise RequestError(f"indptr does not fit {fits}")
-        used = int(pointers[-1])  # SciPy may have allocated more
+        # SciPy may have allocated more entries than it uses.
+        used = int(pointers[-1])
         indices = np.ravel(stored["indices"])[:used]
         try:
             indices = whole(indices, "indices", 0, short - 1, used)
@@ -320,8 +315,9 @@ class ArrayFiles:
             )
 
 
-def whole(values: Any, what: str, low: int = -(2**62), high: int = 2**62, count: int | None = None) -> Indices:
-    """Whole numbers of any type as int64; compiled code checks neither types nor ranges of indices."""
+def whole(values: Any, what: str, low: int | None = None, high: int | None = None, count: int | None = None) -> Indices:
+    """Integers of any type as int64; compiled code checks neither types nor ranges of indices."""
+    low, high = -(2**62) if low is None else low, 2**62 if high is None else high
     values = np.ravel(values)
     if values.dtype.kind not in "iuf" or np.any(values != np.round(values)):
         raise RequestError(f"{what} has values that are no whole numbers; expected indices")

@@ -1,4 +1,4 @@
-"""What the numbers of a model pack mean: definiteness, Dirichlet rows, signs and scalings of reference solutions."""
+"""Checks of the numbers of a model pack: definiteness, Dirichlet rows, signs and scalings of reference solutions."""
 
 from __future__ import annotations
 
@@ -19,15 +19,6 @@ from vibench.packs.manifest import read_manifest
 from vibench.packs.pack import ModelPack, PackSolutions
 from vibench.packs.reader import PackReader, naming, one_triangle
 from vibench.qp.verification import kkt_residuals
-
-FACTORISED = 3
-"""Listed parameters at which the definiteness of A is checked; a run checks it wherever it solves."""
-
-PENALTY = 1e10
-"""Ratio of the largest to the median diagonal entry of A above which the former penalises Dirichlet unknowns."""
-
-NEGATIVE_RTOL = 1e-8
-"""Size of negative entries of λ, relative to its largest one, that count as round-off."""
 
 
 @requested
@@ -62,8 +53,11 @@ def _check(pack: ModelPack) -> float | None:
     if not np.any(reference.lam):
         raise RequestError("solutions.lam is zero everywhere: no constraint is active, there is nothing to reduce")
     solved = pack.V is not None and reference.u is not None
-    residuals = [_Solution.of(pack, reference, k).residual for k in range(len(reference.parameters))] if solved else []
-    if reference.lam.min() < -NEGATIVE_RTOL * np.abs(reference.lam).max():
+    residuals = (
+        [_Solution.from_pack(pack, reference, k).residual for k in range(len(reference.parameters))] if solved else []
+    )
+    # Negative entries up to 1e-8 of the largest one are round-off.
+    if reference.lam.min() < -1e-8 * np.abs(reference.lam).max():
         if solved:
             raise _explained(pack, reference, int(np.argmin(reference.lam.min(axis=0))))
         raise _of_signs(reference.lam)
@@ -92,7 +86,8 @@ def _check_operators(pack: ModelPack, X_V: Any) -> None:
                     member.sum.coefficients(mu)
             except NumericalError as error:
                 raise RequestError(f"operators.{name}: {error}") from None
-    for mu in listed[np.linspace(0, len(listed) - 1, FACTORISED).round().astype(int)]:
+    # Three samples: a run checks the definiteness of A wherever it solves.
+    for mu in listed[np.linspace(0, len(listed) - 1, 3).round().astype(int)]:
         matrix = A.at(mu)
         _check_dirichlet(matrix, X_V)
         try:
@@ -102,7 +97,7 @@ def _check_operators(pack: ModelPack, X_V: Any) -> None:
 
 
 def _replaced_rows(matrix: Any) -> bool:
-    """Whether some rows have a diagonal entry alone while their columns have more."""
+    """Whether some rows have only a diagonal entry while their columns have more."""
     return bool(np.any((_couplings(matrix) == 0) & (_couplings(matrix.T) > 0)))
 
 
@@ -115,9 +110,10 @@ def _why_indefinite(A: Any) -> str:
 
 
 def _check_dirichlet(A: Any, X_V: Any) -> None:
-    diagonal = A.diagonal()
-    if diagonal.max(initial=0.0) > PENALTY * max(float(np.median(diagonal)), 0.0) > 0.0:
-        k = np.flatnonzero(diagonal > PENALTY * np.median(diagonal))
+    # Penalties of Dirichlet unknowns are ten orders of magnitude above the median of the diagonal.
+    penalty, diagonal = 1e10, A.diagonal()
+    if diagonal.max(initial=0.0) > penalty * max(float(np.median(diagonal)), 0.0) > 0.0:
+        k = np.flatnonzero(diagonal > penalty * np.median(diagonal))
         raise RequestError(
             f"operators.A has diagonal entries of {diagonal.max():.0e} at {len(k)} unknowns, the first is {k[0]}: a "
             "penalty for Dirichlet conditions was left in; remove these unknowns, or name the free ones in spaces.free"
@@ -140,7 +136,7 @@ def _couplings(matrix: Any) -> Array:
 
 def _of_signs(lam: Array) -> RequestError:
     """The error for λ that has negative entries, without a solution u that would explain them."""
-    if lam.max() <= NEGATIVE_RTOL * np.abs(lam).max():
+    if lam.max() <= 1e-8 * np.abs(lam).max():
         return RequestError("solutions.lam is negative: λ has the other sign, it is −λ that is nonnegative")
     i, k = np.unravel_index(lam.argmin(), lam.shape)
     return RequestError(
@@ -158,8 +154,8 @@ class _Solution:
     lam: Array
 
     @classmethod
-    def of(cls, pack: ModelPack, given: PackSolutions, k: int) -> _Solution:
-        assert given.u is not None  # where solutions are compared with operators
+    def from_pack(cls, pack: ModelPack, given: PackSolutions, k: int) -> _Solution:
+        assert given.u is not None, "solutions are compared with operators"
         try:
             vi = pack.at(given.parameters[k])
         except NumericalError as error:
@@ -169,18 +165,20 @@ class _Solution:
     @property
     def residual(self) -> float:
         """The largest relative KKT residual; infinite for λ outside W⁺."""
-        if self.lam.min(initial=0.0) < -NEGATIVE_RTOL * np.abs(self.lam).max(initial=0.0):
+        if self.lam.min(initial=0.0) < -1e-8 * np.abs(self.lam).max(initial=0.0):
             return float("inf")
         return kkt_residuals(self.vi, self.u, np.maximum(self.lam, 0.0)).worst
 
-    def change(self, *, u: float = 1.0, lam: float = 1.0, **factors: float) -> _Solution:
-        """A copy with its parts multiplied by factors."""
-        vi = replace(self.vi, **{name: factor * getattr(self.vi, name) for name, factor in factors.items()})
-        return _Solution(vi, u * self.u, lam * self.lam)
+    def change(self, **factors: float) -> _Solution:
+        """A copy with members, u or lam multiplied by factors."""
+        members = {name: factor * getattr(self.vi, name) for name, factor in factors.items() if name in MEMBERS}
+        u, lam = (factors.get(name, 1.0) * getattr(self, name) for name in ("u", "lam"))
+        return _Solution(replace(self.vi, **members), u, lam)
 
 
 Change = Callable[[_Solution, InnerProduct], _Solution]
 
+# Possible mistakes in a solution that solves nothing, each with the change that corrects it.
 MISTAKES: Mapping[str, Change] = {
     "λ has the other sign: with B u ≤ g, A u + Bᵀλ = f and λ ≥ 0": lambda s, _: s.change(lam=-1.0),
     "the constraints are B u ≥ g: write B and g with the other sign": lambda s, _: s.change(B=-1.0, g=-1.0),
@@ -197,12 +195,11 @@ MISTAKES: Mapping[str, Change] = {
         s, lam=W.apply(s.lam)
     ),
 }
-"""What may be wrong with a solution that solves nothing, and the change that mends it."""
 
 
 def _explained(pack: ModelPack, given: PackSolutions, k: int) -> RequestError:
     """The error for a reference solution, with the single change that would make it right if there is one."""
-    solution, tolerance = _Solution.of(pack, given, k), given.tolerance
+    solution, tolerance = _Solution.from_pack(pack, given, k), given.tolerance
     title = f"solutions: column {k}, mu = {given.parameters[k].tolist()}, does not solve the problem"
     for meant, change in MISTAKES.items():
         if change(solution, pack.W).residual <= tolerance:

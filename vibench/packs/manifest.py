@@ -11,17 +11,14 @@ from annotated_types import Ge, Gt, MinLen
 from pydantic import AllowInfNan, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from vibench.errors import RequestError, fault_line
-from vibench.interfaces.expressions import normal_names
+from vibench.interfaces.affine import normal_names
 from vibench.packs.array_files import safe_path
 
+# Name of the manifest in its folder.
 FILE = "pack.toml"
-"""Name of the manifest in its folder."""
 
-LARGEST = 2**24
-"""Most bytes of the manifest."""
-
+# Version of the format that is read and written.
 VERSION = 1
-"""Version of the format that is read and written."""
 
 Finite: TypeAlias = Annotated[float, AllowInfNan(False)]
 Text: TypeAlias = Annotated[str, MinLen(1)]
@@ -187,13 +184,6 @@ class Manifest(_Table):
         yield from _references(self)
 
 
-REFERENCES = frozenset(
-    {"X_V", "X_W", "free", "contact", "integrals", "constant", "each", "table", "array", "u", "lam"}
-    | {"file", "points", "unknowns", "positions"}
-)
-"""Keys whose texts refer to files."""
-
-
 def _references(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
     if isinstance(value, BaseModel):
         for name, part in value:
@@ -201,7 +191,11 @@ def _references(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[str, 
     elif isinstance(value, list):
         for k, part in enumerate(value):
             yield from _references(part, (*place, str(k)))
-    elif isinstance(value, str) and place[-1] in REFERENCES:
+    # Keys whose texts refer to files.
+    elif isinstance(value, str) and place[-1] in {
+        "X_V", "X_W", "free", "contact", "integrals", "constant", "each", "table", "array", "u", "lam", "file",
+        "points", "unknowns", "positions",
+    }:  # fmt: skip
         yield ".".join(name for name in place if name not in ("constant", "array")), value
 
 
@@ -214,8 +208,8 @@ def read_manifest(folder: Path) -> Manifest:
         Naming the key, what is wrong with it, and what is expected.
     """
     path = safe_path(folder, FILE)
-    if (size := path.stat().st_size) > LARGEST:
-        raise RequestError(f"{FILE} has {size} bytes, at most {LARGEST} are read; write points to an array")
+    if (size := path.stat().st_size) > (most := 2**24):
+        raise RequestError(f"{FILE} has {size} bytes, at most {most} are read; write points to an array")
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

@@ -15,8 +15,7 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError, RequestError
-from vibench.interfaces.affine import AffineSum, Thetas, entries_of
-from vibench.interfaces.expressions import Expression
+from vibench.interfaces.affine import AffineSum, Expression, Thetas, entries_of
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
@@ -27,12 +26,6 @@ from vibench.model.affine import decomposed, held_out_error
 from vibench.packs.manifest import Manifest
 from vibench.reduction.cones import project_on_cone
 
-SAME_RTOL = 1e-8
-"""Largest distance between a parameter and a listed one that count as the same, relative to the widths of the box.
-
-Far above round-off, since assemblies are timed next to a parameter, far below the distances of listed ones.
-"""
-
 
 @dataclass(frozen=True)
 class Listing:
@@ -40,6 +33,11 @@ class Listing:
 
     parameters: Array
     widths: Array
+
+    @staticmethod
+    def _are_same(distance: float) -> bool:
+        # Far above round-off, since assemblies are timed next to a parameter, far below distances of listed ones.
+        return distance <= 1e-8
 
     def number(self, mu: Array) -> int:
         """Number of the listed parameter that equals mu (d,).
@@ -51,7 +49,7 @@ class Listing:
         """
         away = np.abs((self.parameters - mu) / self.widths).max(axis=1)
         nearest = int(away.argmin())
-        if not away[nearest] <= SAME_RTOL:
+        if not self._are_same(away[nearest]):
             raise NumericalError(f"the pack has arrays at its listed parameters only; mu = {mu.tolist()} is not listed")
         return nearest
 
@@ -61,12 +59,13 @@ class Listing:
 
         places = (self.parameters - self.parameters.min(axis=0)) / self.widths
         _, first, number = np.unique(places, axis=0, return_index=True, return_inverse=True)
-        if len(first) < len(places):  # of equal points a tree would find all pairs
+        # A tree would find all pairs of equal points, which may be very many.
+        if len(first) < len(places):
             again = int(np.setdiff1d(np.arange(len(places)), first)[0])
             return int(first[number.ravel()[again]]), again
         away, nearest = KDTree(places).query(places, k=2, p=np.inf)
         k = int(away[:, 1].argmin())
-        return (k, int(nearest[k, 1])) if away[k, 1] <= SAME_RTOL else None
+        return (k, int(nearest[k, 1])) if self._are_same(away[k, 1]) else None
 
 
 @dataclass(frozen=True)
@@ -287,7 +286,8 @@ def pack_multipliers(pack: ModelPack) -> tuple[Array, Array]:
     training = np.array([tuple(mu) in of_training for mu in pack.reference.parameters.tolist()])
     if not training.any():
         raise RequestError("none of the parameters of the solutions is a training parameter")
-    lam = np.maximum(pack.reference.lam, 0.0)  # what is negative is round-off, as checks of the pack have found
+    # Negative entries are round-off, as the checks of the pack have found.
+    lam = np.maximum(pack.reference.lam, 0.0)
     return lam[:, training], lam[:, ~training]
 
 

@@ -17,7 +17,7 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError, RequestError, requested
-from vibench.interfaces.expressions import Expression, normal_names
+from vibench.interfaces.affine import Expression, normal_names
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import MEMBERS, without_infinities

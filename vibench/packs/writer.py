@@ -23,11 +23,6 @@ from vibench.packs.manifest import FILE, VERSION
 
 _save_arrays: Callable[..., None] = partial(np.savez_compressed, allow_pickle=False)
 
-EXPLANATION = """\
-# u = argmin ½ uᵀA u − fᵀu subject to B u ≤ g, with A u + Bᵀλ = f and λ ≥ 0, on the free unknowns.
-# Listed parameters are numbered from 0: those of the training set, then those of the validation set.
-"""
-
 
 def write_pack(
     problem: Problem, folder: Path, *, name: str, source: str, validation: int, seed: int, solutions: bool = False
@@ -62,7 +57,11 @@ def write_pack(
         lines += _operator_table(problem, listed, part)
         lines += _solution_table(problem, listed, part) if solutions else []
         lines += _output_tables(problem, part)
-        (part / FILE).write_text(EXPLANATION + "\n".join(lines) + "\n", encoding="utf-8")
+        explanation = (
+            "# u = argmin ½ uᵀA u − fᵀu subject to B u ≤ g, with A u + Bᵀλ = f and λ ≥ 0, on the free unknowns.\n"
+            "# Listed parameters are numbered from 0: those of the training set, then those of the validation set.\n"
+        )
+        (part / FILE).write_text(explanation + "\n".join(lines) + "\n", encoding="utf-8")
 
 
 @contextlib.contextmanager

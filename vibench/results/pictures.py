@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vibench.interfaces.pictures import Picture
+from vibench.interfaces.outputs import Picture
 from vibench.results.sqlite import read_rows
 from vibench.text import printable
 

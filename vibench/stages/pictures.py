@@ -10,8 +10,8 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
+from vibench.interfaces.outputs import Picture
 from vibench.interfaces.parameters import ParameterBox
-from vibench.interfaces.pictures import Picture
 from vibench.plugins.plugin import Plugin
 from vibench.results.pictures import failure_rows, members, picture_rows
 from vibench.stages.base import Result, Row, Stage, build_problem

@@ -10,9 +10,8 @@ import scipy.sparse as sp
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.highfidelity import active_set
-from vibench.interfaces.outputs import Output
+from vibench.interfaces.outputs import MeshFields, Output, Picture
 from vibench.interfaces.parameters import ParameterBox
-from vibench.interfaces.pictures import MeshFields, Picture
 from vibench.interfaces.problem import MEMBERS
 from vibench.interfaces.validation import training_parameters, validation_parameters
 from vibench.linalg.inner_product import InnerProduct, singular_values

@@ -12,7 +12,7 @@ from samples import SampleStore, carry_out
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
-from vibench.interfaces.pictures import Picture
+from vibench.interfaces.outputs import Picture
 from vibench.plugins.plugin import Plugin
 from vibench.results import pictures
 from vibench.results.database import ResultsDatabase

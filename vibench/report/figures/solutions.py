@@ -11,7 +11,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.tri import Triangulation
 
 from vibench.arrays import Array
-from vibench.interfaces.pictures import Picture
+from vibench.interfaces.outputs import Picture
 from vibench.report.figures.data import ProblemTables
 from vibench.report.figures.style import COLOURS, CaptionedFigure, Layout, Pages, Sheet
 

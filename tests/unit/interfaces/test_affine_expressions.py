@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vibench.errors import NumericalError, RequestError
-from vibench.interfaces.expressions import CONSTANTS, FUNCTIONS, Expression
+from vibench.interfaces.affine import CONSTANTS, FUNCTIONS, Expression
 
 NAMES = ("a", "b")
 numbers = st.floats(0.0, 1e3).map(repr) | st.integers(0, 50).map(str)
