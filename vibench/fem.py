@@ -86,8 +86,8 @@ class Unilateral:
         sign = 1.0 if self.sense == "<=" else -1.0
         if callable(values) and self._integrals is not None:
             return sign * self._integrals(values)
-        given = np.broadcast_to(values(self.points) if callable(values) else values, self.W.dim)
-        return sign * self.W.apply(np.asarray(given, float))
+        at_points = np.broadcast_to(values(self.points) if callable(values) else values, self.W.dim)
+        return sign * self.W.apply(np.asarray(at_points, float))
 
 
 def unilateral(basis: Basis, sense: Sense, *, free: Indices | None = None, lumped: bool = True) -> Unilateral:
@@ -171,8 +171,8 @@ def normal_constraint(
     # Entries below round-off are components of a normal that vanish.
     B.data[np.abs(B.data) <= 1e-14 * np.max(np.abs(B.data), initial=0.0)] = 0.0
     B.eliminate_zeros()
-    kept = np.arange(len(vertices)) if free is None else np.flatnonzero(abs(B[:, free]).sum(axis=1) > 0.0)
-    B, vertices = sp.csr_array(B[kept]), vertices[kept]
+    constrained = np.arange(len(vertices)) if free is None else np.flatnonzero(abs(B[:, free]).sum(axis=1) > 0.0)
+    B, vertices = sp.csr_array(B[constrained]), vertices[constrained]
     dofs, points = scalar.nodal_dofs[0, vertices], basis.mesh.p[:, vertices]
     if lumped:
         return Unilateral(B, _diagonal(_positive(lumped_mass(scalar), dofs)), vertices, points, "<=")

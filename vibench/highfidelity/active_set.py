@@ -94,20 +94,20 @@ class HighFidelitySolver:
         refuses it, or B touches unknowns outside the declared `contact_dofs`.
         """
         vi = checked_assembly(self._problem, mu)
-        found = self.verify(mu, vi, self.solve_assembled(mu, vi))
-        self.remember(mu, found)
-        return found
+        solution = self.verify(mu, vi, self.solve_assembled(mu, vi))
+        self.remember(mu, solution)
+        return solution
 
     def solve_assembled(self, mu: Array, vi: VariationalInequality) -> ActiveSetSolution:
         """Solve the variational inequality `vi` assembled at mu (d,); unless remembered, no other starts from it."""
         return solve_unverified(vi, self.condensed(vi), self._start(mu))
 
-    def verify(self, mu: Array, vi: VariationalInequality, found: ActiveSetSolution) -> HighFidelitySolution:
+    def verify(self, mu: Array, vi: VariationalInequality, unverified: ActiveSetSolution) -> HighFidelitySolution:
         """The solution of `vi`, which has to be the variational inequality solved last, at mu (d,), verified.
 
         Raises a `NumericalError` if its residuals are above `ACCURACY`, or the problem refuses it.
         """
-        solution = verified(vi, self._stiffness or self.condensed(vi), found)
+        solution = verified(vi, self._stiffness or self.condensed(vi), unverified)
         reason = self._problem.refuse(mu, solution.u, solution.lam)
         if reason:
             raise NumericalError(f"at mu = {mu.tolist()}: {reason}")
@@ -218,8 +218,8 @@ def solve_unverified(
     system = stiffness.active_set_system(program)
     starts = [] if start is None else [start[reading.kept]]
     for active in [*starts, np.zeros(len(reading.kept), bool)]:
-        if found := _solution_everywhere(system, active, reading.equal):
-            u, forces, iterations = found
+        if settled := _solution_everywhere(system, active, reading.equal):
+            u, forces, iterations = settled
             fallback = ""
             break
     else:
@@ -234,18 +234,18 @@ def solve_unverified(
 
 
 def verified(
-    vi: VariationalInequality, stiffness: CondensedStiffness, found: ActiveSetSolution
+    vi: VariationalInequality, stiffness: CondensedStiffness, unverified: ActiveSetSolution
 ) -> HighFidelitySolution:
     """A solution with its natural residuals, refined where these are above `ACCURACY`.
 
     Raises a `NumericalError` if they are still above it then.
     """
-    solution = _refined_to_accuracy(vi, stiffness, found)
+    solution = _refined_to_accuracy(vi, stiffness, unverified)
     if not solution.residuals.worst <= ACCURACY:
         # Condensation may lose more digits than refinement wins back.
         plain = CondensedStiffness(vi.A)
         again = solve_unverified(vi, plain, solution.lam > 0.0)
-        fallback = "; ".join(filter(None, (found.fallback, "solved without condensation")))
+        fallback = "; ".join(filter(None, (unverified.fallback, "solved without condensation")))
         solution = _refined_to_accuracy(vi, plain, replace(again, fallback=fallback))
     if not solution.residuals.worst <= ACCURACY:
         raise NumericalError(
@@ -255,17 +255,17 @@ def verified(
 
 
 def _refined_to_accuracy(
-    vi: VariationalInequality, stiffness: CondensedStiffness, found: ActiveSetSolution
+    vi: VariationalInequality, stiffness: CondensedStiffness, unverified: ActiveSetSolution
 ) -> HighFidelitySolution:
     """The solution after as many steps of iterative refinement as `ACCURACY` takes, at most three."""
-    u, lam = found.u, found.lam
+    u, lam = unverified.u, unverified.lam
     residuals = verification.kkt_residuals(vi, u, lam, stiffness.dual_norms)
     for _ in range(3):
         if residuals.worst <= ACCURACY:
             break
         u, lam = _refined(vi, stiffness, u, lam)
         residuals = verification.kkt_residuals(vi, u, lam, stiffness.dual_norms)
-    return HighFidelitySolution(u, lam, found.fallback, found.iterations, residuals)
+    return HighFidelitySolution(u, lam, unverified.fallback, unverified.iterations, residuals)
 
 
 def _without_cycling(
@@ -276,9 +276,9 @@ def _without_cycling(
     if not equal.any() and answer.alpha is not None and np.all(np.isfinite(answer.alpha)):
         weights = answer.alpha * row_norms(vi.B)
         guess = weights > 1e-8 * np.max(weights, initial=0.0)
-        found = _solution_everywhere(system, guess)
-        if found is not None:
-            return found, f"the active set cycled; first guess by {FALLBACK_SOLVER}"
+        settled = _solution_everywhere(system, guess)
+        if settled is not None:
+            return settled, f"the active set cycled; first guess by {FALLBACK_SOLVER}"
     exact = least_distance_solution(vi, SparseCholesky(vi.A, "A"), equal, guess)
     if exact is None:
         raise NumericalError("no active set solves the high-fidelity problem; is it feasible?")

@@ -68,10 +68,10 @@ def coarse_contact(solve: Callable[[Array], Array], vi: VariationalInequality) -
     displacements = solve(np.column_stack([coarse.toarray().T, vi.f]))
     K, excess = coarse @ displacements[:, :-1], coarse @ displacements[:, -1] - bounds
     values, vectors = np.linalg.eigh(0.5 * (K + K.T))
-    kept = values > EPS * len(values) * np.max(values, initial=0.0)
-    root = np.sqrt(values[kept])
+    regular = values > EPS * len(values) * np.max(values, initial=0.0)
+    root = np.sqrt(values[regular])
     try:
-        forces, _ = nnls(root[:, None] * vectors[:, kept].T, (vectors[:, kept].T @ excess) / root)
+        forces, _ = nnls(root[:, None] * vectors[:, regular].T, (vectors[:, regular].T @ excess) / root)
     except RuntimeError:
         # Without convergence the rows that are violated without forces are a larger guess.
         forces = np.maximum(excess, 0.0)

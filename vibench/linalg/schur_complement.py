@@ -152,10 +152,10 @@ class StaticCondensation:
             return self._retained_block.T
         retained, interface = sp.coo_array(self._retained_block), self._pattern.interface
         rows, columns = retained.coords
-        kept = ~(np.isin(rows, interface) & np.isin(columns, interface))
-        data = np.concatenate([retained.data[kept], self._factor.schur_blocks().toarray().ravel()])
-        rows = np.concatenate([rows[kept], np.repeat(interface, len(interface))])
-        columns = np.concatenate([columns[kept], np.tile(interface, len(interface))])
+        apart = ~(np.isin(rows, interface) & np.isin(columns, interface))
+        data = np.concatenate([retained.data[apart], self._factor.schur_blocks().toarray().ravel()])
+        rows = np.concatenate([rows[apart], np.repeat(interface, len(interface))])
+        columns = np.concatenate([columns[apart], np.tile(interface, len(interface))])
         return sp.csc_array((data, (rows, columns)), shape=retained.shape)
 
     @property

@@ -151,8 +151,8 @@ class LoadCoordinates:
     def __init__(self, V: InnerProduct, basis: Array, dofs: Indices, loads: ContactLoads) -> None:
         self._contact = ContactCoordinates(V, basis, dofs)
         acting = loads.fixed.any(axis=0)
-        given = self._contact.supremizers(np.hstack([loads.fixed[:, acting], np.eye(len(dofs))[:, loads.reached]]))
-        self._axes, represented = _beside(self._contact.plain, given)
+        spanning = self._contact.supremizers(np.hstack([loads.fixed[:, acting], np.eye(len(dofs))[:, loads.reached]]))
+        self._axes, represented = _beside(self._contact.plain, spanning)
         dim, count = self._axes.shape[1], int(acting.sum())
         self.plain: Array = np.eye(dim, basis.shape[1])
         self._fixed, self._reached = np.zeros((dim, loads.fixed.shape[1])), np.ascontiguousarray(represented[:, count:])

@@ -146,13 +146,13 @@ class ContactInfSup:
         S = self._schur
         if isinstance(S, BlockDiagonal) or not self._lost <= 0.5:
             return None
-        iterations, kept = Lanczos(lambda v: W.riesz(S @ v), W.matrix), 1.0 - 1.01 * self._lost
+        iterations, softness = Lanczos(lambda v: W.riesz(S @ v), W.matrix), 1.0 - 1.01 * self._lost
 
         def estimate(accuracy: float) -> float:
-            return float(abs(theta) * np.sqrt(kept / iterations.largest(accuracy)))
+            return float(abs(theta) * np.sqrt(softness / iterations.largest(accuracy)))
 
         def stable(beta: float) -> bool:
-            square = beta**2 / kept
+            square = beta**2 / softness
             tau = square / theta
             parts = [2.0 * tau * B, -(tau**2) * S, -square * W.matrix]
             return is_proved_definite(parts, implementation(DEFAULT))
