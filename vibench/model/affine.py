@@ -119,7 +119,8 @@ def coefficients(
     for name in declared:
         of = problem.affine[name]
         for first, names in sums:
-            if of.thetas is first.thetas and len(of.terms) == len(first.terms):  # they share its values
+            # Members that share a function share its values: it is evaluated once.
+            if of.thetas is first.thetas and len(of.terms) == len(first.terms):
                 names.append(name)
                 break
         else:
@@ -148,7 +149,8 @@ def check_affine(problem: Problem, training: Array) -> None:
             exact, summed = getattr(vi, name), without_infinities(declared.at(mu))
             if summed.shape != exact.shape:
                 raise NumericalError(f"the affine sum of {name} has shape {summed.shape}, {name} itself {exact.shape}")
-            if name == "g":  # absent rows would hide all others
+            # Absent rows are huge numbers in g, which would hide the differences of all others.
+            if name == "g":
                 exact, summed = (np.where(is_absent(exact) & is_absent(summed), 0.0, each) for each in (exact, summed))
             away, size = float(abs(summed - exact).max()), float(abs(exact).max())
             # 1e-9: sums and assemblies differ by round-off, wrong declarations by much more
@@ -263,7 +265,8 @@ class _Entries:
             weights *= units[self.rows]
         if name in ("A", "B"):
             weights *= units[self.columns]
-        if name in ("B", "g"):  # rows may have any scale, or be far
+        # Rows may have any scale, or be far: each is measured by its own largest entry.
+        if name in ("B", "g"):
             largest = np.zeros(self._shape[0])
             np.maximum.at(largest, self.rows, weights * np.abs(self.values).max(axis=1, initial=0.0))
             weights /= np.where(largest > 0.0, largest, 1.0)[self.rows]

@@ -216,6 +216,7 @@ def errors(
         energy_u, natural_lam = reference.energies(k, vi, energy)
         rows.append(
             Errors(
+                # A relative error of a zero would divide round-off by round-off: the scaled one tells how large it is.
                 error_u=None if zero_u[k] else ratio(float(error_u[k]), float(norm_u[k])),
                 error_lambda=None if zero_lam[k] else ratio(float(error_lam[k]), float(norm_lam[k])),
                 error_u_energy=None if zero_u[k] else ratio(in_energy, energy_u),
@@ -259,6 +260,7 @@ def output_errors(
         pairs = zip(output.values(mus, *reduced), exact_values, strict=True)
         for row, (value, exact) in zip(rows, pairs, strict=True):
             error = abs(float(value - exact))
+            # an output may vanish, as a force without contact
             relative = None if abs(exact) <= UNMEASURABLE * largest else error / abs(float(exact))
             own = {"value": float(value), "reference": float(exact), "error": relative}
             row.append({"output": output.name, "unit": output.unit} | own | {"scaled": ratio(error, largest)})
@@ -305,7 +307,8 @@ def high_fidelity_residuals(
     excess = np.asarray(on.in_extended_precision @ values.astype(np.longdouble) - vi.g, dtype=float)
     size = float(np.hypot(energy.norm(u) if u_energy is None else u_energy, on.force_norm(lam)))
     violated = np.flatnonzero(excess > round_off_of_terms(on.entries, on.sizes @ np.abs(values) + np.abs(vi.g)))
-    pressed = lam > 0.0  # elsewhere s may be infinite
+    # s may be infinite where λ is zero.
+    pressed = lam > 0.0
     gap = abs(float(lam[pressed] @ excess[pressed]))
     return Residuals(
         primal=ratio(_largest_step(on, energy, violated, excess[violated]), size),

@@ -174,6 +174,7 @@ class ReducedModel:
         first: tuple[SparseMatrix, Array] | None = None
         shared: bool | None = None
         for vi in vis:
+            # Supremizers span the same space if B is a positive multiple of an earlier one.
             alike = first is not None and (proportionality(vi.B, first[0]) or 0.0) > 0.0
             if first is not None and alike and shared:
                 yield first[1]
@@ -221,6 +222,7 @@ def projections(Z: Array, chi: Array) -> dict[str, Callable[[Any], Array]]:
     """Galerkin projections on span Z (n×N') and the cone of χ (m×R) by member, linear maps: dense A, f, B, g."""
 
     def stiffness(A: Any) -> Array:
+        # Symmetrise: solvers factorise one triangle, verification uses both.
         projected = Z.T @ np.asarray(A @ Z)
         return np.asarray(0.5 * (projected + projected.T))
 

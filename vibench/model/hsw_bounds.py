@@ -49,6 +49,7 @@ def hsw_bounds(
     where known.
     """
     residuals = residuals or [vi.f - vi.A @ u[:, k] - vi.B.T @ lam[:, k] for k, vi in enumerate(vis)]
+    # All representers in one block: the factor of X_V is read once.
     columns = np.column_stack(residuals)
     dual_norms = norms_by_solutions(columns, problem.V.riesz(columns))
     excesses = (vi.B @ u[:, k] - vi.g for k, vi in enumerate(vis))

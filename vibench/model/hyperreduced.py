@@ -147,6 +147,7 @@ def hyper_reduce(model: ReducedModel, members: Mapping[str, AffineMember]) -> Re
     contact = members["B"].way is Evaluation.CONTACT
     count, rank = model.generators.shape[1], model.span.shape[1]
     sampled, affine = evaluated_members(members)
+    # The dual program needs A⁻¹ and independent generators; then queries solve it with one factor.
     dual_is_regular = A.constant and coordinates is None and A.shape[0] >= count == rank > 0
     return ReducedOperators(
         sampled_entries=sampled,
@@ -180,7 +181,8 @@ def _tested(model: ReducedModel, eta: Array) -> tuple[Array, Array | None]:
     """Multipliers whose contact loads give those of (η, χ): η and C, where χ = η C up to round-off, or all of them."""
     combination = _combination(model, eta)
     W, chi = model.problem.W, model.generators
-    missed = W.norm(chi - eta @ combination) > 1e-14 * W.norm(chi)  # more than round-off
+    # Combinations that miss χ by more than round-off would change the bounds: then χ has loads of its own.
+    missed = W.norm(chi - eta @ combination) > 1e-14 * W.norm(chi)
     return (np.hstack([eta, chi]), None) if missed.any() else (eta, combination)
 
 
@@ -293,7 +295,8 @@ class HyperReducedModel:
         `samples` are the `coefficients` at mu, which callers evaluate for other purposes, too.
         """
         members = self._members(samples, self._varying(mu))
-        missing = len(members.f) - members.B.shape[1]  # coordinates of supremizers that are zero
+        # The last coordinates of supremizers may be zero, and have no columns.
+        missing = len(members.f) - members.B.shape[1]
         return replace(members, B=np.pad(members.B, ((0, 0), (0, missing)))) if missing else members
 
     def _varying(self, mu: Array) -> tuple[Array, Array] | None:
@@ -372,6 +375,7 @@ def _enriched(members: VariationalInequality, plain: Array) -> tuple[Array, Arra
     """
     A, f, B, count = members.A, members.f, members.B, len(members.B) - len(members.g)
     used, N = B.shape[1], plain.shape[1]
+    # Unit columns: the pivots of the factorisation tell dependent supremizers, whatever their forces are.
     lengths = np.sqrt(np.einsum("ij,ij->i", B[:count], B[:count]))
     added = B[:count, N:].T[:, lengths > 0.0] / lengths[lengths > 0.0]
     Y = np.zeros((used, N))

@@ -245,7 +245,8 @@ class OnlineCertificate:
         z = residual_coefficients(query.theta, query.y, self.forces, contact, query.alpha, query.lam)
         coordinates, beside, missing = self.residual.parts(z)
         square_of_u = float(query.x @ (query.program.A @ query.x))
-        u_norm = sqrt(max(0.0, square_of_u) / (lower - base.stiffness_error))  # of u_N in X
+        # ‖u_N‖_X from ‖u_N‖ in the interpolated stiffness, whose coercivity is at least α less its error
+        u_norm = sqrt(max(0.0, square_of_u) / (lower - base.stiffness_error))
         lacking = base.load_error + base.stiffness_error * u_norm
         rho = sqrt(float(coordinates @ coordinates) + beside**2) + missing + lacking
         # an upper bound of rᵀw: what r has besides its coordinates may act along w, and w' is within η of w
@@ -262,7 +263,8 @@ class OnlineCertificate:
                 query.spectrum,
             )
             of_u, of_lam = min(of_u, others[0]), min(of_lam, others[1])
-        least = sqrt(max(0.0, square_of_u - base.stiffness_error * u_norm**2)) - of_u  # of ‖u‖
+        # a lower bound of ‖u‖_A, from that of ‖u_N‖_A and the triangle inequality
+        least = sqrt(max(0.0, square_of_u - base.stiffness_error * u_norm**2)) - of_u
         relative = of_u / least if least > 0.0 else inf
         beta, which = base.inf_sup.lower_bound(float(query.theta["B"][0]), lambda: query.contact.B, upper)
         in_W = of_lam / beta if beta > 0.0 else inf
@@ -301,7 +303,8 @@ class OnlineCertificate:
         both = BoundTerms.corrected(rho, gap).primal + eta * sqrt(upper)
         relative = inf
         if 0.0 < bound.relative < inf:
-            relative = both / (bound.u_energy / bound.relative)  # over the least ‖u‖ that is known
+            # over the lower bound of ‖u‖ that the first bounds gave
+            relative = both / (bound.u_energy / bound.relative)
         in_W = both / bound.inf_sup if bound.inf_sup > 0.0 else inf
         corrected = replace(
             bound, u_energy=both, lambda_natural=both, relative=relative, rho=rho, omega=0.0, kappa=gap, lam=in_W
@@ -358,7 +361,8 @@ def _near(problem: Problem, chi: Array, training: Array) -> Indices:
     for mu in training:
         contact = contact_at(problem, mu)
         touches, rows = abs(sp.csr_array(contact.B)) > 0.0, np.any(chi > 0.0, axis=1)
-        near |= touches.T @ (touches @ (touches.T @ rows))  # one ring of neighbours around the support
+        # One ring of neighbours around the support: corrections seldom reach farther.
+        near |= touches.T @ (touches @ (touches.T @ rows))
     return np.flatnonzero(near)
 
 

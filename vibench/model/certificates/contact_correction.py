@@ -65,7 +65,8 @@ def complementary(fixed: Array, rows_of: Callable[[Indices], Array], released: M
         if len(rows):
             among = rows_of(rows)
             _, v, singular = dposv(among[:, rows], -fixed[rows])
-            if singular:  # also a cycle is left to the descent, which needs no start
+            # A cycle or a singular system is left to the descent, which needs no start.
+            if singular:
                 break
             nu = fixed + v @ among
             nu[rows] = 0.0
@@ -147,7 +148,8 @@ def tied_correction(
         slack = B @ w - excess
         rounded = round_off + 1.01 * EPS * (np.diff(B.indptr) + 4.0) * (abs(B) @ np.abs(w))
         eta = equalities.distance((np.abs(slack) + rounded)[rows.equalities])
-        eta += equalities.distance(np.abs(missed))  # ν belongs to the w before the step
+        # ν belongs to the w before the step: its distance counts twice.
+        eta += equalities.distance(np.abs(missed))
         reach = equalities.reach * eta
         lacking = np.where(rows.implied, 0.0, rounded + reach - slack)
         if np.all(lacking <= 0.0):  # NaN is not
@@ -294,7 +296,8 @@ class _Program:
                 lacking = np.where(self.near, lacking, far)
                 if np.all(lacking <= 0.0):  # NaN is not
                     pushing = np.maximum(nu, 0.0)
-                    pulls = np.any(nu < -8.0 * EPS * self.lam)  # beyond the round-off in ν − λ + λ
+                    # A force pulls if ν is negative beyond the round-off in ν − λ + λ.
+                    pulls = np.any(nu < -8.0 * EPS * self.lam)
                     gap = dual_gap(pushing, slack)
                     return load, norm, dual_gap(self.lam, slack), None if pulls else pushing, gap, 0.0
                 if np.any(lacking[~self.near] > 0.0):
@@ -329,7 +332,8 @@ class _Program:
         if difference.any():
             wanted = wanted - block @ (self.compliance @ (self.B.T @ difference)) / self.gamma
         S = self.compliance.congruent(block) / self.gamma
-        units = np.sqrt(S.diagonal())  # of rows, which may have any scale
+        # Rows may have any scale: factorise in units of their own compliance.
+        units = np.sqrt(S.diagonal())
         units[~(units > 0.0)] = 1.0
         S /= np.outer(units, units)
         # 1e-13 of the diagonal, so that dependent rows have a factorisation; w is verified in any case
@@ -396,7 +400,8 @@ def defect_corrected_bounds(
     found = find_contact_correction(compliance, contact, on_contact + shift, uncertain, lam, middle)
     if found is None or found.nu is None:
         return inf, inf
-    along = found.load @ directions[found.unknowns]  # the coordinates of X w, whose rest is orthogonal to z
+    # the coordinates of X w, whose rest is orthogonal to z
+    along = found.load @ directions[found.unknowns]
     beside = max(0.0, found.norm**2 - float(along @ along))
     round_off = terms * EPS * (float(np.linalg.norm(moved)) + found.norm)
     distance = float(np.linalg.norm(moved - along)) + round_off

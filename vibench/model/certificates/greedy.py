@@ -262,7 +262,8 @@ class IncrementalModel:
         program = project(vi, self._basis, self.generators)
         answer: ExactSolution | QPSolution | None = exact_solution(program)
         if answer is None:
-            answer = solve_qp(program, "piqp", 1e-9)  # no active set is exact up to round-off
+            # No active set is exact up to round-off: the generators are dependent, for instance.
+            answer = solve_qp(program, "piqp", 1e-9)
         if answer.x is None or answer.alpha is None:
             return None
         return self._basis @ answer.x, self.generators @ np.maximum(answer.alpha, 0.0)

@@ -111,7 +111,8 @@ class PreparedCorrections:
         """The ν on the rows J, a with c = B₀ᵀ a, ‖w‖ and B w − s (m,) of a w that is feasible."""
         B = B if isinstance(B, (float, sp.csr_array)) else sp.csr_array(B)
         theta, terms = (B, self.terms) if isinstance(B, float) else (1.0, self.terms + int(np.diff(B.indptr).max()))
-        if theta == 0.0:  # B vanishes, and no load on its rows lifts anything
+        # B vanishes, and no load on its rows lifts anything.
+        if theta == 0.0:
             return None
         excess, size, unit = _times(B, self.basis @ y) - g, _times(abs(B), self.sizes), 1.01 * terms * EPS
         round_off = unit * (float(y @ y) ** 0.5 * size[:, 0] + g_size)
@@ -129,7 +130,8 @@ class PreparedCorrections:
             if lacking.max() <= 0.0:  # NaN is not
                 square = float(a @ (values[self.rows] if isinstance(B, float) else self.compliance @ a))
                 return nu, a, max(0.0, square) ** 0.5, slack
-            if lacking[self.rows].max() <= 0.0:  # rows beyond J are violated
+            # Larger margins on J do not help if only rows beyond J are violated.
+            if lacking[self.rows].max() <= 0.0:
                 return None
             margin = margin + 2.0 * np.maximum(lacking, 0.0)
         return None

@@ -191,7 +191,8 @@ def _directions(R: Array, scale: Array, allowed: float) -> tuple[Array, float]:
     columns, and nothing remains.
     """
     count, rest = R.shape[1], 0.0
-    if count > 1000:  # a decomposition of all would cost more than a randomised one
+    # A decomposition of so many terms would cost more than a randomised one, with 100 directions to spare.
+    if count > 1000:
         randomised = _random_range(R, scale, allowed, limit=900, block=100)  # 100 directions more than are used
         if randomised is None:
             return np.linalg.qr(R * scale)[0], 0.0

@@ -137,6 +137,7 @@ def rotated(terms: tuple[SparseMatrix, ...], theta: Array) -> tuple[Array, list[
     places = pattern.nonzero()
     entries = np.column_stack([np.asarray(sp.csr_array(term)[places]).ravel() for term in terms])
     q, r = np.linalg.qr(entries)
+    # Principal directions of the samples in an orthonormal basis of the entries: norms are Euclidean there.
     left, _, _ = np.linalg.svd(r @ theta)
     rows = np.ascontiguousarray((q @ left).T)
     modes = [sp.csr_array((mode, pattern.indices, pattern.indptr), shape=pattern.shape) for mode in rows]
@@ -152,5 +153,6 @@ def combined(terms: Sequence[SparseMatrix], theta: Array) -> list[SparseMatrix]:
 def leading_terms(theta: Array) -> int:
     """Number of rotated terms that are more than 1e-4 of the variation of A over samples θ (Q×P)."""
     varying = np.linalg.norm(theta - theta.mean(axis=1, keepdims=True), axis=0).max()
-    rest = np.sqrt(np.cumsum((theta**2)[::-1], axis=0)[::-1].max(axis=1))  # of this term and those after it
+    # norms of the sums of each term and those after it, the largest over the samples
+    rest = np.sqrt(np.cumsum((theta**2)[::-1], axis=0)[::-1].max(axis=1))
     return int(np.count_nonzero(rest > 1e-4 * varying))
