@@ -106,8 +106,11 @@ def interpolate_on_box(
     values = _stacked([evaluate(mu) for mu in points])
     values = {name: each @ terms[name] if name in terms else each for name, each in values.items()}
     scale = {name: float(np.linalg.norm(each, axis=-1).max()) or 1.0 for name, each in values.items()}
-    # A coefficient counts by what it adds to the array: times the norm of its term.
-    units = {name: scale[name] / _norms(terms[name]) if name in terms else scale[name] for name in scale}
+    # A coefficient counts by what it adds to the array: times the norm of its term, unless that vanishes.
+    units: dict[str, Any] = dict(scale)
+    for name, given in terms.items():
+        norms = np.linalg.norm(given, axis=1)
+        units[name] = scale[name] / np.where(norms > 0.0, norms, 1.0)
     if alike:
         units |= dict.fromkeys(alike, np.min([np.asarray(units[name]) for name in alike], axis=0))
     along = _Sampled(evaluate, lower, upper, units)
@@ -123,7 +126,10 @@ def interpolate_on_box(
     for _ in range(3):
         counts = _within(counts, budget)
         kept = {name: _needed(c, 0.1 * tolerance) for name, c in along.coefficients(counts).items()}
-        polynomials = {name: _with_terms(*kept[name], units[name], terms[name], 0.1 * tolerance) for name in terms}
+        polynomials = {}
+        for name, given in terms.items():
+            theta = _without_smallest(kept[name][1], 0.1 * tolerance) * units[name]
+            polynomials[name] = AffinePolynomial(kept[name][0], theta, given, np.inf)
         polynomials |= {name: _plain(*kept[name], units[name]) for name in kept if name not in terms}
         polynomials = {name: measured(name, polynomials[name]) for name in kept}
         if max(p.error for p in polynomials.values()) <= tolerance:
@@ -203,11 +209,6 @@ def _needed(coefficients: Array, tolerance: float) -> tuple[Indices, Array]:
     return np.stack(np.unravel_index(kept, shape[:-1]), axis=1), flat[kept]
 
 
-def _with_terms(indices: Indices, theta: Array, unit: Any, terms: Array, tolerance: float) -> AffinePolynomial:
-    """The polynomial with given terms (Q×size) from coefficients of θ (K×Q) in a unit, a number or an array (Q,)."""
-    return AffinePolynomial(indices, _without_smallest(theta, tolerance) * unit, terms, np.inf)
-
-
 def _plain(indices: Indices, coefficients: Array, unit: Any) -> AffinePolynomial:
     """The polynomial with its coefficients (K×size) themselves as terms, or its entries, whichever are fewer."""
     count, size = coefficients.shape
@@ -236,12 +237,6 @@ def _without_smallest(coefficients: Array, tolerance: float) -> Array:
     kept = coefficients.ravel().copy()
     kept[rising[np.cumsum(sizes[rising]) <= tolerance]] = 0.0
     return np.asarray(kept.reshape(coefficients.shape))
-
-
-def _norms(terms: Array) -> Array:
-    """Norms (Q,) of terms (Q×size), 1 for those that vanish."""
-    norms = np.linalg.norm(terms, axis=1)
-    return np.where(norms > 0.0, norms, 1.0)
 
 
 def _stacked(evaluated: Sequence[Mapping[str, Array]]) -> dict[str, Array]:

@@ -21,6 +21,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.interfaces.problem import Problem, VariationalInequality, is_absent
 from vibench.linalg.inner_product import InnerProduct
+from vibench.model.bound_terms import in_dual_set
 from vibench.qp.verification import norms_by_solutions
 from vibench.reduction import cones
 from vibench.stability.coercivity import Stability
@@ -54,15 +55,14 @@ def hsw_bounds(
     dual_norms = norms_by_solutions(columns, problem.V.riesz(columns))
     excesses = (vi.B @ u[:, k] - vi.g for k, vi in enumerate(vis))
     return [
-        None if is_absent(vis[k].g).any() else _bound(problem.W, s, lam[:, k], float(dual_norms[k]), constants[k])
+        None
+        if is_absent(vis[k].g).any() or not in_dual_set(lam[:, k])
+        else _bound(problem.W, s, lam[:, k], float(dual_norms[k]), constants[k])
         for k, s in enumerate(excesses)
     ]
 
 
-def _bound(W: InnerProduct, excess: Array, lam: Array, residual: float, stability: Stability) -> HSWBounds | None:
-    """The bounds from s (m,), λ_N (m,) and δ_r."""
-    if np.min(lam, initial=0.0) < 0.0:
-        return None
+def _bound(W: InnerProduct, excess: Array, lam: Array, residual: float, stability: Stability) -> HSWBounds:
     alpha, gamma, beta = stability.coercivity.value, stability.continuity.value, stability.inf_sup.span
     if beta <= 0.0:
         return HSWBounds(float("inf"), float("inf"))

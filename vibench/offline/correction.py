@@ -10,7 +10,7 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.interfaces.problem import VariationalInequality
-from vibench.model.bound_terms import BoundNote, CorrectionMode
+from vibench.model.bound_terms import BoundNote, CorrectionMode, in_dual_set
 from vibench.model.certificates.base import Guarantee, contact_unknowns
 from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate
 from vibench.model.error_bounds import CorrectedPair, corrected_pair
@@ -61,7 +61,7 @@ class Corrector:
 
     def in_full(self, mu: Array, u: Array, lam: Array) -> Answer:
         """The answer at high-fidelity cost."""
-        if lam.min(initial=0.0) < 0.0:
+        if not in_dual_set(lam):
             return Answer(u, lam, note=BoundNote.NOT_IN_CONE)
         kept = assemblies(self.model.problem)
         pair = corrected_pair(kept.at(mu), kept.energy_at(mu), u, lam)

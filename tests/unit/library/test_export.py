@@ -9,6 +9,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any
@@ -119,7 +120,8 @@ def assembled_in_full(template: vibench.Model, problem: vibench.Problem, kind: v
 
 def with_row(template: vibench.Model, queried: Any) -> vibench.Model:
     """A model that answers queries, with the row of a real cell."""
-    return vibench.Model(queried, "piqp", 1e-10, row=template.row)
+    offline = vibench.Reduction(queried.problem, None, None, None, None).given(assembled=queried)
+    return replace(template, offline=offline, certificate=None)
 
 
 @pytest.mark.parametrize("kind", [vibench.Kind.NONE, vibench.Kind.PER_PARAMETER])
