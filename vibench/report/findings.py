@@ -31,13 +31,7 @@ from vibench.report.figures.data import (
 from vibench.results import consistency, formats
 from vibench.results.consistency import agreement_sentence
 from vibench.results.paired_timing import PairedTiming
-from vibench.results.ranking import (
-    LARGEST_BAND,
-    Criterion,
-    eligible,
-    leaderboard,
-    too_loose,
-)
+from vibench.results.ranking import LARGEST_BAND, Criterion, eligible, leaderboard, too_loose
 from vibench.results.read import read_table
 from vibench.results.schema import KEYS, TABLES
 from vibench.stability.infsup import VANISHES

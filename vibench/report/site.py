@@ -374,11 +374,7 @@ class _Pages:
     def __init__(self, citation: Citation) -> None:
         self._environment = html.environment("templates/site")
         self._environment.filters["number"] = formats.cell_text
-        self._shared = {
-            "citation": citation,
-            "vibench": distribution_version("vibench"),
-            "criteria": list(Criterion),
-        }
+        self._shared = {"citation": citation, "vibench": distribution_version("vibench"), "criteria": list(Criterion)}
 
     def write(self, path: Path, name: str, root: str, **content: Any) -> None:
         """Write a page of the template of that name; `root` leads from it to the folder of the site."""

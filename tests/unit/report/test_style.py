@@ -17,17 +17,7 @@ from matplotlib.figure import Figure
 from vibench.plugins.kinds import DUAL, PRIMAL
 from vibench.plugins.registry import registered
 from vibench.report.figures.data import file_names
-from vibench.report.figures.style import (
-    COLOURS,
-    Looks,
-    Series,
-    Sheet,
-    caption_of,
-    look_of,
-    plot,
-    styled,
-    write_figure,
-)
+from vibench.report.figures.style import COLOURS, Looks, Series, Sheet, caption_of, look_of, plot, styled, write_figure
 from vibench.text import printable
 
 SOLVERS = ("piqp", "proxqp", "osqp", "clarabel", "daqp", "quadprog", "highs", "scs", "cvxopt", "ecos")

@@ -25,16 +25,7 @@ from vibench.report.figures.data import (
     series,
     titled_parts,
 )
-from vibench.report.figures.style import (
-    HIGH_FIDELITY_LOOK,
-    Layout,
-    Looks,
-    Pages,
-    Series,
-    Sheet,
-    plot,
-    scatter,
-)
+from vibench.report.figures.style import HIGH_FIDELITY_LOOK, Layout, Looks, Pages, Series, Sheet, plot, scatter
 from vibench.results import ranking
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
 from vibench.study.cells import UNCORRECTED
