@@ -91,7 +91,12 @@ class Comparison:
                 numbers = {"ratio": middle, "ratio_low": low, "ratio_high": high, "farthest_ratio": farthest}
                 about = {"what": what, "run": pair.run, "against": pair.against, "cells": len(differences)}
                 rows.append(about | counts | numbers)
-        return pd.DataFrame(rows).sort_values("what", kind="stable", ignore_index=True, key=_places)
+        # The order in which columns are compared; break-even is last.
+        order = ["cell", "queries_ok", "status", "N", "R", "rank", "enrichment", "beta_span_min", "beta_cone_lower_min"]
+        order += [*ERRORS, "error_u_zero_max", "error_lambda_zero_max", "offline_s", "online_s"]
+        places = {what: place for place, what in enumerate(order)}
+        by = {"kind": "stable", "ignore_index": True, "key": lambda whats: whats.map(places).fillna(len(order))}
+        return pd.DataFrame(rows).sort_values("what", **by)
 
     @property
     def by_run(self) -> pd.DataFrame:
@@ -100,7 +105,8 @@ class Comparison:
         "same code" counts the cells that the code of the first run computed.
         """
         first, everywhere = self.runs[0], set.intersection(*(set(run.cells) for run in self.runs))
-        differing = _differing([run.versions for run in self.runs])
+        names = dict.fromkeys(name for run in self.runs for name in run.versions)
+        differing = [name for name in names if len({run.versions.get(name, "") for run in self.runs}) > 1]
         rows = [
             {
                 "run": run.name,
@@ -180,6 +186,7 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
         differences += [Difference(cell, "cell", "", "new", ChangeKind.CHANGED) for cell in new]
         means = _on_common_queries(first, run, shared)
         for key in shared:
+            # Means over different queries are no comparison.
             one, two = first.cells[key] | means[0].get(key, {}), run.cells[key] | means[1].get(key, {})
             differences += of_numbers(one, two, limit)
         notes.append(f"{of_run}{len(shared)} cells are in both runs")
@@ -187,6 +194,7 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
             notes.append(f"{of_run}errors of {len(means[0])} of them are compared on the queries that are ok in both")
         compared = 0
         for earlier in runs[:k]:
+            # Seconds of a cell are compared once, with the first run of the same machine and protocol.
             same = run.measured_beside(earlier, unless=runs[: runs.index(earlier)])
             compared += len(same)
             if same:
@@ -239,20 +247,6 @@ def _row(pair: RunPair, one: Difference) -> dict[str, Any]:
 
 
 def _named(cell: Mapping[str, Any]) -> dict[str, Any]:
-    """The columns that tell a cell from others."""
     tolerance = "" if pd.isna(cell["primal_tol"]) else f", δ {cell['primal_tol']:g}"
     asked = f"{formats.asked(cell, 'pod')}, {formats.asked(cell, 'dual')}{tolerance}"
     return {name: cell[name] for name in (*AXES, "cell") if name != "asked"} | {"asked": asked}
-
-
-def _places(whats: pd.Series) -> pd.Series:
-    """Places of columns in the table by column: the order in which they are compared, break-even last."""
-    order = ["cell", "queries_ok", "status", "N", "R", "rank", "enrichment", "beta_span_min", "beta_cone_lower_min"]
-    order += [*ERRORS, "error_u_zero_max", "error_lambda_zero_max", "offline_s", "online_s"]
-    return whats.map(lambda what: order.index(what) if what in order else len(order))
-
-
-def _differing(versions: Sequence[Mapping[str, str]]) -> list[str]:
-    """Names whose versions are not the same in all runs that have them."""
-    names = dict.fromkeys(name for some in versions for name in some)
-    return [name for name in names if len({some.get(name, "") for some in versions}) > 1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
@@ -82,8 +82,7 @@ class ComparedRun:
     def thresholds_of(self, cells: Collection[str]) -> pd.DataFrame:
         """Rows of the break-evens in which no other cells take part."""
         thresholds, keys = self._thresholds, set(cells)
-        both = (thresholds[end].isin(keys) for end in ("cell_a", "cell_b"))
-        of_a, of_b = both
+        of_a, of_b = (thresholds[end].isin(keys) for end in ("cell_a", "cell_b"))
         return thresholds[(of_a | thresholds["cell_a"].isna()) & of_b]
 
     @cached_property
@@ -237,14 +236,11 @@ def of_seconds(one: ComparedRun, two: ComparedRun, shared: Sequence[str], limit:
     disturbed = {key for key in shared if one.cells[key]["disturbed"] == 1 or two.cells[key]["disturbed"] == 1}
     for key in shared:
         before, after = one.cells[key], two.cells[key]
-        intervals: dict[str, Callable[[], Interval]] = {
-            "offline_s": lambda b=before, a=after: _offline_interval(b, a),  # type: ignore[misc]
-            "online_s": lambda k=key: _online_interval(one.rounds(k), two.rounds(k)),  # type: ignore[misc]
-        }
         for name in ("offline_s", "online_s"):
             verdict, interval = _verdict(before[name], after[name], limit), UNKNOWN
             if verdict in (ChangeKind.WORSE, ChangeKind.BETTER) and pd.notna(after[name]):
-                interval = intervals[name]()
+                rounds = (one.rounds(key), two.rounds(key))
+                interval = _online_interval(*rounds) if name == "online_s" else _offline_interval(before, after)
                 decided = key not in disturbed and (interval[0] > 1.0 or interval[1] < 1.0)
                 verdict = verdict if decided else ChangeKind.UNDECIDED
             if verdict is not None:
@@ -263,6 +259,7 @@ def _online_interval(before: Sequence[float], after: Sequence[float]) -> Interva
     """Bootstrap interval of the ratio of medians over rounds, resampled in each of the runs."""
     if min(len(before), len(after)) < FEWEST_ROUNDS:
         return UNKNOWN
+    # A fixed seed: the same runs always get the same verdict.
     rng = np.random.default_rng(0)
     drawn = [np.array(some)[rng.integers(len(some), size=(DRAWS, len(some)))] for some in (before, after)]
     medians_before, medians_after = (np.median(rounds, axis=1) for rounds in drawn)
@@ -275,6 +272,7 @@ def _break_evens(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator
     keys = [name for name in STORED["thresholds"] if not name.endswith(results)]
     for row in one.merge(two, on=keys, suffixes=("_one", "_two")).to_dict("records"):
         before, after = (_break_even(row, k) for k in ("one", "two"))
+        # Numbers of queries have wide intervals: those that overlap are no change.
         verdict: ChangeKind | None = ChangeKind.CHANGED
         if before == after:
             verdict = ChangeKind.EQUAL
@@ -288,6 +286,7 @@ def _break_evens(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator
             verdict = ChangeKind.CHANGED
         elif ChangeKind.WORSE in own and verdict is ChangeKind.CHANGED and after.meaning == Meaning.NEVER:
             verdict = ChangeKind.WORSE
+        # A break-even belongs to the cell of its model b.
         cell = row | {
             name: row[f"{name}_b"] for name in ("cell", "formulation", "primal", "assembly", "bounds", "primal_tol")
         }

@@ -104,23 +104,16 @@ def _whole_run(read: Mapping[str, pd.DataFrame]) -> Iterator[tuple[Weight, str]]
     cells, queries = read["cells"], read["queries"]
     ok = int((cells["status"] == Status.OK).sum())
     count, accurate = (int(cells[name].fillna(0).sum()) for name in ("queries", "queries_ok"))
-    yield (
-        Weight.WHOLE_RUN,
-        f"{_number(len(cells), 'cell')}, {ok} with every query ok; {accurate} of {count} queries meet the prescribed "
-        "accuracy in their recomputed KKT residuals.",
-    )
+    met = f"{accurate} of {count} queries meet the prescribed accuracy in their recomputed KKT residuals"
+    yield Weight.WHOLE_RUN, f"{_number(len(cells), 'cell')}, {ok} with every query ok; {met}."
     violated = consistency.violations(queries, cells.set_index("cell")["enrichment_kind"]) if len(queries) else []
+    invariants = "of the inf-sup constants and the error bounds"
+    # A violated invariant is an error of vibench or of a plugin, and no number of the run is to be trusted.
     if violated:
-        yield (
-            Weight.ALARM,
-            f"{_number(len(violated), 'invariant')} of the inf-sup constants and the error bounds {_are(violated)} "
-            f"violated: {violated[0]}.",
-        )
+        number = _number(len(violated), "invariant")
+        yield Weight.ALARM, f"{number} {invariants} {_are(violated)} violated: {violated[0]}."
     elif len(queries):
-        yield (
-            Weight.WHOLE_RUN,
-            f"The invariants of the inf-sup constants and the error bounds hold in all {len(queries)} queries.",
-        )
+        yield Weight.WHOLE_RUN, f"The invariants {invariants} hold in all {len(queries)} queries."
     disagreements = read["disagreements"]
     if agreement := agreement_sentence(disagreements, cells["solver"].nunique()):
         flagged = bool(disagreements["flagged"].sum())
@@ -134,25 +127,18 @@ def _whole_run(read: Mapping[str, pd.DataFrame]) -> Iterator[tuple[Weight, str]]
     }
     for source, (what, remedy) in remedies.items():
         if len(loose := cells[too_loose(cells, source)]):
-            yield (
-                Weight.WHOLE_RUN,
-                f"{_number(len(loose), 'cell')} {_are(loose)} not compared with others: {what} "
-                f"10 % or more of an error there (column {source}_share_mean). {remedy}",
-            )
+            left_out = f"{_number(len(loose), 'cell')} {_are(loose)} not compared with others"
+            cause = f"{what} 10 % or more of an error there (column {source}_share_mean)"
+            yield Weight.WHOLE_RUN, f"{left_out}: {cause}. {remedy}"
     few = cells[cells["queries_ok"] < 0.5 * cells["queries"]]
     if len(few):
-        yield (
-            Weight.WHOLE_RUN,
-            f"{_number(len(few), 'cell')} {'has' if len(few) == 1 else 'have'} fewer than half of the queries ok: "
-            "such errors are not compared with others.",
-        )
+        having = f"{_number(len(few), 'cell')} {'has' if len(few) == 1 else 'have'}"
+        # The same half as in `on_common_queries`.
+        yield Weight.WHOLE_RUN, f"{having} fewer than half of the queries ok: such errors are not compared with others."
     timed, disturbed = int(cells["disturbed"].notna().sum()), int((cells["disturbed"] == 1).sum())
     if disturbed:
-        yield (
-            Weight.WHOLE_RUN,
-            f"{disturbed} of {_number(timed, 'timed cell')} {'was' if disturbed == 1 else 'were'} timed while other "
-            "processes slowed the machine down (column disturbed).",
-        )
+        those = f"{disturbed} of {_number(timed, 'timed cell')} {'was' if disturbed == 1 else 'were'}"
+        yield Weight.WHOLE_RUN, f"{those} timed while other processes slowed the machine down (column disturbed)."
 
 
 def _number(count: int, noun: str) -> str:
@@ -169,6 +155,7 @@ def _answer(data: ProblemTables, paired: PairedTiming) -> Iterator[str]:
         if not standings.bands:
             none = f"None of {_number(standings.cells, 'cell')} has every query ok and mean errors of at most"
             yield f"{none} {_percent(LARGEST_BAND)}."
+        # The widest and the narrowest band, which are one where there is one.
         for band in standings.bands[:1] + standings.bands[1:][-1:]:
             winner = band.winner(Criterion.QUERY)
             if winner is None:
@@ -204,6 +191,7 @@ def _errors(cell: Any) -> str:
 def _stability(cells: pd.DataFrame, compared: Comparable) -> Iterator[str]:
     """Effect of the enrichments on the inf-sup constant over the span and on the error of the multiplier."""
     errors = dict(zip(compared.cells["cell"], compared.cells["error_lambda_mean"], strict=True))
+    # Constants do not depend on corrections: uncorrected models say more of the enrichment.
     if (plain := cells["correction"] == UNCORRECTED).any():
         cells = cells[plain]
     for row in cells[cells["enrichment_kind"] == Kind.NONE].head(1).itertuples():

@@ -34,18 +34,6 @@ from vibench.results.sqlite import read_meta, study_of
 from vibench.stability.infsup import VANISHES
 from vibench.text import printable
 
-# Columns of the table of cells, those that matter most first.
-OF_CELLS = (
-    "cell", *show.AXES, "status", "queries_ok", "error_lambda_mean", "error_u_mean", "online_s", "offline_s",
-    "beta_span_min", "beta_cone_lower_min", "N", "R", "enrichment", "queries_zero_u", "error_u_zero_max",
-    "queries_zero_lambda", "error_lambda_zero_max",
-)  # fmt: skip
-# Columns that are offered besides, and not shown at first.
-MORE_OF_CELLS = (
-    "hf_s", "online_q1_s", "online_q3_s", "share_validation", "violation_max", "solver_share_mean", "residual_max",
-    "peak_memory_mib", "slowdown", "reason", "fallbacks", "machine",
-)  # fmt: skip
-
 
 @dataclass(frozen=True)
 class TableGrid:
@@ -92,12 +80,23 @@ class TableGrid:
 
 def grid_of_cells(cells: pd.DataFrame, caption: str) -> TableGrid:
     """The table of all cells, in the order of the rows."""
-    names = [n for n in (*OF_CELLS, *MORE_OF_CELLS) if n in ("cell", *show.AXES) or cells[n].notna().any()]
-    says_nothing = [name for name in names if STORED["cells"][name].heading and not formats.says_something(cells, name)]
+    columns = STORED["cells"]
+    # Columns that matter most come first; those of `offered` are not shown at first.
+    first = (
+        "cell", *show.AXES, "status", "queries_ok", "error_lambda_mean", "error_u_mean", "online_s", "offline_s",
+        "beta_span_min", "beta_cone_lower_min", "N", "R", "enrichment", "queries_zero_u", "error_u_zero_max",
+        "queries_zero_lambda", "error_lambda_zero_max",
+    )  # fmt: skip
+    offered = (
+        "hf_s", "online_q1_s", "online_q3_s", "share_validation", "violation_max", "solver_share_mean", "residual_max",
+        "peak_memory_mib", "slowdown", "reason", "fallbacks", "machine",
+    )  # fmt: skip
+    names = [n for n in (*first, *offered) if n in ("cell", *show.AXES) or cells[n].notna().any()]
+    says_nothing = [name for name in names if columns[name].heading and not formats.says_something(cells, name)]
     length = short_keys(cells["cell"])
-    frame = formats.under_headings(cells.assign(cell=cells["cell"].str[:length]), names, STORED["cells"])
-    hidden = [_heading(STORED["cells"], name) for name in (*says_nothing, *MORE_OF_CELLS) if name in names]
-    axes = tuple(_heading(STORED["cells"], name) for name in (*show.AXES, "status"))
+    frame = formats.under_headings(cells.assign(cell=cells["cell"].str[:length]), names, columns)
+    hidden = [_heading(columns, name) for name in (*says_nothing, *offered) if name in names]
+    axes = tuple(_heading(columns, name) for name in (*show.AXES, "status"))
     disturbed, left_out = _disturbed(cells["cell"], cells), (*hidden, *_constant(frame))
     return TableGrid("summary", "All cells", caption, frame, axes, left_out, disturbed)
 
@@ -138,11 +137,6 @@ def _disturbed(keys: pd.Series, cells: pd.DataFrame) -> tuple[int, ...]:
     return tuple(k for k, key in enumerate(keys) if key in disturbed)
 
 
-def to_json(grids: Sequence[TableGrid]) -> str:
-    """The tables as JSON that may stand in a script element: nothing in it ends the element."""
-    return script_safe({grid.name: _columnar(grid) for grid in grids})
-
-
 def _columnar(grid: TableGrid) -> dict[str, Any]:
     return {
         "rows": len(grid.frame),
@@ -159,7 +153,14 @@ def _columnar(grid: TableGrid) -> dict[str, Any]:
 def _column(name: str, values: pd.Series) -> dict[str, Any]:
     """A column as numbers, as texts, or as codes of texts if most of them recur; a constant value is written once."""
     heading = printable(name)
-    if pd.api.types.is_numeric_dtype(values) or _numbers_in_text(values):
+    # Tolerances are texts, since a dimension may replace them.
+    numeric = pd.api.types.is_numeric_dtype(values) or (
+        name != "cell"
+        and len(values) > 0
+        and all(isinstance(value, str) for value in values)
+        and pd.to_numeric(values.drop_duplicates(), errors="coerce").notna().all()
+    )
+    if numeric:
         numbers = [short(value, 6) for value in values]
         return {"name": heading, "numbers": numbers if len(set(numbers)) > 1 else numbers[:1]}
     texts = [printable(formats.cell_text(value)) for value in values]
@@ -170,13 +171,6 @@ def _column(name: str, values: pd.Series) -> dict[str, Any]:
         return {"name": heading, "levels": levels}
     number = {text: k for k, text in enumerate(levels)}
     return {"name": heading, "levels": levels, "codes": [number[text] for text in texts]}
-
-
-def _numbers_in_text(values: pd.Series) -> bool:
-    """Whether a column of texts has only numbers: tolerances are texts, since a dimension may replace them."""
-    if not len(values) or not all(isinstance(value, str) for value in values):
-        return False
-    return bool(pd.to_numeric(values.drop_duplicates(), errors="coerce").notna().all()) and values.name != "cell"
 
 
 # Findings that can be unfolded; nobody would read the thousands of a large study.
@@ -245,7 +239,7 @@ def page(path: Path, pool: ProcessPoolExecutor | None = None, *, figures: bool =
         plots={plot.name: plot for plot in live},
         overviews=first_plots,
         plots_alone=[plot for plot in live if plot.name not in {image.name for image in images}],
-        table_data=Markup(to_json(grids)),
+        table_data=Markup(script_safe({grid.name: _columnar(grid) for grid in grids})),
         plot_data=Markup(script_safe({plot.name: plot.data for plot in (*first_plots, *live)})),
         library=Markup(plots.library()) if live or first_plots else "",
         style=Markup(_asset("report.css")),

@@ -38,6 +38,7 @@ def _write_cleaned(path: Path, copy: Path) -> None:
     with open_read_only(path) as db:
         db.execute("VACUUM INTO ?", (str(copy.absolute()),))
     parents = {Path(place).parent for place in _places(path)}
+    # Longer names first: those of folders in others would leave parts of them.
     folders = sorted((str(one) for one in parents if len(one.parts) > 2), key=len, reverse=True)
     inside = [re.compile(rf"(?<!\w){re.escape(folder)}(?![\w-])") for folder in folders]
     texts = {

@@ -231,21 +231,17 @@ class FigureImage:
 
 def image_of(name: str, figure: Figure) -> FigureImage:
     """The picture of a figure."""
-    dots, stream = _dots(figure), io.BytesIO()
-    # A third of the time of more thorough compression, for a quarter more bytes.
-    dots.save(stream, "webp", lossless=True, method=1, quality=0)
-    source = "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
-    return FigureImage(name, caption_of(figure), bool(getattr(figure, "part", "")), seen(figure), source, *dots.size)
-
-
-def _dots(figure: Figure) -> Image.Image:
-    """The pixels of a figure in a palette of 256 colours; line drawings need fewer."""
     # Sharp enough at the width of a page, and a tenth of the bytes of a vector picture of many lines.
     figure.set_dpi(110)
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()
-    whole = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    return whole.quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).convert("RGB")
+    whole, stream = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"), io.BytesIO()
+    # Line drawings need fewer than 256 colours.
+    dots = whole.quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).convert("RGB")
+    # A third of the time of more thorough compression, for a quarter more bytes.
+    dots.save(stream, "webp", lossless=True, method=1, quality=0)
+    source = "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
+    return FigureImage(name, caption_of(figure), bool(getattr(figure, "part", "")), seen(figure), source, *dots.size)
 
 
 def seen(figure: Figure) -> str:
@@ -259,7 +255,10 @@ def seen(figure: Figure) -> str:
 def _panel_text(panel: Axes) -> str:
     if not panel.axison and not panel.collections:
         return ""
-    said = list(_series_text(panel)) or list(_areas(panel))
+    # Fields drawn in colours, for a panel without lines.
+    values = [one.get_array() for one in panel.collections]
+    fields = [array for array in values if array is not None and np.isfinite(array).any()]
+    said = list(_series_text(panel)) or [f"a field between {np.nanmin(a):.3g} and {np.nanmax(a):.3g}" for a in fields]
     if not said:
         return ""
     title, x, y = (unbroken(text) for text in (panel.get_title(), panel.get_xlabel(), panel.get_ylabel()))
@@ -281,14 +280,6 @@ def _series_text(panel: Axes) -> Iterator[str]:
     for which, line, value in (("lowest", lowest, values.min()), ("highest", highest, values.max())):
         if _name(line):
             yield f"the {which} is {value:.3g} of {_name(line)}"
-
-
-def _areas(panel: Axes) -> Iterator[str]:
-    """A field drawn in colours, with its range."""
-    for one in panel.collections:
-        values = one.get_array()
-        if values is not None and np.isfinite(values).any():
-            yield f"a field between {np.nanmin(values):.3g} and {np.nanmax(values):.3g}"
 
 
 def _line(line: Line2D) -> str:

@@ -56,6 +56,7 @@ def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
         write_program(program, file)
     recorded_x: Array | None = None
     table: list[dict[str, Any]] = []
+    # The recorded solution is verified again, not its recorded residuals repeated.
     if solved := recorded.rows("solutions").get(query):
         recorded_x, alpha = vectors(solved)
         solution = QPSolution(recorded_x, alpha, rows[query]["solver_status"] or "", rows[query]["iterations"])
@@ -119,6 +120,7 @@ def export(run: str, folder: Path, places: Mapping[str, str] = {}, *, sequence: 
     with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=TEMPORARY, suffix=PART) as scratch:
+            # An interruption leaves nothing under the name of the folder.
             new = Path(scratch) / folder.name
             new.mkdir()
             count = _write_set(list(models.values()), new)
@@ -151,7 +153,6 @@ def _write_sequences(models: Sequence[RecordedCell], folder: Path) -> None:
 
 
 def _name(model: RecordedCell, query: int) -> str:
-    """Name of a program of a reduced model, given by its first cell."""
     return f"{model.row['cell']}-{query}"
 
 

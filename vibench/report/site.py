@@ -66,7 +66,8 @@ def write(site: Path, fill: Callable[[Path], None]) -> None:
             new = Path(scratch) / "site"
             new.mkdir()
             fill(new)
-            files = _digests(new)
+            written = (path for path in sorted(new.rglob("*")) if path.is_file())
+            files = {path.relative_to(new).as_posix(): _digest(path) for path in written}
             _write_catalogue(new, {name: [digest] for name, digest in files.items()})
             if site.is_dir() and any(site.iterdir()):
                 _replace_files(site, new, files)
@@ -95,7 +96,10 @@ def _replace_files(site: Path, new: Path, files: Mapping[str, str]) -> None:
     for name, digests in before.items():
         if name not in files and (site / name).is_file() and _digest(site / name) in digests:
             (site / name).unlink()
-            _remove_empty(site, (site / name).parent)
+            folder = (site / name).parent
+            while folder != site and not any(folder.iterdir()):
+                folder.rmdir()
+                folder = folder.parent
     _write_catalogue(new, {name: [digest] for name, digest in files.items()})
     (new / CATALOGUE).replace(site / CATALOGUE)
 
@@ -108,16 +112,6 @@ def _refuse_links(site: Path, name: str) -> None:
     for depth in range(1, len(parts) + 1):
         if site.joinpath(*parts[:depth]).is_symlink():
             raise RequestError(f"'{site.joinpath(*parts[:depth])}' is a symbolic link; move it elsewhere")
-
-
-def _remove_empty(site: Path, folder: Path) -> None:
-    while folder != site and not any(folder.iterdir()):
-        folder.rmdir()
-        folder = folder.parent
-
-
-def _digests(folder: Path) -> dict[str, str]:
-    return {path.relative_to(folder).as_posix(): _digest(path) for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def _digest(path: Path) -> str:
@@ -139,10 +133,6 @@ def _written(site: Path) -> dict[str, list[str]]:
         return {str(name): [str(digest) for digest in digests] for name, digests in dict(files).items()}
     except (OSError, ValueError, KeyError, TypeError):
         raise RequestError(f"'{catalogue}' cannot be read as the list of the files of a site") from None
-
-
-# Columns of the cells on the page of a run, beside those that name a cell.
-SHOWN_CELLS = ("N", "R", "enrichment", "error_u_mean", "error_lambda_mean", "online_s", "offline_s")
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,10 +178,8 @@ class PublishedRun:
         yield "cells", f"{len(rows)}: " + ", ".join(f"{count} {status}" for status, count in counts.items())
         yield "machine", "; ".join(self.run.machines)
         disturbed = sum(row["disturbed"] == 1 for row in rows)
-        yield (
-            "seconds",
-            f"CPU seconds on one thread; {disturbed} of {len(rows)} cells were timed on a disturbed machine",
-        )
+        timed = f"{disturbed} of {len(rows)} cells were timed on a disturbed machine"
+        yield "seconds", f"CPU seconds on one thread; {timed}"
         yield "versions", ", ".join(f"{name} {text}" for name, text in self.run.versions.items() if text)
         yield "code", self.code
         yield "study file", ", ".join(sorted({str(row["study_hash"]) for row in rows if row["study_hash"]}))
@@ -222,8 +210,8 @@ class PublishedRun:
         commands.append((f"vibench compare {FILE} YOUR-RUN", "your run beside this one"))
         return commands
 
-    def cells(self) -> list[dict[str, Any]]:
-        """The cells of the run, each with the command that computes it again, in the order of the axes."""
+    def cells(self, columns: Sequence[str]) -> list[dict[str, Any]]:
+        """The cells of the run with some columns, and with the commands that compute them again."""
         return [
             {
                 "key": key,
@@ -233,7 +221,7 @@ class PublishedRun:
                     way(row["assembly"], row["bounds"], row["correction"]) or "full",
                 ],
                 "status": str(row["status"]),
-                "numbers": [cell_text(row[name]) for name in SHOWN_CELLS],
+                "numbers": [cell_text(row[name]) for name in columns],
                 "command": f"vibench run {FILE} --cell {shlex.quote(key)} --out again",
             }
             for key, row in self.run.cells.items()
@@ -301,14 +289,18 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 
 def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation, *, figures: bool) -> None:
-    """Write all files of the site."""
     pages = _Pages(citation)
     limit = 1.25
     comparisons = {study: compare([run.run.path for run in group], limit) for study, group in _comparable(runs)}
     for run in runs:
         _write_run(site / "runs" / run.folder, run, pages, figures)
+    # Every run has a leaderboard: seconds of other runs may come from a busier machine, or from other parameters.
+    boards: list[tuple[PublishedRun, tuple[Standings, ...]]] = []
+    for run in runs:
+        timings = PairedTiming(read_table(run.run.path, "timings").to_dict("records"))
+        boards.append((run, leaderboard(in_order(read_table(run.run.path, "cells")), timings)))
     links = {run.run.name: f"runs/{run.folder}/index.html" for run in runs}
-    pages.write(site / "leaderboard.html", "leaderboard", "", boards=list(_boards(runs)), links=links, way=html.way)
+    pages.write(site / "leaderboard.html", "leaderboard", "", boards=boards, links=links, way=html.way)
     sections = [_section(site, number, *item) for number, item in enumerate(comparisons.items(), start=1)]
     pages.write(site / "comparison.html", "comparison", "", sections=sections, limit=limit)
     filters = {name: sorted({value for run in runs for value in run.values[name]}) for name in runs[0].values}
@@ -330,7 +322,9 @@ def _write_run(own: Path, run: PublishedRun, pages: _Pages, figures: bool) -> No
         _write(own / "tables" / f"{name}.csv", formats.to_csv(rows))
     _write(own / "requirements.txt", requirements(run.run.versions, run.code))
     _write(own / "provenance.json", json.dumps(run.provenance, indent=1, ensure_ascii=True, sort_keys=True) + "\n")
-    pages.write(own / "index.html", "run", "../../", run=run, cells=run.cells(), columns=SHOWN_CELLS, tables=published)
+    columns = ("N", "R", "enrichment", "error_u_mean", "error_lambda_mean", "online_s", "offline_s")
+    shown = {"cells": run.cells(columns), "columns": columns, "tables": published}
+    pages.write(own / "index.html", "run", "../../", run=run, **shown)
 
 
 def _comparable(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, list[PublishedRun]]]:
@@ -343,13 +337,6 @@ def _comparable(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, list[Publis
         comparable = [run for run in group if run.run.cells.keys() & first]
         if len(comparable) > 1:
             yield study, comparable
-
-
-def _boards(runs: Sequence[PublishedRun]) -> Iterator[tuple[PublishedRun, tuple[Standings, ...]]]:
-    """The leaderboard of every run; seconds of different runs are not ranked together."""
-    for run in runs:
-        cells, timings = (read_table(run.run.path, name) for name in ("cells", "timings"))
-        yield run, leaderboard(in_order(cells), PairedTiming(timings.to_dict("records")))
 
 
 def _section(site: Path, number: int, study: str, comparison: Comparison) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 from vibench import interrupts
 from vibench.errors import RequestError, unknown_name
 from vibench.files import TEMPORARY, read_regular, write_atomically
+from vibench.report.figures import convergence
 from vibench.report.figures.constants import inf_sup, shares
 from vibench.report.figures.convergence import diagnostics, enrichment, orthogonality, projection_errors
 from vibench.report.figures.costs import break_even, dimension, outputs, precision, solvers, total_cost, work_precision
@@ -48,9 +49,6 @@ OF_PROBLEM: dict[str, DrawPages] = {
 }
 # Figures of every problem and dual strategy.
 OF_DUAL: dict[str, DrawPages] = {"enrichment": enrichment, "inf-sup": inf_sup}
-
-# The figures that read the histories; no other one does.
-OF_HISTORIES: frozenset[DrawPages] = frozenset({diagnostics, projection_errors, orthogonality, enrichment})
 
 FigureTask = tuple[str, DrawPages, ProblemTables]
 """A figure to be drawn: name of its first file, function that draws its pages, and their data."""
@@ -197,9 +195,10 @@ def _submitted(
     tasks: Sequence[FigureTask], finish: Callable[[str, Figure], Made], pool: ProcessPoolExecutor
 ) -> Iterator[dict[int, Future[list[Made]]]]:
     """Context with the figures that other processes may draw, by place."""
-    # Histories are never sent: a large study has millions of rows, and drawing their few lines takes less time.
-    places = [k for k, (_, draw, _) in enumerate(tasks) if draw not in OF_HISTORIES]
-    # None fails in a figure that reads histories without being one of OF_HISTORIES; empty ones would not be noticed.
+    # Only figures of `convergence` read histories, which are never sent: a large study has millions of rows, and their
+    # few lines are drawn in less time.
+    places = [k for k, (_, draw, _) in enumerate(tasks) if draw.__module__ != convergence.__name__]
+    # None, since other figures that read histories would not notice empty ones.
     none = cast("pd.DataFrame", None)
     sent = [(name, draw, replace(data, histories=none)) for name, draw, data in (tasks[k] for k in places)]
     with contextlib.ExitStack() as stack:

@@ -136,7 +136,6 @@ def _name_zeros(panels: list[Axes], zeros: list[list[str]]) -> None:
 
 
 def _caption(data: ProblemTables, constants: pd.DataFrame, shown: pd.DataFrame, along: bool) -> str:
-    """What is shown, and which tolerances are not."""
     text = [
         f"Inf-sup constants β of {data.problem} with the cones of {data.duals[0]} at the validation parameters, "
         f"{data.queries['query'].nunique()} of them, for the high-fidelity pair and every primal strategy: over the "

@@ -115,13 +115,11 @@ def cone_errors(title: str, errors: Mapping[str, Array]) -> CaptionedFigure:
 
 
 def _in_panels(histories: pd.DataFrame) -> list[dict[str, pd.DataFrame]]:
-    """The longest cone of every dual strategy, in groups of as many as a panel takes."""
     cones = [(str(dual), rows) for dual, rows in longest(histories)]
     return [dict(group) for group in parts(cones)] or [{}]
 
 
 def _cones(axes: Axes, cones: Mapping[str, pd.DataFrame], xlabel: str, ylabel: str) -> None:
-    """A line for every cone."""
     looks = Looks(map(Series, cones))
     for dual, steps in cones.items():
         plot(axes, steps["step"], positive(steps["value"], 0.0), looks[Series(dual)], dual)

@@ -82,14 +82,12 @@ def _errors_against(
 
 
 def _points(panel: Axes, cells: pd.DataFrame, x: pd.Series, y: pd.Series, names: Iterable[Any], looks: Looks) -> None:
-    """The points of some cells, in the looks of their primal strategies."""
     for name in names:
         mine = cells.index[cells["primal"] == name]
         scatter(panel, x[mine], y[mine], looks[Series(str(name))], str(name))
 
 
 def _name_points(sheet: Sheet, panel: Axes, cells: pd.DataFrame, x: pd.Series, y: pd.Series) -> None:
-    """Write (N, R) and δ of some cells at their points."""
     for index, text in point_names(cells).items():
         sheet.label(panel, x[index], y[index], text)
 
@@ -181,6 +179,7 @@ def break_even(data: ProblemTables) -> Pages:
 
 def _front(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Places of the points on the Pareto front, of those that are small in x and y, from left to right."""
+    # From left to right, a point is on the front if it is lower than all before it.
     order = np.lexsort((y, x))
     best = np.minimum.accumulate(y[order])
     kept: np.ndarray = order[np.concatenate([np.ones(min(len(best), 1), dtype=bool), best[1:] < best[:-1]])]
@@ -326,7 +325,6 @@ def _accuracy(panel: Axes, queries: pd.DataFrame, names: list[str], looks: Looks
 
 
 def _profile(panel: Axes, queries: pd.DataFrame, names: list[str], looks: Looks) -> None:
-    """The profiles of some solvers, against the fastest of all."""
     solved = queries["solve_s"].where(queries["status"] == Status.OK, np.inf).fillna(np.inf)
     by = [*program_columns(), "accuracy", "solver"]
     instances = queries.assign(time=solved).groupby(by, dropna=False)["time"].min().unstack()

@@ -172,13 +172,12 @@ def _name_formulations(frame: pd.DataFrame) -> None:
         return
     for column in ("primal", "primal_b"):
         if column in frame:
-            made = _per_combination(frame[["formulation", column]], _model_name)
+            made = _per_combination(
+                frame[["formulation", column]],
+                lambda name, primal: name if primal == NO_SUCH_AXIS else f"{name} ({primal})",
+            )
             frame[column] = frame[column].where(~other, made)
     frame["dual"] = frame["dual"].where(frame["dual"] != NO_SUCH_AXIS, "no cone")
-
-
-def _model_name(formulation: str, primal: str) -> str:
-    return formulation if primal == NO_SUCH_AXIS else f"{formulation} ({primal})"
 
 
 def _per_combination(frame: pd.DataFrame, value: Callable[..., Any]) -> pd.Series:
@@ -345,19 +344,15 @@ def longest(histories: pd.DataFrame) -> Iterator[tuple[Any, pd.DataFrame]]:
 
 def file_names(labels: list[str]) -> list[str]:
     """File names for labels, in their order, all different."""
-    plain = [_file_name(label) for label in labels]
+    # Letters and digits, cut to 90 bytes: two labels are part of a name of at most 255.
+    words = (re.sub(r"[^\w.=-]+", "-", label).strip("-.")[:60] for label in labels)
+    plain = [text.encode()[:90].decode(errors="ignore") or "unnamed" for text in words]
     names: list[str] = []
     for name in plain:
         numbered = (f"{name}-{k}" for k in count(1))
         taken = {*plain, *names}
         names.append(name if plain.count(name) == 1 else next(one for one in numbered if one not in taken))
     return names
-
-
-def _file_name(label: str) -> str:
-    """The letters and digits of a label, cut to 90 bytes: two labels are part of a name of at most 255."""
-    plain = re.sub(r"[^\w.=-]+", "-", label).strip("-.")[:60]
-    return plain.encode()[:90].decode(errors="ignore") or "unnamed"
 
 
 def program_columns() -> list[str]:

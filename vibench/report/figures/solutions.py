@@ -124,7 +124,6 @@ def _on_mesh(picture: Picture) -> Triangulation | None:
 
 
 def _contact_boundary(axes: Axes, picture: Picture) -> None:
-    """The line between nodes with and without contact."""
     part = _on_mesh(picture) if len(picture.positions) == 2 else None
     touching = (picture.multiplier > 0.0).astype(float)
     if part is not None and 0.0 < touching.mean() < 1.0:

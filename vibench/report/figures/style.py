@@ -95,7 +95,10 @@ class Looks:
 
     def __init__(self, series: Iterable[Series]) -> None:
         alike: dict[Look, list[Series]] = defaultdict(list)
-        for one in sorted(set(series), key=_order):
+        # Texts come before numbers.
+        numbers = {one: one.variant if isinstance(one.variant, float) else None for one in series}
+        order = {one: (one.name, n is not None, n or 0.0, str(one.variant)) for one, n in numbers.items()}
+        for one in sorted(order, key=order.__getitem__):
             alike[look_of(one.name)].append(one)
         self._known = {one: replace(look, rank=rank) for look, group in alike.items() for rank, one in enumerate(group)}
 
@@ -104,12 +107,6 @@ class Looks:
 
     def __iter__(self) -> Iterator[Series]:
         return iter(self._known)
-
-
-def _order(series: Series) -> tuple[str, bool, float, str]:
-    """Sort key: name, then variants, texts before numbers."""
-    number = isinstance(series.variant, float)
-    return series.name, number, float(series.variant) if number else 0.0, str(series.variant)
 
 
 @dataclass(frozen=True)
@@ -334,21 +331,17 @@ def _label_points(axes: Axes, points: list[tuple[float, float, str]]) -> int:
         return 0
     scale = 72.0 / float(axes.figure.dpi)
     places = scale * axes.transData.transform([(x, y) for x, y, _ in drawn])
-    inside = tuple(scale * float(end) for end in axes.bbox.extents)
+    left, bottom, right, top = (scale * float(end) for end in axes.bbox.extents)
     # Lengths are in points (1/72 inch): a label keeps 3.5 clear around every point.
     clear, missing = 3.5, 0
     taken: list[Box] = [(x - clear, y - clear, x + clear, y + clear) for x, y in places]
     for (x, y, text), place in zip(drawn, places, strict=True):
         if not text:
             continue
-        box = next(
-            (
-                box
-                for box in _boxes(place, text, clear)
-                if _within(box, inside) and not any(_overlap(box, other) for other in taken)
-            ),
-            None,
+        inside = (
+            b for b in _boxes(place, text, clear) if left <= b[0] and bottom <= b[1] and b[2] <= right and b[3] <= top
         )
+        box = next((box for box in inside if not any(_overlap(box, other) for other in taken)), None)
         if box is None:
             missing += 1
             continue
@@ -368,10 +361,6 @@ def _boxes(place: Array, text: str, clear: float) -> Iterator[Box]:
         x = place[0] + (clear + 1.0 if across > 0 else -clear - 1.0 - width if across < 0 else -0.5 * width)
         y = place[1] + (clear if up > 0 else -clear - height if up < 0 else -0.5 * height)
         yield x, y, x + width, y + height
-
-
-def _within(box: Box, outer: tuple[float, ...]) -> bool:
-    return box[0] >= outer[0] and box[1] >= outer[1] and box[2] <= outer[2] and box[3] <= outer[3]
 
 
 def _overlap(one: Box, other: Box) -> bool:
