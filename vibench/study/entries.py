@@ -83,6 +83,7 @@ class Entry(BaseModel):
         if self.is_registered:
             return find(kind, self.name)
         if not isinstance(self._given, GivenPlugin):
+            # Take its state now: later calls must return the same plugin.
             self._given = give(kind, self.title, self._given)
         return self._given
 

@@ -72,6 +72,7 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
         raise RequestError(f"{path}: not valid TOML: {error}") from None
     given = {key: list(values) for key, values in (overrides or {}).items() if values}
     source = str(path) if path == Path(request) else f"study '{request}'"
+    # The fault may be in either of them.
     source += " with the options of the command line" if given else ""
     content = _replace_axes(content, given)
     _anchor(content, path.absolute().parent)
@@ -99,6 +100,7 @@ def _tables(entries: Any) -> list[dict[str, Any]]:
 def _anchor_options(kind: PluginKind, entry: dict[str, Any], folder: Path) -> None:
     plugin, given = find(kind, str(entry.get("name"))), entry.get("options")
     for options in (entry, given if isinstance(given, dict) else {}):
+        # A name that nobody registers is refused later, with the other names of the study.
         for name in plugin.path_options if plugin.entries else ():
             value = options.get(name)
             if isinstance(value, str) and value and not value.startswith("/"):
@@ -121,6 +123,7 @@ def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> di
         for table in tables:
             for key, tolerance, size in (("pod", "pod", "N"), ("dual_tol", "dual", "R")):
                 if key in given:
+                    # A grid takes tolerances or sizes: those of the command line replace either.
                     table.pop(size, None)
                     table[tolerance] = given[key]
             if "primal_tol" in given:
@@ -157,6 +160,7 @@ def expand(study: Study) -> list[Cell]:
     duals, primals = _made(DUAL, study.dual), _made(PRIMAL, study.primal)
     formulations = _made(FORMULATION, study.formulation)
     for (problem, plugin, sets, validation), table in product(problems, study.tolerances):
+        # Nested enrichments of one table are grown once, to the smallest of their tolerances.
         nested = {entry.title: _nested_tolerances(entry, table) for entry in study.primal}
         for training, (entry, formulation) in product(sets, formulations):
             uses = entry.uses

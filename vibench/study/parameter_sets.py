@@ -125,6 +125,7 @@ def check_sets(problem: Plugin, training: ParameterSet, validation: ParameterSet
             "makes no validation set"
         )
     mus = parameters_of(problem, validation)
+    # The problem itself may have equal sets.
     if training.sampling is None and validation.sampling is None:
         return
     if np.isin(_rows(mus), _rows(parameters_of(problem, training))).all():
@@ -141,6 +142,7 @@ def _rows(mus: Array) -> Array:
 
 def chunk_edges(count: int) -> list[int]:
     """Numbers of the first parameter of every chunk of `count` parameters, and `count` (CHUNKS + 1,)."""
+    # Rounded edges: chunks differ by one parameter at most.
     return [int(edge) for edge in np.linspace(0, count, CHUNKS + 1).round()]
 
 

@@ -244,6 +244,7 @@ class Study(_Model):
                 one.model_copy(update={"options": {FACTORISATION: study.factorisation} | one.options})
                 for one in study.problem
             )
+        # After the types: messages about names need valid entries.
         _check_names(study)
         return study
 
@@ -342,6 +343,7 @@ def _check_sets(study: Study, entry: ProblemEntry) -> None:
     samplings = [one for one in entries if isinstance(one, SamplingEntry) and one.name != OWN]
     for sampling in samplings:
         sampling.registered(SAMPLING).check_options(sampling.options)
+    # Without files and samplings nothing can be wrong with them, and building a problem takes seconds.
     if not samplings and not entry.registered(PROBLEM).data_digest({**entry.options, **entry.places}):
         return
     problem, validation = entry.plugin(PROBLEM), study.validation_set(entry)
