@@ -229,7 +229,7 @@ def check_answer(program: VariationalInequality, answer: QPSolution, accuracy: f
         raise NumericalError(f"timed in other units of the unknowns, {reason}; does the solver remember answers?")
 
 
-def infeasibility_certificate(program: VariationalInequality, tolerance: float = 1e-10) -> Array | None:
+def infeasibility_certificate(program: VariationalInequality) -> Array | None:
     """Multipliers α ≥ 0 with Bᵀα = 0 and gᵀα = −1 (Farkas), or `None` if none are found; dense programs only."""
     if not isinstance(program.B, np.ndarray):
         return None
@@ -248,7 +248,7 @@ def infeasibility_certificate(program: VariationalInequality, tolerance: float =
         alpha, distance = nnls(system / columns, target, maxiter=30 * system.shape[1])
     except RuntimeError:  # nnls did not converge, which certifies nothing
         return None
-    if distance > tolerance * max(1.0, float(alpha.max(initial=0.0))):
+    if distance > 1e-10 * max(1.0, float(alpha.max(initial=0.0))):
         return None
     certificate = np.zeros(len(kept))
     certificate[kept] = alpha / (columns * rows * depth)
