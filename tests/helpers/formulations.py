@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
 
+import vibench
 from vibench import Array, Formulation, FormulationAnswer, FormulationModel, Multiplier, QuerySettings, Reduction
 
 
@@ -68,3 +70,17 @@ class NearestModel(FormulationModel):
     def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
         assert answer.x is not None
         return self.u[:, int(answer.x[0])].copy(), None
+
+
+class Coarse(Formulation):
+    """The mixed program with every other generator of the cone: a formulation that the machinery runs as `mixed`."""
+
+    has_program = has_certificate = takes_start = True
+
+    def build(self, offline: Reduction) -> Mapping[str, Any]:
+        return {}
+
+    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+        cone = replace(offline.cone, generators=offline.cone.generators[:, ::2], free=offline.cone.free[::2])
+        phase = replace(offline).given(pod=offline.pod, cone=cone, enrichment=offline.enrichment)
+        return vibench.ProgramModel(phase.assembled)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from broken_formulations import Misbehaves
 from fake_plugins import Wire
-from formulations import Nearest, Program
+from formulations import Coarse, Nearest, Program
 
 from vibench import RequestError, Run, Study, open_run, run
 from vibench.results.consistency import violations
@@ -86,6 +86,30 @@ def test_the_mixed_formulation_as_a_plugin_gives_its_numbers(found: Run) -> None
     assert {"error_u", "error_lambda_natural", "bound_u_energy", "hf_dual_residual", "primal_residual"} <= set(kept)
     for name in kept:
         np.testing.assert_allclose(other[name].astype(float), own[name].astype(float), rtol=1e-9, atol=1e-14)
+
+
+def test_a_new_formulation_with_programs_runs_as_the_mixed_one(tmp_path: Path) -> None:
+    """It has its rows for all solvers, ways of assembly, bounds and corrections, and its columns."""
+    asked = Study(
+        name="coarse", validation=2, problem=[{"name": "radial-obstacle", "options": {"resolution": 150}}],
+        formulation=["mixed", Coarse], dual=["mcpg"], primal=["offline-pga"], solvers=["piqp", "osqp"], accuracy=[1e-6],
+        assembly=["full", "reduced"], bounds=[False, True], correction=["none", "feasible"], warm_start=True,
+        timing_rounds=1, timing_rounds_min=1,
+        tolerances=[{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
+    )  # fmt: skip
+    done = run(asked, tmp_path / "run", jobs=1, progress=False)
+    way = ["solver", "assembly", "bounds", "correction"]
+    for table, index in (("cells", way), ("queries", [*way, "query"])):
+        frame = done.table(table).set_index("formulation")
+        mixed, coarse = (frame.loc[name].set_index(index).sort_index() for name in ("mixed", "Coarse"))
+        assert set(mixed["status"]) == set(coarse["status"]) == {"ok"}
+        # Errors of λ in relative reduced form may be missing where the coarse model has no contact, no other column.
+        assert [*mixed.columns[mixed.notna().any()]] == [*coarse.columns[coarse.notna().any()]]
+        assert set(mixed.index) == set(coarse.index)
+    cells = done.cells.set_index("formulation")
+    assert set(cells.loc["Coarse", "R"]) == {-(-int(cells.loc["mixed", "R"].iloc[0]) // 2)}
+    assert (cells.loc["Coarse", "online_assemble_s"] > 0.0).all()
+    assert (cells.loc["Coarse", "bound_online_violations"].dropna() == 0).all()
 
 
 def test_all_are_judged_by_the_same_bounds(found: Run) -> None:

@@ -131,6 +131,27 @@ def test_every_strategy_that_takes_a_tolerance_must_be_given_one(cells_of: Expan
             cells_of(changed(STUDY, "tolerances", 0, key, to=values))
 
 
+@pytest.mark.parametrize(
+    ("before", "now"),
+    [
+        ({"assembly": ["full", "certified"]}, {"assembly": ["full", "reduced"], "bounds": [True]}),
+        ({"assembly": ["reduced", "certified"]}, {"assembly": ["reduced"], "bounds": [False, True]}),
+        ({"assembly": ["compiled"]}, {"assembly": ["reduced"], "formulation": ["compiled"]}),
+        (
+            {"assembly": ["full", "compiled", "certified"]},
+            {"assembly": ["full", "reduced"], "bounds": [True], "formulation": ["mixed", "compiled"]},
+        ),
+    ],
+)
+def test_words_of_before_are_translated_and_a_line_says_what_to_write(
+    before: dict[str, Any], now: dict[str, Any], cells_of: Expand
+) -> None:
+    with pytest.warns(UserWarning, match=r"^assembly = .* is of before; write now: .*") as noted:
+        translated = cells_of(STUDY | before)
+    assert len(noted) == 1
+    assert [cell.key for cell in translated] == [cell.key for cell in cells_of(STUDY | now)]
+
+
 SAMPLE = Cell(
     problem=Plugin("problem", "p", '{"a": 1}', "package 1"),
     dual=Plugin("dual strategy", "d", "{}", "package 1"),
