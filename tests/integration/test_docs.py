@@ -249,7 +249,7 @@ def test_a_rule_of_the_reference_is_a_rule(tmp_path: Path) -> None:
     [
         ("library.md", 13, {"runs", "tables", "decision.html", "inf-sup.svg"}),
         ("tolerances.md", 2, {"runs"}),
-        ("methods.md", 34, {"runs", "points.npy"}),
+        ("methods.md", 35, {"runs", "points.npy"}),
     ],
 )
 def test_a_page_prints_what_it_says(
