@@ -148,6 +148,7 @@ class Plan:
             "solver": chosen.get("solver", installed_solvers(registered(SOLVER))),
             "accuracy": [1e-6, 1e-10],
         }
+        # Whoever names a plugin waits for it: two problems of a study are enough then.
         every = self.setting.problems if self.chosen else filter(_takes_no_option, registered(PROBLEM))
         cases = []
         for name in self.chosen.get("problem", every):

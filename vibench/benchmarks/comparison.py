@@ -94,6 +94,7 @@ def _measured(name: str, entry: Mapping[str, Any]) -> Measured:
     extra, stats = entry.get("extra_info", {}), entry["stats"]
     axes = {str(axis): unbroken(str(value)) for axis, value in extra.get("axes", {}).items()}
     axes = {"problem": axes.get("case", "")} | axes
+    # Files that pytest-benchmark alone has written have one pass.
     passes = [stats, *extra.get("passes", [])]
     calibrations = [_seconds(one, "calibration_s") for one in passes if "calibration_s" in one]
     accuracy = extra.get("accuracy", {}).items()

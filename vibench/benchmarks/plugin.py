@@ -143,6 +143,7 @@ class Passes:
     @pytest.hookimpl(wrapper=True)
     def pytest_pyfunc_call(self) -> Generator[None, object, object]:
         """Let a plugin that raises what Ctrl-C does fail its benchmark alone."""
+        # pytest would take these for the wish to end the session.
         try:
             return (yield)
         except (KeyboardInterrupt, SystemExit) as error:
@@ -197,7 +198,8 @@ class Passes:
             while True:
                 deadline = time.monotonic() + limit
                 while not ours.poll(1.0):
-                    if os.getppid() != parent:  # the command was killed
+                    # The command was killed.
+                    if os.getppid() != parent:
                         raise KeyboardInterrupt
                     if time.monotonic() > deadline:
                         raise TimeoutError(f"stopped after {limit:g} s")
@@ -216,6 +218,7 @@ class Passes:
                 os.killpg(process, signal.SIGKILL)
             status = os.waitpid(process, 0)[1]
             ours.close()
+        # The process ended within this benchmark: the report that it owes is made here.
         if begun < len(items):
             item = items[begun]
             reason = reason or f"the worker process died with {manner_of_death(os.waitstatus_to_exitcode(status))}"
@@ -239,7 +242,8 @@ class Passes:
                     faulthandler.dump_traceback_later(2.0 * self._plan.setting.seconds + 60.0, exit=True)
                     following = items[number + 1] if number + 1 < len(items) else None
                     for report in runtestprotocol(items[number], log=False, nextitem=following):
-                        if os.getpid() != own:  # a plugin forked
+                        # A plugin forked: the copy must not speak for this process.
+                        if os.getpid() != own:
                             return
                         self._note(report)
                         connection.send(
@@ -285,6 +289,7 @@ class Passes:
 
     def _put_together(self) -> None:
         """Give pytest-benchmark one entry for the rounds of all passes of a benchmark, and one for each that failed."""
+        # An entry with an error is in no file, but lets a file without benchmarks be written.
         for name in {**self._timed, **self._failed}:
             passes = self._timed.get(name, [])
             first = passes[0] if passes else {"group": None, "iterations": 1, "extra_info": {}, "axes": {}}

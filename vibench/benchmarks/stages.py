@@ -140,6 +140,7 @@ class StageInputs:
             self.problem, dual, strategy, spaces.modes, spaces.generators, tolerance,
             assembly="reduced", interpolation=self.interpolation, solver="piqp", accuracy=1e-10,
         ).given(snapshots=self.snapshots, parameters=self.training)  # fmt: skip
+        # POD and cone do not depend on the enrichment: all strategies share them.
         if primal is not None:
             before = self.reduction(spaces)
             reduction = reduction.given(pod=before.pod, cone=before.cone, multipliers=before.multipliers)
@@ -232,6 +233,7 @@ def test_enrichment(timing: Timing, inputs: StageInputs, primal: PrimalChoice) -
     def judge(enrichment: Enrichment) -> Info:
         check_enrichment(enrichment, offline.problem.V, offline.basis)
         model = reduction.given(enrichment=enrichment).projection
+        # σ costs a full assembly and an orthonormalisation at every parameter.
         some = np.unique(np.linspace(0, len(offline.training) - 1, 9).round().astype(int))
         figures = {"sigma": max(_sigma(model, offline.training[k]) for k in some)}
         size = 0 if enrichment.vectors is None else enrichment.vectors.shape[1]
@@ -260,6 +262,7 @@ def test_separation(timing: Timing, inputs: StageInputs) -> None:
 def _interpolation_error(inputs: StageInputs, members: Mapping[str, AffineMember]) -> float:
     """Largest relative error of a member at validation parameters, no further than the problem samples."""
     sampled = {name: m for name, m in members.items() if m.way is Evaluation.INTERPOLATED}
+    # Affine members are exact.
     if not sampled:
         return 0.0
     sampler = inputs.problem.sampler({name: (m.rows, m.columns) for name, m in sampled.items()})
@@ -406,6 +409,7 @@ def test_formulation(timing: Timing, inputs: StageInputs, formulation: str) -> N
 
 def test_formulated_query(timing: Timing, inputs: StageInputs, formulation: str) -> None:
     """A query of a formulation; reached are errors, and residuals of the high-fidelity problem."""
+    # Another parameter in every call: a formulation that keeps its last answer gains nothing.
     model, mus = _formulated(inputs, formulation)(), _in_turn(inputs)
 
     def query() -> FormulationAnswer:

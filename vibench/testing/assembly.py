@@ -144,6 +144,7 @@ def definiteness(case: AssemblyCase) -> None:
     """A is positive definite."""
     for where, arrays in case.results.items():
         try:
+            # The factorisation proves it, as in a run.
             InnerProduct(arrays["A"], "A")
         except NumericalError as error:
             eigenvalue = ""
@@ -185,6 +186,7 @@ def continuity(case: AssemblyCase) -> Iterator[str]:
     if not case.in_time:
         yield Note("not looked for, for lack of time")
         return
+    # A member that vanishes has no scale, and constant ones were compared already.
     largest = {name: max(largest_entry(arrays[name]) for arrays in case.results.values()) for name in MEMBERS}
     scales = {name: s for name, s in largest.items() if s > 0.0 and name not in case.plugin.constant}
 
@@ -192,6 +194,7 @@ def continuity(case: AssemblyCase) -> Iterator[str]:
         return case.evaluate(start + t * (end - start))
 
     lower, upper, centre, *others = case.mus
+    # A jump may follow one parameter, or a combination of several that only a random line crosses.
     lines = [(lower, upper), (others[0], others[1])]
     if len(lower) > 1:
         along = np.eye(len(lower), dtype=bool)
@@ -252,6 +255,7 @@ def _check_contact(case: AssemblyCase, dofs: Indices, mu: Array, full: Arrays) -
 
 def _check_contact_loads(case: AssemblyCase, dofs: Indices, mu: Array, full: Arrays) -> None:
     """Loads of multipliers on all rows, on a part of them, and none are those of B and g."""
+    # Multipliers on all rows, on the first half of them, and on none.
     eta = np.random.default_rng(0).random((len(full["g"]), 3)) * [1.0, 1.0, 0.0]
     eta[len(eta) // 2 :, 1] = 0.0
     for chosen in (eta, eta[:, 1:]):
@@ -295,6 +299,7 @@ def by_entries(case: AssemblyCase) -> Iterator[str]:
         return
     rng, pattern = np.random.default_rng(0), case.results[at(case.mus[0])]
     wanted = {name: _places(name, pattern[name], rng) for name in names}
+    # A run samples one member or several in one call.
     for chosen in [*([name] for name in names), names]:
         _check_sampler(case, {name: wanted[name] for name in chosen})
 
@@ -337,6 +342,7 @@ def _summed(name: str, parts: Array, dofs: Indices, n: int) -> object:
         kept = dofs.T >= 0
         return np.bincount(dofs.T[kept], weights=parts[kept], minlength=n)
     rows, columns = np.broadcast_arrays(dofs.T[:, :, None], dofs.T[:, None, :])
+    # −1 stands for a node without an unknown.
     kept = (rows >= 0) & (columns >= 0)
     return sp.csr_array(sp.coo_array((parts[kept], (rows[kept], columns[kept])), shape=(n, n)))
 

@@ -122,11 +122,13 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
 
     def determinism(self) -> Iterator[str]:
         """A second call and another instance give the same results to the last bit."""
+        # Results may depend on a state of the instance, or on one that it is made with.
         again = list(self._deviations("a second call", self._evaluation(self.plugin)))
         yield from again or self._deviations("another instance", self._evaluation(self.create()))
 
     def another_process(self) -> Iterator[str]:
         """Another process, whose sets have another order, gives the same results up to `round_off`."""
+        # Three arguments show an order of sets; a process of its own costs a second instance.
         some = dict([*self.arguments.items()][-3:])
         try:
             there = call_in_other_process(_evaluated, type(self), self.create, some, seconds=self.seconds)
@@ -145,6 +147,7 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
             faulty = [key for key, value in getattr(self.plugin, "__dict__", {}).items() if _pickling_error(value)]
             where = f": look at attribute {', '.join(faulty)}" if faulty else ""
             raise ConformanceError(f"the {type(self.plugin).__name__} cannot be pickled ({reason}){where}")
+        # A run stores the results of all stages, and later processes read them.
         name, before = next(iter(self.results.items()))
         try:
             after = self.stored(before)
@@ -215,8 +218,10 @@ def difference(one: Any, other: Any, limit: float = 0.0) -> str:
     sizes = np.abs(_entries(gap))
     if not len(sizes) or np.max(sizes) <= limit:
         return ""
+    # NaN counts as the largest difference.
     place = _place(gap, int(np.argmax(np.where(np.isnan(sizes), np.inf, sizes))))
     values = float(one[place]), float(other[place])
+    # Six digits do not tell round-off: all of them are printed then.
     short = [f"{value:.6g}" for value in values]
     first, second = short if short[0] != short[1] else map(repr, values)
     return f"entry {place} is {first} against {second}"

@@ -106,6 +106,7 @@ class Check(Generic[CaseT_contra]):
         except (Exception, SystemExit) as error:  # noqa: BLE001  a plugin may raise anything
             lines.append(str(error) if isinstance(error, ConformanceError) else raised(error))
         faults = [line for line in lines if not isinstance(line, Note | Doubt)]
+        # A fault may repeat at every parameter.
         if len(faults) > 5:
             faults[5:] = ["and more"]
         doubtful = any(isinstance(line, Doubt) for line in lines)
@@ -210,6 +211,7 @@ class Examination:
     def __init__(self, plugin: Any, kind: str | None = None, seconds: float = SECONDS, **given: Any) -> None:
         self.kind, self.title, self.seconds = kind or kind_of(plugin), _title(plugin), seconds
         self.checks = {one.name: one for one in case_of(self.kind).checks}
+        # By value where no other process can import it: from notebooks, and functions of tests.
         self._pickled = cloudpickle.dumps((plugin, given | {"seconds": seconds}))
         self._results = dict[str, CheckResult]()
         self._left = seconds
@@ -217,6 +219,7 @@ class Examination:
     def result(self, name: str) -> CheckResult:
         """Result of one check, made when it is first asked for, after those that it needs."""
         if name not in self._results:
+            # pytest may have selected this check alone.
             earlier = [self.result(needed) for needed in self.checks[name].needs]
             self._results[name] = self._make(name, earlier)
         return self._results[name]
@@ -239,6 +242,7 @@ class Examination:
             result: CheckResult = answer[0]
             self._left -= answer[1]
             return result
+        # A hanging call used all the time: no other check is begun.
         if answer.status is Status.TIMEOUT:
             self._left = 0.0
             return CheckResult(name, Verdict.FAILED, f"stopped: the checks take longer than {self.seconds:g} s")

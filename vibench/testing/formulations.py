@@ -57,7 +57,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         return self.offline or sample_reduction()
 
     def phase(self, plugin: Formulation) -> _Seen:
-        """The offline phase that a formulation gets: without what it does not use."""
+        """The offline phase that a formulation gets, without the steps that it does not use."""
         uses, whole = axes_of(plugin, f"{type(plugin).__name__}"), self.whole
         pod, dual, primal = (axis in uses for axis in ("pod", "dual", "primal"))
         given: dict[str, Any] = {"snapshots": whole.snapshots}
@@ -72,7 +72,8 @@ class FormulationCase(Case[Formulation, Array, Answered]):
             whole.generators if dual else None,
             whole.tolerance if primal else None,
         ).given(**given)
-        assert isinstance(phase, _Seen)  # as what it was made of
+        assert isinstance(phase, _Seen)
+        # The attributes that this function has read are no use by the formulation.
         phase.seen.clear()
         return phase
 
@@ -84,9 +85,11 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         return {at(mu): mu for mu in np.concatenate([fixed, box.sample(4, seed=0)])}
 
     def model_of(self, plugin: Formulation) -> Model:
-        """The model of an instance, from what it has built once that was stored."""
+        """The model of an instance, made of its stored offline part."""
+        # Keyed by identity: two instances may be equal. The instance is kept, so that no other gets its number.
         if id(plugin) not in self._made:
             offline = self.phase(plugin)
+            # A run builds once and loads the artefact: what storing changes would be found nowhere else.
             built = self.clocked("building", lambda: check_built(plugin.build(offline)))
             self._made[id(plugin)] = plugin, self._of(plugin, offline, loads(dumps(dict(built))))
         return self._made[id(plugin)][1]
@@ -104,12 +107,11 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         return Answered(answer, solver, of.online.reconstruct(argument.copy(), answer))
 
     def arrays(self, result: Answered) -> Arrays:
-        """Coefficients and pair."""
         named = {"x": result.answer.x, "alpha": result.answer.alpha, "u": result.pair[0], "λ": result.pair[1]}
         return {name: value for name, value in named.items() if value is not None}
 
     def stored(self, result: Answered) -> Answered:
-        """A result as results have it: the coefficients of the answer alone."""
+        """A result with the coefficients of the answer as a run stores them."""
         answer = result.answer
         coefficients = loads(dumps({"x": answer.x, "alpha": answer.alpha}))
         return replace(result, answer=replace(answer, **coefficients))

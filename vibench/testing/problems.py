@@ -139,6 +139,7 @@ def high_fidelity_solution(case: AssemblyCase) -> Iterator[str]:
             answer = solver.solve(mus[k].copy())
         except NumericalError as error:
             raise ConformanceError(f"no solution {at(mus[k])}: {error}") from error
+        # Exactly: the active set method leaves no negative multipliers.
         if np.min(answer.lam) < 0.0:
             yield f"the multiplier is not in W⁺ {at(mus[k])}: entry {np.argmin(answer.lam)} is {np.min(answer.lam):.1e}"
             return
@@ -235,7 +236,8 @@ def quantities_of_interest(case: AssemblyCase) -> Iterator[str]:
     solved = active_set.HighFidelitySolver(case.plugin).solve(mu[0].copy())
     u, lam = solved.u[:, None], solved.lam[:, None]
     for one, again in zip(declared, case.plugin.outputs, strict=True):
-        for columns in ((u, lam), (0.0 * u, 0.0 * lam)):  # a reduced solution may have no contact
+        # A reduced solution may have no contact.
+        for columns in ((u, lam), (0.0 * u, 0.0 * lam)):
             if one.values(mu, *columns) != again.values(mu, *columns):
                 yield f"the output '{one.name}' differs in a second call {at(mu[0])}"
     yield Note(f"{', '.join(names)}" if names else "no outputs")

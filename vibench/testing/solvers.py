@@ -187,7 +187,8 @@ class SolverCase:
         program = deepcopy(self.typical)
         earlier = self.create(program, ACCURACY)
         kept = copies(_vectors(earlier))
-        program.f[:] *= -0.5  # the same arrays with other values
+        # The same arrays with other values: a solver that caches by address answers the old program.
+        program.f[:] *= -0.5
         later = self.create(program, ACCURACY)
         if later.x is None or later.alpha is None or earlier.x is None:
             yield "a program with a solution gets none at a second call"
@@ -203,6 +204,7 @@ class SolverCase:
         Seconds alone depend on what else the machine does, calls alone on the number of iterations.
         """
         program = _scaled(self.programs["many constraints"].program)
+        # The first nine are counted, the others timed: the profiler that counts calls slows them down.
         new = [replace(program, f=program.f * (1.0 + 1e-6 * (k + 1))) for k in range(18)]
         again = [deepcopy(program) for _ in new]
         self.create(program, ACCURACY)
@@ -210,6 +212,7 @@ class SolverCase:
         pairs = zip(again[9:], new[9:], strict=True)
         seconds = [[timed(partial(self.create, each, ACCURACY))[1].cpu for each in pair] for pair in pairs]
         fast, slow = map(min, zip(*seconds, strict=True))
+        # Calls and seconds together: an early end of the iterations saves calls, a busy machine changes seconds.
         if kept < solved and slow > 5.0 * fast:
             yield (
                 f"a program solved before takes {fast:.1g} s of CPU, a new one {slow:.1g} s: solutions are kept, and "

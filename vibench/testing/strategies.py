@@ -112,6 +112,7 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
     def errors(self) -> Iterator[str]:
         """Claimed errors are the projection errors of the first r generators."""
         for stop, cone in self.results.items():
+            # R + 1 errors claim nested generators, e(0) … e(R); one is e(R) alone.
             first = 0 if len(cone.errors) == cone.size + 1 else cone.size
             for r, claimed in enumerate(cone.errors, first):
                 error = self._errors(cone, r, self.lam).max(initial=0.0)
@@ -133,6 +134,7 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
         """Zero, repeated and single snapshots are reduced; snapshots that all vanish are reduced or refused."""
         tolerance = next(iter(self.tolerances), 0.3)
         some, stop = self.lam, Stop(tolerance=tolerance)
+        # Greedy constructions divide by norms of remainders, which vanish for these snapshots.
         largest = some[:, [np.linalg.norm(some, axis=0).argmax()]]
         for name, snapshots in {
             "with a zero snapshot": np.hstack([np.zeros((len(some), 1)), some]),
@@ -285,6 +287,7 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
         if not isinstance(self.plugin, NestedStrategy):
             yield Note("not declared")
             return
+        # A run grows an enrichment once, through all tolerances of a study.
         tolerances = {name: tolerance for name, tolerance in self.arguments.items() if tolerance is not None}
         grown = grow_through(self.plugin, copy_of(self.model), tolerances.values())
         fixed = self._fixed()
@@ -417,12 +420,14 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
         seeds = [self._variant(seed=seed) for seed in range(4)]
         for name, box in self.arguments.items():
             samples = [self.evaluate(box, plugin) for plugin in seeds]
+            # One point may be a rule of its own, such as the centre.
             if len(samples[0]) > 1 and all(np.array_equal(samples[0], other) for other in samples[1:]):
                 yield Doubt(f"{name}: seeds 0 to 3 give the same points, so that the option 'seed' changes nothing")
 
     def no_mutation(self) -> Iterator[str]:
         """Neither the box nor NumPy's global random numbers are changed."""
         for name, box in self.arguments.items():
+            # A strategy that seeds the global generator would fix the random numbers of all others.
             given, state = _copy(box), np.random.get_state()  # noqa: NPY002  the state that others share
             self.plugin.parameters(given)
             for what in ("lower", "upper"):
@@ -488,6 +493,7 @@ class DistanceTrainer(Trainer):
 
     def solve(self, mu: Array, bound: float = float("nan")) -> None:  # noqa: ARG002
         """Note the parameter."""
+        # Bounds fall with every solution: a rule that stops at any bound has stopped by then.
         if len(self.solved) >= 5000:
             raise ConformanceError("train does not end after 5000 solutions, with bounds that decrease")
         self.solved.append(np.array(mu, float))
