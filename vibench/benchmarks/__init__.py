@@ -175,7 +175,7 @@ def run_pytest(options: Sequence[str]) -> None:
 
 
 def _knows(problem: str, resolution: Resolution) -> bool:
-    """Whether a problem has such a resolution; one that cannot be loaded has none."""
+    """Return if a problem has such a resolution; one that cannot be loaded has none."""
     try:
         find(PROBLEM, problem).check_options({"resolution": resolution})
     except RequestError:
@@ -184,7 +184,7 @@ def _knows(problem: str, resolution: Resolution) -> bool:
 
 
 def _takes_no_option(problem: str) -> bool:
-    """Whether a problem needs no option, as a folder; one that cannot be loaded counts, its benchmarks then fail."""
+    """Return if a problem needs no option, as a folder; one that cannot be loaded counts: its benchmarks then fail."""
     try:
         return not any(option.required for option in find(PROBLEM, problem).options.values())
     except RequestError:

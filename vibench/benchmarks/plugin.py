@@ -54,7 +54,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Register what has a state."""
+    """Register the plugin with the state of a session."""
     config.pluginmanager.register(Passes(config), "vibench-passes")
 
 
@@ -315,13 +315,13 @@ class Passes:
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_benchmark_update_machine_info(self, machine_info: dict[str, Any]) -> None:
-        """Add what was timed where, as `vibench` names it."""
+        """Add machine, libraries and code as `vibench` names them."""
         own = {"machine": provenance.machine(), "libraries": provenance.libraries(), "code": provenance.core_code()}
         machine_info["vibench"] = own
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_benchmark_update_json(self, output_json: dict[str, Any]) -> None:
-        """Add why benchmarks failed."""
+        """Add the reasons of benchmarks that failed."""
         output_json["failed"] = self._failed
 
 

@@ -163,7 +163,6 @@ class StageInputs:
 
 
 def solve_all(problem: Problem, mus: Array) -> list[HighFidelitySolution]:
-    """High-fidelity solutions at parameters (P×d), one after the other."""
     solver = HighFidelitySolver(problem)
     return [solver.solve(mu) for mu in mus]
 
@@ -195,7 +194,6 @@ def residual_figures(residuals: Residuals) -> dict[str, float]:
 
 
 def test_pod(timing: Timing, inputs: StageInputs) -> None:
-    """POD of the snapshots."""
     V, u, stop = inputs.problem.V, inputs.snapshots.u, inputs.usual.modes
 
     def judge(modes: POD) -> Info:
@@ -285,7 +283,7 @@ def relative_difference(value: Array, exact: Array) -> float:
 
 
 def test_projection_of_members(timing: Timing, inputs: StageInputs, primal: PrimalChoice) -> None:
-    """What reduced assembly prepares for one enrichment."""
+    """Projection of the members on one enriched space."""
     _check_reduced(inputs, primal)
     reduction, members = inputs.reduction(inputs.usual, primal), inputs.members
 

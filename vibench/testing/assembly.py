@@ -44,7 +44,6 @@ class AssemblyCase(Case[Problem, Array, Arrays]):
 
     @cached_property
     def one_assembly(self) -> float:
-        """Wall seconds of the first assembly."""
         box, problem = self.plugin.parameters, self.plugin
         return timed(lambda: problem.assemble(0.5 * (box.lower + box.upper)))[1].wall
 

@@ -190,7 +190,6 @@ def parametrize_with_checks(*plugins: Any, kind: str | None = None, **given: Any
 
 
 def _report(examination: Examination, name: str) -> None:
-    """Report the result of a check to pytest."""
     import pytest  # noqa: PLC0415  see above
 
     result = examination.result(name)

@@ -53,7 +53,6 @@ class FormulationCase(Case[Formulation, Array, Answered]):
 
     @cached_property
     def whole(self) -> Reduction:
-        """The offline phase with all axes."""
         return self.offline or sample_reduction()
 
     def phase(self, plugin: Formulation) -> _Seen:
@@ -100,7 +99,6 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         return Model(plugin, offline, built, "piqp" if "solvers" in uses else None, ACCURACY)
 
     def evaluate(self, argument: Array, plugin: Formulation | None = None) -> Answered:
-        """The answer at a parameter (d,), and its pair."""
         of, mu = self.model_of(plugin or self.plugin), argument.copy()
         settings, solver = of.settings()
         answer = self.clocked("a query", lambda: of.online.solve(mu, settings))
@@ -207,7 +205,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         yield Note(f"at a training parameter, errors of {of_u:.1e} (u) and {of_lam:.1e} (λ)")
 
     def axes_used(self) -> Iterator[str]:
-        """What `uses` declares is used: cells would be repeated over an axis on which nothing depends."""
+        """Every axis in `uses` is used: cells would be repeated over an axis on which nothing depends."""
         self.results  # noqa: B018  the first use builds and asks
         of = self.model_of(self.plugin)
         assert isinstance(of.offline, _Seen)
@@ -301,7 +299,7 @@ class _Seen(Reduction):
 
 
 def _faults_of(answer: FormulationAnswer, model: FormulationModel) -> Iterator[str]:
-    """What is wrong with an answer, but for the pair that it stands for."""
+    """Faults of an answer, except those of its pair."""
     if not isinstance(answer.outcome, Outcome):
         yield f"the outcome is {answer.outcome!r}; expected a vibench.Outcome"
         return

@@ -160,7 +160,7 @@ def high_fidelity_solution(case: AssemblyCase) -> Iterator[str]:
 
 
 def interpolation(case: AssemblyCase) -> Iterator[str]:
-    """What reduced assembly interpolates is also right at parameters outside the training set."""
+    """Interpolated members are also right at parameters outside the training set."""
     problem, mus = case.plugin, training_parameters(case.plugin)
     names = [name for name in MEMBERS if name in problem.entrywise - problem.constant - set(problem.affine)]
     # A quarter of the time is left to this check.

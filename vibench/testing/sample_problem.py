@@ -43,7 +43,6 @@ class MovingSupport(Problem):
         self.W = InnerProduct(_tridiagonal(self._width / 6.0, self._width * 2.0 / 3.0, m), "X_W")
 
     def training_set(self) -> Array:
-        """The 5×5 grid."""
         return self.parameters.grid(5, 5)
 
     def assemble(self, mu: Array) -> VariationalInequality:
@@ -56,12 +55,10 @@ class MovingSupport(Problem):
 
     @property
     def element_dofs(self) -> Indices:
-        """The nodes at both ends of the intervals."""
         left = np.arange(-1, self.V.dim)
         return np.stack([left, np.where(left + 1 < self.V.dim, left + 1, -1)])
 
     def element_sampler(self, elements: Indices) -> Sampler:
-        """The same on every interval."""
         h = self._h
         stiffness = np.tile(np.array([[1.0, -1.0], [-1.0, 1.0]]) / h, (len(elements), 1, 1))
         return lambda _: {"A": stiffness, "f": np.full((len(elements), 2), -2.0 * h)}
@@ -73,7 +70,6 @@ def _tridiagonal(off: float, diagonal: float, n: int) -> SparseMatrix:
 
 class _Greedy(DualStrategy):
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        """The greedy cone."""
         return greedy_cone(snapshots, W, stop)
 
 
@@ -97,7 +93,6 @@ def sample_offline(modes: int = 4, generators: int = 6) -> Offline:
 
 class _Supremizers(PrimalStrategy):
     def build(self, offline: Offline, tolerance: float | None) -> Enrichment:  # noqa: ARG002
-        """The supremizers of one training parameter."""
         V, B = offline.problem.V, offline.problem.constraint(offline.training[0])[0]
         return Enrichment(Kind.FIXED, vectors=V.orthonormalise(supremizers(V, B, offline.span), offline.basis))
 
@@ -114,6 +109,5 @@ def copy_of(offline: Offline) -> Offline:
 
 
 def arrays_of(offline: Offline) -> Arrays:
-    """All arrays that a strategy could change, by name."""
     names = ("basis", "span", "training", "cone.generators", "cone.errors", "problem.V.matrix", "problem.W.matrix")
     return {f"offline.{name}": attrgetter(name)(offline) for name in names}

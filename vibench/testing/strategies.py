@@ -71,7 +71,6 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
         return stops | {f"size {value}": Stop(size=value) for value in self.sizes}
 
     def evaluate(self, argument: Stop, plugin: DualStrategy | None = None, snapshots: Array | None = None) -> Cone:
-        """Cone of all snapshots, or of others."""
         given = (self.lam if snapshots is None else snapshots).copy()
         return self.clocked("a cone", lambda: (plugin or self.plugin).reduce(given, self.space, argument))
 
@@ -178,7 +177,7 @@ def _round_off(error: float) -> float:
 
 
 def _cone_fault(cone: object, W: InnerProduct) -> str:
-    """What is wrong with a cone, and where; "" if nothing is."""
+    """The first fault of a cone, and its place; "" if there is none."""
     try:
         checked = check_cone(cone, W)
     except NumericalError as error:
@@ -458,7 +457,6 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
 
     @property
     def _given(self) -> dict[str, Any]:
-        """Options that are given."""
         return dict(getattr(self.create, "keywords", {}))
 
     def _takes(self, option: str) -> bool:
@@ -466,7 +464,6 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
         return isinstance(constructor, type) and option in inspect.signature(constructor).parameters
 
     def _variant(self, **options: Any) -> Sampling:
-        """The strategy with other options."""
         constructor: Callable[..., Sampling] = getattr(self.create, "func", self.create)
         return constructor(**self._given | options)
 
@@ -492,7 +489,6 @@ class DistanceTrainer(Trainer):
         self._box, self.solved = box, list[Array]()
 
     def solve(self, mu: Array, bound: float = float("nan")) -> None:  # noqa: ARG002
-        """Note the parameter."""
         # Bounds fall with every solution: a rule that stops at any bound has stopped by then.
         if len(self.solved) >= 5000:
             raise ConformanceError("train does not end after 5000 solutions, with bounds that decrease")
@@ -513,7 +509,6 @@ def _copy(box: ParameterBox) -> ParameterBox:
 
 
 def _train(plugin: Sampling, box: ParameterBox) -> list[Array]:
-    """The parameters at which a strategy solves."""
     assert isinstance(plugin, AdaptiveSampling)  # its caller asks for no other
     trainer = DistanceTrainer(box)
     try:
