@@ -81,6 +81,7 @@ def covered(found: MeanEstimate | None, true: float) -> bool:
     return low <= true <= high
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["steady", "drifting", "bursty"])
 def test_intervals_of_ratios_contain_the_truth_in_93_to_98_of_100_runs(kind: str) -> None:
     """Against the high-fidelity model, between cells of a group, and between cells of different groups."""
@@ -98,6 +99,7 @@ def test_intervals_of_ratios_contain_the_truth_in_93_to_98_of_100_runs(kind: str
     assert all(0.93 <= np.mean(some) <= 0.98 for some in inside.values())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["steady", "drifting", "bursty"])
 def test_intervals_of_cells_whose_rounds_end_when_they_are_decided_contain_the_truth(kind: str) -> None:
     """A decision at 99 % ends the rounds of a cell; six blocks are the most."""
@@ -147,6 +149,7 @@ def runs_of_break_even(kind: str, offline_noise: float, rng: np.random.Generator
         yield one.result.low is not None and one.result.high is not None and one.result.low <= true <= one.result.high
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [0.05, 0.1, 0.2])
 @pytest.mark.parametrize("kind", ["steady", "drifting", "bursty"])
 def test_intervals_of_break_even_include_the_noise_of_offline_seconds(kind: str, noise: float) -> None:
@@ -180,16 +183,19 @@ def test_solutions_of_a_block_count_alike_beside_every_model() -> None:
     assert np.isnan(beside(seconds[2:], pace))
 
 
-def test_without_other_models_an_interval_is_students() -> None:
+def test_without_other_models_an_interval_is_students_and_other_runs_differ_by_their_conditions() -> None:
     values = [0.1, 0.3, 0.2]
     rows = [
         {"cell": "c", "block": str(k), "total_s": np.exp(value), "hf_s": 1.0, "pace": 1.0}
         for k, value in enumerate(values)
     ]
-    found = PairedTiming(rows).ratio_within(None, "c")
+    paired = PairedTiming(rows)
+    found, of_other_runs = paired.ratio_within(None, "c"), paired.ratio(None, "c")
     assert found is not None
     expected = student.interval(0.95, 2, loc=0.2, scale=0.1 / np.sqrt(3.0))
     assert found.interval(TAIL) == pytest.approx(expected)
+    assert of_other_runs is not None
+    assert of_other_runs.error == pytest.approx(np.hypot(found.error, CONDITIONS))
 
 
 @pytest.mark.parametrize("degrees", [2.0, 8.0])
