@@ -29,7 +29,7 @@ from vibench.library import runs
 from vibench.plugins import registry
 from vibench.plugins.kinds import STUDY
 from vibench.results.sqlite import FILE
-from vibench.storage.artefacts import CACHE_VARIABLE
+from vibench.stages.artefacts import CACHE_VARIABLE
 
 # The examples of a test are the same ones every time and everywhere; `--hypothesis-profile=explore` draws new ones.
 settings.register_profile("same", deadline=None, derandomize=True, database=None)

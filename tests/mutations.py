@@ -73,7 +73,7 @@ FAULTS = (
     ),
     Fault(
         "cell-after-cell",
-        "vibench/rounds/timing_rounds.py",
+        "vibench/stages/timing_rounds.py",
         "number, within = divmod(item, len(self.cells))\n",
         "within, number = divmod(item, self.rounds)\n",
         ("tests/unit/rounds/test_timing_rounds.py",),
@@ -494,7 +494,7 @@ FAULTS = (
     ),
     Fault(
         "checksum-not-verified",
-        "vibench/storage/artefacts.py",
+        "vibench/stages/artefacts.py",
         "if digest != _digest(key, content):",
         "if False:",
         ("tests/unit/storage/test_artefacts.py",),

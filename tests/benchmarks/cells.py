@@ -28,7 +28,7 @@ from vibench.arrays import Array
 from vibench.execution.run import Options, run_study
 from vibench.library.progress import ProgressDisplay
 from vibench.results.sqlite import FILE
-from vibench.storage.artefacts import CACHE_VARIABLE
+from vibench.stages.artefacts import CACHE_VARIABLE
 
 GRIDS = {200: (5, 4), 2_000: (20, 10), 20_000: (50, 40)}
 """Tolerances of the POD and of the cone, by the number of cells; each pair has `ACCURACIES`."""

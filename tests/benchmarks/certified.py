@@ -44,7 +44,7 @@ from vibench.offline.correction import Answer, Corrector
 from vibench.offline.models import Model
 from vibench.plugins.plugin import Plugin
 from vibench.qp.solve import solve_qp
-from vibench.stages.judging.pairs import VIOLATION
+from vibench.stages.assessment import VIOLATION
 
 SEED = 2027
 

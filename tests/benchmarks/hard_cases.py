@@ -25,7 +25,7 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.model.error_bounds import bound_errors_at, corrected_pair
 from vibench.offline.assemblies import assemblies
 from vibench.stability.coercivity import coercivity_and_continuity, energy_inf_sup
-from vibench.stages.judging.pairs import VIOLATION
+from vibench.stages.assessment import VIOLATION
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 from decimals import difference, exact_decimal

@@ -27,7 +27,7 @@ import vibench
 from vibench.offline.assemblies import Assemblies
 from vibench.offline.sweep import high_fidelity_sweep
 from vibench.qp.solve import solve_qp
-from vibench.stages.judging.pairs import VIOLATION
+from vibench.stages.assessment import VIOLATION
 
 TRAINING, SIZE, UNTIMED = (2, 2, 2, 3), 14, 20
 

@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from running import assert_same_numbers
 
-from vibench.storage.artefacts import CACHE_VARIABLE
+from vibench.stages.artefacts import CACHE_VARIABLE
 
 WAYS = {
     "one worker": ("--jobs", "1"),

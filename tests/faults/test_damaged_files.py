@@ -21,8 +21,8 @@ from vibench.results.database import ResultsDatabase
 from vibench.results.read import results_file
 from vibench.results.schema import STORED
 from vibench.results.sqlite import FILE, read_meta, read_rows, study_of
-from vibench.storage.artefacts import CACHE_VARIABLE, SUFFIX, Store
-from vibench.storage.serialisation import dumps
+from vibench.stages.artefacts import CACHE_VARIABLE, SUFFIX, Store
+from vibench.stages.serialisation import dumps
 
 STUDY = {
     "name": "small",

@@ -21,7 +21,7 @@ from running import Vibench, assert_same_numbers, rows, without_seconds
 from samples import wire_study, write_study
 
 from vibench.results.sqlite import FILE
-from vibench.storage.artefacts import CACHE_VARIABLE
+from vibench.stages.artefacts import CACHE_VARIABLE
 
 WIRES = [{"name": "wire", "label": f"{nodes}", "options": {"nodes": nodes}} for nodes in (20, 40)]
 LONG = wire_study(

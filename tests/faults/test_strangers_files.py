@@ -25,8 +25,8 @@ from vibench.report import figures
 from vibench.results.read import read_table, results_file
 from vibench.results.show import export as write_export
 from vibench.results.sqlite import FILE
-from vibench.storage import artefacts
-from vibench.storage.artefacts import CACHE_VARIABLE, SUFFIX, Artefact, Store, usable_store
+from vibench.stages import artefacts
+from vibench.stages.artefacts import CACHE_VARIABLE, SUFFIX, Artefact, Store, usable_store
 from vibench.timing import NO_TIME
 
 

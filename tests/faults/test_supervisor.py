@@ -27,8 +27,8 @@ from vibench.plugins.kinds import PROBLEM
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find
 from vibench.qp.status import Status
+from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, Stage, Unstored
-from vibench.storage.artefacts import Store
 
 Run = Callable[..., "Done | Failed | Unstored"]
 

@@ -17,8 +17,8 @@ import numpy as np
 from forking import SUPERVISOR
 
 from vibench.plugins.plugin import Plugin
+from vibench.stages.artefacts import Store
 from vibench.stages.base import SHARE, Failed, Items, ItemwiseStage, Result, Stage, TimeLimit
-from vibench.storage.artefacts import Store
 from vibench.timing import Seconds
 
 

@@ -43,7 +43,7 @@ LOADED = [
 ]  # fmt: skip
 """Libraries that the template imports."""
 
-PACKAGES = ("cli", "execution", "plugins", "results", "stages", "storage", "study", "testing")
+PACKAGES = ("cli", "execution", "plugins", "results", "stages", "study", "testing")
 """Packages of vibench that the template imports with all their modules, and so most others; plugins it does not."""
 
 TESTS = Path(__file__).parents[1]

@@ -16,11 +16,11 @@ import pandas as pd
 import vibench
 from vibench.plugins.plugin import Plugin
 from vibench.results.schema import STORED
+from vibench.stages.artefacts import Artefact, Store
 from vibench.stages.base import Stage
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.formulation import FormulationStage
-from vibench.storage.artefacts import Artefact, Store
 from vibench.study.parameter_sets import ParameterSet
 
 STUDY: Mapping[str, Any] = {

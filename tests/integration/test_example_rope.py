@@ -21,7 +21,7 @@ from sources import SOURCES, mentions
 from vibench.interfaces.problem import MEMBERS
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
-from vibench.storage.artefacts import CACHE_VARIABLE
+from vibench.stages.artefacts import CACHE_VARIABLE
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "vibench-rope"
 

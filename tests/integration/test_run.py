@@ -19,7 +19,7 @@ from samples import wire_study, write_study
 import vibench.execution.run  # noqa: F401  lists the classes of all stages
 from vibench.results.schema import TABLES
 from vibench.results.sqlite import FILE
-from vibench.storage.artefacts import CACHE_VARIABLE, SUFFIX, Store, encoded
+from vibench.stages.artefacts import CACHE_VARIABLE, SUFFIX, Store, encoded
 from vibench.study.parameter_sets import CHUNKS
 
 SOLVERS = ["piqp", "careful", "gives-up"]

@@ -19,8 +19,8 @@ from transformed import Transformed
 from vibench.interfaces.strategies import Stop
 from vibench.plugins.plugin import Plugin
 from vibench.stages.base import value_of
+from vibench.stages.cell_stage import CellRows
 from vibench.stages.enrichment import SingleEnrichment
-from vibench.stages.judging.cell_goal import CellRows
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.study.parameter_sets import ParameterSet
 

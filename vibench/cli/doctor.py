@@ -35,7 +35,7 @@ from vibench.plugins.registry import RegisteredPlugin, find, registered, unreada
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
-from vibench.storage.artefacts import CACHE_VARIABLE, LOCK, Store, default_folder
+from vibench.stages.artefacts import CACHE_VARIABLE, LOCK, Store, default_folder
 from vibench.study.matrix import read_study
 from vibench.text import new_console
 from vibench.timing import DISTURBED, Calibration, Stopwatch

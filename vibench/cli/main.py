@@ -78,7 +78,7 @@ def clean(
     import pandas as pd
 
     from vibench.cli.console import print_frame
-    from vibench.storage.artefacts import usable_store
+    from vibench.stages.artefacts import usable_store
 
     store = usable_store()
     stored = pd.DataFrame(store.contents(), columns=["stored", "MiB", "days"])

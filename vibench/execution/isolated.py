@@ -21,9 +21,9 @@ from vibench.qp.scaling import in_units, random_units
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, verify
+from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, Items, ItemwiseStage, Stage, TimeLimit
-from vibench.storage.artefacts import Store
-from vibench.storage.serialisation import dumps, loads, storable
+from vibench.stages.serialisation import dumps, loads, storable
 from vibench.study.spec import Limits
 from vibench.timing import NO_TIME, Seconds, median_seconds
 

@@ -24,9 +24,9 @@ from vibench.plugins.plugin import Plugin
 from vibench.results.read import read_table, results_file
 from vibench.results.selection import key_of
 from vibench.results.sqlite import read_meta, read_rows, study_of
+from vibench.stages.artefacts import Store, usable_store
 from vibench.stages.base import Done, Stage
 from vibench.stages.cell_queries import cell_queries
-from vibench.storage.artefacts import Store, usable_store
 from vibench.study.cells import Cell
 from vibench.study.matrix import study_of_cell
 from vibench.study.spec import Study

@@ -27,10 +27,10 @@ from vibench.results.sqlite import (
     set_aside,
     study_of,
 )
-from vibench.rounds.timed_seconds import TimedRound, seconds_of_cell, seconds_of_queries
+from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Row, Stage, value_of
-from vibench.stages.judging.cell_goal import CellRows
-from vibench.storage.artefacts import History, Store
+from vibench.stages.cell_stage import CellRows
+from vibench.stages.timed_seconds import TimedRound, seconds_of_cell, seconds_of_queries
 from vibench.study.cells import NO_SUCH_AXIS, Axes, Cell, digest
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.spec import Limits, Study

@@ -34,12 +34,12 @@ from vibench.qp.status import Status
 from vibench.results.break_even import break_even_rows
 from vibench.results.consistency import disagreement_rows
 from vibench.results.database import ResultsDatabase
-from vibench.rounds.timing_rounds import SHARE, TimingRounds
+from vibench.stages.artefacts import Store, usable_store
 from vibench.stages.base import Done, Failed, Stage, Unstored
 from vibench.stages.cell_queries import cell_queries
-from vibench.stages.judging.cell_goal import CellRows
+from vibench.stages.cell_stage import CellRows
 from vibench.stages.pictures import PictureStage
-from vibench.storage.artefacts import Store, usable_store
+from vibench.stages.timing_rounds import SHARE, TimingRounds
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand
 from vibench.study.spec import Study

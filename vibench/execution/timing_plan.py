@@ -8,12 +8,12 @@ from collections.abc import Iterable, Mapping
 from vibench.execution.recording import ResultWriter
 from vibench.results.break_even import FEWEST_ROUNDS, BreakEvenComparison, Meaning, compared
 from vibench.results.paired_timing import PairedTiming
-from vibench.rounds.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
-from vibench.rounds.timed_seconds import TimedCell, TimedRound
-from vibench.rounds.timing_rounds import SHARE, TimingRounds, block_rows
+from vibench.stages.artefacts import Store
 from vibench.stages.base import Failed, Row, Stage
 from vibench.stages.cell_queries import CellQueries
-from vibench.storage.artefacts import Store
+from vibench.stages.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
+from vibench.stages.timed_seconds import TimedCell, TimedRound
+from vibench.stages.timing_rounds import SHARE, TimingRounds, block_rows
 from vibench.study.cells import Cell
 from vibench.timing import Seconds
 

@@ -38,8 +38,8 @@ from vibench.execution.jobs import (
 )
 from vibench.execution.supervisor import MARK, kill_marked
 from vibench.qp.status import Status
+from vibench.stages.artefacts import Store
 from vibench.stages.base import LOST, SHARE, Done, Failed, Items, ItemwiseStage, Unstored
-from vibench.storage.artefacts import Store
 
 T = TypeVar("T")
 Send = Callable[[Any], None]

@@ -27,10 +27,7 @@ from vibench.model.hyperreduced import AnyReducedModel
 from vibench.offline import c_source
 from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, member_polynomials
 from vibench.qp.verification import QPSolution
-from vibench.storage.serialisation import storable
 from vibench.text import one_line
-
-storable(AffinePolynomial)
 
 COMPILERS = ("cc", "gcc", "clang")
 """C compilers that are looked for where the environment variable CC names none."""
@@ -48,7 +45,6 @@ SAYS = {0: "solved", 1: "inaccurate", 2: "the constraints contradict each other"
 """What the codes of the program mean."""
 
 
-@storable
 @dataclass(frozen=True)
 class CompiledModel:
     """What the C source of a model is made of: polynomials of A, f, B and g, the box (d,), the accuracy it verifies."""

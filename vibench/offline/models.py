@@ -29,7 +29,6 @@ from vibench.interfaces.formulations import (
 )
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import Problem, VariationalInequality
-from vibench.interfaces.strategies import Cone, Enrichment, Kind
 from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import contact_unknowns, output_weights
 from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate, OnlineCorrection, output_error_bound
@@ -45,8 +44,6 @@ from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers, solve_qp, takes_start
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, verify
-from vibench.reduction.pod import POD
-from vibench.storage.serialisation import storable
 from vibench.text import brief, normal_name
 from vibench.timing import timed
 
@@ -54,9 +51,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from vibench.offline.reduction import Reduction
-
-for _step in (POD, Cone, Kind, Enrichment):
-    storable(_step)  # steps of other offline phases, which a formulation may build
 
 Parameters = Sequence[float] | Array | Mapping[str, float]
 """A parameter mu: its components in the order of `ParameterBox.names`, or by these names."""

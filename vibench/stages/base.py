@@ -18,7 +18,7 @@ from vibench.interfaces.problem import Problem
 from vibench.plugins.plugin import Plugin
 from vibench.provenance import libraries, numerical_code, source_hash
 from vibench.qp.status import Status
-from vibench.storage.artefacts import History, Store
+from vibench.stages.artefacts import History, Store
 from vibench.study.cells import Axes, digest
 from vibench.study.parameter_sets import ParameterSet
 from vibench.timing import NO_TIME, Seconds
@@ -120,7 +120,8 @@ class Stage(ABC):
         """Hash of the code that determines the value; that of the inputs is in their keys."""
         # Of its own layer only the modules count that it imports from: an edit of one stage keeps most other artefacts.
         imported = {str(getattr(one, "__module__", "")) for one in vars(sys.modules[cls.__module__]).values()}
-        own = {name for name in imported if name.startswith(("vibench.stages.", "vibench.rounds."))} - {__name__}
+        carriers = {__name__, "vibench.stages.artefacts", "vibench.stages.serialisation"}  # they hand over numbers
+        own = {name for name in imported if name.startswith("vibench.stages.")} - carriers
         sources = [source_hash(Path(str(sys.modules[name].__file__))) for name in sorted({cls.__module__, *own})]
         return " ".join([*sources, numerical_code(below="stages")])
 

@@ -20,23 +20,23 @@ from vibench.plugins.plugin import Plugin
 from vibench.qp.exact import ExactSolution
 from vibench.results.consistency import vectors
 from vibench.stability.infsup import stability_ratio
+from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AssemblyStage, ExactSolutions, ReducedPrograms
+from vibench.stages.assessment import error_columns, pair_columns
 from vibench.stages.base import Row, Stage, TimeLimit, value_of
+from vibench.stages.cell_stage import CellStage, CellWork, QueryRows, inf_sup_columns
 from vibench.stages.certification import CertificateStage
 from vibench.stages.enrichment import EnrichmentStage, spaces_of
 from vibench.stages.formulation import FormulationStage
 from vibench.stages.infsup_constants import InfSupConstants
-from vibench.stages.judging.cell_goal import CellGoal, CellItems, QueryRows, inf_sup_columns
-from vibench.stages.judging.pairs import error_columns, pair_columns
 from vibench.stages.offline import ReducedCone
 from vibench.stages.query import ModelQuery, ProgramQuery, Queries, run_query
-from vibench.storage.artefacts import Store
 from vibench.study.cells import Cell
 from vibench.study.parameter_sets import ParameterSet
 
 
 @dataclass(frozen=True)
-class CellQueries(CellGoal):
+class CellQueries(CellStage):
     """All queries of one cell."""
 
     built: FormulationStage
@@ -138,7 +138,7 @@ def cell_queries(cell: Cell, query_seconds: float) -> CellQueries:
     )  # fmt: skip
 
 
-class _Queries(CellItems):
+class _Queries(CellWork):
     """The queries of a cell: solve, verify and assess every one."""
 
     def __init__(self, stage: CellQueries, store: Store) -> None:

@@ -12,10 +12,10 @@ from vibench.model.certificates.contact_correction import ContactCompliance
 from vibench.model.certificates.prepared_correction import PreparedCorrections
 from vibench.model.certificates.residual import ResidualBasis
 from vibench.model.certificates.spectral import SpectralBounds
+from vibench.stages.artefacts import Store
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.formulation import AffineDecomposition, FormulationStage
-from vibench.storage.artefacts import Store
-from vibench.storage.serialisation import storable
+from vibench.stages.serialisation import storable
 from vibench.timing import timed
 
 for _kind in (

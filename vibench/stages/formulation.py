@@ -10,28 +10,34 @@ from typing import Any
 from vibench.arrays import Array
 from vibench.interfaces.formulations import Formulation
 from vibench.interfaces.problem import Problem
+from vibench.interfaces.strategies import Cone, Enrichment, Kind
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky
 from vibench.linalg.definite import BlockDiagonal
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
+from vibench.model.chebyshev import AffinePolynomial
 from vibench.model.hyperreduced import ProjectedMember, ReducedOperators
+from vibench.offline.compiled import CompiledModel
 from vibench.offline.models import ACCURACY, Model, check_built
 from vibench.offline.reduction import Reduction
 from vibench.offline.sweep import Snapshots
 from vibench.plugins.plugin import Plugin
+from vibench.reduction.pod import POD
 from vibench.reduction.supremizers import ContactCoordinates, LoadCoordinates, SpannedCoordinates
+from vibench.stages.artefacts import Store
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.offline import ConeStage, PODStage, ReducedCone
+from vibench.stages.serialisation import storable
 from vibench.stages.snapshots import gather, solution_stages
-from vibench.storage.artefacts import Store
-from vibench.storage.serialisation import storable
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.timing import timed
 
 for _kind in (
     AffineMember, Evaluation, ReducedOperators, ProjectedMember, ContactCoordinates, LoadCoordinates,
     SpannedCoordinates, InnerProduct, SparseCholesky, PartialCholesky, BlockDiagonal,
+    # what formulations may build: steps of other offline phases, and programs of the machine
+    POD, Cone, Kind, Enrichment, CompiledModel, AffinePolynomial,
 ):  # fmt: skip
     storable(_kind)
 

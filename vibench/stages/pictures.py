@@ -14,10 +14,10 @@ from vibench.interfaces.outputs import Picture
 from vibench.interfaces.parameters import ParameterBox
 from vibench.plugins.plugin import Plugin
 from vibench.results.pictures import failure_rows, members, picture_rows
+from vibench.stages.artefacts import Store
 from vibench.stages.base import Result, Row, Stage, build_problem
+from vibench.stages.serialisation import storable
 from vibench.stages.snapshots import gather, solution_stages
-from vibench.storage.artefacts import Store
-from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.text import one_line

@@ -22,10 +22,10 @@ from vibench.qp.solve import solve_qp, takes_start
 from vibench.qp.status import Status
 from vibench.qp.verification import RECOGNISED, QPSolution, check_answer, slack, verify
 from vibench.results.consistency import solution_row
+from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AssemblyStage, ReducedPrograms
 from vibench.stages.base import Row, TimeLimit, value_of
 from vibench.stages.formulation import FormulationStage
-from vibench.storage.artefacts import Store
 from vibench.study.parameter_sets import ParameterSet
 from vibench.timing import SLOW, Seconds, timed
 

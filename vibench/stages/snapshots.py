@@ -24,9 +24,9 @@ from vibench.offline.sweep import Snapshots
 from vibench.plugins.kinds import PROBLEM
 from vibench.plugins.plugin import Plugin
 from vibench.qp.scaling import nearby
+from vibench.stages.artefacts import History, Store
 from vibench.stages.base import SHARE, Result, Stage, build_problem, faults_of, value_of
-from vibench.storage.artefacts import History, Store
-from vibench.storage.serialisation import storable
+from vibench.stages.serialisation import storable
 from vibench.study.cells import Axes
 from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_of, chunk_size
 from vibench.timing import NO_TIME, SLOW, Seconds, median_of, timed

@@ -22,7 +22,7 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError, in_a_line
 from vibench.execution.isolated import NotImportableError
 from vibench.plugins.options import options_of
-from vibench.storage.serialisation import dumps, loads
+from vibench.stages.serialisation import dumps, loads
 from vibench.testing.checks import (
     SECONDS,
     Check,

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+import vibench.stages.formulation  # noqa: F401  lists the classes that formulations may store
 from vibench.arrays import Array
 from vibench.errors import NumericalError, RequestError, VibenchError
 from vibench.interfaces.formulations import (
@@ -25,7 +26,7 @@ from vibench.offline.assemblies import assemblies
 from vibench.offline.models import ACCURACY, CellSolver, Model, check_built
 from vibench.offline.reduction import Reduction
 from vibench.qp.status import Status
-from vibench.storage.serialisation import dumps, loads
+from vibench.stages.serialisation import dumps, loads
 from vibench.testing.case import Arrays, Case, at, difference, differences, largest_entry, unmutated
 from vibench.testing.checks import Check, ConformanceError, Note
 from vibench.testing.sample_problem import sample_reduction

@@ -35,7 +35,7 @@ from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction.cones import project_on_cone
 from vibench.reduction.nested import NestedStrategy, grow_through
 from vibench.stages.enrichment import BuiltEnrichment
-from vibench.storage.serialisation import dumps, loads
+from vibench.stages.serialisation import dumps, loads
 from vibench.testing.case import Arrays, Case, array_fault, at, difference, unmutated
 from vibench.testing.checks import Check, ConformanceError, Doubt, Note, raised
 from vibench.testing.sample_problem import arrays_of, copy_of, sample_offline, sample_snapshots

@@ -14,7 +14,8 @@ import vibench
 from vibench import Enrichment, Formulation, Kind, Offline, PrimalStrategy, Reduction, Snapshots, Stop, UnsupportedError
 from vibench.offline.models import Model
 from vibench.offline.sweep import high_fidelity_sweep
-from vibench.storage.serialisation import dumps, loads
+from vibench.stages import formulation as _  # noqa: F401  lists the classes that formulations may store
+from vibench.stages.serialisation import dumps, loads
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies.cpg import CPG
 from vibench_strategies.dictionary import Dictionary

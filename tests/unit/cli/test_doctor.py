@@ -19,7 +19,7 @@ from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.qp.verification import Residuals
-from vibench.storage.artefacts import CACHE_VARIABLE, Store, default_folder
+from vibench.stages.artefacts import CACHE_VARIABLE, Store, default_folder
 from vibench.timing import NO_TIME, Seconds, Stopwatch
 
 FINE = Trial(Status.OK, "", residuals=Residuals(0.0, 2e-9, 0.0))

@@ -33,8 +33,8 @@ from vibench.execution import executors
 from vibench.execution.executors import Dask, Local
 from vibench.execution.jobs import Job
 from vibench.execution.run import Observer, Options, run_study
+from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Stage
-from vibench.storage.artefacts import Store
 from vibench.study.spec import Study
 
 

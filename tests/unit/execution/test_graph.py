@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vibench.execution.graph import Graph
+from vibench.stages.artefacts import Store
 from vibench.stages.base import Result, Stage
-from vibench.storage.artefacts import Store
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from samples import SampleStore, carry_out
 
 from vibench.execution.timing_plan import OfflinePlan
 from vibench.results.break_even import SCATTER
-from vibench.rounds.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
 from vibench.stages.assembly import ExactSolutions
 from vibench.stages.base import Stage
 from vibench.stages.cell_queries import CellQueries, cell_queries
+from vibench.stages.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, read_study
 from vibench.timing import Seconds

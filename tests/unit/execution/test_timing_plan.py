@@ -16,10 +16,10 @@ from vibench.execution.recording import ResultWriter, labels_of
 from vibench.execution.timing_plan import TimingPlan, block_sizes
 from vibench.qp.status import Status
 from vibench.results.database import ResultsDatabase
-from vibench.rounds.timed_seconds import TimedCell, TimedRound
-from vibench.rounds.timing_rounds import TimingRounds
 from vibench.stages.base import Failed
 from vibench.stages.cell_queries import CellQueries, cell_queries
+from vibench.stages.timed_seconds import TimedCell, TimedRound
+from vibench.stages.timing_rounds import TimingRounds
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, read_study
 from vibench.timing import Seconds

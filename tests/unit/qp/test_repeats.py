@@ -24,15 +24,14 @@ from vibench.plugins.plugin import Plugin
 from vibench.qp.scaling import in_units, nearby, random_units
 from vibench.qp.solve import solve_qp
 from vibench.qp.verification import QPSolution
-from vibench.rounds import timing_rounds
-from vibench.rounds.timing_rounds import TimingRounds
-from vibench.stages import snapshots
+from vibench.stages import snapshots, timing_rounds
+from vibench.stages.artefacts import Store
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.query import ProgramQuery
 from vibench.stages.snapshots import SnapshotStage
-from vibench.storage.artefacts import Store
+from vibench.stages.timing_rounds import TimingRounds
 from vibench.study.parameter_sets import ParameterSet
 
 PROBLEM = Plugin("problem", "obstacle", '{"resolution": 150}', "repeats")

@@ -16,15 +16,15 @@ from vibench.interfaces.strategies import Stop
 from vibench.model.galerkin import ReducedModel
 from vibench.plugins.plugin import Plugin
 from vibench.qp.status import Status
-from vibench.rounds import marginal_solutions, timing_rounds
-from vibench.rounds.marginal_solutions import MarginalSolution, MarginalSolutions, SolutionsBeside, parts_alike
-from vibench.rounds.timed_seconds import TimedCell, TimedRound, round_columns, seconds_of_cell, seconds_of_queries
-from vibench.rounds.timing_rounds import TimingRounds, block_rows
+from vibench.stages import marginal_solutions, timing_rounds
 from vibench.stages.base import Failed
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
+from vibench.stages.marginal_solutions import MarginalSolution, MarginalSolutions, SolutionsBeside, parts_alike
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.snapshots import gather
+from vibench.stages.timed_seconds import TimedCell, TimedRound, round_columns, seconds_of_cell, seconds_of_queries
+from vibench.stages.timing_rounds import TimingRounds, block_rows
 from vibench.study.parameter_sets import ParameterSet
 from vibench.timing import NO_TIME, Seconds
 

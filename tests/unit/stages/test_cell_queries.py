@@ -20,9 +20,9 @@ from vibench.plugins.plugin import Plugin
 from vibench.qp import verification
 from vibench.qp.solve import solve_qp, takes_start
 from vibench.stages import cell_queries
+from vibench.stages.assessment import error_columns
 from vibench.stages.base import value_of
 from vibench.stages.enrichment import SingleEnrichment
-from vibench.stages.judging.pairs import error_columns
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.query import path_before, query_before
 from vibench.study.parameter_sets import ParameterSet

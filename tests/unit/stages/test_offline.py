@@ -26,9 +26,9 @@ from vibench.stability.coercivity import Stability
 from vibench.stages import snapshots
 from vibench.stages.base import LOST, Failed, value_of
 from vibench.stages.cell_queries import CellQueries
+from vibench.stages.cell_summary import summarise
 from vibench.stages.enrichment import NestedEnrichment, SingleEnrichment
 from vibench.stages.infsup_constants import ReferenceConstants
-from vibench.stages.judging.cell_summary import summarise
 from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage
 from vibench.stages.snapshots import SnapshotStage, gather, solution_stages
 from vibench.study.parameter_sets import CHUNKS, OWN_TRAINING, ParameterSet, chunk_of

@@ -19,9 +19,9 @@ from vibench import NumericalError, Problem, VariationalInequality
 from vibench.interfaces.validation import AGREEMENT_RTOL, Fingerprint, ReferenceAssembly, fingerprint
 from vibench.model.error_bounds import REFERENCE
 from vibench.plugins.plugin import Plugin
+from vibench.stages.artefacts import Store
 from vibench.stages.base import build_problem
 from vibench.stages.snapshots import fingerprint_here, gather, solution_stages
-from vibench.storage.artefacts import Store
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.testing.checks import call_in_other_process
 

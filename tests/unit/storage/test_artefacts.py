@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vibench.errors import NumericalError, RequestError, StorageError
-from vibench.storage import artefacts as module
-from vibench.storage.artefacts import SUFFIX, Artefact, History, Store, encoded
+from vibench.stages import artefacts as module
+from vibench.stages.artefacts import SUFFIX, Artefact, History, Store, encoded
 from vibench.timing import Seconds
 
 TIME = Seconds(1.5, 2.5)

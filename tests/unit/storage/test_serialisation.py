@@ -24,7 +24,7 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction.supremizers import ContactCoordinates
 from vibench.stages import assembly  # noqa: F401  lists what operators consist of
-from vibench.storage.serialisation import STRUCTURE, DamagedArtefactError, dumps, loads, storable
+from vibench.stages.serialisation import STRUCTURE, DamagedArtefactError, dumps, loads, storable
 from vibench.timing import Seconds
 
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vibench.results.break_even import SCATTER, offline_factor
+from vibench.stages.artefacts import Store
 from vibench.stages.base import Result, Row, Stage
 from vibench.stages.cell_queries import CellQueries
-from vibench.storage.artefacts import Store
 from vibench.timing import Seconds
 
 NOTICEABLE = 1e-3

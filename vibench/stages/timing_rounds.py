@@ -17,19 +17,19 @@ from vibench.offline.assemblies import Assemblies
 from vibench.offline.correction import corrected_in_full
 from vibench.provenance import machine
 from vibench.results.paired_timing import beside, paces
-from vibench.rounds.marginal_solutions import (
+from vibench.stages.artefacts import Store
+from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, TimeLimit, build_problem
+from vibench.stages.cell_queries import CellQueries
+from vibench.stages.marginal_solutions import (
     ASSEMBLY_SEED,
     MarginalSolution,
     MarginalSolutions,
     SolutionsBeside,
     parts_alike,
 )
-from vibench.rounds.timed_seconds import TimedCell, TimedRound, round_columns
-from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, TimeLimit, build_problem
-from vibench.stages.cell_queries import CellQueries
 from vibench.stages.query import ModelQuery, Queries
 from vibench.stages.snapshots import TimedSnapshots, gather
-from vibench.storage.artefacts import Store
+from vibench.stages.timed_seconds import TimedCell, TimedRound, round_columns
 from vibench.timing import NO_TIME, Seconds, calibration, timed
 
 SHARE = 3

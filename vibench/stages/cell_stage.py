@@ -24,12 +24,12 @@ from vibench.provenance import machine
 from vibench.qp.status import Status
 from vibench.stability.coercivity import Stability
 from vibench.stability.infsup import InfSup
+from vibench.stages.artefacts import Artefact, Store
 from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, TimeLimit, build_problem
+from vibench.stages.cell_summary import summarise
 from vibench.stages.infsup_constants import ReferenceConstants
-from vibench.stages.judging.cell_summary import summarise
 from vibench.stages.offline import ConstraintMatrices
 from vibench.stages.snapshots import TimedSnapshots, gather, solution_stages
-from vibench.storage.artefacts import Artefact, Store
 from vibench.study.parameter_sets import ParameterSet
 from vibench.timing import median_of
 
@@ -54,7 +54,7 @@ class CellRows:
     parameters: tuple[tuple[str, str], ...] = ()
 
 
-class CellGoal(ItemwiseStage):
+class CellStage(ItemwiseStage):
     """All queries of one cell, each an item; the value is a `CellRows`. Subclasses are frozen dataclasses."""
 
     label = "queries"
@@ -126,10 +126,10 @@ class CellGoal(ItemwiseStage):
         return solution_stages(self.problem, self.validation_set)
 
 
-class CellItems(Items):
+class CellWork(Items):
     """The queries of a cell: every one is solved, verified and assessed."""
 
-    def __init__(self, stage: CellGoal, store: Store) -> None:
+    def __init__(self, stage: CellStage, store: Store) -> None:
         self._goal, self._store = stage, store
         self._problem: Problem = build_problem(stage.problem)
         solved = _solutions(_Solutions(stage.problem, stage.training, stage.validation, store.folder, store))

@@ -17,7 +17,7 @@ from cachetools import LRUCache
 from vibench.errors import RequestError, StorageError
 from vibench.files import PART, TEMPORARY, locked, write_atomically
 from vibench.provenance import machine
-from vibench.storage.serialisation import DamagedArtefactError, dumps, loads, storable
+from vibench.stages.serialisation import DamagedArtefactError, dumps, loads, storable
 from vibench.text import one_line
 from vibench.timing import Seconds
 
