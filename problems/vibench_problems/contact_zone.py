@@ -1,4 +1,4 @@
-"""What problems with a square contact zone in one quarter of space have in common: integrals of the pressure."""
+"""Integrals of the pressure, shared by problems with a square contact zone in one quarter of space."""
 
 from __future__ import annotations
 

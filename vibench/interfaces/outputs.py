@@ -1,4 +1,4 @@
-"""What a problem derives from its solutions: quantities of interest, pictures in the plane, and fields on a mesh."""
+"""Quantities of interest, pictures in the plane and fields on a mesh, which a problem derives from its solutions."""
 
 from __future__ import annotations
 

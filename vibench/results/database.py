@@ -1,4 +1,7 @@
-"""What a results file can hold: printable text of bounded length, numbers of 64 bits; any other value is named."""
+"""The results file: one SQLite database per run folder, one transaction per cell.
+
+It holds printable texts of bounded length and numbers of 64 bits; an error names any other value.
+"""
 
 from __future__ import annotations
 

@@ -211,7 +211,7 @@ def bands(
 
 
 def _compared(cells: pd.DataFrame, column: str) -> pd.Series:
-    """What is compared: a column, or instead of seconds of a query their ratio to those of a high-fidelity solution.
+    """Values that are compared: a column, or the ratio of seconds of a query to those of a high-fidelity solution.
 
     Both are timed in the same rounds; those of other cells may have come when the machine was slower.
     """
