@@ -138,7 +138,7 @@ def figure(cells: pd.DataFrame, queries: pd.DataFrame) -> Figure:
     for column, problem in enumerate(problems):
         mine = queries[queries["cell"].isin(certified.loc[certified["problem"] == problem, "cell"])]
         for row, (norm, (error, bounds)) in enumerate(NORMS.items()):
-            panel, errors = sheet.at(row, column), mine[error]
+            panel, errors = sheet.panel(row, column), mine[error]
             for name, bound in bounds.items():
                 scatter(panel, errors, mine[f"bound_{bound}"], look_of(name), name, markersize=3)
             ends = [errors[errors > 0.0].min(), errors.max()]

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import pairwise, product
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
@@ -20,7 +19,7 @@ from page import CERTIFIED, SECONDS, Page, made_by, origin, read, start
 
 from vibench import HighFidelitySolver, create
 from vibench.highfidelity.active_set import solve_high_fidelity
-from vibench.report.figures.style import STYLE, CaptionedFigure
+from vibench.report.figures.style import CaptionedFigure, styled
 from vibench.results import formats
 from vibench.study.matrix import read_study
 from vibench.timing import timed
@@ -196,7 +195,7 @@ def pressed(resolution: str = "medium") -> Figure:
     problem, mu = create("problem", "hertz3d", {"resolution": resolution, "factorisation": "available"}), MUS[1]
     solution = HighFidelitySolver(problem).solve(mu)
     picture = problem.picture(mu, solution.u, solution.lam)
-    with mpl.rc_context(STYLE):
+    with styled():
         figure = CaptionedFigure(figsize=(9.0, 3.6), layout="constrained")
         figure.caption = (
             f"A quarter of the surface pressed by a rigid paraboloid of the radii {mu[0]:g} m and {mu[1]:g} m, its "

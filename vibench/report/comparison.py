@@ -24,8 +24,8 @@ from vibench.report.differences import (
     Difference,
     agreement,
     compared_runs,
-    of_numbers,
-    of_seconds,
+    number_differences,
+    timing_differences,
 )
 from vibench.results import formats
 from vibench.results.break_even import FEWEST_ROUNDS
@@ -188,7 +188,7 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
         for key in shared:
             # Means over different queries are no comparison.
             one, two = first.cells[key] | means[0].get(key, {}), run.cells[key] | means[1].get(key, {})
-            differences += of_numbers(one, two, limit)
+            differences += number_differences(one, two, limit)
         notes.append(f"{of_run}{len(shared)} cells are in both runs")
         if means[0]:
             notes.append(f"{of_run}errors of {len(means[0])} of them are compared on the queries that are ok in both")
@@ -198,7 +198,7 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
             same = run.measured_beside(earlier, unless=runs[: runs.index(earlier)])
             compared += len(same)
             if same:
-                by_pair[run.name, earlier.name] += of_seconds(earlier, run, same, limit)
+                by_pair[run.name, earlier.name] += timing_differences(earlier, run, same, limit)
         if compared < len([key for key in run.cells if any(key in earlier.cells for earlier in runs[:k])]):
             notes.append(f"{of_run}times and break-even of different machines or protocols are not compared")
     notes += _agreements(runs)

@@ -170,7 +170,7 @@ class Difference(NamedTuple):
         return float(self.after) / float(self.before) if numbers and self.before else float("nan")
 
 
-def of_numbers(one: Mapping[str, Any], two: Mapping[str, Any], limit: float) -> Iterator[Difference]:
+def number_differences(one: Mapping[str, Any], two: Mapping[str, Any], limit: float) -> Iterator[Difference]:
     """Differences of a cell that do not depend on the machine; none in columns that are empty in both runs."""
     severities = (Status(one["status"]).severity, Status(two["status"]).severity)
     verdicts: dict[str, ChangeKind | None] = {
@@ -227,7 +227,7 @@ def _verdict(
     return ChangeKind.BETTER if small > limit * large else ChangeKind.WITHIN_LIMIT
 
 
-def of_seconds(one: ComparedRun, two: ComparedRun, shared: Sequence[str], limit: float) -> Iterator[Difference]:
+def timing_differences(one: ComparedRun, two: ComparedRun, shared: Sequence[str], limit: float) -> Iterator[Difference]:
     """Differences in seconds and break-even of cells that one machine measured in both runs.
 
     They are undecided if a row is marked as disturbed.

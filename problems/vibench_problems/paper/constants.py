@@ -146,13 +146,13 @@ def comparison(evidence: Evidence) -> CaptionedFigure | None:
     for column, pair in enumerate(pairs):
         rows, x, xlabel = evidence.abscissa(evidence.loose(pair))
         for row, (generated, part) in enumerate((("span", "span"), ("cone", "cone_upper"))):
-            panel = sheet.at(row, column)
+            panel = sheet.panel(row, column)
             _constants(panel, x, rows, part, looks, zeros=row == 0)
             panel.set(ylabel=f"β over {generated}", yscale="log")
             panel.set_xlabel(xlabel)
-        sheet.at(0, column).set_title(f"(N, R) = {evidence.size(pair)}, δ = {pair.loose:g}; paper {pair.name}")
-    low, high = sheet.at(0, 0).get_ylim()
-    sheet.at(0, 0).set_ylim(low * (low / high) ** 0.12, high)  # space for what is zero
+        sheet.panel(0, column).set_title(f"(N, R) = {evidence.size(pair)}, δ = {pair.loose:g}; paper {pair.name}")
+    low, high = sheet.panel(0, 0).get_ylim()
+    sheet.panel(0, 0).set_ylim(low * (low / high) ** 0.12, high)  # space for what is zero
     caption = (
         f"Inf-sup constants at the validation parameters, {paper.heading}, over the span of the generators (upper row) "
         "and over their cone (lower row, upper ends of certified intervals): β_HF of the high-fidelity pair, β_dec "

@@ -235,16 +235,16 @@ def greedy(evidence: Evidence) -> CaptionedFigure | None:
     for row, pair in enumerate(pairs):
         title = f"(N, R) = {evidence.size(pair)}, paper {pair.name}"
         for column, (quantity, ylabel) in enumerate((("sigma", "σ(µₙ)"), ("beta_span_min", "min β over D_train"))):
-            panel, curve = sheet.at(row, column), evidence.growth(pair, quantity)
+            panel, curve = sheet.panel(row, column), evidence.growth(pair, quantity)
             look = looks[Series(PGA, paper.tight)]
             plot(panel, list(curve), for_log_axis(list(curve.values())), look, f"{PGA}, δ = {paper.tight:g}")
             panel.set(xlabel="vectors n", ylabel=ylabel, title=title, yscale="log")
-        panel = sheet.at(row, 2)
+        panel = sheet.panel(row, 2)
         for delta in (paper.tight, pair.loose):
             rows, x, xlabel = evidence.abscissa(evidence.constants(pair, "fixed", delta))
             plot(panel, x, rows["beta_span"], looks[Series(PGA, delta)], f"{PGA}, δ = {delta:g}")
             panel.set(xlabel=xlabel, ylabel="β_off over D_valid", title=title)
-    sheet.at(0, 2).set_ylim(0, None)
+    sheet.panel(0, 2).set_ylim(0, None)
     caption = (
         f"The projected greedy algorithm, {paper.heading}, a row for every pair (N, R). Left, the largest σ over the "
         "training set against the number n of vectors; middle, the smallest β over the span on the training set; both "

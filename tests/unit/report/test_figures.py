@@ -358,7 +358,7 @@ def test_every_strategy_is_drawn_ten_to_a_panel(count: int, results: Path) -> No
                                                many(data.histories, "dual", "mcpg")]))  # fmt: skip
     assert in_tens(next(convergence.projection_errors(cones)).axes[1:]) == count
     assert in_tens(next(convergence.orthogonality(cones)).axes) == count
-    mine = data.of_dual("mcpg")
+    mine = data.restrict_to_dual("mcpg")
     fixed = replace(mine, queries=many(mine.queries, "primal", "offline-pga"),
                     histories=many(mine.histories, "primal", "offline-pga"))  # fmt: skip
     assert in_tens(next(convergence.enrichment(fixed)).axes[::3]) == count
@@ -472,7 +472,7 @@ def test_several_processes_draw_the_same_files(
 
 def test_the_tightest_enrichment_is_the_one_that_went_farthest(results: Path) -> None:
     """Whichever way its tolerance runs, and however many training parameters there are."""
-    mine = dict(of_file(results))["obstacle"].of_dual("mcpg")
+    mine = dict(of_file(results))["obstacle"].restrict_to_dual("mcpg")
     steps = mine.histories[mine.histories["stage"] == "enrichment"]
     longer = steps[steps["quantity"].isin(["sigma", "beta_span_min"])]
     last = longer[longer["step"] == longer["step"].max()].assign(step=longer["step"].max() + 1)
@@ -545,7 +545,7 @@ def test_a_caption_says_which_tolerances_are_left_out(change: Callable[..., None
 
 
 def test_a_long_figure_is_drawn_in_parts(results: Path) -> None:
-    data = dict(of_file(results))["obstacle"].of_dual("mcpg")
+    data = dict(of_file(results))["obstacle"].restrict_to_dual("mcpg")
     pairs = pd.concat([data.queries.assign(pair=f"pair {k}") for k in range(8)])
     task = ("name", figures.inf_sup, replace(data, queries=pairs, extent=Extent.PAGES))
     (rendered,) = figures.render([task], lambda name, figure: (name, figure))
@@ -577,13 +577,14 @@ def test_what_is_computed_once_per_combination_is_that_of_every_row() -> None:
 
 def test_a_report_has_half_a_page_of_a_long_figure_and_the_whole_of_any_other(results: Path) -> None:
     name, data = next((name, data) for name, data in of_file(results) if name == "obstacle")
-    mine = data.of_dual("mcpg")
+    mine = data.restrict_to_dual("mcpg")
 
     def long(frame: pd.DataFrame) -> pd.DataFrame:
         clones = [frame.assign(dual=f"mcpg {k}", cell=frame["cell"] + str(k)) for k in range(13)]
         return pd.concat(clones, ignore_index=True)
 
-    many = replace(data, cells=long(mine.cells), queries=pd.concat([long(mine.queries), data.of_dual("cpg").queries]))
+    queries = pd.concat([long(mine.queries), data.restrict_to_dual("cpg").queries])
+    many = replace(data, cells=long(mine.cells), queries=queries)
     tasks = list(figures.figures_of(name, replace(many, extent=Extent.BEGINNING), ["cpg"]))
     assert {one.removeprefix("obstacle-") for one, *_ in tasks} >= {*OF_PROBLEM, "cpg-inf-sup"}
     assert "obstacle-mcpg-inf-sup" not in [one for one, *_ in tasks]

@@ -185,10 +185,10 @@ def test_a_file_has_its_caption_and_no_date(form: str) -> None:
 
 
 def test_a_sheet_has_three_panels_in_a_row_and_hides_what_is_left_over() -> None:
-    made = Sheet.of(7, "seven", share="all")
+    made = Sheet.with_panels(7, "seven", share="all")
     assert len(made.panels) == 9
     assert [panel.axison for panel in made.panels] == [True] * 7 + [False] * 2
-    assert made.at(1, 0) is made.panels[3]
+    assert made.panel(1, 0) is made.panels[3]
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 1.0)), min_size=1, max_size=60))

@@ -66,8 +66,8 @@ def figures_of(name: str, data: ProblemTables, duals: Collection[str]) -> Iterat
     yield from ((f"{name}-{kind}", draw, data) for kind, draw in OF_PROBLEM.items())
     for dual, file in zip(data.duals, file_names(data.duals), strict=True):
         if dual in duals:
-            of_dual = data.of_dual(dual)
-            yield from ((f"{name}-{file}-{kind}", draw, of_dual) for kind, draw in OF_DUAL.items())
+            of_cone = data.restrict_to_dual(dual)
+            yield from ((f"{name}-{file}-{kind}", draw, of_cone) for kind, draw in OF_DUAL.items())
 
 
 def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
@@ -83,7 +83,7 @@ def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = N
         raise unknown_name("figure", kind, (*OF_PROBLEM, *OF_DUAL))
     data = _only("problem", by_problem, problem)
     if kind in OF_DUAL:
-        data = _only("dual strategy", {name: data.of_dual(name) for name in data.duals}, dual)
+        data = _only("dual strategy", {name: data.restrict_to_dual(name) for name in data.duals}, dual)
     with styled():
         figure = next((OF_PROBLEM | OF_DUAL)[kind](data), None)
     if figure is None:

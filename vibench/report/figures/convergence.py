@@ -44,7 +44,7 @@ def diagnostics(data: ProblemTables) -> Pages:
     if reported.empty:
         return
     quantities = list(reported["quantity"].unique())
-    sheet = Sheet.of(len(quantities), f"{data.problem}: diagnostics over the parameters")
+    sheet = Sheet.with_panels(len(quantities), f"{data.problem}: diagnostics over the parameters")
     looks = Looks(map(Series, stages))
     for panel, quantity in zip(sheet.panels, quantities, strict=False):
         first = 1
@@ -65,7 +65,7 @@ def projection_errors(data: ProblemTables) -> Pages:
     """Relative projection errors of the POD and of the cones against their size (paper, Figures 5 and 11)."""
     errors = data.histories[data.histories["quantity"] == "error"]
     cones = _in_panels(errors[errors["stage"] == "cone"])
-    sheet = Sheet.of(1 + len(cones), f"{data.problem}: projection errors over the training set")
+    sheet = Sheet.with_panels(1 + len(cones), f"{data.problem}: projection errors over the training set")
     left, *others = sheet.panels
     for _, steps in longest(errors[errors["stage"] == "pod"]):
         # A tail below this is round-off.
@@ -89,7 +89,7 @@ def orthogonality(data: ProblemTables) -> Pages:
     if steps.empty:
         return
     cones = _in_panels(steps)
-    sheet = Sheet.of(len(cones), f"{data.problem}: angles between generators", share="all")
+    sheet = Sheet.with_panels(len(cones), f"{data.problem}: angles between generators", share="all")
     for panel, names in zip(sheet.panels, cones, strict=False):
         _cones(panel, names, "number of preceding generators r", "e_orth(r)")
     yield sheet.finish(
@@ -101,7 +101,7 @@ def orthogonality(data: ProblemTables) -> Pages:
 def cone_errors(title: str, errors: Mapping[str, Array]) -> CaptionedFigure:
     """Relative errors of cones, by dual strategy, against their numbers of generators 0 … R."""
     groups = parts(sorted(errors))
-    sheet = Sheet.of(len(groups), f"{title}: projection errors of the multipliers", share="all")
+    sheet = Sheet.with_panels(len(groups), f"{title}: projection errors of the multipliers", share="all")
     looks = Looks(map(Series, errors))
     for panel, names in zip(sheet.panels, groups, strict=False):
         for dual in names:
@@ -144,7 +144,7 @@ def enrichment(data: ProblemTables) -> Pages:
             histories = data.histories[(data.histories["stage"] == "enrichment") & (data.histories["pair"] == pair)]
             steps = _tightest(histories[histories["primal"].isin({name for name, _ in names})])
             for column, quantity in enumerate(("sigma", "beta_span_min")):
-                panel, name_of = sheet.at(row, column), ("largest σ", "min β over span")[column]
+                panel, name_of = sheet.panel(row, column), ("largest σ", "min β over span")[column]
                 for name, one in by_strategy(steps[steps["quantity"] == quantity]):
                     look = looks[series(one["primal"].iloc[0], one["primal_tol"].iloc[0])]
                     # σ that is round-off is drawn at the floor, so that its curve ends at the last vector.
@@ -154,10 +154,10 @@ def enrichment(data: ProblemTables) -> Pages:
                 panel.set(xlabel="vectors added", ylabel=f"{name_of}, training set", title=title)
                 panel.set(xlim=(0, None), yscale="log")
                 counted(panel)
-            _validation(sheet.at(row, 2), data, fixed[fixed["pair"] == pair], names, looks)
-            sheet.at(row, 2).set_title(title)
+            _validation(sheet.panel(row, 2), data, fixed[fixed["pair"] == pair], names, looks)
+            sheet.panel(row, 2).set_title(title)
         # All rows share this axis.
-        sheet.at(0, 2).set_ylim(0, None)
+        sheet.panel(0, 2).set_ylim(0, None)
         yield sheet.finish(_enrichment_caption(data, fixed, floor), part)
 
 

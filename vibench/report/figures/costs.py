@@ -65,7 +65,7 @@ def _errors_against(
         sheet = Sheet(len(rows), 2, heading, Layout(width=4.4, height=3.3), "all", "col")
         for row, (way, mine, names) in enumerate(rows):
             for place, (column, ylabel) in enumerate(ERRORS.items()):
-                panel, drawn = sheet.at(row, place), mine[mine[column].notna()]
+                panel, drawn = sheet.panel(row, place), mine[mine[column].notna()]
                 _points(panel, drawn, x, drawn[column], names, looks)
                 _name_points(sheet, panel, drawn[drawn["primal"].isin(names)], x, drawn[column])
                 if front:
@@ -119,7 +119,7 @@ def outputs(data: ProblemTables) -> Pages:
     ]
     for shown, part in data.pages(panels, 12):
         solver = models["solver"].iloc[0]
-        sheet = Sheet.of(len(shown), f"{data.problem}, {solver}: quantities of interest")
+        sheet = Sheet.with_panels(len(shown), f"{data.problem}, {solver}: quantities of interest")
         looks = Looks(Series(name) for _, _, names in shown for name in names)
         for panel, (title, mine, names) in zip(sheet.panels, shown, strict=False):
             x, y = 1e3 * mine["online_s"], mine["error_scaled_mean"]
@@ -156,7 +156,7 @@ def break_even(data: ProblemTables) -> Pages:
     left_out = f"Models without such a number, or with an undecided one, have no point: {without}." * bool(without)
     for shown, part in data.pages(panels, 12):
         solver = decided["solver"].iloc[0]
-        sheet = Sheet.of(len(shown), f"{data.problem}, {solver}: break-even and accuracy")
+        sheet = Sheet.with_panels(len(shown), f"{data.problem}, {solver}: break-even and accuracy")
         looks = Looks(Series(str(name)) for _, mine, _ in shown for name in mine["primal"].unique())
         for panel, (measure, mine, error) in zip(sheet.panels, shown, strict=False):
             number = mine["benefit_threshold"]
@@ -196,7 +196,7 @@ def total_cost(data: ProblemTables) -> Pages:
         for part, places in titled_parts(title, list(range(len(models))), "models", beside_reference=True)
     ]
     for shown, part in data.pages(panels, 12):
-        sheet = Sheet.of(len(shown), f"{data.problem}, {cells['solver'].iloc[0]}: total cost", share="all")
+        sheet = Sheet.with_panels(len(shown), f"{data.problem}, {cells['solver'].iloc[0]}: total cost", share="all")
         looks = Looks(_model(cell) for _, mine in shown for cell in mine.itertuples())
         for panel, (title, mine) in zip(sheet.panels, shown, strict=False):
             model = mine.iloc[0]
@@ -259,10 +259,10 @@ def solvers(data: ProblemTables) -> Pages:
     sheet = Sheet(len(groups), 1 + compared, f"{data.problem}: QP solvers", sharex="col", sharey="col")
     looks = Looks(map(Series, names))
     for row, group in enumerate(groups):
-        _accuracy(sheet.at(row, 0), queries, group, looks)
-        sheet.at(row, 0).axhline(1.0, color="0.4", linewidth=0.8, linestyle=(0, (1, 2)), label="prescribed accuracy")
+        _accuracy(sheet.panel(row, 0), queries, group, looks)
+        sheet.panel(row, 0).axhline(1.0, color="0.4", linewidth=0.8, linestyle=(0, (1, 2)), label="prescribed accuracy")
         if compared:
-            _profile(sheet.at(row, 1), queries, group, looks)
+            _profile(sheet.panel(row, 1), queries, group, looks)
     yield sheet.finish(
         f"QP solvers on the programs of {data.problem}. {'Left, the' if compared else 'The'} largest residual of a "
         "reduced model's programs, relative to the prescribed accuracy, against the median time of a program, one "
@@ -298,9 +298,16 @@ def precision(data: ProblemTables) -> Pages:
                 # A logarithmic axis has no zero.
                 error = np.maximum(medians[f"solver_error_{name}"], 1e-16)
                 # Every point is an accuracy, and has a marker.
-                plot(sheet.at(row, column), 1e3 * medians["solve_s"], error, looks[Series(solver)], solver, markevery=1)
+                plot(
+                    sheet.panel(row, column),
+                    1e3 * medians["solve_s"],
+                    error,
+                    looks[Series(solver)],
+                    solver,
+                    markevery=1,
+                )
         for column, name in enumerate(("u", "λ")):
-            panel = sheet.at(row, column)
+            panel = sheet.panel(row, column)
             panel.set(xlabel="median time of a program [ms]", ylabel=f"median error of {name} made by the solver")
             panel.set(xscale="log", yscale="log")
     accuracies = ", ".join(f"{value:g}" for value in sorted(shared["accuracy"].unique(), reverse=True))

@@ -84,7 +84,7 @@ class ProblemTables:
         for k in range(count)[: 1 if self.extent is Extent.BEGINNING else count]:
             yield panels[k * most : (k + 1) * most], f"Part {k + 1} of {count}." * (count > 1)
 
-    def of_dual(self, dual: str) -> ProblemTables:
+    def restrict_to_dual(self, dual: str) -> ProblemTables:
         """The rows of one dual strategy."""
         frames = {name: getattr(self, name) for name in TABLES}
         return replace(self, **{name: frame[frame["dual"] == dual] for name, frame in frames.items()})

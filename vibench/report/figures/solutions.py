@@ -33,13 +33,13 @@ def draw_solutions(title: str, shown: Sequence[tuple[str, Picture]]) -> Captione
     sheet = Sheet(2, len(shown), title, layout)
     ranges = (_range([one.values for one in pictures]), _range([one.multiplier for one in pictures]))
     for column, (heading, picture) in enumerate(shown):
-        field, multiplier = sheet.at(0, column), sheet.at(1, column)
+        field, multiplier = sheet.panel(0, column), sheet.panel(1, column)
         field.set_title(heading, fontsize=8)
         last = column == len(shown) - 1
         draw_field(field, picture, ranges[0], bar=last)
         draw_multiplier(multiplier, picture, ranges[1], bar=last)
     for row, places in enumerate(([one.points for one in pictures], [one.positions for one in pictures])):
-        for panel in (sheet.at(row, column) for column in range(len(shown))):
+        for panel in (sheet.panel(row, column) for column in range(len(shown))):
             name_axes(panel, pictures[0].length_unit, places)
     first = pictures[0]
     parameters = "; ".join(heading for heading, _ in shown)

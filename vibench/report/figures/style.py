@@ -194,7 +194,7 @@ class Sheet:
             panel.tick_params(labelbottom=True, labelleft=True)
 
     @classmethod
-    def of(cls, count: int, title: str = "", layout: Layout = Layout(), share: Share = "none") -> Sheet:
+    def with_panels(cls, count: int, title: str = "", layout: Layout = Layout(), share: Share = "none") -> Sheet:
         """A sheet with at least `count` panels, at most three in a row; those beyond `count` are not shown."""
         columns = max(1, min(count, 3))
         sheet = cls(-(-count // columns) or 1, columns, title, layout, share, share)
@@ -202,7 +202,7 @@ class Sheet:
             panel.set_axis_off()
         return sheet
 
-    def at(self, row: int, column: int) -> Axes:
+    def panel(self, row: int, column: int) -> Axes:
         """One panel."""
         return self.panels[row * self._columns + column]
 
@@ -258,7 +258,7 @@ def two_rows(count: int, title: str) -> tuple[Sheet, list[Axes], list[Axes]]:
     blocks = -(-count // columns) or 1
     sheet = Sheet(2 * blocks, columns, title, sharex="all")
     upper, lower = (
-        [sheet.at(2 * (k // columns) + row, k % columns) for k in range(blocks * columns)] for row in (0, 1)
+        [sheet.panel(2 * (k // columns) + row, k % columns) for k in range(blocks * columns)] for row in (0, 1)
     )
     for panels in (upper, lower):
         for panel in panels[1:]:
