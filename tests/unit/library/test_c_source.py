@@ -138,6 +138,11 @@ def test_errors_of_polynomials_are_in_the_bounds(tmp_path: Path) -> None:
     )
     model = model_of(vibench.run(study, tmp_path / "run", progress=False, jobs=1), "obstacle", "certified")
     certified = certify(model, tmp_path / "model.npz", tolerance=1e-2)
+    assert model.certificate is not None
+    arrays = exported(model, tolerance=1e-2, c=True).arrays
+    assert arrays["certificate_energy_error"] > 0.0
+    assert arrays["certificate_load_error"] > model.certificate.base.load_error
+    assert arrays["certificate_stiffness_error"] > model.certificate.base.stiffness_error
     for mu in model.parameters.sample(20, seed=5):
         code, u, lam, bounds = certified(mu, False)
         assert code == 0
