@@ -154,15 +154,15 @@ class Work(Items):
     def __init__(self, stage: InItems) -> None:
         self.stage = stage
 
-    def item(self, number: int, time_limit: TimeLimit) -> Any:
+    def run_item(self, number: int, time_limit: TimeLimit) -> Any:
         misbehave(self.stage.unlimited[number] if self.stage.unlimited else "")
         with time_limit():
             misbehave(self.stage.hows[number])
         return number, os.getpid()
 
-    def lost(self, number: int, failed: Failed) -> Any:
+    def failed(self, number: int, failed: Failed) -> Any:
         return number, failed
 
-    def finish(self, items: Sequence[Any]) -> Any:
+    def collect(self, items: Sequence[Any]) -> Any:
         misbehave(self.stage.at_end)
         return list(items)

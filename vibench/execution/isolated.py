@@ -47,7 +47,7 @@ class IsolatedCall(ItemwiseStage, Items):
     def begin(self, store: Store) -> Items:  # noqa: ARG002
         return self
 
-    def item(self, number: int, time_limit: TimeLimit) -> Any:  # noqa: ARG002
+    def run_item(self, number: int, time_limit: TimeLimit) -> Any:  # noqa: ARG002
         """Value of the function; a `NotImportableError` if this process cannot import what was pickled."""
         with time_limit():
             sys.path += [folder for folder in self.path if folder not in sys.path]
@@ -57,10 +57,10 @@ class IsolatedCall(ItemwiseStage, Items):
                 return NotImportableError(in_a_line(error))
             return function(*arguments)
 
-    def lost(self, number: int, failed: Failed) -> Failed:  # noqa: ARG002
+    def failed(self, number: int, failed: Failed) -> Failed:  # noqa: ARG002
         return failed
 
-    def finish(self, items: Sequence[Any]) -> Any:
+    def collect(self, items: Sequence[Any]) -> Any:
         return items[0]
 
 
@@ -121,7 +121,7 @@ class SolverTrials(ItemwiseStage, Items):
     def begin(self, store: Store) -> Items:  # noqa: ARG002
         return self
 
-    def item(self, number: int, time_limit: TimeLimit) -> Trial:
+    def run_item(self, number: int, time_limit: TimeLimit) -> Trial:
         """Solve the program with one solver and verify its solution; the time limit includes loading a plugin."""
         with time_limit():
             return self._trial(self.solvers[number])
@@ -135,10 +135,10 @@ class SolverTrials(ItemwiseStage, Items):
         status, reason, residuals = verify(program, solution, accuracy)
         return Trial(status, reason, solution, residuals, seconds)
 
-    def lost(self, number: int, failed: Failed) -> Trial:  # noqa: ARG002
+    def failed(self, number: int, failed: Failed) -> Trial:  # noqa: ARG002
         return Trial(failed.status, failed.reason)
 
-    def finish(self, items: Sequence[Trial]) -> list[Trial]:
+    def collect(self, items: Sequence[Trial]) -> list[Trial]:
         return list(items)
 
 

@@ -126,13 +126,13 @@ def perform(
         LOST.set(job.lost)
         if isinstance(job.stage, ItemwiseStage):
             items = _begun(job.stage, store)
-            earlier = {number: items.lost(number, failed) for number, failed in progress.lost.items()} | progress.done
+            earlier = {number: items.failed(number, failed) for number, failed in progress.lost.items()} | progress.done
             items.resume(earlier)
             done = earlier | _done(job, items, batch, send, enter)
             if not batch.ends:
                 return BatchDone()
             _last.clear()
-            value = items.finish([done[number] for number in range(job.stage.items)])
+            value = items.collect([done[number] for number in range(job.stage.items)])
             return Done((), value, time.perf_counter() - start)
         SHARE.set(lambda fraction: send(FractionDone(fraction)))
         result = job.stage.run(store)
@@ -188,8 +188,8 @@ def _done(job: Job, items: Items, batch: Batch, send: Send, enter: Enter) -> dic
                 enter(number, False)
 
         enter(number, False)
-        value = _guarded(job.memory_gib, partial(items.item, number, time_limit))
-        done[number] = items.lost(number, value) if isinstance(value, Failed) else value
+        value = _guarded(job.memory_gib, partial(items.run_item, number, time_limit))
+        done[number] = items.failed(number, value) if isinstance(value, Failed) else value
         send(ItemDone(number, done[number]))
     return done
 

@@ -19,7 +19,7 @@ from vibench.stages.base import Stage
 from vibench.study.cells import Cell
 from vibench.text import new_console, print_line, printable
 
-# Stages of one problem that take about as long: the problem, and `Stage.sort`.
+# Stages of one problem that take about as long: the problem, and `Stage.kind_of_work`.
 _Sort = tuple[Plugin | None, str]
 
 
@@ -116,7 +116,7 @@ class TimeLeft:
 
 
 def _sort(stage: Stage) -> _Sort:
-    return next((plugin for plugin in stage.plugins if plugin.kind is PROBLEM), None), stage.sort
+    return next((plugin for plugin in stage.plugins if plugin.kind is PROBLEM), None), stage.kind_of_work
 
 
 def duration(seconds: float) -> str:

@@ -126,7 +126,7 @@ class Stage(ABC):
         return " ".join([*sources, numerical_code(below="stages")])
 
     @property
-    def sort(self) -> str:
+    def kind_of_work(self) -> str:
         """Stages of the same sort take about as long; the remaining time of a run is estimated by it."""
         return self.label
 
@@ -217,15 +217,15 @@ class Items(ABC):
         """Take note of the values of items that another process did, or lost; by default nothing."""
 
     @abstractmethod
-    def item(self, number: int, time_limit: TimeLimit) -> Any:
+    def run_item(self, number: int, time_limit: TimeLimit) -> Any:
         """Do one item, and the operations of it that have a limit of their own `with time_limit():`."""
 
     @abstractmethod
-    def lost(self, number: int, failed: Failed) -> Any:
+    def failed(self, number: int, failed: Failed) -> Any:
         """The substitute for a item that exceeded its limit or whose process died."""
 
     @abstractmethod
-    def finish(self, items: Sequence[Any]) -> Any:
+    def collect(self, items: Sequence[Any]) -> Any:
         """The value of the stage."""
 
 
@@ -250,7 +250,7 @@ class ItemwiseStage(Stage):
     def run(self, store: Store) -> Result:
         """All items in this process, in their order."""
         work = self.begin(store)
-        return Result(work.finish([work.item(number, nullcontext) for number in range(self.items)]))
+        return Result(work.collect([work.run_item(number, nullcontext) for number in range(self.items)]))
 
 
 def value_of(store: Store, stage: Stage) -> Any:

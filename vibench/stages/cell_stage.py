@@ -90,7 +90,7 @@ class CellStage(ItemwiseStage):
         """The stages whose artefacts the rounds of timing read."""
 
     @property
-    def sort(self) -> str:
+    def kind_of_work(self) -> str:
         """Queries of one solver take about as long."""
         return f"{self.label} with {self.solver}"
 
@@ -137,10 +137,10 @@ class CellWork(Items):
         self._zeros = zeros(self._problem, self._compared)
         self._stability = stage.reference.gather(store)
 
-    def item(self, number: int, time_limit: TimeLimit) -> QueryRows:
+    def run_item(self, number: int, time_limit: TimeLimit) -> QueryRows:
         """The rows of one query; of one without constants the reason."""
         constants = self._stability[number]
-        return self.lost(number, constants) if isinstance(constants, Failed) else self.answer(number, time_limit)
+        return self.failed(number, constants) if isinstance(constants, Failed) else self.answer(number, time_limit)
 
     @abstractmethod
     def answer(self, number: int, time_limit: TimeLimit) -> QueryRows:
@@ -158,12 +158,12 @@ class CellWork(Items):
     def sizes(self, rows: Sequence[Row]) -> tuple[Row, list[str]]:
         """Columns of the model of the cell, and its fallbacks, from the rows of its queries."""
 
-    def lost(self, number: int, failed: Failed) -> QueryRows:
+    def failed(self, number: int, failed: Failed) -> QueryRows:
         """The row of a query that exceeded its limit or whose process died."""
         outcome = {"status": failed.status.value, "reason": failed.reason}
         return self.known(number) | outcome, None
 
-    def finish(self, items: Sequence[QueryRows]) -> CellRows:
+    def collect(self, items: Sequence[QueryRows]) -> CellRows:
         """All rows; the row of the cell has means and extremes over the queries."""
         solutions = {k: solution for k, (_, solution) in enumerate(items) if solution is not None}
         assessed = dict(zip(solutions, self._assess(solutions), strict=True))

@@ -129,7 +129,7 @@ class InfSupConstants(Stage):
     constraints: ConstraintMatrices
 
     @property
-    def sort(self) -> str:
+    def kind_of_work(self) -> str:
         """The constants of a larger space take longer."""
         return f"{self.label} of {'V' if self.space is None else self.space.label}"
 

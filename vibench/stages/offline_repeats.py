@@ -27,9 +27,9 @@ class OfflineRepeat(Stage):
     number: int
 
     @property
-    def sort(self) -> str:
+    def kind_of_work(self) -> str:
         """It takes about as long as the stage itself."""
-        return self.stage.sort
+        return self.stage.kind_of_work
 
     def inputs(self) -> tuple[Stage, ...]:
         """What the stage itself reads."""

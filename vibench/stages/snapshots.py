@@ -96,7 +96,7 @@ class SnapshotStage(Stage):
     chunk: int
 
     @property
-    def sort(self) -> str:
+    def kind_of_work(self) -> str:
         """Those of the two sets take differently long."""
         return f"{self.label} of the {self.parameters.role} set"
 

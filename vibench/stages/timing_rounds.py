@@ -130,7 +130,7 @@ class _Rounds(Items):
     def _beside(self) -> SolutionsBeside:
         return SolutionsBeside(self._marginal, [seconds.cpu for seconds in self._reference.seconds])
 
-    def item(self, number: int, time_limit: TimeLimit) -> TimedRound:
+    def run_item(self, number: int, time_limit: TimeLimit) -> TimedRound:
         """One round of one cell, after a warm-up if it is the cell's first one in this process."""
         within, cell = self._stage.place(number)
         at, before = self._stage.first + within, self._slowdown
@@ -218,11 +218,11 @@ class _Rounds(Items):
             self._models[key] = stage.queries(self._store)
         return self._models[key]
 
-    def lost(self, number: int, failed: Failed) -> Failed:  # noqa: ARG002
+    def failed(self, number: int, failed: Failed) -> Failed:  # noqa: ARG002
         """A round without a result."""
         return failed
 
-    def finish(self, items: Sequence[TimedRound | Failed]) -> tuple[TimedCell, ...]:
+    def collect(self, items: Sequence[TimedRound | Failed]) -> tuple[TimedCell, ...]:
         """The rounds of every cell, in their order."""
         rounds: list[dict[int, TimedRound]] = [{} for _ in self._stage.cells]
         lost: list[list[Failed]] = [[] for _ in rounds]

@@ -126,7 +126,7 @@ def test_a_run_in_space_says_in_its_first_minute_how_long_it_will_take(monkeypat
     while graph.waiting or running:
         for stage in graph.begin(2 - len(running)):
             left.begin(stage)
-            running[stage.key] = stage, now[0], now[0] + RECORDED.get(stage.sort, 0.5)
+            running[stage.key] = stage, now[0], now[0] + RECORDED.get(stage.kind_of_work, 0.5)
         told = []
         for stage, began, end in running.values():
             solved = int(max(0.0, (now[0] - began) / (end - began) * (SOLUTIONS + 4) - 4)) / SOLUTIONS

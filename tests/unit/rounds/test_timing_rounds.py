@@ -88,7 +88,7 @@ def test_a_machine_that_slows_down_halfway_meets_all_alike() -> None:
     stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 12)
     spent = [1.0 if item < stage.items / 2 else 3.0 for item in range(stage.items)]
     items = [replace(steady(one), beside=Seconds(2.0 * one, 2.0 * one)) for one in spent]
-    timed = timing_rounds._Rounds.finish(_in(stage), items)
+    timed = timing_rounds._Rounds.collect(_in(stage), items)
     one, other = map(seconds_of_cell, block_rows(stage, timed))
     assert one == other
     assert one["online_q1_s"] < one["online_s"] < one["online_q3_s"]
@@ -242,7 +242,7 @@ def test_a_lost_round_is_told_and_the_others_keep_their_numbers() -> None:
     items: list[TimedRound | Failed] = [steady(2.0) for _ in range(stage.items)]
     gone = next(item for item in range(stage.items) if stage.place(item) == (1, 0))
     items[gone] = Failed(Status.CRASHED, "the worker died")
-    timed = _in(stage).finish(items)
+    timed = _in(stage).collect(items)
     assert [list(one.rounds) for one in timed] == [[6, 8], [6, 7, 8]]
     assert [(one.lost, one.reason) for one in timed] == [(1, "the worker died"), (0, "")]
     assert [[row["round"] for row in rows] for rows in block_rows(stage, timed)] == [[6, 8], [6, 7, 8]]
