@@ -112,8 +112,11 @@ class Reduction:
                 raise RequestError(
                     f"{name} is {brief(repr(value), 80)}, expected a Stop: Stop(tolerance=…) or Stop(size=…)"
                 )
-        if not isinstance(self.assembly, str) or self.assembly not in get_args(Assembly):
-            raise RequestError(f"assembly is {brief(repr(self.assembly), 80)}, expected 'full' or 'reduced'")
+        for name, choices in (("assembly", get_args(Assembly)), ("bounds", (True, False))):
+            value = getattr(self, name)
+            if not isinstance(value, str | bool) or value not in choices:
+                right = " or ".join(map(repr, choices))
+                raise RequestError(f"{name} is {brief(repr(value), 80)}, expected {right}")
         for name in ("interpolation", "accuracy"):
             value = getattr(self, name)
             if not isinstance(value, int | float | np.number) or not 0.0 < value < 1.0:
