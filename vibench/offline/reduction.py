@@ -121,6 +121,9 @@ class Reduction:
             value = getattr(self, name)
             if not isinstance(value, int | float | np.number) or not 0.0 < value < 1.0:
                 raise RequestError(f"{name} is {brief(repr(value), 80)}, expected a number between 0 and 1")
+        self._check_tolerance()
+
+    def _check_tolerance(self) -> None:
         if self.primal is None and self.tolerance is not None:
             raise RequestError("without a primal strategy there is no tolerance")
         if self.primal is not None and self.primal.takes_tolerance == (self.tolerance is None):
