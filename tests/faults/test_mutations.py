@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import pytest
-
-from mutations import FAULTS, ROOT, Fault, changed
+from mutations import FAULTS, ROOT, changed
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
-def test_a_fault_can_be_put_in_its_place(fault: Fault) -> None:
-    text = changed(ROOT, fault)
-    assert fault.wrong in text
-    if fault.file.endswith(".py"):
-        compile(text, fault.file, "exec")
-    assert all((ROOT / tests).exists() for tests in fault.tests)
-
-
-def test_faults_have_different_names() -> None:
-    assert len({fault.name for fault in FAULTS}) == len(FAULTS) >= 10
+def test_every_fault_can_be_put_in_its_place() -> None:
+    for fault in FAULTS:
+        text = changed(ROOT, fault)
+        if fault.file.endswith(".py"):
+            compile(text, fault.file, "exec")
+        assert all((ROOT / tests).exists() for tests in fault.tests), fault.name
+    assert len(FAULTS) >= 90
