@@ -22,11 +22,7 @@ if TYPE_CHECKING:
 def bench_plugins(
     plugin: Annotated[
         list[str] | None,
-        Argument(
-            metavar="PLUGIN",
-            help="Names, or problem|primal|dual|formulation|solver:NAME; all by default.",
-            autocompletion=plugins,
-        ),
+        Argument(help="Names, or problem|primal|dual|formulation|solver:NAME; all by default.", autocompletion=plugins),
     ] = None,
     out: Annotated[Path | None, Option(metavar="FILE", help="Keep the JSON file of pytest-benchmark.")] = None,
     against: Annotated[Path | None, Option(metavar="FILE", help="Compare with an earlier file.")] = None,
@@ -123,7 +119,6 @@ def _measured(rows: pd.DataFrame) -> pd.DataFrame:
     from vibench.results.formats import cell_text
 
     def largest(reached: dict[str, float | None]) -> str:
-        """The largest figure of accuracy of a benchmark; those of its table are of the same kind."""
         figures = {name.removeprefix("reached_"): value for name, value in reached.items() if pd.notna(value)}
         name = max(figures, key=lambda name: figures[name] or 0.0, default="")
         return f"{name} {cell_text(figures[name])}" if name else ""

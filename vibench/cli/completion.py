@@ -10,7 +10,8 @@ import io
 import os
 import sqlite3
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
+from importlib.resources import files
 from pathlib import Path
 
 import typer
@@ -22,77 +23,11 @@ from vibench.results.schema import STORED, TABLES
 # Tables that `vibench show` prints.
 SHOWN = ("summary", "best", "benefits", *TABLES)
 
-# Examples at the end of the help of every command; a test runs their options.
-EXAMPLES: Mapping[str, tuple[str, ...]] = {
-    "run": (
-        "vibench run",
-        "vibench run quick --solver piqp --dry-run",
-        "vibench run my-study.toml --jobs 4 --out results",
-        "vibench run quick --pod-tol 1e-2 --pod-tol 1e-3",
-        "vibench run results.sqlite --cell 3f9a --out again",
-    ),
-    "list": ("vibench list", "vibench list solvers"),
-    "show": (
-        "vibench show quick",
-        "vibench show quick 625b",
-        "vibench show quick --table benefits",
-        "vibench show quick --where \"solver = 'piqp' and beta_span_min < 1e-3\"",
-        "vibench show quick --columns cell,solver,error_u_mean --sort -error_u_mean",
-        "vibench show runs/quick --format csv",
-    ),
-    "report": ("vibench report quick", "vibench report runs/quick --no-figures --out quick.html"),
-    "figures": ("vibench figures quick", "vibench figures runs/quick --out pictures -j 1"),
-    "compare": (
-        "vibench compare runs/laptop runs/server runs/cluster",
-        "vibench compare runs/2024 runs/2025 --column online_s",
-        "vibench compare runs/2024 runs/2025 --table columns --format csv",
-        "vibench compare runs/before runs/after --table changes --strict",
-    ),
-    "publish": (
-        "vibench publish quick site",
-        'vibench publish a b site --author "Doe, Jane" --doi 10.5281/zenodo.1234567',
-    ),
-    "replay": ("vibench replay quick 3f9a", "vibench replay quick 3f9a --query 7"),
-    "export": (
-        "vibench export quick programs",
-        "vibench export quick 3f9a membrane.npz",
-        "vibench export quick 3f9a membrane.c --tolerance 1e-6",
-        "vibench export quick 3f9a membrane.vtu --mu 1.0,0.02,-0.01",
-    ),
-    "check": (
-        "vibench check my-problem --option resolution=medium",
-        "vibench check primal:mine",
-        "vibench check my_package.cable:Cable",
-        "vibench check solver:piqp",
-        "vibench check sampling:my-points --option size=32 --option seed=1",
-    ),
-    "bench": (
-        "vibench bench my-problem",
-        "vibench bench my-problem piqp --out before.json",
-        "vibench bench my-problem piqp --against before.json",
-        "vibench bench --read after.json --against before.json --format csv",
-    ),
-    "new": (
-        "vibench new study my-study",
-        "vibench new pack my-model",
-        "vibench new problem cable",
-        "vibench new dual my-cone --out packages",
-    ),
-    "pack": (
-        "vibench pack my-model",
-        "vibench pack my-model --cones --dual-tol 1e-3",
-        "vibench pack my-problem my-model --option resolution=coarse",
-        "vibench pack my-problem my-model --seed 2022 --validation 16 --solutions",
-    ),
-    "clean": ("vibench clean --dry-run", "vibench clean --older-than 30"),
-    "help": ("vibench help show", "vibench help timing_rounds", "vibench help online_s", "vibench help supremizer"),
-    "doctor": ("vibench doctor", "vibench doctor --out /scratch/runs"),
-}
-
 
 def examples(command: str) -> str:
     """The last paragraph of a command's help; the leading backspace makes click keep its line breaks."""
-    return "\n".join(["\b", "Examples:", *(f"  {line}" for line in EXAMPLES[command])])
+    lines = (files("vibench.cli") / "examples.txt").read_text(encoding="utf-8").splitlines()
+    return "\n".join(["\b", "Examples:", *(f"  {line}" for line in lines if line.split()[1] == command)])
 
 
 @contextlib.contextmanager
@@ -126,11 +61,7 @@ def whole_words() -> Iterator[None]:
 
 def words(choices: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
     """A completion with the words of a function, which is called when a shell asks."""
-
-    def complete(incomplete: str) -> list[str]:
-        return _beginning(incomplete, choices())
-
-    return complete
+    return lambda incomplete: _beginning(incomplete, choices())
 
 
 def names(*kinds: PluginKind) -> Callable[[str], list[str]]:
@@ -152,10 +83,6 @@ def _beginning(word: str, choices: Iterable[str]) -> list[str]:
         return []
 
 
-def _formulations() -> Iterable[str]:
-    return _registered(FORMULATION)
-
-
 def _solvers() -> Iterable[str]:
     """QP solvers, installed or not."""
     from vibench.qp.settings import SETTINGS
@@ -175,7 +102,8 @@ def _error_measures() -> Iterable[str]:
     return [*columns_of_measures(), "output:"]
 
 
-formulations, solvers, runs, error_measures = map(words, (_formulations, _solvers, _runs, _error_measures))
+formulations = names(FORMULATION)
+solvers, runs, error_measures = map(words, (_solvers, _runs, _error_measures))
 corrections = words(lambda: ("none", "feasible", "auto"))
 lists = words(lambda: (kind.plural for kind in PluginKind))
 table_names = words(lambda: SHOWN)
@@ -204,8 +132,8 @@ def plugin_options(context: typer.Context, incomplete: str) -> list[str]:
 def studies(incomplete: str) -> list[str]:
     """Registered studies, and study files in the current folder or in the folder of the word."""
     folder, slash, _ = incomplete.rpartition("/")
-    files = (f"{folder}{slash}{path.name}" for path in Path(folder + slash).glob("*.toml"))
-    return sorted([*_beginning(incomplete, _registered(STUDY)), *_beginning(incomplete, files)])
+    found = (f"{folder}{slash}{path.name}" for path in Path(folder + slash).glob("*.toml"))
+    return sorted([*_beginning(incomplete, _registered(STUDY)), *_beginning(incomplete, found)])
 
 
 def cells(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:

@@ -135,9 +135,9 @@ def check_factorisations() -> Iterator[Diagnosis]:
             yield Diagnosis(name, f"{version}: residual {left:.0e} ({one.summary})")
 
 
-def wire(n: int = 12) -> VariationalInequality:
-    """A wire of n nodes in contact with a flat support around its middle; dense, like reduced programs."""
-    step = 1.0 / (n + 1)
+def wire() -> VariationalInequality:
+    """A wire of 12 nodes in contact with a flat support around its middle; dense, like reduced programs."""
+    n, step = 12, 1.0 / 13
     A = (2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)) / step
     return VariationalInequality(A, np.full(n, -4.0 * step), -step * np.eye(n), np.full(n, 0.2 * step))
 

@@ -66,7 +66,7 @@ def _global_options(
 
 
 def clean(
-    older_than: Annotated[float, Option(min=0.0, metavar="DAYS", help="Keep younger artefacts.")] = 0.0,
+    older_than: Annotated[float | None, Option(min=0.0, metavar="DAYS", help="Keep younger artefacts.")] = None,
     dry_run: Annotated[bool, Option("--dry-run", help="Only show what is stored.")] = False,
     yes: Annotated[bool, Option("--yes", "-y", help="Delete without asking.")] = False,
 ) -> None:
@@ -80,9 +80,9 @@ def clean(
     from vibench.cli.console import print_frame
     from vibench.stages.artefacts import usable_store
 
-    store = usable_store()
+    store, seconds = usable_store(), 86400.0 * (older_than or 0.0)
     stored = pd.DataFrame(store.contents(), columns=["stored", "MiB", "days"])
-    going = int((stored["days"] >= older_than * 86400.0).sum())
+    going = int((stored["days"] >= seconds).sum())
     stored["MiB"], stored["days"] = stored["MiB"] / 2**20, stored["days"] / 86400.0
     stored["stored"] = stored["stored"].str.replace("-", " ")
     columns = {"files": ("MiB", "size"), "MiB": ("MiB", "sum"), "oldest [days]": ("days", "max")}
@@ -94,7 +94,7 @@ def clean(
         if not sys.stdin.isatty():
             raise RequestError("nothing was deleted: answer the question on a terminal, or say --yes")
         typer.confirm(f"Delete {going} of {len(stored)} files?", abort=True)
-    freed = store.clear(older_than * 86400.0)
+    freed = store.clear(seconds)
     echo(f"{freed / 2**20:.1f} MiB freed; later runs recompute what they need")
 
 
@@ -248,7 +248,11 @@ def run_command_line() -> None:
     usage_error = typer.BadParameter.__mro__[2]
     arguments = sys.argv[1:] or ["--help"]
     try:
-        _print_any_text()
+        # A question mark stands for what a terminal or a pipe cannot encode, rather than abort a run. Tests and
+        # notebooks replace the streams by others, which have no encoding to change.
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="replace")
         warnings.showwarning = _warning
         _search_working_directory_last()
         if new := renamed(arguments):
@@ -271,14 +275,6 @@ def run_command_line() -> None:
             raise
         code = _print_error(error.format_message(), 2)  # type: ignore[attr-defined]
     sys.exit(code if isinstance(code, int) else 0)
-
-
-def _print_any_text() -> None:
-    """Print a question mark for what the encoding of a terminal or a pipe lacks, rather than abort a run."""
-    for stream in (sys.stdout, sys.stderr):
-        # Tests and notebooks replace the streams by others, which have no encoding to change.
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
 
 
 def _search_working_directory_last() -> None:

@@ -156,7 +156,15 @@ def export(
         count = replay.export(run, target, places_of(at), sequence=sequence)
         echo(f"{count} programs in {target / 'programs'}; `python {target / 'check.py'}` rechecks every solution")
     elif kind == ".vtu":
-        _export_fields(run, cell[0], mu, target, places_of(at))
+        from vibench.library.runs import open_run
+        from vibench.library.vtu import export_vtu
+
+        try:
+            components = [float(each) for each in mu.split(",")]
+        except ValueError:
+            raise RequestError(f"--mu is {mu!r}, expected numbers separated by commas, such as 1.2,0.05") from None
+        export_vtu(open_run(run, at=places_of(at)).model(cell[0]), components, target)
+        echo(f"u, λ and their errors at mu = {components}: {target}")
     else:
         _export_model(run, cell[0], target, tolerance, bases, places_of(at))
 
@@ -200,15 +208,3 @@ def _export_model(
     sources = [file.with_suffix(end) for end in (".c", ".h") if target.suffix == ".c"]
     written = ", ".join(map(str, [file, file.with_name(RUNTIME), *sources]))
     echo(f"{written}: `from {Path(RUNTIME).stem} import Model`, then `Model({str(file)!r}).solve(mu)`")
-
-
-def _export_fields(run: str, cell: str, mu: str, file: Path, places: Mapping[str, str]) -> None:
-    from vibench.library.runs import open_run
-    from vibench.library.vtu import export_vtu
-
-    try:
-        components = [float(each) for each in mu.split(",")]
-    except ValueError:
-        raise RequestError(f"--mu is {mu!r}, expected numbers separated by commas, such as 1.2,0.05") from None
-    export_vtu(open_run(run, at=places).model(cell), components, file)
-    echo(f"u, λ and their errors at mu = {components}: {file}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -82,12 +83,11 @@ def check_plugin(
     echo(f"{checked}{remark}")
     loaded = checked.load() if checked.entries else partial(of_qpsolvers, solver=checked.name)
     create = partial(loaded, **options) if options else loaded
-    counts = dict.fromkeys(Verdict, 0)
+    counts = Counter[Verdict]()
     for result in Examination(create, checked.kind.cli_name, seconds).results():
         echo(str(result))
         counts[result.verdict] += 1
-    told = (f"{count} {verdict}" for verdict, count in counts.items() if count or verdict is not Verdict.WARNING)
-    echo(", ".join(told))
+    echo(", ".join(f"{counts[one]} {one}" for one in Verdict if counts[one] or one is not Verdict.WARNING))
     if counts[Verdict.FAILED]:
         raise Exit(1)
 
@@ -163,7 +163,12 @@ def _loaded_rows(kind: PluginKind, sizes: bool = False) -> Iterator[Row]:
                 lines += map(str, plugin.options.values())
             if kind is PROBLEM:
                 lines += _parameters(plugin.load())
-                lines += [_size(plugin)] if sizes else []
+                needed = ", ".join(name for name, option in plugin.options.items() if option.required)
+                if sizes and needed:
+                    lines.append(f"its size depends on {needed}")
+                elif sizes:
+                    problem = plugin.load()()
+                    lines.append(f"n = {problem.V.dim} unknowns, m = {problem.W.dim} constraints")
         except VibenchError as error:
             description = str(error)
         except Exception as error:  # noqa: BLE001  annotations of plugins are evaluated
@@ -181,26 +186,16 @@ def _parameters(problem: type) -> Iterator[str]:
             yield f"mu_{k}: {name} from {low:g} to {high:g}" + f" {unit}" * (unit != "1")
 
 
-def _size(plugin: RegisteredPlugin) -> str:
-    """Numbers of unknowns and constraints of a problem with its default options, in a line."""
-    needed = [name for name, option in plugin.options.items() if option.required]
-    if needed:
-        return f"its size depends on {', '.join(needed)}"
-    problem = plugin.load()()
-    return f"n = {problem.V.dim} unknowns, m = {problem.W.dim} constraints"
-
-
 def _solvers_by_version() -> list[Row]:
     """QP solvers and their versions, without loading them."""
     from vibench import provenance
     from vibench.qp.settings import SETTINGS
 
-    ours = []
+    rows = list(_read_rows(SOLVER))
     for name in SETTINGS:
-        version = provenance.solver_version(name)
-        package = provenance.solver_distribution(name)
-        ours.append((name, version, "" if version else f"not installed: `pip install {package}`", ""))
-    return sorted([*ours, *_read_rows(SOLVER)])
+        version, package = provenance.solver_version(name), provenance.solver_distribution(name)
+        rows.append((name, version, "" if version else f"not installed: `pip install {package}`", ""))
+    return sorted(rows)
 
 
 def _solver_rows() -> Iterator[Row]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -55,8 +54,7 @@ def show(
     ] = "",
     limit: Annotated[int, Option(min=0, metavar="N", help="Print the first N rows; 0 for all.")] = 0,
     error: Annotated[
-        str,
-        Option(help="Compare models by solution, u, lambda, output:NAME.", autocompletion=error_measures),
+        str, Option(help="Compare models by solution, u, lambda, output:NAME.", autocompletion=error_measures)
     ] = "",
     within: Annotated[float | None, Option(metavar="ERROR", help="Largest error in best and benefits.")] = None,
     queries: Annotated[float | None, Option(metavar="N", help="Best: the cheapest model for N queries.")] = None,
@@ -72,8 +70,10 @@ def show(
     from vibench.text import new_console
 
     path = results_file(run)
-    measured = partial(show.look_up, path, table, cell=cell, error=error, largest=within, queries=queries)
-    view = measured(columns=parts(columns), where=where, sort=parts(sort), limit=limit)
+    view = show.look_up(
+        path, table, cell=cell, error=error, largest=within, queries=queries,
+        columns=parts(columns), where=where, sort=parts(sort), limit=limit,
+    )  # fmt: skip
     # A cell alone is a list of all its columns: no table is as wide.
     if form == "terminal" and cell and table == "summary" and not columns and len(view.rows):
         (key,) = view.rows["cell"]
@@ -161,8 +161,14 @@ PRIORITY = (
 
 def _print_changes(compared: Comparison, limit: float) -> None:
     """Print what changed between runs, the worst first, and how many changes there are."""
+    from vibench.report.differences import MOVED
+
+    # By verdict, then by how far the ratio is from 1: a factor of 2 is as far as one of 1/2.
+    order = compared.changes["verdict"].map([verdict.value for verdict in MOVED].index)
+    far = compared.changes["ratio"].map(lambda ratio: max(ratio, 1.0 / ratio) if ratio > 0.0 else 1.0)
+    weighed = compared.changes.assign(order=order, far=-far).sort_values(["order", "far"], kind="stable")
+    changes = readable(weighed.drop(columns=["order", "far"]), len(compared.runs))
     # Forty changes are some screens; programs read all of them as CSV.
-    changes = readable(_by_weight(compared.changes), len(compared.runs))
     if len(changes):
         names = [run.name for run in compared.runs]
         title = " → ".join(names) if len(names) == 2 else f"changes from {names[0]}"
@@ -200,14 +206,3 @@ def readable(frame: pd.DataFrame, runs: int) -> pd.DataFrame:
     shown = frame.drop(columns=["ratio_low", "ratio_high", *["run", "against"] * (runs == 2)])
     shown.insert(shown.columns.get_loc("ratio") + 1, "interval", texts)
     return shown.rename(columns={"farthest_ratio": "farthest ratio"})
-
-
-def _by_weight(changes: pd.DataFrame) -> pd.DataFrame:
-    """The worst changes first: by verdict, then by how far the ratio is from 1."""
-    from vibench.report.differences import MOVED
-
-    # A factor of 2 is as far as one of 1/2.
-    order = changes["verdict"].map([verdict.value for verdict in MOVED].index)
-    far = changes["ratio"].map(lambda ratio: max(ratio, 1.0 / ratio) if ratio > 0.0 else 1.0)
-    weighed = changes.assign(order=order, far=-far).sort_values(["order", "far"], kind="stable")
-    return weighed.drop(columns=["order", "far"])

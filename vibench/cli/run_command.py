@@ -205,17 +205,17 @@ def failures(rows: Rows, run: str) -> Iterator[str]:
             continue
         which = f"the first is {first['cell']}, " if len(group) > 1 else f"{first['cell']}, "
         queries = f"{first['queries_ok']} of {first['queries']} queries ok"
-        remedy = _remedy(first, rows, run) if first["status"] == Status.INACCURATE else ""
+        remedy = ""
+        if first["status"] == Status.INACCURATE:
+            # Solvers of one model solve the same programs.
+            same = [
+                row for row in rows if all(row[name] == first[name] for name in ("model", "accuracy", "correction"))
+            ]
+            fine = ", ".join(sorted({row["solver"] for row in same if row["status"] == Status.OK}))
+            remedy = f"; ok with {fine}" if fine else f"; `vibench replay {run} {first['cell']}` tries other solvers"
         yield f"{count}{first['status']}: {which}{formats.name_of_cell(first)}: {queries}; {first['reason']}{remedy}"
     if others := sum(map(len, ranked[REASONS:])):
         yield f"{others} cells not ok for {len(ranked) - REASONS} other reasons"
-
-
-def _remedy(cell: Mapping[str, Any], rows: Rows, run: str) -> str:
-    # Solvers of one model solve the same programs.
-    same = [row for row in rows if all(row[name] == cell[name] for name in ("model", "accuracy", "correction"))]
-    fine = sorted({row["solver"] for row in same if row["status"] == Status.OK})
-    return f"; ok with {', '.join(fine)}" if fine else f"; `vibench replay {run} {cell['cell']}` tries other solvers"
 
 
 def reasons(rows: Rows) -> str:

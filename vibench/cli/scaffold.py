@@ -27,16 +27,10 @@ def write_package(kind: PluginKind, name: str, parent: Path) -> Path:
     package, word = _package(name), kind.cli_name
     camel, snake = "".join(word.capitalize() for word in name.split("-")), name.replace("-", "_")
     words = {
-        "name": name,
-        "package": package,
-        "module": kind.module,
+        "name": name, "package": package, "module": kind.module, "kind": word, "title": str(kind),
         "cls": f"solve_{snake}" if kind is SOLVER else camel + word.capitalize(),
-        "kind": word,
-        "title": str(kind),
-        "group": kind.entry_points,
-        "test": snake,
-        "version": distribution_version("vibench"),
-    }
+        "group": kind.entry_points, "test": snake, "version": distribution_version("vibench"),
+    }  # fmt: skip
     sources = {
         "pyproject.toml": "pyproject.toml",
         "README.md": f"README-{word}.md",
