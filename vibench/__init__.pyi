@@ -74,7 +74,7 @@ from .offline.models import Model as Model
 from .offline.models import Solution as Solution
 from .offline.program_model import ProgramModel as ProgramModel
 from .offline.reduction import Reduction as Reduction
-from .offline.sweep import Snapshots as Snapshots
+from .offline.reduction import Snapshots as Snapshots
 from .plugins.registry import create as create
 from .qp.status import Status as Status
 from .qp.verification import QPSolution as QPSolution

@@ -8,7 +8,7 @@ import numpy as np
 
 from vibench import Cone, Kind, Offline, Problem, Reduction, Stop, no_free
 from vibench.model.galerkin import ReducedModel
-from vibench.offline.sweep import high_fidelity_sweep
+from vibench.offline.reduction import high_fidelity_sweep
 from vibench.reduction import LazyMaximum
 from vibench.stability.infsup import cone_basis
 from vibench_strategies.cpg import CPG

@@ -38,8 +38,7 @@ from vibench.model.galerkin import ReducedModel, ReducedProblem, project
 from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel, hyper_reduce
 from vibench.offline.assemblies import assemblies
 from vibench.offline.models import Model, Solution
-from vibench.offline.reduction import Reduction
-from vibench.offline.sweep import Snapshots, high_fidelity_sweep
+from vibench.offline.reduction import Reduction, Snapshots, high_fidelity_sweep
 from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM
 from vibench.plugins.registry import find, qp_solver
 from vibench.qp.solve import solve_qp

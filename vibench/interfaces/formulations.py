@@ -22,25 +22,22 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, TypeAlias
 
 from vibench.arrays import Array
 from vibench.errors import RequestError
 from vibench.interfaces.problem import VariationalInequality
 
-if TYPE_CHECKING:  # both are above this layer; a formulation is handed objects of theirs
-    from vibench.model.certificates.bounds import OnlineCertificate
-    from vibench.model.galerkin import ReducedProblem
-    from vibench.model.hyperreduced import AnyReducedModel
-    from vibench.offline.reduction import Reduction
-    from vibench.qp.verification import QPSolution
+# The layers above define these classes; nothing here imports them. Plugins annotate with the classes themselves.
+OfflinePhase: TypeAlias = Any
+"""A `vibench.Reduction`."""
+AssemblingModel: TypeAlias = Any
+"""A reduced model, whose `assemble(mu)` has the reduced `program`."""
+Certificate: TypeAlias = Any
+"""A certificate at online cost."""
 
 AXES = ("pod", "dual", "primal", "solvers", "accuracy", "assembly")
 """The axes of a study that a formulation may have; it is not repeated over those that it does not have."""
-
-
-NEEDED_BY_PRIMAL = ("pod", "dual")
-"""What an enrichment is an enrichment of, and what for."""
 
 
 class Outcome(StrEnum):
@@ -95,12 +92,32 @@ class FormulationAnswer:
         return cls(None, None, outcome, reason)
 
 
+class ProgramSolution(Protocol):
+    """The solution of a quadratic program, as `vibench.QPSolution`."""
+
+    @property
+    def x(self) -> Array | None:
+        """The unknowns (n,)."""
+
+    @property
+    def alpha(self) -> Array | None:
+        """The multipliers (m,) ≥ 0."""
+
+    @property
+    def solver_status(self) -> str:
+        """The status that the solver reports."""
+
+    @property
+    def iterations(self) -> int | None:
+        """Its steps, where it counts any."""
+
+
 class SolveQP(Protocol):
     """The QP solver of the cell."""
 
     def __call__(
         self, program: VariationalInequality, *, factor: Array | None = None, start: tuple[Array, Array] | None = None
-    ) -> QPSolution:
+    ) -> ProgramSolution:
         """The solution x (n,), α (m,) ≥ 0 of min ½xᵀA x − fᵀx, B x ≤ g, dense; either is `None` if it has found none.
 
         `factor` is the Cholesky factor (lower) of A where it is known, `start` a solution to start from where the
@@ -144,7 +161,7 @@ class FormulationModel(ABC):
     """How many of the coefficients of u are not of V_N, where it is not the enrichment of the offline phase."""
     fallbacks: tuple[str, ...] = ()
     """One line for every step that deviates from the algorithm."""
-    reduced: AnyReducedModel
+    reduced: AssemblingModel
     """The model that assembles `program`, of formulations that declare `has_program`."""
 
     @abstractmethod
@@ -159,14 +176,14 @@ class FormulationModel(ABC):
         and for no other. A negative coefficient of λ is an error, even one of round-off: every bound needs λ ≥ 0.
         """
 
-    def program(self, mu: Array) -> ReducedProblem:
+    def program(self, mu: Array) -> Any:
         """The quadratic program at mu (d,), for formulations that declare `has_program`; `alpha` is on `generators`.
 
         `x` and `alpha` of answers are its solution, against which they are verified.
         """
         return self.reduced.assemble(mu)
 
-    def certificate(self, offline: Reduction) -> OnlineCertificate:
+    def certificate(self, offline: OfflinePhase) -> Certificate:
         """The certificate of `reduced`, prepared offline and timed, for formulations that declare `has_certificate`.
 
         Raises
@@ -199,7 +216,7 @@ class Formulation(ABC):
     is_default: ClassVar[bool] = False
     """Whether studies that name no formulation have this one; of all that are registered at most one."""
 
-    def build(self, offline: Reduction) -> Mapping[str, Any]:  # noqa: ARG002
+    def build(self, offline: OfflinePhase) -> Mapping[str, Any]:  # noqa: ARG002
         """Data that the formulation adds to the offline phase, by default none; its seconds are recorded apart.
 
         Parameters
@@ -225,7 +242,7 @@ class Formulation(ABC):
         return {}
 
     @abstractmethod
-    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+    def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:
         """The model, from the offline phase and from what `build` returned, which may have been stored in between.
 
         Steps of `offline` are read from where they are stored, and not computed again. Without a `build` of its own, a
@@ -244,6 +261,7 @@ def axes_of(formulation: type[Formulation] | Formulation, title: str) -> tuple[s
     declared = formulation.uses
     if not isinstance(declared, tuple) or not set(declared) <= set(AXES):
         raise RequestError(f"the {title} declares uses = {declared!r}, expected a tuple of some of {', '.join(AXES)}")
-    if "primal" in declared and not set(NEEDED_BY_PRIMAL) <= set(declared):
+    # An enrichment enriches V_N, for the generators of a cone.
+    if "primal" in declared and not {"pod", "dual"} <= set(declared):
         raise RequestError(f"the {title} declares uses = {declared!r}: 'primal' needs 'pod' and 'dual'")
     return tuple(axis for axis in AXES if axis in declared)

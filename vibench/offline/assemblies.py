@@ -16,32 +16,24 @@ from vibench.model.errors import EnergyNorm
 from vibench.stability.coercivity import Constant, Quotients, coercivity, continuity, energy_inf_sup, share_of_diagonal
 from vibench.stability.contact_infsup import ContactInfSup, multiple_of
 
-LIMIT = 2**28
-"""Size limit of the assemblies in bytes; the least recently used one is dropped first."""
-
-FACTORS = 3 * 2**28
-"""The same of factors of A and of compliances; those of the last parameter are kept whatever their size. Cells use the
-same parameters in the same order: too small a cache is none."""
-
-MANY = 1000
-"""Constants of so many parameters are kept."""
-
 
 class Assemblies:
     """Cached assemblies of one problem; timed code must use none of it but `energy_of`."""
 
-    def __init__(self, problem: Problem, limit: int = LIMIT) -> None:
+    def __init__(self, problem: Problem, limit: int | None = None, factor_limit: int | None = None) -> None:
         self._problem = problem
-        self._kept: LRUCache[bytes, VariationalInequality] = LRUCache(limit, getsizeof=_bytes)
-        self._energies: LRUCache[bytes, EnergyNorm] = LRUCache(FACTORS, getsizeof=self._own_bytes)
+        # Limits in bytes: 256 MiB of assemblies, and 768 MiB of factors of A and compliances. Cells use the same
+        # parameters in the same order, so a cache that does not hold all of them never hits.
+        self._kept: LRUCache[bytes, VariationalInequality] = LRUCache(limit or 2**28, getsizeof=_bytes)
+        self._energies: LRUCache[bytes, EnergyNorm] = LRUCache(factor_limit or 3 * 2**28, getsizeof=self._own_bytes)
         self._last: tuple[bytes, EnergyNorm] | None = None
         self._solver = HighFidelitySolver(problem, condensing=True)
         self._contact: ContactInfSup | None = None
         self._quotients: LRUCache[bytes, Quotients] = LRUCache(1)  # it holds vectors
-        self._alphas: LRUCache[bytes, Constant] = LRUCache(MANY)
-        self._gammas: LRUCache[bytes, Constant] = LRUCache(MANY)
-        self._digests: LRUCache[tuple[str, bytes], bytes] = LRUCache(2 * MANY)
-        self._betas: LRUCache[tuple[bytes, bytes], Constant] = LRUCache(MANY)
+        self._alphas: LRUCache[bytes, Constant] = LRUCache(1000)
+        self._gammas: LRUCache[bytes, Constant] = LRUCache(1000)
+        self._digests: LRUCache[tuple[str, bytes], bytes] = LRUCache(2000)
+        self._betas: LRUCache[tuple[bytes, bytes], Constant] = LRUCache(1000)
 
     def at(self, mu: Array) -> VariationalInequality:
         """A copy of `checked_assembly` at mu (d,), which later assemblies leave as it is."""

@@ -20,14 +20,6 @@ from vibench.interfaces.affine import CONSTANTS, AffineSum, Expression, Thetas
 from vibench.interfaces.problem import MEMBERS
 from vibench.model.chebyshev import AffinePolynomial
 
-PER_LINE = 4
-
-PREFIX = "certificate_"
-"""Of the names of arrays of a certificate."""
-
-SPECTRAL = ("anchors", "lower", "upper", "count", "term_norms", "spectral_error")
-"""Arrays of a certificate that are only there where A depends on the parameter."""
-
 
 @dataclass(frozen=True)
 class ExactMember:
@@ -65,7 +57,7 @@ def _in_c(node: ast.expr, names: Sequence[str]) -> str:
             text = f"({'-' if isinstance(op, ast.USub) else '+'}{_in_c(operand, names)})"
         case ast.Call(func=ast.Name(id=name), args=arguments):
             values = [_in_c(each, names) for each in arguments]
-            # functions have the same names in both languages but for these, and two arguments at most in C
+            # Functions have the same names in both languages but for these, and two arguments at most in C.
             c_name = {"abs": "fabs", "min": "fmin", "max": "fmax"}.get(name, name)
             text = reduce(lambda a, b: f"{c_name}({a}, {b})", values) if len(values) > 1 else f"{c_name}({values[0]})"
         case _:
@@ -105,15 +97,15 @@ def source(
         "lower": _numbers(arrays["lower"]),
         "upper": _numbers(arrays["upper"]),
         "members": "\n".join(_member(key, own[key]) for key in MEMBERS),
-        "output_count": 0,
     }
-    # a function that nothing calls would be a warning of the compiler
+    # A function that nothing calls would be a warning of the compiler.
     some = any(isinstance(one, AffinePolynomial) for one in own.values())
     values["products"] = _filled("reduced_model_products.c", {}) if some else ""
     parts: list[str] = []
+    values["output_count"] = len(arrays.get("outputs_x", ()))
     if "outputs_x" in arrays:
         names = (f"{output['name']} [{output['unit']}]" for output in about["outputs"]["linear"])
-        values |= {"output_names": _comment(", ".join(names)), "output_count": len(arrays["outputs_x"])}
+        values["output_names"] = _comment(", ".join(names))
         values |= {"output_arrays": "\n".join(_array(key, arrays[key]) for key in ("outputs_x", "outputs_alpha"))}
         parts.append("outputs")
     if thetas:
@@ -135,18 +127,23 @@ def _of_certificate(
     thetas: Mapping[str, AffinePolynomial | ExactMember], arrays: Mapping[str, Array]
 ) -> dict[str, Any]:
     """Values for the templates of a certificate: sizes, polynomials and arrays."""
-    own: dict[str, Array] = {f"{PREFIX}{name}": np.zeros(1) for name in SPECTRAL}
-    own |= {name: array for name, array in arrays.items() if name.startswith(PREFIX) and name != f"{PREFIX}lift"}
-    (rows, loads), (directions, kept) = own[f"{PREFIX}responses"].shape, own[f"{PREFIX}factor"].shape
-    numbers = loads * (loads + 1) // 2 + 8 * rows + 20 * loads + own[f"{PREFIX}norms"].size + kept
+    # These arrays exist only where A depends on the parameter; C needs them always.
+    spectral = ("anchors", "lower", "upper", "count", "term_norms", "spectral_error")
+    own: dict[str, Array] = {f"certificate_{name}": np.zeros(1) for name in spectral}
+    own |= {name: array for name, array in arrays.items() if name.startswith("certificate_")}
+    own.pop("certificate_lift", None)
+    (rows, loads), (directions, kept) = own["certificate_responses"].shape, own["certificate_factor"].shape
+    norms = own["certificate_norms"].size
+    # Doubles on the stack of the certificate, for its documentation in the header.
+    numbers = loads * (loads + 1) // 2 + 8 * rows + 20 * loads + norms + kept
     sizes = {name: polynomial.terms.shape[1] for name, polynomial in thetas.items()}
     return sizes | {
         "rows": rows,
         "loads": loads,
         "directions": directions,
         "kept": kept,
-        "residual_terms": own[f"{PREFIX}norms"].size,
-        "spectral": int(f"{PREFIX}anchors" in arrays),
+        "residual_terms": norms,
+        "spectral": int("certificate_anchors" in arrays),
         "stack": round(8e-3 * numbers) + 1,
         "thetas": "\n".join(_member(key, polynomial) for key, polynomial in thetas.items()),
         "arrays": "\n".join(map(_array, own, own.values())),
@@ -193,7 +190,7 @@ def _member(name: str, member: AffinePolynomial | ExactMember) -> str:
 def _numbers(values: Array | Indices) -> str:
     """Numbers that a compiler reads back to the last bit."""
     texts = [repr(value).replace("inf", "HUGE_VAL") for value in np.ravel(values).tolist()]
-    return ",\n".join(", ".join(texts[k : k + PER_LINE]) for k in range(0, len(texts), PER_LINE))
+    return ",\n".join(", ".join(texts[k : k + 4]) for k in range(0, len(texts), 4))
 
 
 def _comment(text: str) -> str:

@@ -1,7 +1,7 @@
-"""Reduced models as programs of the machine: their exported C source, compiled and loaded into this process.
+"""Reduced models as machine code: their exported C source, compiled and loaded into this process.
 
-A query is one call of the program, from the parameter to the verified solution. It runs in the calling process: whoever
-may not die with it asks in a process of its own, as the workers of a run are.
+A query is one call, from the parameter to the verified solution. A crash of the program ends the calling process, so
+that runs call it in their workers.
 """
 
 from __future__ import annotations
@@ -29,25 +29,10 @@ from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, member_polynomia
 from vibench.qp.verification import QPSolution
 from vibench.text import one_line
 
-COMPILERS = ("cc", "gcc", "clang")
-"""C compilers that are looked for where the environment variable CC names none."""
-
-FLAGS = ("-std=c99", "-O3", "-shared", "-fPIC")
-"""Options of the compiler; no sum may be reordered."""
-
-STACK = 4 * 2**20
-"""Bytes of arrays that the program may have on the stack, which has eight mebibytes and aborts the process beyond."""
-
-OUTSIDE = 16
-"""Added to the code of the program at parameters outside the box."""
-
-SAYS = {0: "solved", 1: "inaccurate", 2: "the constraints contradict each other", 3: "not solved"}
-"""What the codes of the program mean."""
-
 
 @dataclass(frozen=True)
 class CompiledModel:
-    """What the C source of a model is made of: polynomials of A, f, B and g, the box (d,), the accuracy it verifies."""
+    """Data of the C source of a model: polynomials of A, f, B and g, the box (d,), the accuracy that it verifies."""
 
     members: Mapping[str, AffinePolynomial]
     lower: Array
@@ -58,7 +43,7 @@ class CompiledModel:
 
     @classmethod
     def of(cls, reduced: AnyReducedModel, accuracy: float) -> CompiledModel:
-        """That of a reduced model.
+        """Interpolate the members of a reduced model.
 
         Raises
         ------
@@ -100,10 +85,12 @@ class CompiledModel:
 def _refuse_large(program: VariationalInequality) -> None:
     """Raise an `UnsupportedError` if programs of this size have too many arrays on the stack."""
     N, R = len(program.f), len(program.g)
-    size = 8 * (5 * N * N + 2 * N * R)  # A packed and twice in full, J and U; B and the normals
-    if size > STACK:
+    # A packed and twice in full, J and U; B and the normals.
+    size = 8 * (5 * N * N + 2 * N * R)
+    # Stacks usually have eight mebibytes, beyond which the process is aborted.
+    if size > 4 * 2**20:
         what = f"the program of {N} unknowns and {R} constraints has {size / 2**20:.1f} MiB of arrays on the stack"
-        raise UnsupportedError(f"{what}, at most {STACK // 2**20} MiB are safe")
+        raise UnsupportedError(f"{what}, at most 4 MiB are safe")
 
 
 class CompiledProgram:
@@ -122,35 +109,39 @@ class CompiledProgram:
         UnsupportedError
             If there is no C compiler, or it fails.
         """
-        with TemporaryDirectory(prefix="vibench-") as folder:  # a library that is loaded needs its file no longer
+        # A library that is loaded needs its file no longer.
+        with TemporaryDirectory(prefix="vibench-") as folder:
             loaded = ctypes.CDLL(str(_compiled(source, Path(folder))))
         return cls(loaded, unknowns, constraints)
 
     def __call__(self, mu: Array) -> QPSolution:
-        """The solution at mu (d,), which is not verified by anyone but the program."""
+        """The solution at mu (d,), verified by the program alone."""
         at = np.ascontiguousarray(mu, dtype=float)
         x, alpha, residuals = np.empty(self._sizes[0]), np.empty(self._sizes[1]), np.empty(3)
         code = self._solve(at.ctypes.data, x.ctypes.data, alpha.ctypes.data, residuals.ctypes.data)
-        says = SAYS.get(code % OUTSIDE, f"code {code}")
-        return QPSolution(x, alpha, says) if code % OUTSIDE in {0, 1} else QPSolution(None, None, says)
+        # The program adds 16 to its code at parameters outside the box.
+        outcome = code % 16
+        texts = ["solved", "inaccurate", "the constraints contradict each other", "not solved"]
+        text = texts[outcome] if outcome < len(texts) else f"code {code}"
+        return QPSolution(x, alpha, text) if outcome in {0, 1} else QPSolution(None, None, text)
 
 
 def compiler() -> list[str]:
-    """The command of the C compiler: that of the environment variable CC, or the first of `COMPILERS` that is there.
+    """The command of the C compiler: that of the environment variable CC, or the first of cc, gcc and clang.
 
     Raises
     ------
     UnsupportedError
         If there is none.
     """
-    named = shlex.split(os.environ.get("CC", ""))
-    for command in [named] if named else [[name] for name in COMPILERS]:
+    named, usual = shlex.split(os.environ.get("CC", "")), ("cc", "gcc", "clang")
+    for command in [named] if named else [[name] for name in usual]:
         if shutil.which(command[0]):
             return command
     if named:
         raise UnsupportedError(f"the environment variable CC names the C compiler '{named[0]}', which is not found")
     raise UnsupportedError(
-        f"there is no C compiler: none of {', '.join(COMPILERS)} is on the PATH; install one, or name it in the "
+        f"there is no C compiler: none of {', '.join(usual)} is on the PATH; install one, or name it in the "
         "environment variable CC"
     )
 
@@ -159,8 +150,9 @@ def _compiled(source: str, folder: Path) -> Path:
     """The shared library of a source, made in a folder."""
     command, library = compiler(), folder / "model.so"
     (folder / "model.c").write_text(source, encoding="utf-8")
+    # No option may reorder sums: bounds of round-off are for this order.
     ended = subprocess.run(
-        [*command, *FLAGS, "model.c", "-o", library.name, "-lm"],
+        [*command, "-std=c99", "-O3", "-shared", "-fPIC", "model.c", "-o", library.name, "-lm"],
         cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace", check=False,
     )  # fmt: skip
     if ended.returncode or not library.is_file():

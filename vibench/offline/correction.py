@@ -1,4 +1,4 @@
-"""What a query answers with: the reduced solution, or the pair that its certificate makes of it."""
+"""Answers of queries: the reduced solution, or the corrected pair of its certificate."""
 
 from __future__ import annotations
 
@@ -18,14 +18,11 @@ from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline.assemblies import Assemblies, assemblies
 
-NO_PAIR = "the certificate found a correction, but no multiplier ν ≥ 0 that belongs to it"
-"""Why a solution that has a bound at online cost has no corrected pair."""
-
 
 class Answer(NamedTuple):
-    """u (n,) and λ (m,), whether they are the corrected pair, and why they are not although that is asked for, or "".
+    """The pair u (n,), λ (m,), whether it is corrected, and a note why it is not although that is asked for.
 
-    `bound` are their bounds at online cost, where the model is certified; `share` is ω/ρ of the reduced solution.
+    `bound` has its bounds at online cost, where the model has them; `share` is ω/ρ of the reduced solution.
     """
 
     u: Array
@@ -46,7 +43,7 @@ class Corrector:
 
     @property
     def cost(self) -> str:
-        """What a correction costs: "online" or "high-fidelity", or "" without any."""
+        """Cost of a correction: "online" or "high-fidelity", or "" without any."""
         if self.mode is CorrectionMode.NONE:
             return ""
         return "high-fidelity" if self.certificate is None else "online"
@@ -63,8 +60,8 @@ class Corrector:
         """The answer at high-fidelity cost."""
         if not in_dual_set(lam):
             return Answer(u, lam, note=BoundNote.NOT_IN_CONE)
-        kept = assemblies(self.model.problem)
-        pair = corrected_pair(kept.at(mu), kept.energy_at(mu), u, lam)
+        cache = assemblies(self.model.problem)
+        pair = corrected_pair(cache.at(mu), cache.energy_at(mu), u, lam)
         if pair is None:
             return Answer(u, lam, note=BoundNote.NO_CORRECTION)
         share = _share(pair.omega, pair.rho)
@@ -86,26 +83,28 @@ class Corrector:
         bound, correction = certificate.certify(problem, mu, model.assemble(mu), x, alpha, self.mode)
         share = None if bound.guarantee is Guarantee.NONE else _share(bound.omega, bound.rho)
         if correction is None:
-            asked = self.mode is not CorrectionMode.NONE and (
+            wanted = self.mode is not CorrectionMode.NONE and (
                 share is None or self.mode.applies(bound.omega, bound.rho)
             )
-            why = bound.note if bound.guarantee is Guarantee.NONE else NO_PAIR
-            return Answer(u, lam, bound, share=share, note=why if asked else "")
+            # The bound exists, but its correction has no multiplier ν ≥ 0 that would make it a pair.
+            no_pair = "the certificate found a correction, but no multiplier ν ≥ 0 that belongs to it"
+            why = bound.note if bound.guarantee is Guarantee.NONE else no_pair
+            return Answer(u, lam, bound, share=share, note=why if wanted else "")
         v = certificate.corrected(u, correction, contact_unknowns(problem))
         return Answer(v, correction.nu, correction.bound, is_corrected=True, share=share)
 
 
 def corrected_in_full(
     model: ReducedModel | HyperReducedModel,
-    kept: Assemblies,
+    cache: Assemblies,
     mu: Array,
     vi: VariationalInequality,
     x: Array,
     alpha: Array,
 ) -> CorrectedPair | None:
-    """The correction at high-fidelity cost from what a query knows, with factorisations of an assembled A."""
+    """The correction at high-fidelity cost of x (N',), α (R,), with factorisations of an assembled A."""
     u = np.asarray(model.reconstruct(mu, vi, x[:, None])[:, 0])
-    return corrected_pair(vi, kept.energy_of(vi), u, np.maximum(model.generators @ alpha, 0.0))
+    return corrected_pair(vi, cache.energy_of(vi), u, np.maximum(model.generators @ alpha, 0.0))
 
 
 def _share(omega: float, rho: float) -> float:

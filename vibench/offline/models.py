@@ -25,6 +25,7 @@ from vibench.interfaces.formulations import (
     FormulationAnswer,
     FormulationModel,
     Multiplier,
+    OfflinePhase,
     QuerySettings,
 )
 from vibench.interfaces.parameters import ParameterBox
@@ -50,13 +51,8 @@ from vibench.timing import timed
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vibench.offline.reduction import Reduction
-
 Parameters = Sequence[float] | Array | Mapping[str, float]
 """A parameter mu: its components in the order of `ParameterBox.names`, or by these names."""
-
-BLOCK = 256
-"""Programs that `Model.solve_all` assembles at once."""
 
 ACCURACY = 1e-7
 """Accuracy of formulations without an axis of accuracies."""
@@ -266,7 +262,7 @@ class Model:
     """
 
     formulation: Formulation
-    offline: Reduction = field(repr=False)
+    offline: OfflinePhase = field(repr=False)
     built: Mapping[str, Any] = field(repr=False)
     solver: str | None
     accuracy: float
@@ -290,7 +286,8 @@ class Model:
     @property
     def problem(self) -> Problem:
         """The high-fidelity problem."""
-        return self.offline.problem
+        problem: Problem = self.offline.problem
+        return problem
 
     @property
     def parameters(self) -> ParameterBox:
@@ -331,7 +328,8 @@ class Model:
                 f"the formulation {type(self.formulation).__name__} has no quadratic program that could be replayed, "
                 "corrected or exported"
             )
-        return self.online.reduced
+        reduced: AnyReducedModel = self.online.reduced
+        return reduced
 
     @property
     def solves_programs(self) -> bool:
@@ -541,8 +539,8 @@ class Model:
 
         Its columns are the parameters by name, status, reason and the worst residual; of a model with bounds these
         and the verdict; `output:NAME` and with bounds `bound:NAME` of every quantity of interest; and CPU seconds.
-        Reduced assembly evaluates the sums of terms of up to `BLOCK` programs at once, and each is said to have taken
-        an equal share of the seconds; programs are solved one after the other.
+        Reduced assembly evaluates the sums of terms of up to 256 programs at once, and each row has an equal part of
+        the seconds; programs are solved one after the other.
 
         Raises
         ------
@@ -559,8 +557,9 @@ class Model:
         if not self.solves_programs:
             return pd.DataFrame([self._answered(at, settings).columns() for at in points])
         rows = []
-        for start in range(0, len(points), BLOCK):
-            block = points[start : start + BLOCK]
+        for start in range(0, len(points), 256):
+            # Blocks bound the memory of the programs that are assembled together.
+            block = points[start : start + 256]
             if isinstance(self.reduced, HyperReducedModel):
                 together, spent = timed(partial(self.reduced.assemble_all, np.array(block)))
                 assembled = ((reduced, spent.cpu / len(block)) for reduced in together)
@@ -590,8 +589,8 @@ class Model:
         return HighFidelitySolver(self.problem)
 
 
-def parameter_in(box: ParameterBox, mu: Parameters, stacklevel: int = 3) -> Array:
-    """A parameter as an array (d,); outside the box there is a warning of the caller so many calls above.
+def parameter_in(box: ParameterBox, mu: Parameters) -> Array:
+    """A parameter as an array (d,); outside the box there is a warning of the caller of the caller.
 
     Raises a `RequestError` if it is no parameter of the box.
     """
@@ -612,7 +611,7 @@ def parameter_in(box: ParameterBox, mu: Parameters, stacklevel: int = 3) -> Arra
     if outside := [name for name, out in zip(box.names, box.outside(at), strict=True) if out]:
         warnings.warn(
             f"{', '.join(outside)}: outside the parameter domain, where the model was not trained",
-            stacklevel=stacklevel,
+            stacklevel=3,
         )
     return at
 

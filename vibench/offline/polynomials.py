@@ -19,13 +19,13 @@ from vibench.model.galerkin import projections
 from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel, hyper_reduce
 
 TOLERANCE = 1e-11
-"""Largest relative error of a polynomial where nothing else is asked for; solutions then agree to 1e-9 and better."""
+"""Default of the largest relative error of a polynomial; solutions then agree to 1e-9 and better."""
 
 EVALUATIONS = 4096
-"""Points of the largest grid on which the members are interpolated, where nothing else is asked for."""
+"""Default of the largest number of points of the interpolation grid."""
 
 Beside = Callable[[Mapping[str, Array]], Mapping[str, Array]]
-"""What else is to be interpolated, from the θ of the members at a parameter."""
+"""Function from the θ of the members at a parameter to further arrays that are interpolated."""
 
 
 class InaccurateError(RequestError):
@@ -48,10 +48,9 @@ def member_polynomials(
 ) -> tuple[AnyReducedModel, dict[str, AffinePolynomial]]:
     """The model whose members are evaluated, see `declared_model`, and polynomials of the members.
 
-    A is a packed upper triangle (row by row). With `fixed` a basis that depends on the parameter is refused; what is
-    interpolated `beside` the members has polynomials, too. Of these, the `rotated` ones are the θ of A times a
-    matrix, by name: one polynomial serves them and A. `check` may refuse a model by its program at one parameter,
-    before it is interpolated.
+    A is a packed upper triangle (row by row). With `fixed` a basis that depends on the parameter is refused. The
+    arrays of `beside` have polynomials, too. Those in `rotated` are the θ of A times a matrix, by name: one polynomial
+    serves them and A. `check` may refuse a model by its program at one parameter, before it is interpolated.
 
     Raises
     ------
@@ -83,7 +82,8 @@ def member_polynomials(
         )
     except NumericalError as error:
         raise RequestError(f"the model cannot be evaluated in the whole parameter box: {error}") from None
-    except (ArithmeticError, ValueError, LookupError) as error:  # what the code of a problem raises
+    except (ArithmeticError, ValueError, LookupError) as error:
+        # The code of a problem may raise any of these at the corners of its box.
         raise RequestError(f"the model cannot be evaluated in the whole parameter box: {in_a_line(error)}") from None
     _refuse_inaccurate(polynomials, tolerance)
     return queried, polynomials
@@ -106,7 +106,8 @@ def declared_model(queried: AnyReducedModel) -> AnyReducedModel:
     if queried.enrichment.supply is not None or not set(MEMBERS) <= {*problem.constant, *problem.affine}:
         check_affine(problem, training)
         return queried
-    members = affine_decomposition(problem, training, tolerance=TOLERANCE)  # nothing is left to interpolate
+    # All members are declared, so that nothing is left to interpolate.
+    members = affine_decomposition(problem, training, tolerance=TOLERANCE)
     return HyperReducedModel(queried, hyper_reduce(queried, members))
 
 
@@ -161,7 +162,7 @@ def _evaluated(
     beside: Beside | None,
     mu: Array,
 ) -> dict[str, Array]:
-    """The members as flat arrays, and what is interpolated beside them; of sums of known terms the θ of a member."""
+    """Flat arrays of the members and those of `beside`; in place of a sum of known terms its θ."""
     theta = coefficients_of(queried, mu)
     found = _packed(members_of(queried, mu, theta), size, mu)
     others = dict(beside(theta) if beside is not None else {})

@@ -11,6 +11,7 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import RequestError, UnsupportedError
+from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.formulations import Formulation, axes_of
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import (
@@ -39,7 +40,6 @@ from vibench.model.hyperreduced import (
     reason_for_full_assembly,
 )
 from vibench.offline.models import Model, check_built
-from vibench.offline.sweep import Snapshots, high_fidelity_sweep
 from vibench.plugins import registry
 from vibench.plugins.kinds import FORMULATION
 from vibench.reduction.pod import POD, pod
@@ -48,6 +48,30 @@ from vibench.text import brief
 
 Assembly: TypeAlias = Literal["full", "reduced"]
 """How a model assembles its programs, as in a study."""
+
+
+@dataclass(frozen=True)
+class Snapshots:
+    """High-fidelity solutions at some parameters.
+
+    Attributes
+    ----------
+    mu
+        Parameters (P×d).
+    u, lam
+        Columns u(mu) (n×P) and λ(mu) (m×P).
+    """
+
+    mu: Array
+    u: Array
+    lam: Array
+
+
+def high_fidelity_sweep(problem: Problem, mus: Array) -> Snapshots:
+    """High-fidelity solutions of a problem at parameters (P×d), one after the other."""
+    solver = HighFidelitySolver(problem)
+    solutions = [solver.solve(mu) for mu in mus]
+    return Snapshots(mus, np.column_stack([s.u for s in solutions]), np.column_stack([s.lam for s in solutions]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,7 @@ from vibench.model.chebyshev import AffinePolynomial
 from vibench.model.hyperreduced import ProjectedMember, ReducedOperators
 from vibench.offline.compiled import CompiledModel
 from vibench.offline.models import ACCURACY, Model, check_built
-from vibench.offline.reduction import Reduction
-from vibench.offline.sweep import Snapshots
+from vibench.offline.reduction import Reduction, Snapshots
 from vibench.plugins.plugin import Plugin
 from vibench.reduction.pod import POD
 from vibench.reduction.supremizers import ContactCoordinates, LoadCoordinates, SpannedCoordinates

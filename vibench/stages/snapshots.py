@@ -20,7 +20,7 @@ from vibench.linalg.inner_product import InnerProduct
 from vibench.model.certificates.greedy import GreedyTrainer
 from vibench.model.error_bounds import reference_bound
 from vibench.offline.assemblies import assemblies
-from vibench.offline.sweep import Snapshots
+from vibench.offline.reduction import Snapshots
 from vibench.plugins.kinds import PROBLEM
 from vibench.plugins.plugin import Plugin
 from vibench.qp.scaling import nearby

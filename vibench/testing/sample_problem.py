@@ -15,8 +15,7 @@ from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import Problem, Sampler, VariationalInequality
 from vibench.interfaces.strategies import Cone, DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, Stop
 from vibench.linalg.inner_product import InnerProduct
-from vibench.offline.reduction import Reduction
-from vibench.offline.sweep import Snapshots, high_fidelity_sweep
+from vibench.offline.reduction import Reduction, Snapshots, high_fidelity_sweep
 from vibench.reduction.cones import greedy_cone
 from vibench.reduction.supremizers import supremizers
 from vibench.testing.case import Arrays

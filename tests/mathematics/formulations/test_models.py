@@ -13,7 +13,7 @@ from transformed import Transformed
 import vibench
 from vibench import Enrichment, Formulation, Kind, Offline, PrimalStrategy, Reduction, Snapshots, Stop, UnsupportedError
 from vibench.offline.models import Model
-from vibench.offline.sweep import high_fidelity_sweep
+from vibench.offline.reduction import high_fidelity_sweep
 from vibench.stages import formulation as _  # noqa: F401  lists the classes that formulations may store
 from vibench.stages.serialisation import dumps, loads
 from vibench_problems.obstacle import Obstacle

@@ -8,8 +8,7 @@ import pytest
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolver, solve_high_fidelity
 from vibench.interfaces.strategies import Stop
-from vibench.offline.reduction import Reduction
-from vibench.offline.sweep import high_fidelity_sweep
+from vibench.offline.reduction import Reduction, high_fidelity_sweep
 from vibench.reduction.supremizers import proportionality
 from vibench.stability.infsup import inf_sup_full, inf_sup_on
 from vibench_problems.hertz import Hertz
