@@ -158,9 +158,10 @@ def test_there_is_no_program_of_a_model_that_is_too_large_or_not_smooth_enough(
         raise AssertionError("a model that is too large was interpolated before it was refused")
 
     with monkeypatch.context() as patched:
-        patched.setattr(compiled, "STACK", 100)
+        large = VariationalInequality(np.eye(400), np.ones(400), np.eye(400), np.ones(400))
+        patched.setattr(polynomials, "members_of", lambda *_: large)
         patched.setattr(polynomials, "interpolate_on_box", interpolated)
-        with pytest.raises(UnsupportedError, match="MiB of arrays on the stack"):
+        with pytest.raises(UnsupportedError, match=r"400 constraints has 8\.5 MiB of arrays on the stack"):
             CompiledModel.of(reduced, 1e-9)
 
     def inaccurate(*_: object, **__: object) -> None:
