@@ -8,6 +8,7 @@ import subprocess
 import warnings
 from collections.abc import Callable
 from importlib.resources import files
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -40,10 +41,8 @@ STRICT = ("-std=c99", "-pedantic", "-O2", "-Wall", "-Wextra", "-Wshadow", "-Wstr
 
 def library(file: Path, strict: tuple[str, ...] = STRICT) -> ctypes.CDLL:
     """A C source, compiled without a warning."""
-    done = subprocess.run(
-        [str(COMPILER), *strict, "-shared", "-fPIC", "-o", file.with_suffix(".so"), file, "-lm"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    command = [str(COMPILER), *strict, "-shared", "-fPIC", "-o", file.with_suffix(".so"), file, "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return ctypes.CDLL(str(file.with_suffix(".so")))
 
@@ -86,7 +85,6 @@ def test_a_c_source_gives_the_answers_of_the_model(model: vibench.Model, tmp_pat
         assert code == 0
         assert residuals.max() <= 1e-12
         exact = exact_solution(model.reduced.assemble(mu).program)
-        assert exact is not None
         assert np.linalg.norm(x - exact.x) <= 1e-9 * np.linalg.norm(exact.x)
         if exact.unique:
             assert np.linalg.norm(alpha - exact.alpha) <= 1e-9 * np.linalg.norm(exact.alpha)
@@ -106,11 +104,8 @@ Certify = Callable[[np.ndarray, bool], tuple[int, np.ndarray, np.ndarray, np.nda
 def certify(model: vibench.Model, file: Path, tolerance: float) -> Certify:
     """The functions of the C source of a model: the code, u, λ and three bounds at a parameter, corrected or not."""
     arrays = export_model(model, file, tolerance=tolerance, evaluations=6000, c=True).arrays
-    found, (rows, loads), basis = (
-        library(file.with_suffix(".c")),
-        arrays["certificate_responses"].shape,
-        arrays["basis"],
-    )
+    found, (rows, loads) = library(file.with_suffix(".c")), arrays["certificate_responses"].shape
+    basis = arrays["basis"]
 
     def certified(mu: np.ndarray, corrected: bool) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
         x, alpha, residuals = np.zeros(basis.shape[1]), np.zeros(arrays["generators"].shape[1]), np.zeros(3)
@@ -133,9 +128,8 @@ def assert_bounded(model: vibench.Model, mu: np.ndarray, u: np.ndarray, lam: np.
 def test_errors_of_polynomials_are_in_the_bounds(tmp_path: Path) -> None:
     """A model whose own error is smaller than what its coarse polynomials miss."""
     problem = [{"name": "obstacle", "options": {"resolution": 150}}]
-    study = small_study(
-        "tight", problem, assembly=["reduced"], bounds=[True], tolerances=[{"pod": [1e-6], "dual": [1e-4]}]
-    )
+    tolerances = [{"pod": [1e-6], "dual": [1e-4]}]
+    study = small_study("tight", problem, assembly=["reduced"], bounds=[True], tolerances=tolerances)
     model = model_of(vibench.run(study, tmp_path / "run", progress=False, jobs=1), "obstacle", "certified")
     certified = certify(model, tmp_path / "model.npz", tolerance=1e-2)
     assert model.certificate is not None
@@ -176,15 +170,28 @@ class Expressed(AffineProblem):
         return self.parameters.grid(4, 4)
 
 
+def assert_certified_alike(
+    model: vibench.Model, certified: Certify, tolerances: tuple[float, ...], of_u: float, bounded: bool = False
+) -> None:
+    """The C source has the bounds and the pair of the model, corrected or not; `bounded` compares with the truth."""
+    for mu, corrected in product(model.parameters.sample(20, seed=5), (False, True)):
+        own = model.solve(mu, accuracy=1e-13, corrected=corrected)
+        assert own.answer.is_corrected is corrected
+        code, u, lam, bounds = certified(mu, corrected)
+        assert code == 0
+        assert np.linalg.norm(u - own.u) <= of_u * np.linalg.norm(own.u)
+        assert np.linalg.norm(lam - own.lam) <= 1e-9 * np.linalg.norm(own.lam)
+        for bound, name, rel in zip(bounds, ("u_energy", "lambda_natural", "relative"), tolerances, strict=True):
+            assert bound == pytest.approx(getattr(own.bound, name), rel=rel), name
+        if bounded:
+            assert_bounded(model, mu, u, lam, bounds)
+
+
 def test_expressions_are_exact_in_c_and_bounds_are_certified(tmp_path: Path) -> None:
     """The same numbers as those of vibench to round-off, though no polynomial of the file reaches that."""
     dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
-    loose = vibench.Stop(tolerance=1e-1)
-    reduction = vibench.Reduction(
-        Expressed(), dual, primal, loose, loose, tolerance=0.3, assembly="reduced", bounds=True
-    )
-    model = reduction.model
-    assert model.certificate is not None
+    strategies = dual, primal, vibench.Stop(tolerance=1e-1), vibench.Stop(tolerance=1e-1)
+    model = vibench.Reduction(Expressed(), *strategies, tolerance=0.3, assembly="reduced", bounds=True).model
     assert model.certificate.base.guarantee is Guarantee.CERTIFIED
     whole = exported(model, tolerance=1e-2, c=True)
     assert set(whole.exact) == {*"AfBg", "theta_A", "theta_f", "theta_B", "theta_g"}
@@ -192,37 +199,16 @@ def test_expressions_are_exact_in_c_and_bounds_are_certified(tmp_path: Path) -> 
     assert whole.error > 1e-8
     certified = certify(model, tmp_path / "model.npz", tolerance=1e-2)
     assert "the bounds are\n * certified" in (tmp_path / "model.h").read_text()
-    for mu in model.parameters.sample(20, seed=5):
-        for corrected in (False, True):
-            own = model.solve(mu, accuracy=1e-13, corrected=corrected)
-            assert own.bound is not None
-            code, u, lam, bounds = certified(mu, corrected)
-            assert code == 0
-            expected = own.bound.u_energy, own.bound.lambda_natural, own.bound.relative
-            assert bounds == pytest.approx(expected, rel=1e-7)
-            assert np.linalg.norm(u - own.u) <= 1e-10 * np.linalg.norm(own.u)
-            assert np.linalg.norm(lam - own.lam) <= 1e-9 * np.linalg.norm(own.lam)
-            assert_bounded(model, mu, u, lam, bounds)
+    assert_certified_alike(model, certified, (1e-7, 1e-7, 1e-7), 1e-10, bounded=True)
 
 
 @pytest.mark.parametrize("problem", PROBLEMS)
-def test_a_c_source_has_the_bounds_and_the_corrected_pair_of_the_model(
+def test_a_c_source_has_the_bounds_and_the_pair_of_the_model(
     problem: str, small_run: vibench.Run, tmp_path: Path
 ) -> None:
     model = model_of(small_run, problem, "certified")
     certified = certify(model, tmp_path / "model.npz", tolerance=2e-13)
-    for mu in model.parameters.sample(20, seed=5):
-        for corrected in (False, True):
-            own = model.solve(mu, accuracy=1e-13, corrected=corrected)
-            assert own.bound is not None
-            assert own.answer.is_corrected is corrected
-            code, u, lam, bounds = certified(mu, corrected)
-            assert code == 0
-            assert np.linalg.norm(u - own.u) <= 1e-9 * np.linalg.norm(own.u)
-            assert np.linalg.norm(lam - own.lam) <= 1e-9 * np.linalg.norm(own.lam)
-            assert bounds[0] == pytest.approx(own.bound.u_energy, rel=1e-9)
-            assert bounds[1] == pytest.approx(own.bound.lambda_natural, rel=1e-9)
-            assert bounds[2] == pytest.approx(own.bound.relative, rel=2e-9)  # and of ‖u‖
+    assert_certified_alike(model, certified, (1e-9, 1e-9, 2e-9), 1e-9)  # the last one has the error of ‖u‖, too
     assert certified(model.parameters.upper, corrected=True)[0] == 0
     code, u, lam, bounds = certified(model.parameters.upper * 1.001, corrected=True)
     assert code == 4
@@ -232,7 +218,7 @@ def test_a_c_source_has_the_bounds_and_the_corrected_pair_of_the_model(
 
 
 @pytest.mark.parametrize("problem", PROBLEMS)
-def test_outputs_are_those_of_the_model_in_script_and_c_and_their_bounds_in_c(
+def test_outputs_and_their_bounds_are_those_of_the_model(
     problem: str, small_run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = model_of(small_run, problem, "certified")
@@ -245,9 +231,9 @@ def test_outputs_are_those_of_the_model_in_script_and_c_and_their_bounds_in_c(
     )
     monkeypatch.setattr(type(model.problem), "outputs", outputs)
     whole = export_model(model, tmp_path / "model.npz", tolerance=2e-13, evaluations=6000, c=True)
-    about, data = whole.about, whole.arrays
-    assert about["outputs"]["left_out"] == ["squared"]
-    names = [output["name"] for output in about["outputs"]["linear"]]
+    data, written = whole.arrays, whole.about["outputs"]
+    assert written["left_out"] == ["squared"]
+    names = [output["name"] for output in written["linear"]]
     assert names == ["load", "force */", "both"]
     found, script = library(tmp_path / "model.c"), Exported(tmp_path / "model.npz")
     x, alpha, residuals = np.zeros(data["basis"].shape[1]), np.zeros(data["generators"].shape[1]), np.zeros(3)
@@ -285,10 +271,10 @@ def test_outputs_are_those_of_the_model_in_script_and_c_and_their_bounds_in_c(
 def test_a_certificate_without_outputs_and_outputs_without_a_certificate(
     small_run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for assembly, outputs in (("certified", ()), ("reduced", (Output("s", "1", u=np.ones(1)),))):
+    for assembly in ("certified", "reduced"):
         model = model_of(small_run, "radial-obstacle", assembly)
-        given = tuple(Output(one.name, one.unit, u=np.ones(model.problem.V.dim)) for one in outputs)
-        monkeypatch.setattr(type(model.problem), "outputs", given)
+        outputs = (Output("s", "1", u=np.ones(model.problem.V.dim)),) if assembly == "reduced" else ()
+        monkeypatch.setattr(type(model.problem), "outputs", outputs)
         folder = tmp_path / assembly
         found = export_model(model, folder / "model.npz", c=True)
         library(folder / "model.c")
@@ -303,12 +289,9 @@ def test_a_certificate_without_outputs_and_outputs_without_a_certificate(
 @pytest.mark.parametrize("steps", [30, 1])  # after one step all that is not done goes to the other method
 def test_both_methods_of_the_correction_in_c_find_that_of_vibench(steps: int, tmp_path: Path) -> None:
     size, zeros = 8, np.zeros(8)
-    text = (
-        files("vibench.offline")
-        .joinpath("templates", "reduced_model_certificate.c.template")
-        .read_text(encoding="utf-8")
-    )
-    basic = files("vibench.offline").joinpath("templates", "reduced_model.c.template").read_text(encoding="utf-8")
+    folder = files("vibench.offline") / "templates"
+    text = (folder / "reduced_model_certificate.c.template").read_text(encoding="utf-8")
+    basic = (folder / "reduced_model.c.template").read_text(encoding="utf-8")
     parts = [
         "#include <float.h>\n#include <math.h>\n#include <string.h>\n"
         f"enum {{ LOADS = {size}, STEPS = {steps} }};\n"
@@ -355,9 +338,8 @@ def test_terms_that_a_problem_declares_are_exported_as_they_are(model: vibench.M
         for q, term in enumerate(declared[name].terms):
             projected = model.reduced.generators.T @ (term if name == "g" else term @ model.reduced.basis)
             assert np.allclose(terms[q], np.ravel(projected), rtol=1e-12, atol=1e-15)
-        assert np.allclose(
-            products(found.members[name].indices, unit[None]) @ found.members[name].coefficients, theta[name]
-        )
+        values = products(found.members[name].indices, unit[None]) @ found.members[name].coefficients
+        assert np.allclose(values, theta[name])
 
 
 def linear(constant: np.ndarray, factors: dict[int, int], dimension: int) -> AffinePolynomial:
@@ -379,10 +361,20 @@ DEPENDENT = {
 }
 
 
+def about(names: list[str], **cell: str) -> dict[str, Any]:
+    return {
+        "parameters": {"names": names, "units": ["1"] * len(names)},
+        "cell": dict.fromkeys(("problem", "dual", "primal", "cell"), "") | cell,
+        "source": {"distribution": "none", "licence": "MIT"},
+        "exported_by": "a test",
+        "accuracy": 1e-9,
+    }
+
+
 @pytest.mark.parametrize("scale", [1.0, 1e-6, 1e6])
 @pytest.mark.parametrize("case", DEPENDENT)
 def test_any_constraints(case: str, scale: float, tmp_path: Path) -> None:
-    """f and g are the parameters: one source solves many programs, degenerate and contradictory ones among them."""
+    """One source solves many programs, degenerate and contradictory ones among them: f and g are the parameters."""
     B = DEPENDENT[case]
     count, n = B.shape
     factor = np.random.default_rng(1).standard_normal((n, n))
@@ -394,18 +386,11 @@ def test_any_constraints(case: str, scale: float, tmp_path: Path) -> None:
         "B": linear(B, {}, dimension),
         "g": linear(np.zeros(count), {n + k: k for k in range(count)}, dimension),
     }
-    about = {
-        "parameters": {"names": ["*/ evil \\"] * dimension, "units": ["1"] * dimension},
-        "cell": {"problem": "*/", "dual": "??/", "primal": "é", "cell": "0"},
-        "source": {"distribution": "none", "licence": "MIT"},
-        "exported_by": "a test",
-        "accuracy": 1e-9,
-    }
+    words = about(["*/ evil \\"] * dimension, problem="*/", dual="??/", primal="é")
     arrays = {"lower": -np.ones(dimension), "upper": np.ones(dimension)}
-    (tmp_path / "case.c").write_text(c_source.source(members, arrays, about, "case")[0], encoding="utf-8")
+    (tmp_path / "case.c").write_text(c_source.source(members, arrays, words, "case")[0], encoding="utf-8")
     solve = compiled(tmp_path / "case.c", n, count)
-    random = np.random.default_rng(2)
-    codes = []
+    random, codes = np.random.default_rng(2), []
     for trial in range(300):
         mu = random.uniform(-1.0, 1.0, dimension)
         mu[random.random(dimension) < 0.2] = 0.0
@@ -429,11 +414,6 @@ def test_any_constraints(case: str, scale: float, tmp_path: Path) -> None:
 
 def test_matrices_that_are_not_positive_definite_fail(tmp_path: Path) -> None:
     one = {name: linear(np.array([value]), {}, 1) for name, value in zip("AfBg", (-1.0, 1.0, 1.0, 1.0), strict=True)}
-    about = {
-        "parameters": {"names": ["t"], "units": ["1"]},
-        "cell": dict.fromkeys(("problem", "dual", "primal", "cell"), ""),
-        "source": {"distribution": "", "licence": ""}, "exported_by": "", "accuracy": 1e-9,
-    }  # fmt: skip
-    text = c_source.source(one, {"lower": np.zeros(1), "upper": np.ones(1)}, about, "9-lives")[0]
+    text = c_source.source(one, {"lower": np.zeros(1), "upper": np.ones(1)}, about(["t"]), "9-lives")[0]
     (tmp_path / "model_9_lives.c").write_text(text, encoding="utf-8")
     assert compiled(tmp_path / "model_9_lives.c", 1, 1)(np.array([0.5]))[0] == 3

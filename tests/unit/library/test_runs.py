@@ -73,7 +73,6 @@ def test_a_run_is_opened_where_it_is(run: vibench.Run, tmp_path: Path, monkeypat
 def test_a_run_is_continued_and_followed(run: vibench.Run, capsys: pytest.CaptureFixture[str]) -> None:
     following = Following()
     vibench.run(vibench.Study(**SETTINGS), run.path.parent, observer=following)
-    assert following.agenda is not None
     assert (following.agenda.to_run, following.cells) == (0, 0)
     assert not capsys.readouterr().out
     vibench.run(vibench.Study(**SETTINGS), run.path.parent)
@@ -85,21 +84,15 @@ def test_figures_and_findings(run: vibench.Run) -> None:
     assert isinstance(figure, matplotlib.figure.Figure)
     assert figure.axes
     assert any(title.startswith("radial-obstacle, cpg") for title in run.findings)
-
-
-@pytest.mark.parametrize(
-    ("kind", "options", "line"),
-    [
+    for kind, options, line in (
         ("infsup", {}, "no figure is called 'infsup'; did you mean 'inf-sup'"),
         ("inf-sup", {}, "the figure is of one dual strategy: name one of cpg, mcpg"),
         ("inf-sup", {"dual": "gpc"}, "no dual strategy is called 'gpc'"),
         ("errors", {"problem": "hertz"}, "no problem is called 'hertz'"),
         ("precision", {}, "no data for the figure 'precision' of radial-obstacle"),
-    ],
-)
-def test_a_figure_that_there_is_not(run: vibench.Run, kind: str, options: dict[str, str], line: str) -> None:
-    with pytest.raises(vibench.RequestError, match=line):
-        run.figure(kind, **options)
+    ):
+        with pytest.raises(vibench.RequestError, match=line):
+            run.figure(kind, **options)
 
 
 def test_a_notebook_shows_the_summary_of_a_run(run: vibench.Run) -> None:
@@ -133,23 +126,17 @@ def test_what_a_run_writes(run: vibench.Run, tmp_path: Path, monkeypatch: pytest
         assert ("<img" in page) == shown
 
 
-@pytest.mark.parametrize(
-    ("changes", "line"),
-    [
+def test_a_wrong_study_or_request_says_so_in_one_line(run: vibench.Run) -> None:
+    for changes, line in (
         ({"problem": ["radial-obstacel"]}, "did you mean 'radial-obstacle'"),
         ({"validatoin": 3}, "no key is called 'validatoin'; did you mean 'validation'"),
         ({"validation": 0}, "validation: .*(found 0)"),
         ({"name": "../up"}, "name: letters, digits"),
         ({"tolerances": [{"pod": [1e-2], "dual": [1e-1]}]}, "gives nothing for 'offline-pga'"),
-    ],
-)
-def test_a_wrong_study_says_so_in_one_line(changes: dict[str, Any], line: str) -> None:
-    with pytest.raises(vibench.RequestError, match=line) as caught:
-        vibench.Study(**SETTINGS | changes)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_wrong_request_for_a_run(run: vibench.Run) -> None:
+    ):
+        with pytest.raises(vibench.RequestError, match=line) as caught:
+            vibench.Study(**SETTINGS | changes)
+        assert "\n" not in str(caught.value)
     with pytest.raises(vibench.RequestError, match="no table is called 'cell'; did you mean 'cells'"):
         run.table("cell")
     with pytest.raises(vibench.RequestError, match="jobs is -1"):

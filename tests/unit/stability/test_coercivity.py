@@ -8,13 +8,7 @@ from numerics import Varying, space, spd
 
 from vibench.errors import NumericalError
 from vibench.stability import coercivity
-from vibench.stability.coercivity import (
-    MARGINS,
-    Constant,
-    coercivity_and_continuity,
-    energy_inf_sup,
-    moved,
-)
+from vibench.stability.coercivity import MARGINS, Constant, coercivity_and_continuity, energy_inf_sup, moved
 
 
 def assert_close(constants: tuple[Constant, Constant], values: np.ndarray) -> None:

@@ -17,14 +17,7 @@ from vibench.model.errors import UNMEASURABLE, EnergyNorm, ReferenceSolutions, e
 from vibench.model.hsw_bounds import hsw_bounds
 from vibench.reduction.supremizers import constraint_classes
 from vibench.stability.coercivity import Stability, coercivity_and_continuity, energy_inf_sup
-from vibench.stability.infsup import (
-    cone_basis,
-    constants_full,
-    constants_on,
-    inf_sup_full,
-    inf_sup_on,
-    nodal_cone,
-)
+from vibench.stability.infsup import cone_basis, constants_full, constants_on, inf_sup_full, inf_sup_on, nodal_cone
 
 
 def energy(vi: VariationalInequality) -> EnergyNorm:

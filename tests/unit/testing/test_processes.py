@@ -18,12 +18,7 @@ from running import PATIENCE, Main
 
 from vibench import testing
 from vibench.execution.isolated import NotImportableError
-from vibench.testing.checks import (
-    CheckResult,
-    ConformanceError,
-    Verdict,
-    call_in_other_process,
-)
+from vibench.testing.checks import CheckResult, ConformanceError, Verdict, call_in_other_process
 from vibench.testing.problems import ProblemCase
 
 

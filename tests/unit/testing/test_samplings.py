@@ -137,10 +137,7 @@ WRONG: Mapping[type[Sampling], tuple[str, str]] = {
     Reseeds: ("no mutation", "1 parameter: parameters changes NumPy's global random numbers"),
     Narrows: ("no mutation", "1 parameter: parameters changes box.lower; work on copies"),
     Raises: ("parameters", "ArithmeticError: no points today (test_samplings.py, line "),
-    Picky: (
-        "parameters",
-        "(position, height, stiffness) is accepted: only on Sundays",
-    ),
+    Picky: ("parameters", "(position, height, stiffness) is accepted: only on Sundays"),
     Unpicklable: ("pickling", "the Unpicklable cannot be pickled"),
     Idle: ("training", "1 parameter: train solves nowhere; expected a training parameter at least"),
     Endless: ("training", "train does not end after 5000 solutions"),
