@@ -47,38 +47,27 @@ def completed(line: str) -> list[str]:
     return [item.value for item in (option or arguments[0]).shell_complete(context, last)]
 
 
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ("vibench run quick --problem ob", ["obstacle"]),
-        ("vibench run quick --dual ", [name for name, plugin in registered(DUAL).items() if not plugin.package]),
-        ("vibench run quick --primal o", ["offline-pga", "online-supremizers"]),
-        ("vibench run quick --solver ", sorted(SETTINGS)),
-        ("vibench run quick --correction ", ["auto", "feasible", "none"]),
-        ("vibench check o", ["obstacle", "offline-pga", "online-supremizers", "orthant"]),
-        ("vibench check sol", ["solver:"]),
-        ("vibench check solver:p", ["solver:piqp", "solver:proxqp"]),
-        ("vibench check dual:c", ["dual:cpg"]),
-        ("vibench check pri", ["primal:"]),
-        ("vibench check primal:o", ["primal:offline-pga", "primal:online-supremizers"]),
-        ("vibench check obstacle --option res", ["resolution="]),
-        ("vibench check problem:radial-obstacle --option ", ["length=", "resolution="]),
-        ("vibench show quick --columns cell,beta_span", ["cell,beta_span_min"]),
-        ("vibench show quick --table thresholds --sort -threshold_l", ["-threshold_low"]),
-        ("vibench show quick --table best --columns error_b", ["error_below"]),
-        ("vibench show quick --table benefits --columns error_", ["error_a", "error_b"]),
-        ("vibench show quick --error ", ["lambda", "output:", "solution", "u"]),
-        ("vibench compare a b --column onl", [name for name in sorted(STORED["cells"]) if name.startswith("onl")]),
-        ("vibench list s", ["sampling", "solvers", "studies"]),
-        ("vibench show quick --table th", ["thresholds"]),
-        ("vibench show quick --table s", ["summary"]),
-    ],
-)
-def test_values_are_completed_with_what_there_is(line: str, words: list[str]) -> None:
-    assert completed(line) == words
-
-
-def test_the_lists_and_tables_offered_are_all_there_are() -> None:
+def test_values_are_completed_with_what_there_is() -> None:
+    for line, *words in (
+        ("run quick --problem ob", "obstacle"),
+        ("run quick --dual ", *(name for name, plugin in registered(DUAL).items() if not plugin.package)),
+        ("run quick --primal o", "offline-pga", "online-supremizers"), ("run quick --solver ", *sorted(SETTINGS)),
+        ("run quick --correction ", "auto", "feasible", "none"),
+        ("check o", "obstacle", "offline-pga", "online-supremizers", "orthant"), ("check sol", "solver:"),
+        ("check solver:p", "solver:piqp", "solver:proxqp"), ("check dual:c", "dual:cpg"), ("check pri", "primal:"),
+        ("check primal:o", "primal:offline-pga", "primal:online-supremizers"),
+        ("check obstacle --option res", "resolution="),
+        ("check problem:radial-obstacle --option ", "length=", "resolution="),
+        ("show quick --columns cell,beta_span", "cell,beta_span_min"),
+        ("show quick --table thresholds --sort -threshold_l", "-threshold_low"),
+        ("show quick --table best --columns error_b", "error_below"),
+        ("show quick --table benefits --columns error_", "error_a", "error_b"),
+        ("show quick --error ", "lambda", "output:", "solution", "u"),
+        ("compare a b --column onl", *(name for name in sorted(STORED["cells"]) if name.startswith("onl"))),
+        ("list s", "sampling", "solvers", "studies"), ("show quick --table th", "thresholds"),
+        ("show quick --table s", "summary"),
+    ):  # fmt: skip
+        assert completed(f"vibench {line}") == words, line
     assert set(completion.lists("")) == set(LISTS)
     assert set(completion.table_names("")) == set(completion.SHOWN) == set(VIEWS) > set(TABLES)
 
@@ -98,13 +87,10 @@ class TestFiles:
         assert completion.studies("nowhere/") == []
 
     def test_runs_are_the_folders_with_results(self) -> None:
-        for name in ("mine", "more", "other"):
+        for name in ("mine", "more", "other", "m\x1b[2J", "m\nrm"):  # a prompt would obey the last two
             Path("runs", name).mkdir(parents=True)
-        for name in ("mine", "other"):
-            Path("runs", name, FILE).touch()
-        for name in ("m\x1b[2J", "m\nrm"):  # a prompt would obey them
-            Path("runs", name).mkdir()
-            Path("runs", name, FILE).touch()
+            if name != "more":
+                Path("runs", name, FILE).touch()
         assert completed("vibench show ") == ["mine", "other"]
         assert completed("vibench replay m") == completed("vibench report m") == ["mine"]
         assert completed("vibench compare mine o") == ["other"]
@@ -128,52 +114,42 @@ def test_a_name_that_two_packages_register_is_completed_once(register: Register)
 
 
 def test_the_installed_command_completes_for_bash(command: str, tmp_path: Path) -> None:
-    asked = {"_VIBENCH_COMPLETE": "complete_bash", "COMP_WORDS": "vibench run paper-", "COMP_CWORD": "2"}
-    done = subprocess.run([command], cwd=tmp_path, env=os.environ | asked, capture_output=True, text=True, check=False)
-    words = done.stdout.split()
-    assert (words[:2], done.stderr) == (["paper-hertz", "paper-obstacle"], "")
-    assert all(word.startswith("paper-") for word in words)  # other packages may have some, too
-
-
-@pytest.mark.parametrize(
-    ("words", "completed"),
-    [
+    """Words that bash breaks are completed after the break; other packages may have further ones."""
+    for words, expected in (
+        (["run", "paper-"], ["paper-hertz", "paper-obstacle"]),
         (["check", "primal", ":", "of"], ["offline-pga"]),
         (["check", "dual", ":"], ["angle-greedy", "cpg"]),
         (["check", "obstacle", "--option", "reso"], ["resolution="]),
         (["run", "--fr"], ["--fresh"]),
-    ],
-)
-def test_words_that_bash_breaks_are_completed_after_the_break(
-    words: list[str], completed: list[str], command: str, tmp_path: Path
-) -> None:
-    asked = {"_VIBENCH_COMPLETE": "complete_bash", "COMP_WORDS": "\n".join(["vibench", *words])}
-    asked["COMP_CWORD"] = str(len(words))
-    done = subprocess.run([command], cwd=tmp_path, env=os.environ | asked, capture_output=True, text=True, check=False)
-    assert (done.stdout.split()[: len(completed)], done.stderr) == (completed, "")
+    ):
+        asked = {"_VIBENCH_COMPLETE": "complete_bash", "COMP_WORDS": "\n".join(["vibench", *words])}
+        environment = os.environ | asked | {"COMP_CWORD": str(len(words))}
+        done = subprocess.run([command], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        assert (done.stdout.split()[: len(expected)], done.stderr) == (expected, "")
+        assert words != ["run", "paper-"] or all(word.startswith("paper-") for word in done.stdout.split())
 
 
-@pytest.mark.parametrize("kind", ["problems", "primal", "dual", "sampling"])
-def test_the_overview_reads_the_options_that_the_registry_knows(kind: str) -> None:
+def test_the_overview_reads_the_options_that_the_registry_knows() -> None:
     """Without importing any plugin."""
-    for plugin in registered(LISTS[kind]).values():
-        assert plugin.names_of_options == list(plugin.options)
-        assert plugin.summary == (plugin.load().__doc__ or "").split("\n")[0]
+    for kind in ("problems", "primal", "dual", "sampling"):
+        for plugin in registered(LISTS[kind]).values():
+            assert plugin.names_of_options == list(plugin.options)
+            assert plugin.summary == (plugin.load().__doc__ or "").split("\n")[0]
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_help_ends_with_examples_that_are_commands(name: str, main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_help_ends_with_examples_that_are_commands(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    code, out, _ = main(name, "--help")
-    assert code == 0
-    examples = [line.strip() for line in completion.examples(name).splitlines()[2:]]
-    assert examples
-    assert [line.strip() for line in out.splitlines()[-len(examples) - 1 :]] == ["Examples:", *examples]
-    assert max(map(len, out.splitlines())) <= 80
-    for example in examples:
-        program, command, *arguments = shlex.split(example)
-        assert (program, command) == ("vibench", name)
-        GROUP.get_command(None, name).make_context(name, arguments)
+    for name in COMMANDS:
+        code, out, _ = main(name, "--help")
+        assert code == 0
+        examples = [line.strip() for line in completion.examples(name).splitlines()[2:]]
+        assert examples
+        assert [line.strip() for line in out.splitlines()[-len(examples) - 1 :]] == ["Examples:", *examples]
+        assert max(map(len, out.splitlines())) <= 80
+        for example in examples:
+            program, command, *arguments = shlex.split(example)
+            assert (program, command) == ("vibench", name)
+            GROUP.get_command(None, name).make_context(name, arguments)
 
 
 def test_the_overview_of_studies_has_whole_sentences() -> None:
@@ -183,14 +159,8 @@ def test_the_overview_of_studies_has_whole_sentences() -> None:
     assert first_sentence("All of it.") == "All of it"
 
 
-def test_the_overview_ends_within_80_columns(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_overview_fits_80_columns_and_cuts_no_command_short(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    _, out, _ = main("list")
-    assert max(map(len, out.splitlines())) <= 80
-
-
-def test_the_overview_cuts_no_command_short(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    _, out, _ = main("--help")
-    lines = {line.split()[0]: line for line in out.splitlines() if line.startswith("  ")}
+    assert max(map(len, main("list")[1].splitlines())) <= 80
+    lines = {line.split()[0]: line for line in main("--help")[1].splitlines() if line.startswith("  ")}
     assert [name for name in COMMANDS if lines[name].endswith("...")] == []

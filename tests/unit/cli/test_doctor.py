@@ -6,6 +6,7 @@ import importlib.metadata
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 from running import Main, Register
@@ -46,8 +47,7 @@ def test_where_all_is_well_the_exit_code_is_zero(main: Main) -> None:
     assert (code, err) == (0, "")
     lines = out.splitlines()
     assert lines[-1] == "nothing is broken"
-    for title in ("versions", "QP solvers", "plugins", "machine", "disk", "timings"):
-        assert title in lines
+    assert {"versions", "QP solvers", "plugins", "machine", "disk", "timings"} <= set(lines)
     for solver in installed_solvers():
         line = next(line for line in lines if line.split()[1:2] == [solver])
         assert line.startswith("ok" if solver in REQUIRED else ("ok", "note"))
@@ -58,71 +58,47 @@ def test_where_all_is_well_the_exit_code_is_zero(main: Main) -> None:
     assert list(Path.cwd().iterdir()) == []
 
 
-def test_what_is_broken_is_named_at_the_end_and_in_the_exit_code(main: Main, trials: dict[str, Trial]) -> None:
-    trials["piqp"] = Trial(Status.INACCURATE, "dual residual 3.0e-02 above 1e-07: solved")
-    code, out, _ = main("doctor")
-    assert code == 1
-    assert out.splitlines()[-1] == "broken: piqp"
-    line = next(line for line in out.splitlines() if line.split()[1:2] == ["piqp"])
-    assert line.startswith("broken")
-    assert "dual residual 3.0e-02" in line
-
-
-def test_a_solver_of_an_extra_that_is_inaccurate_is_a_note(main: Main, trials: dict[str, Trial]) -> None:
-    (solver, *_) = sorted(set(installed_solvers()) - REQUIRED) or [""]
-    if not solver:
-        pytest.skip("no solver of an extra is installed")
-    trials[solver] = Trial(Status.INACCURATE, "dual residual 1.7e-07 above 1e-07: found")
-    code, out, _ = main("doctor")
-    assert (code, out.splitlines()[-1]) == (0, "nothing is broken")
-    (line,) = (line for line in out.splitlines() if line.split()[1:2] == [solver])
-    assert line.startswith("note")
-    assert "1.7e-07 above 1e-07" in line
+def test_an_inaccurate_solver_is_broken_if_required_and_else_a_note(main: Main, trials: dict[str, Trial]) -> None:
+    cases = [("piqp", (1, "broken: piqp"), "broken")]
+    cases += [(name, (0, "nothing is broken"), "note") for name in sorted({*installed_solvers()} - REQUIRED)[:1]]
+    for solver, ends, health in cases:
+        trials.clear()
+        trials[solver] = Trial(Status.INACCURATE, "dual residual 1.7e-07 above 1e-07: found")
+        code, out, _ = main("doctor")
+        assert (code, out.splitlines()[-1]) == ends
+        line = next(line for line in out.splitlines() if line.split()[1:2] == [solver])
+        assert line.startswith(health)
+        assert "dual residual 1.7e-07 above 1e-07" in line
 
 
 @pytest.mark.usefixtures("trials")
-class TestSolvers:
-    def test_one_that_is_not_installed_is_a_note_with_the_extra_that_brings_it(
-        self, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        self._without("ecos", "", monkeypatch)
-        found = by_subject(list(doctor.check_solvers()))
-        assert set(found) >= set(SETTINGS)
-        assert found["ecos"].health is Health.NOTE
-        assert "'vibench[solvers]'" in found["ecos"].text
+def test_solvers_that_cannot_be_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    installed, known = installed_solvers, provenance.solver_version
 
-    def test_one_that_vibench_needs_is_broken_without_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self._without("osqp", "", monkeypatch)
-        assert by_subject(list(doctor.check_solvers()))["osqp"].health is Health.BROKEN
-
-    def test_one_that_cannot_be_imported_is_broken_with_the_reason(
-        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-    ) -> None:
-        (tmp_path / "ecos.py").write_text("raise ImportError('built for another NumPy')\n")
-        monkeypatch.syspath_prepend(str(tmp_path))
-        monkeypatch.delitem(sys.modules, "ecos", raising=False)
-        self._without("ecos", "2.0.14", monkeypatch)
-        found = by_subject(list(doctor.check_solvers()))["ecos"]
-        assert found.health is Health.BROKEN
-        assert "ImportError: built for another NumPy" in found.text
-
-    @staticmethod
-    def _without(solver: str, version: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def found_without(solver: str, version: str) -> Diagnosis:
         """The solver cannot be run; its distribution is there in this version, or not at all."""
-        installed, known = installed_solvers, provenance.solver_version
         monkeypatch.setattr(doctor, "installed_solvers", lambda extra=(): [n for n in installed(extra) if n != solver])
         monkeypatch.setattr(provenance, "solver_version", lambda name: version if name == solver else known(name))
+        found = by_subject(list(doctor.check_solvers()))
+        assert set(found) >= set(SETTINGS)
+        return found[solver]
 
-
-def test_what_vibench_needs_and_what_is_for_extras_is_read_from_its_metadata() -> None:
-    found = doctor.required_distributions()
-    assert found["numpy"] == found["qpsolvers"] == []
-    assert found["daqp"] == ["solvers"]
-    assert found["cvxopt"] == ["solvers", "test"]
+    assert found_without("osqp", "").health is Health.BROKEN  # vibench needs it
+    missing = found_without("ecos", "")
+    assert missing.health is Health.NOTE
+    assert "'vibench[solvers]'" in missing.text
+    (tmp_path / "ecos.py").write_text("raise ImportError('built for another NumPy')\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "ecos", raising=False)
+    wrong = found_without("ecos", "2.0.14")
+    assert wrong.health is Health.BROKEN
+    assert "ImportError: built for another NumPy" in wrong.text
 
 
 def test_a_library_that_is_missing_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
-    known = provenance.distribution_version
+    needed, known = doctor.required_distributions(), provenance.distribution_version
+    assert needed["numpy"] == needed["qpsolvers"] == []
+    assert (needed["daqp"], needed["cvxopt"]) == (["solvers"], ["solvers", "test"])
     monkeypatch.setattr(provenance, "distribution_version", lambda name: "" if name == "scipy" else known(name))
     found = by_subject(list(doctor.check_versions()))
     assert found["scipy"].health is Health.BROKEN
@@ -136,37 +112,30 @@ def test_every_plugin_that_does_not_load_has_a_line_with_the_reason(register: Re
         ("vibench.problems", "gone", "no_such_module:Problem"),
         ("vibench.problems", "no-problem", "pathlib:Path"),
         ("vibench.studies", "wrong", "test_doctor:WRONG"),
+        *(("vibench.qp_solvers", "mine", f"{module}:solve") for module in ("one", "other")),
     )
     globals()["WRONG"] = tmp_path / "wrong.toml"
     found = by_subject(list(doctor.check_plugins()))
     assert found["problem"] == Diagnosis("problem", "fine")
     broken = {subject: finding.text for subject, finding in found.items() if finding.health is Health.BROKEN}
-    assert set(broken) == {"problem 'gone'", "problem 'no-problem'", "study 'wrong'"}
-    assert "no_such_module" in broken["problem 'gone'"]
-    assert "not a subclass" in broken["problem 'no-problem'"]
-    assert "name" in broken["study 'wrong'"]
+    reasons = {
+        "problem 'gone'": "no_such_module", "problem 'no-problem'": "not a subclass", "study 'wrong'": "name",
+        "QP solver 'mine'": "two packages",
+    }  # fmt: skip
+    assert set(broken) == set(reasons)
+    assert [subject for subject, reason in reasons.items() if reason not in broken[subject]] == []
 
 
 @pytest.mark.usefixtures("trials")
-def test_the_error_of_a_plugin_is_no_markup_and_no_escape_sequence(
-    main: Main, register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "odd_module.py").write_text("raise ImportError('[/b] [red]:warning: \\x1b[2J\\ud800')\n")
-    monkeypatch.syspath_prepend(tmp_path)
+def test_the_error_of_a_plugin_is_no_markup(main: Main, register: Register, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("odd_module.py").write_text("raise ImportError('[/b] [red]:warning: \\x1b[2J\\ud800')\n")
+    monkeypatch.syspath_prepend(Path.cwd())
     register(("vibench.problems", "[/i]\x1b[31m", "odd_module:Problem"))
     code, out, err = main("doctor")
     assert (code, err) == (1, "")
     assert all(line.isprintable() for line in out.splitlines())
     assert r"problem '[/i]\u001b[31m'" in out
     assert r"ImportError: [/b] [red]:warning: \u001b[2J\ud800" in " ".join(out.split())
-
-
-def test_a_name_that_two_packages_register_is_broken_and_stops_nothing(register: Register) -> None:
-    register(("vibench.qp_solvers", "mine", "one:solve"), ("vibench.qp_solvers", "mine", "other:solve"))
-    found = by_subject(list(doctor.check_plugins()))
-    assert found["QP solver 'mine'"].health is Health.BROKEN
-    assert "two packages" in found["QP solver 'mine'"].text
-    assert "problem" in found
 
 
 class TestDisk:
@@ -178,23 +147,17 @@ class TestDisk:
         assert "taken/below: cannot be used: Not a directory" in out
 
     def test_a_folder_that_takes_no_locks_is_broken(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        def locked(path: Path, **_: object) -> None:
-            raise RequestError(f"'{path}' cannot be locked: No locks available")
-
-        monkeypatch.setattr(doctor, "locked", locked)
+        monkeypatch.setattr(doctor, "locked", Mock(side_effect=RequestError("cannot be locked: No locks available")))
         found = by_subject(list(doctor.check_disk(tmp_path)))["runs"]
         assert found.health is Health.BROKEN
         assert "No locks available" in found.text
 
     def test_little_room_is_a_note(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=2**28))
-        assert by_subject(list(doctor.check_disk(tmp_path / "new")))["runs"] == Diagnosis(
-            "runs", f"{tmp_path / 'new'}: 0.2 GiB free", Health.NOTE
-        )
+        found = by_subject(list(doctor.check_disk(tmp_path / "new")))["runs"]
+        assert found == Diagnosis("runs", f"{tmp_path / 'new'}: 0.2 GiB free", Health.NOTE)
 
-    def test_artefacts_are_counted_where_the_variable_puts_them(
-        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-    ) -> None:
+    def test_artefacts_are_counted_in_their_folder(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
         Store(default_folder()).put("pod-1", "x" * 2**20, NO_TIME, ())
         found = by_subject(list(doctor.check_disk(tmp_path)))
@@ -204,21 +167,19 @@ class TestDisk:
 
 
 class TestTimings:
-    @pytest.mark.parametrize(
-        ("others", "slowdown", "doubts"),
-        [(0.0, 1.0, []), (3.0, 1.0, ["other load"]), (0.0, 1.4, ["slowdown"]), (3.0, 2.0, ["other load", "slowdown"])],
-    )
-    def test_load_and_an_unsteady_calculation_are_doubts(
-        self, others: float, slowdown: float, doubts: list[str], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(doctor, "_busy_seconds", iter([100.0, 101.0 + others]).__next__)
-        monkeypatch.setattr(doctor, "Stopwatch", _SecondOfWork)
+    def test_load_and_an_unsteady_calculation_are_doubts(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(doctor, "Stopwatch", lambda: SimpleNamespace(seconds=lambda: Seconds(1.0, 1.0)))
         monkeypatch.setattr("os.cpu_count", lambda: 2)
-        monkeypatch.setattr(doctor.Calibration, "slowdown", lambda _: slowdown)
-        found = by_subject(list(doctor.check_timings()))
-        assert [subject for subject in found if found[subject].health is Health.NOTE][:-1] == doubts
-        assert f"{others:.1f} of 2 cores" in found["other load"].text
-        assert ("can be trusted" in found["verdict"].text) is not bool(doubts)
+        for others, slowdown, doubts in (
+            (0.0, 1.0, []), (3.0, 1.0, ["other load"]), (0.0, 1.4, ["slowdown"]),
+            (3.0, 2.0, ["other load", "slowdown"]),
+        ):  # fmt: skip
+            monkeypatch.setattr(doctor, "_busy_seconds", iter([100.0, 101.0 + others]).__next__)
+            monkeypatch.setattr(doctor.Calibration, "slowdown", lambda _, slowdown=slowdown: slowdown)
+            found = by_subject(list(doctor.check_timings()))
+            assert [subject for subject in found if found[subject].health is Health.NOTE][:-1] == doubts
+            assert f"{others:.1f} of 2 cores" in found["other load"].text
+            assert ("can be trusted" in found["verdict"].text) is not bool(doubts)
 
     def test_the_machine_that_works_is_seen_to_work(self) -> None:
         before = doctor._busy_seconds()
@@ -228,10 +189,3 @@ class TestTimings:
         while watch.seconds().cpu < 0.1:
             pass
         assert doctor._busy_seconds() - before >= 0.05
-
-
-class _SecondOfWork:
-    """A watch that always says one second."""
-
-    def seconds(self) -> Seconds:
-        return Seconds(1.0, 1.0)

@@ -7,7 +7,6 @@ import io
 from collections.abc import Callable
 
 import pandas as pd
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
@@ -16,8 +15,6 @@ from vibench.cli.console import echo, print_frame
 from vibench.text import new_console, print_line
 
 ANYTHING = st.text(st.characters())
-
-MARKUP = ["[/b]", "[red]membrane[/red]", ":warning:", "[link=file:///]a[/link]", "[bold", r"\[x]", "`a` *b* <c>"]
 
 
 def printed(action: Callable[[], object]) -> list[str]:
@@ -29,16 +26,12 @@ def printed(action: Callable[[], object]) -> list[str]:
 
 @given(ANYTHING, ANYTHING)
 def test_every_line_is_one_printable_line(one: str, other: str) -> None:
-    lines = printed(lambda: echo(one, other))
-    assert len(lines) == 3
-    assert all(line.isprintable() for line in lines)
-
-
-@given(ANYTHING)
-def test_a_line_on_a_console_is_one_printable_line(text: str) -> None:
-    lines = printed(lambda: print_line(new_console(), text))
-    assert len(lines) == 2
-    assert lines[0].isprintable()
+    for lines, count in (
+        (printed(lambda: echo(one, other)), 3),
+        (printed(lambda: print_line(new_console(), one)), 2),
+    ):
+        assert len(lines) == count
+        assert all(line.isprintable() for line in lines)
 
 
 @given(ANYTHING)
@@ -47,20 +40,24 @@ def test_a_table_is_printable(text: str) -> None:
     assert all(line.isprintable() for line in printed(lambda: print_frame(frame, text)))
 
 
-@pytest.mark.parametrize("text", MARKUP)
-def test_markup_is_text(text: str) -> None:
-    assert printed(lambda: echo(text)) == [text, ""]
-    assert printed(lambda: print_line(new_console(), text)) == [text, ""]
-    assert printed(lambda: new_console().print(text)) == [text, ""]
-    whole = "\n".join(printed(lambda: print_frame(pd.DataFrame({"name": [text, "b"], text: ["x", "y"]}), text)))
-    assert whole.count(text) == 3
-
-
-@pytest.mark.parametrize("text", MARKUP)
-def test_markup_is_text_on_a_terminal_of_any_kind(text: str) -> None:
-    out = io.StringIO()
-    print_line(Console(file=out, force_terminal=True, width=20), text)
-    assert out.getvalue() == f"{text}\n"
+def test_markup_is_text() -> None:
+    for text in (
+        "[/b]",
+        "[red]membrane[/red]",
+        ":warning:",
+        "[link=file:///]a[/link]",
+        "[bold",
+        r"\[x]",
+        "`a` *b* <c>",
+    ):
+        assert printed(lambda: echo(text)) == [text, ""]  # noqa: B023
+        assert printed(lambda: print_line(new_console(), text)) == [text, ""]  # noqa: B023
+        assert printed(lambda: new_console().print(text)) == [text, ""]  # noqa: B023
+        frame = pd.DataFrame({"name": [text, "b"], text: ["x", "y"]})
+        assert "\n".join(printed(lambda: print_frame(frame, text))).count(text) == 3  # noqa: B023
+        out = io.StringIO()  # a terminal of any kind
+        print_line(Console(file=out, force_terminal=True, width=20), text)
+        assert out.getvalue() == f"{text}\n"
 
 
 def test_cells_of_several_lines_keep_them() -> None:

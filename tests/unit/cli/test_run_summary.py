@@ -26,10 +26,20 @@ def row(cell: str, reason: str, status: str = "inaccurate", **more: Any) -> dict
     return cell_row(**own | {"pod_size": None, "cell": cell, "reason": reason, "status": status} | more)
 
 
-def test_reasons_that_differ_in_their_numbers_alone_are_one_line() -> None:
+def test_a_line_for_every_reason_names_a_cell_by_all_its_axes() -> None:
+    """Reasons that differ in their numbers alone are one; there are never more lines than reasons that matter."""
     rows = [row(f"c{k}", f"{k} of 16 queries, first mu=({k}.5, -1e-0{k}): gap residual {k}.1e-07") for k in range(1, 9)]
     (line,) = failures(rows, "runs/a")
     assert line.startswith("8 cells inaccurate: the first is c1, ")
+    (line,) = failures([row("c1", "broke", "error")], "runs/a")
+    axes = "box (text) · cpg · pga 0.5 · 0.001, R=4 · osqp 1e-08 · reduced"
+    assert line == f"error: c1, {axes}: 15 of 16 queries ok; broke"
+    missing = "the QP solver 'ecos' is not installed: `pip install ecos`"
+    (line,) = failures([row(f"c{k}", missing, "unavailable") for k in range(24)], "runs/a")
+    assert line == f"24 cells unavailable: {missing}"
+    lines = list(failures([row(f"c{k}", "a" * k, "error") for k in range(1000)], "runs/a"))
+    assert len(lines) == REASONS + 1
+    assert lines[-1] == f"{1000 - REASONS} cells not ok for {1000 - REASONS} other reasons"
 
 
 def test_a_missed_accuracy_has_a_remedy() -> None:
@@ -45,36 +55,21 @@ def test_a_missed_accuracy_has_a_remedy() -> None:
     assert line.endswith("dual residual 3.5e-09; `vibench replay runs/a c1` tries other solvers")
 
 
-def test_a_cell_is_named_by_all_its_axes() -> None:
-    (line,) = failures([row("c1", "broke", "error")], "runs/a")
-    assert (
-        line == "error: c1, box (text) · cpg · pga 0.5 · 0.001, R=4 · osqp 1e-08 · reduced: 15 of 16 queries ok; broke"
-    )
+Captured = pytest.CaptureFixture[str]
 
 
-def test_what_is_not_installed_is_said_once_with_the_command_that_installs_it() -> None:
-    rows = [row(f"c{k}", "the QP solver 'ecos' is not installed: `pip install ecos`", "unavailable") for k in range(24)]
-    (line,) = failures(rows, "runs/a")
-    assert line == "24 cells unavailable: the QP solver 'ecos' is not installed: `pip install ecos`"
-
-
-def test_never_more_lines_than_reasons_that_matter() -> None:
-    rows = [row(f"c{k}", "a" * k, "error") for k in range(1000)]
-    lines = list(failures(rows, "runs/a"))
-    assert len(lines) == REASONS + 1
-    assert lines[-1] == f"{1000 - REASONS} cells not ok for {1000 - REASONS} other reasons"
-
-
-def test_a_run_of_which_no_cell_is_the_best_says_why(
-    tmp_path: Path, main: Main, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """At the end of the run, and where the best cells are asked for; not for rows that were not asked for."""
-    rows = [row(f"c{k}", "broke") for k in range(21)]
-    made = ResultsDatabase(tmp_path / "run", {"name": "sample"})
+def end_of_run(folder: Path, rows: list[dict[str, Any]]) -> bool:
+    """Print the summary of a run with these rows."""
+    made = ResultsDatabase(folder, {"name": "sample"})
     for one in rows:
         made.write_cell(one, [])
     made.close()
-    assert not print_summary("sample", tmp_path / "run" / FILE, rows)
+    return print_summary("sample", folder / FILE, rows)
+
+
+def test_a_run_of_which_no_cell_is_the_best_says_why(tmp_path: Path, main: Main, capsys: Captured) -> None:
+    """At the end of the run, and where the best cells are asked for; not for rows that were not asked for."""
+    assert not end_of_run(tmp_path / "run", [row(f"c{k}", "broke") for k in range(21)])
     assert no_best_cell() in capsys.readouterr().out.splitlines()
     code, out, _ = main("show", str(tmp_path / "run"), "--table", "best")
     assert code == 0
@@ -84,9 +79,7 @@ def test_a_run_of_which_no_cell_is_the_best_says_why(
         assert out.splitlines() == [f"run: {table}: no rows"]
 
 
-def test_rows_that_differ_in_options_alone_say_which(
-    tmp_path: Path, main: Main, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rows_that_differ_in_options_alone_say_which(tmp_path: Path, main: Main, capsys: Captured) -> None:
     """Options that have one value for a name are not said, nor are those of a name that tells its rows apart."""
     options = ('{"tolerance": 0.1, "size": 9}', '{"tolerance": 0.01, "size": 9}', '{"size": 9}')
     fine = {"status": "ok", "queries_ok": 16, "training": "greedy", "dual": "cpg", "dual_options": '{"k": 2}'}
@@ -94,11 +87,7 @@ def test_rows_that_differ_in_options_alone_say_which(
     rows.append(row("c4", "", **fine | {"training": "random", "training_options": '{"size": 3}'}))
     rows.append(row("c5", "", **fine | {"problem": "rope", "problem_options": "{}", "training": "y"}))
     rows.append(row("c6", "", **fine | {"problem": "rope", "problem_options": '{"mesh": "fine"}', "training": "x"}))
-    made = ResultsDatabase(tmp_path / "run", {"name": "sample"})
-    for one in rows:
-        made.write_cell(one, [])
-    made.close()
-    print_summary("sample", tmp_path / "run" / FILE, rows)
+    end_of_run(tmp_path / "run", rows)
     ended = capsys.readouterr().out
     _, shown, _ = main("show", str(tmp_path / "run"))
     for printed in (ended, shown):
@@ -111,7 +100,7 @@ def test_rows_that_differ_in_options_alone_say_which(
     assert set(out.split()) == {"training", "greedy", "random", "x", "y"}
 
 
-def test_what_to_do_next_are_commands(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_to_do_next_are_commands(capsys: Captured) -> None:
     group: Any = typer.main.get_command(app)
     next_steps(Path("a folder's"), "this table again", all_ok=False, figures=False)
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  vibench ")]
@@ -121,17 +110,10 @@ def test_what_to_do_next_are_commands(capsys: pytest.CaptureFixture[str]) -> Non
         assert program == "vibench"
         context = group.get_command(None, command).make_context(command, arguments)
         assert "a folder's" in (context.params.get("run"), *context.params.get("names", ()))
-
-
-@pytest.mark.parametrize("length", range(1, 27))
-def test_what_to_do_next_fits_80_columns(length: int, capsys: pytest.CaptureFixture[str]) -> None:
-    """A command alone may be longer: it stays one line to copy."""
-    next_steps(Path("r" * length), "this table again", all_ok=False, figures=False)
-    lines = capsys.readouterr().out.splitlines()
-    assert max(len(line) for line in lines if not line.endswith("\"status != 'ok'\"")) <= 80
-    assert [line.strip() for line in lines].count("what is not ok") == 1
-
-
-def test_a_run_is_named_as_briefly_as_it_can_be() -> None:
     assert run_argument(Path("runs/quick")) == "quick"
     assert run_argument(Path("other/quick")) == "other/quick"
+    for length in range(1, 27):  # fits 80 columns; a command alone may be longer: it stays one line to copy
+        next_steps(Path("r" * length), "this table again", all_ok=False, figures=False)
+        lines = capsys.readouterr().out.splitlines()
+        assert max(len(line) for line in lines if not line.endswith("\"status != 'ok'\"")) <= 80
+        assert [line.strip() for line in lines].count("what is not ok") == 1

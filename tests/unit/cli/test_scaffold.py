@@ -8,6 +8,7 @@ import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -69,24 +70,15 @@ def test_the_tests_of_new_packages_are_green(written: dict[str, Path], installed
     assert f"{checks + len(NAMES)} passed" in done.stdout  # every package has one more test
 
 
-def test_a_new_plugin_passes_its_checks_as_it_is(vibench: Vibench, site: Path, tmp_path: Path) -> None:
-    """One by the command; the tests of the packages above run the checks of all of them."""
+def test_new_plugins_pass_their_checks_and_give_rows_as_they_are(vibench: Vibench, site: Path, tmp_path: Path) -> None:
+    # one by the command; the tests of the packages above run the checks of all of them
     done = vibench(tmp_path, "check", "my-rope", plugins=site)
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
     assert "problem 'my-rope'" in done.stdout
     assert "passed, 0 failed, 0 skipped" in done.stdout
-
-
-def test_new_plugins_give_rows_without_an_edit(vibench: Vibench, site: Path, tmp_path: Path) -> None:
-    tolerances = [{"pod": [1e-3], "dual": [1e-2], "primal": {"tied": [0.5]}}]
-    study = wire_study(
-        problem=["my-rope"],
-        dual=["cone"],
-        primal=["tied"],
-        solvers=["for-rope"],
-        formulation=["program"],
-        tolerances=tolerances,
-    )
+    axes = {axis: [NAMES[kind]] for axis, kind in (("problem", "problem"), ("dual", "dual"), ("primal", "primal"))}
+    axes |= {"solvers": [NAMES["solver"]], "formulation": [NAMES["formulation"]]}
+    study = wire_study(**axes, tolerances=[{"pod": [1e-3], "dual": [1e-2], "primal": {"tied": [0.5]}}])
     done = vibench(tmp_path, "run", write_study(tmp_path, study), "--out", "out", "--jobs", "1", plugins=site)
     assert done.returncode == 0, done.stdout + done.stderr
     (row,) = rows(tmp_path / "out")
@@ -130,12 +122,6 @@ def test_the_command_says_what_to_do_next(main: Main) -> None:
 BAD = ["", "Rope", "1rope", "rope_1", "rope-", "-rope", "my--rope", "ro pe", "../rope", "röpe", "rope\n", "a" * 41]
 
 
-def test_a_name_that_cannot_be_one_is_refused(main: Main) -> None:
-    for name in BAD:
-        refused(main("new", "problem", "--", name), "cannot be the name of a plugin", "such as 'my-problem'")
-    assert list(Path.cwd().iterdir()) == []
-
-
 @given(st.from_regex(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", fullmatch=True) | st.text(max_size=12))
 def test_a_name_that_is_accepted_is_good_everywhere(name: str) -> None:
     try:
@@ -147,45 +133,29 @@ def test_a_name_that_is_accepted_is_good_everywhere(name: str) -> None:
     assert name.isascii()
 
 
-def test_names_that_are_taken_are_refused(main: Main) -> None:
+def test_names_and_places_that_are_taken_are_refused(main: Main) -> None:
     taken = next(iter(registered(PROBLEM)))
     refused(main("new", "problem", taken), f"there is a problem '{taken}' already", "choose another name")
     refused(main("new", "solver", "piqp"), "there is a QP solver 'piqp' already", "choose another name")
     refused(main("new", "primal", "strategies"), "vibench itself has a package of that name")
+    refused(main("new", "stage", "rope"), "stage", "problem")
+    for name in BAD:
+        refused(main("new", "problem", "--", name), "cannot be the name of a plugin", "such as 'my-problem'")
     assert list(Path.cwd().iterdir()) == []
     assert main("new", "dual", taken)[0] == 0
-
-
-def test_an_existing_folder_is_left_alone(main: Main) -> None:
     Path("vibench-rope").mkdir()
     Path("vibench-rope/notes.txt").write_text("precious")
     refused(main("new", "problem", "rope"), "'vibench-rope' exists already", "--out")
     assert Path("vibench-rope/notes.txt").read_text() == "precious"
-    assert [path.name for path in Path.cwd().iterdir()] == ["vibench-rope"]
-
-
-def test_a_file_is_no_folder_to_write_in(main: Main) -> None:
     Path("file").touch()
     refused(main("new", "problem", "rope", "--out", "file"), "'file' is a file; expected a folder")
     refused(main("new", "problem", "rope", "--out", "file/below"), "'file/below' cannot be made")
-
-
-def test_a_kind_that_is_none_is_refused(main: Main) -> None:
-    refused(main("new", "stage", "rope"), "stage", "problem")
+    assert {path.name for path in Path.cwd().iterdir()} == {"vibench-rope", "file", f"vibench-{taken}"}
 
 
 def test_nothing_is_left_of_a_package_that_could_not_be_written(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
-    written = 0
-    write = Path.write_text
-
-    def full(path: Path, *arguments: object, **more: object) -> int:
-        nonlocal written
-        written += 1
-        if written == 3:
-            raise OSError(28, "No space left on device")
-        return write(path, *arguments, **more)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(Path, "write_text", full)
+    full = [None, None, OSError(28, "No space left on device")]
+    monkeypatch.setattr(Path, "write_text", Mock(side_effect=full))
     code, out, err = main("new", "problem", "rope")
     assert (code, out, err) == (1, "", "vibench: 'vibench-rope' cannot be written: No space left on device\n")
     assert list(Path.cwd().iterdir()) == []
@@ -194,17 +164,13 @@ def test_nothing_is_left_of_a_package_that_could_not_be_written(main: Main, monk
 class TestStart:
     """`vibench new study` and `vibench new pack`: what they write works as it is."""
 
-    def test_a_new_study_has_cells(self, main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.chdir(tmp_path)
+    def test_a_new_study_has_cells(self, main: Main) -> None:
         code, out, _ = main("new", "study", "my-study")
         assert (code, out.splitlines()[1]) == (0, "  vibench run my-study.toml --dry-run")
         code, out, _ = main("run", "my-study.toml", "--dry-run")
         assert (code, out.splitlines()[-1]) == (0, "12 cells")
 
-    def test_the_script_of_a_new_pack_writes_one_that_is_imported(
-        self, main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.chdir(tmp_path)
+    def test_the_script_of_a_new_pack_writes_one_that_is_imported(self, main: Main) -> None:
         _, out, _ = main("new", "pack", "my-model")
         script, check = (line.split()[1:] for line in out.splitlines()[1:])
         assert check == ["pack", "my-model"]
@@ -212,8 +178,7 @@ class TestStart:
         code, out, _ = main("pack", "my-model")
         assert (code, out.splitlines()[0]) == (0, "my-model")
         pack = create("problem", "pack", {"path": "my-model"})
-        found = HighFidelitySolver(pack).solve(np.array([4.0, 0.1]))
-        assert found.lam.any()
+        assert HighFidelitySolver(pack).solve(np.array([4.0, 0.1])).lam.any()
         assert [output.name for output in pack.outputs] == ["mean deflection"]
 
     @pytest.mark.parametrize("what", ["study", "pack"])

@@ -6,8 +6,6 @@ import os
 import subprocess
 import sys
 
-import pytest
-
 HEAVY = {"numpy", "scipy", "pandas", "matplotlib", "pydantic", "qpsolvers", "rich", "skfem", "vibench_problems"}
 
 
@@ -28,35 +26,24 @@ def test_help_imports_no_heavy_library(command: str) -> None:
         assert packages & HEAVY == set()
 
 
-def test_the_list_imports_no_plugin_and_no_table(command: str) -> None:
+def test_lists_import_no_tables_and_plugins_only_for_their_options(command: str) -> None:
     packages, printed = imported(command, "list")
     assert "obstacle" in printed
     assert packages & {"scipy", "pandas", "skfem", "qpsolvers", "matplotlib"} == set()
-
-
-def test_a_list_of_problems_loads_them_and_no_tables(command: str) -> None:
     packages, printed = imported(command, "list", "problems")
     assert "resolution: " in printed
     assert "skfem" in packages
     assert packages & {"pandas", "matplotlib", "qpsolvers"} == set()
 
 
-@pytest.mark.parametrize(
-    ("line", "word"),
-    [
-        ("vibench r", "replay"),
-        ("vibench run paper-", "paper-hertz"),
-        ("vibench run --dual ", "mcpg"),
-        ("vibench check ", "obstacle"),
-        ("vibench list ", "solvers"),
-        ("vibench show quick --table ", "histories"),
-        ("vibench check obstacle --option ", "resolution="),
-    ],
-)
-def test_completion_imports_no_heavy_library(line: str, word: str, command: str) -> None:
-    words = {"COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}
-    packages, printed = imported(command, _VIBENCH_COMPLETE="complete_bash", **words)
-    assert word in printed.split()
-    assert "vibench" in packages
-    package = {"vibench_problems"} if "--option" in line else set()  # the package that holds the module, not the module
-    assert packages & (HEAVY - {"pydantic"}) == package  # typer itself checks the words before with pydantic
+def test_completion_imports_no_heavy_library(command: str) -> None:
+    for line, word in (
+        ("r", "replay"), ("run paper-", "paper-hertz"), ("run --dual ", "mcpg"), ("check ", "obstacle"),
+        ("list ", "solvers"), ("show quick --table ", "histories"), ("check obstacle --option ", "resolution="),
+    ):  # fmt: skip
+        words = {"COMP_WORDS": f"vibench {line}", "COMP_CWORD": str(line.count(" ") + 1)}
+        packages, printed = imported(command, _VIBENCH_COMPLETE="complete_bash", **words)
+        assert word in printed.split()
+        assert "vibench" in packages
+        package = {"vibench_problems"} if "--option" in line else set()  # the package that holds the module
+        assert packages & (HEAVY - {"pydantic"}) == package  # typer itself checks the words before with pydantic

@@ -15,7 +15,7 @@ from vibench.errors import NumericalError
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp import solve, verification
 from vibench.qp.settings import SETTINGS
-from vibench.qp.solve import DIRECT, DirectSolution, installed_solvers, solve_qp
+from vibench.qp.solve import DIRECT, installed_solvers, solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution
 from vibench.text import LONGEST
@@ -31,10 +31,14 @@ def program(seed: int, n: int = 6, m: int = 4, sizes: tuple[int, int] = (-4, 4))
     return VariationalInequality(spd(n, rng), 1e-3 * rng.standard_normal(n) * 50.0, B, g)
 
 
-def test_without_unknowns_there_is_nothing_to_solve_but_something_to_violate() -> None:
+def test_programs_without_unknowns_or_constraints() -> None:
     for bound, status in ((1.0, "ok"), (-1.0, "infeasible")):
         vi = VariationalInequality(np.zeros((0, 0)), np.zeros(0), np.zeros((1, 0)), np.array([bound]))
         assert verification.verify(vi, solve_qp(vi, "osqp", 1e-8), 1e-8)[0] == status
+    vi = VariationalInequality(np.eye(3), np.arange(3.0), np.zeros((0, 3)), np.zeros(0))
+    answer = solve_qp(vi, "piqp", 1e-8)
+    assert verification.verify(vi, answer, 1e-8)[0] is Status.OK
+    assert np.allclose(answer.x, np.arange(3.0), atol=1e-7)
 
 
 @pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])
@@ -47,7 +51,6 @@ def test_required_solvers_reach_the_accuracy_they_are_asked_for(solver: str, acc
         answer = solve_qp(vi, solver, accuracy)
         status, reason, found = verification.verify(vi, answer, accuracy)
         assert status is Status.OK, (seed, reason)
-        assert found is not None
         assert found.worst <= accuracy
         assert answer.iterations is not None
         x, _ = exact(vi)
@@ -65,14 +68,9 @@ def test_sparse_programs_go_through_the_same_door() -> None:
 @given(seeds, st.integers(1, 7), st.integers(0, 5))
 def test_with_a_factor_of_a_the_dual_is_solved_and_gives_the_same_solution(seed: int, n: int, m: int) -> None:
     vi = program(seed, n, m, sizes=(0, 1))
-    asked = []
-
-    def watched(scaled: VariationalInequality, accuracy: float) -> QPSolution:
-        asked.append(len(scaled.f))
-        return solve_qp(scaled, "piqp", accuracy)
-
-    factor = np.linalg.cholesky(vi.A)
-    primal, dual = (solve_qp(vi, "watched", 1e-10, {"watched": watched}, L) for L in (None, factor))
+    asked, factor = list[int](), np.linalg.cholesky(vi.A)
+    watched = {"watched": lambda scaled, accuracy: asked.append(len(scaled.f)) or solve_qp(scaled, "piqp", accuracy)}
+    primal, dual = (solve_qp(vi, "watched", 1e-10, watched, L) for L in (None, factor))
     assert asked == [n] + ([m] if m else [])  # the dual has as many unknowns as there are constraints
     assert np.allclose(dual.x, primal.x, atol=1e-6 * max(1e-3, np.abs(primal.x).max()))
     assert np.all(dual.alpha >= 0.0)
@@ -83,9 +81,7 @@ def test_with_a_factor_of_a_the_dual_is_solved_and_gives_the_same_solution(seed:
 
 
 @pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])
-def test_the_dual_of_a_program_with_rows_of_very_different_sizes_is_solved_to_the_accuracy_asked_for(
-    solver: str,
-) -> None:
+def test_the_dual_of_a_program_with_rows_of_very_different_sizes_is_solved_to_the_accuracy(solver: str) -> None:
     for seed in range(30):
         vi = program(seed)
         primal, dual = (solve_qp(vi, solver, 1e-9, factor=L) for L in (None, np.linalg.cholesky(vi.A)))
@@ -94,97 +90,63 @@ def test_the_dual_of_a_program_with_rows_of_very_different_sizes_is_solved_to_th
         assert np.allclose(dual.x, exact(vi)[0], atol=1e-6 * max(1.0, np.abs(primal.x).max()))
 
 
-def test_negative_multipliers_of_a_dual_are_set_to_zero_and_reported() -> None:
+def test_negative_multipliers_are_set_to_zero_and_reported() -> None:
     vi = VariationalInequality(np.diag([2.0, 3.0]), np.array([2.0, 3.0]), np.eye(2), np.array([0.5, 2.0]))
-
-    def wrong(scaled: VariationalInequality, accuracy: float) -> QPSolution:
-        return QPSolution(np.array([1.0, -0.1]), np.zeros(2), "solved", 4)
-
-    answer = solve_qp(vi, "wrong", 1e-7, {"wrong": wrong}, np.diag(np.sqrt([2.0, 3.0])))
+    wrong = {"wrong": lambda *_: QPSolution(np.array([1.0, -0.1]), np.zeros(2), "solved", 4)}
+    answer = solve_qp(vi, "wrong", 1e-7, wrong, np.diag(np.sqrt([2.0, 3.0])))  # of the dual program
     assert answer.alpha[0] > 0.0 == answer.alpha[1]
     assert np.allclose(answer.x, [1.0 - answer.alpha[0] / 2.0, 1.0])
     assert np.isclose(answer.negative, 0.1 * answer.alpha[0])
     assert (answer.solver_status, answer.iterations) == ("solved", 4)
-
-
-def test_a_solver_that_gives_up_on_the_dual_gives_no_solution() -> None:
-    vi = program(3)
-    answer = solve_qp(vi, "no", 1e-7, {"no": lambda *_: QPSolution(None, None, "gave up")}, np.linalg.cholesky(vi.A))
-    assert (answer.x, answer.alpha, answer.solver_status) == (None, None, "gave up")
-    assert verification.verify(vi, answer, 1e-7)[0] is Status.FAILED
-
-
-def test_a_program_without_constraints() -> None:
-    vi = VariationalInequality(np.eye(3), np.arange(3.0), np.zeros((0, 3)), np.zeros(0))
-    answer = solve_qp(vi, "piqp", 1e-8)
-    assert verification.verify(vi, answer, 1e-8)[0] is Status.OK
-    assert np.allclose(answer.x, np.arange(3.0), atol=1e-7)
-
-
-INFEASIBLE = VariationalInequality(np.eye(2), np.ones(2), np.array([[1.0, 0.0], [-1.0, 0.0]]), np.array([-1.0, -1.0]))
-
-
-def test_infeasible_only_with_a_certificate_of_our_own() -> None:
-    alpha = verification.infeasibility_certificate(INFEASIBLE)
-    assert alpha is not None
-    assert np.all(alpha >= 0.0)
-    assert np.allclose(INFEASIBLE.B.T @ alpha, 0.0)
-    assert INFEASIBLE.g @ alpha < 0.0
-    assert verification.infeasibility_certificate(program(0)) is None
-    nothing = QPSolution(None, None, "infeasible, I say")
-    assert verification.verify(INFEASIBLE, nothing, 1e-7)[0] is Status.INFEASIBLE
-    status, reason, found = verification.verify(program(0), nothing, 1e-7)
-    assert status is Status.FAILED
-    assert "infeasible, I say" in reason
-    assert found is None
-
-
-def test_not_finite_is_seen_before_anything_else() -> None:
-    vi = program(1)
-    x, alpha = exact(vi)
-    x[0] = np.nan
-    assert verification.verify(vi, QPSolution(x, alpha, "solved"), 1e-7)[0] is Status.NONFINITE
-
-
-@pytest.mark.parametrize(
-    ("load", "x", "alpha", "name"), [(2.0, 0.5, 1.0, "gap"), (6.0, 3.0, 0.0, "primal")], ids=["gap", "primal"]
-)
-def test_one_residual_alone_makes_an_answer_inaccurate(load: float, x: float, alpha: float, name: str) -> None:
-    """The program, min x² − load·x subject to x ≤ 1, has a solution: nothing here is infeasible."""
-    vi = VariationalInequality(A=np.array([[2.0]]), f=np.array([load]), B=np.array([[1.0]]), g=np.ones(1))
-    status, reason, found = verification.verify(vi, QPSolution(np.array([x]), np.array([alpha]), "solved"), 1e-6)
-    assert status is Status.INACCURATE
-    assert reason.startswith(f"{name} residual")
-    assert "above 1e-06" in reason
-    assert "solved" in reason
-    assert [key for key in ("primal", "dual", "gap") if getattr(found, key) > 0.0] == [name]
-
-
-def test_negative_multipliers_are_set_to_zero_and_reported() -> None:
-    vi = VariationalInequality(np.eye(2), np.ones(2), np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([0.5, 0.5]))
-
-    def wrong(scaled: VariationalInequality, accuracy: float) -> QPSolution:
-        return QPSolution(np.array([0.5, 0.5]), np.array([0.5, -0.1]), "solved")
-
-    answer = solve_qp(vi, "wrong", 1e-7, {"wrong": wrong})
-    assert answer.alpha is not None
+    vi = VariationalInequality(np.eye(2), np.ones(2), np.eye(2), np.array([0.5, 0.5]))
+    wrong = {"wrong": lambda *_: QPSolution(np.array([0.5, 0.5]), np.array([0.5, -0.1]), "solved")}
+    answer = solve_qp(vi, "wrong", 1e-7, wrong)
     assert answer.alpha.tolist() == [0.5, 0.0]
     assert np.isclose(answer.negative, 0.1)
     assert "multipliers down to -1e-01" in verification.verify(vi, answer, 1e-7)[1]
 
 
+def test_a_solver_that_gives_up_on_the_dual_or_answers_no_number_is_seen() -> None:
+    vi = program(3)
+    answer = solve_qp(vi, "no", 1e-7, {"no": lambda *_: QPSolution(None, None, "gave up")}, np.linalg.cholesky(vi.A))
+    assert (answer.x, answer.alpha, answer.solver_status) == (None, None, "gave up")
+    assert verification.verify(vi, answer, 1e-7)[0] is Status.FAILED
+    x, alpha = exact(vi)
+    x[0] = np.nan
+    assert verification.verify(vi, QPSolution(x, alpha, "solved"), 1e-7)[0] is Status.NONFINITE
+
+
+def test_infeasible_only_with_a_certificate_of_our_own() -> None:
+    infeasible, nothing = programs()[-1], QPSolution(None, None, "infeasible, I say")
+    alpha = verification.infeasibility_certificate(infeasible)
+    assert np.all(alpha >= 0.0)
+    assert np.allclose(infeasible.B.T @ alpha, 0.0)
+    assert infeasible.g @ alpha < 0.0
+    assert verification.infeasibility_certificate(program(0)) is None
+    assert verification.verify(infeasible, nothing, 1e-7)[0] is Status.INFEASIBLE
+    status, reason, found = verification.verify(program(0), nothing, 1e-7)
+    assert (status, found) == (Status.FAILED, None)
+    assert "infeasible, I say" in reason
+
+
+def test_one_residual_alone_makes_an_answer_inaccurate() -> None:
+    """The program, min x² − load·x subject to x ≤ 1, has a solution: nothing here is infeasible."""
+    for load, x, alpha, name in ((2.0, 0.5, 1.0, "gap"), (6.0, 3.0, 0.0, "primal")):
+        vi = VariationalInequality(A=np.array([[2.0]]), f=np.array([load]), B=np.array([[1.0]]), g=np.ones(1))
+        status, reason, found = verification.verify(vi, QPSolution(np.array([x]), np.array([alpha]), "solved"), 1e-6)
+        assert status is Status.INACCURATE
+        assert reason.startswith(f"{name} residual")
+        assert "above 1e-06" in reason
+        assert "solved" in reason
+        assert [key for key in ("primal", "dual", "gap") if getattr(found, key) > 0.0] == [name]
+
+
 def test_a_registered_solver_sees_scaled_data_and_its_answer_is_scaled_back() -> None:
-    vi = program(5)
-    seen = {}
-
-    def brute(scaled: VariationalInequality, accuracy: float) -> QPSolution:
-        seen["rows"] = np.linalg.norm(scaled.B, axis=1)
-        seen["f"] = np.abs(scaled.f).max()
-        return QPSolution(*exact(scaled), "found")
-
-    answer = solve_qp(vi, "brute", 1e-9, {"brute": brute})
-    assert np.allclose(seen["rows"], 1.0)
-    assert np.isclose(seen["f"], 1.0)
+    vi, seen = program(5), list[VariationalInequality]()
+    brute = {"brute": lambda scaled, _: seen.append(scaled) or QPSolution(*exact(scaled), "found")}
+    answer = solve_qp(vi, "brute", 1e-9, brute)
+    assert np.allclose(np.linalg.norm(seen[0].B, axis=1), 1.0)
+    assert np.isclose(np.abs(seen[0].f).max(), 1.0)
     assert verification.kkt_residuals(vi, answer.x, answer.alpha).worst < 1e-9
 
 
@@ -202,24 +164,17 @@ def test_the_status_of_a_solver_is_one_short_printable_line(status: str) -> None
         assert len(found) <= LONGEST
 
 
-def test_a_status_that_is_no_text_is_an_error() -> None:
+def test_numbers_of_iterations_are_whole_or_left_out() -> None:
+    """The solution is judged all the same."""
+    for number in (0, 7, np.int64(7), np.uint8(7), 2**63 - 1):
+        found = answered("solved", number).iterations
+        assert (type(found), found) == (int, number)
+    for number in (2**80, 2**63, -1, -(2**70), np.uint64(2**63), 2.5, np.nan, np.inf, "7", [7], None):
+        answer = answered("solved", number)
+        assert answer.iterations is None
+        assert answer.x is not None
     with pytest.raises(NumericalError, match="reports the status None; expected a text"):
         answered(None, 3)
-
-
-@pytest.mark.parametrize("number", [0, 7, np.int64(7), np.uint8(7), 2**63 - 1])
-def test_a_number_of_iterations_is_kept_as_a_whole_number(number: Any) -> None:
-    found = answered("solved", number).iterations
-    assert type(found) is int
-    assert found == number
-
-
-@pytest.mark.parametrize("number", [2**80, 2**63, -1, -(2**70), np.uint64(2**63), 2.5, np.nan, np.inf, "7", [7], None])
-def test_what_is_no_number_of_iterations_is_left_out(number: Any) -> None:
-    """The solution is judged all the same."""
-    found = answered("solved", number)
-    assert found.iterations is None
-    assert found.x is not None
 
 
 def test_severities_follow_the_order_of_the_statuses() -> None:
@@ -246,28 +201,22 @@ def test_a_direct_call_is_the_call_of_qpsolvers(solver: str, monkeypatch: pytest
         warm = [solve.solve_qp(vi, solver, 1e-9, start=start) for vi, start in zip(programs(), cold, strict=True)]
         return cold + dual + warm
 
-    direct = answers()
+    def exactly(answer: QPSolution) -> tuple[object, ...]:
+        bits = [None if values is None else values.tobytes() for values in (answer.x, answer.alpha)]
+        return (*bits, answer.solver_status, answer.iterations, answer.negative)
+
+    direct = [exactly(answer) for answer in answers()]
+    # an answer depends on nothing that was solved before
+    again = [exactly(solve.solve_qp(vi, solver, 1e-9)) for vi in reversed(programs())]
+    assert again[::-1] == direct[: len(again)]
     monkeypatch.setattr(solve, "DIRECT", {})
-    for ours, theirs in zip(direct, answers(), strict=True):
-        assert (ours.solver_status, ours.iterations, ours.negative) == (
-            theirs.solver_status,
-            theirs.iterations,
-            theirs.negative,
-        )
-        for one, other in ((ours.x, theirs.x), (ours.alpha, theirs.alpha)):
-            assert (one is None) == (other is None)
-            assert one is None or other is None or one.tobytes() == other.tobytes()
+    assert [exactly(answer) for answer in answers()] == direct
 
 
 def test_multipliers_of_the_dual_program_are_bounds_and_constraints_are_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[bool] = []
-
-    def piqp(program: VariationalInequality, bounds: bool, **settings: object) -> DirectSolution:
-        told.append(bounds)
-        return DIRECT["piqp"](program, bounds, **settings)
-
-    monkeypatch.setattr(solve, "DIRECT", {"piqp": piqp})
-    vi = programs()[1]
+    told, piqp, vi = list[bool](), DIRECT["piqp"], programs()[1]
+    watched = lambda program, bounds, **settings: told.append(bounds) or piqp(program, bounds, **settings)  # noqa: E731
+    monkeypatch.setattr(solve, "DIRECT", {"piqp": watched})
     for factor in (None, np.linalg.cholesky(vi.A)):
         solve.solve_qp(vi, "piqp", 1e-9, factor=factor)
     assert told == [False, True]
@@ -281,28 +230,17 @@ def test_bounds_give_what_rows_give(solver: str, monkeypatch: pytest.MonkeyPatch
     bounds = answers()
     monkeypatch.setattr(solve, "SETTINGS", {solver: replace(SETTINGS[solver], bounds=False)})
     for one, other in zip(bounds, answers(), strict=True):
-        assert one.x is not None
-        assert one.alpha is not None
         assert np.allclose(one.x, other.x, rtol=0.0, atol=1e-8)
         assert np.allclose(one.alpha, other.alpha, rtol=0.0, atol=1e-8)
 
 
-@pytest.mark.parametrize("solver", sorted(set(DIRECT) & set(solve.installed_solvers())))
-def test_an_answer_depends_on_nothing_that_was_solved_before(solver: str) -> None:
-    of_program = [solve.solve_qp(vi, solver, 1e-9) for vi in programs()]
-    for vi, first in reversed(list(zip(programs(), of_program, strict=True))):
-        again = solve.solve_qp(vi, solver, 1e-9)
-        assert (again.x is None) == (first.x is None)
-        assert again.x is None or first.x is None or again.x.tobytes() == first.x.tobytes()
-
-
-@pytest.mark.parametrize("solver", sorted(SETTINGS))
-def test_a_tighter_accuracy_never_asks_for_less(solver: str) -> None:
-    loose, tight = SETTINGS[solver].at(1e-4), SETTINGS[solver].at(1e-8)
-    assert loose.keys() == tight.keys()
-    for key, value in tight.items():
-        if isinstance(value, float) and not isinstance(loose[key], bool):
-            assert value <= loose[key]
+def test_a_tighter_accuracy_never_asks_for_less() -> None:
+    for settings in SETTINGS.values():
+        loose, tight = settings.at(1e-4), settings.at(1e-8)
+        assert loose.keys() == tight.keys()
+        for key, value in tight.items():
+            if isinstance(value, float) and not isinstance(loose[key], bool):
+                assert value <= loose[key]
 
 
 @pytest.mark.parametrize("solver", sorted(set(SETTINGS) & set(installed_solvers())))

@@ -66,17 +66,11 @@ def test_units_rows_and_bases_change_nothing(seed: int, length: int, force: int,
 
 
 @given(seeds, st.sampled_from([1e6, 1e20, np.inf]))
-def test_a_far_row_says_nothing_of_the_others(seed: int, far: float) -> None:
+def test_far_rows_and_sparse_formats_change_nothing(seed: int, far: float) -> None:
     vi, (x, alpha) = program(seed), answer(seed)
     beside = replace(vi, B=np.vstack([vi.B, vi.B[:1]]), g=np.append(vi.g, far))
     same(kkt_residuals(beside, x, np.append(alpha, 0.0)), kkt_residuals(vi, x, alpha))
-
-
-@given(seeds)
-def test_sparse_and_dense_programs_have_the_same(seed: int) -> None:
-    vi, (x, alpha) = program(seed), answer(seed)
-    sparse = replace(vi, A=sp.csr_array(vi.A), B=sp.csr_array(vi.B))
-    same(kkt_residuals(sparse, x, alpha), kkt_residuals(vi, x, alpha))
+    same(kkt_residuals(replace(vi, A=sp.csr_array(vi.A), B=sp.csr_array(vi.B)), x, alpha), kkt_residuals(vi, x, alpha))
 
 
 @given(seeds)
@@ -100,13 +94,13 @@ def test_a_membrane_in_small_units_without_contact_is_no_solution() -> None:
     assert reason.startswith("primal residual")
 
 
-@pytest.mark.parametrize("far", [2e5, 2e7, 1e20])
-def test_far_gaps_are_no_scale(far: float) -> None:
+def test_far_gaps_are_no_scale() -> None:
     """Without load, an error of 10 % of the penetration beside a gap that is far away."""
-    vi = VariationalInequality(np.eye(2), np.zeros(2), np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([-1.0, far]))
-    assert verify(vi, QPSolution(np.array([-1.0, 0.0]), np.array([1.0, 0.0]), ""), 1e-8)[0] is Status.OK
-    assert verify(vi, QPSolution(np.array([-0.9, 0.0]), np.array([0.9, 0.0]), ""), 1e-8)[0] is Status.INACCURATE
-    assert verify(vi, QPSolution(np.array([-1.1, 0.0]), np.array([1.1, 0.0]), ""), 1e-8)[0] is Status.INACCURATE
+    for far in (2e5, 2e7, 1e20):
+        vi = VariationalInequality(np.eye(2), np.zeros(2), np.eye(2), np.array([-1.0, far]))
+        for depth, status in ((1.0, Status.OK), (0.9, Status.INACCURATE), (1.1, Status.INACCURATE)):
+            answer = QPSolution(np.array([-depth, 0.0]), np.array([depth, 0.0]), "")
+            assert verify(vi, answer, 1e-8)[0] is status
 
 
 def test_what_nothing_drives_stays_where_it_is() -> None:
@@ -117,23 +111,19 @@ def test_what_nothing_drives_stays_where_it_is() -> None:
     assert kkt_residuals(vi, np.array([1e-9, 0.0]), np.zeros(2)).dual == pytest.approx(1.0)  # no other scale is there
 
 
-def test_no_data_have_no_residual_and_what_is_not_definite_has_none_either() -> None:
+def test_no_data_have_no_residual_and_what_is_no_number_or_not_definite_is_not_hidden() -> None:
     empty = VariationalInequality(np.zeros((0, 0)), np.zeros(0), np.zeros((1, 0)), np.ones(1))
     assert kkt_residuals(empty, np.zeros(0), np.zeros(1)).worst == 0.0
+    assert not kkt_residuals(program(0), np.full(6, np.nan), np.zeros(4)).worst <= 1.0
     with pytest.raises(NumericalError, match="A is not positive definite"):
         kkt_residuals(replace(program(0), A=-np.eye(6)), np.ones(6), np.zeros(4))
 
 
-def test_what_is_not_a_number_is_not_hidden() -> None:
-    assert not kkt_residuals(program(0), np.full(6, np.nan), np.zeros(4)).worst <= 1.0
-
-
-@pytest.mark.parametrize("far", [1.0, 1e20, np.inf])
-def test_contradictions_are_certified_beside_a_far_row(far: float) -> None:
-    B, g = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]]), np.array([-1.0, 0.5, far])
-    vi = VariationalInequality(np.eye(2), np.zeros(2), B, g)
-    alpha = infeasibility_certificate(vi)
-    assert alpha is not None
-    assert np.allclose(B.T @ alpha, 0.0, atol=1e-9)
-    assert alpha[:2] @ g[:2] < 0.0
-    assert infeasibility_certificate(replace(vi, g=np.array([-1.0, 1.5, far]))) is None
+def test_contradictions_are_certified_beside_a_far_row() -> None:
+    B = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]])
+    for far in (1.0, 1e20, np.inf):
+        vi = VariationalInequality(np.eye(2), np.zeros(2), B, np.array([-1.0, 0.5, far]))
+        alpha = infeasibility_certificate(vi)
+        assert np.allclose(B.T @ alpha, 0.0, atol=1e-9)
+        assert alpha[:2] @ vi.g[:2] < 0.0
+        assert infeasibility_certificate(replace(vi, g=np.array([-1.0, 1.5, far]))) is None
