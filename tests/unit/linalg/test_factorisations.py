@@ -20,6 +20,9 @@ def _installed(request: pytest.FixtureRequest) -> None:
         pytest.skip(f"{chosen.distribution} is not installed")
 
 
+Sizes = tuple[int, ...]
+
+
 def membranes(sizes: tuple[int, ...], weight: float = 1.0) -> sp.csc_array:
     """Stiffnesses of square membranes that do not touch."""
     blocks = []
@@ -37,15 +40,12 @@ def condensed(A: np.ndarray, last: np.ndarray) -> np.ndarray:
 @EVERY
 @pytest.mark.parametrize("weight", [1e-9, 2e11])
 @pytest.mark.parametrize("sizes", [(15,), (9, 12)], ids=["one body", "two bodies"])
-def test_solutions_and_schur_complements_are_the_dense_ones(
-    chosen: Implementation, sizes: tuple[int, ...], weight: float
-) -> None:
+def test_solutions_and_schur_complements_are_dense_ones(chosen: Implementation, sizes: Sizes, weight: float) -> None:
     A, rng = membranes(sizes, weight), np.random.default_rng(0)
     n, dense = A.shape[0], A.toarray()
     factor = chosen.factorise(A, "A")
     for right in (rng.standard_normal(n), rng.standard_normal((n, 3)), np.zeros((n, 0)), np.zeros(n)):
-        expected = np.linalg.solve(dense, right)
-        np.testing.assert_allclose(factor.solve(right), expected, atol=1e-12 / weight)
+        np.testing.assert_allclose(factor.solve(right), np.linalg.solve(dense, right), atol=1e-12 / weight)
     last = np.concatenate([np.arange(5), np.arange(n - 4, n)])
     order = np.concatenate([np.setdiff1d(np.arange(n), last), last])
     partly = chosen.eliminate(A, order, len(last), "A")
@@ -64,9 +64,7 @@ def test_solutions_and_schur_complements_are_the_dense_ones(
 
 @EVERY
 @pytest.mark.parametrize("sizes", [(15,), (9, 12)], ids=["one body", "two bodies"])
-def test_a_factor_with_some_unknowns_last_makes_inner_products_euclidean(
-    chosen: Implementation, sizes: tuple[int, ...]
-) -> None:
+def test_a_factor_with_some_unknowns_last_makes_inner_products_euclidean(chosen: Implementation, sizes: Sizes) -> None:
     A, rng = membranes(sizes), np.random.default_rng(1)
     n, dense = A.shape[0], A.toarray()
     last = np.concatenate([np.arange(5), np.arange(n - 4, n)])
@@ -79,35 +77,30 @@ def test_a_factor_with_some_unknowns_last_makes_inner_products_euclidean(
         np.testing.assert_allclose(F.T @ whitened, u.T @ right, rtol=1e-12, atol=1e-12)
         on_last = factored.solve_factor_transposed(np.eye(n)[:, last])
         assert not on_last[:-9].any()
-        expected = np.linalg.solve(factored.trailing_factor.T, np.eye(9))
-        np.testing.assert_allclose(on_last[-9:], expected, atol=1e-13)
+        np.testing.assert_allclose(on_last[-9:], np.linalg.inv(factored.trailing_factor.T), atol=1e-13)
 
 
 @EVERY
-@pytest.mark.parametrize("count", [0, 1, 4], ids=["empty contact", "one unknown left", "nothing eliminated"])
-def test_tiny_matrices_and_empty_contact(chosen: Implementation, count: int) -> None:
+def test_tiny_matrices_and_empty_contact(chosen: Implementation) -> None:
     A = sp.csc_array(np.diag([2.0, 3.0, 4.0, 5.0]) - 0.5 * np.eye(4, k=1) - 0.5 * np.eye(4, k=-1))
-    partly = chosen.eliminate(A, np.arange(4), count, "A")
-    np.testing.assert_allclose(partly.schur_blocks().toarray(), condensed(A.toarray(), np.arange(4 - count, 4)))
-    assert partly.extend(np.ones(count)).shape == (4,)
+    for count in (0, 1, 4):
+        partly = chosen.eliminate(A, np.arange(4), count, "A")
+        np.testing.assert_allclose(partly.schur_blocks().toarray(), condensed(A.toarray(), np.arange(4 - count, 4)))
+        assert partly.extend(np.ones(count)).shape == (4,)
     assert chosen.factorise(sp.csc_array([[4.0]]), "A").solve(np.array([2.0])) == pytest.approx(0.5)
     assert chosen.factorise(sp.csc_array((0, 0)), "A").solve(np.zeros((0, 2))).shape == (0, 2)
 
 
 @EVERY
-@pytest.mark.parametrize(
-    "matrix",
-    [
+def test_what_is_not_definite_is_refused_by_name(chosen: Implementation) -> None:
+    for matrix in (
         -np.eye(3), np.diag([1.0, 0.0, 1.0]), np.array([[1.0, 2.0], [2.0, 1.0]]), np.array([[1.0, 1.0], [1.0, 1.0]]),
         np.diag([1.0, np.nan]), np.diag([1.0, np.inf]), np.array([[1.0, np.nan], [np.nan, 1.0]]),
         membranes((8,)).toarray() - 1.0 * np.eye(64),
-    ],
-    ids=["negative", "zero pivot", "indefinite", "singular", "NaN", "infinite", "NaN off", "indefinite mesh"],
-)  # fmt: skip
-def test_what_is_not_definite_is_refused_by_name(chosen: Implementation, matrix: np.ndarray) -> None:
-    with pytest.raises(NumericalError, match="the thing"):
-        chosen.factorise(sp.csc_array(matrix), "the thing")
-    assert not is_proved_definite([sp.csc_array(matrix)], chosen)
+    ):  # fmt: skip
+        with pytest.raises(NumericalError, match="the thing"):
+            chosen.factorise(sp.csc_array(matrix), "the thing")
+        assert not is_proved_definite([sp.csc_array(matrix)], chosen)
 
 
 def test_names() -> None:
