@@ -50,7 +50,7 @@ def completed(line: str) -> list[str]:
 def test_values_are_completed_with_what_there_is() -> None:
     for line, *words in (
         ("run quick --problem ob", "obstacle"),
-        ("run quick --dual ", *(name for name, plugin in registered(DUAL).items() if not plugin.package)),
+        ("run quick --dual ", *registered(DUAL)),
         ("run quick --primal o", "offline-pga", "online-supremizers"), ("run quick --solver ", *sorted(SETTINGS)),
         ("run quick --correction ", "auto", "feasible", "none"),
         ("check o", "obstacle", "offline-pga", "online-supremizers", "orthant"), ("check sol", "solver:"),

@@ -30,26 +30,10 @@ seeds = st.integers(0, 10_000)
 
 @given(seeds)
 def test_the_span_constant_is_the_smallest_generalised_singular_value(seed: int) -> None:
-    W = space(6, seed)
-    rng = np.random.default_rng(seed)
+    W, rng = space(6, seed), np.random.default_rng(seed)
     chi = rng.random((6, 3))
-    cone = cone_basis(chi / W.norm(chi), W)
-    image = rng.standard_normal((5, 6))
-    smallest = scipy.linalg.eigh(
-        (image @ cone.chi).T @ (image @ cone.chi), cone.gram, eigvals_only=True, subset_by_index=[0, 0]
-    )[0]
-    assert np.isclose(beta_span(image @ cone.span), np.sqrt(max(smallest, 0.0)), rtol=1e-6, atol=1e-7)
-
-
-def test_the_span_constant_is_zero_exactly_below_the_rank_and_honest_at_it() -> None:
-    W = space(6)
-    chi = np.random.default_rng(0).random((6, 3))
-    chi = np.column_stack([chi, chi[:, 0] + chi[:, 1]])  # rank 3 of 4
-    cone = cone_basis(chi / W.norm(chi), W)
-    assert cone.rank == 3
-    assert beta_span(np.ones((2, 3))) == 0.0
-    assert beta_span(np.eye(3)) == 1.0
-    assert beta_span(np.zeros((4, 0))) == np.inf
+    cone, image = cone_basis(chi / W.norm(chi), W), rng.standard_normal((5, 6))
+    assert np.isclose(beta_span(image @ cone.span), span_constant(image @ cone.chi, cone.gram), rtol=1e-6, atol=1e-7)
 
 
 def kahan(n: int, c: float) -> np.ndarray:
@@ -66,36 +50,31 @@ def test_the_rank_is_that_of_the_singular_values() -> None:
     assert cone.rank == 89
     assert np.allclose(cone.span.T @ cone.span, np.eye(89), atol=1e-12)
     assert cone.rank_gap > 1e8
-
-
-def test_a_rank_without_a_gap_is_seen() -> None:
-    """Singular values that fall evenly through the threshold."""
+    # singular values that fall evenly through the threshold have no gap there
     rng = np.random.default_rng(0)
     left, right = (np.linalg.qr(rng.standard_normal((20, 16)))[0] for _ in range(2))
-    chi = left @ np.diag(10.0 ** -np.arange(16.0)) @ right[:16].T
-    cone = cone_basis(chi, InnerProduct(sp.eye_array(20)))
+    cone = cone_basis(left @ np.diag(10.0 ** -np.arange(16.0)) @ right[:16].T, InnerProduct(sp.eye_array(20)))
     assert cone.rank in (12, 13)
     assert 5.0 < cone.rank_gap < 20.0
-
-
-def test_a_full_rank_just_above_the_threshold_is_seen() -> None:
+    # a full rank just above the threshold
     cone = cone_basis(np.diag([1.0, 0.5, 3.0 * RANK_RTOL]), InnerProduct(sp.eye_array(3)))
-    assert cone.rank == 3
-    assert cone.rank_gap == pytest.approx(3.0)
+    assert (cone.rank, cone.rank_gap) == (3, pytest.approx(3.0))
+    # three generators and a sum of two of them
+    W, chi = space(6), np.random.default_rng(0).random((6, 3))
+    chi = np.column_stack([chi, chi[:, 0] + chi[:, 1]])
+    assert cone_basis(chi / W.norm(chi), W).rank == 3
+    # no generators
+    cone = cone_basis(np.zeros((6, 0)), W)
+    assert (cone.rank, cone.gram_condition, cone.rank_gap, cone.span.shape) == (0, None, np.inf, (6, 0))
+    assert (beta_span(np.ones((2, 3))), beta_span(np.eye(3)), beta_span(np.zeros((4, 0)))) == (0.0, 1.0, np.inf)
 
 
-@pytest.mark.parametrize("distance", [1e-4, 1e-8, 1e-11, 1e-13])
-def test_the_condition_of_nearly_parallel_generators_does_not_saturate(distance: float) -> None:
+def test_the_condition_of_nearly_parallel_generators_does_not_saturate() -> None:
     """cond G = (1 + cos φ) / (1 − cos φ) of two unit vectors at the angle φ: 4 / φ² for small angles."""
-    chi = np.array([[1.0, np.cos(distance)], [0.0, np.sin(distance)]])
-    cone = cone_basis(chi, InnerProduct(sp.eye_array(2)))
-    assert cone.gram_condition == pytest.approx(4.0 / distance**2, rel=1e-2)
-
-
-def test_without_generators_there_is_neither_rank_nor_condition() -> None:
-    cone = cone_basis(np.zeros((6, 0)), space(6))
-    assert (cone.rank, cone.gram_condition, cone.rank_gap) == (0, None, np.inf)
-    assert cone.span.shape == (6, 0)
+    for distance in (1e-4, 1e-8, 1e-11, 1e-13):
+        chi = np.array([[1.0, np.cos(distance)], [0.0, np.sin(distance)]])
+        cone = cone_basis(chi, InnerProduct(sp.eye_array(2)))
+        assert cone.gram_condition == pytest.approx(4.0 / distance**2, rel=1e-2)
 
 
 @pytest.mark.parametrize("mu", [0.0, 0.5, 1.0])
@@ -152,12 +131,8 @@ def test_steps_are_the_smallest_constants_of_leading_parts(seed: int, first: int
     for block in projected:
         block[:, -1] = block[:, 0] + small * block[:, -1]
     found = ProjectedSupremizers(projected, classes)
-    direct = np.array(
-        [
-            [abs(c) * beta_span(projected[k][:rows]) for k, c in zip(classes.members, classes.factors, strict=True)]
-            for rows in range(first, first + 6)
-        ]
-    )
+    pairs = list(zip(classes.members, classes.factors, strict=True))
+    direct = np.array([[abs(c) * beta_span(projected[k][:r]) for k, c in pairs] for r in range(first, first + 6)])
     assert found.over_steps(first) == pytest.approx(direct.min(axis=1), rel=1e-12, abs=1e-14)
     assert found.beta_span() == pytest.approx(direct[-1], rel=1e-12)
     reachable = np.abs(classes.factors) * (1.0 + rng.random(2)[classes.members]) * (1.0 + direct.max())
@@ -167,9 +142,8 @@ def test_steps_are_the_smallest_constants_of_leading_parts(seed: int, first: int
 
 
 def test_without_multipliers_nothing_is_unstable() -> None:
-    classes = constraint_classes([sp.csr_array(np.ones((2, 3)))])
-    assert ProjectedSupremizers([np.zeros((4, 0))], classes).over_steps(2).tolist() == [np.inf] * 3
-    none = ProjectedSupremizers([np.zeros((4, 0))], classes)
+    none = ProjectedSupremizers([np.zeros((4, 0))], constraint_classes([sp.csr_array(np.ones((2, 3)))]))
+    assert none.over_steps(2).tolist() == [np.inf] * 3
     assert none.stability_ratios(2, np.array([np.inf])).tolist() == [1.0] * 3
 
 
@@ -214,18 +188,18 @@ def test_the_cone_interval_holds_the_minimum_over_all_faces(seed: int, rows: int
     assert sharp.split("/")[1] in ("U0", "U1", "U2")
 
 
-@pytest.mark.parametrize("seed", range(30))
-def test_hard_cases_are_known_to_one_percent(seed: int) -> None:
+def test_hard_cases_are_known_to_one_percent() -> None:
     """M changes its sign, and there are fewer primal vectors than generators, or hardly more."""
-    count = 4 + seed % 6
-    C, G = random_pair(seed, count - 2 + seed % 4, count, 0.0)
-    C[:, 0] *= np.sign(-(C[:, 0] @ C[:, 1]))
-    assert (C.T @ C).min() < 0.0
-    lower, upper, _ = cone_interval(C, G, span_constant(C, G))
-    exact = minimum_by_faces(C.T @ C, G)
-    assert lower - 1e-7 <= exact <= upper + 1e-7
-    if seed != 24:  # there the semidefinite program is not exact
-        assert upper - lower <= 0.01 * upper + 1e-7
+    for seed in range(30):
+        count = 4 + seed % 6
+        C, G = random_pair(seed, count - 2 + seed % 4, count, 0.0)
+        C[:, 0] *= np.sign(-(C[:, 0] @ C[:, 1]))
+        assert (C.T @ C).min() < 0.0
+        lower, upper, _ = cone_interval(C, G, span_constant(C, G))
+        exact = minimum_by_faces(C.T @ C, G)
+        assert lower - 1e-7 <= exact <= upper + 1e-7
+        if seed != 24:  # there the semidefinite program is not exact
+            assert upper - lower <= 0.01 * upper + 1e-7
 
 
 def test_ten_generators_of_which_the_minimum_needs_many() -> None:
@@ -268,28 +242,19 @@ def test_zeros_of_the_gram_matrix_that_were_rounded_limit_nothing() -> None:
     assert entrywise_bound(M, G) == pytest.approx(2.0 - 4 * 0.1)
 
 
-def test_the_interval_is_a_point_where_the_minimum_sits_on_a_generator() -> None:
-    C = np.array([[1.0, 0.9], [0.0, 1.5]])
+def test_intervals_of_special_cases() -> None:
     G = np.array([[1.0, 0.2], [0.2, 1.0]])
-    assert cone_interval(C, G, 0.1) == (1.0, 1.0, "L½/U0")
-
-
-def test_opposite_images_leave_no_stability_over_the_cone() -> None:
-    C, G = np.array([[1.0, -1.0], [0.0, 0.0]]), np.eye(2)
-    lower, upper, _ = cone_interval(C, G, 0.0)
+    # a point where the minimum sits on a generator
+    assert cone_interval(np.array([[1.0, 0.9], [0.0, 1.5]]), G, 0.1) == (1.0, 1.0, "L½/U0")
+    # opposite images leave no stability over the cone
+    lower, upper, _ = cone_interval(np.array([[1.0, -1.0], [0.0, 0.0]]), np.eye(2), 0.0)
     assert lower == 0.0
     assert upper < 1e-12
-
-
-def test_without_generators_the_constant_is_infinite_and_without_primal_vectors_zero() -> None:
+    # without generators, and without primal vectors
     assert cone_interval(np.zeros((3, 0)), np.zeros((0, 0)), np.inf)[:2] == (np.inf, np.inf)
     assert cone_interval(np.zeros((0, 2)), np.eye(2), 0.0)[:2] == (0.0, 0.0)
-
-
-def test_a_lower_bound_above_the_upper_one_is_not_hidden() -> None:
-    """Nothing but a bug leads to it, and the invariants of a run are to show it."""
-    lower, upper, _ = cone_interval(np.eye(2), np.eye(2), span=2.0)
-    assert (lower, upper) == (2.0, 1.0)
+    # Only a bug leads to a lower bound above the upper one; the invariants of a run are to show it.
+    assert cone_interval(np.eye(2), np.eye(2), span=2.0)[:2] == (2.0, 1.0)
 
 
 @given(seeds)

@@ -50,9 +50,7 @@ def test_errors_as_defined() -> None:
 
 
 @given(st.floats(-12.0, 3.0), st.floats(-12.0, 3.0), st.floats(-20.0, 20.0), st.integers(0, 1000))
-def test_what_is_zero_beside_the_training_set_has_no_relative_error(
-    share_u: float, share_lam: float, unit: float, seed: int
-) -> None:
+def test_what_is_zero_beside_the_training_set_has_no_relative_error(share_u, share_lam, unit, seed) -> None:
     """Whatever the unit: its error on the scale of the training set is known, as that of any other."""
     problem, rng = Varying(), np.random.default_rng(seed)
     vi = problem.assemble(np.array([0.5]))
@@ -115,7 +113,6 @@ def test_errors_and_bounds_of_many_queries_are_those_of_each() -> None:
             hsw_bounds(problem, [vi], [known[k]], *own[1:])[0],
         )
         for found, expected in zip(together, alone, strict=True):
-            assert expected is not None
             assert getattr(found[k], "note", "") == getattr(expected, "note", "")
             numbers = [[value for value in astuple(one) if not isinstance(value, str)] for one in (found[k], expected)]
             assert numbers[0] == pytest.approx(numbers[1], rel=1e-10, abs=1e-12)
