@@ -22,7 +22,7 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from vibench.offline.sweep import high_fidelity_sweep
+from vibench.offline.reduction import high_fidelity_sweep
 
 import vibench
 from vibench.offline.assemblies import Assemblies

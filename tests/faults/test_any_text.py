@@ -32,7 +32,7 @@ from vibench.results.database import ResultsDatabase
 from vibench.results.read import in_order, read_table
 from vibench.results.schema import STORED, TABLES
 from vibench.results.sqlite import FILE
-from vibench.stages.query import Query, run_query
+from vibench.stages.query import ProgramQuery, run_query
 
 ANYTHING = st.text(st.characters(), max_size=50) | st.sampled_from([LABEL, ODD, "$$", "_", "[/b]", "=1", "|", "\\", ""])
 """All of Unicode, lone surrogates included."""
@@ -55,7 +55,7 @@ def answered(text: str, count: Any) -> dict[str, Any]:
         return QPSolution(np.ones(1), np.zeros(1), text, count)
 
     with mock.patch.object(registry, "qp_solver", lambda name: {name: solver}):
-        row, _ = run_query(Query(PROGRAM, None, "odd", 1e-7), 60.0, lambda _: None)
+        row, _ = run_query(ProgramQuery(PROGRAM, None, "odd", 1e-7), 60.0, contextlib.nullcontext)
     assert row["status"] == "ok", row["reason"]
     return row
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skfem import Basis, BilinearForm, ElementTriP1, LinearForm, MeshTri, condense, solve
 from skfem.helpers import dot, grad
-from vibench.offline.sweep import high_fidelity_sweep
+from vibench.offline.reduction import high_fidelity_sweep
 
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.strategies import Stop

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from vibench.offline.sweep import high_fidelity_sweep
+from vibench.offline.reduction import high_fidelity_sweep
 
 import vibench
 from vibench import Reduction, RequestError, Stop, create

@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import exact, space, spd
-from vibench.offline.sweep import high_fidelity_sweep
+from vibench.offline.reduction import high_fidelity_sweep
 
 from vibench import create
 from vibench.errors import UnsupportedError
