@@ -62,34 +62,30 @@ def test_kkt_conditions_hold_with_exact_zeros() -> None:
 
 def test_a_cycling_active_set_is_helped_and_the_help_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     vi = string(50, 0.02, 1.0)
-    alone = active_set.solve_high_fidelity(vi)
+    alone, iterate = active_set.solve_high_fidelity(vi), active_set.active_set_iterations
     assert alone.fallback == ""
-    iterate, calls = active_set.active_set_iterations, []
-
-    def cycles_at_first(system, active, *equal):
-        calls.append(active)
-        return None if len(calls) == 1 else iterate(system, active, *equal)
-
-    monkeypatch.setattr(active_set, "active_set_iterations", cycles_at_first)
+    cycles_at_first = iter([None])
+    monkeypatch.setattr(active_set, "active_set_iterations", lambda *given: next(cycles_at_first, iterate(*given)))
     helped = active_set.solve_high_fidelity(vi)
     assert "cycled" in helped.fallback
     assert np.allclose(helped.u, alone.u, atol=1e-12)
     assert np.array_equal(helped.lam == 0.0, alone.lam == 0.0)
 
 
-def test_no_active_constraint_and_all_active() -> None:
-    free = active_set.solve_high_fidelity(string(20, 10.0, 1.0))
-    assert np.all(free.lam == 0.0)
+def test_no_active_constraint_all_active_and_what_is_infeasible() -> None:
+    assert np.all(active_set.solve_high_fidelity(string(20, 10.0, 1.0)).lam == 0.0)
     pressed = active_set.solve_high_fidelity(string(20, 0.0, 1.0))
     assert np.allclose(pressed.lam, 1.0)
     assert np.abs(pressed.u).max() < 1e-15
-
-
-def test_an_infeasible_problem_is_refused() -> None:
+    problem, mu = Varying(), np.array([0.5])
+    vi = problem.assemble(mu)  # constraints that touch nothing leave a linear problem
+    free = replace(vi, B=sp.csr_array(vi.B.shape), g=np.ones(len(vi.g)))
+    found = active_set.HighFidelitySolver(problem).solve_assembled(mu, free)
+    assert np.allclose(found.u, np.linalg.solve(vi.A.toarray(), vi.f))
+    assert not found.lam.any()
     B = sp.csr_array(np.array([[1.0, 0.0], [-1.0, 0.0]]))
-    vi = VariationalInequality(sp.csc_array(np.eye(2)), np.ones(2), B, np.array([-1.0, -1.0]))
     with pytest.raises(NumericalError):
-        active_set.solve_high_fidelity(vi)
+        active_set.solve_high_fidelity(VariationalInequality(sp.csc_array(np.eye(2)), np.ones(2), B, -np.ones(2)))
 
 
 def test_a_contact_set_that_moves_node_by_node_is_followed_to_its_end() -> None:
@@ -117,12 +113,3 @@ def test_a_stiffness_that_is_not_symmetric_is_refused_and_where() -> None:
     crooked[0, 1] *= 1.001
     with pytest.raises(NumericalError, match=r"A at mu = \[0.5\] is not symmetric"):
         solver.check_coercive(mu, replace(vi, A=sp.csc_array(crooked)))
-
-
-def test_constraints_that_touch_nothing_leave_a_linear_problem() -> None:
-    problem, mu = Varying(), np.array([0.5])
-    vi = problem.assemble(mu)
-    free = replace(vi, B=sp.csr_array(vi.B.shape), g=np.ones(len(vi.g)))
-    found = active_set.HighFidelitySolver(problem).solve_assembled(mu, free)
-    assert np.allclose(found.u, np.linalg.solve(vi.A.toarray(), vi.f))
-    assert not found.lam.any()

@@ -47,9 +47,7 @@ def test_a_start_depends_on_the_parameter_alone_and_can_be_copied_after_use() ->
     assert np.array_equal(pickle.loads(pickle.dumps(nested)).nearest, nested.nearest)
 
 
-def test_the_obstacle_starts_from_a_coarser_mesh_where_its_own_is_fine_and_nothing_is_solved(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_obstacle_starts_from_a_coarser_mesh_where_its_own_is_fine(monkeypatch: pytest.MonkeyPatch) -> None:
     cold = HighFidelitySolver(Obstacle(1500)).solve(MU)
     monkeypatch.setattr(obstacle, "NESTED", 1000)
     problem = Obstacle(1500)

@@ -59,25 +59,16 @@ def test_every_tolerance_gets_what_building_for_it_alone_gives(offline: Offline)
     assert seconds[0] < seconds[-1]
 
 
-def test_a_tolerance_beyond_reach_costs_no_other(offline: Offline) -> None:
+def test_a_tolerance_beyond_reach_costs_no_other_and_failures_are_named(offline: Offline) -> None:
     grown = grow_through(UnitVectors(), offline, [0.5, 0.1])
     assert grown.at(grown.milestone(0.5)).vectors.shape[1] == 1
     with pytest.raises(NumericalError, match=r"tolerance 0\.1 is not reached: four are all there are"):
         grown.milestone(0.1)
-
-
-def test_a_strategy_that_just_ends_has_missed_the_tolerance(offline: Offline) -> None:
     with pytest.raises(NumericalError, match=r"tolerance 0\.1 is not reached: the strategy has no further vector"):
         Ends().build(offline, 0.1)
     assert Ends().build(offline, 1.0).vectors.shape[1] == 0
-
-
-def test_a_construction_that_fails_at_once_is_no_tolerance_missed(offline: Offline) -> None:
     with pytest.raises(NumericalError, match=r"^no space to begin with$"):
         grow_through(Fails(), offline, [1.0])
-
-
-def test_a_nested_strategy_needs_a_tolerance(offline: Offline) -> None:
     with pytest.raises(ValueError, match="UnitVectors needs a tolerance"):
         UnitVectors().build(offline, None)
 

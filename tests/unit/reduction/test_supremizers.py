@@ -75,9 +75,7 @@ def test_proportional_matrices_are_recognised_and_others_are_not() -> None:
 
 @pytest.mark.parametrize("reach", [3, 5, None])
 @pytest.mark.parametrize("dependent", [False, True])
-def test_coordinates_of_loads_that_vary_on_some_unknowns_are_those_of_their_supremizers(
-    reach: int | None, dependent: bool
-) -> None:
+def test_coordinates_of_varying_loads_are_those_of_their_supremizers(reach: int | None, dependent: bool) -> None:
     V, rng, dofs = space(16), np.random.default_rng(3), np.arange(5, 15)
     basis = V.orthonormalise(rng.standard_normal((16, 3)))
     fixed = np.zeros((10, 4))
