@@ -22,10 +22,10 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from vibench.offline.reduction import high_fidelity_sweep
 
 import vibench
 from vibench.offline.assemblies import Assemblies
+from vibench.offline.reduction import high_fidelity_sweep
 from vibench.qp.solve import solve_qp
 from vibench.stages.assessment import VIOLATION
 

@@ -10,12 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skfem import Basis, BilinearForm, ElementTriP1, LinearForm, MeshTri, condense, solve
 from skfem.helpers import dot, grad
-from vibench.offline.reduction import high_fidelity_sweep
 
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.strategies import Stop
 from vibench.model.affine import Evaluation, affine_decomposition
-from vibench.offline.reduction import Reduction
+from vibench.offline.reduction import Reduction, high_fidelity_sweep
 from vibench.reduction.supremizers import constraint_classes, supremizers
 from vibench_problems.disc_mesh import aspect_ratios
 from vibench_problems.obstacle import RADIUS, Obstacle

@@ -10,8 +10,8 @@ from samples import SampleStore, carry_out
 
 from vibench import AdaptiveSampling, Array, HighFidelitySolver, ParameterBox, Stop, Trainer, create
 from vibench.plugins.plugin import Plugin
-from vibench.stages.formulation import AffineDecomposition
 from vibench.stages.base import value_of
+from vibench.stages.formulation import AffineDecomposition
 from vibench.stages.offline import ConstraintMatrices, PODStage
 from vibench.stages.snapshots import gather, parameters_in, solution_stages
 from vibench.study.parameter_sets import ParameterSet

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from vibench.offline.reduction import high_fidelity_sweep
 
 import vibench
 from vibench import Reduction, RequestError, Stop, create
 from vibench.library.vtu import export_vtu
+from vibench.offline.reduction import high_fidelity_sweep
 
 meshio = pytest.importorskip("meshio")
 

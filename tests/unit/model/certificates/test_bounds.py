@@ -12,7 +12,6 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import exact, space, spd
-from vibench.offline.reduction import high_fidelity_sweep
 
 from vibench import create
 from vibench.errors import UnsupportedError
@@ -31,6 +30,7 @@ from vibench.model.certificates.prepared_correction import prepare_corrections
 from vibench.model.certificates.residual import ColumnBlock, residual_basis
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
+from vibench.offline.reduction import high_fidelity_sweep
 from vibench.qp.exact import exact_solution
 
 N, M = 14, 5
