@@ -14,11 +14,11 @@ import scipy.fft
 from vibench.arrays import Array, Indices
 from vibench.linalg.inner_product import svd
 
+# from a parameter mu (d,) to flat arrays (size,) by name, of the same sizes everywhere
 Evaluate = Callable[[Array], Mapping[str, Array]]
-"""From a parameter mu (d,) to flat arrays (size,) by name, of the same sizes everywhere."""
 
+# random points at which the error is measured
 MEASURED = 100
-"""Random points at which the error is measured."""
 
 
 @dataclass(frozen=True)
@@ -81,21 +81,11 @@ def interpolate_on_box(
     need. If all have the tolerance, those without given terms are factorised into θ and terms by a singular value
     decomposition.
 
-    Parameters
-    ----------
-    evaluate
-        The arrays at a parameter.
-    lower, upper
-        The box (d,).
-    tolerance
-        Relative error asked for. It may be missed: functions that are not smooth take too many points. The errors of
-        the result say so.
-    budget
-        Largest number of points of a grid.
-    terms
-        Flat terms (Q×size) of those arrays for which `evaluate` returns the coefficients θ (Q,) instead.
-    alike
-        Names of arrays with terms whose θ are the same: so are their polynomials, which serve the most demanding one.
+    `evaluate` gives the arrays at a parameter of the box from `lower` to `upper` (d,), and `budget` is the largest
+    number of points of a grid. The relative `tolerance` may be missed: functions that are not smooth take too many
+    points. The errors of the result say so. `terms` are flat terms (Q×size) of those arrays for which `evaluate`
+    returns the coefficients θ (Q,) instead, `alike` names of arrays with terms whose θ are the same: so are their
+    polynomials, which serve the most demanding one.
     """
     random = np.random.default_rng(0)
     # degrees are chosen along three random lines in every direction: one alone may miss an oscillation
@@ -130,7 +120,12 @@ def interpolate_on_box(
         for name, given in terms.items():
             theta = _without_smallest(kept[name][1], 0.1 * tolerance) * units[name]
             polynomials[name] = AffinePolynomial(kept[name][0], theta, given, np.inf)
-        polynomials |= {name: _plain(*kept[name], units[name]) for name in kept if name not in terms}
+        for name in kept.keys() - terms.keys():
+            indices, c = kept[name]
+            count, size = c.shape
+            # the coefficients themselves are the terms, or the entries of the array, whichever are fewer
+            theta, own = (c, units[name] * np.eye(size)) if size < count else (np.eye(count), units[name] * c)
+            polynomials[name] = AffinePolynomial(indices, theta, own, np.inf)
         polynomials = {name: measured(name, polynomials[name]) for name in kept}
         if max(p.error for p in polynomials.values()) <= tolerance:
             # only now: the decomposition of a large array takes minutes
@@ -207,14 +202,6 @@ def _needed(coefficients: Array, tolerance: float) -> tuple[Indices, Array]:
     rising = np.argsort(norms, kind="stable")
     kept = np.sort(rising[np.cumsum(norms[rising]) > tolerance]) if norms.sum() > tolerance else np.zeros(1, np.intp)
     return np.stack(np.unravel_index(kept, shape[:-1]), axis=1), flat[kept]
-
-
-def _plain(indices: Indices, coefficients: Array, unit: Any) -> AffinePolynomial:
-    """The polynomial with its coefficients (K×size) themselves as terms, or its entries, whichever are fewer."""
-    count, size = coefficients.shape
-    if size < count:
-        return AffinePolynomial(indices, coefficients, unit * np.eye(size), np.inf)
-    return AffinePolynomial(indices, np.eye(count), unit * coefficients, np.inf)
 
 
 def _factorised(indices: Indices, coefficients: Array, unit: Any, tolerance: float) -> AffinePolynomial:

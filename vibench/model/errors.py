@@ -35,16 +35,10 @@ High-fidelity solutions have residuals up to 1e-10, so that either may be an err
 
 @dataclass(frozen=True)
 class EnergyNorm:
-    """The energy norm at one parameter and its dual norm, from factorisations of A(µ).
+    """The energy norm of a sparse SPD A(µ) (n×n) at one parameter, and its dual norm.
 
-    Attributes
-    ----------
-    A
-        Sparse SPD (n×n).
-    stiffness
-        A condensed on the unknowns that constraints involve, for programs with this A and these constraints.
-    shared
-        Whether the errors of many solutions are measured with it: data that they share is worth more work then.
+    `stiffness` is A condensed on the unknowns that constraints involve. `shared` tells whether the errors of many
+    solutions are measured with it: data that they share is worth more work then.
     """
 
     A: SparseMatrix

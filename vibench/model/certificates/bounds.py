@@ -126,40 +126,21 @@ class _Query:
     """One reduced solution, and what its bounds and its correction share; the constraint is evaluated at most once."""
 
     def __init__(
-        self,
-        certificate: OnlineCertificate,
-        problem: Problem,
-        mu: Array,
-        reduced: ReducedProblem,
-        x: Array,
-        alpha: Array,
+        self, base: CertificateBase, problem: Problem, mu: Array, reduced: ReducedProblem, x: Array, lam: Array
     ) -> None:
-        self._certificate, self._evaluated = certificate, reduced.evaluated
-        self.problem, self.mu, self.program, self.x, self.alpha = problem, mu, reduced.program, x, alpha
-        self.lam, self.y = certificate.generators @ alpha, reduced.evaluated.in_space(x)
-        self.theta = certificate.base.coefficients(reduced.evaluated.samples)
-        self.spectrum = certificate.base.spectrum(mu, self.theta["A"])  # α and γ
-
-    @cached_property
-    def contact(self) -> Contact:
-        """The constraint on the contact unknowns; the assembly of the program may have evaluated it."""
-        return self._evaluated.contact or contact_at(self.problem, self.mu)
-
-    @cached_property
-    def on_contact(self) -> tuple[Array, Array]:
-        """The solution u_N (k,) on the contact unknowns, and a bound of its round-off."""
-        certificate = self._certificate
-        return certificate.contact_basis @ self.y, float(np.linalg.norm(self.y)) * certificate.unit_round_off
+        evaluated = reduced.evaluated
+        self.problem, self.mu, self.x, self.lam, self.y = problem, mu, x, lam, evaluated.in_space(x)
+        self.A, self.samples, self._contact = reduced.program.A, evaluated.samples, evaluated.contact
+        self.theta = base.coefficients(self.samples)
+        self.lower, self.upper = base.spectrum(mu, self.theta["A"])
 
     @property
-    def constraint(self) -> tuple[float | SparseMatrix, Array, Array]:
-        """The constraint as prepared corrections take it, and a bound of the terms of g."""
-        terms = self._certificate.base.bound_terms
-        if terms is None:
-            return self.contact.B, self.contact.g, np.abs(self.contact.g)
-        samples = self._evaluated.samples
-        of_g = samples["g"] if "g" in samples else np.ones(1)
-        return float(self.theta["B"][0]), terms @ of_g, self._certificate.bound_sizes @ np.abs(of_g)
+    def contact(self) -> Contact:
+        """The constraint on the contact unknowns; the assembly of the program may have evaluated it."""
+        # no cached property: its lock costs more than all other attributes of a query
+        if self._contact is None:
+            self._contact = contact_at(self.problem, self.mu)
+        return self._contact
 
 
 @dataclass(frozen=True)
@@ -210,7 +191,7 @@ class OnlineCertificate:
 
     def evaluate(self, problem: Problem, mu: Array, reduced: ReducedProblem, x: Array, alpha: Array) -> OnlineBound:
         """Bounds of a solution x (N',), α (R,) of a reduced program that a `HyperReducedModel` assembled at mu (d,)."""
-        return self._bound(_Query(self, problem, mu, reduced, x, alpha))
+        return self._bound(_Query(self.base, problem, mu, reduced, x, self.generators @ alpha), alpha)
 
     def certify(
         self,
@@ -222,29 +203,37 @@ class OnlineCertificate:
         mode: CorrectionMode = CorrectionMode.FEASIBLE,
     ) -> tuple[OnlineBound, OnlineCorrection | None]:
         """The bounds of `evaluate`, and the corrected pair with its own where the mode asks for it and there is one."""
-        query = _Query(self, problem, mu, reduced, x, alpha)
-        bound = self._bound(query)
+        query = _Query(self.base, problem, mu, reduced, x, self.generators @ alpha)
+        bound = self._bound(query, alpha)
         if bound.guarantee is Guarantee.NONE or not mode.applies(bound.omega, bound.rho):
             return bound, None
         return bound, self._corrected_pair(query, bound)
 
-    def _bound(self, query: _Query) -> OnlineBound:
-        base, problem, mu = self.base, query.problem, query.mu
-        if not in_dual_set(query.lam):
+    def _bound(self, query: _Query, alpha: Array) -> OnlineBound:
+        base, lam, lower, upper = self.base, query.lam, query.lower, query.upper
+        if not in_dual_set(lam):
             return OnlineBound.none(BoundNote.NOT_IN_CONE)
-        if not base.is_exact and problem.parameters.outside(mu).any():
+        if not base.is_exact and query.problem.parameters.outside(query.mu).any():
             return OnlineBound.none(BoundNote.OUTSIDE)
-        lower, upper = query.spectrum
         if not lower > base.stiffness_error:
             return OnlineBound.none(BoundNote.NOT_COERCIVE)
-        correction, note = self._correction(query, upper)
-        if correction is None:
-            return OnlineBound.none(note)
-        along, norm, kappa, eta = correction
+        quick, note = None, ""
+        if self.prepared is not None:
+            quick = self.prepared.correction(*self._constraint(query), query.y, lam, upper)
+            note = BoundNote.NOT_PREPARED
+        if quick is not None:
+            (along, norm, kappa), eta, note = quick, 0.0, ""
+        else:
+            best = find_contact_correction(self.compliance, query.contact, *self._on_contact(query), lam, upper)
+            if best is None:
+                return OnlineBound.none(BoundNote.NO_CORRECTION)
+            # coordinates of X w in the basis of residuals
+            along = best.load @ self.contact_directions[best.unknowns]
+            norm, kappa, eta = best.norm, best.kappa, best.eta
         contact = None if self.forces is None else query.contact
-        z = residual_coefficients(query.theta, query.y, self.forces, contact, query.alpha, query.lam)
+        z = residual_coefficients(query.theta, query.y, self.forces, contact, alpha, lam)
         coordinates, beside, missing = self.residual.parts(z)
-        square_of_u = float(query.x @ (query.program.A @ query.x))
+        square_of_u = float(query.x @ (query.A @ query.x))
         # ‖u_N‖_X from ‖u_N‖ in the interpolated stiffness, whose coercivity is at least α less its error
         u_norm = sqrt(max(0.0, square_of_u) / (lower - base.stiffness_error))
         lacking = base.load_error + base.stiffness_error * u_norm
@@ -258,9 +247,9 @@ class OnlineCertificate:
                 self.compliance,
                 self.contact_directions,
                 query.contact,
-                (*query.on_contact, query.lam),
+                (*self._on_contact(query), lam),
                 (coordinates, beside + missing + lacking),
-                query.spectrum,
+                (lower, upper),
             )
             of_u, of_lam = min(of_u, others[0]), min(of_lam, others[1])
         # a lower bound of ‖u‖_A, from that of ‖u_N‖_A and the triangle inequality
@@ -271,40 +260,38 @@ class OnlineCertificate:
         own = terms.rho, terms.omega, kappa, lower
         return OnlineBound(of_u, of_lam, relative, *own, base.guarantee, str(note), in_W, beta, which)
 
-    def _correction(self, query: _Query, gamma: float) -> tuple[tuple[Array, float, float, float] | None, str]:
-        """Coordinates of X w in the basis of residuals, ‖w‖, κ and η; and why w is not prepared, or there is none."""
-        prepared = self.prepared
-        if prepared is not None:
-            quick = prepared.correction(*query.constraint, query.y, query.lam, gamma)
-            if quick is not None:
-                return (*quick, 0.0), ""
-        best = find_contact_correction(self.compliance, query.contact, *query.on_contact, query.lam, gamma)
-        if best is None:
-            return None, BoundNote.NO_CORRECTION
-        along = best.load @ self.contact_directions[best.unknowns]
-        return (along, best.norm, best.kappa, best.eta), "" if prepared is None else BoundNote.NOT_PREPARED
+    def _on_contact(self, query: _Query) -> tuple[Array, Array]:
+        """The solution u_N (k,) on the contact unknowns, and a bound of its round-off."""
+        return self.contact_basis @ query.y, float(np.linalg.norm(query.y)) * self.unit_round_off
+
+    def _constraint(self, query: _Query) -> tuple[float | SparseMatrix, Array, Array]:
+        """The constraint as prepared corrections take it, and a bound of the terms of g."""
+        terms = self.base.bound_terms
+        if terms is None:
+            contact = query.contact
+            return contact.B, contact.g, np.abs(contact.g)
+        of_g = query.samples.get("g", self.base.one)
+        return float(query.theta["B"][0]), terms @ of_g, self.bound_sizes @ np.abs(of_g)
 
     def _corrected_pair(self, query: _Query, bound: OnlineBound) -> OnlineCorrection | None:
         """The corrected pair of a solution whose bounds are known."""
-        (lower, upper), lam, contact = query.spectrum, query.lam, query.contact
+        lower, upper, lam, contact = query.lower, query.upper, query.lam, query.contact
         middle = 0.5 * (lower + upper)
         pair, eta = None, 0.0
         # prepared corrections of some bodies alone are not the best ones, and no ν belongs to them
         if self.prepared is not None and self.base.bound_terms is not None:
-            B, g, g_size = query.constraint
+            B, g, g_size = self._constraint(query)
             pair = self.prepared.multiplier(float(B), g, g_size, query.y, lam, middle)
         if pair is None:
-            best = find_contact_correction(self.compliance, contact, *query.on_contact, lam, middle)
+            best = find_contact_correction(self.compliance, contact, *self._on_contact(query), lam, middle)
             if best is None or best.nu is None:
                 return None
             pair, eta = (best.nu, best.norm, best.gap), best.eta
         nu, norm, gap = pair
         rho = bound.rho + (0.5 * (upper - lower) * norm + middle * eta) / sqrt(lower)
-        both = BoundTerms.corrected(rho, gap).primal + eta * sqrt(upper)
-        relative = inf
-        if 0.0 < bound.relative < inf:
-            # over the lower bound of ‖u‖ that the first bounds gave
-            relative = both / (bound.u_energy / bound.relative)
+        both = sqrt(rho**2 + 2.0 * gap) + eta * sqrt(upper)
+        # over the lower bound of ‖u‖ that the first bounds gave
+        relative = both / (bound.u_energy / bound.relative) if 0.0 < bound.relative < inf else inf
         in_W = both / bound.inf_sup if bound.inf_sup > 0.0 else inf
         corrected = replace(
             bound, u_energy=both, lambda_natural=both, relative=relative, rho=rho, omega=0.0, kappa=gap, lam=in_W

@@ -49,14 +49,10 @@ from vibench.qp.scaling import row_norms
 
 
 def complementary(fixed: Array, rows_of: Callable[[Indices], Array], released: Mask) -> Array:
-    """The multiplier ν (i,) up to round-off; its correction has to be verified in any case.
+    """The multiplier ν (i,) of ν₀ (i,) up to round-off; its correction has to be verified in any case.
 
-    Parameters
-    ----------
-    fixed, released
-        ν₀ (i,), and where v may be positive at first (i,); the systems that are solved have the size of such sets.
-    rows_of
-        Rows of M (·×i) from their numbers.
+    `rows_of` gives rows of M (·×i) by their numbers. `released` are those where v may be positive at first (i,); the
+    systems that are solved have the size of such sets.
     """
     # two or three exchanges are usual; after 30 they cycle
     for _ in range(30):
@@ -119,14 +115,7 @@ def tied_correction(
 ) -> tuple[Array, float, float, Array, float, float] | None:
     """Values c (k,), ‖w'‖, κ, ν (m,), νᵀ(B w' − s) and η; `None` without equalities, or if no w was found.
 
-    Parameters
-    ----------
-    C, contact
-        C (k×k), and B (m×k) and g (m,).
-    excess, round_off, size
-        s (m,), a bound of its round-off, and of its terms.
-    lam, gamma
-        λ ≥ 0 (m,) and γ.
+    `excess` is s (m,), with bounds of its round-off and of its terms.
     """
     B = sp.csr_array(contact.B)
     # opposite rows with less room than 1e-12 of the terms of s are an equality, as in `vibench.model.error_bounds`
@@ -232,16 +221,9 @@ def held_rows(compliance: ContactCompliance, contact: Contact, on_contact: Array
 def find_contact_correction(
     compliance: ContactCompliance, contact: Contact, on_contact: Array, uncertain: Array, lam: Array, gamma: float
 ) -> ContactCorrection | None:
-    """Find a w with B w ≥ s = B u_N − g, close to the best one; `None` if none was found.
+    """Find a w with B w ≥ s = B u_N − g, close to the best one for λ ≥ 0 (m,) and γ; `None` if none was found.
 
-    Parameters
-    ----------
-    compliance, contact
-        C, and B (m×k) and g (m,).
-    on_contact, uncertain
-        u_N (k,) on the contact unknowns, and a bound (k,) of its round-off.
-    lam, gamma
-        λ ≥ 0 (m,) and γ.
+    `on_contact` is u_N (k,) on the contact unknowns, and `uncertain` a bound (k,) of its round-off.
     """
     B = sp.csr_array(contact.B)
     if not B.has_canonical_format or len(B.indices) > B.nnz:
@@ -249,7 +231,8 @@ def find_contact_correction(
         B.sum_duplicates()
     size, terms = sp.csr_array((np.abs(B.data), B.indices, B.indptr), B.shape), 1.01 * EPS * (np.diff(B.indptr) + 4.0)
     excess = B @ on_contact - contact.g
-    round_off = 1.01 * (size @ uncertain) + terms * (size @ np.abs(on_contact) + np.abs(contact.g))
+    total = size @ np.abs(on_contact) + np.abs(contact.g)
+    round_off = 1.01 * (size @ uncertain) + terms * total
     reach = size @ compliance.root
     for unknowns, position, C in compliance.blocks:
         if not len(C):
@@ -264,7 +247,6 @@ def find_contact_correction(
         best = _Program(C, restricted, near, excess, round_off, reach, terms, lam, gamma).best()
         if best is not None:
             return ContactCorrection(unknowns, *best)
-    total = size @ np.abs(on_contact) + np.abs(contact.g)
     tied = tied_correction(compliance.matrix, contact, excess, round_off, total, lam, gamma)
     return None if tied is None else ContactCorrection(np.arange(len(compliance.matrix)), *tied)
 
@@ -328,7 +310,12 @@ class _Program:
         difference = np.where(chosen | (lam * size <= 1e-6 * np.abs(excess)), 0.0, -lam)
         if not len(rows):
             return difference
-        block, wanted = _selected_rows(self.B, chosen), excess[rows]
+        # faster than a selection of rows, which checks indices
+        counts = np.diff(self.B.indptr)
+        kept = np.repeat(chosen, counts)
+        ends = np.concatenate([np.zeros(1, self.B.indptr.dtype), np.cumsum(counts[chosen], dtype=self.B.indptr.dtype)])
+        block = sp.csr_array((self.B.data[kept], self.B.indices[kept], ends), (len(rows), self.B.shape[1]))
+        wanted = excess[rows]
         if difference.any():
             wanted = wanted - block @ (self.compliance @ (self.B.T @ difference)) / self.gamma
         S = self.compliance.congruent(block) / self.gamma
@@ -344,14 +331,6 @@ class _Program:
             np.linalg.lstsq(S, wanted)[0] if singular else _complementary(factor, wanted, known) - known
         ) / units
         return difference
-
-
-def _selected_rows(B: SparseMatrix, chosen: Mask) -> SparseMatrix:
-    """The chosen rows of a matrix; faster than its own selection, which checks indices."""
-    counts = np.diff(B.indptr)
-    kept = np.repeat(chosen, counts)
-    ends = np.concatenate([np.zeros(1, B.indptr.dtype), np.cumsum(counts[chosen], dtype=B.indptr.dtype)])
-    return sp.csr_array((B.data[kept], B.indices[kept], ends), (len(ends) - 1, B.shape[1]))
 
 
 def _complementary(factor: Array, excess: Array, lam: Array) -> Array:
@@ -379,18 +358,9 @@ def defect_corrected_bounds(
 ) -> tuple[float, float]:
     """Bounds of ‖u − u_N‖_A and of ‖Bᵀ(λ − λ_N)‖_{A⁻¹}; infinite where no correction was found.
 
-    Parameters
-    ----------
-    compliance, directions
-        C, and the coordinates (k×K) of the contact unknowns, as functionals, in the basis of residuals.
-    contact
-        B (m×k) and g (m,).
-    solution
-        u_N (k,) on the contact unknowns, a bound (k,) of its round-off, and λ_N ≥ 0 (m,).
-    residual
-        Its coordinates (K,), and the norm of what they lack.
-    spectrum
-        α > 0 and γ.
+    `directions` are the coordinates (k×K) of the contact unknowns, as functionals, in the basis of residuals;
+    `solution` is u_N (k,) on the contact unknowns, a bound (k,) of its round-off, and λ_N ≥ 0 (m,); `residual` its
+    coordinates (K,) and the norm of what they lack; `spectrum` α > 0 and γ.
     """
     (on_contact, uncertain, lam), (coordinates, outside), (lower, upper) = solution, residual, spectrum
     middle = 0.5 * (lower + upper)

@@ -76,14 +76,8 @@ class PreparedCorrections:
     ) -> tuple[Array, float, float] | None:
         """Coordinates (K,) of X w in the basis of residuals, ‖w‖, and κ; `None` if no w was found.
 
-        Parameters
-        ----------
-        B
-            θ where B(µ) is θ(µ) B₀ everywhere, else B (m×k).
-        g, g_size
-            g (m,), and a bound (m,) of the terms that it is the sum of.
-        y, lam, gamma
-            Coordinates (d,) of u_N, λ ≥ 0 (m,), and γ.
+        `B` is θ where B(µ) is θ(µ) B₀ everywhere, else B (m×k); `g_size` is a bound (m,) of the terms that g (m,) is
+        the sum of; `y` are coordinates (d,) of u_N.
         """
         found = self._feasible(B, g, g_size, y, lam, gamma)
         if found is None:
@@ -116,9 +110,9 @@ class PreparedCorrections:
             return None
         excess, size, unit = _times(B, self.basis @ y) - g, _times(abs(B), self.sizes), 1.01 * terms * EPS
         round_off = unit * (float(y @ y) ** 0.5 * size[:, 0] + g_size)
-        margin, here = first_margin(round_off), lam[self.rows]
+        margin, here = first_margin(round_off), lam.take(self.rows)
         for _ in range(4):
-            wanted, scale = (excess + margin)[self.rows], gamma / theta**2
+            wanted, scale = (excess + margin).take(self.rows), gamma / theta**2
             released = here * self._diagonal <= -scale * wanted
             nu = complementary(here + scale * (self.inverse @ wanted), self.inverse.__getitem__, released)
             nu = np.maximum(nu, 0.0)
@@ -128,7 +122,7 @@ class PreparedCorrections:
             slack = _times(B, values) - excess
             lacking = round_off + (unit * float(self.reach @ np.abs(a))) * size[:, 1] - slack
             if lacking.max() <= 0.0:  # NaN is not
-                square = float(a @ (values[self.rows] if isinstance(B, float) else self.compliance @ a))
+                square = float(a @ (values.take(self.rows) if isinstance(B, float) else self.compliance @ a))
                 return nu, a, max(0.0, square) ** 0.5, slack
             # Larger margins on J do not help if only rows beyond J are violated.
             if lacking[self.rows].max() <= 0.0:
@@ -161,20 +155,9 @@ def prepare_corrections(
 ) -> PreparedCorrections | None:
     """Prepare corrections by loads that are multiples of some rows of B₀; `None` where these are dependent, or none.
 
-    Parameters
-    ----------
-    B
-        B₀ (m×k); zero on unknowns of bodies that corrections must not load.
-    scaled
-        Whether B(µ) is θ(µ) B₀ everywhere.
-    compliance
-        C (k×k).
-    rows
-        The rows (m,) of J.
-    basis
-        Φ (k×d) at the contact unknowns.
-    directions
-        Coordinates (k×K) of the contact unknowns as functionals.
+    `B` is B₀ (m×k), zero on unknowns of bodies that corrections must not load; `scaled` tells whether B(µ) is θ(µ) B₀
+    everywhere; `rows` (m,) are J. Φ (k×d) is taken at the contact unknowns, whose coordinates as functionals are
+    `directions` (k×K).
     """
     J, B = np.flatnonzero(rows), sp.csr_array(B)
     chosen, root = B[J], np.sqrt(np.diag(compliance))

@@ -117,7 +117,7 @@ class ResidualBasis:
 
         These are of the part that is orthogonal to U with the round-off, and of the terms that are left out.
         """
-        represented = z[self.kept]
+        represented = z.take(self.kept)
         scaled = self.inverse_scale * represented
         beside = self.remainder * float(scaled @ scaled) ** 0.5
         return self.factor @ represented, beside, float(self.norms @ np.abs(z))

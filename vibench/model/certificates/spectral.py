@@ -64,7 +64,8 @@ class SpectralBounds:
     def evaluate(self, mu: Array, theta: Array) -> tuple[float, float]:
         """The bounds α(µ) and γ(µ) at mu (d,) with the rotated θ(µ) (Q,); a negative α(µ) is no bound."""
         where, c = self._weights(mu)
-        combined = np.array(c) @ self._rows[where]
+        # `take` is three times as fast as an index that is a list
+        combined = np.array(c) @ self._rows.take(where, axis=0)
         lacking = float(np.abs(theta - combined[2:]) @ self.norms) + 2.0 * self.error
         return float(combined[0]) - lacking, float(combined[1]) + lacking
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ from vibench.model.affine import affine_decomposition
 from vibench.model.bound_terms import BoundNote
 from vibench.model.certificates import bounds as bounds_module
 from vibench.model.certificates import contact_correction
-from vibench.model.certificates.base import CertificateBase, Guarantee, certificate_base, unsupported
+from vibench.model.certificates.base import Guarantee, certificate_base, unsupported
 from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate, prepare
 from vibench.model.certificates.prepared_correction import prepare_corrections
 from vibench.model.certificates.residual import ColumnBlock, residual_basis
@@ -529,7 +529,7 @@ def test_problems_that_cannot_be_certified_say_why() -> None:
 def test_what_is_stored_is_of_contact_and_reduced_size() -> None:
     """Only the base has arrays of mesh size, which no evaluation reads."""
     problem, model, certificate = prepared("affine")
-    without = CertificateBase(**(vars(certificate.base) | {"X": None, "terms": ()}))
+    without = replace(certificate.base, X=cast(Any, None), terms=())
     forgetful = replace(certificate, base=without)
     mu = np.array([1.2, 0.3])
     reduced = model.assemble(mu)

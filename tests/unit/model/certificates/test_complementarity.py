@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
@@ -60,10 +61,15 @@ def test_it_ends_with_the_right_signs(seed: int, size: int, condition: float, ti
     assert np.max(np.minimum(nu, v)) <= reach
 
 
-def test_where_exchanging_all_at_once_cycles_the_solution_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "seeds", [(859, 1029, 1057, 1113, 1218, 2131), pytest.param(range(3000), marks=pytest.mark.long)]
+)
+def test_where_exchanging_all_at_once_cycles_the_solution_is_found(
+    seeds: Sequence[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     cycled = []
     monkeypatch.setattr(complementarity, "descent", lambda M, fixed: cycled.append((M, fixed)) or fixed)
-    for seed in range(3000):
+    for seed in seeds:
         M, fixed, start = problem(seed, 4, 1e3, False)
         complementary(fixed, lambda rows, M=M: M[rows], start)
     monkeypatch.undo()
