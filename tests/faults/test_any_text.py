@@ -92,7 +92,7 @@ def recorded(folder: Path, text: str, count: Any) -> Path:
 def outputs(path: Path) -> list[str]:
     """Every table of a results file in every format, and the summary as it is shown."""
     read = {table: in_order(read_table(path, table)) for table in TABLES}
-    found = [form(frame) for frame in read.values() for form in formats.FORMS.values()]
+    found = [formats.to_text(frame, form) for frame in read.values() for form in ("markdown", "csv", "latex", "json")]
     summary = formats.summary(read["cells"])
     with contextlib.redirect_stdout(io.StringIO()) as out:
         print_frame(summary, "summary")

@@ -56,7 +56,7 @@ def bench_plugins(
     if form == "terminal":
         _print_benchmarks(frame, timed, earlier, limit)
     else:
-        sys.stdout.write(formats.FORMS[form](frame))
+        sys.stdout.write(formats.to_text(frame, form))
     if (timed.failed and read is None) or (earlier is not None and comparison.regressions(frame)):
         raise Exit(1)
 

@@ -89,7 +89,7 @@ def show(
             echo(view.view.empty)
     else:
         # Programs read csv and json, people the other forms, with headings and rounded numbers.
-        sys.stdout.write(formats.FORMS[form](view.exact if form in {"csv", "json"} else view.readable))
+        sys.stdout.write(formats.to_text(view.exact if form in {"csv", "json"} else view.readable, form))
 
 
 def compare_runs(
@@ -116,7 +116,7 @@ def compare_runs(
     compared = compare([results_file(one) for one in run], limit)
     frame = compared.values(column) if column else compared.table(table or "changes")
     if form != "terminal":
-        sys.stdout.write(formats.FORMS[form](whole_numbers(frame)))
+        sys.stdout.write(formats.to_text(whole_numbers(frame), form))
     elif column or table not in (None, "changes"):
         # What a table says of each run, in a column of its own, matters most.
         first = [*(one.name for one in compared.runs), *PRIORITY]

@@ -39,7 +39,7 @@ HIGH_FIDELITY = "high-fidelity"
 
 
 class Meaning(StrEnum):
-    """When the second model, b, is cheaper in total than the first, a."""
+    """Range of queries for which the second model, b, is cheaper in total than the first, a."""
 
     FROM = "from"
     UNTIL = "until"
@@ -89,33 +89,6 @@ def break_even(offline_a: float, online_a: float, offline_b: float, online_b: fl
     if dearer >= 0.0 and faster <= 0.0:
         return BreakEven(None, Meaning.NEVER)
     return BreakEven(dearer / faster, Meaning.FROM if dearer > 0.0 else Meaning.UNTIL)
-
-
-@dataclass(frozen=True)
-class Costs:
-    """Seconds offline and per query of a model: measured, and drawn (`DRAWS`,) as another run might measure them."""
-
-    offline: float
-    online: float
-    offline_draws: Array
-    online_draws: Array
-
-
-def drawn_break_even(a: Costs, b: Costs, tail: float = TAIL) -> BreakEven:
-    """Break-even of b against a with its interval; undecided where more than `tail` of the draws deny its meaning."""
-    dearer, faster = b.offline_draws - a.offline_draws, a.online_draws - b.online_draws
-    drawn = {
-        Meaning.AT_ONCE: (dearer <= 0.0) & (faster >= 0.0),
-        Meaning.FROM: (dearer > 0.0) & (faster > 0.0),
-        Meaning.UNTIL: (dearer < 0.0) & (faster < 0.0),
-    }
-    drawn[Meaning.NEVER] = ~np.any(list(drawn.values()), axis=0)
-    measured = break_even(a.offline, a.online, b.offline, b.online)
-    equal = drawn[Meaning.FROM] | drawn[Meaning.UNTIL]
-    low, high = np.quantile(dearer[equal] / faster[equal], (TAIL, 1.0 - TAIL)) if equal.any() else (None, None)
-    if np.mean(drawn[measured.meaning]) < 1.0 - tail:
-        return BreakEven(None, Meaning.UNDECIDED, low)
-    return measured if measured.number is None else BreakEven(measured.number, measured.meaning, low, high)
 
 
 class BreakEvenComparison(NamedTuple):
@@ -190,7 +163,7 @@ def _shared_axes() -> tuple[str, ...]:
 
 
 def _is_blank(value: object) -> bool:
-    """Whether a column of an axis has the value of a cell without this axis."""
+    # The values of a cell that lacks an axis.
     return value in (None, NO_SUCH_AXIS, "{}")
 
 
@@ -214,14 +187,13 @@ def _compared(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
 
 
 def _as_certified(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
-    """Whether both have certificates or none has."""
     return bool(a["bounds"] == b["bounds"])
 
 
 def _comparison(
     paired: PairedTiming, a: Mapping[str, Any] | None, b: Mapping[str, Any], tail: float
 ) -> BreakEvenComparison:
-    """Break-even of b against a; what both have in common, offline phases or the set-up, does not differ."""
+    """Break-even of b against a with its interval; common offline phases, or the set-up, do not differ."""
     key, offline_a = (None, b["hf_setup_s"]) if a is None else (a["cell"], a["offline_s"])
     ratio, level = paired.ratio(key, b["cell"]), paired.level(key, b["cell"])
     if ratio is None or level is None:
@@ -230,22 +202,37 @@ def _comparison(
     rng = np.random.default_rng(0)
     shared = b["hf_setup_s"] if a is None else shared_offline(a, b)
     seconds, quotients = paired.draws(key, b["cell"], rng, DRAWS)
-    online_a, quotient = float(np.exp(level.mean)), float(np.exp(ratio.mean))
-    costs_a = Costs(offline_a, online_a, offline_draws(a, shared, rng) if a else np.full(DRAWS, offline_a), seconds)
-    costs_b = Costs(b["offline_s"], online_a * quotient, offline_draws(b, shared, rng), seconds * quotients)
-    result = drawn_break_even(costs_a, costs_b, tail)
+    online_a = float(np.exp(level.mean))
+    online_b = online_a * float(np.exp(ratio.mean))
+    # Seconds that other runs might measure, beside those that this run has measured.
+    others = offline_draws(a, shared, rng) if a else np.full(DRAWS, offline_a)
+    dearer = offline_draws(b, shared, rng) - others
+    faster = seconds - seconds * quotients
+    drawn = {
+        Meaning.AT_ONCE: (dearer <= 0.0) & (faster >= 0.0),
+        Meaning.FROM: (dearer > 0.0) & (faster > 0.0),
+        Meaning.UNTIL: (dearer < 0.0) & (faster < 0.0),
+    }
+    drawn[Meaning.NEVER] = ~np.any(list(drawn.values()), axis=0)
+    measured = break_even(offline_a, online_a, b["offline_s"], online_b)
+    equal = drawn[Meaning.FROM] | drawn[Meaning.UNTIL]
+    low, high = np.quantile(dearer[equal] / faster[equal], (TAIL, 1.0 - TAIL)) if equal.any() else (None, None)
+    result = measured if measured.number is None else replace(measured, low=low, high=high)
+    if np.mean(drawn[measured.meaning]) < 1.0 - tail:
+        result = BreakEven(None, Meaning.UNDECIDED, low)
     if result.meaning is Meaning.UNDECIDED:
-        faster, margin = float(np.mean(quotients < 1.0)), math.log(MARGIN)
+        margin = math.log(MARGIN)
         if all(abs(end) <= margin for end in ratio.interval(tail)):
             result = BreakEven(None, Meaning.AS_FAST)
-        elif tail < faster < 1.0 - tail:
+        # More rounds decide nothing where it is only the offline seconds that do not differ enough.
+        elif tail < float(np.mean(quotients < 1.0)) < 1.0 - tail:
             result = replace(result, rounds=_rounds_missing(paired, key, b["cell"]))
-    low, high = ratio.interval(TAIL)
-    return BreakEvenComparison(a, b, result, (online_a, online_a * quotient), (math.exp(-high), math.exp(-low)))
+    least, most = ratio.interval(TAIL)
+    return BreakEvenComparison(a, b, result, (online_a, online_b), (math.exp(-most), math.exp(-least)))
 
 
 def _rounds_missing(paired: PairedTiming, a: str | None, b: str) -> int | None:
-    """How many more rounds would decide between two queries at their present scatter: which is faster, or neither."""
+    """Number of further rounds that would decide which of two queries is faster, or neither, at the present scatter."""
     within, done = paired.ratio_within(a, b), paired.rounds(a, b)
     if within is None:
         return None
@@ -292,12 +279,5 @@ def _row(one: BreakEvenComparison) -> dict[str, Any]:
 
 def _high_fidelity(b: Mapping[str, Any]) -> Mapping[str, Any]:
     """The high-fidelity model beside a cell, as a cell."""
-    model = {
-        "cell": None,
-        "formulation": default_formulation(),
-        "primal": HIGH_FIDELITY,
-        "primal_tol": None,
-        "assembly": "",
-        "bounds": None,
-    }
-    return {**b, **model, "offline_s": b["hf_setup_s"]}
+    model = {"primal": HIGH_FIDELITY, "formulation": default_formulation(), "assembly": ""}
+    return {**b, **model, **dict.fromkeys(("cell", "primal_tol", "bounds")), "offline_s": b["hf_setup_s"]}

@@ -18,7 +18,6 @@ from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from vibench.arrays import Array
 from vibench.interfaces.strategies import Kind
@@ -132,13 +131,12 @@ def disagreement_rows(
         keys = {name: same[-1][name] for name in STORED["disagreements"] if name in KEYS}
         rows = ((cell, row) for cell in same for row in fine_solutions(cell["cell"]))
         # Without slack it is the answer of a formulation to no program that all solvers were given.
-        answers = (_recorded(cell, row) for cell, row in rows if row["slack_linear"] is not None)
+        answers = (
+            Recorded(cell["solver"], row["query"], vectors(row)[0], Slack(row["slack_linear"], row["slack_constant"]))
+            for cell, row in rows
+            if row["slack_linear"] is not None
+        )
         yield from (keys | row for row in compare(answers))
-
-
-def _recorded(cell: Mapping[str, Any], row: Mapping[str, Any]) -> Recorded:
-    left_open = Slack(row["slack_linear"], row["slack_constant"])
-    return Recorded(cell["solver"], row["query"], vectors(row)[0], left_open)
 
 
 def agreement_sentence(disagreements: pd.DataFrame, solvers: int) -> str:
@@ -162,22 +160,21 @@ def compare(answers: Iterable[Recorded]) -> Iterator[dict[str, Any]]:
         by_solver.setdefault(answer.solver, {})[answer.query] = answer
     for a, b in combinations(sorted(by_solver), 2):
         common = sorted(by_solver[a].keys() & by_solver[b].keys())
-        if common:
-            yield {"solver_a": a, "solver_b": b, **_differences(by_solver[a], by_solver[b], common)}
-
-
-def _differences(a: Mapping[int, Recorded], b: Mapping[int, Recorded], queries: list[int]) -> dict[str, Any]:
-    apart = np.array([float(np.linalg.norm(a[k].x - b[k].x)) for k in queries])
-    limits = np.array([allowed(a[k].slack, b[k].slack) for k in queries])
-    sizes = np.array([float(np.linalg.norm(a[k].x)) for k in queries])
-    relative = apart / np.where(sizes > 0.0, sizes, 1.0)
-    far = apart > limits
-    worst = int(np.argmax(relative))
-    return {
-        "queries": len(queries),
-        "difference_max": float(relative[worst]),
-        "query_worst": queries[worst],
-        "allowed_worst": float(limits[worst] / (sizes[worst] or 1.0)),
-        "flagged": int(far.sum()),
-        "query_flagged": queries[int(np.argmax(far))] if far.any() else None,
-    }
+        if not common:
+            continue
+        pairs = [(by_solver[a][k], by_solver[b][k]) for k in common]
+        apart = np.array([float(np.linalg.norm(x.x - y.x)) for x, y in pairs])
+        limits = np.array([allowed(x.slack, y.slack) for x, y in pairs])
+        sizes = np.array([float(np.linalg.norm(x.x)) for x, _ in pairs])
+        relative, far = apart / np.where(sizes > 0.0, sizes, 1.0), apart > limits
+        worst = int(np.argmax(relative))
+        yield {
+            "solver_a": a,
+            "solver_b": b,
+            "queries": len(common),
+            "difference_max": float(relative[worst]),
+            "query_worst": common[worst],
+            "allowed_worst": float(limits[worst] / (sizes[worst] or 1.0)),
+            "flagged": int(far.sum()),
+            "query_flagged": common[int(np.argmax(far))] if far.any() else None,
+        }

@@ -22,15 +22,14 @@ from vibench.errors import RequestError, StorageError, VibenchError
 from vibench.qp.status import Status
 from vibench.results.schema import KEYS, STORED, VERSION, Column, SqlType, column_of
 from vibench.results.sqlite import (
-    BUSY_SECONDS,
     DAMAGED,
     FILE,
     DamagedResultsError,
     DigestError,
     Digests,
     code_of,
+    connect,
     read_meta,
-    refuse_pipes,
     study_of,
     text_reader,
 )
@@ -64,17 +63,6 @@ def storable(table: str, row: Mapping[str, Any]) -> dict[str, Any]:
 @lru_cache(maxsize=256)
 def _stored_text(column: Column, value: str) -> Any:
     return stored(column, value)
-
-
-def error_row(cell: Mapping[str, Any], reason: str) -> dict[str, Any]:
-    """The row of a cell whose own rows cannot be stored: what identifies it, and the reason."""
-    # Columns that do not depend on what the stages of the cell compute.
-    identity = (
-        "cell", *KEYS, "queries", "seed", "validation", "validation_options", "study_hash", "code", "machine",
-        "threads", "versions", "definition",
-    )  # fmt: skip
-    row = {name: cell[name] for name in identity if name in cell}
-    return row | {"status": Status.ERROR.value, "reason": f"the results cannot be stored: {reason}", "queries_ok": 0}
 
 
 def stored(column: Column, value: Any) -> Any:
@@ -122,10 +110,8 @@ class ResultsDatabase:
             if not anew:
                 _refuse_other(path, study)
             folder.mkdir(parents=True, exist_ok=True)
-            refuse_pipes(path)
-            # Absolute, since SQLite may take a name that begins with "file:" for a URI.
             self._path = path.absolute()
-            self._db = sqlite3.connect(self._path, timeout=BUSY_SECONDS)
+            self._db = connect(self._path, "rwc")
             self._db.text_factory = text_reader()
             self._digests = Digests(self._db)
             with contextlib.ExitStack() as opened:
@@ -235,7 +221,14 @@ class ResultsDatabase:
                 self.keep(f"parameters of {cell.get('problem')}", json.dumps(parameters))
             return self._write_cell(cell, queries=queries, solutions=solutions, outputs=outputs)
         except (UnstorableError, sqlite3.Error) as error:
-            return self._write_cell(error_row(cell, str(error)))
+            # Columns that do not depend on the results of the stages of the cell.
+            identity = (
+                "cell", *KEYS, "queries", "seed", "validation", "validation_options", "study_hash", "code", "machine",
+                "threads", "versions", "definition",
+            )  # fmt: skip
+            row = {name: cell[name] for name in identity if name in cell}
+            reason = f"the results cannot be stored: {error}"
+            return self._write_cell(row | {"status": Status.ERROR.value, "reason": reason, "queries_ok": 0})
 
     def keep(self, key: str, value: str) -> None:
         """Keep a text in the table `meta`, in place of an earlier one with the same key."""
@@ -253,7 +246,11 @@ class ResultsDatabase:
 
     def _write_cell(self, cell: Mapping[str, Any], **others: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         with self._writing():
-            self._add_columns(others.get("queries", ()))
+            # A column for every parameter mu_1, mu_2, … of the queries.
+            there = {row[1] for row in self._db.execute("PRAGMA table_info(queries)")}
+            for name in dict.fromkeys(name for row in others.get("queries", ()) for name in row):
+                if name not in there and name.startswith("mu_"):
+                    self._db.execute(f'ALTER TABLE queries ADD COLUMN "{name}" REAL')
             self._remove(cell["cell"])
             for table, rows in {"cells": [cell], **others}.items():
                 self._insert(table, rows)
@@ -354,7 +351,16 @@ class ResultsDatabase:
             with self._db:
                 self._db.execute("BEGIN IMMEDIATE")
                 yield
-                self._check_place()
+                try:
+                    there = os.path.samestat(self._path.stat(), self._opened)
+                except OSError:
+                    there = False
+                # SQLite would go on writing into a file that nobody finds any more.
+                if not there:
+                    raise StorageError(
+                        f"'{self._path}' was removed or replaced during the run; the same command runs its cells "
+                        "again, with the artefacts that are stored"
+                    )
         except sqlite3.DatabaseError as error:
             code = code_of(error)
             # A full, lost or read-only disk, or a file locked or damaged by another program; the rest is a bug.
@@ -363,31 +369,12 @@ class ResultsDatabase:
                 sqlite3.SQLITE_BUSY, sqlite3.SQLITE_CORRUPT,
             ):  # fmt: skip
                 raise
-            waited = f" by another program for {BUSY_SECONDS:g} s" if code == sqlite3.SQLITE_BUSY else ""
+            waited = " by another program for 60 s" if code == sqlite3.SQLITE_BUSY else ""
             raise StorageError(f"results cannot be written: {error}{waited}") from None
-
-    def _check_place(self) -> None:
-        """Refuse to continue if the results file was removed or replaced since it was opened."""
-        try:
-            there = os.path.samestat(self._path.stat(), self._opened)
-        except OSError:
-            there = False
-        if not there:
-            raise StorageError(
-                f"'{self._path}' was removed or replaced during the run; the same command runs its cells again, "
-                "with the artefacts that are stored"
-            )
 
     def _insert(self, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
         for row in rows:
             self._db.execute(_insertion(table, tuple(row)), tuple(storable(table, row).values()))
-
-    def _add_columns(self, queries: Sequence[Mapping[str, Any]]) -> None:
-        """Add a column for every parameter mu_1, mu_2, … of the rows."""
-        there = {row[1] for row in self._db.execute("PRAGMA table_info(queries)")}
-        for name in dict.fromkeys(name for row in queries for name in row):
-            if name not in there and name.startswith("mu_"):
-                self._db.execute(f'ALTER TABLE queries ADD COLUMN "{name}" REAL')
 
 
 @lru_cache(maxsize=32)

@@ -24,13 +24,12 @@ from vibench.text import printable_lines, unbroken
 
 def to_csv(frame: pd.DataFrame) -> str:
     """CSV with full precision; a text that a spreadsheet would take for a formula has an apostrophe before it."""
-    columns = [[None if _is_missing(value) else value for value in column.tolist()] for _, column in frame.items()]
+    # NaN differs from itself; `pandas.isna` would take a hundred times as long.
+    columns = [
+        [None if value is None or value is pd.NA or bool(value != value) else value for value in column.tolist()]  # noqa: PLR0124
+        for _, column in frame.items()
+    ]
     return csv_lines([list(map(str, frame.columns)), *zip(*columns, strict=True)])
-
-
-def _is_missing(value: Any) -> bool:
-    """Scalar `pandas.isna`, a hundred times as fast."""
-    return value is None or value is pd.NA or bool(value != value)  # noqa: PLR0124  a NaN
 
 
 def csv_lines(rows: Iterable[Sequence[Any]]) -> str:
@@ -65,18 +64,6 @@ def to_latex(frame: pd.DataFrame) -> str:
     return f"% needs \\usepackage{{booktabs}}\n{table}"
 
 
-LATEX = str.maketrans({
-    **{sign: f"\\{sign}" for sign in "&%$#_{}"}, "\\": r"\textbackslash{}", "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}",
-    "[": "{[}", "*": "{*}",  # arguments of the line break before them, at the beginning of a row
-    **{sign: f"${command}$" for sign, command in {
-        "≤": r"\leq", "≥": r"\geq", "→": r"\to", "−": "-", "√": r"\surd", "∞": r"\infty", "‖": r"\|", "Δ": r"\Delta",
-        "²": "^2", "·": r"\cdot", "×": r"\times", "γ": r"\gamma", "α": r"\alpha",
-    }.items()}, "–": "--", "…": r"\dots{}", "\u202f": r"\,",
-    "µ": r"$\mu$", "μ": r"$\mu$", "β": r"$\beta$", "δ": r"$\delta$", "λ": r"$\lambda$", "σ": r"$\sigma$",
-})  # fmt: skip
-
-
 def _markdown(text: str) -> str:
     # A backslash makes text of what Markdown acts on; underscores inside words, and units in brackets, are text anyway.
     escaped = re.sub(r"[\\`*|]|\](?=[(\[])|(?<![^\W_])_|_(?![^\W_])", r"\\\g<0>", text)
@@ -87,7 +74,17 @@ def _markdown(text: str) -> str:
 
 def to_latex_text(text: str) -> str:
     """A text whose characters LaTeX shows, and acts on none of them."""
-    return text.translate(LATEX)
+    characters = str.maketrans({
+        **{sign: f"\\{sign}" for sign in "&%$#_{}"}, "\\": r"\textbackslash{}", "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}",
+        "[": "{[}", "*": "{*}",  # arguments of the line break before them, at the beginning of a row
+        **{sign: f"${command}$" for sign, command in {
+            "≤": r"\leq", "≥": r"\geq", "→": r"\to", "−": "-", "√": r"\surd", "∞": r"\infty", "‖": r"\|",
+            "Δ": r"\Delta", "²": "^2", "·": r"\cdot", "×": r"\times", "γ": r"\gamma", "α": r"\alpha",
+        }.items()}, "–": "--", "…": r"\dots{}", "\u202f": r"\,",
+        "µ": r"$\mu$", "μ": r"$\mu$", "β": r"$\beta$", "δ": r"$\delta$", "λ": r"$\lambda$", "σ": r"$\sigma$",
+    })  # fmt: skip
+    return text.translate(characters)
 
 
 def _as_text(frame: pd.DataFrame, escape: Callable[[str], str]) -> pd.DataFrame:
@@ -166,8 +163,9 @@ def decimal_interval(low: float, high: float) -> str:
     return "" if pd.isna(low) or pd.isna(high) else f"{cell_text(float(low))}–{cell_text(float(high))}"
 
 
-# Formats in which a table is printed when the output is not a terminal.
-FORMS = {"markdown": to_markdown, "csv": to_csv, "latex": to_latex, "json": to_json}
+def to_text(frame: pd.DataFrame, form: str) -> str:
+    """A table in one of the formats of files: markdown, csv, latex or json."""
+    return {"markdown": to_markdown, "csv": to_csv, "latex": to_latex, "json": to_json}[form](frame)
 
 
 def summary(cells: pd.DataFrame) -> pd.DataFrame:

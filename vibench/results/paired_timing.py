@@ -29,9 +29,6 @@ from vibench.arrays import Array
 # under different loads (docs/measurement.md).
 CONDITIONS = 0.05
 
-# Degrees of freedom above which a variance counts as known; infinitely many would be NaN in differences.
-_CERTAIN = 1e3
-
 
 class MeanEstimate(NamedTuple):
     """A mean with its standard error and the degrees of freedom of that error."""
@@ -54,12 +51,13 @@ class MeanEstimate(NamedTuple):
         """Difference of independent means with the degrees of freedom of Welch and Satterthwaite."""
         mine, others = self.error**2, other.error**2
         spread = mine**2 / self.freedom + others**2 / other.freedom
-        freedom = (mine + others) ** 2 / spread if spread else _CERTAIN
-        return MeanEstimate(self.mean - other.mean, math.sqrt(mine + others), min(freedom, _CERTAIN))
+        freedom = (mine + others) ** 2 / spread if spread else math.inf
+        # With a thousand degrees of freedom a variance counts as known; infinitely many would be NaN in differences.
+        return MeanEstimate(self.mean - other.mean, math.sqrt(mine + others), min(freedom, 1e3))
 
     def of_other_runs(self) -> MeanEstimate:
         """The estimate for other cold runs, which differ by `CONDITIONS` beyond their blocks."""
-        return self.minus(MeanEstimate(0.0, CONDITIONS, _CERTAIN))
+        return self.minus(MeanEstimate(0.0, CONDITIONS, 1e3))
 
 
 @dataclass
@@ -89,27 +87,23 @@ class CommonVariance:
             return 0.0, 0.0
         mean, squares, noise = self._sums / count
         excess = (squares - mean**2) * count / (count - 1.0) - noise
-        if excess <= polygamma(1, _CERTAIN / 2.0):
-            return math.exp(mean), min(most, _CERTAIN)
-        half = _inverse_trigamma(excess)
+        # Scatter that noise explains up to a thousand degrees of freedom: the variances count as equal.
+        if excess <= polygamma(1, 500.0):
+            return math.exp(mean), min(most, 1e3)
+        # Newton's method for the argument at which the trigamma function is the excess (Smyth 2004, appendix).
+        half = 0.5 + 1.0 / excess
+        for _ in range(50):
+            trigamma = float(polygamma(1, half))
+            step = trigamma * (1.0 - trigamma / excess) / float(polygamma(2, half))
+            half += step
+            if abs(step) < 1e-9 * half:
+                break
         return math.exp(mean + float(digamma(half)) - math.log(half)), min(most, 2.0 * half)
 
 
 def _variance(values: Sequence[float]) -> float:
     # Equal numbers have a variance of round-off, whose logarithm must exist.
     return max(float(np.var(values, ddof=1)), 1e-18)
-
-
-def _inverse_trigamma(value: float) -> float:
-    """Argument at which the trigamma function has a positive value, by Newton's method (Smyth 2004, appendix)."""
-    x = 0.5 + 1.0 / value
-    for _ in range(50):
-        trigamma = float(polygamma(1, x))
-        step = trigamma * (1.0 - trigamma / value) / float(polygamma(2, x))
-        x += step
-        if abs(step) < 1e-9 * x:
-            break
-    return x
 
 
 def paces(seconds: Array) -> Array:
@@ -144,11 +138,6 @@ class Block(NamedTuple):
 
     online: float
     ratio: float
-
-    @property
-    def high_fidelity(self) -> float:
-        """Logarithm of the seconds of the high-fidelity solution in the ratio."""
-        return self.online - self.ratio
 
 
 # block of a round, seconds of a query in it at its pace, and their ratio to those of a high-fidelity solution
@@ -249,7 +238,7 @@ class PairedTiming:
         """
         mine = self._blocks.get(b, {})
         if a is None:
-            values = [x.high_fidelity for x in mine.values() if math.isfinite(x.ratio)]
+            values = [x.online - x.ratio for x in mine.values() if math.isfinite(x.ratio)]
         else:
             others = self._blocks.get(a, {})
             values = [x.online for name, x in others.items() if name in mine] or [x.online for x in others.values()]

@@ -23,15 +23,15 @@ def members(arrays: bool) -> list[str]:
 
 def picture_rows(drawn: Iterable[tuple[str, Picture]]) -> list[dict[str, Any]]:
     """Rows of the pictures table, one for every title and picture, without the columns that identify the problem."""
-    return [
-        {
-            "number": k,
-            "title": title,
-            "names": json.dumps([getattr(one, text) for text in members(arrays=False)]),
-            "data": _packed(one),
-        }
-        for k, (title, one) in enumerate(drawn)
-    ]
+    rows = list[dict[str, Any]]()
+    # Single precision, which is enough to draw.
+    precision = {name: np.int32 if name == "triangles" else np.float32 for name in members(arrays=True)}
+    for k, (title, one) in enumerate(drawn):
+        stream = io.BytesIO()
+        np.savez_compressed(stream, **{name: getattr(one, name).astype(kind) for name, kind in precision.items()})
+        names = json.dumps([getattr(one, text) for text in members(arrays=False)])
+        rows.append({"number": k, "title": title, "names": names, "data": stream.getvalue()})
+    return rows
 
 
 def failure_rows(reason: str) -> list[dict[str, Any]]:
@@ -55,14 +55,6 @@ def read(path: Path) -> Iterator[Shown]:
     for row in (dict(zip(names, values, strict=True)) for values in rows):
         picture = None if row["data"] is None else _unpacked(row["data"], row["names"])
         yield Shown((row["problem"], row["problem_options"]), row["title"] or "", picture, row["reason"] or "")
-
-
-def _packed(picture: Picture) -> bytes:
-    """The arrays, in single precision, compressed."""
-    stream = io.BytesIO()
-    precision = {name: np.int32 if name == "triangles" else np.float32 for name in members(arrays=True)}
-    np.savez_compressed(stream, **{name: getattr(picture, name).astype(kind) for name, kind in precision.items()})
-    return stream.getvalue()
 
 
 def _unpacked(data: bytes, names: str) -> Picture:

@@ -150,12 +150,12 @@ def unstable(cells: pd.DataFrame) -> pd.Series:
 
 
 def eligible(cells: pd.DataFrame) -> pd.Series:
-    """Which rows of the cells table take part in a comparison; `excluded` says why the others do not."""
+    """Mask of the rows of the cells table that take part in a comparison; `excluded` gives the others' reasons."""
     return ~excluded(cells).any(axis=1)
 
 
 def too_loose(cells: pd.DataFrame, source: Literal["solver", "assembly"]) -> pd.Series:
-    """Which cells are left out where strategies are compared, since the source makes too large a share of an error."""
+    """Mask of the cells to which the source contributes too large a fraction of an error to compare strategies."""
     # At a tenth of an error the solver or the assembly, not the strategies, would decide who is more accurate.
     return cells[f"{source}_share_mean"].astype(float) >= 0.1
 
@@ -353,7 +353,11 @@ def model_row(cell: Mapping[str, Any], setup: float, solution: float) -> dict[st
     row |= {"N": cell.get("dim_V"), "R": cell.get("dim_W"), "primal_options": "{}", "training_options": "{}"}
     row |= {"formulation": "", "formulation_options": "{}"}
     row |= {"dual_options": "{}", "cell": "", "primal": HIGH_FIDELITY, "dual": "", "training": cell.get("training")}
-    row |= {"error_u_mean": 0.0, "error_lambda_mean": 0.0, "offline_s": setup, "online_s": solution, "hf_s": solution}
+    row |= dict.fromkeys(("error_u_mean", "error_lambda_mean"), 0.0) | {
+        "offline_s": setup,
+        "online_s": solution,
+        "hf_s": solution,
+    }
     return row | {"solver": "", "assembly": "", "bounds": None, "correction": "none", "disturbed": 0}
 
 
@@ -429,36 +433,26 @@ def cheapest(
     measured = errors_of_solution(cells) if errors is None else errors.reindex(cells.index)
     fine = ~excluded(cells, measured).any(axis=1) & cells["online_s"].notna()
     rows = list[dict[str, Any]]()
+    # Columns that are equal in cells whose queries have the same solutions, with certificates or without: the fastest
+    # cell of a model is seldom the one with certificates.
+    axes = ["model", "correction", "solver", "accuracy"]
+    known = {} if certified is None else certified.dropna()
     for _, mine in cells[fine].groupby(["problem", "problem_options", "machine"], dropna=False, sort=False):
         levels = reached_errors(measured[mine.index]) if within is None else [within]
-        every, bounds = list(candidates(mine, paired)), dict(_of_models(mine, certified))
+        every, models = list(candidates(mine, paired)), mine[["cell", *axes]].itertuples(index=False)
+        bounds = {tuple(model): float(known[cell]) for cell, *model in models if cell in known}
         for level in levels:
             allowed = {None, *mine["cell"][measured[mine.index] <= level * (1.0 + 1e-12)]}
             row = _winner([one for one in every if one.key in allowed], paired, queries)
-            bound = bounds.get(tuple(row[name] for name in _model_axes()))
+            bound = bounds.get(tuple(row[name] for name in axes))
             rows.append(row | {"error_below": level, "certified_error": bound})
     others = [*cells.columns.drop("problem"), *(name for name in added_columns() if name != "error_below")]
-    return pd.DataFrame(_without_repeats(rows), columns=["problem", "error_below", *others])
-
-
-def _model_axes() -> tuple[str, ...]:
-    """Columns that are equal in cells whose queries have the same solutions, with certificates or without."""
-    return "model", "correction", "solver", "accuracy"
-
-
-def _of_models(cells: pd.DataFrame, certified: pd.Series | None) -> Iterator[tuple[tuple[Any, ...], float]]:
-    """Bounds of mean errors by `_model_axes`: the fastest cell of a model is seldom the one with certificates."""
-    known = {} if certified is None else certified.dropna()
-    for cell, *key in cells[["cell", *_model_axes()]].itertuples(index=False):
-        if cell in known:
-            yield tuple(key), float(known[cell])
-
-
-def _without_repeats(rows: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """The rows without those whose model is that of the next smaller error of the same problem."""
-    for row, following in zip(rows, [*rows[1:], None], strict=True):
-        if following is None or (row["problem"], row["cell"]) != (following["problem"], following["cell"]):
-            yield row
+    # Without the rows whose model is that of the next smaller error of the same problem.
+    models = [(row["problem"], row["cell"]) for row in rows]
+    different = [
+        row for row, mine, following in zip(rows, models, [*models[1:], None], strict=True) if mine != following
+    ]
+    return pd.DataFrame(different, columns=["problem", "error_below", *others])
 
 
 def candidates(cells: pd.DataFrame, paired: PairedTiming) -> Iterator[Candidate]:
@@ -481,22 +475,13 @@ def candidates(cells: pd.DataFrame, paired: PairedTiming) -> Iterator[Candidate]
 
 
 def _winner(every: Sequence[Candidate], paired: PairedTiming, queries: float) -> dict[str, Any]:
-    """The row of the cheapest model, with what `cheapest_columns` adds."""
+    """The row of the cheapest model with the columns that `cheapest_columns` adds."""
     totals = np.array([one.offline + queries * one.online for one in every])
     drawn = np.array([one.offline_draws + queries * one.online_draws for one in every])
     first = int(np.argmin(totals))
     best, others = every[first], [one for k, one in enumerate(every) if k != first]
     low, high = np.quantile(drawn[first], (TAIL, 1.0 - TAIL)).tolist() if best.key else (None, None)
-    begin, end = _cheapest_between(best, others)
-    ties = sum(_ties(best, one, paired, queries) for one in others)
-    sure = float(np.mean(np.argmin(drawn, axis=0) == first))
-    numbers = {"total_s": float(totals[first]), "total_low_s": low, "total_high_s": high}
-    between = {"cheapest_from": begin, "cheapest_until": end}
-    return {**best.row, "online_s": best.online, **numbers, **between, "probability": sure, "ties": ties}
-
-
-def _cheapest_between(best: Candidate, others: Sequence[Candidate]) -> tuple[float, float]:
-    """The numbers of queries between which a model is the cheapest, which it is for one of them."""
+    # The numbers of queries between which it is the cheapest, from its break-even with every other model.
     begin, end = 0.0, math.inf
     for one in others:
         dearer, faster = best.offline - one.offline, one.online - best.online
@@ -504,7 +489,11 @@ def _cheapest_between(best: Candidate, others: Sequence[Candidate]) -> tuple[flo
             begin = max(begin, dearer / faster)
         elif faster < 0.0:
             end = min(end, dearer / faster)
-    return math.ceil(begin), end if math.isinf(end) else math.floor(end)
+    ties = sum(_ties(best, one, paired, queries) for one in others)
+    sure = float(np.mean(np.argmin(drawn, axis=0) == first))
+    numbers = {"total_s": float(totals[first]), "total_low_s": low, "total_high_s": high}
+    between = {"cheapest_from": math.ceil(begin), "cheapest_until": end if math.isinf(end) else math.floor(end)}
+    return {**best.row, "online_s": best.online, **numbers, **between, "probability": sure, "ties": ties}
 
 
 def _ties(best: Candidate, other: Candidate, paired: PairedTiming, queries: float) -> bool:

@@ -108,10 +108,14 @@ def _order(names: Collection[str]) -> list[str]:
 def in_order(frame: pd.DataFrame) -> pd.DataFrame:
     """Rows sorted by the columns that identify them, loose tolerances first, whatever order cells finished in."""
     by = _order(frame.columns)
-    ascending = [_rises(name) for name in by]
+
+    def uncorrected_first(column: pd.Series) -> pd.Series:
+        return column != UNCORRECTED if column.name == "correction" else column
+
     return frame.sort_values(
-        by, ascending=ascending, kind="stable", na_position="first", ignore_index=True, key=_without_correction_first
-    )
+        by, ascending=list(map(_rises, by)), kind="stable", na_position="first", ignore_index=True,
+        key=uncorrected_first,
+    )  # fmt: skip
 
 
 def terms_in_order(names: Collection[str]) -> list[str]:
@@ -130,10 +134,6 @@ def terms_in_order(names: Collection[str]) -> list[str]:
 def _rises(name: str) -> bool:
     """Whether the smallest value of a column comes first."""
     return "_tol" not in name
-
-
-def _without_correction_first(column: pd.Series) -> pd.Series:
-    return column != UNCORRECTED if column.name == "correction" else column
 
 
 def whole_numbers(frame: pd.DataFrame) -> pd.DataFrame:

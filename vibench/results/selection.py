@@ -74,7 +74,14 @@ def _answers(
         raise RequestError(f"--where has {len(expression)} characters, at most 1000 are read")
     if re.search(r'["`;\[\]\'?@$#:\0]|--|/\*', outside.replace("''", "")):
         raise _wrong(expression, "it may hold columns, numbers, operators and texts in single quotes")
-    _refuse_unbalanced(expression, outside)
+    # An unmatched parenthesis would close the one around the expression.
+    depth = 0
+    for sign in outside:
+        depth += (sign == "(") - (sign == ")")
+        if depth < 0:
+            break
+    if depth:
+        raise _wrong(expression, "its parentheses do not match")
 
     # An authoriser, since the expression may come from anybody: SQLite runs LIKE and GLOB as functions, and all others
     # are refused.
@@ -98,7 +105,9 @@ def _answers(
             raise RequestError(f"--where selects rows of {table}, of which the table is made; {about}") from None
         if unknown:
             raise unknown_name(f"column of {table}", printable(unknown[1]), columns) from None
-        raise _wrong(expression, _in_words(error)) from None
+        refused = any(word in str(error) for word in ("prohibited", "authorized"))
+        why = "functions, subqueries and other tables are refused" if refused else printable(str(error))
+        raise _wrong(expression, why) from None
 
 
 def _text_free(expression: str) -> str:
@@ -123,24 +132,6 @@ def _opened(
         marks = ", ".join("?" * len(frame.columns))
         db.executemany(f'INSERT INTO "{table}" VALUES ({marks})', values.itertuples(index=False, name=None))
         yield db
-
-
-def _refuse_unbalanced(expression: str, outside: str) -> None:
-    """Refuse an expression that would close the parenthesis around it."""
-    depth = 0
-    for sign in outside:
-        depth += (sign == "(") - (sign == ")")
-        if depth < 0:
-            break
-    if depth:
-        raise _wrong(expression, "its parentheses do not match")
-
-
-def _in_words(error: sqlite3.Error) -> str:
-    """The message of SQLite, or that something is refused."""
-    if any(word in str(error) for word in ("prohibited", "authorized")):
-        return "functions, subqueries and other tables are refused"
-    return printable(str(error))
 
 
 def _wrong(expression: str, why: str) -> RequestError:

@@ -159,7 +159,11 @@ class Table:
         rows = self.rows.assign(cell=self.rows["cell"].str[: self.key_length]) if "cell" in self.rows else self.rows
         for axis in told:
             pairs = zip(rows[axis], rows[f"{axis}_options"], strict=True)
-            texts = [_with_options(name, text, self.varying.get((axis, name), ())) for name, text in pairs]
+            texts = []
+            for name, text in pairs:
+                # An option at its default is not recorded.
+                given, keys = _options(text), self.varying.get((axis, name), ())
+                texts.append(" ".join([name, *(f"{key} {given[key]}" for key in keys if key in given)]))
             rows = rows.assign(**{axis: texts})
         return formats.under_headings(rows, names, self.view.headings or {}).rename(columns=dict(self.parameters))
 
@@ -206,7 +210,7 @@ def look_up(
     columns: Sequence[str] = (),
     where: str = "",
     sort: Sequence[str] = (),
-    limit: int = 0,
+    limit: int | None = None,
     error: str = "",
     largest: float | None = None,
     queries: float | None = None,
@@ -242,7 +246,9 @@ def look_up(
     rows = view.rows(frame if largest is None or name == "best" else ranking.within(frame, largest))
     named = _parameters(path, rows)
     by_heading = {column.heading: key for key, column in (view.headings or {}).items() if column.heading}
-    by_heading |= _parameters_by_name(named, rows)
+    # Parameters also by their headings and names, where no column is called so.
+    texts = [(text, key) for key, heading in named.items() for text in (heading, heading.partition(" [")[0])]
+    by_heading |= {text: key for text, key in texts if text not in rows}
     if sort:
         resolved = [f"{'-' * key.startswith('-')}{by_heading.get(k, k)}" for key in sort for k in [key.lstrip("-")]]
         rows = selection.sorted_by(rows, resolved, name)
@@ -272,21 +278,17 @@ def _parameters(path: Path, rows: pd.DataFrame) -> dict[str, str]:
     return {name: heading for name, heading in joined.items() if taken.count(heading) == 1}
 
 
-def _parameters_by_name(named: Mapping[str, str], rows: pd.DataFrame) -> dict[str, str]:
-    """The columns by their headings, and by these without units, where no column is called so."""
-    both = [(text, key) for key, heading in named.items() for text in (heading, heading.partition(" [")[0])]
-    return {text: key for text, key in both if text not in rows}
-
-
-def _cells_needed(path: Path, view: View, cell: str, where: str, sort: Sequence[str], limit: int) -> Sequence[str]:
+def _cells_needed(
+    path: Path, view: View, cell: str, where: str, sort: Sequence[str], limit: int | None
+) -> Sequence[str]:
     """Cells of all rows of a large table that are asked for, where they are few; none where all rows are read."""
     named = [key.removeprefix("-") for key in sort]
     # These have many rows of each cell, and their cells are distinguished by columns of the table of cells.
-    if view.source not in ("queries", "timings", "outputs") or not (cell or limit):
+    if view.source not in ("queries", "timings", "outputs"):
         return ()
     if cell:
         return (_key_of(path, cell),)
-    if not set(STORED[view.source]).issuperset(named):  # a parameter, or no column at all
+    if not limit or not set(STORED[view.source]).issuperset(named):  # a parameter, or no column at all
         return ()
     first = [
         f'"{name}" IS NULL, "{name}" {"DESC" if key.startswith("-") else "ASC"}'
@@ -328,14 +330,6 @@ def _options(text: str | None) -> dict[str, str]:
         key: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
         for key, value in options.items()
     }
-
-
-def _with_options(name: str, text: str | None, keys: Sequence[str]) -> str:
-    """A name and those of its options that tell it apart; an option at its default is not recorded."""
-    if not keys:
-        return name
-    given = _options(text)
-    return " ".join([name, *(f"{key} {given[key]}" for key in keys if key in given)])
 
 
 def _measured(

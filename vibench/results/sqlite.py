@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import groupby
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from vibench.errors import RequestError
 from vibench.files import TEMPORARY
@@ -139,9 +139,6 @@ class DamagedResultsError(RequestError):
 # Suffix of a damaged database that is kept.
 DAMAGED = ".damaged"
 
-# Longest wait in seconds for a lock that another program holds.
-BUSY_SECONDS = 60.0
-
 
 def code_of(error: sqlite3.Error) -> int:
     """Primary error code of SQLite; 0 for errors of Python's own."""
@@ -156,13 +153,13 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
     SQLite makes an index beside it: in a folder that cannot be written, copies of both are read.
     """
     with contextlib.ExitStack() as stack:
-        connection = stack.enter_context(contextlib.closing(_connection(path)))
+        connection = stack.enter_context(contextlib.closing(connect(path, "ro")))
         if not _has_index(connection) and path.is_file():
             copy = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=TEMPORARY))) / path.name
             for end in ("", "-wal"):
                 with contextlib.suppress(FileNotFoundError):
                     shutil.copyfile(f"{path}{end}", f"{copy}{end}")
-            connection = stack.enter_context(contextlib.closing(_connection(copy)))
+            connection = stack.enter_context(contextlib.closing(connect(copy, "ro")))
         connection.execute("PRAGMA trusted_schema=OFF")
         connection.text_factory = text_reader()
         yield connection
@@ -178,9 +175,11 @@ def refuse_pipes(path: Path) -> None:
             raise RequestError(f"'{beside}' is no regular file; remove it")
 
 
-def _connection(path: Path) -> sqlite3.Connection:
+def connect(path: Path, mode: Literal["ro", "rwc"]) -> sqlite3.Connection:
+    """Open a database that is no pipe or device, to read it only or to create it where it is missing."""
     refuse_pipes(path)
-    return sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=BUSY_SECONDS)
+    # Another program may hold a lock for long; a minute is the longest wait.
+    return sqlite3.connect(f"{path.absolute().as_uri()}?mode={mode}", uri=True, timeout=60.0)
 
 
 def _has_index(connection: sqlite3.Connection) -> bool:
@@ -255,8 +254,8 @@ def read_meta(path: Path) -> dict[str, str]:
         ) from None
 
 
+# Columns and some rows of a table.
 Part: TypeAlias = tuple[list[str], list[tuple[Any, ...]]]
-"""Columns and some rows of a table."""
 
 
 def read_rows(path: Path, table: str, cells: Sequence[str] = ()) -> Part:

@@ -173,7 +173,7 @@ def test_a_block_has_the_median_of_its_rounds_at_their_pace_and_that_of_their_ra
     ]
     (block,) = blocks_of(rows).values()
     assert np.exp(block) == pytest.approx([1.0, 0.25])
-    assert np.exp(block.high_fidelity) == pytest.approx(4.0)
+    assert np.exp(block.online - block.ratio) == pytest.approx(4.0)
 
 
 def test_solutions_of_a_block_count_alike_beside_every_model() -> None:
