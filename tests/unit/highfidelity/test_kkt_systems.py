@@ -166,18 +166,11 @@ def hertz() -> Problem:
     return create("problem", "hertz", {"resolution": 300})
 
 
-def one_row(factor: object, vi: object) -> np.ndarray:
-    return np.arange(len(vi.g)) == 0  # type: ignore[attr-defined]
-
-
-def nowhere(factor: object, vi: object) -> np.ndarray:
-    return np.zeros(len(vi.g), bool)  # type: ignore[attr-defined]
-
-
 @pytest.mark.parametrize("constant", [True, False], ids=["constant", "varying"])
-@pytest.mark.parametrize("guess", [None, one_row, nowhere], ids=["coarse problem", "one row", "nothing"])
-def test_solutions_do_not_depend_on_the_zone(hertz: Problem, guess: object, constant: bool) -> None:
+@pytest.mark.parametrize("rows", [None, 1, 0], ids=["coarse problem", "one row", "nothing"])
+def test_solutions_do_not_depend_on_the_zone(hertz: Problem, rows: int | None, constant: bool) -> None:
     expected = [HighFidelitySolver(hertz).solve(mu) for mu in MUS]
+    guess = None if rows is None else lambda factor, vi: np.arange(len(vi.g)) < rows
     with mock.patch.multiple(kkt_systems, MANY_UNKNOWNS=0, coarse_contact=guess or kkt_systems.coarse_contact):
         with mock.patch.object(type(hertz), "constant", frozenset({"A", "f"} if constant else ())):
             solver = HighFidelitySolver(hertz)
@@ -195,9 +188,8 @@ def test_solutions_do_not_depend_on_the_zone(hertz: Problem, guess: object, cons
         force = hertz.assemble(MUS[-1]).B.T @ found.lam
         energy = force @ np.linalg.solve(hertz.assemble(MUS[-1]).A.toarray(), force)
         assert solver._stiffness.dual_norms(force[:, None]) == pytest.approx(np.sqrt(energy), rel=1e-9)
-        assert solver._stiffness.compliance(force[hertz.contact_dofs]) @ force[hertz.contact_dofs] == pytest.approx(
-            energy, rel=1e-9
-        )
+        there = force[hertz.contact_dofs]
+        assert solver._stiffness.compliance(there) @ there == pytest.approx(energy, rel=1e-9)
     assert len(zones[-1]) < len(hertz.contact_dofs)
     assert np.isin(zones[0], zones[-1]).all()
 

@@ -64,7 +64,6 @@ def test_the_obstacle_starts_from_a_coarser_mesh_where_its_own_is_fine(monkeypat
 def test_a_start_of_the_wrong_kind_is_named(start: Mask) -> None:
     problem = Obstacle(400)
     problem.start = lambda mu, nearest: start  # type: ignore[method-assign]
-    with pytest.raises(
-        NumericalError, match=rf"start returns .*; expected \({problem.W.dim},\) and bool, a NestedStart, or None"
-    ):
+    expected = rf"start returns .*; expected \({problem.W.dim},\) and bool, a NestedStart, or None"
+    with pytest.raises(NumericalError, match=expected):
         HighFidelitySolver(problem).solve(MU)

@@ -36,6 +36,7 @@ pytestmark = pytest.mark.skipif(COMPILER is None, reason="NO C COMPILER (cc, gcc
 Answer = tuple[int, np.ndarray, np.ndarray, np.ndarray]
 Solve = Callable[[np.ndarray], Answer]
 POINTER = ctypes.POINTER(ctypes.c_double)
+Patch = pytest.MonkeyPatch
 STRICT = ("-std=c99", "-pedantic", "-O2", "-Wall", "-Wextra", "-Wshadow", "-Wstrict-prototypes", "-Werror")
 
 
@@ -203,9 +204,7 @@ def test_expressions_are_exact_in_c_and_bounds_are_certified(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("problem", PROBLEMS)
-def test_a_c_source_has_the_bounds_and_the_pair_of_the_model(
-    problem: str, small_run: vibench.Run, tmp_path: Path
-) -> None:
+def test_a_c_source_has_bounds_and_pair_of_the_model(problem: str, small_run: vibench.Run, tmp_path: Path) -> None:
     model = model_of(small_run, problem, "certified")
     certified = certify(model, tmp_path / "model.npz", tolerance=2e-13)
     assert_certified_alike(model, certified, (1e-9, 1e-9, 2e-9), 1e-9)  # the last one has the error of ‖u‖, too
@@ -218,9 +217,7 @@ def test_a_c_source_has_the_bounds_and_the_pair_of_the_model(
 
 
 @pytest.mark.parametrize("problem", PROBLEMS)
-def test_outputs_and_their_bounds_are_those_of_the_model(
-    problem: str, small_run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_outputs_and_their_bounds(problem: str, small_run: vibench.Run, tmp_path: Path, monkeypatch: Patch) -> None:
     model = model_of(small_run, problem, "certified")
     rng, sizes = np.random.default_rng(0), (model.problem.V.dim, model.problem.W.dim)
     outputs = (
@@ -268,9 +265,7 @@ def test_outputs_and_their_bounds_are_those_of_the_model(
     assert np.all(errors == np.inf)
 
 
-def test_a_certificate_without_outputs_and_outputs_without_a_certificate(
-    small_run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_either_a_certificate_or_outputs(small_run: vibench.Run, tmp_path: Path, monkeypatch: Patch) -> None:
     for assembly in ("certified", "reduced"):
         model = model_of(small_run, "radial-obstacle", assembly)
         outputs = (Output("s", "1", u=np.ones(model.problem.V.dim)),) if assembly == "reduced" else ()

@@ -306,9 +306,7 @@ def test_polishing_ends_where_changes_of_all_rows_at_once_cycle() -> None:
         assert max(reduced_model.residuals(A, f, B, g, x, alpha)) <= 1e-12
 
 
-def test_solvers_that_give_up_are_not_believed(
-    run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wrong_solvers_are_not_believed(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     exported = per_file(model_of(run, "radial-obstacle"), tmp_path)
     assert exported.solve([0.17, 0.1]).status == "ok"
     for place in range(3):  # Python takes the larger of 0 and NaN for 0
@@ -431,7 +429,7 @@ def test_an_approximation_is_offered_with_its_error(run: vibench.Run, tmp_path: 
     assert Exported(tmp_path / "model.npz").solve(mu).u == pytest.approx(model.solve(mu).u, abs=10.0 * offered)
 
 
-def test_models_that_have_no_such_export_are_refused(
+def test_models_without_an_export_are_refused(
     run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = model_of(run, "radial-obstacle")

@@ -28,10 +28,8 @@ def estimate(K: np.ndarray, M: sp.csc_array, accuracy: float) -> float:
 @pytest.mark.parametrize("scale", [1.0, 1e100, 1e-100])
 def test_the_eigenvalue_of_largest_magnitude_is_as_accurate_as_asked(accuracy: float, scale: float) -> None:
     n = 60
-    multiple, dominant = (
-        np.concatenate([np.full(3, 5.0), np.linspace(0.1, 4.9, n - 3)]),
-        np.append(1.0, np.full(n - 1, 1e-9)),
-    )
+    multiple = np.concatenate([np.full(3, 5.0), np.linspace(0.1, 4.9, n - 3)])
+    dominant = np.append(1.0, np.full(n - 1, 1e-9))
     continuous = np.linspace(0.5, 1.0, n)  # the largest one is at its edge
     for spectrum in (np.linspace(-1.0, 3.0, n), np.linspace(-3.0, 1.0, n), continuous, multiple, dominant):
         found = estimate(*pencil(n, scale * spectrum), accuracy)

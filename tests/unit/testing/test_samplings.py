@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -24,36 +24,23 @@ class Uniform(Sampling):
         return box.sample(self.size, self.seed)
 
 
-class Transposed(Uniform):
-    def parameters(self, box: ParameterBox) -> Array:
-        return super().parameters(box).T
+def variant(name: str, points: Callable[[Uniform, ParameterBox], Array]) -> type[Uniform]:
+    """A strategy of this module with other points."""
+    return type(name, (Uniform,), {"parameters": points, "__module__": __name__, "__doc__": name})
 
 
-class Outside(Uniform):
-    def parameters(self, box: ParameterBox) -> Array:
-        return super().parameters(box) + (box.upper - box.lower)
+def entropy() -> int:
+    return int(np.random.default_rng().integers(2**32))
 
 
-class Twice(Uniform):
-    def parameters(self, box: ParameterBox) -> Array:
-        return np.repeat(super().parameters(box)[: -(-self.size // 2)], 2, axis=0)[: self.size]
-
-
-class PerAxis(Uniform):
-    """Takes its size for that of an axis."""
-
-    def parameters(self, box: ParameterBox) -> Array:
-        return box.grid(*[self.size] * box.dim)
-
-
-class Unseeded(Uniform):
-    def parameters(self, box: ParameterBox) -> Array:
-        return box.sample(self.size, int(np.random.default_rng().integers(2**32)))
-
-
-class Deaf(Uniform):
-    def parameters(self, box: ParameterBox) -> Array:
-        return box.sample(self.size, 1)
+Transposed = variant("Transposed", lambda self, box: box.sample(self.size, self.seed).T)
+Outside = variant("Outside", lambda self, box: box.sample(self.size, self.seed) + (box.upper - box.lower))
+Twice = variant(
+    "Twice", lambda self, box: np.repeat(box.sample((self.size + 1) // 2, self.seed), 2, axis=0)[: self.size]
+)
+PerAxis = variant("PerAxis", lambda self, box: box.grid(*[self.size] * box.dim))  # takes its size for that of an axis
+Unseeded = variant("Unseeded", lambda self, box: box.sample(self.size, entropy()))
+Deaf = variant("Deaf", lambda self, box: box.sample(self.size, 1))
 
 
 class OfHashes(Uniform):
@@ -124,7 +111,7 @@ class Beyond(Farthest):
 
 class Wanders(Farthest):
     def train(self, box: ParameterBox, trainer: Trainer) -> None:
-        trainer.solve(box.sample(1, int(np.random.default_rng().integers(2**32)))[0])
+        trainer.solve(box.sample(1, entropy())[0])
 
 
 WRONG: Mapping[type[Sampling], tuple[str, str]] = {
