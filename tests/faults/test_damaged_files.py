@@ -25,17 +25,11 @@ from vibench.stages.artefacts import CACHE_VARIABLE, SUFFIX, Store
 from vibench.stages.serialisation import dumps
 
 STUDY = {
-    "name": "small",
-    "seed": 3,
-    "validation": 2,
-    "solvers": ["piqp", "osqp"],
-    "dual": ["mcpg"],
-    "primal": ["decorrelated", "offline-pga"],
-    "assembly": ["full", "reduced"],
+    "name": "small", "seed": 3, "validation": 2, "solvers": ["piqp", "osqp"], "dual": ["mcpg"],
+    "primal": ["decorrelated", "offline-pga"], "assembly": ["full", "reduced"],
     "problem": [{"name": "radial-obstacle", "options": {"resolution": 200}}],
-    "tolerances": [{"pod": [1e-1], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
-    "timing_rounds": 2,
-}
+    "tolerances": [{"pod": [1e-1], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}], "timing_rounds": 2,
+}  # fmt: skip
 HEAD = 8192
 """Bytes at the beginning of a results file that say what the others are: header and schema."""
 
@@ -229,26 +223,30 @@ def test_a_damaged_index_is_made_again(made: Path, results: Path) -> None:
     database.close()
 
 
-@pytest.mark.parametrize("table", ["histories", "pictures"])
-def test_a_run_is_not_resumed_where_no_cell_explains_the_damage(table: str, results: Path) -> None:
-    with closing(sqlite3.connect(results)) as db:
-        db.execute(f"DELETE FROM {table} WHERE rowid = 1")
-        db.commit()
-    before = rows(results.parent, table)
-    with pytest.raises(RequestError, match=f"is damaged: rows of the table '{table}' have changed; use another --out"):
-        ResultsDatabase(results.parent, study(results))
-    assert rows(results.parent, table) == before
-    assert [path.name for path in results.parent.iterdir()] == [FILE]
+def test_a_run_is_not_resumed_where_no_cell_explains_the_damage(results: Path) -> None:
+    content = results.read_bytes()
+    for table in ("histories", "pictures"):
+        results.write_bytes(content)
+        with closing(sqlite3.connect(results)) as db:
+            db.execute(f"DELETE FROM {table} WHERE rowid = 1")
+            db.commit()
+        before = rows(results.parent, table)
+        said = f"is damaged: rows of the table '{table}' have changed; use another --out"
+        with pytest.raises(RequestError, match=said):
+            ResultsDatabase(results.parent, study(results))
+        assert rows(results.parent, table) == before
+        assert [path.name for path in results.parent.iterdir()] == [FILE]
 
 
-@pytest.mark.parametrize("table", ["cells", "queries"])
-def test_a_status_that_does_not_exist_is_refused(table: str, results: Path, main: Main) -> None:
+def test_a_status_that_does_not_exist_is_refused(results: Path, main: Main) -> None:
     """Written by a stranger, with the right digest."""
-    execute(results.parent, f"UPDATE {table} SET status = 'fine'")
-    folder = str(results.parent)
-    code, _, errors = main("compare", folder, folder, "--table", "changes")
-    assert code == 2
-    assert f"has the status 'fine' in '{table}', expected one of ok, inaccurate" in errors
+    content, folder = results.read_bytes(), str(results.parent)
+    for table in ("cells", "queries"):
+        results.write_bytes(content)
+        execute(results.parent, f"UPDATE {table} SET status = 'fine'")
+        code, _, errors = main("compare", folder, folder, "--table", "changes")
+        assert code == 2
+        assert f"has the status 'fine' in '{table}', expected one of ok, inaccurate" in errors
 
 
 WRONG = {
@@ -260,20 +258,18 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("wrong", WRONG, ids=str)
 @pytest.mark.parametrize("command", ["show", "report", "figures", "compare"])
-def test_a_value_that_is_none_of_its_column_is_refused(
-    command: str, wrong: tuple[str, str, str], results: Path, main: Main
-) -> None:
+def test_a_value_that_is_none_of_its_column_is_refused(command: str, results: Path, main: Main) -> None:
     """Written by a stranger, with the right digest."""
-    table, column, value = wrong
-    execute(results.parent, f"UPDATE {table} SET {column} = {value} WHERE rowid = 1")
-    folder = str(results.parent)
-    beside = {"show": ["--table", table], "compare": [folder], "report": ["--no-figures"], "figures": ["--jobs", "1"]}
-    code, _, errors = main(command, folder, *beside.get(command, []))
-    assert code == 2
-    assert f"in the column '{column}' of '{table}', expected {WRONG[wrong]}" in errors
-    assert errors.count("\n") == 1
+    content, folder = results.read_bytes(), str(results.parent)
+    for (table, column, value), expected in WRONG.items():
+        results.write_bytes(content)
+        execute(results.parent, f"UPDATE {table} SET {column} = {value} WHERE rowid = 1")
+        more = {"show": ["--table", table], "compare": [folder], "report": ["--no-figures"], "figures": ["--jobs", "1"]}
+        code, _, errors = main(command, folder, *more[command])
+        assert code == 2
+        assert f"in the column '{column}' of '{table}', expected {expected}" in errors
+        assert errors.count("\n") == 1
 
 
 @pytest.mark.parametrize("damages", [flips(3, 90), truncations(4, 40)], ids=["flips", "truncations"])

@@ -194,13 +194,9 @@ def test_drawn_packs_are_read_or_refused_in_a_line(tmp_path: Path) -> None:
     command = [sys.executable, "-c", READ, str(tmp_path), str(COUNT), str(SEED)]
     helpers = str(Path(__file__).parents[1] / "helpers")
     done = subprocess.run(
-        command,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
+        command, capture_output=True, text=True, check=False, timeout=300,
         env={"PYTHONPATH": helpers, "PATH": "/usr/bin"},
-    )
+    )  # fmt: skip
     assert done.returncode == 0, (done.returncode, done.stdout[-200:], done.stderr[-3000:])
     accepted, _, elsewhere = done.stdout.splitlines()[-1].partition(" ")
     assert elsewhere == "[]"

@@ -25,13 +25,10 @@ from vibench.stages.artefacts import CACHE_VARIABLE
 
 WIRES = [{"name": "wire", "label": f"{nodes}", "options": {"nodes": nodes}} for nodes in (20, 40)]
 LONG = wire_study(
-    problem=WIRES,
-    timing_rounds=2,
-    dual=["cpg", "mcpg"],
-    primal=["decorrelated", "online-supremizers", "offline-pga"],
+    problem=WIRES, timing_rounds=2, dual=["cpg", "mcpg"], primal=["decorrelated", "online-supremizers", "offline-pga"],
     solvers=["piqp", "osqp", "gives-up"],
     tolerances=[{"pod": [1e-2, 1e-3], "dual": [1e-2], "primal": {"offline-pga": [0.5, 0.1]}}],
-)
+)  # fmt: skip
 SHORT = LONG | {"problem": WIRES[:1], "tolerances": [{"pod": [1e-2], "dual": [1e-2], "primal": {"offline-pga": [0.5]}}]}
 STUDIES = {"long": LONG, "short": SHORT}
 CELLS = {"long": 2 * 2 * 4 * 3 * 2, "short": 2 * 3 * 3}
@@ -138,11 +135,7 @@ def test_a_run_that_is_killed_again_and_again_loses_and_doubles_nothing(
     [*(pytest.param(kib, "long", marks=pytest.mark.long) for kib in (1, 12, 40, 100, 300)), (100, "short")],
 )
 def test_a_full_disk_stops_a_run_with_one_line_and_a_later_one_completes_it(
-    kib: int,
-    length: str,
-    undisturbed: Callable[[str], Undisturbed],
-    vibench: Vibench,
-    place: Path,
+    kib: int, length: str, undisturbed: Callable[[str], Undisturbed], vibench: Vibench, place: Path
 ) -> None:
     full = vibench(place, *OPTIONS, file_kib=kib)
     assert full.returncode in (1, 2)

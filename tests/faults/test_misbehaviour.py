@@ -50,17 +50,13 @@ BAD_PRIMALS: Mapping[str, tuple[set[str], str]] = {
 BAD_SOLVERS: Mapping[str, tuple[set[str], str]] = {
     "raises": ({"error"}, "RuntimeError: the solver gave in"),
     "nothing": ({"error"}, "NumericalError: the solver returned a NoneType, expected a QPSolution"),
-    "gives-up": ({"failed"}, "the solver returned nothing: gave up"),
-    "nan": ({"nonfinite"}, "not finite"),
-    "wrong": ({"inaccurate"}, "residual"),
-    "wrong-length": ({"error"}, "3 of 3 queries"),
-    "dies": ({"crashed"}, "exit code 7"),
-    "segfaults": ({"crashed"}, "died with signal SIGSEGV"),
+    "gives-up": ({"failed"}, "the solver returned nothing: gave up"), "nan": ({"nonfinite"}, "not finite"),
+    "wrong": ({"inaccurate"}, "residual"), "wrong-length": ({"error"}, "3 of 3 queries"),
+    "dies": ({"crashed"}, "exit code 7"), "segfaults": ({"crashed"}, "died with signal SIGSEGV"),
     "hangs": ({"timeout"}, "stopped after query_seconds = 3 s"),
-    "hungry": ({"error"}, "out of memory: the limit is memory_gib = 8"),
-    "leaves": ({"error"}, "SystemExit: 3"),
+    "hungry": ({"error"}, "out of memory: the limit is memory_gib = 8"), "leaves": ({"error"}, "SystemExit: 3"),
     "ecos": ({"unavailable"}, "the QP solver 'ecos' is not installed"),
-}
+}  # fmt: skip
 FINE: Mapping[str, list[str]] = {
     "problem": ["wire", "wire-chatty"], "dual": ["cpg"], "primal": ["decorrelated", "enrichment-counts"],
     "solver": ["piqp", "careful", "counts", "chatty"],
@@ -128,33 +124,28 @@ def cells(run: Run) -> pd.DataFrame:
     return found[~found.index.duplicated()].sort_index()
 
 
-def test_every_cell_has_a_row(cells: pd.DataFrame) -> None:
+def test_every_cell_has_a_row_with_a_reason_of_one_line_and_its_origin(cells: pd.DataFrame, run: Run) -> None:
     problems = ([*FINE["problem"], *BAD_PROBLEMS], FINE["dual"], FINE["primal"], FINE["solver"])
     strategies = (
-        ["wire"],
-        [*FINE["dual"], *BAD_DUALS],
-        ["decorrelated", *BAD_PRIMALS],
-        [*FINE["solver"], *BAD_SOLVERS],
-    )
+        ["wire"], [*FINE["dual"], *BAD_DUALS], ["decorrelated", *BAD_PRIMALS], [*FINE["solver"], *BAD_SOLVERS],
+    )  # fmt: skip
     expected = pd.MultiIndex.from_product(problems).union(pd.MultiIndex.from_product(strategies))
     assert sorted(cells.index) == sorted(expected)
-
-
-def test_the_runs_are_complete_and_say_nothing_on_standard_error(run: Run) -> None:
     assert (run.codes, run.errors) == ([0, 0], ["", ""])
+    reasons = [*cells["reason"], *(row["reason"] for row in run.rows("queries"))]
+    assert [reason for reason in reasons if "\n" in reason] == []
+    assert all(cells["reason"][cells["status"] != "ok"])
+    for name in ("seed", "study_hash", "code", "machine", "threads", "versions"):
+        assert cells[name].notna().all(), name
+        assert (cells[name] != "").all(), name
 
 
 def test_what_plugins_print_is_kept_out_of_the_way(run: Run) -> None:
     assert not any(words in printed for printed in run.printed for words in ("past Python", "the last words"))
     logs = [(folder / "workers.log").read_text() for folder in run.folders]
     said = (
-        "assembling [",
-        "careful",
-        "written past Python",
-        "solving",
-        "solving past Python",
-        "Fatal Python error: Seg",
-    )
+        "assembling [", "careful", "written past Python", "solving", "solving past Python", "Fatal Python error: Seg",
+    )  # fmt: skip
     assert [words for words in said if words not in logs[0]] == []
     assert all("the last words" in log for log in logs)  # printed by what crashed right after
 
@@ -166,21 +157,21 @@ def test_what_misbehaves_takes_nothing_else_along(cells: pd.DataFrame) -> None:
     assert set(fine["reason"]) == {""}
 
 
-@pytest.mark.parametrize("axis", ["problem", "dual", "primal", "solver"])
-def test_a_plugin_that_misbehaves_costs_its_cells(axis: str, cells: pd.DataFrame) -> None:
-    bad_plugins = {"problem": BAD_PROBLEMS, "dual": BAD_DUALS, "primal": BAD_PRIMALS, "solver": BAD_SOLVERS}[axis]
+def test_a_plugin_that_misbehaves_costs_its_cells(cells: pd.DataFrame) -> None:
     good = {"problem": "wire", "dual": "cpg", "primal": "decorrelated"}
-    others = {name: value for name, value in good.items() if name != axis and (axis, name) != ("dual", "primal")}
-    for plugin, (statuses, reason) in bad_plugins.items():
-        mine = cells.xs((plugin, *others.values()), level=(axis, *others))
-        if axis != "solver":
-            mine = mine.loc[mine.index.get_level_values("solver") != "ecos"]
-        assert set(mine["status"]) == statuses, plugin
-        begins = axis in ("dual", "primal")
-        assert all(found.startswith(reason) if begins else reason in found for found in mine["reason"]), plugin
-        if axis == "solver":
-            assert set(mine["queries_ok"]) == {0}
-            assert mine["online_s"].isna().all()
+    bad_plugins = {"problem": BAD_PROBLEMS, "dual": BAD_DUALS, "primal": BAD_PRIMALS, "solver": BAD_SOLVERS}
+    for axis, of_axis in bad_plugins.items():
+        others = {name: value for name, value in good.items() if name != axis and (axis, name) != ("dual", "primal")}
+        for plugin, (statuses, reason) in of_axis.items():
+            mine = cells.xs((plugin, *others.values()), level=(axis, *others))
+            if axis != "solver":
+                mine = mine.loc[mine.index.get_level_values("solver") != "ecos"]
+            assert set(mine["status"]) == statuses, plugin
+            begins = axis in ("dual", "primal")
+            assert all(found.startswith(reason) if begins else reason in found for found in mine["reason"]), plugin
+            if axis == "solver":
+                assert set(mine["queries_ok"]) == {0}
+                assert mine["online_s"].isna().all()
     assert set(cells.xs("ecos", level="solver")["status"]) == {"unavailable"}
 
 
@@ -193,18 +184,6 @@ def test_reasons_name_the_command_that_checks_the_plugin(cells: pd.DataFrame) ->
         ("wire", "cpg", "enrichment-long", "primal:enrichment-bad --option=how=long"),
     ):
         assert cells.loc[(problem, dual, primal, "piqp"), "reason"].endswith(f"; run `vibench check {check}`")
-
-
-def test_every_reason_is_one_line(cells: pd.DataFrame, run: Run) -> None:
-    reasons = [*cells["reason"], *(row["reason"] for row in run.rows("queries"))]
-    assert [reason for reason in reasons if "\n" in reason] == []
-    assert all(cells["reason"][cells["status"] != "ok"])
-
-
-def test_every_cell_says_where_its_numbers_come_from(cells: pd.DataFrame) -> None:
-    for name in ("seed", "study_hash", "code", "machine", "threads", "versions"):
-        assert cells[name].notna().all(), name
-        assert (cells[name] != "").all(), name
 
 
 def test_queries_that_were_asked_have_rows_of_their_own(run: Run) -> None:
@@ -225,30 +204,20 @@ def test_whole_numbers_are_stored_as_whole_numbers(run: Run) -> None:
     assert [row["value"] for row in known if row["problem"] == "wire"] == [0, 1, 2]
 
 
-def test_progress_counts_up_to_the_number_of_cells(run: Run) -> None:
+def test_progress_the_end_and_the_tables_have_all_cells(run: Run) -> None:
     for folder, printed in zip(run.folders, run.printed, strict=True):
         counted = [(int(k), int(n)) for k, n in re.findall(r"^\[(\d+)/(\d+)\]", printed, re.MULTILINE)]
-        count = len(rows(folder))
+        statuses = [row["status"] for row in rows(folder)]
+        count, fine = len(statuses), statuses.count("ok")
         assert counted == sorted(counted)
         assert len(set(counted)) == len(counted) > 5
         assert {n for _, n in counted} == {count}
-
-
-def test_the_end_names_what_is_not_ok(run: Run) -> None:
-    for folder, printed in zip(run.folders, run.printed, strict=True):
-        statuses = [row["status"] for row in rows(folder)]
-        fine = statuses.count("ok")
-        assert f"{len(statuses)} cells, {fine} ok, {len(statuses) - fine} not ok" in printed
+        assert f"{count} cells, {fine} ok, {count - fine} not ok" in printed
         for status in set(statuses) - {"ok"}:
             assert re.search(rf"\b{status}: ", printed)
-
-
-def test_the_tables_are_written(run: Run) -> None:
-    for folder in run.folders:
-        tables, count = folder / "tables", len(rows(folder))
-        assert len(pd.read_csv(tables / "cells.csv")) == count
-        assert len((tables / "summary.md").read_text(encoding="utf-8").splitlines()) == count + 2
-        assert len(pd.read_csv(tables / "queries.csv")) == len(rows(folder, "queries"))
+        assert len(pd.read_csv(folder / "tables" / "cells.csv")) == count
+        assert len((folder / "tables" / "summary.md").read_text(encoding="utf-8").splitlines()) == count + 2
+        assert len(pd.read_csv(folder / "tables" / "queries.csv")) == len(rows(folder, "queries"))
 
 
 def test_queries_that_went_well_before_the_solver_died_are_kept(vibench: Vibench, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import os
 import random
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -70,43 +70,35 @@ def test_an_export_that_is_killed_is_whole_or_not_there(small_run: Run, vibench:
         assert made.exists() == (tmp_path / arguments[-1]).exists()
 
 
-@pytest.mark.parametrize("kib", [20, 150, 600])
-def test_a_site_on_a_full_disk_is_one_line(kib: int, run: Path, vibench: Vibench, tmp_path: Path) -> None:
-    done = vibench(tmp_path, "publish", str(run), str(tmp_path / "site"), "--no-figures", "--yes", file_kib=kib)
-    assert done.returncode == 2, done.stderr
-    assert done.stderr.startswith("vibench: ")
-    assert "cannot be written" in done.stderr
-    assert done.stderr.count("\n") == 1
-    assert not (tmp_path / "site").exists()
-    assert {path.name for path in tmp_path.iterdir()} == {"run"}
+def test_a_site_on_a_full_disk_is_one_line(run: Path, vibench: Vibench, tmp_path: Path) -> None:
+    for kib in (20, 150, 600):
+        done = vibench(tmp_path, "publish", str(run), str(tmp_path / "site"), "--no-figures", "--yes", file_kib=kib)
+        assert done.returncode == 2, done.stderr
+        assert done.stderr.startswith("vibench: ")
+        assert "cannot be written" in done.stderr
+        assert done.stderr.count("\n") == 1
+        assert {path.name for path in tmp_path.iterdir()} == {"run"}
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("show", "loop"), ("publish", "--yes", "run", "loop"), ("publish", "--yes", "run", "loop/site"),
-        ("run", "loop"),
-        ("run", "study.toml", "--out", "loop/x"), ("pack", "loop"), ("export", "run", "loop/x"),
-        ("export", "run", "0", "loop/m.npz"), ("bench", "--read", "loop"), ("run", "loop/study.toml"),
-        ("report", "run", "--out", "loop/x", "--no-figures"),
-    ],
-    ids=" ".join,
+LOOPS = (
+    "show loop", "publish --yes run loop", "publish --yes run loop/site", "run loop", "run study.toml --out loop/x",
+    "pack loop", "export run loop/x", "export run 0 loop/m.npz", "bench --read loop", "run loop/study.toml",
+    "report run --out loop/x --no-figures",
 )  # fmt: skip
-def test_links_in_a_circle_are_one_line(
-    arguments: tuple[str, ...], run: Path, main: Main, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+
+
+def test_links_in_a_circle_are_one_line_and_replaced_by_a_report(
+    run: Path, main: Main, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(run.parent)
     write_study(tmp_path, wire_study())
     Path("loop").symlink_to("again")
     Path("again").symlink_to("loop")
-    code, _, err = main(*arguments)
-    assert (code, err.count("\n")) == (2, 1), err
-
-
-def test_a_report_replaces_a_link_in_a_circle(run: Path, main: Main, tmp_path: Path) -> None:
-    (tmp_path / "loop").symlink_to("loop")
-    assert main("report", str(run), "--out", str(tmp_path / "loop"), "--no-figures")[0] == 0
-    assert (tmp_path / "loop").is_file()
+    for arguments in LOOPS:
+        code, _, err = main(*arguments.split())
+        assert (code, err.count("\n")) == (2, 1), (arguments, err)
+    assert main("report", "run", "--out", "loop", "--no-figures")[0] == 0
+    assert not Path("loop").is_symlink()
 
 
 @contextmanager
@@ -123,33 +115,24 @@ def of_another_user(path: Path) -> Iterator[None]:
         path.chmod(0o755)
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("show", "theirs"),
-        ("publish", "--yes", "theirs", "theirs/site", "--no-figures"),
-        ("report", "theirs", "--no-figures"),
-    ],
-    ids=" ".join,
-)
 def test_a_folder_of_another_user_is_one_line(
-    arguments: tuple[str, ...], run: Path, main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Path, main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    shutil.copytree(run, tmp_path / "theirs")
-    assert main(*arguments)[0] == 0  # what is imported late may be in a folder that nobody may read
-    shutil.rmtree(tmp_path / "theirs")
-    shutil.copytree(run, tmp_path / "theirs")
-    with of_another_user(tmp_path / "theirs"):
-        code, out, err = main(*arguments)
-    assert (code, out, err.count("\n")) == (2, "", 1), err
+    for line in ("show theirs", "publish --yes theirs theirs/site --no-figures", "report theirs --no-figures"):
+        shutil.copytree(run, tmp_path / "theirs")
+        assert main(*line.split())[0] == 0  # what is imported late may be in a folder that nobody may read
+        shutil.rmtree(tmp_path / "theirs")
+        shutil.copytree(run, tmp_path / "theirs")
+        with of_another_user(tmp_path / "theirs"):
+            code, out, err = main(*line.split())
+        shutil.rmtree(tmp_path / "theirs")
+        assert (code, out, err.count("\n")) == (2, "", 1), err
 
 
-def test_a_clock_that_jumps_changes_no_run(
-    main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed_clock: Callable[[], float]
-) -> None:
-    jumps = random.Random(1)
-    monkeypatch.setattr(time, "time", lambda: undisturbed_clock() + jumps.choice([-1e6, 0.0, 1e6]))
+def test_a_clock_that_jumps_changes_no_run(main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    jumps, undisturbed = random.Random(1), time.time
+    monkeypatch.setattr(time, "time", lambda: undisturbed() + jumps.choice([-1e6, 0.0, 1e6]))
     write_study(tmp_path, wire_study(problem=[COARSE], solvers=["piqp"]))
     code, _, err = main(
         "run", str(tmp_path / "study.toml"), "--out", str(tmp_path / "out"), "--jobs", "1", "--no-figures"
@@ -157,8 +140,3 @@ def test_a_clock_that_jumps_changes_no_run(
     assert (code, err) == (0, "")
     assert {row["status"] for row in rows(tmp_path / "out")} == {"ok"}
     assert (tmp_path / "out" / FILE).is_file()
-
-
-@pytest.fixture
-def undisturbed_clock() -> Callable[[], float]:
-    return time.time

@@ -35,17 +35,15 @@ Run = Callable[..., "Done | Failed | Unstored"]
 
 @pytest.fixture
 def watcher() -> Iterator[Supervisor]:
-    made = Supervisor()
-    yield made
-    made.close()
+    with contextlib.closing(Supervisor()) as made:
+        yield made
 
 
 @pytest.fixture(scope="module")
 def shared() -> Iterator[Supervisor]:
     """One supervisor for most tests: after whatever a test did to its process, the next one is served."""
-    made = Supervisor()
-    yield made
-    made.close()
+    with contextlib.closing(Supervisor()) as made:
+        yield made
 
 
 @pytest.fixture
@@ -58,19 +56,16 @@ def run(shared: Supervisor, tmp_path: Path) -> Run:
     return go
 
 
-def test_a_stage_that_goes_well_is_stored(run: Run, tmp_path: Path) -> None:
-    stage = Whole("fine")
-    assert isinstance(run(stage), Done)
-    found = Store(tmp_path).get(stage.key)
-    assert found is not None
-    assert found.value == "fine"
-
-
-def test_a_stage_says_which_share_of_it_is_done(run: Run, shared: Supervisor) -> None:
+def test_a_stage_that_goes_well_is_stored_and_says_which_share_of_it_is_done(
+    run: Run, shared: Supervisor, tmp_path: Path
+) -> None:
     for how, share in (("third", 1.0 / 3.0), ("fine", 0.0)):
         stage = Whole(how)
         assert isinstance(run(stage), Done)
         assert shared.fraction_done == (stage.key, share)
+    found = Store(tmp_path).get(stage.key)
+    assert found is not None
+    assert found.value == "fine"
 
 
 def test_processes_of_tests_are_forked_whatever_seed_dask_leaves_in_the_environment(
@@ -99,18 +94,18 @@ def test_an_item_beyond_its_limit_costs_itself(run: Run, how: str, monkeypatch: 
 
 
 @pytest.mark.usefixtures("new_workers")
-@pytest.mark.parametrize(("how", "words"), [("exit", "exit code 5"), ("segfault", "signal SIGSEGV")])
-def test_an_item_that_kills_its_process_costs_itself(run: Run, how: str, words: str) -> None:
-    found = run(InItems((how, "fine", how, "fine")))
+def test_an_item_that_kills_its_process_costs_itself(run: Run) -> None:
+    found = run(InItems(("exit", "fine", "segfault", "fine")))
     assert isinstance(found, Done)
-    for number in (0, 2):
+    for number, words in ((0, "exit code 5"), (2, "signal SIGSEGV")):
         assert found.value[number][1] == Failed(Status.CRASHED, f"the worker process died with {words}")
     assert found.value[1][1] != found.value[3][1]  # each death takes another process
 
 
-def test_what_an_item_raises_costs_itself(run: Run) -> None:
-    found = run(InItems(("interrupt", "fine")))
+def test_what_an_item_raises_costs_itself_and_a_death_before_its_limit_begins(run: Run) -> None:
+    found = run(InItems(("interrupt", "fine", "fine"), unlimited=("", "exit", "")))
     assert isinstance(found, Done)
+    assert [isinstance(value, Failed) for _, value in found.value] == [True, True, False]
     assert found.value[0][1].status is Status.ERROR
     assert "KeyboardInterrupt" in found.value[0][1].reason
 
@@ -120,12 +115,6 @@ def test_beyond_the_limit_of_the_cell_the_items_done_are_kept(run: Run) -> None:
     assert isinstance(found, Done)
     assert [isinstance(value, Failed) for _, value in found.value] == [False, False, True, True]
     assert found.value[3][1] == Failed(Status.TIMEOUT, "stopped after cell_seconds = 4 s")
-
-
-def test_an_item_that_dies_before_its_limit_begins_costs_itself(run: Run) -> None:
-    found = run(InItems(("fine", "fine", "fine"), unlimited=("", "exit", "")))
-    assert isinstance(found, Done)
-    assert [isinstance(value, Failed) for _, value in found.value] == [False, True, False]
 
 
 def test_many_quick_items_have_the_limit_of_the_cell_too(run: Run) -> None:
@@ -154,13 +143,15 @@ def test_a_process_without_memory_is_replaced(run: Run) -> None:
 
 
 @pytest.mark.usefixtures("new_workers")
-@pytest.mark.parametrize("kind", ["child", "daemon"])
-def test_what_a_plugin_started_ends_with_its_process(kind: str, watcher: Supervisor, tmp_path: Path) -> None:
-    seconds = unique()
-    assert isinstance(watcher.run(Job(str(tmp_path), InItems((f"{kind} {seconds}",)), 1.0, 30.0, 8.0)), Done)
-    await_sleeper(seconds)
+def test_what_a_plugin_started_ends_with_its_process(watcher: Supervisor, tmp_path: Path) -> None:
+    started = {kind: unique() for kind in ("child", "daemon")}
+    items = InItems(tuple(f"{kind} {seconds}" for kind, seconds in started.items()))
+    assert isinstance(watcher.run(Job(str(tmp_path), items, 1.0, 30.0, 8.0)), Done)
+    for seconds in started.values():
+        while not sleepers(seconds):  # a process that has just begun has no name yet
+            time.sleep(0.01)
     watcher.close()
-    assert not sleepers(seconds)
+    assert not any(map(sleepers, started.values()))
 
 
 @pytest.mark.usefixtures("new_workers")
@@ -177,11 +168,6 @@ def unique() -> int:
     return 10**6 + random.randrange(10**9)
 
 
-def await_sleeper(seconds: int) -> None:
-    while not sleepers(seconds):  # a process that has just begun has no name yet
-        time.sleep(0.01)
-
-
 def sleepers(seconds: int) -> list[str]:
     found = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
@@ -190,7 +176,9 @@ def sleepers(seconds: int) -> list[str]:
     return found
 
 
-def test_a_plugin_that_is_not_the_one_planned_with_is_refused(run: Run) -> None:
+def test_a_plugin_or_a_vibench_that_is_not_the_one_planned_with_is_refused(
+    run: Run, watcher: Supervisor, tmp_path: Path
+) -> None:
     """Its result would be stored under the hash of the other."""
     known = Plugin("problem", "obstacle", "{}", find(PROBLEM, "obstacle").code)
     assert isinstance(run(OfAPlugin(OfAPlugin(problem=known))), Done)
@@ -198,9 +186,6 @@ def test_a_plugin_that_is_not_the_one_planned_with_is_refused(run: Run) -> None:
     found = run(OfAPlugin(OfAPlugin(problem=other)))
     assert isinstance(found, Failed)
     assert found.reason == "the problem 'obstacle' was changed since the run began; run the study again"
-
-
-def test_another_vibench_than_planned_with_is_refused(watcher: Supervisor, tmp_path: Path) -> None:
     found = watcher.run(replace(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0), code="older"))
     assert isinstance(found, Failed)
     assert "vibench or one of the libraries was changed" in found.reason
@@ -245,14 +230,12 @@ def test_a_talkative_job_can_be_stopped(watcher: Supervisor, tmp_path: Path) -> 
         watcher.run(job, lambda _: watcher.stop())
 
 
-@pytest.mark.parametrize("where", ["at_begin", "at_end"])
-@pytest.mark.parametrize(
-    ("how", "status"), [("sleep", Status.TIMEOUT), ("exit", Status.CRASHED), ("interrupt", Status.ERROR)]
-)
-def test_what_is_not_of_an_item_costs_the_cell(run: Run, where: str, how: str, status: Status) -> None:
-    found = run(InItems(("fine",), **{where: how}), cell=0.5 if how == "sleep" else 20.0)
-    assert isinstance(found, Failed)
-    assert found.status is status
+def test_what_is_not_of_an_item_costs_the_cell(run: Run) -> None:
+    statuses = {"sleep": Status.TIMEOUT, "exit": Status.CRASHED, "interrupt": Status.ERROR}
+    for where, (how, status) in itertools.product(("at_begin", "at_end"), statuses.items()):
+        found = run(InItems(("fine",), **{where: how}), cell=0.5 if how == "sleep" else 20.0)
+        assert isinstance(found, Failed)
+        assert found.status is status
 
 
 def test_a_whole_stage_that_hangs_or_dies_is_said_so(run: Run) -> None:

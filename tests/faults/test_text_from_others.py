@@ -30,13 +30,10 @@ PLUGINS = {
 }  # fmt: skip
 
 STUDY = wire_study(
-    problem=[{"name": "odd-wire", "label": LABEL}],
-    dual=["odd-cone", {"name": "cpg", "label": f"@{LABEL}"}],
+    problem=[{"name": "odd-wire", "label": LABEL}], dual=["odd-cone", {"name": "cpg", "label": f"@{LABEL}"}],
     primal=["wordy-enrichment", {"name": "odd-enrichment", "label": f"_{LABEL}"}, "decorrelated"],
-    solvers=[*PLUGINS["vibench.qp_solvers"], "piqp"],
-    accuracy=1e-10,
-    timing_rounds=2,
-)
+    solvers=[*PLUGINS["vibench.qp_solvers"], "piqp"], accuracy=1e-10, timing_rounds=2,
+)  # fmt: skip
 """What goes wrong comes first; the solver has no part in errors, or figures would leave all cells out."""
 
 
@@ -90,11 +87,8 @@ def test_the_run_ends_with_a_row_for_every_cell(ended: tuple[Path, str]) -> None
             assert len(row["fallbacks"]) == 2 * LONGEST
     unreadable = cells[cpg, "decorrelated", "odd-unreadable"]
     assert unreadable["reason"].endswith("UnreadableError: its message cannot be read")
-
-
-def test_iterations_that_are_no_number_of_them_are_missing_and_nothing_else_is(ended: tuple[Path, str]) -> None:
     queries = by_strategies(ended[0] / "run", "queries")
-    cpg = printable(f"@{LABEL}")
+    # Iterations that are no number of them are missing, and nothing else is.
     pairs = zip(queries[cpg, "decorrelated", "odd-counts"], queries[cpg, "decorrelated", "piqp"], strict=True)
     for odd, plain in pairs:
         assert (odd["status"], odd["iterations"]) == ("ok", None)
@@ -115,18 +109,14 @@ def test_histories_and_pictures_have_printable_names(ended: tuple[Path, str]) ->
     assert len(shown) == 3
 
 
-def test_a_later_run_resumes_behind_all_of_it(ended: tuple[Path, str], vibench: Vibench) -> None:
-    folder, _ = ended
-    before = rows(folder / "run")
+def test_whatever_is_printed_and_written_is_printable_and_resumed(ended: tuple[Path, str], vibench: Vibench) -> None:
+    folder, printed = ended
+    run = folder / "run"
+    before = rows(run)
     done = vibench(folder, "run", "study.toml", "--jobs", "1", "--out", "run")
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("30 cells, 0 to run, 0 stages\n")
-    assert rows(folder / "run") == before
-
-
-def test_whatever_is_printed_and_written_is_printable(ended: tuple[Path, str], vibench: Vibench) -> None:
-    folder, printed = ended
-    run = folder / "run"
+    assert rows(run) == before
     written = [*(run / "tables").iterdir(), *(run / "figures").glob("*.svg")]
     assert len(list((run / "figures").glob("*.png"))) == len(written) - len(TABLES) - 1 >= 8
     texts = [printed, *(path.read_text(encoding="utf-8") for path in written)]

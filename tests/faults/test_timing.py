@@ -43,7 +43,7 @@ def test_a_cell_that_never_answers_leaves_the_seconds_of_the_others(vibench: Vib
 
 
 def test_what_was_answered_but_not_timed_is_timed_by_the_next_run(vibench: Vibench, tmp_path: Path) -> None:
-    """As after an interruption between the last answer and the first round."""
+    """As after an interruption between the last answer and the first round; a study may ask for more rounds."""
     write_study(tmp_path, wire_study())
     folder = tmp_path / "runs" / "wire"
     vibench(tmp_path, "run", "study.toml", "--jobs", "1")
@@ -54,13 +54,6 @@ def test_what_was_answered_but_not_timed_is_timed_by_the_next_run(vibench: Viben
     assert len(rows(folder, "timings")) == ROUNDS
     printed, _ = run_again(vibench, tmp_path)
     assert "1 cells, 0 to run, 0 stages" in printed
-
-
-def test_a_study_may_ask_for_more_rounds(vibench: Vibench, tmp_path: Path) -> None:
-    write_study(tmp_path, wire_study(timing_rounds=2))
-    folder = tmp_path / "runs" / "wire"
-    vibench(tmp_path, "run", "study.toml", "--jobs", "1")
-    assert len(rows(folder, "timings")) == 2
     assert {row["meaning"] for row in rows(folder, "thresholds")} == {"undecided"}
     write_study(tmp_path, wire_study(timing_rounds=7))
     printed, _ = run_again(vibench, tmp_path)

@@ -1,4 +1,4 @@
-"""Formulations that are wrong, each in one way; what `vibench check` has to find, and nothing else."""
+"""Formulations that are _wrong, each in one way; what `vibench check` has to find, and nothing else."""
 
 from __future__ import annotations
 
@@ -14,16 +14,21 @@ from formulations import Program, ProgramModel
 
 from vibench import Array, FormulationAnswer, FormulationModel, Multiplier, Outcome, QuerySettings, Reduction, solve_qp
 
-Change = Callable[[FormulationAnswer], FormulationAnswer]
+
+def _wrong(name: str, **members: Any) -> type[Program]:
+    """The mixed formulation with a model that has other members."""
+    kind = type(f"{name}Model", (ProgramModel,), members)
+    return type(name, (Program,), {"__module__": __name__, "model": lambda self, offline, built: kind(offline)})
 
 
-class _Wrong(Program):
-    """The mixed formulation with another model."""
+def _answering(name: str, change: Callable[[FormulationAnswer, Array], Any]) -> type[Program]:
+    """The mixed formulation with another answer."""
+    return _wrong(name, solve=lambda self, mu, settings: change(ProgramModel.solve(self, mu, settings), mu))
 
-    kind: ClassVar[type[ProgramModel]] = ProgramModel
 
-    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
-        return self.kind(offline)
+def _rebuilding(name: str, change: Callable[[Array, Array], Any]) -> type[Program]:
+    """The mixed formulation that makes another pair of its answer."""
+    return _wrong(name, reconstruct=lambda self, mu, answer: change(*ProgramModel.reconstruct(self, mu, answer)))
 
 
 class AxisThatIsNone(Program):
@@ -53,119 +58,70 @@ class MakesADictionary(Program):
         return {"basis": offline.pod.basis}  # type: ignore[return-value]
 
 
-class WithoutDimension(_Wrong):
-    class kind(ProgramModel):  # noqa: N801
-        def __init__(self, offline: Reduction) -> None:
-            super().__init__(offline)
-            del self.dimension
+def _without_dimension(self: Any, offline: Reduction) -> None:
+    ProgramModel.__init__(self, offline)
+    del self.dimension
 
 
-class AnswersInATuple(_Wrong):
-    class kind(ProgramModel):  # noqa: N801
-        def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
-            answer = super().solve(mu, settings)
-            return answer.x, answer.alpha  # type: ignore[return-value]
+def _more_than_declared(self: Any, offline: Reduction) -> None:
+    ProgramModel.__init__(self, offline)
+    self.generators = 3
 
 
-class NotANumber(_Wrong):
-    class kind(ProgramModel):  # noqa: N801
-        def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
-            answer = super().solve(mu, settings)
-            assert answer.x is not None
-            answer.x[2] = np.nan
-            return answer
+def _stepped_on(answer: FormulationAnswer, mu: Array) -> FormulationAnswer:
+    mu += 1e-3
+    return answer
 
 
-class NeverConverges(_Wrong):
-    class kind(ProgramModel):  # noqa: N801
-        def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
-            return replace(super().solve(mu, settings), outcome=Outcome.INACCURATE, reason="100 steps were too few")
+def _same_solver(self: Any, mu: Array, settings: QuerySettings) -> FormulationAnswer:
+    found = solve_qp(self.assembled.assemble(mu).program, "piqp", settings.accuracy)
+    return FormulationAnswer(found.x, found.alpha)
 
 
-class SaysNotWhy(_Wrong):
-    class kind(ProgramModel):  # noqa: N801
-        def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
-            outcome = Outcome.FAILED if mu[0] > 0.0 else Outcome.OK
-            return replace(super().solve(mu, settings), outcome=outcome)
+WithoutDimension = _wrong("WithoutDimension", __init__=_without_dimension)
+MoreThanDeclared = _wrong("MoreThanDeclared", __init__=_more_than_declared)
+# It says that it has a solver, and always calls the same one.
+NoProgram = _wrong("NoProgram", solve=_same_solver)
+# It changes the parameter that it is given.
+StepsOn = _answering("StepsOn", _stepped_on)
+AnswersInATuple = _answering("AnswersInATuple", lambda answer, mu: (answer.x, answer.alpha))
+NotANumber = _answering(
+    "NotANumber", lambda answer, mu: replace(answer, x=answer.x * np.where(answer.x == answer.x[2], np.nan, 1.0))
+)
+NeverConverges = _answering(
+    "NeverConverges", lambda answer, mu: replace(answer, outcome=Outcome.INACCURATE, reason="100 steps were too few")
+)
+SaysNotWhy = _answering(
+    "SaysNotWhy", lambda answer, mu: replace(answer, outcome=Outcome.FAILED if mu[0] > 0.0 else Outcome.OK)
+)
+Rolls = _answering(
+    "Rolls", lambda answer, mu: replace(answer, x=answer.x * (1.0 + 1e-9 * np.random.default_rng().random()))
+)
+OfAnotherSize = _rebuilding("OfAnotherSize", lambda u, lam: (u[1:], lam))
+Pulls = _rebuilding("Pulls", lambda u, lam: (u, lam - 1e-12 * lam.max()))
+ForgetsTheMultiplier = _rebuilding("ForgetsTheMultiplier", lambda u, lam: (u, None))
+WrongSide = _rebuilding("WrongSide", lambda u, lam: (-u, lam))
 
 
-class MoreThanDeclared(_Wrong):
-    class kind(ProgramModel):  # noqa: N801
-        def __init__(self, offline: Reduction) -> None:
-            super().__init__(offline)
-            self.generators = 3
-
-
-class OfAnotherSize(_Wrong):
-    class kind(ProgramModel):  # noqa: N801
-        def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
-            u, lam = super().reconstruct(mu, answer)
-            return u[1:], lam
-
-
-class Pulls(_Wrong):
-    class kind(ProgramModel):  # noqa: N801
-        def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
-            u, lam = super().reconstruct(mu, answer)
-            assert lam is not None
-            return u, lam - 1e-12 * lam.max()
-
-
-class ForgetsTheMultiplier(_Wrong):
-    class kind(ProgramModel):  # noqa: N801
-        def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
-            return super().reconstruct(mu, answer)[0], None
-
-
-class RemembersItsScale(_Wrong):
+class RemembersItsScale(Program):
     """The factor of u is not among the coefficients."""
 
-    class kind(ProgramModel):  # noqa: N801
-        scale = 1.0
-
-        def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
-            answer = super().solve(mu, settings)
-            assert answer.x is not None
-            self.scale = float(np.linalg.norm(answer.x))
-            return replace(answer, x=answer.x / self.scale)
-
-        def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
-            u, lam = super().reconstruct(mu, answer)
-            return self.scale * u, lam
+    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+        return _ScaledModel(offline)
 
 
-class Rolls(_Wrong):
-    class kind(ProgramModel):  # noqa: N801
-        def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
-            answer = super().solve(mu, settings)
-            assert answer.x is not None
-            return replace(answer, x=answer.x * (1.0 + 1e-9 * np.random.default_rng().random()))
+class _ScaledModel(ProgramModel):
+    scale = 1.0
 
+    def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
+        answer = super().solve(mu, settings)
+        assert answer.x is not None
+        self.scale = float(np.linalg.norm(answer.x))
+        return replace(answer, x=answer.x / self.scale)
 
-class StepsOn(_Wrong):
-    """Changes the parameter that it is given."""
-
-    class kind(ProgramModel):  # noqa: N801
-        def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
-            answer = super().solve(mu, settings)
-            mu += 1e-3
-            return answer
-
-
-class WrongSide(_Wrong):
-    class kind(ProgramModel):  # noqa: N801
-        def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
-            u, lam = super().reconstruct(mu, answer)
-            return -u, lam
-
-
-class NoProgram(_Wrong):
-    """Says that it has a solver, and always calls the same one."""
-
-    class kind(ProgramModel):  # noqa: N801
-        def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
-            found = solve_qp(self.assembled.assemble(mu).program, "piqp", settings.accuracy)
-            return FormulationAnswer(found.x, found.alpha)
+    def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
+        u, lam = super().reconstruct(mu, answer)
+        return self.scale * u, lam
 
 
 class SolverOfItsOwnAccord(Program):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -12,7 +13,6 @@ from fake_plugins import Wire
 from vibench import (
     Array,
     Contact,
-    ContactLoads,
     InnerProduct,
     MeshFields,
     Output,
@@ -48,76 +48,112 @@ class Declared(Wire):
         return Picture(points, np.array([[0], [1], [2]]), u, "deflection [m]", x[None], lam, "multiplier [N/m²]")
 
 
-class Changed(Wire):
+def _variant(name: str, base: type[Problem] = Wire, **members: Any) -> type[Problem]:
+    """A problem with other members."""
+    return type(name, (base,), {"__module__": __name__, **members})
+
+
+def _changed(name: str, member: str, wrong: Callable[[Any, Array], Any], above: float = -np.inf) -> type[Problem]:
     """A wire of which one member is made wrong from some force on."""
 
-    member, above = "A", -np.inf
+    def assemble(self: Any, mu: Array) -> VariationalInequality:
+        vi = Wire.assemble(self, mu)
+        return vi if mu[0] < above else replace(vi, **{member: wrong(getattr(vi, member), mu)})
 
-    def wrong(self, value: Any, mu: Array) -> Any:
-        raise NotImplementedError
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        vi = super().assemble(mu)
-        if mu[0] < self.above:
-            return vi
-        return replace(vi, **{self.member: self.wrong(getattr(vi, self.member), mu)})
+    return _variant(name, assemble=assemble)
 
 
-class Asymmetric(Changed):
-    def wrong(self, value: Any, mu: Array) -> Any:
-        return value + sp.csr_array(([1e-3 * mu[0]], ([2], [3])), shape=value.shape)
+def _infinite(B: sp.csr_array) -> sp.csr_array:
+    return sp.csr_array((np.where(np.arange(12) == 5, np.inf, B.data), B.indices, B.indptr))
 
 
-class Indefinite(Changed):
-    def wrong(self, value: Any, mu: Array) -> Any:
-        return value - 4.0 * (mu[0] - 4.0) * self.mass / 0.9
+Asymmetric = _changed("Asymmetric", "A", lambda A, mu: A + sp.csr_array(([1e-3 * mu[0]], ([2], [3])), shape=A.shape))
+Indefinite = _changed("Indefinite", "A", lambda A, mu: A - 4.0 * (mu[0] - 4.0) * Wire().mass / 0.9)
+NotFinite = _changed("NotFinite", "f", lambda f, mu: np.where(np.arange(len(f)) == 7, np.nan, f), above=5.0)
+InfiniteMatrix = _changed("InfiniteMatrix", "B", lambda B, mu: _infinite(B))
+WrongShape = _changed("WrongShape", "B", lambda B, mu: B[:, :-1])
+Integers = _changed("Integers", "g", lambda g, mu: np.zeros(len(g), dtype=int))
+Column = _changed("Column", "f", lambda f, mu: f[:, None])
+Dense = _changed("Dense", "A", lambda A, mu: A.toarray())
+RowList = _changed("RowList", "B", lambda B, mu: B.tolil())
+# The support gives way by a hundredth above a force of 5.4321 N/m.
+Jumps = _changed("Jumps", "g", lambda g, mu: 1.01 * g, above=5.4321)
+# At one force alone it is another wire.
+JumpsAtTheCentre = _changed("JumpsAtTheCentre", "A", lambda A, mu: 2.0 * A if mu[0] == 6.0 else A)
+Random = _changed("Random", "f", lambda f, mu: f * (1.0 + 1e-15 * np.random.default_rng().random(len(f))))
+# The wire is pulled off its support.
+WrongSign = _changed("WrongSign", "B", lambda B, mu: -B)
+
+FalselyConstant = _variant("FalselyConstant", constant=frozenset({"A", "f"}))
+ConstantOfNothing = _variant("ConstantOfNothing", constant=frozenset({"a"}))
+ConstantText = _variant("ConstantText", constant="A")
+SamplesNothing = _variant("SamplesNothing", entrywise=frozenset({"f"}))
+OneSample = _variant("OneSample", training_set=lambda self: np.array([[5.0], [5.0]]))
+Outside = _variant("Outside", training_set=lambda self: np.linspace(3.0, 8.0, 6)[:, None])
+Flat = _variant("Flat", training_set=lambda self: np.linspace(4.0, 8.0, 6))
+OtherValidation = _variant(
+    "OtherValidation",
+    validation_set=lambda self, count, seed: self.parameters.sample(
+        count, int(np.random.default_rng().integers(2**31))
+    ),
+)
+BackwardsBox = _variant("BackwardsBox", parameters=ParameterBox(("force",), np.array([8.0]), np.array([4.0]), ("N/m",)))
+NamedByText = _variant("NamedByText", parameters=ParameterBox("force", np.array([4.0]), np.array([8.0]), ("N/m",)))  # type: ignore[arg-type]
+OutputsOfOneName = _variant(
+    "OutputsOfOneName",
+    outputs=property(
+        lambda self: (Output("force", "N", lam=np.ones(self.W.dim)), Output("force", "N", u=np.ones(self.V.dim)))
+    ),
+)
+OutputOfNothing = _variant(
+    "OutputOfNothing",
+    outputs=property(lambda self: (Output("peak", "m", function=lambda mu, u, lam: float(u[lam > 0.0].max())),)),
+)
+OutputOfAnotherSize = _variant(
+    "OutputOfAnotherSize", outputs=property(lambda self: (Output("force", "N", lam=np.ones(self.W.dim + 1)),))
+)
+OutOfReach = _variant(
+    "OutOfReach", refuse=lambda self, mu, u, lam: "the force is more than the wire bears" if mu[0] > 7.0 else ""
+)
+ContactOfNothing = _variant(
+    "ContactOfNothing", contact=lambda self, mu: Contact(-self.mass, np.full(self.W.dim, self.depth * self.step))
+)
+
+# The loads of multipliers are those of others.
+LoadsWrong = _variant("LoadsWrong", Declared, contact_loads=lambda self, eta: Declared.contact_loads(self, 2.0 * eta))
+# Loads vary on more rows than it says.
+LoadsReachFarther = _variant(
+    "LoadsReachFarther", Declared, contact_loads=lambda self, eta: replace(Declared.contact_loads(self, eta), reach=1)
+)
+NoContact = _variant("NoContact", Declared, contact=lambda self, mu: None)
+# B touches an unknown that is not declared.
+Overlooked = _variant("Overlooked", Declared, contact_dofs=property(lambda self: np.arange(1, self.V.dim)))
+Falling = _variant("Falling", Declared, contact_dofs=property(lambda self: np.arange(self.V.dim)[::-1]))
+NoMeasure = _variant("NoMeasure", Declared, multiplier_integrals=lambda self: np.zeros(self.W.dim))
 
 
-class NotFinite(Changed):
-    member, above = "f", 5.0
-
-    def wrong(self, value: Any, mu: Array) -> Any:
-        return np.where(np.arange(len(value)) == 7, np.nan, value)
-
-
-class InfiniteMatrix(Changed):
-    member = "B"
-
-    def wrong(self, value: Any, mu: Array) -> Any:
-        return sp.csr_array((np.where(np.arange(12) == 5, np.inf, value.data), value.indices, value.indptr))
+class IndefiniteNorm(Wire):
+    def __init__(self) -> None:
+        super().__init__()
+        self.V = InnerProduct(self.stiffness - 1e3 * self.mass)
 
 
-class WrongShape(Changed):
-    member = "B"
-
-    def wrong(self, value: Any, mu: Array) -> Any:
-        return value[:, :-1]
-
-
-class Integers(Changed):
-    member = "g"
-
-    def wrong(self, value: Any, mu: Array) -> Any:
-        return np.zeros(len(value), dtype=int)
+class IndefiniteDualNorm(Wire):
+    def __init__(self) -> None:
+        super().__init__()
+        self.W = InnerProduct(self.mass - 2.0 * self.step * sp.eye_array(self.mass.shape[0]), "X_W")
 
 
-class Column(Changed):
-    member = "f"
-
-    def wrong(self, value: Any, mu: Array) -> Any:
-        return value[:, None]
-
-
-class Dense(Changed):
-    def wrong(self, value: Any, mu: Array) -> Any:
-        return value.toarray()
+class NoSpace(Wire):
+    def __init__(self) -> None:
+        super().__init__()
+        self.V = self.stiffness  # type: ignore[assignment]
 
 
-class RowList(Changed):
-    member = "B"
-
-    def wrong(self, value: Any, mu: Array) -> Any:
-        return value.tolil()
+class NoConstraint(Wire):
+    def __init__(self) -> None:
+        super().__init__()
+        self.W = InnerProduct(sp.csr_array((0, 0)))
 
 
 class NoInequality(Wire):
@@ -133,67 +169,20 @@ class Raises(Wire):
         return super().assemble(mu)
 
 
-class IndefiniteNorm(Wire):
-    def __init__(self) -> None:
-        super().__init__()
-        self.V = InnerProduct(self.stiffness - 1e3 * self.mass)
-
-
-class IndefiniteDualNorm(Wire):
-    def __init__(self) -> None:
-        super().__init__()
-        self.W = InnerProduct(self.mass - 2.0 * self.step * sp.eye_array(self.mass.shape[0]), "X_W")
-
-
 class NormChangedLater(Wire):
     def __init__(self) -> None:
         super().__init__()
         self.V.matrix.data *= -1.0
 
 
-class NoSpace(Wire):
-    def __init__(self) -> None:
-        super().__init__()
-        self.V = self.stiffness  # type: ignore[assignment]
-
-
-class NoConstraint(Wire):
-    def __init__(self) -> None:
-        super().__init__()
-        self.W = InnerProduct(sp.csr_array((0, 0)))
-
-
-class Jumps(Changed):
-    """The support gives way by a hundredth above a force of 5.4321 N/m."""
-
-    member, above = "g", 5.4321
-
-    def wrong(self, value: Any, mu: Array) -> Any:
-        return 1.01 * value
-
-
-class JumpsAtTheCentre(Changed):
-    """At one force alone it is another wire."""
-
-    def wrong(self, value: Any, mu: Array) -> Any:
-        return 2.0 * value if mu[0] == 6.0 else value
-
-
-class Random(Changed):
-    member = "f"
-
-    def wrong(self, value: Any, mu: Array) -> Any:
-        return value * (1.0 + 1e-15 * np.random.default_rng().random(len(value)))
-
-
-class Remembers(Changed):
+class Remembers(Wire):
     """The load depends on the force before."""
 
-    member, last = "f", 4.0
+    last = 4.0
 
-    def wrong(self, value: Any, mu: Array) -> Any:
-        found, self.last = value + 1e-9 * self.last, float(mu[0])
-        return found
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi, before, self.last = super().assemble(mu), self.last, float(mu[0])
+        return replace(vi, f=vi.f + 1e-9 * before)
 
 
 class CountsInstances(Wire):
@@ -226,18 +215,6 @@ class OneBuffer(Wire):
         return replace(super().assemble(mu), f=self._load)
 
 
-class FalselyConstant(Wire):
-    constant: ClassVar[frozenset[str]] = frozenset({"A", "f"})
-
-
-class ConstantOfNothing(Wire):
-    constant: ClassVar[frozenset[str]] = frozenset({"a"})
-
-
-class ConstantText(Wire):
-    constant: ClassVar[frozenset[str]] = "A"  # type: ignore[assignment]
-
-
 class PartlyWrong(Declared):
     """On the contact alone the bound is another one."""
 
@@ -246,48 +223,10 @@ class PartlyWrong(Declared):
         return Contact(found.B, found.g * (1.0 + 1e-6))
 
 
-class LoadsWrong(Declared):
-    """The loads of multipliers are those of others."""
-
-    def contact_loads(self, eta: Array) -> ContactLoads:
-        return super().contact_loads(2.0 * eta)
-
-
-class LoadsReachFarther(Declared):
-    """Loads vary on more rows than it says."""
-
-    def contact_loads(self, eta: Array) -> ContactLoads:
-        return replace(super().contact_loads(eta), reach=1)
-
-
-class NoContact(Declared):
-    def contact(self, mu: Array) -> Any:
-        return None
-
-
-class ContactOfNothing(Wire):
-    def contact(self, mu: Array) -> Contact:
-        return Contact(-self.mass, np.full(self.W.dim, self.depth * self.step))
-
-
 class ContactChangesTheParameter(Declared):
     def contact(self, mu: Array) -> Contact:
         mu += 1.0
         return super().contact(mu)
-
-
-class Overlooked(Declared):
-    """B touches an unknown that is not declared."""
-
-    @property
-    def contact_dofs(self) -> Any:
-        return np.arange(1, self.V.dim)
-
-
-class Falling(Declared):
-    @property
-    def contact_dofs(self) -> Any:
-        return np.arange(self.V.dim)[::-1]
 
 
 class SamplesWrong(Declared):
@@ -303,56 +242,6 @@ class SamplesWrong(Declared):
         return wrong
 
 
-class SamplesNothing(Wire):
-    entrywise: ClassVar[frozenset[str]] = frozenset({"f"})
-
-
-class OneSample(Wire):
-    def training_set(self) -> Array:
-        return np.array([[5.0], [5.0]])
-
-
-class OutputsOfOneName(Wire):
-    @property
-    def outputs(self) -> tuple[Output, ...]:
-        return (Output("force", "N", lam=np.ones(self.W.dim)), Output("force", "N", u=np.ones(self.V.dim)))
-
-
-class OutputOfNothing(Wire):
-    @property
-    def outputs(self) -> tuple[Output, ...]:
-        return (Output("peak", "m", function=lambda mu, u, lam: float(u[lam > 0.0].max())),)
-
-
-class OutputOfAnotherSize(Wire):
-    @property
-    def outputs(self) -> tuple[Output, ...]:
-        return (Output("force", "N", lam=np.ones(self.W.dim + 1)),)
-
-
-class Outside(Wire):
-    def training_set(self) -> Array:
-        return np.linspace(3.0, 8.0, 6)[:, None]
-
-
-class Flat(Wire):
-    def training_set(self) -> Array:
-        return np.linspace(4.0, 8.0, 6)
-
-
-class OtherValidation(Wire):
-    def validation_set(self, count: int, seed: int) -> Array:
-        return self.parameters.sample(count, int(np.random.default_rng().integers(2**31)))
-
-
-class BackwardsBox(Wire):
-    parameters = ParameterBox(("force",), np.array([8.0]), np.array([4.0]), ("N/m",))
-
-
-class NamedByText(Wire):
-    parameters = ParameterBox("force", np.array([4.0]), np.array([8.0]), ("N/m",))  # type: ignore[arg-type]
-
-
 class Unpicklable(Wire):
     def __init__(self) -> None:
         super().__init__()
@@ -361,19 +250,6 @@ class Unpicklable(Wire):
 
 class Worse(Outside, Unpicklable):
     """Wrong in two ways."""
-
-
-class WrongSign(Wire):
-    """The wire is pulled off its support."""
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        vi = super().assemble(mu)
-        return replace(vi, B=-vi.B)
-
-
-class OutOfReach(Wire):
-    def refuse(self, mu: Array, u: Array, lam: Array) -> str:
-        return "the force is more than the wire bears" if mu[0] > 7.0 else ""
 
 
 class PaintsNothing(Declared):
@@ -386,11 +262,6 @@ class InsideOut(Declared):
     def mesh_fields(self, mu: Array, u: Array, lam: Array) -> MeshFields:
         corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
         return MeshFields(corners, {"tetra": np.arange(4)[None]}, {}, {})
-
-
-class NoMeasure(Declared):
-    def multiplier_integrals(self) -> Array:
-        return np.zeros(self.W.dim)
 
 
 class Unfinished(Problem):

@@ -6,7 +6,7 @@ Where the docstring of a class says nothing else, `vibench check` names the mist
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
 from typing import Any, ClassVar
@@ -120,6 +120,57 @@ class AllElements(ByElements):
         return super().element_sampler(np.arange(self.V.dim + 1))
 
 
+def _changed(
+    name: str, base: type[Problem], change: Callable[[Any, VariationalInequality, Array], Any]
+) -> type[Problem]:
+    """A problem with other members A, f, B, g."""
+
+    def assemble(self: Any, mu: Array) -> VariationalInequality:
+        vi = base.assemble(self, mu)
+        return replace(vi, **change(self, vi, mu))
+
+    return type(name, (base,), {"__module__": __name__, "assemble": assemble})
+
+
+def _built(name: str, base: type[Problem], **members: Callable[[Any], Any]) -> type[Problem]:
+    """A problem of which members are replaced when it is made."""
+
+    def init(self: Any) -> None:
+        base.__init__(self)
+        for member, made in members.items():
+            setattr(self, member, made(self))
+
+    return type(name, (base,), {"__module__": __name__, "__init__": init})
+
+
+# The reaction has the wrong sign, which matters where the rate is large and the volatility small.
+IndefiniteSomewhere = _changed(
+    "IndefiniteSomewhere", Option, lambda self, vi, mu: {"A": sp.csr_array(vi.A - 1.6 * mu[1] * self._M[1:-1, 1:-1])}
+)
+# u ≥ −ψ in place of u ≤ ψ: no constraint is ever active.
+WrongSide = _changed("WrongSide", Bar, lambda self, vi, mu: {"B": -vi.B})
+# g has the wrong sign: u ≤ −ψ, which sticks everywhere.
+NegativeGap = _changed("NegativeGap", Bar, lambda self, vi, mu: {"g": -vi.g})
+# B, declared constant, turns with the place of the apex.
+ConstantConstraint = _changed(
+    "ConstantConstraint", Cube, lambda self, vi, mu: {"B": sp.csr_array(vi.B * (1.0 + 0.1 * mu[1]))}
+)
+NoisyLoad = _changed(
+    "NoisyLoad", Bar, lambda self, vi, mu: {"f": vi.f * (1.0 + 1e-6 * np.random.default_rng().random(len(vi.f)))}
+)
+# The load has an entry for the nodes on the boundary, too.
+LoadOnAllNodes = _changed("LoadOnAllNodes", Bar, lambda self, vi, mu: {"f": np.full(49, mu[0] / 36.0)})
+# κ is the root of a complex number.
+ComplexStiffness = _changed("ComplexStiffness", Option, lambda self, vi, mu: {"A": sp.csr_array(vi.A.astype(complex))})
+IntegerBound = _changed("IntegerBound", Cube, lambda self, vi, mu: {"f": np.zeros(self.V.dim, dtype=int)})
+# The twist is not used.
+IgnoresTheParameter = _changed("IgnoresTheParameter", Bar, lambda self, vi, mu: {"f": 6.0 * self._weights})
+
+EuclideanNorm = _built("EuclideanNorm", Cube, V=lambda cube: InnerProduct(sp.eye_array(cube.V.dim, format="csc")))
+# X_W is that of all nodes, and not of those of the top.
+DualNormOfAllNodes = _built("DualNormOfAllNodes", Cube, W=lambda cube: InnerProduct(sp.eye_array(27, format="csc")))
+
+
 class SkewStiffness(Option):
     """The Black–Scholes operator with its first derivative, not symmetrised."""
 
@@ -128,30 +179,6 @@ class SkewStiffness(Option):
         ones = np.ones(self.V.dim - 1)
         drift = sp.csr_array(sp.diags_array([ones, -ones], offsets=[1, -1])) * (0.5 * (mu[1] - 0.5 * mu[0] ** 2))
         return replace(vi, A=sp.csr_array(vi.A + drift))
-
-
-class IndefiniteSomewhere(Option):
-    """The reaction has the wrong sign, which matters where the rate is large and the volatility small."""
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        vi = super().assemble(mu)
-        return replace(vi, A=sp.csr_array(vi.A - 1.6 * mu[1] * self._M[1:-1, 1:-1]))
-
-
-class WrongSide(Bar):
-    """u ≥ −ψ in place of u ≤ ψ: no constraint is ever active."""
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        vi = super().assemble(mu)
-        return replace(vi, B=-vi.B)
-
-
-class NegativeGap(Bar):
-    """g has the wrong sign: u ≤ −ψ, which sticks everywhere."""
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        vi = super().assemble(mu)
-        return replace(vi, g=-vi.g)
 
 
 class PermutedNorm(Option):
@@ -168,12 +195,6 @@ class MassNorm(Bar):
         basis = Basis(MeshTri.init_tensor(cells, cells), ElementTriP1())
         free = basis.complement_dofs(basis.get_dofs())
         self.V = InnerProduct(fem.mass(basis)[free][:, free])
-
-
-class EuclideanNorm(Cube):
-    def __init__(self) -> None:
-        super().__init__()
-        self.V = InnerProduct(sp.eye_array(self.V.dim, format="csc"))
 
 
 class SingularDualNorm(Bar):
@@ -198,14 +219,6 @@ class ConstantStiffness(Option):
     constant: ClassVar[frozenset[str]] = frozenset({"A"})
 
 
-class ConstantConstraint(Cube):
-    """B, declared constant, turns with the place of the apex."""
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        vi = super().assemble(mu)
-        return replace(vi, B=sp.csr_array(vi.B * (1.0 + 0.1 * mu[1])))
-
-
 class RandomMesh(Bar):
     """The mesh of every instance has other nodes."""
 
@@ -225,12 +238,6 @@ class NamesOfNodes(Bar):
         self._stiffness = self._stiffness[order][:, order]
         self._distance = self._distance[order]
         self.V = InnerProduct(self.V.matrix[order][:, order])
-
-
-class NoisyLoad(Bar):
-    def assemble(self, mu: Array) -> VariationalInequality:
-        vi = super().assemble(mu)
-        return replace(vi, f=vi.f * (1.0 + 1e-6 * np.random.default_rng().random(len(vi.f))))
 
 
 class OneVector(Bar):
@@ -255,43 +262,8 @@ class NotANumberInACorner(Option):
         return replace(vi, g=vi.g * factor)
 
 
-class LoadOnAllNodes(Bar):
-    """The load has an entry for the nodes on the boundary, too."""
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        return replace(super().assemble(mu), f=np.full(49, mu[0] / 36.0))
-
-
-class DualNormOfAllNodes(Cube):
-    """X_W is that of all nodes, and not of those of the top."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.W = InnerProduct(sp.eye_array(27, format="csc"))
-
-
-class IgnoresTheParameter(Bar):
-    """The twist is not used."""
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        return super().assemble(np.array([6.0]))
-
-
 class UpsideDownBox(Bar):
     parameters = ParameterBox(("twist",), np.array([8.0]), np.array([1.0]), ("1/m",))
-
-
-class ComplexStiffness(Option):
-    """κ is the root of a complex number."""
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        vi = super().assemble(mu)
-        return replace(vi, A=sp.csr_array(vi.A.astype(complex)))
-
-
-class IntegerBound(Cube):
-    def assemble(self, mu: Array) -> VariationalInequality:
-        return replace(super().assemble(mu), f=np.zeros(self.V.dim, dtype=int))
 
 
 class OtherSamples(Cube):

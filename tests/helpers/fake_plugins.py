@@ -7,7 +7,8 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -79,22 +80,14 @@ class Raises(Wire):
         raise ArithmeticError("the wire\nsnapped")
 
 
-class NotANumber(Wire):
-    def assemble(self, mu: Array) -> VariationalInequality:
-        vi = super().assemble(mu)
-        return VariationalInequality(vi.A, vi.f * np.nan, vi.B, vi.g)
+def _changed(name: str, change: Callable[[VariationalInequality], VariationalInequality]) -> type[Wire]:
+    """A wire that is changed after its assembly."""
+    return type(name, (Wire,), {"__module__": __name__, "assemble": lambda self, mu: change(Wire.assemble(self, mu))})
 
 
-class WrongShape(Wire):
-    def assemble(self, mu: Array) -> VariationalInequality:
-        vi = super().assemble(mu)
-        return VariationalInequality(vi.A, vi.f, vi.B, vi.g[:-1])
-
-
-class Indefinite(Wire):
-    def assemble(self, mu: Array) -> VariationalInequality:
-        vi = super().assemble(mu)
-        return VariationalInequality(-vi.A, vi.f, vi.B, vi.g)
+NotANumber = _changed("NotANumber", lambda vi: replace(vi, f=vi.f * np.nan))
+WrongShape = _changed("WrongShape", lambda vi: replace(vi, g=vi.g[:-1]))
+Indefinite = _changed("Indefinite", lambda vi: replace(vi, A=-vi.A))
 
 
 class Broken(Wire):
@@ -125,11 +118,9 @@ class Segfaults(Wire):
         return super().assemble(mu)
 
 
-class Infeasible(Wire):
-    def assemble(self, mu: Array) -> VariationalInequality:
-        vi = super().assemble(mu)
-        both = sp.csr_array(sp.vstack([vi.B[:6], -vi.B[:6]]))
-        return VariationalInequality(vi.A, vi.f, both, np.full(12, -1.0))
+Infeasible = _changed(
+    "Infeasible", lambda vi: replace(vi, B=sp.csr_array(sp.vstack([vi.B[:6], -vi.B[:6]])), g=np.full(12, -1.0))
+)
 
 
 class CrookedSpace(Wire):

@@ -118,12 +118,9 @@ class Block(AffineProblem):
         gap = (x**2 + (y - 0.5 * size) ** 2) / (2.0 * size)
         g = [(1.0, gap), ("place", -x / size), ("place**2", np.full_like(x, 0.5 / size)), ("-depth", np.ones_like(x))]
         self.declare(
-            A=elasticity.assemble(basis),
-            f=np.zeros(basis.N),
-            B=contact.B,
-            g=[(theta, contact.bound(values)) for theta, values in g],
-            free=free,
-        )
+            A=elasticity.assemble(basis), f=np.zeros(basis.N), B=contact.B,
+            g=[(theta, contact.bound(values)) for theta, values in g], free=free,
+        )  # fmt: skip
 
     def training_set(self) -> Array:
         return self.parameters.grid(6, 3)

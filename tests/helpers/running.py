@@ -55,14 +55,9 @@ def started(command: list[str], folder: Path, plugins: Path) -> Iterator[subproc
     """
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(
-        command,
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(plugins), "PYTHONUNBUFFERED": "1"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+        command, cwd=folder, env=os.environ | {"PYTHONPATH": str(plugins), "PYTHONUNBUFFERED": "1"},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
     signal.signal(signal.SIGINT, before)
     try:
         yield process

@@ -61,12 +61,8 @@ def _fill(database: ResultsDatabase) -> None:
 
 
 HISTORIES = (
-    ("pod", "error"),
-    ("cone", "error"),
-    ("cone", "e_orth"),
-    ("enrichment", "sigma"),
-    ("enrichment", "beta_span_min"),
-)
+    ("pod", "error"), ("cone", "error"), ("cone", "e_orth"), ("enrichment", "sigma"), ("enrichment", "beta_span_min"),
+)  # fmt: skip
 """Stage and quantity of the histories."""
 
 

@@ -24,16 +24,11 @@ from vibench.stages.formulation import FormulationStage
 from vibench.study.parameter_sets import ParameterSet
 
 STUDY: Mapping[str, Any] = {
-    "name": "sample",
-    "seed": 7,
-    "validation": 3,
-    "accuracy": 1e-7,
-    "solvers": ["piqp", "osqp"],
-    "dual": ["cpg", "mcpg"],
-    "primal": ["decorrelated", "offline-pga"],
+    "name": "sample", "seed": 7, "validation": 3, "accuracy": 1e-7, "solvers": ["piqp", "osqp"],
+    "dual": ["cpg", "mcpg"], "primal": ["decorrelated", "offline-pga"],
     "problem": [{"name": "obstacle", "options": {"resolution": "coarse"}}],
     "tolerances": [{"pod": [1e-2, 1e-3], "dual": [1e-1], "primal": {"offline-pga": [0.5, 0.3, 0.1]}}],
-}
+}  # fmt: skip
 """A study that uses every axis."""
 
 RECORDED: Mapping[str, Any] = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}
@@ -133,50 +128,27 @@ def query_rows(cell: str = "c1", count: int = 2, **columns: Any) -> list[dict[st
 
 FAKES: Mapping[str, Mapping[str, str]] = {
     "vibench.problems": {
-        "wire": "Wire",
-        "wire-raises": "Raises",
-        "wire-nan": "NotANumber",
-        "wire-shape": "WrongShape",
-        "wire-indefinite": "Indefinite",
-        "wire-broken": "Broken",
-        "wire-hungry": "Hungry",
-        "wire-sleeps": "Sleeps",
-        "wire-exits": "Exits",
-        "wire-segfaults": "Segfaults",
-        "wire-infeasible": "Infeasible",
-        "wire-crooked": "CrookedSpace",
-        "wire-chatty": "Chatty",
+        "wire": "Wire", "wire-raises": "Raises", "wire-nan": "NotANumber", "wire-shape": "WrongShape",
+        "wire-indefinite": "Indefinite", "wire-broken": "Broken", "wire-hungry": "Hungry",
+        "wire-sleeps": "Sleeps", "wire-exits": "Exits", "wire-segfaults": "Segfaults",
+        "wire-infeasible": "Infeasible", "wire-crooked": "CrookedSpace", "wire-chatty": "Chatty",
     },
     "vibench.dual_strategies": {
-        "cone-needs": "NeedyCone",
-        "cone-raises": "RaisingCone",
-        "cone-waits": "WaitingCone",
+        "cone-needs": "NeedyCone", "cone-raises": "RaisingCone", "cone-waits": "WaitingCone",
         "cone-bad": "BadCone",
     },
     "vibench.primal_strategies": {
-        "enrichment-raises": "RaisingEnrichment",
-        "enrichment-counts": "CountingEnrichment",
+        "enrichment-raises": "RaisingEnrichment", "enrichment-counts": "CountingEnrichment",
         "enrichment-bad": "BadVectors",
     },
     "vibench.qp_solvers": {
-        "careful": "careful",
-        "raises": "raises",
-        "nothing": "nothing",
-        "gives-up": "gives_up",
-        "nan": "not_a_number",
-        "wrong": "wrong",
-        "wrong-length": "wrong_length",
-        "counts": "numpy_count",
-        "dies": "dies",
-        "leaves": "leaves",
-        "hangs": "hangs",
-        "segfaults": "segfaults",
-        "dies-sometimes": "dies_sometimes",
-        "dies-once": "dies_once",
-        "hungry": "hungry",
+        "careful": "careful", "raises": "raises", "nothing": "nothing", "gives-up": "gives_up",
+        "nan": "not_a_number", "wrong": "wrong", "wrong-length": "wrong_length", "counts": "numpy_count",
+        "dies": "dies", "leaves": "leaves", "hangs": "hangs", "segfaults": "segfaults",
+        "dies-sometimes": "dies_sometimes", "dies-once": "dies_once", "hungry": "hungry",
         "chatty": "chatty",
     },
-}
+}  # fmt: skip
 """What the third-party package registers: group → name → member of `fake_plugins`."""
 
 
@@ -203,16 +175,9 @@ def install(folder: Path, module: ModuleType, members: Mapping[str, Mapping[str,
 def wire_study(**axes: Any) -> dict[str, Any]:
     """A study of the third party's small problem, of one cell unless axes are given."""
     content = {
-        "name": "wire",
-        "seed": 3,
-        "validation": 3,
-        "solvers": ["piqp"],
-        "dual": ["cpg"],
-        "primal": ["decorrelated"],
-        "problem": ["wire"],
-        "tolerances": [{"pod": [1e-3], "dual": [1e-2]}],
-        "timing_rounds": ROUNDS,
-    }
+        "name": "wire", "seed": 3, "validation": 3, "solvers": ["piqp"], "dual": ["cpg"], "primal": ["decorrelated"],
+        "problem": ["wire"], "tolerances": [{"pod": [1e-3], "dual": [1e-2]}], "timing_rounds": ROUNDS,
+    }  # fmt: skip
     return content | axes
 
 
@@ -250,16 +215,10 @@ def small_study(name: str, problem: Sequence[Mapping[str, Any]], **axes: Any) ->
 
 SMALL = small_study(
     "small",
-    [
-        {"name": "radial-obstacle", "options": {"resolution": 200}},
-        {"name": "obstacle", "options": {"resolution": 150}},
-    ],
-    primal=["decorrelated", "online-supremizers", "offline-pga"],
-    assembly=["full", "reduced"],
-    bounds=[False, True],
-    tolerances=[{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
-    validation=3,
-)
+    [{"name": "radial-obstacle", "options": {"resolution": 200}}, {"name": "obstacle", "options": {"resolution": 150}}],
+    primal=["decorrelated", "online-supremizers", "offline-pga"], assembly=["full", "reduced"], bounds=[False, True],
+    tolerances=[{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}], validation=3,
+)  # fmt: skip
 """The study of the run that tests of models share."""
 
 

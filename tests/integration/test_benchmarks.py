@@ -62,16 +62,8 @@ def third_party(tmp_path_factory: pytest.TempPathFactory) -> Timed:
     site = install_fakes(folder / "site")
     (site / "fake_plugins-1.0.dist-info" / "entry_points.txt").write_text(REGISTERED)
     plugins = [
-        "wire",
-        "wire-broken",
-        "careful",
-        "lost",
-        "cone-raises",
-        "cone-exits",
-        "cone-interrupts",
-        "mcpg",
-        *PRIMALS,
-    ]
+        "wire", "wire-broken", "careful", "lost", "cone-raises", "cone-exits", "cone-interrupts", "mcpg", *PRIMALS,
+    ]  # fmt: skip
     options = ["--seconds", "0.001", "--out", str(folder / "file.json")]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COLUMNS", "80")
@@ -91,6 +83,11 @@ def test_a_problem_that_is_only_registered_is_timed_in_every_stage(third_party: 
     assert expected <= set(third_party.benchmarks)
     assert all(entry["stats"]["median"] > 0.0 for entry in third_party.benchmarks.values())
     assert third_party.benchmarks["query[wire-decorrelated]"]["extra_info"]["n"] == 12
+    duals = {entry["extra_info"]["axes"].get("dual") for entry in third_party.benchmarks.values()}
+    solvers = {entry["extra_info"]["axes"].get("solver") for entry in third_party.benchmarks.values()}
+    assert (duals, solvers) == ({None, "mcpg"}, {None, "careful"})  # only chosen plugins are timed
+    assert set(third_party.file["machine_info"]["vibench"]) == {"machine", "libraries", "code"}
+    assert {entry["options"]["timer"] for entry in third_party.benchmarks.values()} == {"process_time"}
 
 
 def test_what_was_reached_is_beside_every_time(third_party: Timed) -> None:
@@ -165,11 +162,6 @@ dual = [1e-2]
 """
 
 
-def test_the_file_says_where_it_was_measured(third_party: Timed) -> None:
-    assert set(third_party.file["machine_info"]["vibench"]) == {"machine", "libraries", "code"}
-    assert {entry["options"]["timer"] for entry in third_party.benchmarks.values()} == {"process_time"}
-
-
 def test_what_is_not_slow_is_timed_in_passes_whose_rounds_are_put_together(third_party: Timed) -> None:
     several = {name: entry["extra_info"]["passes"] for name, entry in third_party.benchmarks.items()}
     assert {len(passes) for passes in several.values()} <= {1, PASSES}
@@ -189,13 +181,6 @@ def test_the_tables_fit_eighty_columns_and_have_every_benchmark(third_party: Tim
     failed = sum(" failed: " in line for line in third_party.err.splitlines())
     assert f"{len(third_party.benchmarks)} benchmarks, {failed} failed; times are CPU times" in lines[-1]
     assert sum(line.startswith(("decorrelated", "offline-pga")) for line in lines) == 3 * 3
-
-
-def test_only_benchmarks_with_a_chosen_plugin_are_timed(third_party: Timed) -> None:
-    duals = {entry["extra_info"]["axes"].get("dual") for entry in third_party.benchmarks.values()}
-    assert duals == {None, "mcpg"}
-    solvers = {entry["extra_info"]["axes"].get("solver") for entry in third_party.benchmarks.values()}
-    assert solvers == {None, "careful"}
 
 
 def test_plugins_are_chosen_by_the_names_of_lists(register: Register) -> None:
@@ -315,15 +300,12 @@ def test_what_got_worse_is_said_and_told_by_the_exit_code(tmp_path: Path, main: 
         assert row["ratio"] == pytest.approx(pair[1]["stats"]["median"] / pair[0]["stats"]["median"])
 
 
-def test_a_row_has_the_figure_that_changed_most(tmp_path: Path, main: Main) -> None:
+def test_a_row_has_the_figure_that_changed_most_and_what_differs_is_said(tmp_path: Path, main: Main) -> None:
     before = written(tmp_path / "before.json", entry("pod[rope]", 2e-3, SAME))
     after = written(tmp_path / "after.json", entry("pod[rope]", 3e-3, SAME | {"gap": 4e-9}))
     code, out, _ = main("bench", "--read", after, "--against", before, "--limit", "2")
     assert code == 1
     assert {"2", "3", "1.5", "gap", "1e-12", "4e-09", "less"} <= set(out.split())
-
-
-def test_what_is_new_or_gone_and_machines_that_differ_are_said(tmp_path: Path, main: Main) -> None:
     before = written(tmp_path / "before.json", entry("a", 1.0, SAME), entry("b", 1.0, SAME))
     after = written(tmp_path / "after.json", entry("b", 1.0, SAME), entry("c", 1.0, SAME), machine="two cores")
     code, out, _ = main("bench", "--read", after, "--against", before)

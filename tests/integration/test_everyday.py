@@ -87,11 +87,9 @@ CERTIFIED = {"primal": "offline-pga", "bounds": 1, "correction": "none"}
 class TestNewUser:
     """Somebody who has just installed vibench."""
 
-    def test_which_problems_are_there_and_what_are_their_parameters(self, narrow: Main) -> None:
+    def test_begin_a_study_of_a_problem_and_see_what_it_would_run(self, narrow: Main) -> None:
         _, out, _ = narrow("list", "problems")
         assert "radius from 0.7 to 1.3 m" in " ".join(out.split())
-
-    def test_begin_a_study_and_see_what_it_would_run(self, narrow: Main) -> None:
         _, out, _ = narrow("new", "study", "first")
         for step in out.splitlines()[1:2]:
             code, listed, _ = narrow(*step.split()[1:])
@@ -188,11 +186,9 @@ class TestEngineer:
         expected = model.solve(np.array(mu)).outputs
         assert values == pytest.approx(expected, rel=1e-9)
 
-    def test_the_licence_is_that_of_the_model(self, exported: Path) -> None:
+    def test_the_licence_the_header_and_the_source_are_there_for_others_to_read(self, exported: Path) -> None:
         about = json.loads(str(np.load(exported / "string.npz")["about"]))
         assert about["source"]["licence"] == "unknown"
-
-    def test_the_header_and_the_source_are_there_for_others_to_read(self, exported: Path) -> None:
         assert {"string.npz", "string.c", "string.h", "reduced_model.py"} <= {path.name for path in exported.iterdir()}
         umask = os.umask(0o022)
         os.umask(umask)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import other_problems
-import pandas as pd
 import pytest
 from running import Vibench, rows
 from samples import install, write_study
@@ -65,24 +64,28 @@ def run(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "runs" / STUDY["name"]
 
 
-@pytest.fixture(scope="module")
-def cells(run: Path) -> pd.DataFrame:
-    return read_table(run / FILE, "cells")
+def test_every_cell_has_every_query_ok_and_sensible_means(run: Path) -> None:
+    """But a put with generators of any sign and no supremizer, for which no point is feasible.
 
-
-@pytest.fixture(scope="module")
-def queries(run: Path) -> pd.DataFrame:
-    return read_table(run / FILE, "queries")
-
-
-def test_every_cell_has_every_query_ok(cells: pd.DataFrame) -> None:
-    """But a put with generators of any sign and no supremizer, for which no point is feasible."""
+    Means of λ below yield were 1e1 to 1e3, solver noise over 1e-12 of the largest multiplier.
+    """
+    cells = read_table(run / FILE, "cells")
     assert len(cells) == len(WITHOUT) * len(DUALS) * len(PRIMALS)
     lost = cells[cells["status"] != "ok"]
     assert set(zip(lost["problem"], lost["dual"], lost["status"], strict=True)) <= {("put", SIGNED, "infeasible")}
+    fine = cells[(cells["dual"] != SIGNED)]
+    assert fine["error_u_mean"].between(0.0, 0.1).all()
+    assert fine.loc[fine["enrichment_kind"] != "none", "error_lambda_mean"].between(0.0, 0.3).all()
+    assert fine["error_lambda_mean"].between(0.0, 6.0).all()  # without supremizers λ is not determined
+    assert cells["queries_zero_lambda"].tolist() == [
+        0 if status != "ok" else WITHOUT[problem]
+        for problem, status in zip(cells["problem"], cells["status"], strict=True)
+    ]
+    assert (fine["error_lambda_max"] >= fine["error_lambda_mean"]).all()
 
 
-def test_queries_without_contact_have_no_relative_error_and_a_small_one(queries: pd.DataFrame) -> None:
+def test_queries_without_contact_have_no_relative_error_and_a_small_one(run: Path) -> None:
+    queries = read_table(run / FILE, "queries")
     zero = queries["zero_lambda"] == 1
     assert queries[zero].groupby("problem")["query"].nunique().to_dict() == {k: n for k, n in WITHOUT.items() if n}
     ok = queries["status"] == "ok"
@@ -94,19 +97,6 @@ def test_queries_without_contact_have_no_relative_error_and_a_small_one(queries:
         signed = queries["dual"] == SIGNED
         assert queries.loc[ok & absent & ~signed, f"error_{name}_scaled"].max() < UNMEASURABLE
     assert set(queries.loc[queries["zero_u"] == 1, "problem"]) == {"lifted"}
-
-
-def test_means_are_sensible(cells: pd.DataFrame) -> None:
-    """Those of λ below yield were 1e1 to 1e3, solver noise over 1e-12 of the largest multiplier."""
-    fine = cells[(cells["dual"] != SIGNED)]
-    assert fine["error_u_mean"].between(0.0, 0.1).all()
-    assert fine.loc[fine["enrichment_kind"] != "none", "error_lambda_mean"].between(0.0, 0.3).all()
-    assert fine["error_lambda_mean"].between(0.0, 6.0).all()  # without supremizers λ is not determined
-    assert cells["queries_zero_lambda"].tolist() == [
-        0 if status != "ok" else WITHOUT[problem]
-        for problem, status in zip(cells["problem"], cells["status"], strict=True)
-    ]
-    assert (fine["error_lambda_max"] >= fine["error_lambda_mean"]).all()
 
 
 def test_the_run_says_so(run: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -77,18 +76,14 @@ if __name__ == "__main__":
 '''
 
 
-def interpreted(script: Path, out: str) -> subprocess.CompletedProcess[str]:
-    """A script run by a new interpreter."""
-    line = [sys.executable, script.name, out]
-    return subprocess.run(line, cwd=script.parent, capture_output=True, text=True, check=False, timeout=PATIENCE)
-
-
-def run_source(
-    folder: Path, source: str, run: Callable[[Path, str], subprocess.CompletedProcess[str]] = run_script
-) -> tuple[int, str, list[Any]]:
+def run_source(folder: Path, source: str, *, anew: bool = False) -> tuple[int, str, list[Any]]:
     """Cells that had to be run, the status of a query of the first one's model, and the rows."""
     (folder / "script.py").write_text(source)
-    done = run(folder / "script.py", "out")
+    if anew:  # by a new interpreter
+        line = [sys.executable, "script.py", "out"]
+        done = subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False, timeout=PATIENCE)
+    else:
+        done = run_script(folder / "script.py", "out")
     assert done.returncode == 0, done.stderr
     count, status, rows = json.loads(done.stdout.splitlines()[-1])
     return count, status, rows
@@ -98,7 +93,7 @@ def run_source(
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder in which the script has run, its results in `out`."""
     folder = tmp_path_factory.mktemp("script")
-    count, status, rows = run_source(folder, SCRIPT, interpreted)
+    count, status, rows = run_source(folder, SCRIPT, anew=True)
     assert (count, status) == (3, "ok")
     assert [(row["problem"], row["dual"], row["dual_options"]) for row in rows] == [
         (name, "MyCone", '{"share": 0.5}') for name in ("Wire", "short", "Slack")

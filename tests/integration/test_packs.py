@@ -12,17 +12,10 @@ from samples import write_study
 from vibench.results.read import read_table
 
 STUDY = {
-    "name": "packed",
-    "seed": 2022,
-    "validation": 4,
-    "accuracy": 1e-8,
-    "solvers": ["piqp"],
-    "dual": ["mcpg"],
-    "primal": ["offline-pga"],
-    "assembly": ["full", "reduced"],
-    "timing_rounds": 1,
+    "name": "packed", "seed": 2022, "validation": 4, "accuracy": 1e-8, "solvers": ["piqp"], "dual": ["mcpg"],
+    "primal": ["offline-pga"], "assembly": ["full", "reduced"], "timing_rounds": 1,
     "tolerances": [{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
-}
+}  # fmt: skip
 ORIGIN = {"cell", "problem_options", "model", "study_hash", "code", "definition", "artefact", "cell_a", "cell_b"}
 """Columns that name the problem or its code."""
 

@@ -42,16 +42,15 @@ def again(first: Path, tmp_path: Path) -> Path:
     return tmp_path / "again"
 
 
-def test_the_results_are_where_the_study_is_named(first: Path) -> None:
-    folder = first / "runs" / "wire"
-    assert (folder / FILE).is_file()
-    assert sorted(path.name for path in (folder / "tables").iterdir()) == sorted(
-        [*(f"{table}.csv" for table in TABLES), "summary.md"]
-    )
+def test_the_results_are_where_the_study_is_named_and_a_second_run_does_nothing_new(
+    vibench: Vibench, again: Path
+) -> None:
+    folder = again / "runs" / "wire"
+    assert {path.name for path in (folder / "tables").iterdir()} == {
+        *(f"{table}.csv" for table in TABLES),
+        "summary.md",
+    }
     assert list((folder / "figures").glob("*.png"))
-
-
-def test_a_second_run_does_nothing_new(vibench: Vibench, again: Path) -> None:
     before = {table: rows(again / "runs" / "wire", table) for table in TABLES if table != "histories"}
     printed, _ = run_again(vibench, again)
     assert "3 cells, 0 to run, 0 stages" in printed
@@ -109,26 +108,21 @@ def test_other_cells_join_those_of_the_same_study(vibench: Vibench, again: Path)
     assert len(pd.read_csv(again / "runs" / "wire" / "tables" / "cells.csv")) == 4
 
 
-@pytest.mark.parametrize(("solvers", "code"), [(["piqp", "gives-up"], 1), (["piqp", "careful", "ecos"], 0)])
-def test_strict_fails_where_a_cell_is_not_ok(solvers: list[str], code: int, vibench: Vibench, again: Path) -> None:
-    chosen = [option for solver in solvers for option in ("--solver", solver)]
-    done = vibench(again, "run", "study.toml", "--strict", "--jobs", "1", *chosen)
-    assert done.returncode == code
-    assert done.stderr == ""
+def test_strict_fails_where_a_cell_is_not_ok(vibench: Vibench, again: Path) -> None:
+    for solvers, code in ((["piqp", "gives-up"], 1), (["piqp", "careful", "ecos"], 0)):
+        chosen = [option for solver in solvers for option in ("--solver", solver)]
+        done = vibench(again, "run", "study.toml", "--strict", "--jobs", "1", *chosen)
+        assert (done.returncode, done.stderr) == (code, "")
 
 
-@pytest.fixture
-def edited_plugins(plugins_folder: Path, tmp_path: Path) -> Path:
-    """The third-party package with another version of its source."""
+def test_a_plugin_that_was_edited_is_run_again(
+    vibench: Vibench, again: Path, plugins_folder: Path, tmp_path: Path
+) -> None:
+    """Problem and solvers come from the package that was edited, and one of them now does its work."""
     shutil.copytree(plugins_folder, tmp_path / "edited")
     with (tmp_path / "edited" / "fake_plugins.py").open("a", encoding="utf-8") as source:
         source.write("\n\ngives_up = careful\n")
-    return tmp_path / "edited"
-
-
-def test_a_plugin_that_was_edited_is_run_again(vibench: Vibench, again: Path, edited_plugins: Path) -> None:
-    """Problem and solvers come from the package that was edited, and one of them now does its work."""
-    printed, after = run_again(vibench, again, plugins=edited_plugins)
+    printed, after = run_again(vibench, again, plugins=tmp_path / "edited")
     assert "3 cells, 3 to run" in printed
     assert [row["status"] for row in after] == ["ok"] * 3
 
@@ -207,27 +201,16 @@ def test_a_run_of_which_nothing_can_run_here_is_an_error(vibench: Vibench, tmp_p
     assert {row["reason"] for row in rows(tmp_path / "runs" / "wire")} == {reason}
 
 
-def test_clean_deletes_nothing_unasked(vibench: Vibench, again: Path, artefacts: Path) -> None:
-    before = sorted(artefacts.glob(f"*{SUFFIX}"))
-    done = vibench(again, "clean")
-    assert done.returncode == 2
-    assert "--yes" in done.stderr
-    assert sorted(artefacts.glob(f"*{SUFFIX}")) == before != []
-
-
-@pytest.fixture(scope="module")
-def edited_core(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the core, to be edited; first on the path it takes the place of the one that is installed."""
-    folder = tmp_path_factory.mktemp("core")
-    package = Path(str(importlib.util.find_spec("vibench").submodule_search_locations[0]))
-    shutil.copytree(package, folder / "vibench")  # with its bytecode, which takes seconds to make
-    return folder
-
-
 def test_only_an_edit_of_what_computes_numbers_runs_anything_again(
-    command: str, plugins_folder: Path, edited_core: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    plugins_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Figures, help texts, the report and the tables may change: the run is complete, and its models open."""
+    package, edited_core = (
+        Path(str(importlib.util.find_spec("vibench").submodule_search_locations[0])),
+        tmp_path / "core",
+    )
+    # First on the path the copy takes the place of what is installed; its bytecode would take seconds to make.
+    shutil.copytree(package, edited_core / "vibench")
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     study = write_study(tmp_path, wire_study())
 
@@ -248,13 +231,7 @@ def test_only_an_edit_of_what_computes_numbers_runs_anything_again(
 
     run = ("run", study, "--jobs", "1", "--no-figures")
     assert "1 cells, 1 to run" in vibench(run)
-    for module in (
-        "report/html.py",
-        "report/figures/style.py",
-        "cli/main.py",
-        "results/read.py",
-        "testing/sample.py",
-    ):
+    for module in ("report/html.py", "report/figures/style.py", "cli/main.py", "results/read.py", "testing/sample.py"):
         edit(module)
     printed = vibench(run, ("export", "wire", "programs"))
     assert "1 cells, 0 to run, 0 stages" in printed
@@ -277,16 +254,6 @@ def test_the_number_of_jobs_changes_no_result(vibench: Vibench, tmp_path: Path) 
         done = vibench(tmp_path, "run", "study.toml", "--jobs", jobs, "--out", jobs, "--fresh")
         assert done.returncode == 0, done.stderr
     assert_same_numbers(tmp_path / "1", tmp_path / "2")
-
-
-def of_another_machine(artefacts: Path) -> None:
-    """Make all artefacts look as if they had been made elsewhere."""
-    store = Store(artefacts)
-    for path in artefacts.glob(f"*{SUFFIX}"):
-        key = path.name.removesuffix(SUFFIX)
-        found = store.get(key)
-        assert found is not None
-        path.write_bytes(encoded(key, replace(found, machine="elsewhere")))
 
 
 def test_artefacts_are_shared_by_studies_and_seconds_only_on_their_machine(
@@ -314,18 +281,24 @@ def test_artefacts_are_shared_by_studies_and_seconds_only_on_their_machine(
     # wall seconds are those of the stages alone: how often short ones are repeated depends on what they take
     again, anew = (rows(tmp_path / folder)[0]["offline_wall_s"] for folder in ("again", "anew"))
     assert again == rows(tmp_path / "runs" / "wire")[0]["offline_wall_s"] != anew  # measured only where made anew
-    of_another_machine(tmp_path / "cache" / "artefacts")
+    store = Store(tmp_path / "cache" / "artefacts")
+    for path in (tmp_path / "cache" / "artefacts").glob(f"*{SUFFIX}"):
+        key = path.name.removesuffix(SUFFIX)
+        path.write_bytes(encoded(key, replace(store.get(key), machine="elsewhere")))
     assert stages("one.toml", "--out", "here") == made + 2
     assert rows(tmp_path / "here")[0]["machine"] == rows(tmp_path / "again")[0]["machine"]
 
 
-def test_clean_shows_and_frees_what_artefacts_take(
+def test_clean_shows_and_frees_what_artefacts_take_and_nothing_unasked(
     vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     vibench(tmp_path, "run", write_study(tmp_path, wire_study()), "--jobs", "1")
     artefacts = tmp_path / "cache" / "artefacts"
     count = len(list(artefacts.glob(f"*{SUFFIX}")))
+    refused = vibench(tmp_path, "clean")
+    assert refused.returncode == 2
+    assert "--yes" in refused.stderr
     for options, left in ((("--dry-run",), count), (("--older-than", "1"), count), (("--yes",), 0)):
         done = vibench(tmp_path, "clean", *options)
         assert (done.returncode, done.stderr) == (0, "")

@@ -29,8 +29,9 @@ def row(cell: str, reason: str, status: str = "inaccurate", **more: Any) -> dict
 def test_a_line_for_every_reason_names_a_cell_by_all_its_axes() -> None:
     """Reasons that differ in their numbers alone are one; there are never more lines than reasons that matter."""
     rows = [row(f"c{k}", f"{k} of 16 queries, first mu=({k}.5, -1e-0{k}): gap residual {k}.1e-07") for k in range(1, 9)]
-    (line,) = failures(rows, "runs/a")
+    line, other = failures([row("c0", "broke"), *rows], "runs/a")
     assert line.startswith("8 cells inaccurate: the first is c1, ")
+    assert other.startswith("inaccurate: c0, ")  # the reason of most cells comes first
     (line,) = failures([row("c1", "broke", "error")], "runs/a")
     axes = "box (text) · cpg · pga 0.5 · 0.001, R=4 · osqp 1e-08 · reduced"
     assert line == f"error: c1, {axes}: 15 of 16 queries ok; broke"

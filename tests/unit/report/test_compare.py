@@ -233,6 +233,8 @@ def test_the_command_ends_with_one_where_something_got_worse(
         compare_runs([str(steady), str(after)], strict=True)
     assert getattr(ended.value, "exit_code", None) == 1
     assert "1 for the worse" in capsys.readouterr().out
+    compare_runs([str(after), str(steady)], strict=True)  # an improvement
+    assert "0 for the worse" in capsys.readouterr().out
     compare_runs([str(quick_run), str(quick_run)], strict=True, form="csv")
     assert capsys.readouterr().out.startswith("run,against,problem,formulation,dual,primal,asked")
     with pytest.raises(RequestError, match="no results in 'nowhere'"):

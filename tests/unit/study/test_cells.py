@@ -150,6 +150,8 @@ def test_words_of_before_are_translated_and_a_line_says_what_to_write(
         translated = cells_of(STUDY | before)
     assert len(noted) == 1
     assert [cell.key for cell in translated] == [cell.key for cell in cells_of(STUDY | now)]
+    assert {cell.bounds for cell in translated if cell.assembly == "full"} <= {False}
+    assert {cell.validation.seed for cell in translated} == {STUDY["seed"]}
 
 
 SAMPLE = Cell(
