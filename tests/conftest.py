@@ -126,7 +126,6 @@ def new_workers(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def command() -> str:
-    """The installed command."""
     return str(Path(sysconfig.get_path("scripts")) / "vibench")
 
 
@@ -173,7 +172,6 @@ def quick_run(shared: Shared) -> Path:
 
 @pytest.fixture(scope="session")
 def small_run(shared: Shared) -> runs.Run:
-    """One run of the study `SMALL`."""
     return runs.open_run(shared("small", lambda folder: runs.run(SMALL, folder, progress=False, jobs=1)))
 
 

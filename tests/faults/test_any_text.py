@@ -43,7 +43,6 @@ SAMPLES = {"TEXT": "text", "REAL": 0.5, "INTEGER": 3, "BLOB": b""}
 
 
 def sample(table: str, **columns: Any) -> dict[str, Any]:
-    """A row of a table in which every column is filled; columns that it does not have are left out."""
     row = {name: SAMPLES[column.kind.split()[0]] for name, column in STORED[table].items()}
     return row | {name: value for name, value in columns.items() if name in row}
 
@@ -61,7 +60,6 @@ def answered(text: str, count: Any) -> dict[str, Any]:
 
 
 PROGRAM = VariationalInequality(np.eye(1), np.ones(1), np.eye(1), np.full(1, 2.0))
-"""Solved by x = 1, α = 0."""
 
 
 def recorded(folder: Path, text: str, count: Any) -> Path:
@@ -90,7 +88,6 @@ def recorded(folder: Path, text: str, count: Any) -> Path:
 
 
 def outputs(path: Path) -> list[str]:
-    """Every table of a results file in every format, and the summary as it is shown."""
     read = {table: in_order(read_table(path, table)) for table in TABLES}
     found = [formats.to_text(frame, form) for frame in read.values() for form in ("markdown", "csv", "latex", "json")]
     summary = formats.summary(read["cells"])
@@ -105,7 +102,6 @@ def page(path: Path) -> str:
 
 
 def drawn(path: Path) -> str:
-    """One of the figures, which has labels everywhere."""
     stream = io.BytesIO()
     (data,) = [data for _, data in problem_tables(path)]
     with styled():

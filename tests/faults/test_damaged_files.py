@@ -50,7 +50,6 @@ def made(vibench: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) 
 
 @pytest.fixture
 def results(made: Path, tmp_path: Path) -> Path:
-    """A copy of the results, to be damaged."""
     (tmp_path / "run").mkdir()
     shutil.copy(made / "out" / FILE, tmp_path / "run" / FILE)
     return tmp_path / "run" / FILE
@@ -79,14 +78,12 @@ def truncations(seed: int, count: int) -> Iterator[Damage]:
 
 
 def everything(path: Path) -> list[Any]:
-    """All that commands read of a results file."""
     found = results_file(str(path))
     read = [[names, *rows] for names, rows in (read_rows(found, table) for table in STORED)]
     return [study_of(found, read_meta(found)), *read]
 
 
 def refusal(path: Path) -> str:
-    """The line in which a damaged file is refused."""
     with pytest.raises(RequestError) as caught:
         everything(path)
     return str(caught.value)

@@ -39,16 +39,12 @@ ALONE = ("--jobs", "1")
 
 @dataclass(frozen=True)
 class Undisturbed:
-    """A run that nothing happened to: its folder, and how long it took."""
-
     folder: Path
     seconds: float
 
 
 @pytest.fixture(scope="module")
 def undisturbed(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Undisturbed]:
-    """Function that runs one of the studies, once."""
-
     @cache
     def run(length: str) -> Undisturbed:
         folder, start = tmp_path_factory.mktemp("undisturbed"), time.monotonic()
@@ -62,7 +58,6 @@ def undisturbed(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> C
 
 @pytest.fixture
 def place(length: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with the study, and artefacts of its own."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     write_study(tmp_path, STUDIES[length])
     return tmp_path

@@ -21,11 +21,9 @@ ODD: list[Any] = [
     {"name": "obstacle", "options": {"resolution": -5}}, {"name": "hertz", "options": {"colour": 3}}, ["osqp", "osqp"],
     [{"name": "cpg", "label": ""}], {"offline-pga": []}, {"offline-pga": [2.0]},
 ]  # fmt: skip
-"""What may stand where something else should."""
 
 
 def places(content: Any, here: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Paths to everything in a study."""
     found = [here] if here else []
     steps = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
     for step, value in steps:
@@ -34,12 +32,10 @@ def places(content: Any, here: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 
 def without_none(value: Any) -> Any:
-    """TOML knows no None."""
     return "None" if value is None else [without_none(v) for v in value] if isinstance(value, list) else value
 
 
 def broken_content(rng: random.Random) -> str:
-    """A study in which some values are others, gone, doubled or under another name."""
     content = copy.deepcopy(dict(STUDY))
     for _ in range(rng.randint(1, 3)):
         *path, last = rng.choice(places(content))
@@ -59,7 +55,6 @@ def broken_content(rng: random.Random) -> str:
 
 
 def broken_text(rng: random.Random) -> bytes:
-    """A study file in which some bytes are others, gone or elsewhere."""
     text = bytearray(toml(STUDY).encode())
     for _ in range(rng.randint(1, 4)):
         place = rng.randrange(len(text))

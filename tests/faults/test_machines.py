@@ -36,7 +36,6 @@ def test_too_few_open_files_are_said_to_be_too_few(tmp_path: Path, monkeypatch: 
 
 
 def unable(*_: object, **__: object) -> None:
-    """What SQLite says of a process that may open no more files."""
     raise sqlite3.OperationalError("unable to open database file")
 
 

@@ -65,8 +65,6 @@ FINE: Mapping[str, list[str]] = {
 
 @dataclass(frozen=True)
 class Run:
-    """Two runs that ended: their folders, their exit codes, and what they said."""
-
     folders: list[Path]
     codes: list[int]
     printed: list[str]
@@ -119,7 +117,6 @@ def run(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 @pytest.fixture(scope="module")
 def cells(run: Run) -> pd.DataFrame:
-    """Their cells; those that are in both count once."""
     found = pd.DataFrame(run.rows()).set_index(["problem", "dual", "primal", "solver"])
     return found[~found.index.duplicated()].sort_index()
 
@@ -196,7 +193,6 @@ def test_queries_that_were_asked_have_rows_of_their_own(run: Run) -> None:
 
 
 def test_whole_numbers_are_stored_as_whole_numbers(run: Run) -> None:
-    """A plugin may count with NumPy's integers."""
     counts = [row["iterations"] for row in run.rows("queries") if row["solver"] == "counts"]
     assert counts
     assert set(counts) == {3}

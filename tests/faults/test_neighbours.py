@@ -13,13 +13,11 @@ from samples import FAKES, ROUNDS, install, wire_study, write_study
 
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folders of two packages."""
     folder = install(tmp_path_factory.mktemp("site") / "both", fake_plugins, FAKES)
     return add(folder, tmp_path_factory, meddling.MEMBERS)
 
 
 def add(folder: Path, temporary: pytest.TempPathFactory, members: dict[str, dict[str, str]]) -> Path:
-    """Install the meddling package beside another one."""
     for part in install(temporary.mktemp("apart") / "site", meddling, members).iterdir():
         part.rename(folder / part.name)
     return folder

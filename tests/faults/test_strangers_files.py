@@ -42,7 +42,6 @@ class Payload:
 
 @pytest.fixture
 def run(quick_run: Path, tmp_path: Path) -> Path:
-    """A copy of a run, to be tampered with."""
     folder = tmp_path / "run"
     folder.mkdir()
     shutil.copy(quick_run / FILE, folder)
@@ -132,7 +131,6 @@ def test_a_damaged_page_is_found(run: Path) -> None:
 
 
 def test_a_link_in_place_of_a_lock_is_not_followed(tmp_path: Path) -> None:
-    """It would be truncated, whatever it points to."""
     valuable = tmp_path / "valuable"
     valuable.write_text("kept")
     folder = tmp_path / "runs"

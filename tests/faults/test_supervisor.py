@@ -48,8 +48,6 @@ def shared() -> Iterator[Supervisor]:
 
 @pytest.fixture
 def run(shared: Supervisor, tmp_path: Path) -> Run:
-    """Function that runs a stage under limits."""
-
     def go(stage: Stage, query: float = 1.0, cell: float = 30.0) -> Done | Failed | Unstored:
         return shared.run(Job(str(tmp_path), stage, query, cell, 8.0))
 

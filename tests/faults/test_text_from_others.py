@@ -47,7 +47,6 @@ def plugins_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def ended(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """The folder of a run that ended, and what it printed."""
     folder = tmp_path_factory.mktemp("odd")
     done = vibench(
         folder, "run", write_study(folder, STUDY), "--jobs", "1", "--out", "run", figures=True, timeout=300.0
@@ -57,7 +56,6 @@ def ended(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
 
 
 def by_strategies(run: Path, table: str) -> dict[tuple[str, str, str], list[dict[str, Any]]]:
-    """The rows of a table by dual strategy, primal strategy and solver."""
     found: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
     for row in rows(run, table):
         found.setdefault((row["dual"], row["primal"], row["solver"]), []).append(row)

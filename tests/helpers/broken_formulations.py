@@ -22,7 +22,6 @@ def _wrong(name: str, **members: Any) -> type[Program]:
 
 
 def _answering(name: str, change: Callable[[FormulationAnswer, Array], Any]) -> type[Program]:
-    """The mixed formulation with another answer."""
     return _wrong(name, solve=lambda self, mu, settings: change(ProgramModel.solve(self, mu, settings), mu))
 
 

@@ -49,7 +49,6 @@ class Declared(Wire):
 
 
 def _variant(name: str, base: type[Problem] = Wire, **members: Any) -> type[Problem]:
-    """A problem with other members."""
     return type(name, (base,), {"__module__": __name__, **members})
 
 

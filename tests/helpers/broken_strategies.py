@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import ClassVar
 
@@ -33,68 +33,48 @@ class Greedy(DualStrategy):
         return greedy_cone(snapshots, W, stop)
 
 
-class NegativeGenerators(Greedy):
+def _reducing(name: str, change: Callable[[Cone, InnerProduct], Cone]) -> type[Greedy]:
+    members = {"reduce": lambda self, snapshots, W, stop: change(greedy_cone(snapshots, W, stop), W)}
+    return type(name, (Greedy,), {"__module__": __name__, **members})
+
+
+def _stopping(name: str, change: Callable[[Stop], Stop]) -> type[Greedy]:
+    members = {"reduce": lambda self, snapshots, W, stop: greedy_cone(snapshots, W, change(stop))}
+    return type(name, (Greedy,), {"__module__": __name__, **members})
+
+
+def _with_a_negative_entry(cone: Cone, W: InnerProduct) -> Cone:
     """Generators with the last one taken out of them; directions that are no multipliers."""
-
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        cone = super().reduce(snapshots, W, stop)
-        chi = cone.generators.copy()
-        chi[3, -1] = -0.01
-        return replace(cone, generators=chi / W.norm(chi))
+    chi = cone.generators.copy()
+    chi[3, -1] = -0.01
+    return replace(cone, generators=chi / W.norm(chi))
 
 
-class Misses(Greedy):
-    """Stops at twice the tolerance, and says so."""
-
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        return super().reduce(snapshots, W, stop if stop.tolerance is None else Stop(tolerance=2.0 * stop.tolerance))
-
-
-class Boasts(Greedy):
-    """Claims smaller errors than it makes, but for the first and the last."""
-
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        cone = super().reduce(snapshots, W, stop)
-        errors = cone.errors.copy()
-        errors[1:-1] *= 0.5
-        return replace(cone, errors=errors)
+def _drawn(cone: Cone, W: InnerProduct) -> Cone:
+    """Snapshots summed up with weights that are drawn each time."""
+    chi = cone.generators * (1.0 + 1e-12 * np.random.default_rng().random((W.dim, 1)))
+    return replace(cone, generators=chi / W.norm(chi))
 
 
-class LastErrorAlone(Greedy):
-    """Says how good the cone is, and nothing of smaller ones; which is all right."""
-
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        cone = super().reduce(snapshots, W, stop)
-        return replace(cone, generators=cone.generators[:, ::-1].copy(), errors=cone.errors[-1:])
-
-
-class OneErrorTooFew(Greedy):
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        cone = super().reduce(snapshots, W, stop)
-        return replace(cone, errors=cone.errors[1:]) if cone.size > 1 else cone
-
-
-class Long(Greedy):
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        cone = super().reduce(snapshots, W, stop)
-        return replace(cone, generators=cone.generators * 2.0)
-
-
-class Oversized(Greedy):
-    """Two generators at least."""
-
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        return super().reduce(snapshots, W, Stop(size=2) if stop.size == 1 else stop)
-
-
-class Draws(Greedy):
-    """Sums the snapshots up with weights that are drawn each time."""
-
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        weights = 1.0 + 1e-12 * np.random.default_rng().random(snapshots.shape[0])
-        cone = super().reduce(snapshots, W, stop)
-        chi = cone.generators * weights[:, None]
-        return replace(cone, generators=chi / W.norm(chi))
+NegativeGenerators = _reducing("NegativeGenerators", _with_a_negative_entry)
+# Claims smaller errors than it makes, but for the first and the last.
+Boasts = _reducing(
+    "Boasts",
+    lambda cone, W: replace(cone, errors=np.r_[cone.errors[:1], 0.5 * cone.errors[1:-1], cone.errors[1:][-1:]]),
+)
+# Says how good the cone is, and nothing of smaller ones; which is all right.
+LastErrorAlone = _reducing(
+    "LastErrorAlone", lambda cone, W: replace(cone, generators=cone.generators[:, ::-1].copy(), errors=cone.errors[-1:])
+)
+OneErrorTooFew = _reducing(
+    "OneErrorTooFew", lambda cone, W: replace(cone, errors=cone.errors[1:]) if cone.size > 1 else cone
+)
+Long = _reducing("Long", lambda cone, W: replace(cone, generators=cone.generators * 2.0))
+Draws = _reducing("Draws", _drawn)
+# Stops at twice the tolerance, and says so.
+Misses = _stopping("Misses", lambda stop: stop if stop.tolerance is None else Stop(tolerance=2.0 * stop.tolerance))
+# Two generators at least.
+Oversized = _stopping("Oversized", lambda stop: Stop(size=2) if stop.size == 1 else stop)
 
 
 class Normalises(Greedy):

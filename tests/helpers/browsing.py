@@ -21,7 +21,6 @@ REQUIRED = "VIBENCH_NEEDS_BROWSER"
 """Where this is set, a missing browser is a failure."""
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-"""Names under which it is installed."""
 
 PATIENCE = 120.0
 """Seconds until what a test waits for is missing: it comes at once, but for a machine that does other work, too."""
@@ -67,7 +66,6 @@ def chromium(downloads: Path) -> Iterator[webdriver.Chrome]:
 
 
 def look(browser: webdriver.Chrome, page: Path, *, width: int = 1280, theme: str = "light", fragment: str = "") -> None:
-    """Open a page anew, in a window of this width and in a colour scheme."""
     size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     prefer(browser, theme)
@@ -91,7 +89,6 @@ def load(browser: webdriver.Chrome, address: str) -> None:
 
 
 def complaints(browser: webdriver.Chrome) -> list[Any]:
-    """Errors and warnings in the console since the last call."""
     return [entry["message"] for entry in browser.get_log("browser") if entry["level"] in {"SEVERE", "WARNING"}]
 
 

@@ -24,7 +24,6 @@ ZERO = Decimal(10) ** -60
 STEPS = 60
 
 exactly = np.frompyfunc(Decimal, 1, 1)
-"""Doubles as decimal numbers, without a rounding."""
 
 
 class ExactProgram:
@@ -63,7 +62,6 @@ class ExactProgram:
         self._lower = lower
 
     def _solve(self, right: Any) -> Any:
-        """A⁻¹ r."""
         x, lower, n = right[self._order].copy(), self._lower, self._n
         for k in range(n):
             if x[k]:
@@ -82,7 +80,6 @@ class ExactProgram:
         return sum((v * x[i] for i, v in zip(indices, values, strict=True)), Decimal(0))
 
     def _image(self, row: int) -> Any:
-        """A⁻¹ bᵀ of a row, kept."""
         if row not in self._images:
             functional = np.full(self._n, Decimal(0), object)
             indices, values = self._rows[row]
@@ -123,7 +120,6 @@ class ExactProgram:
         return u, lam
 
     def _wrong(self, u: Any, lam: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Rows that are violated, and rows with negative multipliers."""
         excess = np.array([self._times(i, u) - self._g[i] for i in range(len(self._rows))], object)
         terms = np.array(
             [
@@ -164,7 +160,6 @@ def exact_decimal(vi: VariationalInequality, guess: np.ndarray) -> tuple[Any, An
 
 
 def difference(exact: Any, approximate: np.ndarray) -> np.ndarray:
-    """Exact − approximate, rounded once."""
     with localcontext() as context:
         context.prec = DIGITS
         return np.asarray(exact - exactly(np.asarray(approximate, float).astype(object)), dtype=float)

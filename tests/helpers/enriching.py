@@ -16,7 +16,6 @@ from vibench_strategies.online_supremizers import OnlineSupremizers
 
 
 def offline(problem: Problem, count: int, modes: int, generators: int) -> Offline:
-    """A reduced setting from some training solutions."""
     training = problem.training_set()
     solved = high_fidelity_sweep(problem, training[:: max(1, len(training) // count)])
     basis = problem.V.orthonormalise(solved.u)[:, :modes]
@@ -32,8 +31,6 @@ def reduced_from(problem: Problem, kind: Kind, modes: int, generators: int) -> R
 
 
 class Plain(LazyMaximum):
-    """Evaluates everything at every step."""
-
     def next(self, evaluate: Callable[[int], float]) -> tuple[int, float]:
         self.bound(np.array([evaluate(p) for p in range(len(self._bounds))]))
         return super().next(lambda p: float(self._bounds[p]))

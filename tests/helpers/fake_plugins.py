@@ -81,7 +81,6 @@ class Raises(Wire):
 
 
 def _changed(name: str, change: Callable[[VariationalInequality], VariationalInequality]) -> type[Wire]:
-    """A wire that is changed after its assembly."""
     return type(name, (Wire,), {"__module__": __name__, "assemble": lambda self, mu: change(Wire.assemble(self, mu))})
 
 
@@ -150,8 +149,6 @@ def segfault() -> None:
 
 
 class BadCone(DualStrategy):
-    """Returns a cone that is broken in the way asked for."""
-
     def __init__(self, how: Literal["nan", "shape", "negative", "long", "nothing"]) -> None:
         self.how = how
 
@@ -164,8 +161,6 @@ class BadCone(DualStrategy):
 
 
 class BadVectors(PrimalStrategy):
-    """Returns vectors that are broken in the way asked for."""
-
     def __init__(self, how: Literal["nan", "shape", "long", "supply", "nothing", "writes"]) -> None:
         self.how = how
 
@@ -187,8 +182,6 @@ def flat_supply(V: InnerProduct, vi: VariationalInequality, span: Array) -> Arra
 
 
 class NeedyCone(DualStrategy):
-    """Needs a distribution that nobody has."""
-
     requires = ("no-such-distribution",)
 
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:

@@ -23,7 +23,6 @@ from vibench.timing import Seconds
 
 
 def misbehave(how: str) -> None:
-    """Do what the word says."""
     if how == "sleep":
         time.sleep(3600)
     elif how == "hang":  # in native code that keeps every other thread of the process waiting
@@ -47,7 +46,6 @@ def misbehave(how: str) -> None:
 
 
 def meet(diary: Path) -> None:
-    """Wait until somebody else has written into a diary, too."""
     while len(diary.read_text().splitlines()) < 2:
         time.sleep(0.01)
 
@@ -69,8 +67,6 @@ def start(kind: str = "", *seconds: str) -> None:
 
 @dataclass(frozen=True)
 class Whole(Stage):
-    """A stage in one item; it notes that it was begun."""
-
     label = "whole"
 
     how: str

@@ -41,7 +41,6 @@ LOADED = [
     "piqp", "platformdirs", "proxsuite", "pydantic", "rich.console", "rich.live", "rich.progress", "rich.table",
     "safetensors", "scipy.optimize", "scipy.sparse.linalg", "skfem", "statistics", "typer",
 ]  # fmt: skip
-"""Libraries that the template imports."""
 
 PACKAGES = ("cli", "execution", "plugins", "results", "stages", "study", "testing")
 """Packages of vibench that the template imports with all their modules, and so most others; plugins it does not."""
@@ -57,7 +56,6 @@ SUPERVISOR = "VIBENCH_TESTS_SUPERVISOR"
 _starting = threading.Lock()
 
 start_new_worker = supervisor.start_worker
-"""Starts a worker process as users' runs do."""
 
 
 class Forked:
@@ -78,7 +76,6 @@ class Forked:
         return int(struct.unpack("q", content)[0]) if content else -signal.SIGKILL
 
     def poll(self) -> int | None:
-        """The exit code, if the process has ended."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.wait(0.0)
         return self.returncode
@@ -124,7 +121,6 @@ class ForkedCommand(Forked):
 
 @contextlib.contextmanager
 def _ended(process: ForkedCommand) -> Iterator[ForkedCommand]:
-    """Block at the end of which whoever is left of the group of a process is killed."""
     try:
         yield process
     finally:
@@ -151,7 +147,6 @@ def template() -> str:
 
 @cache
 def _started() -> str:
-    """Start the template process."""
     folder = tempfile.mkdtemp(prefix="vibench-tests-")
     ours, theirs = socket.socketpair()
     address = f"{folder}/socket"
@@ -188,7 +183,6 @@ def run_command(
 
 
 def run_script(script: Path, *arguments: str, timeout: float = 600.0) -> subprocess.CompletedProcess[str]:
-    """Run a script of Python in its folder, as `subprocess.run` does."""
     program = {"main": "script", "arguments": [str(script), *arguments], "path": [str(script.parent), *paths()]}
     with _ended(ForkedCommand(program, script.parent)) as process:
         out, err = process.communicate(timeout)
@@ -262,7 +256,6 @@ def _load() -> None:
 
 
 def _hash_stages(kind: Any) -> None:
-    """Hash the sources that determine the values of all stages of a kind."""
     for stage in kind.__subclasses__():
         stage.code()
         _hash_stages(stage)
@@ -287,7 +280,6 @@ def _forked(client: socket.socket, own: Sequence[socket.socket]) -> int:
 
 
 def _tell(children: dict[int, socket.socket]) -> None:
-    """Tell who asked for them how the processes ended that have ended."""
     for pid, client in list(children.items()):
         ended, status = os.waitpid(pid, os.WNOHANG)
         if ended:

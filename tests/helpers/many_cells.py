@@ -22,7 +22,6 @@ CLONED = ("cells", "queries", "histories", "thresholds")
 KEYS = ("cell", "cell_a", "cell_b", "artefact", "model")
 
 SCALED = ("error_u", "error_lambda", "error_u_mean", "error_lambda_mean", "online_s", "solve_s", "offline_s")
-"""Columns whose values are other ones in every clone."""
 
 
 def write_many(run: Path, folder: Path, cells: int, queries: int = 16, solver: str = "piqp") -> Path:

@@ -23,7 +23,6 @@ def refuse(*arguments: Any, **options: Any) -> Any:
 
 
 def meddle() -> None:
-    """Change whatever is shared in a process."""
     np.seterr(all="raise")
     warnings.simplefilter("error")
     os.chdir("/")
@@ -74,7 +73,6 @@ MEMBERS = {
     "vibench.problems": {"wire-meddles": "Meddles"},
     "vibench.qp_solvers": {"meddling": "meddling", "roughly": "forgetful"},
 }
-"""What the package registers."""
 
 TAKEN = {
     "vibench.dual_strategies": {"cpg": "Meddles"},

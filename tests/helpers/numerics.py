@@ -17,7 +17,6 @@ def spd(n: int, rng: np.random.Generator, spread: float = 10.0) -> Array:
 
 
 def space(n: int, seed: int = 0) -> InnerProduct:
-    """A random inner product."""
     return InnerProduct(sp.csc_array(spd(n, np.random.default_rng(seed))))
 
 

@@ -24,10 +24,8 @@ from vibench import (
 )
 
 LABEL = "=1+1 [/b] [red] $x^{ $ `a` | <img src=x onerror=alert(1)> </script> \x1b[31m\n@ [x](javascript:y)"
-"""What a study may call something."""
 
 ODD = f"{LABEL} \ud800"
-"""What a program may say, too."""
 
 
 class OddWire(Wire):

@@ -70,7 +70,6 @@ class Put(Problem):
         return self.parameters.grid(5, 4)
 
     def symmetrised(self, mu: Array, value: Array) -> Array:
-        """w from the value V at all nodes."""
         return np.exp((mu[1] / mu[0] ** 2 - 0.5) * self.x) * value
 
     def assemble(self, mu: Array) -> VariationalInequality:

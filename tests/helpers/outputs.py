@@ -6,7 +6,6 @@ from html.parser import HTMLParser
 
 
 def clean(text: str) -> bool:
-    """Whether a text has no control characters but the ends of its lines."""
     return all(line.isprintable() for line in text.split("\n"))
 
 

@@ -38,12 +38,9 @@ MANIFEST: Mapping[str, Any] = {
     },
     "solutions": {"u": "solutions.npz:u", "lam": "solutions.npz:lam"},
 }
-"""A cable pressed onto a floor: load and depth of the floor are the parameters."""
 
 
 class Cable:
-    """The arrays of the pack."""
-
     def __init__(self) -> None:
         width = 1.0 / (SIZE + 1)
         off = np.ones(SIZE - 1)
@@ -60,14 +57,12 @@ class Cable:
 
 
 def group(name: str, matrix: Any) -> dict[str, Any]:
-    """The arrays of a sparse matrix in a .npz file."""
     matrix = sp.csr_array(matrix)
     parts = {"data": matrix.data, "indices": matrix.indices, "indptr": matrix.indptr, "shape": np.array(matrix.shape)}
     return {f"{name}/{part}": value for part, value in parts.items()}
 
 
 def write_arrays(folder: Path, cable: Cable) -> None:
-    """The arrays of a cable, which may have been changed."""
     np.savez(folder / "spaces.npz", **group("X_V", cable.X_V), **group("X_W", cable.X_W))
     np.savez(folder / "vectors.npz", mass=cable.mass)
     np.savez(folder / "solutions.npz", u=cable.u, lam=cable.lam)
@@ -80,12 +75,10 @@ def write_manifest(folder: Path, content: Mapping[str, Any]) -> None:
 
 
 def manifest() -> dict[str, Any]:
-    """The manifest, to be changed."""
     return copy.deepcopy(dict(MANIFEST))
 
 
 def write_cable(folder: Path) -> Path:
-    """The pack as it should be."""
     folder.mkdir(parents=True)
     write_arrays(folder, Cable())
     write_manifest(folder, MANIFEST)

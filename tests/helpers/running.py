@@ -20,7 +20,6 @@ from vibench.results.sqlite import FILE, Digests, read_text
 from vibench.testing.checks import CheckResult, Verdict
 
 Vibench = Callable[..., "subprocess.CompletedProcess[str]"]
-"""Runs the installed command in a folder."""
 
 PATIENCE = 600.0
 """Seconds after which a process that does not end is taken to hang: a busy machine may take minutes for a short run."""
@@ -35,7 +34,6 @@ Shared = Callable[[str, Callable[[Path], object]], Path]
 """Makes a folder of a name by a function, once for all parallel workers."""
 
 Changed = Callable[..., Path]
-"""Gives a copy of the results of a real run, changed by SQL."""
 
 
 def run_of(study: str, folder: Path) -> Path:
@@ -78,7 +76,6 @@ def rows(folder: Path, table: str = "cells") -> list[dict[str, Any]]:
 
 
 def failures(results: Sequence[CheckResult]) -> dict[str, str]:
-    """The messages of the checks of a plugin that fail, by the names of the checks."""
     return {result.check: result.message for result in results if result.verdict is Verdict.FAILED}
 
 
@@ -94,7 +91,6 @@ def execute(folder: Path, *statements: str) -> None:
 
 
 def seal(db: sqlite3.Connection) -> None:
-    """Write the digests of all rows that there are."""
     db.text_factory = read_text
     db.execute("DELETE FROM digests")
     for table in ("meta", *STORED):
@@ -113,7 +109,6 @@ def run_again(vibench: Vibench, folder: Path, *options: str, **more: Any) -> tup
 
 
 def read_until(process: subprocess.Popen[str], words: str) -> None:
-    """Read what a process prints until some words come."""
     assert process.stdout is not None
     printed = ""
     while words not in printed:
@@ -123,7 +118,6 @@ def read_until(process: subprocess.Popen[str], words: str) -> None:
 
 
 def workers(pid: int) -> list[int]:
-    """The worker processes that a process started."""
     found: list[int] = []
     for children in Path(f"/proc/{pid}/task").glob("*/children"):
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):
@@ -193,7 +187,6 @@ UNSOLVED = ("cell", "model", "N", "R", "rank", "gram", "enrichment", "dim_", "be
 
 
 def _split(frame: pd.DataFrame, shaky: set[str]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Rows without the solvers whose answers vary, and rows with them."""
     solvers = frame.columns.intersection(["solver", "solver_a", "solver_b"])
     theirs = frame[solvers].isin(shaky).any(axis=1)
     return frame[~theirs], frame[theirs]

@@ -17,12 +17,10 @@ from vibench.results.schema import STORED, Column, SqlType
 from vibench.results.sqlite import FILE
 
 QUERIES_PER_CELL, ROUNDS, STEPS = 5, 8, 6
-"""Sizes of the run."""
 
 PROBLEMS = ("membrane", "plate")
 
 PRIMALS = (("none", None, Kind.NONE), ("at-every-query", None, Kind.PER_PARAMETER), ("fixed", 0.5, Kind.FIXED))
-"""Label, tolerance and kind of the enrichments."""
 
 STUDY = {"name": "sample", "seed": 0, "validation": QUERIES_PER_CELL}
 
@@ -63,7 +61,6 @@ def _fill(database: ResultsDatabase) -> None:
 HISTORIES = (
     ("pod", "error"), ("cone", "error"), ("cone", "e_orth"), ("enrichment", "sigma"), ("enrichment", "beta_span_min"),
 )  # fmt: skip
-"""Stage and quantity of the histories."""
 
 
 def _keys(problem: str, dual: str, primal: str, tolerance: float | None) -> Row:

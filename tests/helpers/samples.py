@@ -29,22 +29,18 @@ STUDY: Mapping[str, Any] = {
     "problem": [{"name": "obstacle", "options": {"resolution": "coarse"}}],
     "tolerances": [{"pod": [1e-2, 1e-3], "dual": [1e-1], "primal": {"offline-pga": [0.5, 0.3, 0.1]}}],
 }  # fmt: skip
-"""A study that uses every axis."""
 
 RECORDED: Mapping[str, Any] = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}
-"""What a results file records of a study."""
 
 SOLVERS_OF_TESTS = ("cvxopt", "osqp", "piqp", "proxqp")
 """Those of the dependencies and of the extra `test`. Others that are installed may be too inexact for a test."""
 
 ROUNDS = 3
-"""Timing rounds of runs whose seconds no test looks at."""
 
 QUICK_ROUNDS = 6
 """Those of the run of `quick` that tests share: with fewer there is no interval of a median."""
 
 REMOVE = object()
-"""Stands for a key that is taken away."""
 
 
 def changed(content: Mapping[str, Any], *path: str | int, to: Any) -> dict[str, Any]:
@@ -63,7 +59,6 @@ def changed(content: Mapping[str, Any], *path: str | int, to: Any) -> dict[str, 
 
 
 def toml(content: Mapping[str, Any]) -> str:
-    """A study's content as TOML."""
     return "".join(f"{_quoted(key)} = {_value(value)}\n" for key, value in content.items())
 
 
@@ -84,14 +79,12 @@ def _quoted(text: str) -> str:
 
 
 def write_study(folder: Path, content: Mapping[str, Any] = STUDY, name: str = "study.toml") -> str:
-    """A study file in a folder; returns its path."""
     path = folder / name
     path.write_text(toml(content), encoding="utf-8")
     return str(path)
 
 
 def cell_row(cell: str = "c1", **columns: Any) -> dict[str, Any]:
-    """A row of the cells table in which every column is filled."""
     samples = {"TEXT": "text", "REAL": 0.5, "INTEGER": 3}
     row = {name: samples[column.kind.split()[0]] for name, column in STORED["cells"].items()}
     return (
@@ -173,7 +166,6 @@ def install(folder: Path, module: ModuleType, members: Mapping[str, Mapping[str,
 
 
 def wire_study(**axes: Any) -> dict[str, Any]:
-    """A study of the third party's small problem, of one cell unless axes are given."""
     content = {
         "name": "wire", "seed": 3, "validation": 3, "solvers": ["piqp"], "dual": ["cpg"], "primal": ["decorrelated"],
         "problem": ["wire"], "tolerances": [{"pod": [1e-3], "dual": [1e-2]}], "timing_rounds": ROUNDS,
@@ -219,7 +211,6 @@ SMALL = small_study(
     primal=["decorrelated", "online-supremizers", "offline-pga"], assembly=["full", "reduced"], bounds=[False, True],
     tolerances=[{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}], validation=3,
 )  # fmt: skip
-"""The study of the run that tests of models share."""
 
 
 def with_ways(rows: pd.DataFrame) -> pd.DataFrame:
@@ -236,7 +227,6 @@ def program_queries(
     warm_start: bool = False,
     bounds: bool = False,
 ) -> CellQueries:
-    """The queries of a cell with the mixed formulation on an enriched space."""
     pod, cone = enrichment.pod, enrichment.cone
     mixed = Plugin("formulation", "mixed", "{}", "test")
     built = FormulationStage(pod.problem, mixed, pod.training, pod, cone, enrichment, interpolation)

@@ -56,7 +56,6 @@ class Transformed(Problem):
         self.affine = {name: self._sum(name, declared) for name, declared in problem.affine.items()}
 
     def _transformed(self, name: str, member: Any) -> Any:
-        """A member in the new unknowns and rows."""
         T, D = self._T, sp.diags_array(self._D)
         if name == "A":
             return self._energy * sp.csr_array(T.T @ member @ T)
@@ -67,7 +66,6 @@ class Transformed(Problem):
         return self._D * member[self._repeated]
 
     def _away(self, g: Array) -> Array:
-        """The bounds with those of the far rows."""
         count = self._base.W.dim
         return np.concatenate([g[:count], np.full(len(g) - count, self._far)])
 

@@ -10,8 +10,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.sparse as sp
-from numerics import space
-from scipy.optimize import nnls
 
 from vibench import timing
 
@@ -46,26 +44,6 @@ def test_both_sides_come_to_the_same_models(
 def test_a_figure_above_its_bound_or_none_at_all_breaks_a_check() -> None:
     fine, above, none = ("fine", 1.0, 1.0), ("above", 1.1, 1.0), ("none", float("nan"), 1.0)
     assert as_published.broken([fine, above, none]) == [above, none]
-
-
-def test_gram_schmidt_drops_what_adds_nothing() -> None:
-    X = space(9).matrix
-    Y = np.random.default_rng(1).standard_normal((9, 5))
-    Y[:, 3] = Y[:, 0] - 2.0 * Y[:, 2]
-    kept = Y.copy()
-    fixed = published.gram_schmidt(Y[:, :1], X)
-    added = published.gram_schmidt(Y, X, fixed)
-    Z = np.column_stack([fixed, added])
-    np.testing.assert_array_equal(Y, kept)
-    np.testing.assert_allclose(Z.T @ X @ Z, np.eye(4), atol=1e-13)
-    np.testing.assert_allclose(published.project_out(Y, Z, X @ Z), 0.0, atol=1e-13)
-
-
-def test_distances_from_a_cone_are_those_of_nonnegative_least_squares() -> None:
-    rng = np.random.default_rng(2)
-    chi, theta = rng.random((12, 4)), rng.random(12)
-    expected = nnls(chi, theta)[1]
-    assert published._distance(chi.T @ chi, chi.T @ theta, theta @ theta) == pytest.approx(expected, rel=1e-9)
 
 
 def test_line_9_leaves_nothing_that_could_still_be_taken_out() -> None:

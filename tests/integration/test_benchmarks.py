@@ -51,7 +51,6 @@ class Timed:
 
     @property
     def benchmarks(self) -> dict[str, dict[str, Any]]:
-        """Entries of the file by name."""
         return {entry["name"].removeprefix("test_"): entry for entry in self.file["benchmarks"]}
 
 

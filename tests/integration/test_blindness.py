@@ -18,7 +18,6 @@ PACKAGES = sorted({entry.module.split(".")[0] for entry in ENTRIES})
 
 
 def imported(tree: ast.AST) -> set[str]:
-    """Packages a source imports, in whatever form."""
     found = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):

@@ -50,13 +50,11 @@ BLOCK = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.MULTILIN
 
 
 def blocks(page: Path) -> list[tuple[str, str, str]]:
-    """The code of a page: language, title or "", text."""
     return BLOCK.findall(page.read_text(encoding="utf-8"))
 
 
 @pytest.fixture(scope="module")
 def reference() -> ModuleType:
-    """The module that makes tables for the pages."""
     spec = importlib.util.spec_from_file_location("reference", DOCS / "reference.py")
     assert spec is not None
     assert spec.loader is not None

@@ -76,7 +76,6 @@ def home(main: Main, shared: Shared, tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def key(home: Path, **wanted: str) -> str:
-    """The key of the cell with these values."""
     (cell,) = (row["cell"] for row in rows(home / "runs" / "mine") if wanted.items() <= row.items())
     return str(cell)
 
@@ -85,8 +84,6 @@ CERTIFIED = {"primal": "offline-pga", "bounds": 1, "correction": "none"}
 
 
 class TestNewUser:
-    """Somebody who has just installed vibench."""
-
     def test_begin_a_study_of_a_problem_and_see_what_it_would_run(self, narrow: Main) -> None:
         _, out, _ = narrow("list", "problems")
         assert "radius from 0.7 to 1.3 m" in " ".join(out.split())
@@ -129,8 +126,6 @@ class TestNewUser:
 
 
 class TestAuthor:
-    """Somebody with a model of their own."""
-
     def test_what_can_be_done_with_a_pack(self, home: Path, narrow: Main) -> None:
         _, out, _ = narrow("pack", "my-model")
         text = " ".join(out.split())
@@ -160,11 +155,8 @@ class TestAuthor:
 
 
 class TestEngineer:
-    """Somebody who wants the reduced model in a program of theirs."""
-
     @pytest.fixture
     def exported(self, home: Path, narrow: Main) -> Path:
-        """The folder of an exported model."""
         (home / "out").mkdir()
         code, out, err = narrow("export", "mine", key(home, **CERTIFIED)[:8], "out/string.c")
         assert (code, err) == (0, "")

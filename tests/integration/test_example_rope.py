@@ -71,7 +71,6 @@ def python(example: Path, artefacts: Path) -> Python:
 
 @pytest.fixture(scope="module")
 def cells(python: Python, command: str, example: Path) -> tuple[pd.DataFrame, pd.DataFrame, str]:
-    """Cells and queries of a small study of the rope, and what the run printed."""
     done = python(command, "run", write_study(example.parent, STUDY), "--jobs", "1", "--strict", "--no-figures")
     path = example.parent / "runs" / STUDY["name"] / FILE
     return read_table(path, "cells"), read_table(path, "queries"), done.stdout

@@ -28,7 +28,6 @@ REASONS = {
 
 
 def study(**axes: Any) -> Study:
-    """A study of the wire."""
     content = {
         "name": "formulations", "seed": 3, "validation": 4, "problem": [Wire], "dual": ["cpg", "mcpg"],
         "primal": ["decorrelated", "online-supremizers"], "solvers": ["piqp", "osqp"], "timing_rounds": 2,

@@ -15,7 +15,6 @@ from vibench_problems.elliptic_contact import elliptic_contact
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PYTHON = "/usr/bin/python3"
-"""The interpreter that Debian's packages are for."""
 
 NEEDED = "VIBENCH_NEEDS_OTHER_CODES"
 """Environment variable under which a code that is not installed is a failure."""
@@ -60,14 +59,12 @@ def export_from_freefem(folder: Path, model: str, size: str) -> None:
 
 
 def certified_model(pack: vibench.Problem) -> vibench.Model:
-    """A reduced model with bounds, all of whose members are declared."""
     dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
     given = vibench.Stop(1e-2), vibench.Stop(1e-2)
     return vibench.Reduction(pack, dual, primal, *given, tolerance=0.5, assembly="reduced", bounds=True).model
 
 
 def run(example: Path, monkeypatch: pytest.MonkeyPatch) -> vibench.Run:
-    """A part of the study of an example, timed once."""
     monkeypatch.chdir(example)
     text = (EXAMPLES / example.name / "study.toml").read_text(encoding="utf-8")
     for whole, part in FEW.items():

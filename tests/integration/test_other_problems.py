@@ -28,7 +28,6 @@ DUALS = ["cpg", "mcpg", "enlarged-cpg", "angle-greedy", "nmf", "orthant", "dicti
 PRIMALS = ["decorrelated", "online-supremizers", "offline-pga", "infsup-greedy", "pod-supremizers"]
 
 WITHOUT = {"torsion": 2, "put": 0, "block": 0, "lifted": 3}
-"""Validation parameters without contact."""
 
 STUDY: dict[str, Any] = {
     "name": "others",
@@ -56,7 +55,6 @@ STUDY: dict[str, Any] = {
 
 @pytest.fixture(scope="module")
 def run(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of the run."""
     folder = tmp_path_factory.mktemp("others")
     plugins = install(folder / "site", other_problems, REGISTERED)
     done = vibench(folder, "run", write_study(folder, STUDY), "--jobs", "1", plugins=plugins, timeout=400.0)

@@ -17,7 +17,6 @@ STUDY = {
     "tolerances": [{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
 }  # fmt: skip
 ORIGIN = {"cell", "problem_options", "model", "study_hash", "code", "definition", "artefact", "cell_a", "cell_b"}
-"""Columns that name the problem or its code."""
 
 RESOLUTION = {"obstacle": 160, "hertz": 300}
 

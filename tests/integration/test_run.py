@@ -37,7 +37,6 @@ def first(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def again(first: Path, tmp_path: Path) -> Path:
-    """A copy of it."""
     shutil.copytree(first, tmp_path / "again")
     return tmp_path / "again"
 
