@@ -39,11 +39,3 @@ def test_the_walk_from_a_study_to_a_row_leads_through_seven_modules_each_once_an
         places.append(LAYERS.index(parts[0]))
     assert len(modules) == len(set(modules)) == 7
     assert places == sorted(places)
-
-
-def test_no_package_has_more_than_fourteen_entries_and_each_says_what_it_is_for() -> None:
-    package = Path(str(vibench.__file__)).parent
-    for folder in {path.parent for path in package.glob("*/**/*.py")} - {package}:
-        assert len([path for path in folder.iterdir() if path.name != "__pycache__"]) <= 14, folder
-        text = (folder / "__init__.py").read_text(encoding="utf-8")
-        assert re.match(r'"""[A-Z].+?\.', text, re.DOTALL), folder

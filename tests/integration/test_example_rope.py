@@ -134,10 +134,3 @@ def test_the_checks_and_the_tests_of_the_package_pass_where_it_is_installed(
     assert " passed, 0 failed, 0 skipped" in python(command, "check", FORMULATION).stdout
     done = python("-m", "pytest", "-p", "no:cacheprovider", where=example)
     assert " passed" in done.stdout
-
-
-def test_a_plugin_stays_as_short_as_it_is_said_to_be() -> None:
-    for file, limit in (("rope", 80), ("fixed_supremizers", 50), ("shepard", 61)):
-        count = len((EXAMPLE / "vibench_rope" / f"{file}.py").read_text(encoding="utf-8").splitlines())
-        assert count < limit
-        assert f"| {count:5d} |" in (EXAMPLE / "README.md").read_text(encoding="utf-8")
