@@ -16,10 +16,11 @@ from typing import Any
 import pandas as pd
 from page import start
 
+from vibench.execution.recording import cell_columns
 from vibench.report.citation import Citation
 from vibench.report.site import publish
 from vibench.results.database import ResultsDatabase
-from vibench.results.schema import STORED, SqlType
+from vibench.results.schema import KEYS, STORED, SqlType
 from vibench.results.sqlite import FILE
 from vibench.study.cells import UNCORRECTED
 from vibench.study.matrix import expand, read_study
@@ -51,8 +52,8 @@ def restore(tables: Path, folder: Path) -> Path:
     """Write a results file of committed tables into a folder; columns that were added after them are empty."""
     cells = rows(tables / "cells.csv")
     if "definition" not in cells[0]:  # left out of a large table: the study says the same
-        definitions = {cell.key: cell.definition for cell in expand(read_study(tables.name))}
-        cells = [row | {"definition": definitions[row["cell"]]} for row in cells]
+        definitions = {identity_of(cell_columns(cell)): cell.definition for cell in expand(read_study(tables.name))}
+        cells = [row | {"definition": definitions[identity_of(row)]} for row in cells]
     identity = {"name": tables.name, "seed": int(cells[0]["seed"]), "validation": int(cells[0]["queries"])}
     database = ResultsDatabase(folder, identity)
     try:
@@ -64,6 +65,12 @@ def restore(tables: Path, folder: Path) -> Path:
     finally:
         database.close()
     return folder / FILE
+
+
+def identity_of(row: dict[str, Any]) -> tuple[str, ...]:
+    """The values that tell a cell of a study from the others: keys of cells depend on the version of vibench."""
+    values = (row.get(name) for name in KEYS if name not in {"cell", "bounds"} and not name.endswith("_options"))
+    return tuple("" if value is None else f"{value:g}" if isinstance(value, float) else str(value) for value in values)
 
 
 def rows(table: Path) -> list[dict[str, Any]]:

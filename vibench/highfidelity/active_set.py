@@ -199,7 +199,10 @@ def solve_high_fidelity(
     start
         Initial active set (m,); empty by default.
 
-    Raises a `NumericalError` if neither the active set method nor its fallback reaches `ACCURACY`.
+    Raises
+    ------
+    NumericalError
+        If neither the active set method nor its fallback reaches `ACCURACY`.
     """
     stiffness = stiffness or CondensedStiffness(vi.A)
     return verified(vi, stiffness, solve_unverified(vi, stiffness, start))
