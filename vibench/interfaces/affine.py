@@ -35,16 +35,11 @@ BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
     ast.Pow: math.pow,
 }  # fmt: skip
 
-UNARY: Mapping[type[ast.unaryop], Callable[[float], float]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
-
 
 def normal_names(names: Iterable[str]) -> tuple[str, ...]:
     """Names of parameters in the Unicode form NFKC, as in expressions: the micro sign becomes a μ.
 
-    Raises
-    ------
-    RequestError
-        If two names are the same then, or one is that of a constant or function of expressions.
+    Raises a `RequestError` if two names are the same then, or one is that of a constant or function of expressions.
     """
     normal = tuple(normal_name(name) for name in names)
     if len(set(normal)) < len(normal):
@@ -93,8 +88,10 @@ class Expression:
         return result
 
 
+# Cached: an expression is evaluated at every parameter.
 @lru_cache(maxsize=1000)
 def _tree(text: str) -> ast.expr:
+    # Texts may come from anybody: a long one would take the time and the memory of the parser.
     if len(text) > 2000:
         raise RequestError(f"the expression '{text[:40]}…' has {len(text)} characters, at most 2000 are read")
     try:
@@ -114,8 +111,8 @@ def _tree(text: str) -> ast.expr:
 
 
 def _check(node: ast.expr, text: str, names: Sequence[str]) -> None:
-    """Refuse everything that is not in the whitelist."""
     match node:
+        # A truth value is an integer for Python, but none for a reader.
         case ast.Constant(value=bool() as value):
             raise RequestError(f"'{text}' contains {value}; expected arithmetic")
         case ast.Constant(value=int() | float() as value):
@@ -130,7 +127,7 @@ def _check(node: ast.expr, text: str, names: Sequence[str]) -> None:
         case ast.BinOp(left=left, op=op, right=right) if type(op) in BINARY:
             _check(left, text, names)
             _check(right, text, names)
-        case ast.UnaryOp(op=op, operand=operand) if type(op) in UNARY:
+        case ast.UnaryOp(op=op, operand=operand) if isinstance(op, ast.UAdd | ast.USub):
             _check(operand, text, names)
         case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
             _check_call(name, arguments, text, names)
@@ -158,7 +155,6 @@ def _check_call(name: str, arguments: Sequence[ast.expr], text: str, names: Sequ
 
 
 def _value(node: ast.expr, values: Mapping[str, float]) -> float:
-    """Value of a checked expression."""
     match node:
         # Floats, so that no power takes longer than another.
         case ast.Constant(value=int() | float() as value):
@@ -168,7 +164,8 @@ def _value(node: ast.expr, values: Mapping[str, float]) -> float:
         case ast.BinOp(left=left, op=op, right=right):
             return BINARY[type(op)](_value(left, values), _value(right, values))
         case ast.UnaryOp(op=op, operand=operand):
-            return UNARY[type(op)](_value(operand, values))
+            value = _value(operand, values)
+            return -value if isinstance(op, ast.USub) else value
         case ast.Call(func=ast.Name(id=name), args=arguments):
             return FUNCTIONS[name](*(_value(argument, values) for argument in arguments))
     raise NumericalError("the expression was not checked")
@@ -253,6 +250,7 @@ class AffineSum:
         theta = self.coefficients(mu)
         if isinstance(self.terms[0], np.ndarray):
             return self._columns @ theta
+        # The same pattern at every mu, so that factorisations keep their symbolic analysis.
         pattern, values = self._stacked
         return sp.csr_array((values @ theta, pattern.indices, pattern.indptr), shape=pattern.shape)
 
@@ -268,6 +266,7 @@ class AffineSum:
         rows, columns = (np.concatenate([term.coords[axis] for term in coo]) for axis in (0, 1))
         shape = self.terms[0].shape
         pattern = sp.csr_array((np.ones(len(rows)), (rows, columns)), shape=shape)
+        # Entries of the pattern are sorted by row and column: their place is found by bisection.
         keys = np.repeat(np.arange(shape[0]), np.diff(pattern.indptr)) * shape[1] + pattern.indices
         places = np.searchsorted(keys, rows.astype(np.int64) * shape[1] + columns)
         number = np.repeat(np.arange(len(coo)), [term.nnz for term in coo])
@@ -288,4 +287,5 @@ def entries_of(array: Any, rows: Indices, columns: Indices) -> Array:
     """Entries (k,) of a vector or a sparse matrix."""
     if isinstance(array, np.ndarray):
         return array[rows]
+    # SciPy returns a matrix of one row, or a sparse array, for some formats.
     return np.asarray(sp.csr_array(array)[rows, columns]).ravel()

@@ -71,6 +71,7 @@ class AffineProblem(Problem):
         if dirichlet_lift is not None:
             given["dirichlet_lift"] = dirichlet_lift
         sums = {name: self._sum(member) for name, member in given.items()}
+        # With `free` the members are declared for all unknowns, before Dirichlet conditions.
         N = n if free is None else int(np.shape(sums["A"].terms[0])[0])
         if free is not None and (len(free) != n or np.max(free, initial=-1) >= N):
             raise NumericalError(f"there are {len(free)} free unknowns of {N}; V has the dimension {n}")
@@ -125,7 +126,6 @@ def _of_product(first: Coefficients, second: Coefficients, third: Coefficients, 
 
 
 def _minus(total: AffineSum, matrix: AffineSum, vector: AffineSum) -> AffineSum:
-    """The sum of total − matrix · vector."""
     products = [A @ v for A in matrix.terms for v in vector.terms]
     thetas = total.thetas, matrix.thetas, vector.thetas
     # A combination of constants stays a constant; constant coefficients are evaluated at no parameter.
@@ -141,6 +141,7 @@ def _constant_or_sum(member: AffineSum) -> Any:
     if not (isinstance(member.thetas, Thetas) and member.thetas.constant):
         return member
     nowhere = np.zeros(0)
+    # The declared array itself: a copy would take the memory of the largest matrices twice.
     if len(member.terms) == 1 and member.coefficients(nowhere)[0] == 1.0:
         return member.terms[0]
     return member.at(nowhere)

@@ -63,6 +63,7 @@ class Output:
                 outputs += 0.0 if weights is None else weights @ columns
         else:
             outputs = np.array([self._value(mus[k], u[:, k], lam[:, k]) for k in range(len(mus))])
+        # The first one is enough for a message.
         for k in np.flatnonzero(~np.isfinite(outputs))[:1]:
             raise NumericalError(f"the output '{self.name}' is {outputs[k]} at mu = {mus[k].tolist()}")
         return outputs
@@ -70,6 +71,7 @@ class Output:
     def _value(self, mu: Array, u: Array, lam: Array) -> float:
         assert self.function is not None  # `values` asks for no other
         try:
+            # Copies: a function may write into its arguments, which others use after it.
             return float(self.function(mu.copy(), u.copy(), lam.copy()))
         except Exception as error:
             raise NumericalError(f"the output '{self.name}' fails at mu = {mu.tolist()}: {in_a_line(error)}") from error
@@ -171,10 +173,12 @@ class MeshFields:
     def of_picture(cls, picture: Picture) -> MeshFields:
         """The triangles of a picture, or its line, with the colour map; the multiplier at vertices at its positions."""
         count, values = picture.points.shape[1], picture.values
+        # Multipliers have vertices of their own, since they may lie between the nodes of the mesh.
         vertices = np.arange(count, count + picture.positions.shape[1])[:, None]
         points = np.zeros((count + len(vertices), 3))
         points[:count, : len(picture.points)] = picture.points.T
         points[count:, : len(picture.positions)] = picture.positions.T
+        # Points on a line come in any order; its segments join neighbours.
         order = np.argsort(picture.points[0], kind="stable")
         line = {"line": np.column_stack([order[:-1], order[1:]])}
         cells = {"triangle": picture.triangles.T} if picture.triangles.size else line

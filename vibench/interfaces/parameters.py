@@ -42,6 +42,7 @@ class ParameterBox:
     @property
     def widths(self) -> Array:
         """Widths (d,) by which distances of parameters are measured; never zero."""
+        # A parameter that does not vary is measured by its size, one near zero by 1.
         return np.where(self.upper > self.lower, self.upper - self.lower, np.maximum(np.abs(self.lower), 1.0))
 
     def grid(self, *counts: int) -> Array:
@@ -71,6 +72,7 @@ class ParameterBox:
         linear = np.asarray(self.lower + unit * (self.upper - self.lower))
         for i in self.logarithmic(log):
             low, high = np.log(self.lower[i]), np.log(self.upper[i])
+            # The exponential of a logarithm may leave the box by round-off.
             linear[:, i] = np.clip(np.exp(low + unit[:, i] * (high - low)), self.lower[i], self.upper[i])
         return linear
 
@@ -88,6 +90,7 @@ class ParameterBox:
 
     def index(self, name: str) -> int:
         """Number of the parameter with this name; raises a `RequestError` if there is none."""
+        # Names look the same in several Unicode forms, such as the micro sign and μ.
         known = {normal_name(one): number for number, one in enumerate(self.names)}
         if normal_name(name) not in known:
             raise unknown_name("parameter", name, self.names)

@@ -246,6 +246,7 @@ class Problem(ABC):
         if contact is None or self.contact_dofs is None:
             vi = self.assemble(mu)
             return vi.B, vi.g
+        # Columns of contact unknowns become those of all unknowns; the entries are shared.
         B = sp.csr_array(contact.B)
         entries = (B.data, self.contact_dofs[B.indices], B.indptr)
         return sp.csr_array(entries, shape=(B.shape[0], self.V.dim)), contact.g

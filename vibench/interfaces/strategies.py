@@ -265,6 +265,7 @@ def check_sample(box: ParameterBox, returned: object) -> Array:
     mus = np.asarray(returned, float)
     if mus.ndim != 2 or mus.shape[1] != box.dim or not len(mus):
         raise RequestError(f"parameters of shape {mus.shape}; expected (P, {box.dim}), a row for each, with P > 0")
+    # Of every kind of fault the first one is named.
     for k, i in np.argwhere(~np.isfinite(mus))[:1]:
         raise RequestError(f"parameter {k} has '{box.names[i]}' = {mus[k, i]}, which is not finite")
     for k, i in np.argwhere(box.outside(mus))[:1]:
@@ -278,6 +279,7 @@ def check_sample(box: ParameterBox, returned: object) -> Array:
                 f"parameter {k} = {mus[k].tolist()} is not available: the problem has matrices only at its "
                 f"{len(listed)} listed parameters; choose among those"
             )
+    # A parameter that occurs twice would count twice in means, and its snapshot in the POD.
     first = np.unique(mus, axis=0, return_index=True)[1]
     for k in sorted(set(range(len(mus))) - set(first.tolist()))[:1]:
         raise RequestError(f"parameter {k}, {mus[k].tolist()}, occurs twice")

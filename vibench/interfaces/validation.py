@@ -38,6 +38,7 @@ def check_cone(cone: object, W: InnerProduct) -> Cone:
         raise NumericalError(f"the generators do not all have unit norm in W: {worst}")
     if cone.free.shape != (chi.shape[1],):
         raise NumericalError(f"'free' has shape {cone.free.shape} for {chi.shape[1]} generators")
+    # Free generators may have any sign.
     signed = np.where(cone.free, 0.0, chi)
     if signed.min(initial=0.0) < 0.0:
         i, r = np.unravel_index(signed.argmin(), signed.shape)
@@ -160,6 +161,7 @@ class Fingerprint:
                 yield f"{name} has {len(mine)} rows against {len(theirs)}"
                 continue
             gap = np.abs(mine - theirs)
+            # Negated, so that NaN differs, too.
             if not np.max(gap, initial=0.0) <= AGREEMENT_RTOL * max(self.scales[name], other.scales[name]):
                 yield f"row {int(np.argmax(np.where(np.isnan(gap), np.inf, gap)))} of {name} differs"
 
@@ -182,6 +184,7 @@ def _probed(array: Any) -> Array:
     """A copy of a vector, or the product of a matrix with a vector that is the same in every process."""
     if array.ndim == 1:
         return np.array(array)
+    # Between 1 and 2, so that no entry is lost beside another one.
     return np.asarray(array @ (1.0 + np.random.default_rng(0).random(array.shape[1])))
 
 

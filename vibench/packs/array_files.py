@@ -27,10 +27,7 @@ from vibench.provenance import memory
 def safe_path(folder: Path, name: str) -> Path:
     """Path of a file in a folder.
 
-    Raises
-    ------
-    RequestError
-        If the name leads elsewhere, there is no such file, or it is a link or no regular file.
+    Raises a `RequestError` if the name leads elsewhere, there is no such file, or it is a link or no regular file.
     """
     parts = PurePosixPath(name).parts
     if not parts or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name:
@@ -40,6 +37,7 @@ def safe_path(folder: Path, name: str) -> Path:
     try:
         for part in parts:
             path /= part
+            # Of every folder on the way, too: a link among them would lead elsewhere.
             mode = path.lstat().st_mode
             if stat.S_ISLNK(mode):
                 raise RequestError(f"'{name}' is a symbolic link; a pack holds its files itself")
@@ -85,6 +83,7 @@ class ArrayFiles:
                 matrix = self._matrix(stored)
                 if 1 not in matrix.shape:
                     raise RequestError(f"a sparse matrix {size_of(matrix.shape)}; expected a dense array")
+                # A sparse vector may declare any length, whatever the size of its file.
                 self.take(8 * max(matrix.shape))
                 stored = matrix.toarray()
             return self._real(stored, infinite)
@@ -153,6 +152,7 @@ class ArrayFiles:
             parts = [name for name in members if name.startswith(f"{inner}/")] if inner else list(members)
             if inner and inner not in members and not parts:
                 raise unknown_name(f"array in '{path.name}'", inner, sorted(members)[:20])
+            # A file of `scipy.sparse.save_npz` is one matrix of several arrays.
             if not inner and len(members) > 1 and "data" not in members:
                 raise RequestError(f"'{path.name}' has several arrays: name one, as in '{path.name}:{parts[0]}'")
             single = inner if inner in members else parts[0] if len(parts) == 1 else None
@@ -167,6 +167,7 @@ class ArrayFiles:
 
     def _array(self, file: IO[bytes], size: int) -> Array:
         """A .npy file of so many bytes; sizes are checked before it is read, and Python objects are refused."""
+        # The header is read by hand: `np.load` would allocate what it declares.
         version = np.lib.format.read_magic(file)
         if version == (1, 0):
             shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
@@ -205,6 +206,7 @@ class ArrayFiles:
                 raise RequestError(f"the Matrix Market file is longer than the {entries} entries that it declares")
         self.take(len(text))
         matrix = scipy.io.mmread(io.BytesIO(text))
+        # The text is released, the matrix stays.
         self._left += len(text)
         return np.asarray(matrix) if layout == "array" else _checked(sp.csr_array(matrix))
 
@@ -219,6 +221,7 @@ class ArrayFiles:
                 link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
                 if link is None:
                     raise RequestError(f"'{path.name}' has no dataset '{inner}'")
+                # Soft and external links may lead out of the file.
                 if not isinstance(link, h5py.HardLink):
                     raise RequestError(f"'{inner}' in '{path.name}' is a link; a pack holds its arrays itself")
                 node = node[part]
@@ -253,7 +256,12 @@ class ArrayFiles:
         self.take(8 * (rows + columns))
         data = self._real(np.ravel(stored["data"]))
         if not compressed:
-            return self._from_triplets(stored, data, rows, columns)
+            i, j = np.ravel(stored["row"]), np.ravel(stored["col"])
+            if not len(i) == len(j) == len(data):
+                raise RequestError(f"row, col and data have {len(i)}, {len(j)} and {len(data)} entries")
+            self.take(16 * len(data))
+            places = (self._based(i, rows), self._based(j, columns))
+            return _checked(sp.csr_array(sp.coo_array((data, places), shape=(rows, columns))))
         written = np.ravel(stored.get("format", b"csr")).tolist()
         if written not in ([b"csr"], [b"csc"]):
             raise RequestError(f"its format is {written}; expected 'csr' or 'csc'")
@@ -271,18 +279,11 @@ class ArrayFiles:
             raise RequestError(f"indices do not fit {fits}: {error}") from None
         return _checked(kind((data[:used], indices, pointers), shape=(rows, columns)))
 
-    def _from_triplets(self, stored: Any, data: Array, rows: int, columns: int) -> SparseMatrix:
-        i, j = np.ravel(stored["row"]), np.ravel(stored["col"])
-        if not len(i) == len(j) == len(data):
-            raise RequestError(f"row, col and data have {len(i)}, {len(j)} and {len(data)} entries")
-        self.take(16 * len(data))
-        places = (self._based(i, rows), self._based(j, columns))
-        return _checked(sp.csr_array(sp.coo_array((data, places), shape=(rows, columns))))
-
     def _based(self, values: Any, count: int) -> Indices:
         values, low, high = whole(values, "it"), self._base, self._base + count - 1
         if len(values) and (values.min() < low or values.max() > high):
             fault = f"it has indices from {values.min()} to {values.max()}; expected {low} to {high}"
+            # Indices that fit the other base were probably written with it.
             other = 1 - self._base
             if other <= values.min() and values.max() <= other + count - 1:
                 fault += f": they count from {other}, so the manifest needs index_base = {other}"
@@ -336,6 +337,7 @@ def _bytes(count: int, dtype: np.dtype[Any]) -> int:
 
 def _checked(matrix: SparseMatrix) -> SparseMatrix:
     """A matrix whose indices SciPy has checked one by one; what is wrong raises a ValueError."""
+    # Products in compiled code would read beyond arrays.
     matrix.check_format(full_check=True)
     return matrix
 

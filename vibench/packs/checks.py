@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError, RequestError, requested
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.linalg.inner_product import InnerProduct, asymmetry
+from vibench.linalg.inner_product import asymmetry
 from vibench.packs.manifest import read_manifest
 from vibench.packs.pack import ModelPack, PackSolutions
 from vibench.packs.reader import PackReader, naming, one_triangle
@@ -74,7 +73,9 @@ def _check_operators(pack: ModelPack, X_V: Any) -> None:
         what = "operators.A" if len(A.arrays) == 1 else f"operators.A, array {k}"
         one_triangle(matrix, what)
         if off := asymmetry(matrix):
-            hint = "; rows of Dirichlet unknowns were replaced and their columns kept" if _replaced_rows(matrix) else ""
+            # Rows with a diagonal entry alone whose columns have more.
+            replaced = np.any((_couplings(matrix) == 0) & (_couplings(matrix.T) > 0))
+            hint = "; rows of Dirichlet unknowns were replaced and their columns kept" if replaced else ""
             raise RequestError(f"{what} is not symmetric: entries differ by {off:.1e}{hint}")
     if all(matrix.nnz == 0 or not np.any(matrix.data) for matrix in B.arrays):
         raise RequestError("operators.B is zero: no constraint acts on any unknown")
@@ -96,12 +97,8 @@ def _check_operators(pack: ModelPack, X_V: Any) -> None:
             raise RequestError(f"operators: {error}; {_why_indefinite(matrix)}") from None
 
 
-def _replaced_rows(matrix: Any) -> bool:
-    """Whether some rows have only a diagonal entry while their columns have more."""
-    return bool(np.any((_couplings(matrix) == 0) & (_couplings(matrix.T) > 0)))
-
-
 def _why_indefinite(A: Any) -> str:
+    # The diagonal of a negative definite matrix is negative.
     if np.all(A.diagonal() < 0.0):
         return "it is −A that is positive definite: the sign of A is the opposite one"
     if np.abs(A @ np.ones(A.shape[0])).max() <= 1e-10 * abs(A).max():
@@ -118,6 +115,7 @@ def _check_dirichlet(A: Any, X_V: Any) -> None:
             f"operators.A has diagonal entries of {diagonal.max():.0e} at {len(k)} unknowns, the first is {k[0]}: a "
             "penalty for Dirichlet conditions was left in; remove these unknowns, or name the free ones in spaces.free"
         )
+    # A Dirichlet row keeps its diagonal entry alone, while X_V was assembled without conditions.
     coupled_V, coupled_A = (_couplings(matrix) > 0 for matrix in (X_V, A))
     alone = np.flatnonzero(coupled_V & ~coupled_A)
     if len(alone) and np.any(coupled_A):
@@ -128,7 +126,6 @@ def _check_dirichlet(A: Any, X_V: Any) -> None:
 
 
 def _couplings(matrix: Any) -> Array:
-    """Number of entries beside the diagonal, per row."""
     off = sp.csr_array(matrix - sp.diags_array(matrix.diagonal()))
     off.eliminate_zeros()
     return np.diff(off.indptr)
@@ -165,6 +162,7 @@ class _Solution:
     @property
     def residual(self) -> float:
         """The largest relative KKT residual; infinite for λ outside W⁺."""
+        # As in `_check`: smaller negative entries are round-off.
         if self.lam.min(initial=0.0) < -1e-8 * np.abs(self.lam).max(initial=0.0):
             return float("inf")
         return kkt_residuals(self.vi, self.u, np.maximum(self.lam, 0.0)).worst
@@ -176,34 +174,32 @@ class _Solution:
         return _Solution(replace(self.vi, **members), u, lam)
 
 
-Change = Callable[[_Solution, InnerProduct], _Solution]
-
-# Possible mistakes in a solution that solves nothing, each with the change that corrects it.
-MISTAKES: Mapping[str, Change] = {
-    "λ has the other sign: with B u ≤ g, A u + Bᵀλ = f and λ ≥ 0": lambda s, _: s.change(lam=-1.0),
-    "the constraints are B u ≥ g: write B and g with the other sign": lambda s, _: s.change(B=-1.0, g=-1.0),
-    "the constraints are B u ≥ g and λ ≤ 0: write B, g and λ with the other sign": lambda s, _: s.change(
-        B=-1.0, g=-1.0, lam=-1.0
-    ),
-    "f has the other sign": lambda s, _: s.change(f=-1.0),
-    "g has the other sign": lambda s, _: s.change(g=-1.0),
-    "B has the other sign": lambda s, _: s.change(B=-1.0),
-    "u has the other sign": lambda s, _: s.change(u=-1.0),
-    "the energy has no factor ½: write 2A, or f, g and λ to match": lambda s, _: s.change(A=2.0),
-    "λ are nodal forces or moments ∫ λ·φ: write the coefficients X_W⁻¹ λ": lambda s, W: replace(s, lam=W.riesz(s.lam)),
-    "λ are coefficients, but B has not been multiplied by X_W, or the other way round": lambda s, W: replace(
-        s, lam=W.apply(s.lam)
-    ),
-}
-
-
 def _explained(pack: ModelPack, given: PackSolutions, k: int) -> RequestError:
     """The error for a reference solution, with the single change that would make it right if there is one."""
     solution, tolerance = _Solution.from_pack(pack, given, k), given.tolerance
     title = f"solutions: column {k}, mu = {given.parameters[k].tolist()}, does not solve the problem"
-    for meant, change in MISTAKES.items():
-        if change(solution, pack.W).residual <= tolerance:
+    # Possible mistakes, each with the change that corrects it; a change of one sign comes before one of several.
+    weighted = replace(solution, lam=pack.W.apply(solution.lam))
+    mistakes = {
+        "λ has the other sign: with B u ≤ g, A u + Bᵀλ = f and λ ≥ 0": solution.change(lam=-1.0),
+        "the constraints are B u ≥ g: write B and g with the other sign": solution.change(B=-1.0, g=-1.0),
+        "the constraints are B u ≥ g and λ ≤ 0: write B, g and λ with the other sign": solution.change(
+            B=-1.0, g=-1.0, lam=-1.0
+        ),
+        "f has the other sign": solution.change(f=-1.0),
+        "g has the other sign": solution.change(g=-1.0),
+        "B has the other sign": solution.change(B=-1.0),
+        "u has the other sign": solution.change(u=-1.0),
+        "the energy has no factor ½: write 2A, or f, g and λ to match": solution.change(A=2.0),
+        "λ are nodal forces or moments ∫ λ·φ: write the coefficients X_W⁻¹ λ": replace(
+            solution, lam=pack.W.riesz(solution.lam)
+        ),
+        "λ are coefficients, but B has not been multiplied by X_W, or the other way round": weighted,
+    }
+    for meant, changed in mistakes.items():
+        if changed.residual <= tolerance:
             return RequestError(f"{title}; probably {meant}")
+    # Columns in another order than the parameters solve other problems of the pack.
     for other, mu in enumerate(given.parameters):
         if other != k and replace(solution, vi=pack.at(mu)).residual <= tolerance:
             return RequestError(f"{title}, but that of parameter {other}: the columns are in another order")

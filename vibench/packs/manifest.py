@@ -202,10 +202,7 @@ def _references(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[str, 
 def read_manifest(folder: Path) -> Manifest:
     """Read and check the manifest of a pack.
 
-    Raises
-    ------
-    RequestError
-        Naming the key, what is wrong with it, and what is expected.
+    Raises a `RequestError` naming the key, what is wrong with it, and what is expected.
     """
     path = safe_path(folder, FILE)
     if (size := path.stat().st_size) > (most := 2**24):
@@ -216,6 +213,7 @@ def read_manifest(folder: Path) -> Manifest:
         raise RequestError(f"{FILE} cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
         raise RequestError(f"{FILE}: not valid TOML: {error}") from None
+    # Before the schema: keys of another version would be faults of this one.
     version = content.get("format", VERSION)
     if isinstance(version, int) and version != VERSION:
         raise RequestError(f"{FILE}: format is {version}; this version of vibench reads format {VERSION}")
@@ -249,6 +247,7 @@ def _check_parameters(given: Parameters) -> None:
     for name, low, high in zip(given.names, given.lower or (), given.upper or (), strict=False):
         if low > high:
             raise RequestError(f"parameters: the lower bound {low:g} of '{name}' is above its upper bound {high:g}")
+    # Neither has points from which a box could be taken.
     if given.lower is None and (given.training.grid is not None or given.validation is None):
         raise RequestError("parameters: a grid, or a random validation set, needs the box: give 'lower' and 'upper'")
 

@@ -1,6 +1,6 @@
 """Meshes in files of others, read by meshio in a process that has limits of memory and time.
 
-The process runs this module: `python -m vibench.packs.meshes FORMAT FILE BYTES SECONDS`, arrays on its output.
+The process runs this module: `python -m vibench.packs.meshes FORMAT FILE BYTES`, arrays on its output.
 """
 
 from __future__ import annotations
@@ -30,17 +30,11 @@ FORMATS = {
     ".obj": "obj",
 }  # fmt: skip
 
-# Seconds of the processor that reading a mesh may take.
-SECONDS = 60
-
 
 def format_of(path: Path) -> str:
     """The name that meshio has for the format of a file.
 
-    Raises
-    ------
-    RequestError
-        If it is not one of `FORMATS`.
+    Raises a `RequestError` if it is not one of `FORMATS`.
     """
     if (form := FORMATS.get(path.suffix.lower())) is None:
         raise RequestError(
@@ -54,15 +48,13 @@ def read_mesh(path: Path, limit: int) -> tuple[Array, Array]:
 
     The numbers of the triangles are of any type and any value.
 
-    Raises
-    ------
-    RequestError
-        If the format is not one of `FORMATS`, meshio is not installed, the file is damaged, or a limit is exceeded.
+    Raises a `RequestError` if the format is not one of `FORMATS`, meshio is not installed, the file is damaged, or a
+    limit is exceeded.
     """
     form = format_of(path)
     if importlib.util.find_spec("meshio") is None:
         raise RequestError("it needs meshio: pip install 'vibench[mesh]'")
-    command = [sys.executable, "-P", "-m", __name__, form, str(path.absolute()), str(limit), str(SECONDS)]
+    command = [sys.executable, "-P", "-m", __name__, form, str(path.absolute()), str(limit)]
     try:
         # A busy machine takes longer than the seconds of the processor; a process that sleeps ends, too.
         done = subprocess.run(
@@ -77,7 +69,7 @@ def read_mesh(path: Path, limit: int) -> tuple[Array, Array]:
     said = done.stderr.decode(errors="replace").strip().splitlines() or ["it is damaged"]
     why = {
         3: f"it takes more than the {limit / 2**30:.3g} GiB of memory that are allowed",
-        -signal.SIGXCPU: f"it takes more than {SECONDS} s",
+        -signal.SIGXCPU: "it takes more than 60 s",
     }
     raise RequestError(f"'{path.name}' cannot be read: {why.get(done.returncode, one_line(said[-1]))}")
 
@@ -91,8 +83,8 @@ def triangles_of(form: str, path: str) -> dict[str, np.ndarray]:
     return {"points": np.asarray(mesh.points, float)[:, :2], "triangles": corners}
 
 
-def main(out: BinaryIO, form: str, path: str, size: str, seconds: str) -> None:
-    """Read a mesh and write its arrays, within bytes of memory beyond those taken, and seconds of the processor."""
+def main(out: BinaryIO, form: str, path: str, size: str) -> None:
+    """Read a mesh and write its arrays, within bytes of memory beyond those taken, and a minute of the processor."""
     # Imported before the limit of memory, which is for the mesh.
     import xml.etree.ElementTree  # noqa: F401, PLC0415
 
@@ -100,7 +92,7 @@ def main(out: BinaryIO, form: str, path: str, size: str, seconds: str) -> None:
 
     statm = Path("/proc/self/statm")
     taken = int(statm.read_text().split()[0]) * resource.getpagesize() if statm.is_file() else 2**30
-    for limit, most in ((resource.RLIMIT_AS, taken + int(size)), (resource.RLIMIT_CPU, int(seconds))):
+    for limit, most in ((resource.RLIMIT_AS, taken + int(size)), (resource.RLIMIT_CPU, 60)):
         hard = resource.getrlimit(limit)[1]
         resource.setrlimit(limit, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
     try:

@@ -42,10 +42,7 @@ class Listing:
     def number(self, mu: Array) -> int:
         """Number of the listed parameter that equals mu (d,).
 
-        Raises
-        ------
-        NumericalError
-            If there is none.
+        Raises a `NumericalError` if there is none.
         """
         away = np.abs((self.parameters - mu) / self.widths).max(axis=1)
         nearest = int(away.argmin())
@@ -128,6 +125,7 @@ class PackMember:
 
     def mapped(self, change: Callable[[Any], Any]) -> PackMember:
         """The member with all its arrays changed."""
+        # Linear maps commute with the coefficients of a sum.
         return replace(self, arrays=tuple(map(change, self.arrays)))
 
     def __str__(self) -> str:
@@ -275,10 +273,7 @@ class ModelPack:
 def pack_multipliers(pack: ModelPack) -> tuple[Array, Array]:
     """The multipliers of a pack at training parameters (m×P), and the others (m×Q).
 
-    Raises
-    ------
-    RequestError
-        If it has none, or none at training parameters.
+    Raises a `RequestError` if it has none, or none at training parameters.
     """
     if pack.reference is None:
         raise RequestError("the pack has no multipliers; [solutions] lam would give them")
@@ -294,10 +289,7 @@ def pack_multipliers(pack: ModelPack) -> tuple[Array, Array]:
 def reduce_multipliers(pack: ModelPack, strategy: DualStrategy, tolerance: float) -> tuple[Cone, float | None]:
     """A cone of the multipliers at training parameters, and its largest error at others, relative to the largest norm.
 
-    Raises
-    ------
-    NumericalError
-        If the strategy fails, or what it returns is no cone.
+    Raises a `NumericalError` if the strategy fails, or what it returns is no cone.
     """
     training, others = pack_multipliers(pack)
     cone = check_cone(strategy.reduce(training, pack.W, Stop(tolerance=tolerance)), pack.W)

@@ -60,6 +60,7 @@ def _files(folder: Path, place: str, name: str, first: int) -> list[Path]:
     return files
 
 
+# Cached: a run computes the key of its problem in every process, and packs may be large.
 @lru_cache(maxsize=10_000)
 def _file_digest(path: Path, size: int, changed: int, inode: int) -> bytes:  # noqa: ARG001  the state is part of the key
     with path.open("rb") as file:
@@ -70,10 +71,7 @@ def _file_digest(path: Path, size: int, changed: int, inode: int) -> bytes:  # n
 def naming(path: str | Path) -> Iterator[Path]:
     """The folder of a pack; errors raised in the block name it.
 
-    Raises
-    ------
-    RequestError
-        If it is no folder.
+    Raises a `RequestError` if it is no folder.
     """
     if not os.path.isdir(path):  # noqa: PTH112  methods of Path raise OSError for names too long for a file
         raise RequestError(f"pack '{path}': there is no such folder")
@@ -99,6 +97,7 @@ class PackReader:
         solutions, mesh = self._manifest.solutions, self._manifest.mesh
         if operators is None and (solutions is None or spaces.free or mesh):
             raise RequestError("without the table [operators] a pack consists of [spaces] X_W and [solutions] lam")
+        # The dual half of a pack needs X_W alone.
         if operators is not None and spaces.X_V is None:
             raise RequestError("spaces.X_V: required with [operators], but not given")
         training, validation, box = self._domain(given)
@@ -113,16 +112,22 @@ class PackReader:
         if not all(member.everywhere for member in members.values()):
             _refuse_repeated(self._listing, "parameters.training and parameters.validation together")
             box = replace(box, listed=self._listed)
+        outputs = self._manifest.outputs
+        if outputs and not n:
+            raise RequestError("outputs need the table [operators]")
         return ModelPack(
             self._manifest, box, training, validation, V, W, members, self._contact(members, n),
             None if spaces.integrals is None else self._vector(spaces.integrals, "spaces.integrals", m),
             None if solutions is None else self._reference(solutions, n, m),
             None if mesh is None else self._mesh(mesh, n, m),
-            tuple(self._output(k, output, n, m) for k, output in enumerate(self._manifest.outputs)),
+            tuple(Output(
+                one.name, one.unit,
+                None if one.u is None else self._kept(self._vector(one.u, f"outputs.{k}.u", self._all)),
+                None if one.lam is None else self._vector(one.lam, f"outputs.{k}.lam", m),
+            ) for k, one in enumerate(outputs)),
         )  # fmt: skip
 
     def _domain(self, given: schema.Parameters) -> tuple[Array, Array | None, ParameterBox]:
-        """The training and the validation set, and the box."""
         units = tuple(given.units or ["1"] * len(self._names))
         if given.lower is not None:
             self._box = ParameterBox(self._names, np.array(given.lower), np.array(given.upper), units)
@@ -182,6 +187,7 @@ class PackReader:
         try:
             return InnerProduct(X, f"spaces.{name}")
         except NumericalError as error:
+            # Constants are in the kernel of a seminorm.
             constants = np.abs(X @ np.ones(rows)).max(initial=0.0) <= 1e-10 * np.abs(X.data).max(initial=0.0)
             hint = "; it is the product of a seminorm, without the L² part" if constants and X.nnz else ""
             raise RequestError(f"{error}{hint}") from None
@@ -221,7 +227,6 @@ class PackReader:
         return PackMember(tuple(values), listing=self._listing)
 
     def _restricted(self, name: str, member: Any) -> Any:
-        """A member of all unknowns on the free ones."""
         if name == "B":
             return sp.csr_array(member)[:, self._free]
         return member[self._free] if name == "f" else sp.csr_array(member)[self._free][:, self._free]
@@ -273,13 +278,6 @@ class PackReader:
             u = self._kept(self._columns(given.u, "solutions.u", self._all, count))
         return PackSolutions(mus, u, lam, given.tolerance)
 
-    def _output(self, number: int, given: schema.LinearOutput, n: int, m: int) -> Output:
-        if not n:
-            raise RequestError("outputs need the table [operators]")
-        u = None if given.u is None else self._kept(self._vector(given.u, f"outputs.{number}.u", self._all))
-        lam = None if given.lam is None else self._vector(given.lam, f"outputs.{number}.lam", m)
-        return Output(given.name, given.unit, u, lam)
-
     def _mesh(self, given: schema.Mesh, n: int, m: int) -> PackMesh:
         try:
             points, triangles = read_mesh(safe_path(self._folder, given.file), self._files.left)
@@ -289,24 +287,22 @@ class PackReader:
         self._files.take(2 * (points.nbytes + triangles.nbytes))  # as they are read, and as they are kept
         corners = whole(triangles, f"mesh.file: the triangles of '{given.file}'", 0, points.shape[1] - 1)
         drawn = self._files.indices(given.points, "mesh.points", points.shape[1])
-        unknowns = np.arange(n) if given.unknowns is None else self._unknowns(given.unknowns)
+        unknowns = np.arange(n)
+        if given.unknowns is not None:
+            unknowns = self._files.indices(given.unknowns, "mesh.unknowns", self._all)
+            if self._free is not None:
+                # The files number all unknowns, the pack the free ones.
+                number = np.full(self._all, -1)
+                number[self._free] = np.arange(len(self._free))
+                unknowns = number[unknowns]
+                if np.any(unknowns < 0):
+                    raise RequestError("mesh.unknowns names an unknown that is not free")
         self._expect("mesh.points", drawn, (len(unknowns),))
         positions = self._files.dense(given.positions, "mesh.positions")
         positions = positions[:, None] if positions.ndim == 1 else positions
         if positions.shape not in ((m, 1), (m, 2)):
             raise RequestError(f"mesh.positions: an array {size_of(positions.shape)}; expected {m}×1 or {m}×2")
         return PackMesh(points, corners.reshape(-1, 3).T, drawn, unknowns, positions.T, given.value, given.multiplier)
-
-    def _unknowns(self, reference: str) -> Indices:
-        """Unknowns of the pack that are named by their numbers in the files."""
-        named = self._files.indices(reference, "mesh.unknowns", self._all)
-        if self._free is None:
-            return named
-        number = np.full(self._all, -1)
-        number[self._free] = np.arange(len(self._free))
-        if np.any(number[named] < 0):
-            raise RequestError("mesh.unknowns names an unknown that is not free")
-        return number[named]
 
     def _kept(self, values: Array) -> Array:
         """Values (N, …) of all unknowns of the files at the free ones (n, …)."""

@@ -16,7 +16,6 @@ import scipy.sparse as sp
 from vibench.arrays import Array
 from vibench.errors import RequestError
 from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.problem import MEMBERS, Problem
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
 from vibench.packs.manifest import FILE, VERSION
@@ -53,9 +52,25 @@ def write_pack(
     listed = np.vstack([training, validation_parameters(problem, validation, seed)])
     with _new_folder(folder) as part:
         lines = [f"format = {VERSION}", f"name = {_toml_text(name)}", f"source = {_toml_text(source)}", ""]
-        lines += _parameter_table(problem, len(training), listed, part) + _space_table(problem, part)
-        lines += _operator_table(problem, listed, part)
-        lines += _solution_table(problem, listed, part) if solutions else []
+        box = problem.parameters
+        _save_arrays(part / "parameters.npz", training=training, validation=listed[len(training) :])
+        lines += [
+            "[parameters]",
+            f"names = [{', '.join(map(_toml_text, box.names))}]",
+            f"units = [{', '.join(map(_toml_text, box.units))}]",
+            f"lower = {box.lower.tolist()}",
+            f"upper = {box.upper.tolist()}",
+            'training = "parameters.npz:training"',
+            'validation = "parameters.npz:validation"',
+            "",
+        ]
+        lines += _space_table(problem, part) + _operator_table(problem, listed, part)
+        if solutions:
+            solver = HighFidelitySolver(problem)
+            exact = [solver.solve(mu) for mu in listed]
+            u, lam = (np.column_stack([getattr(one, name) for one in exact]) for name in ("u", "lam"))
+            _save_arrays(part / "solutions.npz", u=u, lam=lam)
+            lines += ["[solutions]", 'u = "solutions.npz:u"', 'lam = "solutions.npz:lam"', ""]
         lines += _output_tables(problem, part)
         explanation = (
             "# u = argmin ½ uᵀA u − fᵀu subject to B u ≤ g, with A u + Bᵀλ = f and λ ≥ 0, on the free unknowns.\n"
@@ -75,22 +90,8 @@ def _new_folder(folder: Path) -> Iterator[Path]:
         part = Path(temporary) / "pack"
         part.mkdir()
         yield part
+        # At once: a folder of this name is complete, whenever the program stops.
         part.rename(folder)
-
-
-def _parameter_table(problem: Problem, training: int, listed: Array, part: Path) -> list[str]:
-    box = problem.parameters
-    _save_arrays(part / "parameters.npz", training=listed[:training], validation=listed[training:])
-    return [
-        "[parameters]",
-        f"names = [{', '.join(map(_toml_text, box.names))}]",
-        f"units = [{', '.join(map(_toml_text, box.units))}]",
-        f"lower = {box.lower.tolist()}",
-        f"upper = {box.upper.tolist()}",
-        'training = "parameters.npz:training"',
-        'validation = "parameters.npz:validation"',
-        "",
-    ]
 
 
 def _space_table(problem: Problem, part: Path) -> list[str]:
@@ -107,8 +108,8 @@ def _space_table(problem: Problem, part: Path) -> list[str]:
 
 
 def _operator_table(problem: Problem, listed: Array, part: Path) -> list[str]:
-    """The table of the members, whose arrays are written."""
     arrays: dict[str, dict[str, Any]] = {name: {} for name in MEMBERS}
+    # Without other members one assembly has all that is written.
     varies = not set(MEMBERS) <= {*problem.constant, *problem.affine}
     for k, mu in enumerate(listed if varies else listed[:1]):
         vi = checked_assembly(problem, mu)
@@ -119,31 +120,20 @@ def _operator_table(problem: Problem, listed: Array, part: Path) -> list[str]:
     lines = ["[operators]", f"entrywise = [{', '.join(map(_toml_text, entrywise))}]"]
     for name in MEMBERS:
         if name in problem.affine:
-            arrays[name], line = _affine(name, problem.affine[name], listed)
+            # Its terms, and its coefficients at the listed parameters: functions have no place in a pack.
+            declared = problem.affine[name]
+            theta = np.column_stack([declared.coefficients(mu) for mu in listed])
+            arrays[name] = {f"theta{q}": values for q, values in enumerate(theta)}
+            for q, term in enumerate(declared.terms):
+                arrays[name] |= _parts(f"term{q}", term)
+            entries = (f'{{ table = "{name}.npz:theta{q}", array = "{name}.npz:term{q}" }}' for q in range(len(theta)))
+            line = f"{name}.affine = [{', '.join(entries)}]"
         else:
             constant = name in problem.constant
             line = f'{name} = "{name}.npz:0"' if constant else f'{name}.each = "{name}.npz:{{}}"'
         _save_arrays(part / f"{name}.npz", **arrays[name])
         lines.append(line)
     return [*lines, ""]
-
-
-def _affine(name: str, declared: AffineSum, listed: Array) -> tuple[dict[str, Any], str]:
-    """Arrays and entry of an affine sum: its terms, and its coefficients at the listed parameters."""
-    theta = np.column_stack([declared.coefficients(mu) for mu in listed])
-    arrays: dict[str, Any] = {f"theta{q}": values for q, values in enumerate(theta)}
-    for q, term in enumerate(declared.terms):
-        arrays |= _parts(f"term{q}", term)
-    entries = (f'{{ table = "{name}.npz:theta{q}", array = "{name}.npz:term{q}" }}' for q in range(len(theta)))
-    return arrays, f"{name}.affine = [{', '.join(entries)}]"
-
-
-def _solution_table(problem: Problem, listed: Array, part: Path) -> list[str]:
-    solver = HighFidelitySolver(problem)
-    exact = [solver.solve(mu) for mu in listed]
-    u, lam = (np.column_stack([getattr(one, name) for one in exact]) for name in ("u", "lam"))
-    _save_arrays(part / "solutions.npz", u=u, lam=lam)
-    return ["[solutions]", 'u = "solutions.npz:u"', 'lam = "solutions.npz:lam"', ""]
 
 
 def _output_tables(problem: Problem, part: Path) -> list[str]:

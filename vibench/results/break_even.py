@@ -158,7 +158,6 @@ class _Groups:
 
 
 def _shared_axes() -> tuple[str, ...]:
-    """Columns of a cell that both models of a comparison have in common."""
     return tuple(name for name in STORED["thresholds"] if name in KEYS)
 
 
@@ -278,6 +277,5 @@ def _row(one: BreakEvenComparison) -> dict[str, Any]:
 
 
 def _high_fidelity(b: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The high-fidelity model beside a cell, as a cell."""
     model = {"primal": HIGH_FIDELITY, "formulation": default_formulation(), "assembly": ""}
     return {**b, **model, **dict.fromkeys(("cell", "primal_tol", "bounds")), "offline_s": b["hf_setup_s"]}

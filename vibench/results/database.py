@@ -89,7 +89,6 @@ def stored(column: Column, value: Any) -> Any:
 
 
 def _history_axes() -> list[str]:
-    """Columns that identify a history."""
     return [name for name in STORED["histories"] if name not in ("artefact", "step", "value")]
 
 
@@ -178,7 +177,6 @@ class ResultsDatabase:
         return self._db.execute("PRAGMA integrity_check(1)").fetchall() == [("ok",)]
 
     def _remove(self, cell: str) -> None:
-        """Remove all rows of a cell."""
         for table in (name for name, columns in STORED.items() if "cell" in columns):
             self._db.execute(f"DELETE FROM {table} WHERE cell = ?", (cell,))
         self._digests.forget(cell=cell)

@@ -88,7 +88,6 @@ def to_latex_text(text: str) -> str:
 
 
 def _as_text(frame: pd.DataFrame, escape: Callable[[str], str]) -> pd.DataFrame:
-    """The table as it is printed, special characters escaped and line breaks removed."""
     rows = [[escape(unbroken(cell_text(value))) for value in row] for row in frame.itertuples(index=False)]
     return pd.DataFrame(rows, columns=[escape(unbroken(str(name))) for name in frame.columns])
 
@@ -184,7 +183,6 @@ def between_formulations(break_even_rows: pd.DataFrame) -> pd.Series:
 
 
 def _for_reading(frame: pd.DataFrame, table: Mapping[str, Column]) -> pd.DataFrame:
-    """The columns that have a heading, under it; some only where they say something."""
     return under_headings(frame, [name for name in shown_columns(table) if says_something(frame, name)], table)
 
 

@@ -422,10 +422,7 @@ def cheapest(
     certified
         Bounds of the mean errors, by cell.
 
-    Raises
-    ------
-    RequestError
-        If the number of queries or the error is not positive.
+    Raises a `RequestError` if the number of queries or the error is not positive.
     """
     for what, value in (("number of queries", queries), ("largest error", within)):
         if value is not None and not 0.0 < value < math.inf:
@@ -475,7 +472,6 @@ def candidates(cells: pd.DataFrame, paired: PairedTiming) -> Iterator[Candidate]
 
 
 def _winner(every: Sequence[Candidate], paired: PairedTiming, queries: float) -> dict[str, Any]:
-    """The row of the cheapest model with the columns that `cheapest_columns` adds."""
     totals = np.array([one.offline + queries * one.online for one in every])
     drawn = np.array([one.offline_draws + queries * one.online_draws for one in every])
     first = int(np.argmin(totals))

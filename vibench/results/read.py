@@ -77,7 +77,6 @@ def checked(path: Path, table: str, part: Part) -> Part:
 
 
 def _expected(column: Column, name: str) -> tuple[Callable[[object], bool], str]:
-    """Check of the values of a column, and its description."""
     if column.kind.is_number:
         return lambda value: isinstance(value, float | int), "a number"
     if name == "meaning":
@@ -97,7 +96,6 @@ def cells_with_errors(path: Path, measure: str = "solution") -> tuple[pd.DataFra
 
 
 def _order(names: Collection[str]) -> list[str]:
-    """Those of the columns with these names by which rows are sorted."""
     order = (
         *KEYS, "formulation_a", "formulation_b", "primal_a", "primal_b", "primal_tol_a", "primal_tol_b", "assembly_a",
         "bounds_a", "assembly_b", "bounds_b", "stage", "quantity", "query", "step",
@@ -132,7 +130,6 @@ def terms_in_order(names: Collection[str]) -> list[str]:
 
 
 def _rises(name: str) -> bool:
-    """Whether the smallest value of a column comes first."""
     return "_tol" not in name
 
 

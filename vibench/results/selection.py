@@ -111,7 +111,6 @@ def _answers(
 
 
 def _text_free(expression: str) -> str:
-    """An expression with its quoted texts emptied."""
     return re.sub(r"'(?:[^']|'')*'", "''", expression)
 
 

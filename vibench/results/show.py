@@ -179,7 +179,6 @@ class Table:
 
     @property
     def _placed(self) -> list[str]:
-        """The columns in their places, or in the order in which they were asked for."""
         headings = self.view.headings
         order = list(headings or self.rows.columns)
         by_place = sorted(
@@ -354,7 +353,6 @@ def _measured(
 
 
 def _best(path: Path, view: View, error: str, largest: float | None, queries: float | None) -> View:
-    """The table of the fastest query at every error, or with a number of queries of the cheapest model."""
     if queries is None and largest is not None:
         raise RequestError("--within is for tables of break-even points, and for the table best with --queries")
     errors = cells_with_errors(path, error)[1] if error else None
@@ -390,7 +388,6 @@ def export(path: Path, folder: Path) -> list[Path]:
 
 
 def _csv_parts(path: Path, table: str) -> Iterator[str]:
-    """A table as CSV, in the order of `in_order`, part by part."""
     header = True
     for part in read_parts(path, table, order=terms_in_order(STORED[table])):
         names, rows = checked(path, table, part)

@@ -113,7 +113,6 @@ def of_cells(cells: Sequence[str]) -> str:
 
 
 def _totals(names: Sequence[str], rows: Iterable[tuple[Any, ...]]) -> dict[Any, int]:
-    """Sum over the rows of each cell."""
     at, totals = (names.index("cell") if "cell" in names else None), dict[Any, int]()
     for cell, group in groupby(rows, key=(lambda row: row[at]) if at is not None else lambda _: ""):
         totals[cell] = totals.get(cell, 0) + sum(map(_digest, group))
