@@ -20,11 +20,10 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct, svd
 from vibench.qp.scaling import ratio
 
+# tolerance of empirical interpolation where none is given
 INTERPOLATION_RTOL = 1e-6
-"""Tolerance of empirical interpolation where none is given."""
-
+# interpolation errors at parameters outside the training set above this multiple of the tolerance are reported
 MISSED = 10.0
-"""Interpolation errors at parameters outside the training set above this multiple of the tolerance are reported."""
 
 
 class Evaluation(StrEnum):
@@ -179,19 +178,10 @@ def decomposed(
 ) -> AffineMember:
     """The decomposition of a member of which nothing is declared, from its values at the training parameters.
 
-    Parameters
-    ----------
-    name
-        "A", "f", "B" or "g".
-    values
-        The member at every training parameter.
-    V
-        Inner product of the primal space. Unknowns are measured in units of the norms of their basis functions, rows of
-        B and g by their largest entry, so that neither the scaling of an unknown nor that of a constraint matters.
-    tolerance
-        Largest relative interpolation error there.
-    entrywise, contact
-        Whether the problem evaluates the member entry by entry, and whether it has `Problem.contact`.
+    Unknowns are measured in units of the norms of their basis functions in V, rows of B and g by their largest entry,
+    so that neither the scaling of an unknown nor that of a constraint matters. `tolerance` is the largest relative
+    interpolation error there. `entrywise` tells whether the problem evaluates the member entry by entry, `contact`
+    whether it has `Problem.contact`.
     """
     if name == "g" and (sometimes := np.any([is_absent(g) ^ is_absent(values[0]) for g in values], axis=0)).any():
         reason = f"row {int(np.argmax(sometimes))} of g is infinite at some parameters and not at others"

@@ -48,21 +48,9 @@ class Representer:
 class ContactForm:
     """The constraints and the energy norm of one parameter on the c retained unknowns.
 
-    Parameters
-    ----------
-    vi
-        A, f, B and g at the parameter.
-    stiffness
-        Its A, condensed on unknowns that include those that B touches.
-    shared
-        Whether bounds of many pairs share D and K.
-
-    Attributes
-    ----------
-    B, sizes
-        B on the retained unknowns and its absolute values, sparse (m×c).
-    is_dense
-        Whether D and K are computed.
+    `stiffness` is A, condensed on unknowns that include those that B touches. `shared` tells whether bounds of many
+    pairs share D and K, `is_dense` whether these are computed. `B` and `sizes` are B on the retained unknowns and its
+    absolute values, sparse (m×c).
     """
 
     def __init__(self, vi: VariationalInequality, stiffness: CondensedStiffness, *, shared: bool) -> None:

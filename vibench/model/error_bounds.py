@@ -43,8 +43,8 @@ from vibench.qp.exact import Rows, least_distance_solution, rows_that_matter
 from vibench.qp.scaling import ratio
 from vibench.stability.coercivity import Constant, Stability
 
+# largest error bound of a high-fidelity solution, relative to it in the energy norms
 REFERENCE = 1e-6
-"""Largest error bound of a high-fidelity solution, relative to it in the energy norms."""
 
 
 @dataclass(frozen=True)
@@ -306,16 +306,9 @@ def _constrained_terms(correction: Correction, u: Array, lam: Array, riesz: Repr
 def find_correction(
     vi: VariationalInequality, energy: EnergyNorm, u: Array, lam: Array, pressed: Mask | None = None
 ) -> Correction | None:
-    """Find a correction of s = B u − g that is close to the best one; `None` if none was found.
+    """Find a correction of u_N (n,) and λ_N ≥ 0 (m,) that is close to the best one; `None` if none was found.
 
-    Parameters
-    ----------
-    vi, energy
-        A, f, B and g at one parameter, and the factorisations of A.
-    u, lam
-        u_N (n,) and λ_N ≥ 0 (m,).
-    pressed
-        Rows (m,) where active sets start; those that λ_N presses by default.
+    Active sets start at the rows `pressed` (m,), by default those that λ_N presses.
     """
     contact = energy.contact_form(vi)
     u = contact.values(u)

@@ -27,10 +27,9 @@ from vibench.qp.verification import Residuals, accurate_residuals, round_off_of_
 
 T = TypeVar("T")
 
+# Relative errors below, and solutions below this fraction of the largest training solution, are treated as zero:
+# high-fidelity solutions have residuals up to 1e-10, so that either may be an error of theirs.
 UNMEASURABLE = 1e-8
-"""Relative errors below, and solutions below this fraction of the largest training solution, are treated as zero.
-
-High-fidelity solutions have residuals up to 1e-10, so that either may be an error of theirs."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +181,7 @@ class Errors:
 
 
 def zeros(problem: Problem, reference: ReferenceSolutions) -> tuple[Mask, Mask]:
-    """Which u (P,) and λ (P,) are zero on the scale of the training set: at most `UNMEASURABLE` of its largest norm.
+    """Masks of u (P,) and λ (P,) that are zero: at most `UNMEASURABLE` of the largest norm over the training set.
 
     Without contact λ is zero, and u too where there is no load; a relative error would divide round-off by round-off.
     """
@@ -228,8 +227,8 @@ def errors(
     return rows
 
 
+# an output of one query: name and unit, `value`, `reference`, `error` (relative, `None` for a zero) and `scaled`
 OutputErrors = dict[str, Any]
-"""An output of one query: name and unit, `value`, `reference`, `error` (relative, `None` for a zero) and `scaled`."""
 
 
 def output_scales(outputs: Sequence[Output], mus: Array, u: Array, lam: Array) -> tuple[float, ...]:

@@ -107,14 +107,8 @@ class OnlineBound:
 class OnlineCorrection:
     """The corrected pair v = u_N − w and ν of one reduced solution.
 
-    Attributes
-    ----------
-    load
-        c (k,) on the contact unknowns E, w = X⁻¹ E c.
-    nu
-        ν ≥ 0 (m,).
-    bound
-        Its bounds. ω is zero in them, ρ the norm of its residual, and κ is νᵀ(B w − s).
+    `load` is c (k,) on the contact unknowns E, w = X⁻¹ E c, and `nu` is ν ≥ 0 (m,). In its bounds ω is zero, ρ the norm
+    of its residual, and κ is νᵀ(B w − s).
     """
 
     load: Array

@@ -182,14 +182,9 @@ class ContactCorrection:
 
 @dataclass(frozen=True)
 class ContactCompliance:
-    """The compliance C on all contact unknowns, and on those that corrections usually involve.
+    """The compliance C (k×k) on all contact unknowns, and on those that corrections usually involve.
 
-    Attributes
-    ----------
-    matrix
-        C (k×k).
-    near
-        Positions (l,) of the contact unknowns that rows near the support of the generators touch, rising.
+    These are `near`: positions (l,), rising, of the unknowns that rows near the support of the generators touch.
     """
 
     matrix: Array

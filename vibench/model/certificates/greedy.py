@@ -74,14 +74,9 @@ class ErrorEstimate:
 
 
 class ContactEstimates:
-    """Estimates of the bounds of one incremental model.
+    """Estimates of the bounds of one incremental model, of a problem that `supports` them.
 
-    Parameters
-    ----------
-    problem
-        One that `supports` estimates.
-    vi, stiffness
-        The variational inequality of the first solution, and its A as a high-fidelity solver condensed it.
+    `vi` is the inequality of the first solution, `stiffness` its A as a high-fidelity solver condensed it.
     """
 
     def __init__(self, problem: Problem, vi: VariationalInequality, stiffness: CondensedStiffness) -> None:
@@ -120,7 +115,9 @@ class ContactEstimates:
         self._sizes = np.linalg.norm(self._at_contact, axis=1)
         self._stiffness, self._loads = self._grown(self._stiffness, self._A, self._f)
         touches = abs(sp.csr_array(vi.B)[:, self._dofs]) > 0.0
-        near = self._near | self._next_to(touches)
+        rows = np.any(generators > 0.0, axis=1)
+        # contact unknowns in rows of the support of a generator, or in rows that touch one of these
+        near = self._near | np.asarray(touches.T @ (touches @ (touches.T @ rows)), bool)
         if np.any(near & ~self._near):
             self._near = near
             self._compliance = ContactCompliance(self._compliance.matrix, np.flatnonzero(near))
@@ -136,11 +133,6 @@ class ContactEstimates:
         grown[:size, :size], grown[:, size:], grown[size:] = projected, new, new.T
         grown[size:, size:] = 0.5 * (new[size:] + new[size:].T)
         return grown, products[:, -1]
-
-    def _next_to(self, touches: Mask) -> Mask:
-        """Contact unknowns (k,) in rows of the support of a generator, or in rows that touch one of these."""
-        rows = np.any(self._generators > 0.0, axis=1)
-        return np.asarray(touches.T @ (touches @ (touches.T @ rows)), bool)
 
     def estimate(self, mu: Array) -> ErrorEstimate:
         """The estimate at mu (d,); infinite where the reduced program has no solution, or no correction was found."""

@@ -145,7 +145,11 @@ def residual_basis(
     # Of many terms those are dropped that add up to 5 % of the typical norm. Few cost little: there 0.3 %, as what
     # they contribute elsewhere may be larger than in the samples.
     fraction = 0.05 if np.count_nonzero(scale) > 1000 else 0.003
-    kept = _worth_keeping(norms * scale, norms * sizes.mean(axis=1), fraction * typical)
+    largest, mean = norms * scale, norms * sizes.mean(axis=1)
+    order, keep = np.argsort(mean), np.ones(len(mean), bool)
+    keep[order[np.cumsum(mean[order]) <= fraction * typical]] = False
+    # contributions below 1e-12 of the largest one are round-off of the others
+    kept = np.flatnonzero(keep & (largest > 1e-12 * largest.max(initial=0.0)))
     pairs = zip(blocks, ranges, strict=True)
     R = np.hstack([block.columns(kept[(kept >= a) & (kept < b)] - a) for block, (a, b) in pairs])
     if last is not None:
@@ -172,18 +176,6 @@ def _with_fewer_rows(R: Array, last: int) -> Array:
     return np.vstack([few, last_rows])
 
 
-def _worth_keeping(largest: Array, mean: Array, allowed: float) -> Indices:
-    """Positions of the terms to keep, rising: the others contribute `allowed` at most on average.
-
-    Contributions below 1e-12 of the largest one are round-off of the others.
-    """
-    order = np.argsort(mean)
-    dropped = np.cumsum(mean[order]) <= allowed
-    keep = np.ones(len(mean), bool)
-    keep[order[dropped]] = False
-    return np.flatnonzero(keep & (largest > 1e-12 * largest.max(initial=0.0)))
-
-
 def _directions(R: Array, scale: Array, allowed: float) -> tuple[Array, float]:
     """Orthonormal basis (n×K) of S = R D (n×p), D = diag(`scale`), up to a remainder, and a bound of its norm.
 
@@ -193,7 +185,7 @@ def _directions(R: Array, scale: Array, allowed: float) -> tuple[Array, float]:
     count, rest = R.shape[1], 0.0
     # A decomposition of so many terms would cost more than a randomised one, with 100 directions to spare.
     if count > 1000:
-        randomised = _random_range(R, scale, allowed, limit=900, block=100)  # 100 directions more than are used
+        randomised = _random_range(R, scale, allowed, limit=900, block=100)
         if randomised is None:
             return np.linalg.qr(R * scale)[0], 0.0
         Q, small, rest = randomised

@@ -18,10 +18,12 @@ from vibench.model.certificates.contact_correction import (
 )
 
 K, M = 7, 6
+EVERY = np.arange(K)
+Program = tuple[np.ndarray, Contact, np.ndarray, np.ndarray, float]
 
 
 @st.composite
-def programs(draw: st.DrawFn) -> tuple[np.ndarray, Contact, np.ndarray, np.ndarray, float]:
+def programs(draw: st.DrawFn) -> Program:
     """C, B and g, u_N and λ ≥ 0 with zeros, γ; rows may be the same, and u_N is feasible in some of them."""
     rng = np.random.default_rng(draw(st.integers(0, 10_000)))
     B = rng.standard_normal((M, K)) * (rng.random((M, K)) < 0.7)
@@ -33,13 +35,9 @@ def programs(draw: st.DrawFn) -> tuple[np.ndarray, Contact, np.ndarray, np.ndarr
     return np.linalg.inv(spd(K, rng, 100.0)), Contact(sp.csr_array(B), g), u, lam, draw(st.sampled_from([1.0, 2.5]))
 
 
-def corrected(
-    given: tuple[np.ndarray, Contact, np.ndarray, np.ndarray, float], near: np.ndarray | None = None
-) -> ContactCorrection | None:
+def corrected(given: Program, near: np.ndarray = EVERY) -> ContactCorrection | None:
     C, contact, u, lam, gamma = given
-    return find_contact_correction(
-        ContactCompliance(C, np.arange(K) if near is None else near), contact, u, np.zeros(K), lam, gamma
-    )
+    return find_contact_correction(ContactCompliance(C, near), contact, u, np.zeros(K), lam, gamma)
 
 
 def values(C: np.ndarray, found: ContactCorrection) -> np.ndarray:
@@ -49,9 +47,7 @@ def values(C: np.ndarray, found: ContactCorrection) -> np.ndarray:
 
 
 @given(programs())
-def test_corrections_are_feasible_also_in_exact_arithmetic_and_close_to_the_best_one(
-    given: tuple[np.ndarray, Contact, np.ndarray, np.ndarray, float],
-) -> None:
+def test_corrections_are_feasible_also_in_exact_arithmetic_and_close_to_the_best_one(given: Program) -> None:
     C, contact, u, lam, gamma = given
     found = corrected(given)
     if found is None:  # opposite rows: round-off decides
@@ -82,7 +78,7 @@ def test_no_random_program_is_without_a_correction() -> None:
         assert corrected((np.linalg.inv(spd(K, rng, 100.0)), contact, u, lam, 1.0)) is not None
 
 
-def chain(far: float) -> tuple[np.ndarray, Contact, np.ndarray, np.ndarray, float]:
+def chain(far: float) -> Program:
     """Two rows on two unknowns each, coupled by C; the first one is violated by 1."""
     C = np.eye(K) + 0.5
     B = sp.csr_array(np.array([[-1.0, -1.0, 0, 0, 0, 0, 0], [0, 0, 0, -1.0, 1.0, 0, 0]]))
