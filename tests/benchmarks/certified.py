@@ -44,7 +44,7 @@ from vibench.offline.correction import Answer, Corrector
 from vibench.offline.models import Model
 from vibench.plugins.plugin import Plugin
 from vibench.qp.solve import solve_qp
-from vibench.stages.assessment import VIOLATION
+from vibench.stages.assessment import is_violated
 
 SEED = 2027
 
@@ -100,7 +100,7 @@ class Tally:
         for which, answer in answers.items():
             if (bound := answer.bound) is not None:
                 above = zip(errors[which], (bound.u_energy, bound.lambda_natural, bound.lam), sizes, strict=True)
-                self.violations += any(not error <= limit + VIOLATION * size for error, limit, size in above)
+                self.violations += any(is_violated(error, limit, size) for error, limit, size in above)
         if (bound := answers["reduced"].bound) is not None:
             self.effectivities.append(
                 (bound.u_energy / errors["reduced"][0], bound.lambda_natural / errors["reduced"][1])
@@ -314,7 +314,7 @@ def meshes(count: int) -> int:
             )
             limits = bounds[0].u_energy, bounds[0].lambda_natural
             size = energy.norm(u)
-            violations += any(not e <= b + VIOLATION * size for e, b in zip(errors, limits, strict=True))
+            violations += any(is_violated(e, b, size) for e, b in zip(errors, limits, strict=True))
             effectivities.append([b / e for e, b in zip(errors, limits, strict=True)])
     query, first, again = np.median(seconds, axis=2).T
     sizes = [problem.V.dim for problem, *_ in found]

@@ -25,7 +25,7 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.model.error_bounds import bound_errors_at, corrected_pair
 from vibench.offline.assemblies import assemblies
 from vibench.stability.coercivity import coercivity_and_continuity, energy_inf_sup
-from vibench.stages.assessment import VIOLATION
+from vibench.stages.assessment import is_violated
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 from decimals import difference, exact_decimal
@@ -116,7 +116,7 @@ def certified(problem: Problem, count: int) -> Iterator[str]:
     for which, rows in found.items():
         bound, error, size = np.array(rows).T
         has = np.isfinite(bound)
-        violated = has & ~(error <= bound + VIOLATION * size)
+        violated = has & is_violated(error, bound, size)
         measurable = has & (error > 1e-8 * size)
         of = bound[measurable] / error[measurable]
         spread = " ".join(f"{value:9.3g}" for value in np.percentile(of, [0, 50, 100])) if len(of) else "none"

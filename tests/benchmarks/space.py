@@ -27,7 +27,7 @@ import vibench
 from vibench.offline.assemblies import Assemblies
 from vibench.offline.reduction import high_fidelity_sweep
 from vibench.qp.solve import solve_qp
-from vibench.stages.assessment import VIOLATION
+from vibench.stages.assessment import is_violated
 
 TRAINING, SIZE, UNTIMED = (2, 2, 2, 3), 14, 20
 
@@ -101,7 +101,7 @@ def unseen(resolution: str, count: str = "1000") -> int:
             assert found.bound is not None
             errors = energy.norm(exact.u - found.u), on.force_representer(exact.lam - found.lam).norm
             bounds = found.bound.u_energy, found.bound.lambda_natural
-            violations[name] += any(e > b + VIOLATION * size for e, b in zip(errors, bounds, strict=True))
+            violations[name] += any(is_violated(e, b, size) for e, b in zip(errors, bounds, strict=True))
             row.append([b / e for e, b in zip(errors, bounds, strict=True)])
         every.append(row)
     medians, largest = np.median(every, axis=0), np.max(every, axis=0)

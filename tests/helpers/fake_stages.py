@@ -18,7 +18,7 @@ from forking import SUPERVISOR
 
 from vibench.plugins.plugin import Plugin
 from vibench.stages.artefacts import Store
-from vibench.stages.base import SHARE, Failed, Items, ItemwiseStage, Result, Stage, TimeLimit
+from vibench.stages.base import PROGRESS, Failed, Items, ItemwiseStage, Result, Stage, TimeLimit
 from vibench.timing import Seconds
 
 
@@ -38,7 +38,7 @@ def misbehave(how: str) -> None:
     elif how == "hunger":
         np.ones(2**36)
     elif how == "third":
-        SHARE.get()(1.0 / 3.0)
+        PROGRESS.get()(1.0 / 3.0)
     elif how == "moment":
         time.sleep(0.05)
     else:

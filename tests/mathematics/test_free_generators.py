@@ -26,7 +26,7 @@ from vibench.results.consistency import violations
 from vibench.results.schema import STORED
 from vibench.stability.infsup import cone_basis, inf_sup
 from vibench.stages.base import value_of
-from vibench.stages.cell_stage import CellRows
+from vibench.stages.cell_queries import CellRows
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.study.parameter_sets import ParameterSet

@@ -19,7 +19,7 @@ from transformed import Transformed
 from vibench.interfaces.strategies import Stop
 from vibench.plugins.plugin import Plugin
 from vibench.stages.base import value_of
-from vibench.stages.cell_stage import CellRows
+from vibench.stages.cell_queries import CellRows
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.study.parameter_sets import ParameterSet

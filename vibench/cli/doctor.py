@@ -35,7 +35,7 @@ from vibench.plugins.registry import RegisteredPlugin, find, registered, unreada
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
-from vibench.stages.artefacts import CACHE_VARIABLE, LOCK, Store, default_folder
+from vibench.stages.artefacts import CACHE_VARIABLE, Store, default_folder
 from vibench.study.matrix import read_study
 from vibench.text import new_console
 from vibench.timing import DISTURBED, Calibration, Stopwatch
@@ -221,7 +221,7 @@ def _folder(subject: str, folder: Path) -> Diagnosis:
         free = shutil.disk_usage(existing).free / 2**30
         with (
             tempfile.TemporaryDirectory(dir=existing, prefix=".vibench-") as scratch,
-            locked(Path(scratch, LOCK), busy="a new lock is already held"),
+            locked(Store(Path(scratch)).lock, busy="a new lock is already held"),
             closing(sqlite3.connect(Path(scratch, "trial.sqlite"))) as db,
         ):
             mode = db.execute("PRAGMA journal_mode=WAL").fetchone()[0]

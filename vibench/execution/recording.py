@@ -29,8 +29,8 @@ from vibench.results.sqlite import (
 )
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Row, Stage, value_of
-from vibench.stages.cell_stage import CellRows
-from vibench.stages.timed_seconds import TimedRound, seconds_of_cell, seconds_of_queries
+from vibench.stages.cell_queries import CellRows
+from vibench.stages.timing_rounds import TimedRound, seconds_of_cell, seconds_of_queries
 from vibench.study.cells import NO_SUCH_AXIS, Axes, Cell, digest
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.spec import Limits, Study

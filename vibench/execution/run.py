@@ -36,10 +36,9 @@ from vibench.results.consistency import disagreement_rows
 from vibench.results.database import ResultsDatabase
 from vibench.stages.artefacts import Store, usable_store
 from vibench.stages.base import Done, Failed, Stage, Unstored
-from vibench.stages.cell_queries import cell_queries
-from vibench.stages.cell_stage import CellRows
+from vibench.stages.cell_queries import CellRows, cell_queries
 from vibench.stages.pictures import PictureStage
-from vibench.stages.timing_rounds import SHARE, TimingRounds
+from vibench.stages.timing_rounds import QUERY_SUBSETS, TimingRounds
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand
 from vibench.study.spec import Study
@@ -199,7 +198,7 @@ class _Run:
         goals = {cell: cell_queries(cell, seconds) for cell in cells if cell.key not in reasons}
         runnable = [cell for cell in todo if cell in goals]
         rounds, fewest = self.study.timing_rounds, self.study.timing_rounds_min
-        requested = SHARE * self.options.repeats
+        requested = QUERY_SUBSETS * self.options.repeats
         self.timing = TimingPlan(goals, max(rounds, requested), self.writer, max(fewest, requested))
         self.offline = OfflinePlan(self.store, self.writer, max(self.options.repeats - 1, 0))
         untimed = self.timing.start(runnable)

@@ -12,8 +12,7 @@ from vibench.stages.artefacts import Store
 from vibench.stages.base import Failed, Row, Stage
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
-from vibench.stages.timed_seconds import TimedCell, TimedRound
-from vibench.stages.timing_rounds import SHARE, TimingRounds, block_rows
+from vibench.stages.timing_rounds import QUERY_SUBSETS, TimedCell, TimedRound, TimingRounds, block_rows
 from vibench.study.cells import Cell
 from vibench.timing import Seconds
 
@@ -68,13 +67,14 @@ class OfflinePlan:
         return True
 
     def finish(self) -> None:
-        stages = {one.key: one for goal in self._cells.values() for some in goal.offline.values() for one in some}
+        phases = [some for goal in self._cells.values() for some in goal.offline_stages.values()]
+        stages = {one.key: one for some in phases for one in some}
         runs = {key: self._runs(stage) for key, stage in stages.items()}
         known = {key: some for key, some in runs.items() if some}
         deviation = scatter(known.values())
         for cell, goal in self._cells.items():
             row = self._writer.database.cell(cell.key)
-            if row is not None and all(one.key in known for some in goal.offline.values() for one in some):
+            if row is not None and all(one.key in known for some in goal.offline_stages.values() for one in some):
                 self._writer.offline(cell, offline_columns(goal, row["hf_setup_s"], known, deviation))
 
     def _runs(self, stage: Stage) -> list[Seconds]:
@@ -97,8 +97,7 @@ class _Group:
         self.rows: dict[str, list[Row]] = defaultdict(list)
         self.rounds: dict[str, list[TimedRound]] = defaultdict(list)
         self.machines: dict[str, set[str]] = defaultdict(set)
-        # Number of the rounds that are missing, and the reason of the first.
-        self.lost: dict[str, tuple[int, str]] = defaultdict(lambda: (0, ""))
+        self.failures: dict[str, list[Failed]] = defaultdict(list)
         # Numbers of the next block and of the next round.
         self.blocks = self.first = 0
 
@@ -170,13 +169,12 @@ class TimingPlan:
             return None
         group = self._planned.pop(stage.key)
         if isinstance(outcome, Failed):
-            outcome = (TimedCell({}, "", stage.rounds, outcome.reason),) * len(stage.cells)
+            outcome = (TimedCell({}, "", (outcome,) * stage.rounds),) * len(stage.cells)
         for goal, rows, timed in zip(stage.cells, block_rows(stage, outcome), outcome, strict=True):
             group.rows[goal.key] += rows
             group.rounds[goal.key] += timed.rounds.values()
             group.machines[goal.key] |= {timed.machine} if timed.rounds else set()
-            count, reason = group.lost[goal.key]
-            group.lost[goal.key] = count + timed.lost, reason or timed.reason
+            group.failures[goal.key] += timed.failures
         group.blocks += 1
         group.first += stage.rounds
         timed_here = {goal.key for goal in stage.cells}
@@ -195,10 +193,10 @@ class TimingPlan:
         return None
 
     def _write(self, group: _Group, cell: Cell, goal: CellQueries) -> None:
-        count, reason = group.lost[goal.key]
-        rows, rounds = group.rows[goal.key], group.rounds[goal.key]
-        everything = len(rows) + count
-        lost = f"{'all' if count == everything else f'{count} of {everything}'} rounds: {reason}" if count else ""
+        rows, rounds, failures = group.rows[goal.key], group.rounds[goal.key], group.failures[goal.key]
+        count, everything = len(failures), len(rows) + len(failures)
+        missing = "all" if count == everything else f"{count} of {everything}"
+        lost = f"{missing} rounds: {failures[0].reason}" if failures else ""
         self._writer.seconds(cell, rows, rounds, group.machines[goal.key], lost)
 
     def _undecided(self, group: _Group) -> list[CellQueries]:
@@ -224,7 +222,7 @@ class TimingPlan:
 
 def block_sizes(rounds: int) -> list[int]:
     """Numbers of rounds of the blocks of `rounds`: a pass over all queries, or less where rounds are few."""
-    blocks = 1 if rounds < FEWEST_ROUNDS else max(2, rounds // SHARE)
+    blocks = 1 if rounds < FEWEST_ROUNDS else max(2, rounds // QUERY_SUBSETS)
     return [rounds // blocks + (k < rounds % blocks) for k in range(blocks)]
 
 

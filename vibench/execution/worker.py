@@ -39,7 +39,7 @@ from vibench.execution.jobs import (
 from vibench.execution.supervisor import MARK, kill_marked
 from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
-from vibench.stages.base import LOST, SHARE, Done, Failed, Items, ItemwiseStage, Unstored
+from vibench.stages.base import FAILED_STAGES, PROGRESS, Done, Failed, Items, ItemwiseStage, Unstored
 
 T = TypeVar("T")
 Send = Callable[[Any], None]
@@ -123,7 +123,7 @@ def perform(
         _check_code(job, batch)
         # Artefacts that were read stay in memory: at most 1 GiB, and an eighth of the limit.
         store = _store(job.store, min(2**30, int(0.125 * job.memory_gib * 2**30)))
-        LOST.set(job.lost)
+        FAILED_STAGES.set(job.lost)
         if isinstance(job.stage, ItemwiseStage):
             items = _begun(job.stage, store)
             earlier = {number: items.failed(number, failed) for number, failed in progress.lost.items()} | progress.done
@@ -134,7 +134,7 @@ def perform(
             _last.clear()
             value = items.collect([done[number] for number in range(job.stage.items)])
             return Done((), value, time.perf_counter() - start)
-        SHARE.set(lambda fraction: send(FractionDone(fraction)))
+        PROGRESS.set(lambda fraction: send(FractionDone(fraction)))
         result = job.stage.run(store)
         store.put(job.stage.key, result.value, result.seconds, result.histories)
         return Done(result.histories, None, time.perf_counter() - start, result.seconds)

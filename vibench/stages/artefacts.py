@@ -27,17 +27,6 @@ CACHE_VARIABLE = "VIBENCH_CACHE"
 SUFFIX = ".artefact"
 """Suffix of artefact files: each holds a digest (SHA-256) of its name and of the content that follows."""
 
-OTHERS, ANYBODY = 0o022, 0o002
-"""Permission bits of all but the owner to write; of those outside the group alone."""
-
-DIGEST = hashlib.sha256().digest_size
-
-LOCK = "lock"
-"""Lock file: shared by runs, exclusive for `clear`."""
-
-KEPT = 2**28
-"""Bytes of artefacts that a store keeps in memory, by the size of their files, unless it is told otherwise."""
-
 
 @storable
 @dataclass(frozen=True)
@@ -51,15 +40,16 @@ class History:
     stage: str
     quantity: str
     values: tuple[float, ...]
-    first_step: int = 0
+    first_step: int
 
     @classmethod
-    def of(cls, stage: str, quantity: object, values: Iterable[Any], first_step: int = 0) -> History:
-        """The history of a quantity that a plugin may have named and evaluated: its name is one printable line.
+    def of(cls, stage: str, quantity: object, values: Iterable[Any], first_step: int | None = None) -> History:
+        """The history of a quantity that a plugin may have named and evaluated; `first_step` is 0 by default.
 
         Raises a `TypeError`, a `ValueError` or an `OverflowError` if a value is no number, or too large for one.
         """
-        return cls(stage, one_line(str(quantity)), tuple(map(float, values)), first_step)
+        # The name must be one printable line: it goes to tables and terminals.
+        return cls(stage, one_line(str(quantity)), tuple(map(float, values)), first_step or 0)
 
 
 storable(Seconds)
@@ -77,10 +67,7 @@ class Artefact:
 
     @classmethod
     def read(cls, content: bytes) -> Artefact:
-        """The artefact that `dumps` wrote.
-
-        Raises a `DamagedArtefactError` if the content is anything else.
-        """
+        """The artefact that `dumps` wrote; raises a `DamagedArtefactError` if the content is anything else."""
         artefact = loads(content)
         if not isinstance(artefact, cls):
             raise DamagedArtefactError("no artefact")
@@ -92,24 +79,25 @@ class Artefact:
 
 
 def default_folder() -> Path:
-    """Where artefacts are kept: `$VIBENCH_CACHE`, or the user's cache folder."""
+    """Folder of the artefacts: `$VIBENCH_CACHE`, or the user's cache folder."""
     return Path(os.environ.get(CACHE_VARIABLE) or platformdirs.user_cache_dir("vibench")).absolute() / "artefacts"
 
 
 class Store:
-    """The artefacts in a folder, of which those used last are kept in memory.
+    """The artefacts in a folder, with a cache of those used last.
 
-    Parameters
-    ----------
-    folder
-        Where their files are.
-    kept
-        Bytes of files whose artefacts are kept in memory at most; a larger artefact is read whenever it is asked for.
+    `cached_bytes` limits the files of cached artefacts, 256 MiB by default; a larger artefact is read at each use.
     """
 
-    def __init__(self, folder: Path, kept: int = KEPT) -> None:
+    def __init__(self, folder: Path, cached_bytes: int | None = None) -> None:
         self.folder = folder
-        self._recent: LRUCache[str, tuple[Artefact, int]] = LRUCache(kept, getsizeof=lambda one: one[1])
+        size = 2**28 if cached_bytes is None else cached_bytes
+        self._recent: LRUCache[str, tuple[Artefact, int]] = LRUCache(size, getsizeof=lambda one: one[1])
+
+    @property
+    def lock(self) -> Path:
+        """Lock file: shared by runs, exclusive for `clear`."""
+        return self.folder / "lock"
 
     def get(self, key: str) -> Artefact | None:
         """The artefact stored under a key; `None` if it is missing or damaged.
@@ -120,9 +108,10 @@ class Store:
             return recent[0]
         try:
             with self._path(key).open("rb") as file:
-                digest, content = file.read(DIGEST), file.read()
+                digest, content = file.read(hashlib.sha256().digest_size), file.read()
+            # Truncated, corrupted or renamed: the stage runs again.
             if digest != _digest(key, content):
-                return None  # truncated, corrupted or renamed
+                return None
             artefact = Artefact.read(content)
         except (FileNotFoundError, DamagedArtefactError):
             return None
@@ -152,7 +141,7 @@ class Store:
 
         Raises a `RequestError` if it is being cleared now, or cannot be written.
         """
-        with locked(self.folder / LOCK, shared=True, busy=f"the artefacts in '{self.folder}' are being removed"):
+        with locked(self.lock, shared=True, busy=f"the artefacts in '{self.folder}' are being removed"):
             yield
 
     def contents(self) -> list[tuple[str, int, float]]:
@@ -164,19 +153,19 @@ class Store:
                 listed.append((path.name.rpartition("-")[0], status.st_size, time.time() - status.st_mtime))
         return listed
 
-    def clear(self, older_than: float = 0.0) -> int:
-        """Remove artefacts older than so many seconds, and temporary files of killed runs; returns the bytes freed.
+    def clear(self, older_than: float | None = None) -> int:
+        """Remove artefacts (older than some seconds) and temporary files of killed runs; returns the bytes freed.
 
         Raises a `RequestError` if a run uses the store.
         """
-        freed = 0
+        freed, newest = 0, time.time() - (older_than or 0.0)
         if not self.folder.is_dir():
             return freed
-        with locked(self.folder / LOCK, busy=f"a run uses the artefacts in '{self.folder}'"):
+        with locked(self.lock, busy=f"a run uses the artefacts in '{self.folder}'"):
             for path in [*self.folder.glob(f"*{SUFFIX}"), *self.folder.glob(f"{TEMPORARY}*{PART}")]:
                 with contextlib.suppress(FileNotFoundError):
                     status = path.lstat()
-                    if path.suffix == PART or time.time() - status.st_mtime >= older_than:
+                    if path.suffix == PART or older_than is None or status.st_mtime <= newest:
                         path.unlink()
                         freed += status.st_size
         return freed
@@ -186,16 +175,14 @@ class Store:
 
 
 def encoded(key: str, artefact: Artefact) -> bytes:
-    """An artefact as it is stored under a key."""
+    """The bytes of the file of an artefact."""
     content = dumps(artefact)
     return _digest(key, content) + content
 
 
 def _digest(key: str, content: bytes) -> bytes:
-    """Digest of the name and the content of an artefact."""
-    code = hashlib.sha256(key.encode() + b"\0")
-    code.update(content)
-    return code.digest()
+    # With the key: a renamed file must not pass for another artefact.
+    return hashlib.sha256(key.encode() + b"\0" + content).digest()
 
 
 def usable_store() -> Store:
@@ -207,7 +194,7 @@ def usable_store() -> Store:
     try:
         store.folder.mkdir(0o700, parents=True, exist_ok=True)
         # Whoever may write could plant false numbers. A folder that is named on purpose may be shared by a group.
-        if store.folder.stat().st_mode & (ANYBODY if os.environ.get(CACHE_VARIABLE) else OTHERS):
+        if store.folder.stat().st_mode & (0o002 if os.environ.get(CACHE_VARIABLE) else 0o022):
             raise RequestError(
                 f"others may write into the folder for artefacts, '{store.folder}': run `chmod go-w` on it, "
                 f"or set {CACHE_VARIABLE} to another one"

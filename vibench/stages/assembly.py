@@ -1,4 +1,4 @@
-"""Assembly of reduced programs, in full or hyper-reduced: its offline part, and the programs of the queries."""
+"""Assembly of the reduced programs of the queries, in full or hyper-reduced, and their exact solutions."""
 
 from __future__ import annotations
 
@@ -36,11 +36,9 @@ class NestedPrograms(Stage):
     validation: ParameterSet
 
     def inputs(self) -> tuple[Stage, ...]:
-        """The growth, and the POD and the cone of its model."""
         return (self.growth.pod, self.growth.cone, self.growth)
 
     def run(self, store: Store) -> Result:
-        """One program per validation parameter; not timed."""
         model = self.growth.reduction(store).projection
         return Result(tuple(_projections(model, self.validation.of(model.problem))))
 
@@ -48,18 +46,22 @@ class NestedPrograms(Stage):
 @storable
 @dataclass(frozen=True)
 class ReducedPrograms:
-    """Reduced programs, for any QP solver."""
+    """Reduced programs at the validation parameters, for any QP solver.
+
+    Attributes
+    ----------
+    factor
+        Cholesky factor (lower) of A, where A is constant and the programs are solved in dual form.
+    errors
+        Largest relative difference of a member of each program from its Galerkin projection; zero for full assembly.
+    projected
+        The Galerkin projections solved to round-off, or `None` where that fails; empty for full assembly.
+    """
 
     programs: tuple[VariationalInequality, ...]
-    """One per validation parameter."""
     factor: Array | None
-    """Cholesky factor (lower) of A, where A is constant and the programs are solved in dual form."""
     errors: tuple[float, ...]
-    """Largest relative difference of a member of the reduced program from its Galerkin projection, per parameter; zero
-    where it is assembled in full."""
     projected: tuple[ExactSolution | None, ...] = ()
-    """The Galerkin projections solved to round-off, or `None` where that fails; none where programs are assembled in
-    full, which are these projections."""
 
 
 @dataclass(frozen=True)
@@ -78,19 +80,21 @@ class AssemblyStage(Stage):
         return None if growth is None else NestedPrograms(growth, self.validation)
 
     def inputs(self) -> tuple[Stage, ...]:
-        """The model, and the programs in full that are known."""
         return (*self.built.model_inputs, *(() if self.nested is None else (self.nested,)))
 
     def run(self, store: Store) -> Result:
-        """Assemble at every parameter; compare reduced programs with full ones."""
         model = self.built.model(store)
         reduced, mus = model.reduced, self.validation.of(model.problem)
         # Nested programs are those of all vectors of the offline phase: a formulation may use other spaces.
         is_own = self.nested is not None and reduced is model.offline.assembled
         larger = value_of(store, self.nested) if self.nested is not None and is_own else None
         if isinstance(reduced, HyperReducedModel):
-            return Result(_reduced(reduced, mus, larger))
-        return Result(_in_full(reduced, mus, larger))
+            return Result(_hyper_reduced(reduced, mus, larger))
+        if larger is None:
+            programs = _projections(reduced, mus)
+        else:
+            programs = [leading_part(program, reduced.fixed_basis.shape[1]) for program in larger]
+        return Result(ReducedPrograms(tuple(programs), None, (0.0,) * len(mus)))
 
     def columns(self, store: Store) -> dict[str, float | int | None]:
         """Columns of a cell: tolerance, training error and terms of every member; none for assembly in full."""
@@ -105,12 +109,10 @@ class AssemblyStage(Stage):
         }
 
 
-InFull = Sequence[VariationalInequality] | None
-"""Fully assembled programs of a larger nested space, one per parameter, if they are known."""
-
-
-def _reduced(model: HyperReducedModel, mus: Array, larger: InFull) -> ReducedPrograms:
-    """The hyper-reduced assembly at every parameter, compared with the Galerkin projection."""
+def _hyper_reduced(
+    model: HyperReducedModel, mus: Array, larger: Sequence[VariationalInequality] | None
+) -> ReducedPrograms:
+    """The hyper-reduced programs, compared with Galerkin projections: the leading parts of `larger` ones if known."""
     matrices = assemblies(model.problem)
     programs, errors, projected, factor = [], [], [], None
     for k, mu in enumerate(mus):
@@ -124,21 +126,15 @@ def _reduced(model: HyperReducedModel, mus: Array, larger: InFull) -> ReducedPro
     return ReducedPrograms(tuple(programs), factor, tuple(errors), tuple(projected))
 
 
-def _in_full(model: ReducedModel, mus: Array, larger: InFull) -> ReducedPrograms:
-    """The projection of the high-fidelity matrices at every parameter."""
-    size = model.fixed_basis.shape[1]
-    programs = [leading_part(p, size) for p in larger] if larger else _projections(model, mus)
-    return ReducedPrograms(tuple(programs), None, (0.0,) * len(mus))
-
-
 def _projections(model: ReducedModel, mus: Array) -> list[VariationalInequality]:
-    """The Galerkin projections at every parameter; constant members are projected once on a fixed basis."""
+    """The Galerkin projections at every parameter."""
     matrices, problem = assemblies(model.problem), model.problem
     if model.kind is Kind.PER_PARAMETER:
         bases = model.primal_bases(map(matrices.at, mus))
         return [project(matrices.at(mu), Z, model.generators) for mu, Z in zip(mus, bases, strict=True)]
     Z, chi, programs = model.fixed_basis, model.generators, list[VariationalInequality]()
     for mu in mus:
+        # Constant members are projected once on a fixed basis.
         known = {name: getattr(programs[0], name) for name in problem.constant if programs}
         programs.append(project(matrices.at(mu), Z, chi, known))
     return programs

@@ -1,9 +1,10 @@
-"""What is measured of the answer of a query, u_N and λ_N: the same for every model, however it was found."""
+"""Errors, bounds and residuals of the answers u_N, λ_N of queries: the same for every model."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 
@@ -34,9 +35,6 @@ from vibench.qp.scaling import ratio
 from vibench.stability.coercivity import Stability
 from vibench.stages.base import Row
 
-VIOLATION = 1e-10
-"""An error above its bound by more than this share of the solution violates it; less is round-off."""
-
 
 def pair_columns(
     problem: Problem,
@@ -62,19 +60,20 @@ def pair_columns(
     sizes = energy_norms(u, forces)
     pairs = zip(rows, bounds, sizes.tolist(), vis, energies, u.T, lam.T, strict=True)
     for row, bound, size, vi, energy, of_u, of_lam in pairs:
-        found = high_fidelity_residuals(vi, energy, of_u, of_lam, bound.rho, size)
-        row |= {"hf_primal_residual": found.primal, "hf_dual_residual": found.dual, "hf_gap": found.gap}
+        hf = high_fidelity_residuals(vi, energy, of_u, of_lam, bound.rho, size)
+        row |= {"hf_primal_residual": hf.primal, "hf_dual_residual": hf.dual, "hf_gap": hf.gap}
     for row, of_query in zip(rows, output_errors(problem.outputs, mus, (u, lam), reference), strict=True):
         row["outputs"] = of_query
     return rows
 
 
 def _columns(error: Errors, bounds: ErrorBounds, hsw: HSWBounds | None) -> Row:
-    """The columns of one pair."""
     row: Row = asdict(error) | {"bound_note": bounds.note}
-    of_u = _measured(error.error_u, error.error_u_scaled) > UNMEASURABLE
-    of_lam = _measured(error.error_lambda, error.error_lambda_scaled) > UNMEASURABLE
-    checked: dict[str, tuple[float, bool, float]] = {}  # a bound, the error, and whether that is measurable
+    # Errors below round-off have no effectivity. Those of zero solutions are relative to the largest training solution.
+    of_u = (error.error_u_scaled if error.error_u is None else error.error_u) > UNMEASURABLE
+    of_lam = (error.error_lambda_scaled if error.error_lambda is None else error.error_lambda) > UNMEASURABLE
+    # A bound, whether its error is measurable, and the error.
+    checked: dict[str, tuple[float, bool, float]] = {}
     if np.isfinite(bounds.u_energy):
         row |= {f"bound_{name}": getattr(bounds, name) for name in ("rho", "rho_range", "omega", "kappa")}
         checked |= {
@@ -99,6 +98,7 @@ def online_columns(bound: OnlineBound, error: Row) -> Row:
     if bound.guarantee is Guarantee.NONE:
         return row
     violated, bounds = False, {"u_energy": bound.u_energy, "lambda_natural": bound.lambda_natural}
+    # The bound in W divides by a lower bound of β_A, which may be zero.
     if bound.inf_sup > 0.0:
         bounds["lambda"] = bound.lam
     for name, value in bounds.items():
@@ -106,16 +106,15 @@ def online_columns(bound: OnlineBound, error: Row) -> Row:
         row[f"bound_online_{name}"] = value
         if f"effectivity_{name}" in error:
             row[f"effectivity_online_{name}"] = ratio(value, absolute)
-        size = absolute / relative if relative else value
-        violated |= not absolute <= value + VIOLATION * size
+        violated |= bool(is_violated(absolute, value, absolute / relative if relative else value))
     row |= {"bound_online_rho": bound.rho, "bound_online_omega": bound.omega, "bound_online_kappa": bound.kappa}
     row |= {"beta_energy_online": bound.inf_sup, "beta_energy_online_note": bound.inf_sup_note}
     return row | {"coercivity_online": bound.coercivity, "bound_online_violated": int(violated)}
 
 
-def _measured(relative: float | None, scaled: float) -> float:
-    """An error relative to its solution, or where that is zero to the largest training solution."""
-    return scaled if relative is None else relative
+def is_violated(error: Array | float, bound: Array | float, size: Array | float) -> Any:
+    """Whether errors exceed their bounds by more than round-off of solutions of a `size`; true for NaN."""
+    return np.logical_not(error <= bound + 1e-10 * size)
 
 
 def error_columns(
@@ -129,9 +128,9 @@ def error_columns(
 ) -> list[Row]:
     """Errors of answers to solutions (x, α), one per parameter of `mus` (P×d), their error bounds and effectivities.
 
-    `exact` are the same programs solved to round-off: what the solver contributes to the errors. `projected` are the
-    programs assembled in full, solved to round-off, where those of the queries are not: what reduced assembly
-    contributes. A `corrector` with a certificate gives bounds at online cost, too.
+    `exact` are the same programs solved to round-off: the difference is the error of the solver. `projected` are the
+    programs assembled in full, solved to round-off, where those of the queries are not: the difference from `exact` is
+    the error of reduced assembly. A `corrector` with a certificate adds bounds at online cost.
     """
     if not solutions:
         return []
@@ -150,15 +149,18 @@ def error_columns(
             row["correction_note"] = answer.note
         if answer.bound is not None:
             row.update(online_columns(answer.bound, row))
-    contributions = _Contributions(corrector, problem.V.norm(reference.u), problem.W.norm(reference.lam))
+    sizes = zip(problem.V.norm(reference.u), problem.W.norm(reference.lam), strict=True)
     full = projected or [None] * len(rows)
-    for k, (row, (x, alpha), own, galerkin) in enumerate(zip(rows, solutions, exact, full, strict=True)):
+    programs = zip(solutions, exact, full, strict=True)
+    for row, mu, answer, norms, ((x, alpha), own, galerkin) in zip(rows, mus, answers, sizes, programs, strict=True):
+        # A program that cannot be solved to round-off separates no errors.
         if own is None:
             continue
-        given = k, mus[k], answers[k].is_corrected, row
-        row.update(contributions.of("solver", *given, ExactSolution(x, alpha, unique=True), own))
+        pairs = {"solver": (ExactSolution(x, alpha, unique=True), own)}
         if galerkin is not None:
-            row.update(contributions.of("assembly", *given, own, galerkin))
+            pairs["assembly"] = own, galerkin
+        for source, (one, other) in pairs.items():
+            row.update(_contribution(source, corrector, mu, answer.is_corrected, norms, row, one, other))
     return rows
 
 
@@ -172,45 +174,47 @@ def _reconstructed(
             return model.reconstruct_all(vis, [x for x, _ in solutions]), lam
         queries = zip(mus, vis, solutions, strict=True)
         return np.hstack([model.reconstruct(mu, vi, x[:, None]) for mu, vi, (x, _) in queries]), lam
-    # a fixed basis: all solutions are reconstructed at once
+    # A fixed basis reconstructs all solutions at once.
     return model.reconstruct(mus[0], vis[0], np.column_stack([x for x, _ in solutions])), lam
 
 
-@dataclass(frozen=True)
-class _Contributions:
-    """What sources of differences contribute to the relative errors of queries; `u` and `lam` (P,) are ‖u‖ and ‖λ‖."""
+def _contribution(
+    source: str,
+    corrector: Corrector,
+    mu: Array,
+    corrected: bool,
+    norms: tuple[float, float],
+    row: Row,
+    one: ExactSolution,
+    other: ExactSolution,
+) -> Row:
+    """Contribution of a source of error, the difference of two solutions of a query, relative to `norms` of u and λ."""
+    parts: Row = {}
+    problem = corrector.model.problem
+    if corrected:
+        pairs = [_corrected(corrector, mu, solution) for solution in (one, other)]
+        if not all(pair.is_corrected for pair in pairs):
+            return parts
+        of_u = float(problem.V.norm(pairs[0].u - pairs[1].u))
+        of_lam = float(problem.W.norm(pairs[0].lam - pairs[1].lam))
+    else:
+        # The basis is orthonormal in V.
+        of_u = float(np.linalg.norm(one.x - other.x))
+        of_lam = float(problem.W.norm(corrector.model.generators @ (one.alpha - other.alpha)))
+    if row["error_u"] is not None:
+        parts["u"] = ratio(of_u, norms[0])
+    # Two multipliers of a program with many do not differ by an error.
+    if row["error_lambda"] is not None and one.unique and other.unique:
+        parts["lambda"] = ratio(of_lam, norms[1])
+    names = [name for name in ("u", "lambda") if (row[f"error_{name}"] or 0.0) > UNMEASURABLE]
+    share = max((parts.get(name, 0.0) / row[f"error_{name}"] for name in names), default=None)
+    return {f"{source}_error_{name}": part for name, part in parts.items()} | {f"{source}_share": share}
 
-    corrector: Corrector
-    u: Array
-    lam: Array
 
-    def of(
-        self, source: str, number: int, mu: Array, corrected: bool, row: Row, one: ExactSolution, other: ExactSolution
-    ) -> Row:
-        """What makes the difference of two solutions of the query contributes, to those of their corrected pairs."""
-        parts: Row = {}
-        problem, unique = self.corrector.model.problem, one.unique and other.unique
-        if corrected:
-            pairs = [self._corrected(mu, solution) for solution in (one, other)]
-            if not all(pair.is_corrected for pair in pairs):
-                return parts
-            of_u = float(problem.V.norm(pairs[0].u - pairs[1].u))
-            of_lam = float(problem.W.norm(pairs[0].lam - pairs[1].lam))
-        else:
-            of_u = float(np.linalg.norm(one.x - other.x))  # the basis is orthonormal in V
-            of_lam = float(problem.W.norm(self.corrector.model.generators @ (one.alpha - other.alpha)))
-        if row["error_u"] is not None:
-            parts["u"] = ratio(of_u, self.u[number])
-        if row["error_lambda"] is not None and unique:
-            parts["lambda"] = ratio(of_lam, self.lam[number])
-        names = [name for name in ("u", "lambda") if (row[f"error_{name}"] or 0.0) > UNMEASURABLE]
-        share = max((parts.get(name, 0.0) / row[f"error_{name}"] for name in names), default=None)
-        return {f"{source}_error_{name}": part for name, part in parts.items()} | {f"{source}_share": share}
-
-    def _corrected(self, mu: Array, solution: ExactSolution) -> Answer:
-        """The corrected pair of a solution, whatever its ω and ρ are."""
-        corrector = replace(self.corrector, mode=CorrectionMode.FEASIBLE)
-        model, vi = corrector.model, assemblies(corrector.model.problem).at(mu)
-        u = np.asarray(model.reconstruct(mu, vi, solution.x[:, None])[:, 0])
-        alpha = np.maximum(solution.alpha, 0.0)
-        return corrector.answer(mu, solution.x, alpha, u, model.generators @ alpha)
+def _corrected(corrector: Corrector, mu: Array, solution: ExactSolution) -> Answer:
+    # Corrected whatever ω and ρ are: both solutions must take the same way.
+    corrector = replace(corrector, mode=CorrectionMode.FEASIBLE)
+    model, vi = corrector.model, assemblies(corrector.model.problem).at(mu)
+    u = np.asarray(model.reconstruct(mu, vi, solution.x[:, None])[:, 0])
+    alpha = np.maximum(solution.alpha, 0.0)
+    return corrector.answer(mu, solution.x, alpha, u, model.generators @ alpha)

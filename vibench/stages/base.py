@@ -1,4 +1,4 @@
-"""What a stage is: a pure function of its inputs, stored as an artefact and shared by every cell that needs it."""
+"""Stages: pure functions of their inputs, stored as artefacts and shared by every cell that needs them."""
 
 from __future__ import annotations
 
@@ -27,21 +27,22 @@ Row = dict[str, Any]
 """A row of a results table: column → value."""
 
 
-SHARE: ContextVar[Callable[[float], None]] = ContextVar("SHARE", default=lambda _: None)
-"""Whom a long stage tells which share of it is done, for the estimate of the time left."""
+PROGRESS: ContextVar[Callable[[float], None]] = ContextVar("PROGRESS", default=lambda _: None)
+"""Progress callback of the running stage (fraction done), for the estimate of the time left."""
 
 
 @lru_cache(maxsize=4)
 def build_problem(plugin: Plugin) -> Problem:
     """The problem of a stage; one instance per process."""
     problem = plugin.create()
-    assert isinstance(problem, Problem)  # `RegisteredPlugin.load` refuses anything else
+    # `RegisteredPlugin.load` refuses anything else.
+    assert isinstance(problem, Problem)
     return problem
 
 
 @contextmanager
 def faults_of(plugin: Plugin) -> Iterator[None]:
-    """Name the command that checks the plugin in the reason of a `NumericalError`, which is the plugin's fault."""
+    """Add the command that checks a plugin to the `NumericalError` that it causes."""
     try:
         yield
     except NumericalError as error:
@@ -50,7 +51,7 @@ def faults_of(plugin: Plugin) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Result:
-    """What a stage computes: its value, the seconds that count as its own, and histories."""
+    """Result of a stage: its value, the seconds that count as its own, and histories."""
 
     value: Any
     seconds: Seconds = NO_TIME
@@ -59,7 +60,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Done:
-    """A stage that succeeded: its histories, its value where that is not stored, wall seconds in all, and its own."""
+    """A stage that succeeded: its histories, its value where that is not stored, wall seconds in all and its own."""
 
     histories: tuple[History, ...]
     value: Any
@@ -69,19 +70,19 @@ class Done:
 
 @dataclass(frozen=True)
 class Failed:
-    """A stage, or a item of one, that failed: the status of the rows that need it, and the reason."""
+    """A stage, or an item of one, that failed: the status of the rows that need it, and the reason."""
 
     status: Status
     reason: str
 
 
-LOST: ContextVar[Mapping[str, Failed]] = ContextVar("LOST", default=MappingProxyType({}))
+FAILED_STAGES: ContextVar[Mapping[str, Failed]] = ContextVar("FAILED_STAGES", default=MappingProxyType({}))
 """Dispensable stages that failed, by their keys, for a stage that needs them."""
 
 
 @dataclass(frozen=True)
 class Unstored:
-    """A stage whose artefact could not be written, and the reason; no other could be written either."""
+    """A stage whose artefact could not be written, and the reason; writing others is not tried."""
 
     reason: str
 
@@ -91,24 +92,32 @@ class Stage(ABC):
 
     The runner, the result writer and the progress display treat all stages alike: a stage declares its label, the axes
     of the study it depends on and the rows that are recorded of it.
+
+    Attributes
+    ----------
+    label
+        Name of the result in a word or two, for messages and for the names of artefacts.
+    stored
+        Whether the value is kept as an artefact, under `key`.
+    partial
+        Whether several stages hold parts of one result; progress is then shown part by part.
+    dispensable
+        Whether stages that need it run even if it failed, and find the reason in `FAILED_STAGES`; these are not
+        `stored`.
     """
 
     label: ClassVar[str]
-    """What the stage computes, in a word or two, for messages and for the names of artefacts."""
     stored: ClassVar[bool] = True
-    """Whether the value is kept as an artefact, under `key`."""
     partial: ClassVar[bool] = False
-    """Whether several stages hold parts of one result; progress is then shown part by part."""
     dispensable: ClassVar[bool] = False
-    """Whether stages that need it run even if it failed, and find the reason in `LOST`; these must not be `stored`."""
 
     @cached_property
     def key(self) -> str:
         """Name of the artefact: the label, and a hash of everything that determines the value.
 
         These are the fields of the stage, the keys of its inputs, the libraries, its own module with those of other
-        stages that it imports, and the layers of vibench below the stages that determine numbers. An edited figure or
-        help text invalidates no artefact. The code of a plugin enters through `Plugin.code`.
+        stages that it imports, and the layers of vibench below the stages that determine numbers. The code of a plugin
+        enters through `Plugin.code`.
         """
         own = {name: _described(value) for name, value in self._fields().items()}
         content = [type(self).__name__, self.code(), libraries(), own, [one.key for one in self.inputs()]]
@@ -120,19 +129,20 @@ class Stage(ABC):
         """Hash of the code that determines the value; that of the inputs is in their keys."""
         # Of its own layer only the modules count that it imports from: an edit of one stage keeps most other artefacts.
         imported = {str(getattr(one, "__module__", "")) for one in vars(sys.modules[cls.__module__]).values()}
-        carriers = {__name__, "vibench.stages.artefacts", "vibench.stages.serialisation"}  # they hand over numbers
+        # These modules only pass values on.
+        carriers = {__name__, "vibench.stages.artefacts", "vibench.stages.serialisation"}
         own = {name for name in imported if name.startswith("vibench.stages.")} - carriers
         sources = [source_hash(Path(str(sys.modules[name].__file__))) for name in sorted({cls.__module__, *own})]
         return " ".join([*sources, numerical_code(below="stages")])
 
     @property
     def kind_of_work(self) -> str:
-        """Stages of the same sort take about as long; the remaining time of a run is estimated by it."""
+        """Name of the stages that take about as long, for the estimate of the time left."""
         return self.label
 
     @property
     def effort(self) -> float:
-        """So many high-fidelity solutions take about as long; this is expected before one of its sort is done."""
+        """Estimated cost in units of one high-fidelity solve, until a stage of its kind is done."""
         return 1.0
 
     @property
@@ -142,7 +152,7 @@ class Stage(ABC):
 
     @property
     def session(self) -> int:
-        """A process that has run a stage of an earlier session is replaced before it runs this one."""
+        """Number of the session: a process that ran a stage of an earlier one is replaced before it runs this one."""
         return 0
 
     @property
@@ -152,11 +162,11 @@ class Stage(ABC):
 
     @property
     def measured_by(self) -> tuple[Stage, str]:
-        """The stage whose work the seconds of this one are, and their name among what it measures."""
+        """The stage that does the work of this one, and the name of its seconds in `measure`."""
         return self, ""
 
     def measure(self, store: Store) -> Mapping[str, Seconds]:
-        """Do the work again, and say how long it took, by name; the artefacts of the inputs are in the store."""
+        """Do the work again and return its seconds by name; the artefacts of the inputs are in the store."""
         return {"": self.run(store).seconds}
 
     def _fields(self) -> dict[str, Any]:
@@ -173,11 +183,11 @@ class Stage(ABC):
 
     @cached_property
     def packages(self) -> frozenset[str]:
-        """Distributions of third parties whose code the stage runs; it shares no process with that of others."""
+        """Third-party distributions whose code the stage runs; a process runs the code of one set of these."""
         return frozenset(plugin.registered.package for plugin in self.plugins) - {""}
 
     def inputs(self) -> tuple[Stage, ...]:
-        """Stages whose artefacts `run` reads itself, by default those among the fields; theirs are not repeated."""
+        """Stages whose artefacts `run` reads itself: by default those among the fields, without the inputs of these."""
         return tuple(value for value in self._fields().values() if isinstance(value, Stage))
 
     @abstractmethod
@@ -194,7 +204,7 @@ class Stage(ABC):
 
 
 def _described(value: Any) -> Any:
-    """A field of a stage as JSON can hold it: a stage by its key, of other objects what they are compared by."""
+    """A field of a stage in JSON: the key of a stage, the compared fields of another object."""
     if isinstance(value, Stage):
         return value.key
     if isinstance(value, bytes):
@@ -214,15 +224,15 @@ class Items(ABC):
     """The items of a stage in progress, which can be done in any order and by several processes."""
 
     def resume(self, done: Mapping[int, Any]) -> None:  # noqa: B027
-        """Take note of the values of items that another process did, or lost; by default nothing."""
+        """Register the values of items that another process did or lost; by default nothing."""
 
     @abstractmethod
     def run_item(self, number: int, time_limit: TimeLimit) -> Any:
-        """Do one item, and the operations of it that have a limit of their own `with time_limit():`."""
+        """Do one item; operations that have a limit of their own run `with time_limit():`."""
 
     @abstractmethod
     def failed(self, number: int, failed: Failed) -> Any:
-        """The substitute for a item that exceeded its limit or whose process died."""
+        """The substitute for an item that exceeded its limit or whose process died."""
 
     @abstractmethod
     def collect(self, items: Sequence[Any]) -> Any:
@@ -230,7 +240,7 @@ class Items(ABC):
 
 
 class ItemwiseStage(Stage):
-    """A stage whose items are kept one by one: if its process dies or hangs, only the current item is lost."""
+    """A stage whose items are returned one by one: if its process dies or hangs, only the current item is lost."""
 
     stored = False
 
@@ -240,7 +250,7 @@ class ItemwiseStage(Stage):
         """Number of items."""
 
     def stage_of(self, number: int) -> Stage:  # noqa: ARG002
-        """The stage whose plugins a item runs; items that run those of other packages get other processes."""
+        """The stage whose plugins an item runs; items that run those of other packages get other processes."""
         return self
 
     @abstractmethod
@@ -248,7 +258,6 @@ class ItemwiseStage(Stage):
         """Prepare for items; the artefacts of the inputs are in the store."""
 
     def run(self, store: Store) -> Result:
-        """All items in this process, in their order."""
         work = self.begin(store)
         return Result(work.collect([work.run_item(number, nullcontext) for number in range(self.items)]))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import FunctionType
 
@@ -45,23 +45,19 @@ class BuiltEnrichment:
 
     @classmethod
     def of(cls, enrichment: Enrichment, strategy: PrimalStrategy) -> BuiltEnrichment:
-        """The enrichment that a strategy has built.
-
-        Raises a `NumericalError` if it has a supply that is not a function in the module of the strategy.
-        """
+        """The enrichment that a strategy has built; a supply must be a function in the module of the strategy."""
         name = "" if enrichment.supply is None else getattr(enrichment.supply, "__name__", "")
         if enrichment.supply is not None and _functions(strategy).get(name) is not enrichment.supply:
             raise NumericalError(f"the supply of the enrichment is not a function in {type(strategy).__module__}")
         return cls(enrichment.kind, enrichment.vectors, enrichment.eta, name, enrichment.history, enrichment.fallbacks)
 
-    def restored(self, strategy: Callable[[], PrimalStrategy]) -> Enrichment:
-        """The enrichment of a strategy; its supply is looked up where `of` found it."""
-        supply = _functions(strategy())[self.supply] if self.supply else None
+    def restored(self, strategy: PrimalStrategy) -> Enrichment:
+        """The enrichment of a strategy, whose module has the supply."""
+        supply = _functions(strategy)[self.supply] if self.supply else None
         return Enrichment(self.kind, self.vectors, self.eta, supply, self.history, self.fallbacks)
 
 
 def _functions(strategy: PrimalStrategy) -> dict[str, FunctionType]:
-    """The functions in the module of a strategy, by name."""
     module = vars(sys.modules[type(strategy).__module__])
     return {name: value for name, value in module.items() if isinstance(value, FunctionType)}
 
@@ -69,16 +65,20 @@ def _functions(strategy: PrimalStrategy) -> dict[str, FunctionType]:
 @storable
 @dataclass(frozen=True)
 class AssessedGrowth:
-    """A nested enrichment and its inf-sup constants on the training set."""
+    """A nested enrichment and its inf-sup constants on the training set.
+
+    Attributes
+    ----------
+    steps, ratios
+        The smallest β_span, and the smallest ratio of β_span to that of V, after every vector (S+1,).
+    training
+        β_span at every training parameter (P,), by tolerance.
+    """
 
     grown: Grown
-    """The vectors, and how many of them each tolerance takes."""
     steps: Array
-    """The smallest β_span over the training set after every vector (S+1,)."""
-    shares: Array
-    """The smallest share of β_span in that of V after every vector (S+1,)."""
+    ratios: Array
     training: Mapping[float, Array]
-    """β_span at every training parameter (P,), by tolerance."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,6 @@ class GrowthStage(Stage):
     tolerances: tuple[float, ...]
 
     def inputs(self) -> tuple[Stage, ...]:
-        """POD, cone, and the training constants that every vector is compared with."""
         return (self.pod, self.cone, self.cone.constraints, TrainingConstants(self.cone))
 
     def run(self, store: Store) -> Result:
@@ -103,11 +102,10 @@ class GrowthStage(Stage):
         projected = _projected(offline, grown.vectors, value_of(store, self.cone.constraints))
         size = offline.basis.shape[1]
         training = {tolerance: projected.first(size + m.count).beta_span() for tolerance, m in grown.milestones.items()}
-        shares = projected.stability_ratios(size, value_of(store, TrainingConstants(self.cone)))
-        return Result(AssessedGrowth(grown, projected.over_steps(size), shares, training))
+        ratios = projected.stability_ratios(size, value_of(store, TrainingConstants(self.cone)))
+        return Result(AssessedGrowth(grown, projected.over_steps(size), ratios, training))
 
     def measure(self, store: Store) -> Mapping[str, Seconds]:
-        """Grow again, without the constants; the seconds of every tolerance."""
         grown = grow_through(self.primal.create(), _offline(store, self.pod, self.cone), self.tolerances)
         return {f"{tolerance!r}": milestone.seconds for tolerance, milestone in grown.milestones.items()}
 
@@ -131,7 +129,6 @@ class EnrichmentStage(Stage):
 
     @property
     def axes(self) -> Axes:
-        """The axes of POD and cone, the primal strategy and its tolerance."""
         stops = self.pod.stop, self.cone.stop
         return Axes(self.pod.problem, self.cone.dual, self.primal, *stops, self.tolerance, self.pod.training)
 
@@ -139,11 +136,6 @@ class EnrichmentStage(Stage):
     def growth(self) -> GrowthStage | None:
         """The stage that holds the vectors of all tolerances of a nested strategy; `None` for any other."""
         return None
-
-    @property
-    def reachable(self) -> TrainingConstants:
-        """The stage of the constants of the whole of V on the training set."""
-        return TrainingConstants(self.cone)
 
     @property
     def model_inputs(self) -> tuple[Stage, ...]:
@@ -164,28 +156,26 @@ class SingleEnrichment(EnrichmentStage):
     """An enrichment built for its tolerance alone; the value is a `BuiltEnrichment`."""
 
     def inputs(self) -> tuple[Stage, ...]:
-        """POD, cone, and the training constants that the enrichment is compared with."""
-        return (self.pod, self.cone, self.cone.constraints, self.reachable)
+        return (self.pod, self.cone, self.cone.constraints, TrainingConstants(self.cone))
 
     def run(self, store: Store) -> Result:
-        """Build the enrichment, timed; assess it on the training set, untimed."""
         offline, strategy = _offline(store, self.pod, self.cone), self.primal.create()
         enrichment, seconds = timed(lambda: strategy.build(offline, self.tolerance))
         with faults_of(self.primal):
             check_enrichment(enrichment, offline.problem.V, offline.basis)
         quantities = dict(enrichment.history)
+        # The assessment on the training set is not timed.
         if enrichment.vectors is not None:
             projected = _projected(offline, enrichment.vectors, value_of(store, self.cone.constraints))
-            size, reachable = offline.basis.shape[1], value_of(store, self.reachable)
+            size, reachable = offline.basis.shape[1], value_of(store, TrainingConstants(self.cone))
             quantities |= {"beta_span_min": projected.over_steps(size)}
             quantities |= {"share_min": projected.stability_ratios(size, reachable)}
             quantities |= {"beta_span_training": projected.beta_span(), "beta_full_span_training": reachable}
         return Result(BuiltEnrichment.of(enrichment, strategy), seconds, _histories(quantities))
 
     def enrichment(self, store: Store) -> Enrichment:
-        """The stored value."""
         stored: BuiltEnrichment = value_of(store, self)
-        return stored.restored(self.primal.create)
+        return stored.restored(self.primal.create())
 
 
 @dataclass(frozen=True)
@@ -196,46 +186,41 @@ class NestedEnrichment(EnrichmentStage):
 
     @property
     def growth(self) -> GrowthStage:
-        """The stage that holds the vectors of all `tolerances`."""
         return GrowthStage(self.pod, self.cone, self.primal, self.tolerances)
 
     @property
     def measured_by(self) -> tuple[Stage, str]:
-        """The growth, which has seconds of every tolerance."""
         return self.growth, f"{self.tolerance!r}"
 
     @property
     def model_inputs(self) -> tuple[Stage, ...]:
-        """POD, cone, the milestone and the vectors."""
         return (*super().model_inputs, self.growth)
 
     def inputs(self) -> tuple[Stage, ...]:
-        """POD and cone, all vectors, and the training constants that they are compared with."""
-        return (self.pod, self.cone, self.growth, self.reachable)
+        return (self.pod, self.cone, self.growth, TrainingConstants(self.cone))
 
     def run(self, store: Store) -> Result:
-        """Look up where the tolerance was reached, and check the vectors up to there."""
-        assert self.tolerance is not None  # a nested strategy always has one
+        # A nested strategy always has a tolerance.
+        assert self.tolerance is not None
         offline, growth = _offline(store, self.pod, self.cone), value_of(store, self.growth)
         milestone: Milestone = growth.grown.milestone(self.tolerance)
         with faults_of(self.primal):
             check_enrichment(growth.grown.at(milestone), offline.problem.V, offline.basis)
         quantities = dict(milestone.history) | {
             "beta_span_min": growth.steps[: milestone.count + 1],
-            "share_min": growth.shares[: milestone.count + 1],
+            "share_min": growth.ratios[: milestone.count + 1],
             "beta_span_training": growth.training[self.tolerance],
-            "beta_full_span_training": value_of(store, self.reachable),
+            "beta_full_span_training": value_of(store, TrainingConstants(self.cone)),
         }
         return Result(milestone, milestone.seconds, _histories(quantities))
 
     def enrichment(self, store: Store) -> Enrichment:
-        """The vectors up to the milestone."""
         stored: Enrichment = value_of(store, self.growth).grown.at(value_of(store, self))
         return stored
 
 
 def spaces_of(cell: Cell) -> tuple[PODStage | None, ConeStage | None, EnrichmentStage | None]:
-    """The stages of V_N, cone and enrichment of a cell; `None` of what its formulation does not have."""
+    """The stages of V_N, cone and enrichment of a cell; `None` where its formulation has no such axis."""
     pod = cone = None
     if cell.pod is not None:
         pod = PODStage(cell.problem, cell.pod, cell.training)
@@ -248,19 +233,12 @@ def spaces_of(cell: Cell) -> tuple[PODStage | None, ConeStage | None, Enrichment
     return pod, cone, SingleEnrichment(pod, cone, cell.primal, cell.primal_tol)
 
 
-def enrichment_stage(cell: Cell) -> EnrichmentStage:
-    """The stage that completes the reduced model of a cell with the mixed formulation."""
-    enrichment = spaces_of(cell)[2]
-    assert enrichment is not None  # the mixed formulation has all axes
-    return enrichment
-
-
 def _histories(quantities: Mapping[str, Array]) -> tuple[History, ...]:
     return tuple(History.of("enrichment", quantity, values) for quantity, values in quantities.items())
 
 
 def _reduction(store: Store, pod: PODStage, cone: ConeStage, interpolation: float | None = None) -> Reduction:
-    """The offline phase as far as V_N and the cone, which are stored."""
+    """The offline phase up to V_N and the cone, which are stored."""
     reduced: ReducedCone = value_of(store, cone)
     reduction = Reduction(
         build_problem(pod.problem),
@@ -276,7 +254,6 @@ def _reduction(store: Store, pod: PODStage, cone: ConeStage, interpolation: floa
 
 
 def _offline(store: Store, pod: PODStage, cone: ConeStage) -> Offline:
-    """The offline data that a primal strategy is built from."""
     problem, basis = build_problem(pod.problem), value_of(store, pod).basis
     reduced: ReducedCone = value_of(store, cone)
     return Offline(problem, basis, reduced.cone, reduced.prepared.span, parameters_in(store, pod.problem, pod.training))

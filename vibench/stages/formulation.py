@@ -1,9 +1,9 @@
-"""A formulation built on the offline phase of a study, as a stage of its own."""
+"""A formulation built on the offline phase of a study, its assembly at reduced cost, and its certificate."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
 
@@ -15,6 +15,12 @@ from vibench.linalg.cholesky import PartialCholesky, SparseCholesky
 from vibench.linalg.definite import BlockDiagonal
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
+from vibench.model.certificates.base import CertificateBase, OnlineInfSup, certificate_base
+from vibench.model.certificates.bounds import OnlineCertificate
+from vibench.model.certificates.contact_correction import ContactCompliance
+from vibench.model.certificates.prepared_correction import PreparedCorrections
+from vibench.model.certificates.residual import ResidualBasis
+from vibench.model.certificates.spectral import SpectralBounds
 from vibench.model.chebyshev import AffinePolynomial
 from vibench.model.hyperreduced import ProjectedMember, ReducedOperators
 from vibench.offline.compiled import CompiledModel
@@ -35,8 +41,9 @@ from vibench.timing import timed
 for _kind in (
     AffineMember, Evaluation, ReducedOperators, ProjectedMember, ContactCoordinates, LoadCoordinates,
     SpannedCoordinates, InnerProduct, SparseCholesky, PartialCholesky, BlockDiagonal,
-    # what formulations may build: steps of other offline phases, and programs of the machine
+    # Formulations may build steps of other offline phases, and compiled programs.
     POD, Cone, Kind, Enrichment, CompiledModel, AffinePolynomial,
+    CertificateBase, ContactCompliance, OnlineInfSup, PreparedCorrections, ResidualBasis, SpectralBounds,
 ):  # fmt: skip
     storable(_kind)
 
@@ -61,10 +68,8 @@ class AffineDecomposition(Stage):
         return Result(*timed(lambda: affine_decomposition(problem, mus, self.tolerance)))
 
     def parameters(self, problem: Problem) -> Array:
-        """Parameters (P×d) at which members are assembled: the training set, or the problem's own.
-
-        That needs no solutions, and an adaptive training has too few parameters for it.
-        """
+        """Parameters (P×d) at which members are assembled: the training set, or the problem's own."""
+        # The decomposition needs no solutions, and an adaptive training has too few parameters for it.
         return (OWN_TRAINING if self.training.is_adaptive else self.training).of(problem)
 
 
@@ -78,20 +83,19 @@ class HyperReduction(Stage):
     decomposition: AffineDecomposition
 
     def inputs(self) -> tuple[Stage, ...]:
-        """The reduced model and the members."""
         return (*self.enrichment.model_inputs, self.decomposition)
 
     def run(self, store: Store) -> Result:
-        """The `ReducedOperators` of a reduced model, or why there are none and queries are assembled in full."""
+        """The `ReducedOperators` of a reduced model, or the reason why its queries are assembled in full."""
         reduction = self.enrichment.reduction(store).given(members=value_of(store, self.decomposition))
-        reduction.projection  # noqa: B018  the clock begins after it
+        reduction.projection  # noqa: B018  computed before the clock begins
         return Result(*timed(lambda: reduction.operators))
 
 
 @storable
 @dataclass(frozen=True)
 class BuiltFormulation:
-    """What a formulation has built, and the reduced operators, where no other stage has made those it uses."""
+    """The result of `Formulation.build`, and the reduced operators it uses if no other stage computes them."""
 
     built: Mapping[str, Any]
     operators: ReducedOperators | str | None
@@ -99,28 +103,25 @@ class BuiltFormulation:
 
 @dataclass(frozen=True, eq=False)
 class _StoredReduction(Reduction):
-    """An offline phase whose snapshots and members are read when they are asked for, and not computed again."""
+    """An offline phase whose snapshots and members are read from the store at their first use."""
 
     read: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
 
     @cached_property
     def snapshots(self) -> Snapshots:
-        """The stored training snapshots."""
-        found: Snapshots = self.read["snapshots"]()
-        return found
+        snapshots: Snapshots = self.read["snapshots"]()
+        return snapshots
 
     @cached_property
     def members(self) -> Mapping[str, AffineMember]:
-        """The stored members, of a phase with assembly in reduced form."""
-        if "members" not in self.read:
-            return super().members
-        found: Mapping[str, AffineMember] = self.read["members"]()
-        return found
+        # Only assembly at reduced cost has stored members.
+        members: Mapping[str, AffineMember] = self.read["members"]() if "members" in self.read else super().members
+        return members
 
 
 @dataclass(frozen=True)
 class FormulationStage(Stage):
-    """A formulation built on the offline phase, `None` being what that does not have; a `BuiltFormulation`."""
+    """A formulation built on the offline phase, of which absent parts are `None`; the value is a `BuiltFormulation`."""
 
     label = "formulation"
 
@@ -141,14 +142,14 @@ class FormulationStage(Stage):
 
     @property
     def reduction(self) -> HyperReduction | None:
-        """The stage that projects the members on an enriched space; without enrichment this stage does it itself."""
+        """The stage that projects the members on an enriched space."""
+        # Without enrichment there is nothing to share: this stage projects itself.
         if self.enrichment is None or self.decomposition is None:
             return None
         return HyperReduction(self.enrichment, self.decomposition)
 
     @property
     def phases(self) -> tuple[Stage, ...]:
-        """The stages of V_N, cone and enrichment."""
         enriched = () if self.enrichment is None else self.enrichment.model_inputs
         return tuple(dict.fromkeys(stage for stage in (self.pod, self.cone, *enriched) if stage is not None))
 
@@ -160,7 +161,8 @@ class FormulationStage(Stage):
 
     @property
     def builds(self) -> bool:
-        """Whether the stage is run: a formulation without `build` whose queries are programs needs spaces alone."""
+        """Whether the stage is run."""
+        # A formulation without `build` whose queries are programs needs the spaces only.
         return self.kind.build is not Formulation.build or not self.kind.has_program
 
     @property
@@ -171,23 +173,21 @@ class FormulationStage(Stage):
         return self.phases if self.reduction is None else (*self.phases, self.reduction)
 
     def inputs(self) -> tuple[Stage, ...]:
-        """The offline phase: snapshots and members among it, if a formulation asks for these."""
         made = (stage for stage in (self.decomposition, self.reduction) if stage is not None)
         return (*solution_stages(self.problem, self.training), *self.phases, *made)
 
     def run(self, store: Store) -> Result:
-        """Build the formulation and make its model, timed: a model may have something to compute, too.
-
-        Raises an `UnsupportedError` if the problem does not have what it needs.
-        """
+        """Build the formulation, timed; raises an `UnsupportedError` if the problem lacks what it needs."""
         offline, formulation = self.offline(store), self.create()
-        offline.snapshots  # noqa: B018  the clock begins after they are read
+        # Read snapshots and members before the clock begins.
+        offline.snapshots  # noqa: B018
         if self.decomposition is not None:
-            offline.members  # noqa: B018  likewise
+            offline.members  # noqa: B018
 
         def work() -> Mapping[str, Any]:
             built = check_built(formulation.build(offline))
-            Model(formulation, offline, built, None, ACCURACY).online  # noqa: B018  is made, and dropped
+            # The model may have something to compute, too: make it and drop it.
+            Model(formulation, offline, built, None, ACCURACY).online  # noqa: B018
             return built
 
         with faults_of(self.formulation):
@@ -196,13 +196,12 @@ class FormulationStage(Stage):
         return Result(BuiltFormulation(dict(built), operators), seconds)
 
     def create(self) -> Formulation:
-        """A new instance of the formulation."""
-        made = self.formulation.create()
-        assert isinstance(made, Formulation)  # `RegisteredPlugin.load` refuses anything else
-        return made
+        formulation = self.formulation.create()
+        # `RegisteredPlugin.load` refuses anything else.
+        assert isinstance(formulation, Formulation)
+        return formulation
 
     def offline(self, store: Store, accuracy: float = ACCURACY) -> Reduction:
-        """The offline phase, whose steps are stored."""
         pod, cone, enrichment = self.pod, self.cone, self.enrichment
         snapshots = solution_stages(self.problem, self.training)
         read: dict[str, Callable[[], Any]] = {"snapshots": lambda: gather(store, snapshots)}
@@ -242,3 +241,66 @@ class FormulationStage(Stage):
             if stored.operators is not None:
                 offline = offline.given(operators=stored.operators)
         return Model(self.create(), offline, built, solver, accuracy)
+
+
+@dataclass(frozen=True)
+class CertificateBaseStage(Stage):
+    """Offline data shared by the certificates of all reduced models of a problem; the value is a `CertificateBase`."""
+
+    label = "certificate base"
+
+    decomposition: AffineDecomposition
+
+    @property
+    def effort(self) -> float:
+        # The bounds of the spectrum take about as long as 25 high-fidelity solutions.
+        return 25.0
+
+    def run(self, store: Store) -> Result:
+        problem = build_problem(self.decomposition.problem)
+        members: Mapping[str, AffineMember] = value_of(store, self.decomposition)
+        training = self.decomposition.parameters(problem)
+        return Result(*timed(lambda: certificate_base(problem, members, training)))
+
+
+@dataclass(frozen=True)
+class CertificateStage(Stage):
+    """Certificate of the queries of one reduced model; the value is its `OnlineCertificate` without the base.
+
+    The base, which is of mesh size, is stored once for all models.
+    """
+
+    label = "certificate"
+
+    built: FormulationStage
+
+    @property
+    def effort(self) -> float:
+        # The functionals of its residuals take about as long as 4 high-fidelity solutions.
+        return 4.0
+
+    @property
+    def base(self) -> CertificateBaseStage:
+        # Cells with bounds have reduced assembly.
+        assert self.built.decomposition is not None
+        return CertificateBaseStage(self.built.decomposition)
+
+    def inputs(self) -> tuple[Stage, ...]:
+        return (*self.built.model_inputs, self.base.decomposition, self.base)
+
+    def certificate(self, store: Store) -> OnlineCertificate:
+        """The certificate, once the stage has been run."""
+        return OnlineCertificate(value_of(store, self.base), **value_of(store, self))
+
+    def run(self, store: Store) -> Result:
+        """Prepare the certificate; raises an `UnsupportedError` if the model is assembled in full."""
+        model = self.built.model(store)
+        offline = model.offline.given(
+            members=value_of(store, self.base.decomposition),
+            certificate_base=value_of(store, self.base),
+            decomposed=self.base.decomposition.parameters(model.problem),
+        )
+        model.reduced  # noqa: B018  assembled before the clock begins
+        prepared, seconds = timed(lambda: model.online.certificate(offline))
+        own = (one.name for one in fields(prepared) if one.name != "base")
+        return Result({name: getattr(prepared, name) for name in own}, seconds)

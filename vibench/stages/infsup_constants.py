@@ -1,4 +1,4 @@
-"""The stages of constants at the validation parameters, inf-sup and others; many cells share each of them."""
+"""The stages of inf-sup and other constants at the validation parameters; many cells share each of them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from vibench.stability.infsup import (
     nodal_cone,
 )
 from vibench.stages.artefacts import Store
-from vibench.stages.base import LOST, SHARE, Failed, Result, Stage, build_problem, value_of
+from vibench.stages.base import FAILED_STAGES, PROGRESS, Failed, Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage
 from vibench.stages.serialisation import storable
@@ -32,10 +32,6 @@ from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_edges, chun
 
 for _kind in (ConstraintClasses, Stability, Constant, InfSup):
     storable(_kind)
-
-
-SOLUTIONS = 6.0
-"""The constants of one parameter take about as long as so many high-fidelity solutions."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +43,6 @@ class ReferenceInfSup(Stage):
     constraints: ConstraintMatrices
 
     def run(self, store: Store) -> Result:
-        """Compute the constants."""
         problem = build_problem(self.constraints.problem)
         return Result(constants_full(problem.V, value_of(store, self.constraints), nodal_cone(problem.W)))
 
@@ -66,60 +61,53 @@ class EnergyConstants(Stage):
 
     @property
     def effort(self) -> float:
-        """By the number of its parameters."""
-        return SOLUTIONS * chunk_size(self.parameters.count, self.chunk)
+        # The constants of one parameter take about as long as six high-fidelity solutions.
+        return 6.0 * chunk_size(self.parameters.count, self.chunk)
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
-        """Compute the constants, those of one parameter together, as long as its factorisation is there."""
-        problem, found = build_problem(self.problem), []
-        kept, (_, mus) = assemblies(problem), chunk_of(self.parameters.of(problem), self.chunk)
+        problem, constants = build_problem(self.problem), []
+        matrices, (_, mus) = assemblies(problem), chunk_of(self.parameters.of(problem), self.chunk)
+        # All constants of one parameter together, as long as its factorisation is there.
         for mu in mus:
-            found.append((kept.coercivity_at(mu), kept.continuity_at(mu), kept.energy_inf_sup_at(mu)))
-            SHARE.get()(len(found) / len(mus))
-        return Result(found)
+            constants.append((matrices.coercivity_at(mu), matrices.continuity_at(mu), matrices.energy_inf_sup_at(mu)))
+            PROGRESS.get()(len(constants) / len(mus))
+        return Result(constants)
 
 
 @dataclass(frozen=True)
 class ReferenceConstants:
-    """The stages of all constants of the high-fidelity problem at the parameters of a set."""
+    """All constants of the high-fidelity problem at the parameters of a set."""
 
     constraints: ConstraintMatrices
 
     @property
-    def inf_sup(self) -> ReferenceInfSup:
-        """The stage of β_HF."""
-        return ReferenceInfSup(self.constraints)
-
-    @property
-    def chunks(self) -> tuple[EnergyConstants, ...]:
+    def energy(self) -> tuple[EnergyConstants, ...]:
         """The stages of α, γ_a and β_A."""
         problem, parameters = self.constraints.problem, self.constraints.parameters
         return tuple(EnergyConstants(problem, parameters, chunk) for chunk in range(CHUNKS))
 
     @property
     def stages(self) -> tuple[Stage, ...]:
-        """All of them."""
-        return (self.inf_sup, *self.chunks)
+        return (ReferenceInfSup(self.constraints), *self.energy)
 
     def gather(self, store: Store) -> list[Stability | Failed]:
-        """The constants at every parameter; of those of a chunk that failed, why it did."""
-        inf_sup: list[InfSup] = value_of(store, self.inf_sup)
-        found: list[Stability | Failed] = []
-        for chunk, (first, end) in zip(self.chunks, pairwise(chunk_edges(len(inf_sup))), strict=True):
-            if (failed := LOST.get().get(chunk.key)) is not None:
-                found += [replace(failed, reason=f"in {chunk.label}: {failed.reason}")] * (end - first)
+        """The constants at every parameter, or the failure of the chunk of the parameter."""
+        inf_sup: list[InfSup] = value_of(store, ReferenceInfSup(self.constraints))
+        constants: list[Stability | Failed] = []
+        for chunk, (first, end) in zip(self.energy, pairwise(chunk_edges(len(inf_sup))), strict=True):
+            if (failed := FAILED_STAGES.get().get(chunk.key)) is not None:
+                constants += [replace(failed, reason=f"in {chunk.label}: {failed.reason}")] * (end - first)
             else:
                 pairs = zip(inf_sup[first:end], value_of(store, chunk), strict=True)
-                found += [Stability(hf, *of_A) for hf, of_A in pairs]
-        return found
+                constants += [Stability(hf, *of_A) for hf, of_A in pairs]
+        return constants
 
 
 @dataclass(frozen=True)
 class InfSupConstants(Stage):
     """Inf-sup constants of a primal space with a reduced cone: an `InfSup` per validation parameter.
 
-    The space is that of a reduced model, V_N alone, or, with `None`, the whole of V, whose constants online supremizers
-    attain.
+    The space is that of a reduced model, V_N alone, or, with `None`, the whole of V.
     """
 
     label = "inf-sup constants"
@@ -130,18 +118,17 @@ class InfSupConstants(Stage):
 
     @property
     def kind_of_work(self) -> str:
-        """The constants of a larger space take longer."""
+        # The constants of a larger space take longer.
         return f"{self.label} of {'V' if self.space is None else self.space.label}"
 
     def inputs(self) -> tuple[Stage, ...]:
-        """The space, the cone and the constraint matrices."""
         spaces = self.space.model_inputs if isinstance(self.space, EnrichmentStage) else (self.space, self.cone)
         return (*(stage for stage in spaces if stage is not None), self.constraints)
 
     def run(self, store: Store) -> Result:
-        """Compute the constants."""
         classes: ConstraintClasses = value_of(store, self.constraints)
         cone: ConeBasis = value_of(store, self.cone).prepared
+        # No enrichment exceeds the constants of the whole of V, and online supremizers attain them.
         if self.space is None:
             return Result(constants_full(build_problem(self.cone.problem).V, classes, cone))
         if isinstance(self.space, PODStage):
@@ -149,10 +136,11 @@ class InfSupConstants(Stage):
         model = self.space.reduction(store).projection
         if model.kind is not Kind.PER_PARAMETER:
             return Result(constants_on(model.fixed_basis, classes, cone))
-        mus, kept = self.constraints.parameters.of(model.problem), assemblies(model.problem)
+        mus, matrices = self.constraints.parameters.of(model.problem), assemblies(model.problem)
         if model.enrichment.eta is None:
-            return Result([_constants_at(model, kept.at(mu), cone) for mu in mus])
-        at_firsts = (kept.at(mu) for mu in mus[classes.firsts])  # a class shares one space
+            return Result([_constants_at(model, matrices.at(mu), cone) for mu in mus])
+        # Parameters with proportional constraint matrices share one space: compute its constants once.
+        at_firsts = (matrices.at(mu) for mu in mus[classes.firsts])
         return Result(expand_classes(classes, [_constants_at(model, vi, cone) for vi in at_firsts]))
 
 

@@ -1,6 +1,6 @@
-"""High-fidelity solutions timed as the sweep over the validation set makes them: what one more of them costs.
+"""High-fidelity solutions timed as the sweep over the validation set makes them: the cost of one more of them.
 
-What else uses a machine changes its speed within tenths of a second. Solutions therefore alternate with the queries
+Other processes change the speed of a machine within tenths of a second. Solutions therefore alternate with the queries
 that they are compared with.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
-from itertools import pairwise
+from itertools import cycle, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -23,48 +23,30 @@ from vibench.stages.snapshots import TimedSnapshots
 from vibench.study.parameter_sets import chunk_edges
 from vibench.timing import Seconds, timed
 
-ENOUGH = 0.05
-"""CPU seconds of high-fidelity solutions beside the queries of a cell in one round after which there is no further."""
-
-LONG = 0.1
-"""CPU seconds from which on a solution averages over what changes the speed of the machine: one is enough for a
-round, and counts for all cells in it."""
-
-SOLUTION_SEED = 2
-"""First of the seeds of solutions in a round: those of the queries beside them are smaller, so that no parameter is the
-same."""
-
-ASSEMBLY_SEED = 5
-"""First of the seeds of assemblies that belong to no solution: there are at most three solutions."""
-
-SAME = 1e-6
-"""Largest distance of a solution next to a parameter from that at it, relative to the largest solution."""
-
 
 @lru_cache(maxsize=1)
 def _solver_of(problem: Problem) -> HighFidelitySolver:
-    """The solver of the problem that this process works on, with its set-up once that is done."""
+    """The solver of the current problem of this process; its set-up is done once."""
     return HighFidelitySolver(problem)
 
 
 class MarginalSolutions:
-    """Solutions of a problem at its validation parameters, after the set-up.
+    """Solutions of a problem next to its validation parameters; the first one in a process does the set-up.
 
-    Each starts from the contact set of the nearest parameter before its own in the same part of the sweep, the first
-    one of a part from that of the nearest after it: to start from none, which takes several times as long, happens
-    once, however many solutions follow, and is part of the set-up. Each is solved at a parameter next to its own. The
-    first one in a process does the set-up.
+    Each starts from a contact set as in the sweep. A start from none takes several times as long but happens once,
+    however many solutions follow: it is part of the set-up.
     """
 
     def __init__(self, problem: Problem, reference: TimedSnapshots, seed: int) -> None:
         self._problem, self._mus, self._u, self._seed = problem, reference.mu, reference.u, seed
         self._solver, self._starts = _solver_of(problem), list(_starts(problem, reference))
-        self._allowed = SAME * float(np.max(problem.V.norm(reference.u), initial=0.0))
+        # A solution next to a parameter differs from that at it by at most 1e-6 of the largest solution.
+        self._allowed = 1e-6 * float(np.max(problem.V.norm(reference.u), initial=0.0))
 
     def solve(self, number: int, *seed: int) -> MarginalSolution:
-        """One solution, its assembly included; another parameter next to its own for every seed.
+        """One solution with its assembly, at another parameter next to its own for every seed.
 
-        There are no seconds if it is not that of this parameter, or if there is none.
+        It has no seconds if it fails or differs from the solution of this parameter.
         """
         assembled = self.assemble(number, *seed)
         vi = assembled.vi
@@ -76,21 +58,28 @@ class MarginalSolutions:
         return assembled._replace(seconds=assembled.assembly + rest) if distance <= self._allowed else assembled
 
     def assemble(self, number: int, *seed: int) -> MarginalSolution:
-        """What is assembled for a solution, without it."""
+        """The assembly of a solution, without it."""
         mu = nearby(self._problem.parameters, self._mus[number], self._seed, number, *seed)
         return MarginalSolution(number, *timed(partial(checked_assembly, self._problem, mu)), None)
 
 
 class MarginalSolution(NamedTuple):
-    """A high-fidelity solution that was timed."""
+    """A high-fidelity solution that was timed.
+
+    Attributes
+    ----------
+    number
+        Number of its validation parameter.
+    vi
+        The matrices next to that parameter; the next assembly may be written into the same arrays.
+    assembly, seconds
+        Seconds of the assembly and of the whole solution; `None` of a wrong one.
+    """
 
     number: int
-    """That of its validation parameter."""
     vi: VariationalInequality
-    """What was assembled next to that parameter; the next assembly may be written into the same arrays."""
     assembly: Seconds
     seconds: Seconds | None
-    """Those of the whole solution; `None` of one that is not the right one."""
 
 
 class SolutionsBeside:
@@ -108,40 +97,42 @@ class SolutionsBeside:
     ) -> Iterator[tuple[int, MarginalSolution | None]]:
         """The queries `order` of a cell in a round, each with the solution that was made before it, if there is one.
 
-        There is one before the first query, one before that in the middle, and one after the last query, unless fewer
-        are enough. They are added to `done`.
+        Solutions are added to `done`.
         """
+        # Solve before the first query, before that in the middle and after the last, unless fewer are enough.
         for place, k in enumerate(order):
             yield k, self._next(done, k, at, cell) if place in (0, len(order) // 2) else None
         self._next(done, order[-1], at, cell)
 
     def _next(self, done: list[MarginalSolution], k: int, at: int, cell: int) -> MarginalSolution | None:
-        if sum(one.seconds.cpu for one in done if one.seconds) > ENOUGH:
+        # 0.05 CPU seconds of solutions beside the queries of a cell are enough for a round.
+        if sum(one.seconds.cpu for one in done if one.seconds) > 0.05:
             return None
-        one = self._long.get(at) or self._marginal.solve(k, at, cell, SOLUTION_SEED + len(done))
-        if one.seconds and one.seconds.cpu > LONG and at not in self._long:
+        # Seeds of queries and warm-ups are 0 and 1: no two parameters of a round are the same.
+        one = self._long.get(at) or self._marginal.solve(k, at, cell, 2 + len(done))
+        # A solution of more than 0.1 s averages over the speed of the machine: it counts for all cells of a round.
+        if one.seconds and one.seconds.cpu > 0.1 and at not in self._long:
             self._long = {at: one._replace(vi=one.vi.copy())}
         done.append(one)
         return one
 
     def seconds(self, done: Sequence[MarginalSolution], part: Sequence[int]) -> Seconds | None:
-        """Mean seconds of solutions at the parameters of a part, from those of some and the sweep; `None` of none."""
+        """Mean seconds of solutions at the parameters of a part, from those of some and the sweep."""
         right = [(one.number, one.seconds) for one in done if one.seconds is not None]
         if not right:
             return None
-        share = float(self._sweep[list(part)].mean() / self._sweep[[k for k, _ in right]].mean()) / len(right)
-        return Seconds(share * sum(s.cpu for _, s in right), share * sum(s.wall for _, s in right))
+        # The sweep tells how solutions at the other parameters of the part compare with these.
+        factor = float(self._sweep[list(part)].mean() / self._sweep[[k for k, _ in right]].mean()) / len(right)
+        return Seconds(factor * sum(s.cpu for _, s in right), factor * sum(s.wall for _, s in right))
 
 
 def _starts(problem: Problem, reference: TimedSnapshots) -> Iterator[Mask]:
-    """The contact set (m,) that each solution starts from: that of the nearest before it in its part of the sweep.
-
-    The first of a part starts from that of the nearest after it, or from its own where it is the only one.
-    """
+    """The contact set (m,) that each solution starts from: that of the nearest before it in its part of the sweep."""
     box = problem.parameters
     width = np.maximum(box.upper - box.lower, np.finfo(float).tiny)
     for first, end in pairwise(chunk_edges(len(reference.mu))):
         for k in range(first, end):
+            # The first of a part starts from the nearest after it, or from its own where it is the only one.
             others = slice(first, k) if k > first else slice(min(first + 1, end - 1), end)
             distances = np.linalg.norm((reference.mu[others] - reference.mu[k]) / width, axis=1)
             yield reference.lam[:, others][:, int(np.argmin(distances))] > 0.0
@@ -149,8 +140,6 @@ def _starts(problem: Problem, reference: TimedSnapshots) -> Iterator[Mask]:
 
 def parts_alike(seconds: Sequence[float], parts: int) -> tuple[tuple[int, ...], ...]:
     """Numbers of solutions dealt out to parts that take about as long: the slowest first, there and back."""
-    order, dealt = np.argsort(-np.asarray(seconds), kind="stable"), [*range(parts), *reversed(range(parts))]
-    where = [dealt[place % len(dealt)] for place in range(len(order))]
-    return tuple(
-        tuple(sorted(int(k) for k, at in zip(order, where, strict=True) if at == part)) for part in range(parts)
-    )
+    order, turns = np.argsort(-np.asarray(seconds), kind="stable").tolist(), [*range(parts), *reversed(range(parts))]
+    dealt = list(zip(order, cycle(turns), strict=False))
+    return tuple(tuple(sorted(k for k, turn in dealt if turn == part)) for part in range(parts))

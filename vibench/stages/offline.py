@@ -14,7 +14,7 @@ from vibench.stability.infsup import ConeBasis, beta_span, cone_basis
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.stages.serialisation import storable
-from vibench.stages.snapshots import choosing_stages, gather, parameters_in, solution_stages
+from vibench.stages.snapshots import gather, parameters_in, solution_stages
 from vibench.study.cells import Axes
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.timing import timed
@@ -35,11 +35,9 @@ class PODStage(Stage):
 
     @property
     def axes(self) -> Axes:
-        """The problem, the training set and the tolerance of the POD."""
         return Axes(problem=self.problem, pod=self.stop, training=self.training)
 
     def inputs(self) -> tuple[Stage, ...]:
-        """The training snapshots."""
         return solution_stages(self.problem, self.training)
 
     def run(self, store: Store) -> Result:
@@ -71,16 +69,13 @@ class ConeStage(Stage):
 
     @property
     def axes(self) -> Axes:
-        """The problem, the training set, the dual strategy and its tolerance."""
         return Axes(problem=self.problem, dual=self.dual, cone=self.stop, training=self.training)
 
     @property
     def constraints(self) -> ConstraintMatrices:
-        """The stage of the training constraint matrices, used to assess the cone."""
         return ConstraintMatrices(self.problem, self.training)
 
     def inputs(self) -> tuple[Stage, ...]:
-        """The training snapshots."""
         return solution_stages(self.problem, self.training)
 
     def run(self, store: Store) -> Result:
@@ -88,7 +83,8 @@ class ConeStage(Stage):
         snapshots, W = gather(store, self.inputs()).lam, build_problem(self.problem).W
         strategy = self.dual.create()
         cone, reducing = timed(lambda: strategy.reduce(snapshots, W, self.stop))
-        with faults_of(self.dual):  # verification, which is not part of the offline time
+        # Verification is no part of the offline time.
+        with faults_of(self.dual):
             check_cone(cone, W)
         prepared, preparing = timed(lambda: cone_basis(cone.generators, W, cone.free))
         orthogonal = orthogonality(cone.generators, W, cone.free)
@@ -106,8 +102,8 @@ class ConstraintMatrices(Stage):
     parameters: ParameterSet
 
     def inputs(self) -> tuple[Stage, ...]:
-        """The solutions, where the parameters are known only with them."""
-        return choosing_stages(self.problem, self.parameters)
+        # The parameters of an adaptive training are known only with its solutions.
+        return solution_stages(self.problem, self.parameters) if self.parameters.is_adaptive else ()
 
     def run(self, store: Store) -> Result:
         """The `ConstraintClasses`."""
@@ -124,7 +120,6 @@ class TrainingConstants(Stage):
     cone: ConeStage
 
     def inputs(self) -> tuple[Stage, ...]:
-        """The cone and the constraint matrices."""
         return (self.cone, self.cone.constraints)
 
     def run(self, store: Store) -> Result:

@@ -1,4 +1,4 @@
-"""Offline stages timed once more: how much their seconds scatter, and what those of a cell are with them."""
+"""Offline stages timed again: the scatter of their seconds, and the offline columns of a cell."""
 
 from __future__ import annotations
 
@@ -13,9 +13,6 @@ from vibench.stages.base import Result, Row, Stage
 from vibench.stages.cell_queries import CellQueries
 from vibench.timing import Seconds
 
-NOTICEABLE = 1e-3
-"""CPU seconds of a stage below which its scatter says nothing of that of a whole offline phase."""
-
 
 @dataclass(frozen=True)
 class OfflineRepeat(Stage):
@@ -28,26 +25,23 @@ class OfflineRepeat(Stage):
 
     @property
     def kind_of_work(self) -> str:
-        """It takes about as long as the stage itself."""
+        # A repeat takes about as long as the stage itself.
         return self.stage.kind_of_work
 
     def inputs(self) -> tuple[Stage, ...]:
-        """What the stage itself reads."""
         return self.stage.inputs()
 
     def run(self, store: Store) -> Result:
-        """Time the work of the stage again; its result is the one that is stored already."""
         return Result({name: [spent.cpu, spent.wall] for name, spent in self.stage.measure(store).items()})
 
     def seconds(self, store: Store, name: str) -> Seconds | None:
-        """Seconds of what has this name, once the stage has been run."""
         artefact = store.get(self.key)
         return None if artefact is None else Seconds(*artefact.value[name])
 
 
 def scatter(runs: Iterable[Sequence[Seconds]]) -> float:
     """Standard deviation of the logarithm of offline seconds, from the stages that were timed more than once."""
-    logarithms = [np.log([one.cpu for one in some]) for some in runs if len(some) > 1 and some[0].cpu >= NOTICEABLE]
+    logarithms = [np.log([one.cpu for one in some]) for some in runs if _is_repeated(len(some), some[0].cpu)]
     if not logarithms:
         return SCATTER
     squares = sum(float(np.sum((one - one.mean()) ** 2)) for one in logarithms)
@@ -55,28 +49,30 @@ def scatter(runs: Iterable[Sequence[Seconds]]) -> float:
 
 
 def offline_columns(cell: CellQueries, setup: float, runs: Mapping[str, Sequence[Seconds]], deviation: float) -> Row:
-    """The offline columns of a cell: of each of its stages the median of its `runs`, by key, and one `setup`.
-
-    `deviation` is the `scatter` of one run. The interval is that of seconds that all deviate alike, as by the speed of
-    the machine; a sum of stages that deviate independently scatters less.
-    """
+    """The offline columns of a cell from the `runs` of its stages by key, one `setup`, and the `scatter` of one run."""
     columns: Row = {}
     times, seconds = list[int](), list[float]()
-    for phase, stages in cell.offline.items():
+    for phase, stages in cell.offline_stages.items():
         mine = [runs[stage.key] for stage in stages]
         typical = [float(np.median([one.cpu for one in some])) for some in mine]
         columns[f"offline_{phase}_s"] = sum(typical) + (setup if phase == "snapshots" else 0.0)
         times += map(len, mine)
         seconds += typical
     total = sum(columns.values())
-    # As often as the seconds were measured, weighed by themselves.
+    # Mean number of runs, weighted by seconds. The interval assumes that all stages deviate alike, as by the speed of
+    # the machine; a sum of stages that deviate independently scatters less.
     often = float(np.average(times, weights=seconds)) if sum(seconds) else 1.0
     factor = offline_factor(deviation / float(np.sqrt(often)))
-    repeats = sum(count > 1 and spent >= NOTICEABLE for count, spent in zip(times, seconds, strict=True))
+    repeats = sum(_is_repeated(count, spent) for count, spent in zip(times, seconds, strict=True))
     ends = {"offline_low_s": total / factor, "offline_high_s": total * factor}
     return columns | {"offline_s": total, **ends, "offline_repeats": repeats}
 
 
+def _is_repeated(times: int, cpu: float) -> bool:
+    # The scatter of a stage below a millisecond says nothing about that of a whole offline phase.
+    return times > 1 and cpu >= 1e-3
+
+
 def sources(cell: CellQueries) -> Iterator[Stage]:
-    """The stages whose work has the offline seconds of a cell."""
-    return (stage.measured_by[0] for stages in cell.offline.values() for stage in stages)
+    """The stages whose work takes the offline seconds of a cell."""
+    return (stage.measured_by[0] for stages in cell.offline_stages.values() for stage in stages)

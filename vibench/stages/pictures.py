@@ -24,9 +24,6 @@ from vibench.text import one_line
 
 storable(Picture)
 
-CORNERS = (0.0, 0.5, 1.0)
-"""Positions in the unit box of parameters at which solutions are drawn: lower corner, centre and upper corner."""
-
 
 @dataclass(frozen=True)
 class PictureStage(Stage):
@@ -39,37 +36,30 @@ class PictureStage(Stage):
 
     @property
     def axes(self) -> Axes:
-        """The problem alone: its pictures are those of one training set."""
+        # Without the training set: all pictures of a problem are those of one.
         return Axes(problem=self.problem)
 
     def inputs(self) -> tuple[Stage, ...]:
-        """The training snapshots."""
         return solution_stages(self.problem, self.training)
 
     def run(self, store: Store) -> Result:
-        """Titles and pictures, in the order of `CORNERS`; empty for a problem without pictures."""
+        """Titles and pictures at the solutions nearest to the lower corner, centre and upper corner of the box."""
         problem, solutions = build_problem(self.problem), gather(store, self.inputs())
-        drawn = []
-        for k in _nearest(problem.parameters, solutions.mu):
+        box, pictures = problem.parameters, []
+        unit = (solutions.mu - box.lower) / np.where(box.upper > box.lower, box.upper - box.lower, 1.0)
+        nearest = (int(np.argmin(np.linalg.norm(unit - corner, axis=1))) for corner in (0.0, 0.5, 1.0))
+        # Few training parameters may be nearest to several of these: draw each once.
+        for k in dict.fromkeys(nearest):
             picture = problem.picture(solutions.mu[k], solutions.u[:, k], solutions.lam[:, k])
             if picture is not None:
-                drawn.append((_title(problem.parameters, solutions.mu[k]), _checked(picture)))
-        return Result(tuple(drawn))
+                pictures.append((_title(box, solutions.mu[k]), _checked(picture)))
+        return Result(tuple(pictures))
 
     def rows(self, value: tuple[tuple[str, Picture], ...]) -> Mapping[str, Sequence[Row]]:
-        """Rows of the pictures table."""
         return {"pictures": picture_rows(value)}
 
     def failure_rows(self, reason: str) -> Mapping[str, Sequence[Row]]:
-        """A row with the reason."""
         return {"pictures": failure_rows(reason)}
-
-
-def _nearest(box: ParameterBox, mus: Array) -> list[int]:
-    """Training parameters (P×d) nearest to the corners and the middle of their box, each once."""
-    width = np.where(box.upper > box.lower, box.upper - box.lower, 1.0)
-    unit = (mus - box.lower) / width
-    return list(dict.fromkeys(int(np.argmin(np.linalg.norm(unit - corner, axis=1))) for corner in CORNERS))
 
 
 def _title(box: ParameterBox, mu: Array) -> str:
@@ -99,7 +89,6 @@ def _checked(picture: Picture) -> Picture:
     wrong = [name for name, right in fits.items() if not right]
     if wrong:
         raise NumericalError(f"the problem's picture has {' and '.join(wrong)} of the wrong shape")
-    own: dict[str, Any] = {
-        name: getattr(picture, name).copy() for name in members(arrays=True)
-    }  # the next picture may use the same arrays
+    # Copy: the next picture may reuse the arrays.
+    own: dict[str, Any] = {name: getattr(picture, name).copy() for name in members(arrays=True)}
     return replace(picture, **own | {name: one_line(getattr(picture, name)) for name in members(arrays=False)})

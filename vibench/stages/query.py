@@ -1,4 +1,4 @@
-"""The queries of a cell: what is solved and timed, and its verification."""
+"""One query of a cell: its solution, which is timed, and its verification."""
 
 from __future__ import annotations
 
@@ -38,33 +38,38 @@ class Answered(NamedTuple):
 
     @property
     def x(self) -> Array | None:
-        """Coefficients of u."""
         return self.answer.x
 
     @property
     def alpha(self) -> Array | None:
-        """Coefficients of λ."""
         return self.answer.alpha
 
 
 @dataclass(frozen=True)
 class ProgramQuery:
-    """An assembled program for the QP solver of the cell."""
+    """An assembled program for the QP solver of the cell.
+
+    Attributes
+    ----------
+    factor
+        The Cholesky factor of A where it is known; the program is then solved in its multipliers.
+    accuracy
+        Relative accuracy prescribed to the solver.
+    start
+        Number and program of the query whose solution the solver starts from; `None` for a cold start.
+    units
+        Units (n,) of the unknowns where they are not those of the model.
+    """
 
     program: VariationalInequality
     factor: Array | None
-    """The Cholesky factor of A where it is known."""
     solver: str
     accuracy: float
-    """Relative accuracy prescribed to the solver."""
     start: tuple[int, VariationalInequality] | None = None
-    """Number and program of the query whose solution the solver starts from; `None` for a cold start."""
     units: Array | None = None
-    """Units (n,) of the unknowns where they are not those of the model."""
 
     @property
     def form(self) -> str:
-        """How it is solved: in the unknowns of the program, or in its multipliers."""
         return "primal" if self.factor is None else "dual"
 
     def in_model(self, x: Array) -> Array:
@@ -72,7 +77,7 @@ class ProgramQuery:
         return x if self.units is None else self.units * x
 
     def repeated(self, *seed: int) -> ProgramQuery:
-        """The same query in other units of the unknowns, which depend on the seed; see `vibench.qp.scaling`."""
+        """The same query in other units of the unknowns, which depend on the seed (see docs/measurement.md)."""
         d = random_units(len(self.program.f), self.accuracy, *seed)
         return replace(
             self,
@@ -83,7 +88,7 @@ class ProgramQuery:
         )
 
     def prepare(self, time_limit: TimeLimit) -> Callable[[], tuple[QPSolution, Seconds]]:
-        """Solve the query to start from, whose seconds are not those of this one; returns the timed solution itself."""
+        """Solve the query to start from, untimed, and return the timed solution of this one."""
         extra = registry.qp_solver(self.solver)
         solve = partial(solve_qp, solver=self.solver, accuracy=self.accuracy, extra=extra, factor=self.factor)
         start: QPSolution | None = None
@@ -98,10 +103,10 @@ class ProgramQuery:
         return solution
 
     def check(self, answer: QPSolution) -> None:
-        """Refuse the answer of a timed repetition that is none; raises a `NumericalError`."""
+        """Raise a `NumericalError` if the answer of a timed repetition is wrong."""
         check_answer(self.program, answer, self.accuracy)
 
-    def judge(self, answer: QPSolution, time_limit: TimeLimit) -> tuple[QueryStatus, Row, Row | None]:  # noqa: ARG002
+    def assess(self, answer: QPSolution, time_limit: TimeLimit) -> tuple[QueryStatus, Row, Row | None]:  # noqa: ARG002
         """The status of an answer, and its columns in the tables of queries and of solutions."""
         status, reason, residuals = verify(self.program, answer, self.accuracy)
         row: Row = {"solver_status": answer.solver_status, "iterations": answer.iterations}
@@ -116,32 +121,31 @@ class ProgramQuery:
 class ModelQuery:
     """A query that the formulation itself answers at a parameter mu (d,).
 
-    `program` is its program, if it has any, `start` number and parameter of the query whose answer it starts from.
+    `near` returns a parameter next to mu for every seed, `program` is its program, if it has any, and `start` number
+    and parameter of the query whose answer it starts from.
     """
 
     model: Model
     mu: Array
     near: Callable[..., Array]
-    """A parameter next to that of the query, for every seed."""
     program: VariationalInequality | None = None
     start: tuple[int, Array] | None = None
 
     @property
     def form(self) -> str:
-        """How it is solved."""
         return "formulation"
 
     def in_model(self, x: Array) -> Array:
-        """Coordinates of the model are those of the answer."""
         return x
 
     def repeated(self, *seed: int) -> ModelQuery:
-        """The query at a parameter next to its own: a cache of answers would be timed otherwise."""
+        """The query at a parameter next to its own."""
+        # A caching formulation would be timed on a cache hit at the same parameter.
         mu = self.near(*seed)
         return replace(self, mu=mu, program=self.program and self.model.online.program(mu).program)
 
     def prepare(self, time_limit: TimeLimit) -> Callable[[], tuple[Answered, Seconds]]:
-        """Answer the query to start from, whose seconds are not of this one; returns the timed solution itself."""
+        """Answer the query to start from, untimed, and return the timed solution of this one."""
         model, start = self.model, None
         if self.start is not None:
             with time_limit():
@@ -156,37 +160,31 @@ class ModelQuery:
         return solution
 
     def check(self, answered: Answered) -> None:
-        """Refuse the answer of a timed repetition that is none; raises a `NumericalError`."""
-        found = self.model.status_of(self.mu, *answered, RECOGNISED, self.program)
-        if found.status is not Status.OK:
-            raise NumericalError(f"timed at a parameter next to its own, {found.status.value}: {found.reason}")
+        """Raise a `NumericalError` if the answer of a timed repetition is wrong."""
+        status = self.model.status_of(self.mu, *answered, RECOGNISED, self.program)
+        if status.status is not Status.OK:
+            raise NumericalError(f"timed at a parameter next to its own, {status.status.value}: {status.reason}")
 
-    def judge(self, answered: Answered, time_limit: TimeLimit) -> tuple[QueryStatus, Row, Row | None]:
+    def assess(self, answered: Answered, time_limit: TimeLimit) -> tuple[QueryStatus, Row, Row | None]:
         """The status of an answer, and its columns in the tables of queries and of solutions."""
         answer, solver = answered
         with time_limit():
-            found = self.model.status_of(self.mu, answer, solver, program=self.program)
+            status = self.model.status_of(self.mu, answer, solver, program=self.program)
+        # A program of the formulation's own has no QP solver whose words could be recorded.
         words = answer.reason if self.program is not None else solver.last[1].solver_status if solver.last else ""
         row: Row = {"solver_status": words, "iterations": answer.iterations, "error_u_predicted": answer.uncertainty}
         x, alpha = answer.x, answer.alpha
         if self.program is None:
-            return found, row, None if found.pair is None or x is None else solution_row(x, alpha, None)
-        if found.residuals is None or x is None or alpha is None:
-            return found, row, None
-        return found, row, solution_row(x, alpha, slack(self.program, x, alpha, self.model.accuracy))
+            return status, row, None if status.pair is None or x is None else solution_row(x, alpha, None)
+        if status.residuals is None or x is None or alpha is None:
+            return status, row, None
+        return status, row, solution_row(x, alpha, slack(self.program, x, alpha, self.model.accuracy))
 
 
 class Queries:
-    """The queries of a model, one per validation parameter, for any QP solver.
+    """The queries of a model at the validation parameters `mus` (P×d), for any QP solver.
 
-    Attributes
-    ----------
-    model
-        The model; its queries are for the solver that they are asked for.
-    mus
-        The validation parameters (P×d).
-    programs
-        The programs at these, of a formulation that has any.
+    `programs` are the programs at these, of a formulation that has any.
     """
 
     def __init__(
@@ -206,35 +204,31 @@ class Queries:
         return query_before(self._validation, self.model.problem)
 
     def near(self, number: int, *seed: int) -> Array:
-        """A parameter (d,) next to that of a query, which depends on the seed: what a timed assembly assembles at."""
+        """A parameter (d,) next to that of a query, which depends on the seed, for timed repetitions."""
         return nearby(self.model.problem.parameters, self.mus[number], self._validation.seed, number, *seed)
 
     def query(
         self, number: int, solver: str | None, accuracy: float | None, warm_start: bool
     ) -> ProgramQuery | ModelQuery:
-        """One query of a solver; for a warm start with the one before it on the path of `query_before`.
-
-        That one is solved again for this purpose, so that a start does not depend on what the process solved before. A
-        primal basis that changes with the parameter allows none: coordinates of two queries are not comparable.
-        """
+        """One query of a solver; for a warm start with the one before it on the path of `query_before`."""
+        # The query before is solved again, so that a start does not depend on what the process solved before.
         before = self._before[number] if warm_start else None
         if self.programs is None or solver is None:
             model = self.model.solving(solver)
             program = None if self.programs is None else self.programs.programs[number]
             start = None if before is None else (before, self.mus[before])
             return ModelQuery(model, self.mus[number], partial(self.near, number), program, start)
-        assert accuracy is not None  # formulations with programs for a QP solver have the axis
+        # Formulations with programs for a QP solver have this axis.
+        assert accuracy is not None
         programs = self.programs.programs
+        # Coordinates of two queries are not comparable if the primal basis changes with the parameter.
         may_start = takes_start(solver) and self.model.reduced.kind is not Kind.PER_PARAMETER
         begun = (before, programs[before]) if before is not None and may_start else None
         return ProgramQuery(programs[number], self.programs.factor, solver, accuracy, begun)
 
 
 def query_before(validation: ParameterSet, problem: Problem) -> list[int | None]:
-    """The query whose solution every query of a validation set starts from: the one before it on the path.
-
-    That is the path of the set itself where it is ordered, else one through nearest neighbours.
-    """
+    """The query whose solution every query starts from: the one before it in an ordered set, else in `path_before`."""
     mus = validation.of(problem)
     return [None, *range(len(mus) - 1)] if validation.is_ordered else path_before(mus, problem.parameters)
 
@@ -254,8 +248,7 @@ def path_before(mus: Array, box: ParameterBox) -> list[int | None]:
 def run_query(query: ProgramQuery | ModelQuery, query_seconds: float, time_limit: TimeLimit) -> tuple[Row, Row | None]:
     """The columns of a query, and those of its solution if there is one.
 
-    A solver that takes more than `query_seconds` has the status timeout. What is ok and took less than `SLOW` is
-    solved a second time, to see whether the solver repeats itself.
+    A solver that takes more than `query_seconds` has the status timeout.
     """
     row: Row = {"form": query.form}
     if query.start is not None:
@@ -263,23 +256,22 @@ def run_query(query: ProgramQuery | ModelQuery, query_seconds: float, time_limit
     try:
         solve = query.prepare(time_limit)
         answer, seconds = solve()
-        judged, columns, solution = query.judge(answer, time_limit)  # type: ignore[arg-type]  # what `prepare` has made
-        again = solve()[0] if judged.status is Status.OK and seconds.wall <= SLOW else None
+        # mypy cannot pair the answer with the class of the query.
+        outcome, columns, solution = query.assess(answer, time_limit)  # type: ignore[arg-type]
+        # Solve fast queries a second time: a deterministic solver repeats itself to the last bit.
+        again = solve()[0] if outcome.status is Status.OK and seconds.wall <= SLOW else None
     except MemoryError:
         raise
     except (Exception, SystemExit) as error:  # noqa: BLE001  a solver or a plugin may raise anything; recorded
         return row | {"status": Status.ERROR.value, "reason": in_a_line(error)}, None
-    status, reason = judged.status, judged.reason
+    status, reason = outcome.status, outcome.reason
     if seconds.wall > query_seconds:
         status, reason = Status.TIMEOUT, f"took {seconds.wall:.1f} s, the limit is {query_seconds:g} s"
-    repeatable = None if again is None else int(_identical(answer, again))
+    repeatable = None
+    if again is not None:
+        pairs = ((answer.x, again.x), (answer.alpha, again.alpha))
+        repeatable = int(all((a is b) if a is None or b is None else a.tobytes() == b.tobytes() for a, b in pairs))
     row |= {"status": status.value, "reason": reason, "repeatable": repeatable} | columns
-    if (residuals := judged.residuals) is not None:
+    if (residuals := outcome.residuals) is not None:
         row |= {"primal_residual": residuals.primal, "dual_residual": residuals.dual, "gap": residuals.gap}
     return row, solution
-
-
-def _identical(one: QPSolution | Answered, other: QPSolution | Answered) -> bool:
-    """Whether two solutions are the same to the last bit."""
-    pairs = ((one.x, other.x), (one.alpha, other.alpha))
-    return all((a is b) if a is None or b is None else a.tobytes() == b.tobytes() for a, b in pairs)

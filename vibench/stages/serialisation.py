@@ -19,14 +19,6 @@ from vibench.arrays import SparseMatrix
 from vibench.errors import NumericalError, VibenchError
 from vibench.text import one_line
 
-STRUCTURE = "structure"
-"""Name of the tensor that holds the JSON text; the others are the arrays it refers to, by their numbers."""
-
-DTYPES = frozenset({
-    "bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float16", "float32", "float64",
-})  # fmt: skip
-"""Types of entries that an array may have."""
-
 SPARSE = {
     "csr": ("data", "indices", "indptr"),
     "csc": ("data", "indices", "indptr"),
@@ -48,10 +40,10 @@ class DamagedArtefactError(VibenchError):
 def storable(kind: ClassT) -> ClassT:
     """Add a class to the closed list of those whose objects may be stored; may be used as a decorator.
 
-    Of a dataclass the fields are stored, of an enumeration the name of the member, of any other class what
-    `__getstate__` returns. Cached properties are not stored. A module that defines a stage lists the classes of its
-    value; two classes of the same name cannot be on the list.
+    A dataclass is stored by its fields, an enumeration by the name of the member, any other class by the value of
+    `__getstate__` without cached properties. A module that defines a stage lists the classes of its value.
     """
+    # Files name classes without their modules.
     if _classes.setdefault(kind.__name__, kind) is not kind:
         raise TypeError(f"two storable classes are called {kind.__name__}")
     return kind
@@ -64,20 +56,18 @@ def dumps(value: Any) -> bytes:
     """
     writer = _Writer()
     text = json.dumps(writer.described(value), allow_nan=False, separators=(",", ":"))
-    return safetensors.numpy.save(writer.arrays | {STRUCTURE: np.frombuffer(text.encode("ascii"), np.uint8)})
+    # One tensor holds the JSON text; the others are the arrays it refers to, by their numbers.
+    return safetensors.numpy.save(writer.arrays | {"structure": np.frombuffer(text.encode("ascii"), np.uint8)})
 
 
 def loads(content: bytes) -> Any:
-    """The value that `dumps` wrote; arrays have the same entries, shape and order in memory.
-
-    Dense ones are read-only: a process keeps values for several stages, and a plugin that wrote into those that it is
-    given would change the results of others.
+    """The value that `dumps` wrote; arrays have the same entries, shape and order in memory, dense ones are read-only.
 
     Raises a `DamagedArtefactError` if the content is anything else. It imports and runs nothing that the content names.
     """
     try:
         arrays = safetensors.numpy.load(content)
-        text = arrays.pop(STRUCTURE).tobytes().decode("ascii")
+        text = arrays.pop("structure").tobytes().decode("ascii")
         structure = json.loads(text, object_pairs_hook=_no_duplicates, parse_constant=_refuse)
         return _Reader(arrays).value(structure)
     except (
@@ -88,61 +78,57 @@ def loads(content: bytes) -> Any:
         AttributeError,
         RecursionError,
         MemoryError,
-        VibenchError,  # a factorisation that is computed again
+        # Factorisations are computed again, which may fail.
+        VibenchError,
     ) as error:
         raise DamagedArtefactError(one_line(str(error))) from None
 
 
 class _Writer:
-    """Describes a value in JSON; arrays are set aside, and one that occurs twice is stored once."""
+    """Describes a value in JSON; arrays are stored apart, and one that occurs twice is stored once."""
 
     def __init__(self) -> None:
         self.arrays: dict[str, np.ndarray[Any, Any]] = {}
         self._numbers: dict[int, str] = {}
-        self._kept: list[Any] = []  # as long as they live, no other object has their identity
+        # Keep described objects alive: identities of collected ones are reused.
+        self._alive: list[Any] = []
 
     def described(self, value: Any) -> Any:
-        """JSON of a value: itself, or an object with the sort of the value as its only name."""
+        """JSON of a value: itself, or an object with the kind of the value as its only key."""
         if value is None or type(value) in (bool, int, str):
             return value
         if type(value) is float:
+            # JSON knows no infinity and no NaN.
             return value if math.isfinite(value) else {"float": repr(value)}
-        if type(value) in (tuple, list) or (isinstance(value, Mapping) and not sp.issparse(value)):
-            return self._container(value)
-        return self._array(value) if type(value) is np.ndarray or isinstance(value, np.generic) else self._object(value)
-
-    def _container(self, value: Any) -> Any:
+        if sp.issparse(value):
+            return self._sparse(value)
         if isinstance(value, Mapping):
             return {"dict": [[self.described(key), self.described(part)] for key, part in value.items()]}
-        return {"tuple" if isinstance(value, tuple) else "list": [self.described(part) for part in value]}
+        if type(value) in (tuple, list):
+            return {type(value).__name__: [self.described(part) for part in value]}
+        return self._array(value) if type(value) is np.ndarray or isinstance(value, np.generic) else self._object(value)
 
     def _array(self, value: Any) -> Any:
         """An array, or a number of NumPy."""
-        if value.dtype.name not in DTYPES:
+        # Booleans, signed and unsigned integers and floats of at most 8 bytes: safetensors has no other type.
+        if value.dtype.kind not in "biuf" or value.dtype.itemsize > 8:
             raise NumericalError(f"an array of the type {value.dtype} cannot be stored")
-        if isinstance(value, np.generic):
-            return {"scalar": self._number(np.asarray(value))}
-        turned = value.flags.f_contiguous and not value.flags.c_contiguous
-        return {"columnwise" if turned else "array": self._number(value)}
-
-    def _number(self, value: np.ndarray[Any, Any]) -> str:
+        columnwise = value.flags.f_contiguous and not value.flags.c_contiguous
+        kind = "scalar" if isinstance(value, np.generic) else "columnwise" if columnwise else "array"
         if id(value) not in self._numbers:
             number = self._numbers[id(value)] = str(len(self.arrays))
-            turned = value.flags.f_contiguous and not value.flags.c_contiguous
-            self._kept.append(value)
-            self.arrays[number] = value.T if turned else np.asarray(value, order="C")
-        return self._numbers[id(value)]
+            self._alive.append(value)
+            self.arrays[number] = value.T if columnwise else np.asarray(value, order="C")
+        return {kind: self._numbers[id(value)]}
 
     def _sparse(self, value: SparseMatrix) -> Any:
         kind = value.format if value.format in SPARSE else "coo"
         stored = value.asformat(kind)
-        self._kept.append(stored)
+        self._alive.append(stored)
         parts = [self.described(np.asarray(getattr(stored, name))) for name in SPARSE[kind]]
         return {"sparse": [value.format, kind, isinstance(value, sp.sparray), list(value.shape), parts]}
 
     def _object(self, value: Any) -> Any:
-        if sp.issparse(value):
-            return self._sparse(value)
         kind, name = type(value), type(value).__name__
         if _classes.get(name) is not kind:
             raise NumericalError(f"a value of the type {kind.__module__}.{kind.__qualname__} cannot be stored")
@@ -151,7 +137,8 @@ class _Writer:
         if is_dataclass(value):
             state = {field.name: getattr(value, field.name) for field in fields(value)}
         else:
-            state = {k: v for k, v in value.__getstate__().items() if not _is_cached(kind, k)}
+            cached = {key for key in value.__getstate__() if isinstance(getattr(kind, key, None), cached_property)}
+            state = {key: part for key, part in value.__getstate__().items() if key not in cached}
         return {"object": [name, {key: self.described(part) for key, part in state.items()}]}
 
 
@@ -160,7 +147,7 @@ class _Reader:
 
     def __init__(self, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
         self._arrays, self._views = arrays, dict[str, np.ndarray[Any, Any]]()
-        self._sorts: dict[str, Callable[[Any], Any]] = {
+        self._kinds: dict[str, Callable[[Any], Any]] = {
             "float": lambda text: {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}[text],
             "tuple": lambda parts: tuple(map(self.value, parts)),
             "list": lambda parts: list(map(self.value, parts)),
@@ -177,24 +164,25 @@ class _Reader:
         """The value of a description."""
         if not isinstance(described, dict):
             if isinstance(described, list):
-                raise TypeError("a list without its sort")
+                raise TypeError("a list without its kind")
             return described
-        ((sort, content),) = described.items()
-        return self._sorts[sort](content)
+        ((kind, content),) = described.items()
+        return self._kinds[kind](content)
 
     def _read_only(self, number: str) -> np.ndarray[Any, Any]:
         """A view of an array, the same one wherever it occurs."""
+        # A process keeps values for several stages: a plugin that wrote into them would change the results of others.
         if number not in self._views:
             self._views[number] = self._arrays[number].view()
             self._views[number].flags.writeable = False
         return self._views[number]
 
     def _part(self, described: tuple[str, str]) -> np.ndarray[Any, Any]:
-        """An array of a sparse matrix, which SciPy sorts in place."""
-        sort, number = described
-        if sort not in ("array", "columnwise"):
+        kind, number = described
+        if kind not in ("array", "columnwise"):
             raise TypeError("a sparse matrix without arrays")
-        return self._arrays[number].T if sort == "columnwise" else self._arrays[number]
+        # Writable: SciPy sorts indices in place.
+        return self._arrays[number].T if kind == "columnwise" else self._arrays[number]
 
     def _sparse(self, wanted: str, kind: str, array: bool, shape: list[int], parts: list[Any]) -> SparseMatrix:
         arrays = [self._part(*part.items()) for part in parts]
@@ -206,8 +194,10 @@ class _Reader:
         if kind in ("csr", "csc", "bsr"):
             if not arrays[1].dtype.kind == arrays[2].dtype.kind == "i":
                 raise ValueError("indices that are no integers")
-            matrix.check_format(full_check=True)  # compiled loops trust the indices
-            matrix.indices, matrix.indptr = arrays[1], arrays[2]  # as they were: the constructor may have copied them
+            # Compiled loops trust the indices.
+            matrix.check_format(full_check=True)
+            # The constructor may have converted them.
+            matrix.indices, matrix.indptr = arrays[1], arrays[2]
         return matrix if wanted == kind else matrix.asformat(wanted)
 
     def _object(self, name: str, described: dict[str, Any]) -> Any:
@@ -227,17 +217,14 @@ def _class(name: str, base: type) -> Any:
     """The class of a name, from the closed list."""
     named = _classes[name]
     if issubclass(named, Enum) is not (base is Enum):
-        raise TypeError(f"{name} is another sort of class")
+        raise TypeError(f"{name} is another kind of class")
     return named
-
-
-def _is_cached(kind: type, name: str) -> bool:
-    return isinstance(getattr(kind, name, None), cached_property)
 
 
 def _no_duplicates(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     pairs = list(pairs)
     unique = dict(pairs)
+    # The reader must not depend on which of two entries JSON keeps.
     if len(unique) != len(pairs):
         raise ValueError("a name that occurs twice")
     return unique

@@ -25,7 +25,7 @@ from vibench.plugins.kinds import PROBLEM
 from vibench.plugins.plugin import Plugin
 from vibench.qp.scaling import nearby
 from vibench.stages.artefacts import History, Store
-from vibench.stages.base import SHARE, Result, Stage, build_problem, faults_of, value_of
+from vibench.stages.base import PROGRESS, Result, Stage, build_problem, faults_of, value_of
 from vibench.stages.serialisation import storable
 from vibench.study.cells import Axes
 from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_of, chunk_size
@@ -33,36 +33,36 @@ from vibench.timing import NO_TIME, SLOW, Seconds, median_of, timed
 
 T = TypeVar("T")
 
-TRAINED = 100
-"""Number of training parameters that is expected of a problem, which is not built to ask for its own."""
-
-VALIDATED = 3.0
-"""As many training solutions take about as long as a validation solution, its repetitions and its error bound."""
-
 storable(Fingerprint)
-
-RUNS = 3
-"""How often a validation solution is solved, so that a disturbed one does not count. That is no more than its share of
-those that rounds time later, beside the queries which they are compared with."""
 
 
 @storable
 @dataclass(frozen=True)
 class TimedSnapshots(Snapshots):
-    """High-fidelity solutions at some parameters, and what they took."""
+    """High-fidelity solutions at some parameters, and their seconds.
+
+    Attributes
+    ----------
+    seconds
+        Seconds per solution, assembly included and set-up excluded: the median of repeats at validation parameters.
+    setups
+        Seconds of the set-up of each chunk: those of the first solution beyond its repetition from a known start.
+    fallbacks
+        Fallbacks of the active set method per solution, "" where it needed none.
+    fingerprint
+        Fingerprint of the problem at the first training parameter, as the process of the chunk assembled it.
+    selecting
+        Seconds of the choice of the parameters by an adaptive training.
+    bounds
+        Relative error bounds of validation solutions, infinite where there is none; empty for training solutions.
+    """
 
     seconds: tuple[Seconds, ...]
-    """Seconds per solution, assembly included and set-up excluded: the median of repeats at validation parameters."""
     setups: tuple[Seconds, ...]
-    """Seconds of the set-up, once per chunk: what the first solution took beyond its repetition from a known start."""
     fallbacks: tuple[str, ...]
-    """Fallbacks of the active set method per solution, "" where it needed none."""
     fingerprint: Fingerprint
-    """Fingerprint of the problem at the first training parameter, as the process of the chunk assembled it."""
     selecting: Seconds = NO_TIME
-    """Seconds of the choice of the parameters, none unless the training is adaptive."""
     bounds: tuple[float, ...] = ()
-    """Relative error bounds of validation solutions, infinite where there is none; none of training solutions."""
 
 
 @dataclass
@@ -73,14 +73,14 @@ class _SetUp:
     seconds: Seconds | None = None
 
     def done(self, solver: HighFidelitySolver, seconds: Seconds) -> None:
-        """The set-up is that of the first chunk; the others have none."""
+        # The first chunk of a process does the set-up; the others have none.
         if self.seconds is None:
             self.solver, self.seconds = solver, seconds
 
 
 @lru_cache(maxsize=1)
 def _set_up(problem: Problem) -> _SetUp:  # noqa: ARG001
-    """That of the problem that this process works on: chunks in one process share it."""
+    """The set-up that the chunks of a problem in one process share."""
     return _SetUp()
 
 
@@ -97,22 +97,22 @@ class SnapshotStage(Stage):
 
     @property
     def kind_of_work(self) -> str:
-        """Those of the two sets take differently long."""
+        # Validation solutions are repeated and verified, which takes longer.
         return f"{self.label} of the {self.parameters.role} set"
 
     @property
     def effort(self) -> float:
-        """Those of the chunk."""
-        each = VALIDATED if self.parameters.role == "validation" else 1.0
-        return each * chunk_size(self.parameters.count or TRAINED, self.chunk)
+        # A validation solution with repetitions and error bound takes about as long as three training solutions.
+        each = 3.0 if self.parameters.role == "validation" else 1.0
+        # The number of a problem's own training parameters is known only once it is built: guess 100.
+        return each * chunk_size(self.parameters.count or 100, self.chunk)
 
     @property
     def axes(self) -> Axes:
-        """The problem, and the training set if it is a part of that."""
+        # The training set names the histories of its own parts only.
         return Axes(self.problem, training=self.parameters if self.parameters.role == "training" else None)
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
-        """Assemble and solve at every parameter of the chunk."""
         with faults_of(self.problem):
             return self._sweep(build_problem(self.problem))
 
@@ -122,7 +122,8 @@ class SnapshotStage(Stage):
         u, lam = np.zeros((problem.V.dim, len(mus))), np.zeros((problem.W.dim, len(mus)))
         seconds, fallbacks, kept = [], [], _set_up(problem)
         solver = kept.solver or HighFidelitySolver(problem)
-        solver.forget()  # no solution may depend on what this process has solved before
+        # No solution may depend on what this process has solved before.
+        solver.forget()
 
         def refuse_shifted() -> None:
             if not np.array_equal(mus, given):
@@ -130,7 +131,7 @@ class SnapshotStage(Stage):
 
         @contextmanager
         def explained(mu: Array, vi: VariationalInequality) -> Iterator[None]:
-            """Name the cause rather than what came of it."""
+            """Name the cause of a failed solution where the problem is at fault."""
             try:
                 yield
             except NumericalError:
@@ -146,12 +147,14 @@ class SnapshotStage(Stage):
 
         solutions: list[ActiveSetSolution] = []
         for k, mu in enumerate(mus):
-            # the first one without repetitions: what it takes from a known start is measured in the end
+            # The first one without repetitions: its seconds from a known start are measured in the end.
             runs, repeated = self._runs if k else 1, itertools.chain([mu], self._near(problem, mu, k))
             (vi, unverified), taken = self._measure(solve, repeated, runs)
-            seconds.append(taken)  # verification, which is what follows, is not timed
+            # The verification below is not timed.
+            seconds.append(taken)
+            # Repetitions at other parameters may have written into the arrays.
             if runs > 1:
-                vi = checked_assembly(problem, mu)  # repetitions at other parameters may have written into its arrays
+                vi = checked_assembly(problem, mu)
             with explained(mu, vi):
                 solution = solver.verify(mu, vi, unverified)
             if k == 0 or "A" not in problem.constant:
@@ -161,7 +164,7 @@ class SnapshotStage(Stage):
             solutions.append(solution)
             u[:, k], lam[:, k] = solution.u, solution.lam
             fallbacks.append(solution.fallback)
-            SHARE.get()((k + 1) / len(mus))
+            PROGRESS.get()((k + 1) / len(mus))
         if solutions:
             beginning, seconds[0] = seconds[0], self._once_started(problem, solver, solve, solutions, mus)
             kept.done(solver, beginning.beyond(seconds[0]))
@@ -173,11 +176,11 @@ class SnapshotStage(Stage):
         return Result(swept, sum(seconds, NO_TIME), self._diagnostics(problem, mus, first))
 
     def _bounds(self, problem: Problem, mus: Array, u: Array, lam: Array) -> Iterator[float]:
-        """Verify the references by their error bounds; training solutions are none."""
-        kept = assemblies(problem)
+        """Error bounds that verify reference solutions; none for training solutions."""
+        matrices = assemblies(problem)
         for k, mu in enumerate(mus if self.parameters.role != "training" else ()):
             try:
-                yield reference_bound(kept.at(mu), kept.energy_at(mu), u[:, k], lam[:, k])
+                yield reference_bound(matrices.at(mu), matrices.energy_at(mu), u[:, k], lam[:, k])
             except NumericalError as error:
                 raise NumericalError(f"at mu = {mu.tolist()}: {error}") from error
 
@@ -189,10 +192,8 @@ class SnapshotStage(Stage):
         solutions: Sequence[ActiveSetSolution],
         mus: Array,
     ) -> Seconds:
-        """Seconds of the first solution from the contact set of the nearest of the others, or from its own without any.
-
-        To start from none takes several times as long, and happens once, however many solutions follow.
-        """
+        """Seconds of the first solution from the contact set of the nearest of the others; if it is alone, its own."""
+        # A start from none takes several times as long but happens once, however many solutions follow.
         solver.forget()
         for mu, solution in list(zip(mus, solutions, strict=True))[min(1, len(solutions) - 1) :]:
             solver.remember(mu, solution)
@@ -200,15 +201,16 @@ class SnapshotStage(Stage):
 
     @property
     def _runs(self) -> int:
-        """A training solution is an offline cost, timed once; of a validation solution the median of a few counts."""
-        return 1 if self.parameters.role == "training" else RUNS
+        # Training solutions are an offline cost, timed once. The median of three runs of a validation solution ignores
+        # a disturbed one; the rounds time it again, beside the queries that it is compared with.
+        return 1 if self.parameters.role == "training" else 3
 
     def _near(self, problem: Problem, mu: Array, number: int) -> Iterator[Array]:
-        """Parameters next to one of the chunk."""
+        # A caching problem would be timed on a cache hit at the same parameter.
         return (nearby(problem.parameters, mu, self.parameters.seed, number, again) for again in itertools.count())
 
     def _measure(self, work: Callable[[Array], T], mus: Iterator[Array], runs: int) -> tuple[T, Seconds]:
-        """The result at the first parameter, and the median of runs at so many, or of one that is slow."""
+        """The result at the first parameter, and the median seconds at the first `runs` of them, or of one slow run."""
         result, first = timed(partial(work, next(mus)))
         rest = range(runs - 1) if first.wall <= SLOW else ()
         return result, median_of([first, *(timed(partial(work, next(mus)))[1] for _ in rest)])
@@ -227,7 +229,7 @@ class SnapshotStage(Stage):
 class AdaptiveTraining(Stage):
     """Training parameters chosen one after the other by a sampling strategy, with their high-fidelity solutions.
 
-    The value is a `TimedSnapshots`; the seconds of the stage have those of the choice, which is made of error bounds.
+    The value is a `TimedSnapshots`; the seconds of the stage include those of the choice.
     """
 
     label = "adaptive training"
@@ -237,12 +239,12 @@ class AdaptiveTraining(Stage):
 
     @property
     def axes(self) -> Axes:
-        """The problem and the training set."""
         return Axes(self.problem, training=self.training)
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """Train; histories are the bounds that led to solutions, the parameters, and the number of bounds so far."""
-        assert self.training.sampling is not None  # a problem's own set is not adaptive
+        # A problem's own set is not adaptive.
+        assert self.training.sampling is not None
         with faults_of(self.problem):
             problem, strategy = build_problem(self.problem), self.training.sampling.create()
             reference = reference_assembly(problem)
@@ -272,11 +274,6 @@ def solution_stages(problem: Plugin, parameters: ParameterSet) -> tuple[Stage, .
     if parameters.is_adaptive:
         return (AdaptiveTraining(problem, parameters),)
     return tuple(SnapshotStage(problem, parameters, chunk) for chunk in range(CHUNKS))
-
-
-def choosing_stages(problem: Plugin, parameters: ParameterSet) -> tuple[Stage, ...]:
-    """The stages that `parameters_in` reads."""
-    return solution_stages(problem, parameters) if parameters.is_adaptive else ()
 
 
 def parameters_in(store: Store, problem: Plugin, parameters: ParameterSet) -> Array:

@@ -1,10 +1,14 @@
-"""Seconds of queries of several cells, each alternated with high-fidelity solutions, round by round."""
+"""Seconds of queries of several cells, each alternated with high-fidelity solutions, round by round, and their columns.
+
+See docs/measurement.md for the design of the rounds.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
+from statistics import fmean, median
 
 import numpy as np
 
@@ -16,12 +20,11 @@ from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel
 from vibench.offline.assemblies import Assemblies
 from vibench.offline.correction import corrected_in_full
 from vibench.provenance import machine
-from vibench.results.paired_timing import beside, paces
+from vibench.results.paired_timing import beside, blocks_of, mean_seconds, paces
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, TimeLimit, build_problem
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.marginal_solutions import (
-    ASSEMBLY_SEED,
     MarginalSolution,
     MarginalSolutions,
     SolutionsBeside,
@@ -29,57 +32,94 @@ from vibench.stages.marginal_solutions import (
 )
 from vibench.stages.query import ModelQuery, Queries
 from vibench.stages.snapshots import TimedSnapshots, gather
-from vibench.stages.timed_seconds import TimedCell, TimedRound, round_columns
-from vibench.timing import NO_TIME, Seconds, calibration, timed
+from vibench.timing import DISTURBED, NO_TIME, Seconds, calibration, timed
 
-SHARE = 3
+QUERY_SUBSETS = 3
 """A round takes a third of the queries of a cell, another one each time: short rounds interleave more closely."""
 
-ROUND_SECONDS = 5.0
-"""Wall seconds of the solver after which a cell's part of a round ends."""
-
 ASSEMBLY_SECONDS = 0.02
-"""CPU seconds of assemblies in full after which no further one is timed in a cell's part of a round."""
+"""CPU seconds of full assemblies after which no further one is timed in a cell's part of a round."""
+
+
+@dataclass(frozen=True)
+class TimedRound:
+    """One round of one cell.
+
+    Attributes
+    ----------
+    assemble, solve, certify
+        Seconds of assembly, solver and certificate by the number of the query. A full assembly is timed for some of
+        the queries, which count for all.
+    slowdown
+        Slowdown of the calibration before or after it, whichever is larger.
+    beside
+        Mean seconds of the high-fidelity solutions beside the queries, their assembly included.
+    """
+
+    assemble: Mapping[int, Seconds]
+    solve: Mapping[int, Seconds]
+    slowdown: float
+    certify: Mapping[int, Seconds] = field(default_factory=dict)
+    beside: Seconds | None = None
+
+    @property
+    def cpu(self) -> float:
+        """CPU seconds of a query, mean over those of the round."""
+        return float(round_columns(self)["total_s"])
+
+    @property
+    def beside_cpu(self) -> float:
+        """CPU seconds of a high-fidelity solution; NaN without one."""
+        return np.nan if self.beside is None else self.beside.cpu
+
+
+@dataclass(frozen=True)
+class TimedCell:
+    """The rounds of one cell by their number, the machine that timed them, and the failures of missing rounds."""
+
+    rounds: Mapping[int, TimedRound]
+    machine: str
+    failures: tuple[Failed, ...] = ()
 
 
 @dataclass(frozen=True)
 class TimingRounds(ItemwiseStage):
     """One block of rounds of cells that are compared; an item is a round of one of them.
 
-    A cell's queries alternate with high-fidelity solutions, so that a disturbance of the machine meets both alike. The
-    order of the cells is another one in each round. The value is a `TimedCell` per cell.
+    A cell's queries alternate with high-fidelity solutions, so that a disturbance of the machine affects both alike.
+    The order of the cells changes from round to round. The value is a `TimedCell` per cell.
+
+    Attributes
+    ----------
+    queries
+        The queries of every cell that are ok.
+    rounds, first
+        Number of rounds, and number of the first one: those of earlier blocks come before.
+    session
+        Blocks of a later session are timed in processes that have timed none of an earlier one.
     """
 
     label = "timing"
 
     cells: tuple[CellQueries, ...]
     queries: tuple[tuple[int, ...], ...]
-    """The queries of every cell that are ok."""
     rounds: int
-    first: int = 0
-    """Number of the first one of its rounds: those of earlier blocks come before."""
+    first: int
     session: int = 0
-    """Blocks of a later session are timed in processes that have timed none of an earlier one."""
 
     @property
     def items(self) -> int:
-        """One for each round of each cell."""
         return self.rounds * len(self.cells)
 
     @property
     def weight(self) -> int:
-        """It works for all of its cells."""
+        # The limit of seconds is for each of its cells.
         return len(self.cells)
 
-    @property
-    def solutions(self) -> tuple[Stage, ...]:
-        """The stages of the high-fidelity solutions at the validation parameters."""
-        return self.cells[0].validation
-
     def inputs(self) -> tuple[Stage, ...]:
-        """The models and the programs of the cells, and the solutions that high-fidelity ones start from."""
-        read = [stage for cell in self.cells for stage in cell.timed_inputs]
-        return tuple(dict.fromkeys((*read, *self.solutions)))
+        # Timed queries read models and programs only; their answers were assessed before.
+        read = [stage for cell in self.cells for stage in cell.model_inputs]
+        return tuple(dict.fromkeys((*read, *self.cells[0].validation)))
 
     def place(self, item: int) -> tuple[int, int]:
         """The round of the block, and the cell, of an item."""
@@ -87,11 +127,10 @@ class TimingRounds(ItemwiseStage):
         return number, int(_order(self.first + number, len(self.cells))[within])
 
     def stage_of(self, number: int) -> Stage:
-        """The cell of an item: processes take turns where its plugins are of other packages than the next one's."""
+        """The cell of an item: another process takes over where its plugins belong to other packages."""
         return self.cells[self.place(number)[1]]
 
     def begin(self, store: Store) -> _Rounds:
-        """Models are loaded when they are first needed; cells that differ in their solver alone share one."""
         return _Rounds(self, store)
 
 
@@ -102,7 +141,7 @@ def _order(number: int, cells: int) -> Indices:
 
 
 class _Rounds(Items):
-    """Rounds in progress."""
+    """Rounds in progress. Models are loaded at their first query; cells that differ only in their solver share one."""
 
     def __init__(self, stage: TimingRounds, store: Store) -> None:
         self._stage, self._store = stage, store
@@ -114,12 +153,12 @@ class _Rounds(Items):
 
     @cached_property
     def _reference(self) -> TimedSnapshots:
-        return gather(self._store, self._stage.solutions)
+        return gather(self._store, self._stage.cells[0].validation)
 
     @cached_property
     def _parts(self) -> tuple[tuple[int, ...], ...]:
         """The validation parameters that the rounds of a block take in turn."""
-        return parts_alike([seconds.cpu for seconds in self._reference.seconds], SHARE)
+        return parts_alike([seconds.cpu for seconds in self._reference.seconds], QUERY_SUBSETS)
 
     @cached_property
     def _marginal(self) -> MarginalSolutions:
@@ -131,48 +170,47 @@ class _Rounds(Items):
         return SolutionsBeside(self._marginal, [seconds.cpu for seconds in self._reference.seconds])
 
     def run_item(self, number: int, time_limit: TimeLimit) -> TimedRound:
-        """One round of one cell, after a warm-up if it is the cell's first one in this process."""
         within, cell = self._stage.place(number)
         at, before = self._stage.first + within, self._slowdown
+        # Warm up with one query: the first one of a process loads, compiles and allocates.
         if cell not in self._warm:
-            self._queries_of(time_limit, self._warming_up(cell, at), at, cell, 1)
+            k = self._stage.queries[cell][0]
+            # A process that has made no high-fidelity solution makes one, which does the set-up; others assemble.
+            solution = self._marginal.assemble(k, at, cell) if self._warm else self._marginal.solve(k, at, cell, 1)
+            self._time_queries(time_limit, [(k, solution)], at, cell, 1)
             self._warm.add(cell)
             before = None
+        # The calibration after a round counts for the next one, unless a warm-up is between them.
         before = calibration().slowdown() if before is None else before
-        part = self._parts[at % SHARE] or self._parts[0]
+        part = self._parts[at % QUERY_SUBSETS] or self._parts[0]
         solutions: list[MarginalSolution] = []
         alternated = self._beside.alternated(self._order(cell, at, part), solutions, at, cell)
-        assemble, solve, certify = self._queries_of(time_limit, alternated, at, cell, 0)
+        assemble, solve, certify = self._time_queries(time_limit, alternated, at, cell, 0)
         self._slowdown = calibration().slowdown()
         return TimedRound(assemble, solve, max(before, self._slowdown), certify, self._beside.seconds(solutions, part))
 
     def _order(self, cell: int, at: int, part: Sequence[int]) -> Sequence[int]:
-        """The queries of a cell in a round; the first one is another one in every block, and for the next cell.
-
-        Solutions at some parameters stand for all by the seconds of the sweep, whose errors should differ by cell.
-        """
+        """The queries of a cell in a round."""
         fine = self._stage.queries[cell]
         mine = [k for k in fine if k in part] or [fine[at % len(fine)]]
-        shift = (at // SHARE + cell) % len(mine)
+        # Solutions at a few parameters are scaled to all by the seconds of the sweep. Start elsewhere in every block
+        # and for every cell, so that the errors of this scaling differ.
+        shift = (at // QUERY_SUBSETS + cell) % len(mine)
         return [*mine[shift:], *mine[:shift]]
 
-    def _warming_up(self, cell: int, at: int) -> Iterator[tuple[int, MarginalSolution]]:
-        """One query with an assembly before it, and a solution in a process that has made none: it does the set-up."""
-        k = self._stage.queries[cell][0]
-        yield k, self._marginal.assemble(k, at, cell) if self._warm else self._marginal.solve(k, at, cell, 1)
-
-    def _queries_of(
+    def _time_queries(
         self,
         time_limit: TimeLimit,
-        alternated: Iterator[tuple[int, MarginalSolution | None]],
+        alternated: Iterable[tuple[int, MarginalSolution | None]],
         at: int,
         cell: int,
         warm_up: int,
     ) -> tuple[dict[int, Seconds], dict[int, Seconds], dict[int, Seconds]]:
-        """Seconds of assembly, solution, certificate and correction of queries, each with the solution before it.
+        """Seconds of assembly, solution, and certificate with correction of queries, each with the solution before it.
 
-        What is timed is equivalent to the queries and nowhere the same: nothing is gained by remembering it.
+        `warm_up` is part of the seeds of what is timed.
         """
+        # Every repetition is perturbed, so that a caching solver or problem cannot be timed on a cache hit.
         stage, seed = self._stage.cells[cell], (at, cell, warm_up)
         assemble: dict[int, Seconds] = {}
         solve: dict[int, Seconds] = {}
@@ -183,9 +221,11 @@ class _Rounds(Items):
             query, near = stage.query(queries, k), queries.near(k, *seed)
             if isinstance(query, ModelQuery):
                 query = query.repeated(*seed)
-                assemble[k] = NO_TIME  # it is part of the solution
+                # The assembly is part of the solution.
+                assemble[k] = NO_TIME
             else:
-                further = partial(self._marginal.assemble, k, at, cell, ASSEMBLY_SEED + warm_up)
+                # Seeds below 5 are those of queries and of the at most three solutions.
+                further = partial(self._marginal.assemble, k, at, cell, 5 + warm_up)
                 seconds = _assembly(queries.model.reduced, near, solution, further, assemble)
                 assemble |= {} if seconds is None else {k: seconds}
                 query = query.repeated(stage.validation_set.seed, k, *seed)
@@ -193,24 +233,27 @@ class _Rounds(Items):
             query.check(answer)  # type: ignore[arg-type]  # what `prepare` has made
             if certified and answer.x is not None and answer.alpha is not None:
                 certify[k] = self._certified(stage, queries, near, (query.in_model(answer.x), answer.alpha))
-            if sum(seconds.wall for seconds in solve.values()) > ROUND_SECONDS:
+            # A slow solver ends its part of a round after 5 s, so that the cells keep alternating.
+            if sum(seconds.wall for seconds in solve.values()) > 5.0:
                 break
         return assemble, solve, certify
 
     def _certified(self, stage: CellQueries, queries: Queries, near: Array, solution: tuple[Array, Array]) -> Seconds:
-        """Seconds of the certificate of a solution at a parameter and of its correction, or of that in full."""
+        """Seconds of the certificate and the correction of a solution at a parameter."""
         model = queries.model.reduced
+        # Without certificate the correction takes high-fidelity matrices, which a full assembly has made already.
         if stage.certificate is None:
-            kept = self._factors.setdefault(stage.built.key, Assemblies(model.problem, 0))
+            factors = self._factors.setdefault(stage.built.key, Assemblies(model.problem, 0))
             vi, assembly = timed(lambda: checked_assembly(model.problem, near).copy())
-            _, seconds = timed(partial(corrected_in_full, model, kept, near, vi, *solution))
+            _, seconds = timed(partial(corrected_in_full, model, factors, near, vi, *solution))
             return assembly + seconds if isinstance(model, HyperReducedModel) else seconds
         key = stage.certificate.key
         if key not in self._certificates:
             self._certificates[key] = stage.certificate.certificate(self._store)
-        assert isinstance(model, HyperReducedModel)  # it has a certificate
-        given = model.problem, near, model.assemble(near), *solution
-        return timed(partial(self._certificates[key].certify, *given, stage.correction))[1]
+        # Only models assembled at reduced cost have certificates.
+        assert isinstance(model, HyperReducedModel)
+        query = model.problem, near, model.assemble(near), *solution
+        return timed(partial(self._certificates[key].certify, *query, stage.correction))[1]
 
     def _queries(self, stage: CellQueries) -> Queries:
         key = stage.model, stage.accuracy
@@ -219,23 +262,19 @@ class _Rounds(Items):
         return self._models[key]
 
     def failed(self, number: int, failed: Failed) -> Failed:  # noqa: ARG002
-        """A round without a result."""
         return failed
 
     def collect(self, items: Sequence[TimedRound | Failed]) -> tuple[TimedCell, ...]:
-        """The rounds of every cell, in their order."""
         rounds: list[dict[int, TimedRound]] = [{} for _ in self._stage.cells]
-        lost: list[list[Failed]] = [[] for _ in rounds]
+        failures: list[list[Failed]] = [[] for _ in rounds]
         for number, outcome in enumerate(items):
             within, cell = self._stage.place(number)
             if isinstance(outcome, Failed):
-                lost[cell].append(outcome)
+                failures[cell].append(outcome)
             else:
                 rounds[cell][self._stage.first + within] = outcome
-        return tuple(
-            TimedCell(mine, machine(), len(gone), gone[0].reason if gone else "")
-            for mine, gone in zip(rounds, lost, strict=True)
-        )
+        cells = zip(rounds, failures, strict=True)
+        return tuple(TimedCell(mine, machine(), tuple(missing)) for mine, missing in cells)
 
 
 def _assembly(
@@ -245,15 +284,13 @@ def _assembly(
     further: Callable[[], MarginalSolution],
     done: Mapping[int, Seconds],
 ) -> Seconds | None:
-    """Seconds of the assembly of a query, `None` where it is not timed.
-
-    In full it costs the same at each parameter: some assemblies stand for all, those of the high-fidelity solutions and
-    `further` ones until they are enough.
-    """
+    """Seconds of the assembly of a query, `None` where it is not timed."""
     if isinstance(model, HyperReducedModel):
         return timed(partial(model.assemble, near))[1]
+    # A full assembly costs the same at every parameter: a few count for all.
     if sum(seconds.cpu for seconds in done.values()) > ASSEMBLY_SECONDS:
         return None
+    # The high-fidelity solution before the query was assembled at another parameter at the same cost.
     assembled = solution or further()
     return assembled.assembly + timed(partial(model.reduce, assembled.vi))[1]
 
@@ -276,3 +313,59 @@ def block_rows(stage: TimingRounds, timed: Sequence[TimedCell]) -> list[list[Row
         ]
         for cell in timed
     ]
+
+
+def round_columns(one: TimedRound) -> Row:
+    """Seconds of the parts of a query and of the whole, means over the queries of a round."""
+    return _columns(*(_of_all(fmean, parts.values()) for parts in (one.assemble, one.solve, one.certify)))
+
+
+def _of_all(average: Callable[[Sequence[float]], float], parts: Iterable[Seconds]) -> Array | None:
+    """Average CPU and wall seconds (2,); `None` of none."""
+    every = [(seconds.cpu, seconds.wall) for seconds in parts]
+    return np.array([average(column) for column in zip(*every, strict=True)]) if every else None
+
+
+def _columns(assemble: Array | None, solve: Array | None, certify: Array | None) -> Row:
+    """The columns that rounds and queries share, from CPU and wall seconds of the parts of a query (2,)."""
+    parts = {"assemble_s": assemble, "solve_s": solve, "certify_s": certify}
+    total, wall = sum((part for part in parts.values() if part is not None), np.zeros(2))
+    seconds = {name: None if part is None else part[0] for name, part in parts.items()}
+    return seconds | {"total_s": total, "total_wall_s": wall}
+
+
+def seconds_of_cell(rows: Sequence[Row]) -> Row:
+    """The columns of a cell from its rounds; empty without any."""
+    if not rows:
+        return dict.fromkeys((
+            "online_s", "online_q1_s", "online_q3_s", "online_wall_s", "online_assemble_s", "online_solve_s",
+            "online_certify_s", "slowdown", "disturbed",
+        ))  # fmt: skip
+    total, wall, slowdown = (np.array([row[name] for row in rows]) for name in ("total_s", "total_wall_s", "slowdown"))
+    certified = [row["certify_s"] for row in rows if row["certify_s"] is not None]
+    low, high = np.quantile(total, (0.25, 0.75))
+    # Geometric means over the blocks of medians over their rounds: the quotient of the two is the paired one.
+    online, high_fidelity = mean_seconds(blocks_of(rows).values())
+    return {
+        "online_s": online,
+        "online_q1_s": low,
+        "online_q3_s": high,
+        "online_wall_s": np.median(wall),
+        "online_assemble_s": np.median([row["assemble_s"] for row in rows]),
+        "online_solve_s": np.median([row["solve_s"] for row in rows]),
+        "online_certify_s": np.median(certified) if certified else None,
+        "slowdown": np.median(slowdown),
+        "disturbed": int(np.median(slowdown) > DISTURBED),
+    } | ({} if high_fidelity is None else {"hf_s": high_fidelity})
+
+
+def seconds_of_queries(rounds: Sequence[TimedRound]) -> dict[int, Row]:
+    """The columns of the queries that were timed: medians over the rounds."""
+    rows = {}
+    for k in sorted({k for one in rounds for k in one.solve}):
+        # A full assembly is not timed for each query of a round: take the seconds of another one.
+        assembled = [one.assemble[k] if k in one.assemble else next(iter(one.assemble.values())) for one in rounds]
+        solved = [one.solve[k] for one in rounds if k in one.solve]
+        certified = [one.certify[k] for one in rounds if k in one.certify]
+        rows[k] = _columns(*(_of_all(median, parts) for parts in (assembled, solved, certified)))
+    return rows

@@ -225,7 +225,7 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
 
     def stored(self, result: Enrichment) -> Enrichment:
         built: BuiltEnrichment = loads(dumps(BuiltEnrichment.of(result, self.plugin)))
-        return built.restored(lambda: self.plugin)
+        return built.restored(self.plugin)
 
     def tolerance(self) -> Iterator[str]:
         """`build` accepts a tolerance exactly if `takes_tolerance` says so."""

@@ -91,7 +91,7 @@ def test_the_scatter_of_stages_is_pooled() -> None:
 
 
 def columns(runs_of: Mapping[str, list[float]], deviation: float = 0.1) -> dict[str, Any]:
-    stages: dict[str, Stage] = {one.key: one for some in GOAL.offline.values() for one in some}
+    stages: dict[str, Stage] = {one.key: one for some in GOAL.offline_stages.values() for one in some}
     runs = {key: [spent(cpu) for cpu in runs_of.get(stage.label, [0.0])] for key, stage in stages.items()}
     return offline_columns(GOAL, 0.5, runs, deviation)
 

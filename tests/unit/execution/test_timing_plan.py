@@ -18,8 +18,7 @@ from vibench.qp.status import Status
 from vibench.results.database import ResultsDatabase
 from vibench.stages.base import Failed
 from vibench.stages.cell_queries import CellQueries, cell_queries
-from vibench.stages.timed_seconds import TimedCell, TimedRound
-from vibench.stages.timing_rounds import TimingRounds
+from vibench.stages.timing_rounds import TimedCell, TimedRound, TimingRounds
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, read_study
 from vibench.timing import Seconds

@@ -53,7 +53,7 @@ CELLS = (cell(None), cell(None, "other"), cell(1e-6), cell(1e-6, "other"))
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     store = Store(tmp_path_factory.mktemp("artefacts"))
-    for stage in TimingRounds(CELLS, (EVERY,) * len(CELLS), 1).inputs():
+    for stage in TimingRounds(CELLS, (EVERY,) * len(CELLS), 1, first=0).inputs():
         if store.get(stage.key) is None:
             carry_out(stage, store)
     return store
@@ -81,7 +81,7 @@ def test_a_solver_that_remembers_programs_never_meets_one_again(store: Store, mo
     """Two cells of one problem and solver are in the rounds, whose programs are the same."""
     solver = Remembers()
     monkeypatch.setattr(registry, "qp_solver", lambda name: {name: solver})
-    timed = TimingRounds(CELLS, (EVERY,) * len(CELLS), 12).run(store).value
+    timed = TimingRounds(CELLS, (EVERY,) * len(CELLS), 12, first=0).run(store).value
     assert [len(one.rounds) for one in timed] == [12] * len(CELLS)
     assert solver.solved == len(CELLS) * (12 + 1)  # a query in every round, and the warm-up
     assert solver.remembered == 0
@@ -94,7 +94,7 @@ def test_an_answer_to_a_similar_program_is_not_timed(which: int, store: Store, m
     # which queries a round begins with depends on measured seconds; units of some let the first answer pass
     monkeypatch.setattr(timing_rounds, "parts_alike", lambda _, parts: (EVERY,) * parts)
     with pytest.raises(NumericalError, match=r"residual .* above 3e-07.*does the solver remember answers"):
-        TimingRounds(CELLS[which : which + 1], (EVERY,), 12).run(store)
+        TimingRounds(CELLS[which : which + 1], (EVERY,), 12, first=0).run(store)
     assert solver.remembered == 1
 
 
@@ -102,7 +102,7 @@ def test_reduced_programs_are_assembled_nowhere_twice(store: Store, monkeypatch:
     """A problem may keep what it computed for a parameter."""
     monkeypatch.setattr(registry, "qp_solver", lambda name: {name: Remembers()})
     visited = visits(monkeypatch, HyperReducedModel, "assemble")
-    TimingRounds(CELLS, (EVERY,) * len(CELLS), 12).run(store)
+    TimingRounds(CELLS, (EVERY,) * len(CELLS), 12, first=0).run(store)
     assert len(visited) == len(set(visited)) == 2 * (12 + 1)
     assert len({tuple(np.round(mu, 6)) for mu in visited}) == len(EVERY)
 

@@ -24,7 +24,7 @@ from vibench.qp.status import Status
 from vibench.reduction.nested import Milestone
 from vibench.stability.coercivity import Stability
 from vibench.stages import snapshots
-from vibench.stages.base import LOST, Failed, value_of
+from vibench.stages.base import FAILED_STAGES, Failed, value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.cell_summary import summarise
 from vibench.stages.enrichment import NestedEnrichment, SingleEnrichment
@@ -376,12 +376,12 @@ def test_without_an_ok_query_there_are_no_means() -> None:
 
 def test_a_chunk_of_constants_that_failed_costs_the_queries_at_its_own_parameters(store: SampleStore) -> None:
     stage = cell("offline-pga", 0.5)
-    first, *_ = stage.reference.chunks
-    token = LOST.set({first.key: Failed(Status.TIMEOUT, "too long")})
+    first, *_ = stage.reference.energy
+    token = FAILED_STAGES.set({first.key: Failed(Status.TIMEOUT, "too long")})
     try:
         rows = stage.run(store).value.queries
     finally:
-        LOST.reset(token)
+        FAILED_STAGES.reset(token)
     lost = chunk_of(np.arange(9.0)[:, None], 0)[1].size
     assert [row["status"] for row in rows] == ["timeout"] * lost + ["ok"] * (9 - lost)
     assert {row["reason"] for row in rows[:lost]} == {"in high-fidelity constants: too long"}

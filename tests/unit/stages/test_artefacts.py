@@ -17,7 +17,7 @@ from vibench.stages.artefacts import SUFFIX, Artefact, History, Store, encoded
 from vibench.timing import Seconds
 
 TIME = Seconds(1.5, 2.5)
-HISTORY = History("pod", "error", (1.0, 0.5))
+HISTORY = History("pod", "error", (1.0, 0.5), 0)
 
 
 def files(folder: Path) -> list[str]:
@@ -43,51 +43,37 @@ def test_a_history_of_anything_else_is_refused(values: list[Any]) -> None:
         History.of("enrichment", "steps", values)
 
 
-def test_what_is_put_is_got_by_another_process(tmp_path: Path) -> None:
-    Store(tmp_path / "new").put("key", np.arange(3.0), TIME, (HISTORY,))
-    found = Store(tmp_path / "new").get("key")
-    assert found is not None
-    np.testing.assert_array_equal(found.value, [0.0, 1.0, 2.0])
-    assert (found.seconds, found.histories) == (TIME, (HISTORY,))
-    assert files(tmp_path / "new") == [f"key{SUFFIX}"]
-
-
-def test_what_was_never_put_is_missing(tmp_path: Path) -> None:
-    assert Store(tmp_path).get("key") is None
-    assert Store(tmp_path / "nowhere").get("key") is None
-
-
-def test_what_was_missing_is_found_later(tmp_path: Path) -> None:
-    reader = Store(tmp_path)
+def test_what_is_put_is_got_by_another_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, reader = tmp_path / "new", Store(tmp_path / "new")
     assert reader.get("key") is None
-    Store(tmp_path).put("key", 1, TIME, ())
+    monkeypatch.setattr(module, "machine", lambda: "there")
+    Store(folder).put("key", np.arange(3.0), TIME, (HISTORY,))
+    monkeypatch.setattr(module, "machine", lambda: "here")
     found = reader.get("key")
     assert found is not None
-    assert found.value == 1
+    np.testing.assert_array_equal(found.value, [0.0, 1.0, 2.0])
+    assert (found.seconds, found.histories, found.machine) == (TIME, (HISTORY,), "there")
+    assert files(folder) == [f"key{SUFFIX}"]
 
 
-def test_an_artefact_says_which_machine_measured_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "machine", lambda: "there")
-    Store(tmp_path).put("key", 1, TIME, ())
-    monkeypatch.setattr(module, "machine", lambda: "here")
-    found = Store(tmp_path).get("key")
-    assert found is not None
-    assert found.machine == "there"
-
-
-def test_what_cannot_be_written_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_what_cannot_be_written_leaves_the_earlier_artefact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(NumericalError, match=r"type builtins\.function cannot be stored"):
         Store(tmp_path).put("key", lambda: 0, TIME, ())
     assert files(tmp_path) == []
-
-
-def test_what_cannot_be_written_leaves_the_earlier_artefact(tmp_path: Path) -> None:
     Store(tmp_path).put("key", 1, TIME, ())
     with pytest.raises(NumericalError, match=r"type builtins\.function cannot be stored"):
         Store(tmp_path).put("key", lambda: 0, TIME, ())
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(module.os, "fsync", full)
+    with pytest.raises(StorageError, match=f"artefacts cannot be written to '{tmp_path}': No space left on device"):
+        Store(tmp_path).put("key", 2, TIME, ())
     found = Store(tmp_path).get("key")
     assert found is not None
     assert found.value == 1
+    assert files(tmp_path) == [f"key{SUFFIX}"]
 
 
 def test_an_artefact_is_not_seen_before_it_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,22 +120,10 @@ def test_a_damaged_artefact_counts_as_missing(damage: Callable[[Path], object], 
     assert Store(tmp_path).get("key") is None
 
 
-def test_many_artefacts_are_all_found(tmp_path: Path) -> None:
-    """More than are kept in memory at a time."""
-    store = Store(tmp_path, kept=10_000)
-    for k in range(200):
-        store.put(f"key-{k}", k, TIME, ())
-    for _ in range(2):
-        for k in range(200):
-            found = store.get(f"key-{k}")
-            assert isinstance(found, Artefact)
-            assert found.value == k
-
-
 def test_artefacts_are_kept_up_to_so_many_bytes_and_those_used_long_ago_go_first(tmp_path: Path) -> None:
     for name, size in (("one", 1000), ("two", 1000), ("three", 1000), ("large", 4000)):
         Store(tmp_path).put(name, np.zeros(size), TIME, ())
-    store = Store(tmp_path, kept=20_000)  # two of them, and their descriptions
+    store = Store(tmp_path, cached_bytes=20_000)  # two of them, and their descriptions
     first, second = store.get("one"), store.get("two")
     assert store.get("one") is first
     assert store.get("two") is second
@@ -161,23 +135,6 @@ def test_artefacts_are_kept_up_to_so_many_bytes_and_those_used_long_ago_go_first
     assert large is not None
     assert len(large.value) == 4000
     assert store.get("large") is not large
-
-
-def test_a_full_disk_is_said_in_a_line_and_leaves_what_was_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    Store(tmp_path).put("key", 1, TIME, ())
-
-    def full(_: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(module.os, "fsync", full)
-    with pytest.raises(StorageError, match=f"artefacts cannot be written to '{tmp_path}': No space left on device"):
-        Store(tmp_path).put("key", 2, TIME, ())
-    found = Store(tmp_path).get("key")
-    assert found is not None
-    assert found.value == 1
-    assert files(tmp_path) == [f"key{SUFFIX}"]
 
 
 def test_what_is_stored_is_counted_and_cleared(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction.supremizers import ContactCoordinates
 from vibench.stages import assembly  # noqa: F401  lists what operators consist of
-from vibench.stages.serialisation import STRUCTURE, DamagedArtefactError, dumps, loads, storable
+from vibench.stages.serialisation import DamagedArtefactError, dumps, loads, storable
 from vibench.timing import Seconds
 
 
@@ -174,7 +174,7 @@ def test_anything_else_is_named_when_it_is_written(value: Any, named: str) -> No
 def crafted(structure: str | bytes, **arrays: Any) -> bytes:
     """What a stranger may write."""
     text = structure.encode() if isinstance(structure, str) else structure
-    found = {STRUCTURE: np.frombuffer(text, np.uint8)} if text else {}
+    found = {"structure": np.frombuffer(text, np.uint8)} if text else {}
     return safetensors.numpy.save(found | {name: np.asarray(value) for name, value in arrays.items()})
 
 
