@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from vibench.qp.solve import solve_qp, takes_start
 from vibench.stages import cell_queries
 from vibench.stages.assessment import error_columns
 from vibench.stages.base import value_of
+from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.query import path_before, query_before
@@ -29,6 +30,14 @@ from vibench.study.parameter_sets import ParameterSet
 
 BOX = ParameterBox(("a", "b"), np.array([0.0, 0.0]), np.array([1.0, 100.0]), ("1", "1"))
 PROBLEM = Plugin("problem", "radial-obstacle", '{"resolution": 200}', "test")
+
+
+def cell(problem: Plugin, solver: str, accuracy: float, dual: str = "cpg", *, bounds: bool = False) -> CellQueries:
+    cone = ConeStage(problem, Plugin("dual strategy", dual, "{}", "test"), Stop(size=3))
+    primal = Plugin("primal strategy", "decorrelated", "{}", "test")
+    enrichment = SingleEnrichment(PODStage(problem, Stop(size=4)), cone, primal, None)
+    validation, interpolation = ParameterSet("validation", 4, 1), 1e-6 if bounds else None
+    return program_queries(enrichment, interpolation, validation, solver, accuracy, bounds=bounds)
 
 
 @given(st.integers(0, 10_000), st.integers(1, 12))
@@ -55,8 +64,7 @@ def test_an_ordered_set_is_its_own_path() -> None:
     assert query_before(own, problem) == path_before(own.of(problem), problem.parameters) != [None, 0, 1, 2, 3]
 
 
-@pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])
-@pytest.mark.parametrize("dual", [False, True])
+@pytest.mark.parametrize(("solver", "dual"), product(["piqp", "proxqp", "osqp"], [False, True]))
 def test_a_start_changes_the_way_and_not_the_answer(solver: str, dual: bool) -> None:
     rng = np.random.default_rng(3)
     A = np.diag(1.0 + rng.random(5))
@@ -72,13 +80,7 @@ def test_a_start_changes_the_way_and_not_the_answer(solver: str, dual: bool) -> 
 
 
 def test_a_query_whose_assessment_fails_costs_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cone = ConeStage(PROBLEM, Plugin("dual strategy", "cpg", "{}", "test"), Stop(size=3))
-    primal = Plugin("primal strategy", "decorrelated", "{}", "test")
-    enrichment = SingleEnrichment(PODStage(PROBLEM, Stop(size=4)), cone, primal, None)
-    stage, store = (
-        program_queries(enrichment, None, ParameterSet("validation", 4, 1), "piqp", 1e-6),
-        SampleStore(tmp_path),
-    )
+    stage, store = cell(PROBLEM, "piqp", 1e-6), SampleStore(tmp_path)
     carry_out(stage, store)
     whole, bad = value_of(store, stage), float(PROBLEM.create().validation_set(4, 1)[2, 0])
 
@@ -102,11 +104,7 @@ def test_a_cell_whose_factors_do_not_fit_is_assessed_in_parts(
 ) -> None:
     """Factors of as many parameters as fit are held at a time; rows are those of all at once."""
     problem = Plugin("problem", "hertz", '{"resolution": "coarse"}', "test")
-    cone = ConeStage(problem, Plugin("dual strategy", "mcpg", "{}", "test"), Stop(size=3))
-    primal = Plugin("primal strategy", "decorrelated", "{}", "test")
-    enrichment = SingleEnrichment(PODStage(problem, Stop(size=4)), cone, primal, None)
-    store, validation = SampleStore(tmp_path), ParameterSet("validation", 4, 1)
-    stage = program_queries(enrichment, 1e-6 if certified else None, validation, "piqp", 1e-8, bounds=certified)
+    store, stage = SampleStore(tmp_path), cell(problem, "piqp", 1e-8, "mcpg", bounds=certified)
     carry_out(stage, store)
     whole, sizes = value_of(store, stage), []
     monkeypatch.setattr(Assemblies, "together", lambda *_: 3)
@@ -125,11 +123,7 @@ def test_a_cell_whose_factors_do_not_fit_is_assessed_in_parts(
 
 
 def test_rows_say_which_query_they_started_from(tmp_path: Path) -> None:
-    cone = ConeStage(PROBLEM, Plugin("dual strategy", "cpg", "{}", "test"), Stop(size=3))
-    primal = Plugin("primal strategy", "decorrelated", "{}", "test")
-    enrichment = SingleEnrichment(PODStage(PROBLEM, Stop(size=4)), cone, primal, None)
-    stage = program_queries(enrichment, None, ParameterSet("validation", 4, 1), "osqp", 1e-6)
-    store, started = SampleStore(tmp_path), {}
+    stage, store, started = cell(PROBLEM, "osqp", 1e-6), SampleStore(tmp_path), {}
     for warm, solver in ((False, "osqp"), (True, "osqp"), (True, "piqp")):
         asked = replace(stage, warm_start=warm, solver=solver)
         carry_out(asked, store)

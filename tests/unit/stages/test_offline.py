@@ -212,23 +212,26 @@ class Factorising(HighFidelitySolver):
     """A solver whose first solution takes 10 s longer than the others, which take 1 s each, by a clock of its own."""
 
     now = 0.0
+    without_contact_set = 0.0
 
     def __init__(self, problem: Problem) -> None:
         super().__init__(problem)
         self._is_set_up = False
 
     def solve_assembled(self, mu: Array, vi: VariationalInequality) -> HighFidelitySolution:
-        Factorising.now += 1.0 if self._is_set_up else 11.0
+        Factorising.now += (1.0 if self._is_set_up else 11.0) + (0.0 if self._solved else self.without_contact_set)
         self._is_set_up = True
         return super().solve_assembled(mu, vi)
 
 
-@pytest.mark.parametrize(("role", "count"), [("training", 0), ("validation", 9), ("validation", 18)])
-def test_the_set_up_is_no_part_of_the_seconds_of_a_solution(
-    role: Literal["training", "validation"], count: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+@pytest.mark.parametrize("extra", [0.0, 5.0])
+@pytest.mark.parametrize(("role", "count"), [("training", 0), ("validation", 4), ("validation", 18)])
+def test_the_set_up_and_a_start_without_contact_set_are_no_part_of_the_seconds_of_a_solution(
+    role: Literal["training", "validation"], count: int, extra: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Whatever the number of parameters that share it: break-even would depend on the number of queries otherwise."""
     made = []
+    monkeypatch.setattr(Factorising, "without_contact_set", extra)
     monkeypatch.setattr(snapshots, "HighFidelitySolver", lambda problem: made.append(1) or Factorising(problem))
     monkeypatch.setattr(snapshots, "_set_up", lru_cache(snapshots._set_up.__wrapped__))
     for clock in ("process_time", "perf_counter"):
@@ -236,34 +239,11 @@ def test_the_set_up_is_no_part_of_the_seconds_of_a_solution(
     alone = SnapshotStage(PROBLEM, ParameterSet(role, count, 3), 0).run(SampleStore(tmp_path))
     for chunk in (1, 0):  # which share the set-up of this process
         found = SnapshotStage(PROBLEM, ParameterSet(role, count, 3), chunk).run(SampleStore(tmp_path))
-        assert found.value.setups == alone.value.setups == (Seconds(10.0, 10.0),)
+        assert found.value.setups == alone.value.setups == (Seconds(10.0 + extra, 10.0 + extra),)
         assert set(found.value.seconds) == {Seconds(1.0, 1.0)}
         assert found.seconds == Seconds(float(len(found.value.mu)), float(len(found.value.mu)))
     assert len(made) == 1
     np.testing.assert_array_equal(found.value.u, alone.value.u)  # whatever was solved before
-
-
-class Beginning(Factorising):
-    """A solver that takes 5 s more from no contact set than from one, too."""
-
-    def solve_assembled(self, mu: Array, vi: VariationalInequality) -> HighFidelitySolution:
-        Factorising.now += 0.0 if self._solved else 5.0
-        return super().solve_assembled(mu, vi)
-
-
-@pytest.mark.parametrize(("role", "count"), [("training", 0), ("validation", 4), ("validation", 18)])
-def test_to_start_from_no_contact_set_is_a_part_of_the_set_up(
-    role: Literal["training", "validation"], count: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """It happens once, however many solutions follow: the share of parts that start anew falls with their size."""
-    monkeypatch.setattr(snapshots, "HighFidelitySolver", Beginning)
-    monkeypatch.setattr(snapshots, "_set_up", lru_cache(snapshots._set_up.__wrapped__))
-    for clock in ("process_time", "perf_counter"):
-        monkeypatch.setattr(timing, clock, lambda: Factorising.now)
-    for chunk in (1, 0):  # which share the set-up of this process
-        found = SnapshotStage(PROBLEM, ParameterSet(role, count, 3), chunk).run(SampleStore(tmp_path)).value
-        assert found.setups == (Seconds(15.0, 15.0),)
-        assert set(found.seconds) == {Seconds(1.0, 1.0)}
 
 
 def test_a_slow_query_is_a_timeout(store: SampleStore) -> None:
@@ -338,6 +318,8 @@ def test_means_are_over_the_ok_queries_and_the_worst_status_names_the_cell() -> 
     assert found["reason"] == "1 of 4 queries, first mu=(0.5): it was failed"
     assert (found["queries"], found["queries_ok"]) == (4, 2)
     assert (found["error_u_mean"], found["error_u_max"]) == (2.0, 3.0)
+    found = summarise([query("nonfinite", None)])
+    assert (found["error_u_mean"], found["residual_max"], found["beta_span_min"]) == (None, None, 0.2)
 
 
 @given(
@@ -365,13 +347,6 @@ def test_what_is_zero_is_counted_apart_and_enters_no_mean(drawn: list[tuple[bool
         assert found[f"error_{name}_max"] == (max(errors) if errors else None)
         mean = found[f"error_{name}_mean"]
         assert mean == pytest.approx(sum(errors) / len(errors)) if errors else mean is None
-
-
-def test_without_an_ok_query_there_are_no_means() -> None:
-    found = summarise([query("nonfinite", None)])
-    assert found["error_u_mean"] is None
-    assert found["residual_max"] is None
-    assert found["beta_span_min"] == 0.2
 
 
 def test_a_chunk_of_constants_that_failed_costs_the_queries_at_its_own_parameters(store: SampleStore) -> None:
