@@ -64,7 +64,7 @@ def test_an_ordered_set_is_its_own_path() -> None:
     assert query_before(own, problem) == path_before(own.of(problem), problem.parameters) != [None, 0, 1, 2, 3]
 
 
-@pytest.mark.parametrize(("solver", "dual"), product(["piqp", "proxqp", "osqp"], [False, True]))
+@pytest.mark.parametrize(("solver", "dual"), [*product(["piqp", "proxqp", "osqp"], [False, True])])
 def test_a_start_changes_the_way_and_not_the_answer(solver: str, dual: bool) -> None:
     rng = np.random.default_rng(3)
     A = np.diag(1.0 + rng.random(5))

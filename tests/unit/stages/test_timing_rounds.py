@@ -54,7 +54,7 @@ EVERY = tuple(range(VALIDATION))
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
     store = SampleStore(tmp_path_factory.mktemp("artefacts"))
-    for stage in TimingRounds(CELLS, (EVERY,) * len(CELLS), 1, first=0, session=0).inputs():
+    for stage in TimingRounds(CELLS, (EVERY,) * len(CELLS), 1, first=0).inputs():
         if store.get(stage.key) is None:
             carry_out(stage, store)
     return store
@@ -76,7 +76,7 @@ def steady(seconds: float, queries: tuple[int, ...] = (0, 1), slowdown: float = 
 
 @given(st.integers(1, 9), st.integers(1, 9))
 def test_every_round_has_every_cell_once_before_the_next_one_begins(rounds: int, count: int) -> None:
-    stage = TimingRounds((CELLS[0],) * count, (EVERY,) * count, rounds, first=0, session=0)
+    stage = TimingRounds((CELLS[0],) * count, (EVERY,) * count, rounds, first=0)
     places = [stage.place(item) for item in range(stage.items)]
     assert [number for number, _ in places] == sorted(number for number, _ in places)
     assert sorted(places) == [(number, k) for number in range(rounds) for k in range(count)]
@@ -84,16 +84,16 @@ def test_every_round_has_every_cell_once_before_the_next_one_begins(rounds: int,
 
 def test_the_order_of_the_cells_changes_from_round_to_round() -> None:
     """Whoever comes after a large model finds its own arrays out of the cache: not always the same one."""
-    stage = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 12, first=0, session=0)
+    stage = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 12, first=0)
     first = [stage.place(number * 6)[1] for number in range(12)]
     assert len(set(first)) > 3
-    later = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 4, first=8, session=0)
+    later = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 4, first=8)
     assert [later.place(number * 6)[1] for number in range(4)] == first[8:]
 
 
 def test_a_machine_that_slows_down_halfway_meets_all_alike() -> None:
     """Cell after cell, the second of two equal ones would seem thrice as slow."""
-    stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 12, first=0, session=0)
+    stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 12, first=0)
     spent = [1.0 if item < stage.items / 2 else 3.0 for item in range(stage.items)]
     items = [replace(steady(one), beside=Seconds(2.0 * one, 2.0 * one)) for one in spent]
     timed = timing_rounds._Rounds.collect(_in(stage), items)
@@ -112,7 +112,7 @@ def _in(stage: TimingRounds) -> timing_rounds._Rounds:
 
 def test_every_ok_query_is_timed_and_no_other(store: SampleStore) -> None:
     fine = (EVERY, (0, 2, 5), EVERY, (3,))
-    timed = TimingRounds(CELLS, fine, 8, first=0, session=0).run(store).value
+    timed = TimingRounds(CELLS, fine, 8, first=0).run(store).value
     for one, numbers in zip(timed, fine, strict=True):
         rounds = list(one.rounds.values())
         assert list(one.rounds) == list(range(8))
@@ -131,7 +131,7 @@ def test_reduced_assembly_is_timed_at_every_query_and_full_assembly_at_as_many_a
 ) -> None:
     monkeypatch.setattr(timing_rounds, "ASSEMBLY_SECONDS", enough)
     monkeypatch.setattr(timing_rounds, "QUERY_SUBSETS", 1)
-    timed = TimingRounds(CELLS, (EVERY,) * len(CELLS), 2, first=0, session=0).run(store).value
+    timed = TimingRounds(CELLS, (EVERY,) * len(CELLS), 2, first=0).run(store).value
     assert [[len(each.assemble) for each in one.rounds.values()] for one in timed[:3]] == [[in_full] * 2] * 3
     assert all(each.assemble.keys() == each.solve.keys() for each in timed[3].rounds.values())
 
@@ -140,7 +140,7 @@ def test_high_fidelity_solutions_start_where_those_of_the_sweep_do(
     store: SampleStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From the contact set of the nearest parameter before; the first one of a part from that of the nearest after."""
-    stage = TimingRounds(CELLS, (EVERY,) * len(CELLS), 1, first=0, session=0)
+    stage = TimingRounds(CELLS, (EVERY,) * len(CELLS), 1, first=0)
     reference = gather(store, stage.cells[0].validation)
     starts: list[Any] = []
     solve = marginal_solutions.solve_unverified
@@ -206,7 +206,7 @@ def test_some_solutions_stand_for_all_of_a_part_by_the_sweep() -> None:
 
 
 def test_rounds_begin_at_other_queries_in_later_blocks_and_for_other_cells(store: SampleStore) -> None:
-    work = TimingRounds(CELLS[:2], (EVERY,) * 2, 1, first=0, session=0).begin(store)
+    work = TimingRounds(CELLS[:2], (EVERY,) * 2, 1, first=0).begin(store)
     assert isinstance(work, timing_rounds._Rounds)
     numbers, parts = range(2 * timing_rounds.QUERY_SUBSETS), work._parts
     assert {work._order(0, at, parts[at % timing_rounds.QUERY_SUBSETS])[0] for at in numbers} == set(EVERY)
@@ -233,7 +233,7 @@ def test_matrices_in_full_are_those_of_the_solutions_and_none_is_assembled_twice
     monkeypatch.setattr(ReducedModel, "reduce", lambda model, vi: (reduced.append(vi), reduce(model, vi))[1])
     monkeypatch.setattr(timing_rounds, "QUERY_SUBSETS", 1)
     monkeypatch.setattr(timing_rounds, "ASSEMBLY_SECONDS", np.inf)
-    TimingRounds(CELLS[:3], (EVERY,) * 3, 4, first=0, session=0).run(store)
+    TimingRounds(CELLS[:3], (EVERY,) * 3, 4, first=0).run(store)
     assert len(calls) == 3 * (1 + 4 * (VALIDATION + 1))  # a warm-up, then every query and the last solution of a round
     assert len(set(calls)) == len(calls)
     assert len(reduced) == 3 * (1 + 4 * VALIDATION)  # none after the last query
@@ -242,12 +242,12 @@ def test_matrices_in_full_are_those_of_the_solutions_and_none_is_assembled_twice
 def test_a_round_that_takes_long_ends_early(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
     prepare = ProgramQuery.prepare
     monkeypatch.setattr(ProgramQuery, "prepare", lambda *of: lambda: (prepare(*of)()[0], Seconds(0.1, 6.0)))
-    timed = TimingRounds(CELLS[:1], (EVERY,), 4, first=0, session=0).run(store).value[0]
+    timed = TimingRounds(CELLS[:1], (EVERY,), 4, first=0).run(store).value[0]
     assert [len(each.solve) for each in timed.rounds.values()] == [1] * 4
 
 
 def test_a_lost_round_is_told_and_the_others_keep_their_numbers() -> None:
-    stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 3, first=6, session=0)
+    stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 3, first=6)
     items: list[TimedRound | Failed] = [steady(2.0) for _ in range(stage.items)]
     gone = next(item for item in range(stage.items) if stage.place(item) == (1, 0))
     items[gone] = Failed(Status.CRASHED, "the worker died")
@@ -258,7 +258,7 @@ def test_a_lost_round_is_told_and_the_others_keep_their_numbers() -> None:
 
 
 def test_rows_have_what_a_high_fidelity_solution_of_their_block_took_at_the_pace_of_their_round() -> None:
-    stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 3, first=0, session=0)
+    stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 3, first=0)
     paced = {k: replace(steady(pace), beside=Seconds(4.0 * pace, 4.0 * pace)) for k, pace in enumerate((1.0, 2.0, 1.0))}
     other = {k: replace(steady(3.0 * pace), beside=Seconds(9.0 * pace, 9.0)) for k, pace in enumerate((1.0, 2.0, 1.0))}
     rows, others = block_rows(stage, [TimedCell(paced, "here"), TimedCell(other, "here")])
@@ -266,7 +266,7 @@ def test_rows_have_what_a_high_fidelity_solution_of_their_block_took_at_the_pace
         assert [row["hf_s"] for row in own] == pytest.approx([6.0, 12.0, 6.0])
         assert [row["pace"] for row in own] == pytest.approx([1.0, 2.0, 1.0])
     assert len({row["block"] for row in (*rows, *others)}) == 1
-    later = TimingRounds((CELLS[0],), (EVERY,), 2, first=2, session=0)
+    later = TimingRounds((CELLS[0],), (EVERY,), 2, first=2)
     ((row,),) = block_rows(later, [TimedCell({2: steady(1.0)}, "here")])
     assert row["block"] != rows[0]["block"]
     assert row["hf_s"] is None
@@ -314,5 +314,5 @@ def test_a_slow_machine_marks_the_row_and_waiting_for_a_core_does_not(wall: floa
 
 
 def test_the_limit_of_the_stage_is_that_of_all_its_cells(tmp_path: Path) -> None:
-    assert TimingRounds(CELLS, (EVERY,) * 4, 12, first=0, session=0).weight == 4
+    assert TimingRounds(CELLS, (EVERY,) * 4, 12, first=0).weight == 4
     assert CELLS[0].weight == 1
