@@ -284,16 +284,13 @@ def test_a_thousand_cells_are_not_a_thousand_lines(report: Make, cells: list[Cel
     lines = printed.getvalue().splitlines()
     assert len(lines) < 60
     assert sum("timeout: " in line for line in lines) == 3
-
-
-def test_what_is_not_installed_is_one_line(report: Make, cells: list[Cell]) -> None:
-    """None where no cell can run here, which the command ends with."""
-    for count, lines in ((48, ["unavailable: no solver: `pip install it`"]), (24, [])):
+    # what is not installed is one line, and none where no cell can run here, with which the command ends
+    for count, told in ((48, ["unavailable: no solver: `pip install it`"]), (24, [])):
         made, printed = report()
         made.start(Agenda(count, 24, 24, [], 0))
         for _ in range(24):
             made.cell(cells[0], {"status": "unavailable", "reason": "no solver: `pip install it`"})
-        assert printed.getvalue().splitlines()[1:] == lines
+        assert printed.getvalue().splitlines()[1:] == told
 
 
 @pytest.mark.parametrize("terminal", [False, True])
