@@ -37,10 +37,6 @@ class TimedProblem:
     def __str__(self) -> str:
         return self.problem if self.resolution is None else f"{self.problem}-{self.resolution}"
 
-    @property
-    def options(self) -> dict[str, Resolution]:
-        return {} if self.resolution is None else {"resolution": self.resolution}
-
 
 @dataclass(frozen=True)
 class PrimalChoice:
@@ -75,10 +71,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Setting:
-    """The last strategies and first tolerances of a study, which complete a model of which one part is timed.
-
-    `seconds` is the wall time that the study allows for a stage.
-    """
+    """Strategies and tolerances that complete a model of which one part is timed; `seconds` is the limit of a stage."""
 
     problems: tuple[str, ...]
     spaces: ReducedSpaces
@@ -87,10 +80,7 @@ class Setting:
 
 
 def setting(study: str) -> Setting:
-    """Return the setting of a study, by its name or file.
-
-    Raises a `RequestError` if there is no such study.
-    """
+    """Return the last strategies and first tolerances of a study, by its name or file, or raise a `RequestError`."""
     spec = read_study(study)
     table, dual, primal = spec.tolerances[0], spec.dual[-1], spec.primal[-1]
     modes = Stop(tolerance=table.pod[0]) if table.pod else Stop(size=(table.N or [0])[0])
@@ -127,8 +117,7 @@ def resolutions(texts: Sequence[str]) -> list[Resolution]:
 class Plan:
     """The benchmarks in which one of the chosen plugins takes part; all that are registered where none is chosen.
 
-    Problems that are needed and not chosen are those of the setting. Problems are timed at those of the resolutions
-    that they know, QP solvers at the first of these alone.
+    Problems that are not chosen are those of the setting, at the resolutions that they know; QP solvers use the first.
     """
 
     chosen: Mapping[str, Sequence[str]]
@@ -158,10 +147,7 @@ class Plan:
 
 
 def run_pytest(options: Sequence[str]) -> None:
-    """Run the benchmarks by pytest with options of `vibench.benchmarks.plugin` in a process of its own.
-
-    Raises a `VibenchError` if they could not be begun.
-    """
+    """Run the benchmarks by pytest with options of `vibench.benchmarks.plugin` in a process of its own."""
     folder = str(files("vibench.benchmarks"))
     command = [sys.executable, "-P", "-m", "pytest", "-c", f"{folder}/pytest.ini", "--rootdir", folder]
     command += ["-p", "pytest_benchmark.plugin", "-p", "no:terminal", "--benchmark-quiet", "--progress", *options]

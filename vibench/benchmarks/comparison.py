@@ -80,12 +80,9 @@ def _parsed(content: bytes) -> Timed:
     info, own = file["machine_info"], file["machine_info"].get("vibench", {})
     timers = sorted({entry["options"]["timer"] for entry in file["benchmarks"] if "options" in entry})
     processor = f"{info.get('cpu', {}).get('brand_raw', '')} {info.get('machine', '')}".strip()
-    machine = {
-        "machine": own.get("machine") or processor,
-        "libraries": own.get("libraries") or f"python {info.get('python_version', '')}",
-        "timer": ", ".join(timers),
-        "code": own.get("code", ""),
-    }
+    libraries = own.get("libraries") or f"python {info.get('python_version', '')}"
+    machine = {"machine": own.get("machine") or processor, "libraries": libraries}
+    machine |= {"timer": ", ".join(timers), "code": own.get("code", "")}
     failed = len(file.get("failed", ()))
     return Timed(benchmarks, failed, {name: unbroken(str(text)) for name, text in machine.items()})
 
@@ -124,8 +121,7 @@ def _seconds(stats: Mapping[str, Any], name: str) -> float:
 def table_of(timed: Timed, earlier: Timed | None, limit: float) -> pd.DataFrame:
     """A row for every benchmark; with an earlier file, for every one of both, and what changed.
 
-    A row has what is timed, with what, its seconds with their quartiles, and what it reached; a row of two files has
-    both medians, and of the figures of accuracy the one that got worse most.
+    A row of two files has both medians, and of the figures of accuracy the one that got worse most.
     """
     if earlier is None:
         return pd.DataFrame([_row(name, one) for name, one in timed.benchmarks.items()])
@@ -151,6 +147,9 @@ def _change(name: str, was: Measured, now: Measured, limit: float) -> dict[str, 
     names = dict.fromkeys([*was.accuracy, *now.accuracy])
     figures = [_Figure(figure, was.accuracy.get(figure), now.accuracy.get(figure)) for figure in names]
     figure = max(figures, key=lambda one: (one.is_worse, one.growth), default=_Figure("", None, None))
+    changes = ["slower"] * _is_slower(was, now, limit) + ["faster"] * _is_slower(now, was, limit)
+    changes += ["less accurate"] if figure.is_worse else []
+    changes += [f"{was.status}, now {now.status or 'nothing'}"] if was.status == "ok" != now.status else []
     return {
         "benchmark": name,
         "group": was.group,
@@ -162,7 +161,7 @@ def _change(name: str, was: Measured, now: Measured, limit: float) -> dict[str, 
         "figure": figure.name,
         "before": figure.before,
         "after": figure.after,
-        "verdict": _verdict(was, now, limit, figure),
+        "verdict": ", ".join(changes),
     }
 
 
@@ -190,20 +189,10 @@ class _Figure:
         return (0.0 if self.before is None else self.after / max(self.before, 1e-10)), self.after
 
 
-def _verdict(was: Measured, now: Measured, limit: float, figure: _Figure) -> str:
-    """Return what got worse, "" if nothing did."""
-    slower = _is_slower(was, now, limit)
-    changes = ["slower"] if slower else ["faster"] if _is_slower(now, was, limit) else []
-    changes += ["less accurate"] if figure.is_worse else []
-    changes += [f"{was.status}, now {now.status or 'nothing'}"] if was.status == "ok" != now.status else []
-    return ", ".join(changes)
-
-
 def _is_slower(was: Measured, now: Measured, limit: float) -> bool:
     """Whether the seconds grew beyond a limit, beyond their spread, and beyond what the machine was slower by.
 
-    The ranges between the quartiles of any two passes must not meet, the medians must be more than 10 µs apart, and
-    their ratio must be above the limit, also relative to the calibration, fixed work that was timed beside both.
+    The calibration is fixed work that was timed beside both.
     """
     # Clocks and caches do not resolve 10 µs.
     if now.seconds - was.seconds <= 10e-6 or now.low <= was.high:

@@ -41,6 +41,8 @@ from vibench.text import printable
 from vibench.timing import calibration, timed
 
 PASSES = 5
+Work = Callable[..., Any]
+Judge = Callable[[Any], Mapping[str, Any]]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -99,20 +101,13 @@ class Passes:
 
     @pytest.fixture
     def timing(self, benchmark: Any, inputs: StageInputs, number: int) -> Timing:
-        """A function that times some work.
+        """A function that times some work, whose result the first pass judges; if that raises, nothing is timed.
 
-        It takes the group of the benchmark, the work, and a function that judges a result; if that raises, nothing is
-        timed. `fresh` gives a new argument of the work for every round, where it takes one. A round has `together`
-        calls, where each does something else. The first pass judges, later ones only time.
+        `fresh` gives a new argument of the work for every round, where it takes one. A round has `together` calls,
+        where each does something else.
         """
 
-        def measure(
-            group: str,
-            work: Callable[..., Any],
-            judge: Callable[[Any], Mapping[str, Any]],
-            fresh: Callable[[], Any] | None = None,
-            together: int = 1,
-        ) -> None:
+        def measure(group: str, work: Work, judge: Judge, fresh: Work | None = None, together: int = 1) -> None:
             def once() -> tuple[Any, Any]:
                 given = () if fresh is None else (fresh(),)
                 return timed(lambda: work(*given))
@@ -150,9 +145,7 @@ class Passes:
             raise RuntimeError(in_a_line(error)) from error
 
     @pytest.hookimpl(wrapper=True)
-    def pytest_runtest_makereport(
-        self, item: pytest.Item, call: pytest.CallInfo[None]
-    ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    def pytest_runtest_makereport(self, item: pytest.Item, call: Any) -> Generator[None, Any, pytest.TestReport]:
         """Attach to the report of a benchmark its rounds and what it reached, or why it was not timed."""
         report = yield
         if call.excinfo is not None:
@@ -182,7 +175,8 @@ class Passes:
             begun = self._serve(begun)
         for reason, count in Counter(self._left_out.values()).items():
             self._tell(f"{count} benchmarks left out: {reason}")
-        self._put_together()
+        # An entry with an error is in no file, but lets a file without benchmarks be written.
+        self._config._benchmarksession.benchmarks += map(self._entry, {**self._timed, **self._failed})  # type: ignore[attr-defined]
         return True
 
     def _serve(self, begun: int) -> int:
@@ -232,6 +226,7 @@ class Passes:
         items, own, memory = self._items, os.getpid(), int(Limits().memory_gib * 2**30)
         os.setpgid(0, 0)  # Ctrl-C on the terminal ends the other process, which ends this one
         resource.setrlimit(resource.RLIMIT_AS, (memory, resource.getrlimit(resource.RLIMIT_AS)[1]))
+        serialised = self._config.hook.pytest_report_to_serializable
         try:
             with threadpool_limits(1):
                 for number in range(begun, len(items)):
@@ -246,9 +241,7 @@ class Passes:
                         if os.getpid() != own:
                             return
                         self._note(report)
-                        connection.send(
-                            self._config.hook.pytest_report_to_serializable(config=self._config, report=report)
-                        )
+                        connection.send(serialised(config=self._config, report=report))
             connection.send(len(items))
         finally:
             os._exit(1)
@@ -257,13 +250,10 @@ class Passes:
         """Note what comes of a benchmark in a pass; returns the line that tells it, if there is one."""
         name, told = _name(report.nodeid), dict(report.user_properties)
         reason = str(told.get("reason", ""))
-        if report.failed:
-            self._failed[name] = reason
+        if not report.passed:
+            (self._failed if report.failed else self._left_out)[name] = reason
             self._ended.add(name)
-            return f"failed: {name}: {reason}"
-        if report.skipped:
-            self._left_out[name] = reason
-            self._ended.add(name)
+            return f"failed: {name}: {reason}" if report.failed else ""
         if isinstance(entry := told.get("benchmark"), dict):
             self._timed.setdefault(name, []).append(entry)
             if entry["extra_info"].pop("slow", False):
@@ -287,31 +277,24 @@ class Passes:
             sys.stderr.write(f"{printable(line)}\n")
             sys.stderr.flush()
 
-    def _put_together(self) -> None:
-        """Give pytest-benchmark one entry for the rounds of all passes of a benchmark, and one for each that failed."""
-        # An entry with an error is in no file, but lets a file without benchmarks be written.
-        for name in {**self._timed, **self._failed}:
-            passes = self._timed.get(name, [])
-            first = passes[0] if passes else {"group": None, "iterations": 1, "extra_info": {}, "axes": {}}
-            several = []
-            for one in passes:
-                stats = Stats()  # type: ignore[no-untyped-call]
-                stats.data.extend(one["data"])
-                fields = {field: getattr(stats, field) for field in ("q1", "median", "q3", "rounds")}
-                several.append(fields | {"calibration_s": one["extra_info"].pop("calibration_s")})
-            fixture = SimpleNamespace(
-                name=f"test_{name}",
-                fullname=f"vibench/benchmarks::test_{name}",
-                group=first["group"],
-                param=name.partition("[")[2].rstrip("]"),
-                params=None,
-                extra_info={**first["extra_info"], "axes": first["axes"], "passes": several},
-                cprofile_stats=None,
-                has_error=name in self._failed,
-            )
-            entry = Metadata(fixture, first["iterations"], {"timer": time.process_time})  # type: ignore[no-untyped-call]
-            entry.stats.data.extend(seconds for one in passes for seconds in one["data"])
-            self._config._benchmarksession.benchmarks.append(entry)  # type: ignore[attr-defined]
+    def _entry(self, name: str) -> Any:
+        """The entry of pytest-benchmark for the rounds of all passes of a benchmark, or for one that failed."""
+        passes = self._timed.get(name, [])
+        first = passes[0] if passes else {"group": None, "iterations": 1, "extra_info": {}, "axes": {}}
+        several = []
+        for one in passes:
+            stats = Stats()  # type: ignore[no-untyped-call]
+            stats.data.extend(one["data"])
+            fields = {field: getattr(stats, field) for field in ("q1", "median", "q3", "rounds")}
+            several.append(fields | {"calibration_s": one["extra_info"].pop("calibration_s")})
+        extra = {**first["extra_info"], "axes": first["axes"], "passes": several}
+        fixture = SimpleNamespace(
+            name=f"test_{name}", fullname=f"vibench/benchmarks::test_{name}", param=name.partition("[")[2].rstrip("]"),
+            group=first["group"], params=None, extra_info=extra, cprofile_stats=None, has_error=name in self._failed,
+        )  # fmt: skip
+        entry = Metadata(fixture, first["iterations"], {"timer": time.process_time})  # type: ignore[no-untyped-call]
+        entry.stats.data.extend(seconds for one in passes for seconds in one["data"])
+        return entry
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_benchmark_update_machine_info(self, machine_info: dict[str, Any]) -> None:

@@ -84,11 +84,7 @@ def _once(make: Callable[Concatenate[StageInputs, P], T]) -> Callable[Concatenat
 
 
 class StageInputs:
-    """The problem of a case, and what its stages need from those before, made once and never timed.
-
-    V_N and the cone stop as the setting says, unless a method is told, and its strategies complete a model of which one
-    part is timed.
-    """
+    """The problem of a case, and what its stages need from those before, made once and never timed."""
 
     def __init__(self, case: TimedProblem, setting: Setting) -> None:
         self.case, self.usual, self.primal = case, setting.spaces, setting.primal
@@ -99,7 +95,8 @@ class StageInputs:
     @property
     @_once
     def problem(self) -> Problem:
-        created: Problem = find(PROBLEM, self.case.problem).create(self.case.options)
+        options = {} if self.case.resolution is None else {"resolution": self.case.resolution}
+        created: Problem = find(PROBLEM, self.case.problem).create(options)
         return created
 
     @property
@@ -111,6 +108,11 @@ class StageInputs:
     @_once
     def snapshots(self) -> Snapshots:
         return high_fidelity_sweep(self.problem, self.training)
+
+    @property
+    @_once
+    def most_modes(self) -> int:
+        return pod(self.snapshots.u, self.problem.V, Stop(tolerance=1e-8)).basis.shape[1]
 
     @property
     @_once
@@ -143,22 +145,14 @@ class StageInputs:
         if primal is not None:
             before = self.reduction(spaces)
             reduction = reduction.given(pod=before.pod, cone=before.cone, multipliers=before.multipliers)
-        return reduction.given(
-            pod=reduction.pod,
-            cone=reduction.cone,
-            multipliers=reduction.multipliers,
-            enrichment=reduction.enrichment,
-        )
+        made = {"pod": reduction.pod, "cone": reduction.cone, "multipliers": reduction.multipliers}
+        return reduction.given(**made, enrichment=reduction.enrichment)
 
     @_once
     def online(self, spaces: ReducedSpaces, primal: PrimalChoice) -> Reduction:
         """The reduction with projected members, or with the reason why queries have to be assembled in full."""
         reduction = self.reduction(spaces, primal).given(members=self.members)
         return reduction.given(operators=reduction.operators)
-
-    @_once
-    def modes(self, stop: Stop) -> int:
-        return len(pod(self.snapshots.u, self.problem.V, stop).basis.T)
 
 
 def solve_all(problem: Problem, mus: Array) -> list[HighFidelitySolution]:
@@ -168,13 +162,8 @@ def solve_all(problem: Problem, mus: Array) -> list[HighFidelitySolution]:
 
 def test_high_fidelity_solution(timing: Timing, inputs: StageInputs) -> None:
     """One high-fidelity solution, by a solver that has solved nothing before."""
-    problem, mu = inputs.problem, inputs.training[0]
-    timing(
-        "high-fidelity solution",
-        lambda solver: solver.solve(mu),
-        lambda solution: _judge_solutions([solution]),
-        lambda: HighFidelitySolver(problem),
-    )
+    mu, fresh = inputs.training[0], partial(HighFidelitySolver, inputs.problem)
+    timing("high-fidelity solution", lambda solver: solver.solve(mu), lambda one: _judge_solutions([one]), fresh)
 
 
 def test_high_fidelity_sweep(timing: Timing, inputs: StageInputs) -> None:
@@ -251,25 +240,19 @@ def test_separation(timing: Timing, inputs: StageInputs) -> None:
     problem, training = inputs.problem, inputs.training
 
     def judge(members: Mapping[str, AffineMember]) -> Info:
-        return {"accuracy": {"interpolation_error": _interpolation_error(inputs, members)}}
+        sampled = {name: m for name, m in members.items() if m.way is Evaluation.INTERPOLATED}
+        # Affine members are exact.
+        if not sampled:
+            return {"accuracy": {"interpolation_error": 0.0}}
+        sampler = problem.sampler({name: (m.rows, m.columns) for name, m in sampled.items()})
+        largest = 0.0
+        for query in inputs.queries:
+            for name, theta in sampler(query.mu).items():
+                summed = sum(value * term for value, term in zip(theta, sampled[name].terms, strict=True))
+                largest = max(largest, relative_difference(summed, getattr(query.vi, name)))
+        return {"accuracy": {"interpolation_error": largest}}
 
     timing("separation", lambda: affine_decomposition(problem, training, inputs.interpolation), judge)
-
-
-def _interpolation_error(inputs: StageInputs, members: Mapping[str, AffineMember]) -> float:
-    """Largest relative error of a member at validation parameters, no further than the problem samples."""
-    sampled = {name: m for name, m in members.items() if m.way is Evaluation.INTERPOLATED}
-    # Affine members are exact.
-    if not sampled:
-        return 0.0
-    sampler = inputs.problem.sampler({name: (m.rows, m.columns) for name, m in sampled.items()})
-    largest = 0.0
-    for query in inputs.queries:
-        for name, theta in sampler(query.mu).items():
-            exact = getattr(query.vi, name)
-            summed = sum(value * term for value, term in zip(theta, sampled[name].terms, strict=True))
-            largest = max(largest, relative_difference(summed, exact))
-    return largest
 
 
 def relative_difference(value: Array, exact: Array) -> float:
@@ -312,10 +295,8 @@ def _check_reduced(inputs: StageInputs, primal: PrimalChoice) -> None:
 
 
 def _time_assembly(timing: Timing, inputs: StageInputs, group: str, model: AnyReducedModel) -> None:
-    mus = _in_turn(inputs)
-    timing(
-        group, lambda: model.assemble(next(mus)), lambda _: _judge_programs(inputs, model), together=len(inputs.queries)
-    )
+    mus, judge = _in_turn(inputs), lambda _: _judge_programs(inputs, model)
+    timing(group, lambda: model.assemble(next(mus)), judge, together=len(inputs.queries))
 
 
 def _judge_programs(inputs: StageInputs, model: AnyReducedModel) -> Info:
@@ -365,16 +346,18 @@ def errors_of(inputs: StageInputs, query: ValidationQuery, u: Array, lam: Array)
     """Relative errors of u and λ, scaled ones where the high-fidelity u or λ is zero."""
     energy = assemblies(inputs.problem).energy_at(query.mu)
     (error,) = errors(inputs.problem, [query.vi], [energy], query.exact, u[:, None], lam[:, None])
-    measured = {"error_u": error.error_u, "error_lambda": error.error_lambda}
-    scaled = {"error_u_scaled": error.error_u_scaled, "error_lambda_scaled": error.error_lambda_scaled}
-    figures = {name: value for name, value in measured.items() if value is not None}
-    return figures | {name: value for name, value in scaled.items() if name.removesuffix("_scaled") not in figures}
+    figures = {}
+    for name in ("error_u", "error_lambda"):
+        relative = getattr(error, name)
+        scaled = f"{name}_scaled"
+        figures |= {scaled: getattr(error, scaled)} if relative is None else {name: relative}
+    return figures
 
 
 def test_solver(timing: Timing, inputs: StageInputs, size: Size, solver: str, accuracy: float) -> None:
     """One reduced program, solved to an accuracy."""
     # The spaces of this size, as far as the snapshots give them.
-    modes = Stop(size=min(size.N, inputs.modes(Stop(tolerance=1e-8))))
+    modes = Stop(size=min(size.N, inputs.most_modes))
     spaces = ReducedSpaces(modes, Stop(size=size.R), inputs.usual.dual)
     N, R = inputs.reduction(spaces).pod.basis.shape[1], inputs.reduction(spaces).cone.size
     # The snapshots of a problem give so many dimensions; larger programs would be the same.
@@ -440,8 +423,7 @@ def _high_fidelity_residuals(answer: Solution) -> Residuals | None:
 
 def largest_figures(several: Iterable[Mapping[str, float]]) -> dict[str, float]:
     """Return the largest of every figure, NaN where one is."""
-    values: dict[str, list[float]] = {}
+    largest: dict[str, float] = {}
     for figures in several:
-        for name, value in figures.items():
-            values.setdefault(name, []).append(value)
-    return {name: float(np.max(one)) for name, one in values.items()}
+        largest |= {name: float(np.maximum(value, largest.get(name, -np.inf))) for name, value in figures.items()}
+    return largest

@@ -23,15 +23,7 @@ from vibench.errors import NumericalError, in_a_line
 from vibench.execution.isolated import NotImportableError
 from vibench.plugins.options import options_of
 from vibench.stages.serialisation import dumps, loads
-from vibench.testing.checks import (
-    SECONDS,
-    Check,
-    ConformanceError,
-    Doubt,
-    Note,
-    call_in_other_process,
-    kind_of,
-)
+from vibench.testing.checks import SECONDS, Check, ConformanceError, Doubt, Note, call_in_other_process, kind_of
 from vibench.timing import timed
 
 PluginT = TypeVar("PluginT")
@@ -46,9 +38,8 @@ Arrays = dict[str, Any]
 class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
     """A plugin under examination, the arguments it is called with, and the results.
 
-    Every call receives copies, so that a plugin that writes to its input fails the check "no mutation" alone. The wall
-    time [s] of each call is limited by `seconds`; `round_off` is the largest relative difference that arrays of another
-    process may have.
+    Every call receives copies, so that a plugin that writes to its input fails the check "no mutation" alone. `seconds`
+    limits each call; `round_off` is the largest relative difference that arrays of another process may have.
     """
 
     base: ClassVar[type]
@@ -136,10 +127,7 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
             yield Note(f"not compared: {error}")
             return
         for line in self._deviations("another process", there.__getitem__, some, self.round_off):
-            yield (
-                f"{line}; look for the order of sets, unseeded random numbers, and what depends on time, folder or "
-                "environment"
-            )
+            yield f"{line}; look for the order of sets, unseeded random numbers, time, folder and environment"
 
     def pickling(self) -> Iterator[str]:
         """The plugin can be sent to another process, and its result be stored."""
@@ -178,11 +166,7 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
                     yield f"{name}: {source} gives different values of {array}: {what}"
 
 
-def _evaluated(
-    case: Callable[[Callable[[], PluginT]], Case[PluginT, ArgumentT, Any]],
-    create: Callable[[], PluginT],
-    arguments: Mapping[str, ArgumentT],
-) -> dict[str, Arrays]:
+def _evaluated(case: type[Case[Any, Any, Any]], create: Any, arguments: Mapping[str, Any]) -> dict[str, Arrays]:
     other = case(create)
     return {name: other.arrays(other.evaluate(argument)) for name, argument in arguments.items()}
 

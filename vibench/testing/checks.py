@@ -125,10 +125,8 @@ def kind_of(plugin: Any) -> str:
     """Return the kind of a class, or of a `partial` of one; a function is a QP solver."""
     cls = getattr(plugin, "func", plugin)
     if not callable(cls):
-        raise TypeError(
-            f"pass the class {type(cls).__name__}, or a function that makes an instance, not an instance: "
-            "two instances are compared"
-        )
+        name = type(cls).__name__
+        raise TypeError(f"pass {name} or a function that makes one, not an instance: two instances are compared")
     named = (kind for kind, one in CHECKED.items() if one.base and isinstance(cls, type) and issubclass(cls, one.base))
     return next(named, "solver")
 
@@ -164,9 +162,8 @@ def check(plugin: Any, *, kind: str | None = None, **given: Any) -> None:
     """
     results = examine(plugin, kind=kind, **given)
     if failures := [f"{each.check}: {each.message}" for each in results if each.verdict is Verdict.FAILED]:
-        raise ConformanceError(
-            "\n".join([f"{_title(plugin)} fails {len(failures)} of {len(results)} checks", *failures])
-        )
+        title = f"{_title(plugin)} fails {len(failures)} of {len(results)} checks"
+        raise ConformanceError("\n".join([title, *failures]))
 
 
 def parametrize_with_checks(*plugins: Any, kind: str | None = None, **given: Any) -> pytest.MarkDecorator:
@@ -270,8 +267,7 @@ def _title(plugin: Any) -> str:
 def call_in_other_process(function: Callable[..., Any], *arguments: Any, seconds: float) -> Any:
     """Value of a function in another process, whose hashes have another seed than those here.
 
-    Raises a `NotImportableError` if function or arguments cannot be sent there, and a `ConformanceError` if the call
-    fails there, or takes longer than so many seconds.
+    Raises a `NotImportableError` if it cannot be sent there, a `ConformanceError` if it fails or takes too long there.
     """
     # The seed orders sets of texts.
     seed = "1" if os.environ.get("PYTHONHASHSEED") != "1" else "2"
@@ -299,13 +295,12 @@ def raised(error: BaseException) -> str:
 
 def plugin_line(error: BaseException) -> str:
     """Return where an exception left the plugin, "cable.py, line 12: self.V = …"; "" if it did not pass through it."""
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not _is_library(frame.filename)]
-    return f"{Path(frames[-1].filename).name}, line {frames[-1].lineno}: {frames[-1].line}" if frames else ""
-
-
-def _is_library(file: str) -> bool:
-    folders = [Path(str(module.__file__)).parent for module in (vibench, np, scipy)]
-    # Installed plugins lie below the standard library, in its folder of packages.
-    if not {"site-packages", "dist-packages"} & set(Path(file).parts):
-        folders.append(Path(sysconfig.get_path("stdlib")))
-    return file.startswith("<") or any(map(Path(file).is_relative_to, folders))
+    libraries = [Path(str(module.__file__)).parent for module in (vibench, np, scipy)]
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        file = Path(frame.filename)
+        # Installed plugins lie below the standard library, in its folder of packages.
+        installed = {"site-packages", "dist-packages"} & set(file.parts)
+        folders = libraries if installed else [*libraries, Path(sysconfig.get_path("stdlib"))]
+        if not frame.filename.startswith("<") and not any(map(file.is_relative_to, folders)):
+            return f"{file.name}, line {frame.lineno}: {frame.line}"
+    return ""

@@ -51,10 +51,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._made: dict[int, tuple[Formulation, Model]] = {}
-
-    @cached_property
-    def whole(self) -> Reduction:
-        return self.offline or sample_reduction()
+        self.whole = self.offline or sample_reduction()
 
     def phase(self, plugin: Formulation) -> _Seen:
         """The offline phase that a formulation gets, without the steps that it does not use."""
@@ -64,14 +61,10 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         given |= {"pod": whole.pod} if pod else {}
         given |= {"cone": whole.cone, "multipliers": whole.multipliers} if dual else {}
         given |= {"enrichment": whole.enrichment} if primal else {}
-        phase = _Seen(
-            whole.problem,
-            whole.dual if dual else None,
-            whole.primal if primal else None,
-            whole.modes if pod else None,
-            whole.generators if dual else None,
-            whole.tolerance if primal else None,
-        ).given(**given)
+        cone = (whole.dual, whole.generators) if dual else (None, None)
+        enrichment = (whole.primal, whole.tolerance) if primal else (None, None)
+        modes = whole.modes if pod else None
+        phase = _Seen(whole.problem, cone[0], enrichment[0], modes, cone[1], enrichment[1]).given(**given)
         assert isinstance(phase, _Seen)
         # The attributes that this function has read are no use by the formulation.
         phase.seen.clear()
@@ -267,23 +260,15 @@ class FormulationCase(Case[Formulation, Array, Answered]):
             yield f"from snapshots without contact, {found.status}: {found.reason}"
 
     checks = (
-        Check("construction", Case.construction),
-        Check("options", Case.options, ("construction",)),
-        Check("axes", axes, ("construction",)),
-        Check("build", build, ("axes",)),
-        Check("model", model, ("build",)),
-        Check("answers", answers, ("model",)),
-        Check("pairs", pairs, ("answers",)),
-        Check("determinism", Case.determinism, ("pairs",)),
-        Check("coefficients", coefficients, ("determinism",)),
-        Check("errors", plausible, ("pairs",)),
-        Check("axes in use", axes_used, ("pairs",)),
-        Check("starts", starts, ("pairs",)),
-        Check("no mutation", no_mutation, ("pairs",)),
+        Check("construction", Case.construction), Check("options", Case.options, ("construction",)),
+        Check("axes", axes, ("construction",)), Check("build", build, ("axes",)), Check("model", model, ("build",)),
+        Check("answers", answers, ("model",)), Check("pairs", pairs, ("answers",)),
+        Check("determinism", Case.determinism, ("pairs",)), Check("coefficients", coefficients, ("determinism",)),
+        Check("errors", plausible, ("pairs",)), Check("axes in use", axes_used, ("pairs",)),
+        Check("starts", starts, ("pairs",)), Check("no mutation", no_mutation, ("pairs",)),
         Check("snapshots without contact", without_contact, ("pairs",)),
         Check("another process", Case.another_process, ("determinism",)),
-        Check("pickling", Case.pickling, ("determinism",)),
-        Check("time", Case.duration, ("answers",)),
+        Check("pickling", Case.pickling, ("determinism",)), Check("time", Case.duration, ("answers",)),
     )  # fmt: skip
 
 

@@ -1,29 +1,382 @@
-"""The conformance checks of problems: spaces, parameters, what is assembled, high-fidelity solutions, pictures."""
+"""The conformance checks of problems: spaces, parameters, all ways to assemble A, f, B and g, solutions, pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse as sp
 
-from vibench.arrays import Array
+from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError
 from vibench.highfidelity import active_set
 from vibench.interfaces.outputs import MeshFields, Output, Picture
 from vibench.interfaces.parameters import ParameterBox
-from vibench.interfaces.problem import MEMBERS
+from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.interfaces.validation import training_parameters, validation_parameters
-from vibench.linalg.inner_product import InnerProduct, singular_values
+from vibench.linalg.inner_product import SYMMETRY_RTOL, InnerProduct, singular_values
 from vibench.model.affine import INTERPOLATION_RTOL, MISSED, assembled_members, decomposed, held_out_error
 from vibench.stability.coercivity import extreme_quotients
-from vibench.testing import assembly
-from vibench.testing.assembly import AssemblyCase
-from vibench.testing.case import array_fault, at, difference, unmutated
-from vibench.testing.checks import Check, ConformanceError, Doubt, Note
+from vibench.testing.case import (
+    Arrays,
+    Case,
+    array_fault,
+    at,
+    copies,
+    difference,
+    differences,
+    find_jump,
+    largest_entry,
+    unmutated,
+)
+from vibench.testing.checks import Check, ConformanceError, Doubt, Note, plugin_line, raised
+from vibench.timing import timed
 
 
-def spaces(case: AssemblyCase) -> Iterator[str]:
+@dataclass(eq=False)
+class ProblemCase(Case[Problem, Array, Arrays]):
+    """A problem and the arrays it assembles, at fewer parameters where these would take longer than `seconds`."""
+
+    base = Problem
+    # The largest difference between two ways to assemble, relative to the largest entry of the member.
+    round_off = 1e-10
+
+    @cached_property
+    def one_assembly(self) -> float:
+        box, problem = self.plugin.parameters, self.plugin
+        return timed(lambda: problem.assemble(0.5 * (box.lower + box.upper)))[1].wall
+
+    @cached_property
+    def points(self) -> int:
+        """Number of parameters, such that all checks take about half of the time limit: 7, or 2 at least."""
+        try:
+            seconds = self.one_assembly
+        except Exception:  # noqa: BLE001  the check "assembly" says what a plugin raises
+            return 7
+        # All checks but the search for jumps make about ten assemblies at each parameter.
+        return int(min(max(0.5 * self.seconds / max(10.0 * seconds, 1e-8), 2), 7))
+
+    @cached_property
+    def mus(self) -> Array:
+        """Parameters (7×d): two corners of the box, its centre, and four random ones; only the first if it is slow."""
+        box = self.plugin.parameters
+        fixed = np.stack([box.lower, box.upper, 0.5 * (box.lower + box.upper)])
+        return np.concatenate([fixed, box.sample(4, seed=0)])[: self.points]
+
+    @cached_property
+    def arguments(self) -> dict[str, Array]:
+        return {at(mu): mu for mu in self.mus}
+
+    def evaluate(self, argument: Array, plugin: Problem | None = None) -> Arrays:
+        """Copies of A, f, B and g at a parameter (d,), and of X_V and X_W."""
+        problem, mu = plugin or self.plugin, argument.copy()
+        vi = self.clocked("an assembly", lambda: problem.assemble(mu))
+        members = {name: getattr(vi, name) for name in MEMBERS}
+        return copies({**members, "X_V": problem.V.matrix, "X_W": problem.W.matrix})
+
+    def arrays(self, result: Arrays) -> Arrays:
+        return result
+
+    def construction(self) -> Iterator[str]:
+        """An instance can be made; a refused Gram matrix is named."""
+        try:
+            yield from super().construction()
+        except NumericalError as error:
+            place = plugin_line(error)
+            names = [f"X_{name}: " for name in "VW" if f"self.{name} =" in place and f"X_{name}" not in str(error)]
+            raise ConformanceError(f"{''.join(names)}{error} ({place})") from error
+
+
+def one_assembly(case: ProblemCase) -> Iterator[str]:
+    """The first assembly is timed; at how many parameters the others can be made follows."""
+    points = case.points
+    with suppress(Exception):  # the next check says what a plugin raises
+        yield Note(f"takes {case.one_assembly:.2g} s")
+    if points < 7:
+        yield Note(f"checks at {points} parameters instead of 7, and none for jumps, for lack of time")
+
+
+def assembly(case: ProblemCase) -> Iterator[str]:
+    """Members have the right types and shapes, and finite values."""
+    n, m = case.plugin.V.dim, case.plugin.W.dim
+    shapes = {"A": (n, n), "f": (n,), "B": (m, n), "g": (m,)}
+    for mu in case.mus:
+        try:
+            vi: object = case.plugin.assemble(mu.copy())
+        except Exception as error:  # a plugin may raise anything
+            raise ConformanceError(f"assemble fails {at(mu)}: {raised(error)}") from error
+        if not isinstance(vi, VariationalInequality):
+            yield f"assemble returns a {type(vi).__name__} {at(mu)}; expected a vibench.VariationalInequality"
+            return
+        lift = {} if vi.dirichlet_lift is None else {"dirichlet_lift": np.shape(vi.dirichlet_lift)}
+        faults = [array_fault(name, getattr(vi, name), s, sparse=name in "AB") for name, s in (shapes | lift).items()]
+        yield from (f"{fault} ({at(mu)})" for fault in faults if fault)
+        if any(faults):
+            return
+    yield Note(f"n = {n}, m = {m}, at {len(case.mus)} parameters")
+
+
+def no_mutation(case: ProblemCase) -> None:
+    """`assemble` changes neither its argument nor earlier results, spaces or bounds."""
+    problem, mus = case.plugin, case.mus.copy()
+    earlier = problem.assemble(case.mus[0].copy())
+    arrays = {"its argument mu": mus, **{f"{name} of an earlier result": getattr(earlier, name) for name in MEMBERS}}
+    arrays |= {"X_V": problem.V.matrix, "X_W": problem.W.matrix}
+    arrays |= {"parameters.lower": problem.parameters.lower, "parameters.upper": problem.parameters.upper}
+    unmutated("assemble", arrays, lambda: [problem.assemble(mu) for mu in mus])
+
+
+def symmetry(case: ProblemCase) -> None:
+    """A is symmetric."""
+    for where, arrays in case.results.items():
+        if what := difference(arrays["A"], arrays["A"].T, SYMMETRY_RTOL * largest_entry(arrays["A"])):
+            raise ConformanceError(f"A is not symmetric {where}: {what} in the transpose")
+
+
+def definiteness(case: ProblemCase) -> None:
+    """A is positive definite."""
+    for where, arrays in case.results.items():
+        try:
+            # The factorisation proves it, as in a run.
+            InnerProduct(arrays["A"], "A")
+        except NumericalError as error:
+            eigenvalue = ""
+            if case.plugin.V.dim <= 2000:  # a dense eigenvalue problem
+                values, vectors = scipy.linalg.eigh(arrays["A"].toarray(), subset_by_index=(0, 0))
+                unknown = np.abs(vectors[:, 0]).argmax()
+                eigenvalue = f": its smallest eigenvalue is {values[0]:.3g}; the eigenvector peaks at unknown {unknown}"
+            raise ConformanceError(f"{error} {where}{eigenvalue}") from error
+
+
+def independence(case: ProblemCase) -> Iterator[str]:
+    """Members declared `constant` do not depend on the parameter; every parameter has an effect."""
+    yield from _undeclarable("constant", case.plugin.constant)
+    first = at(case.mus[0])
+    for name in (name for name in MEMBERS if name in case.plugin.constant):
+        reference = case.results[first][name]
+        for where, arrays in case.results.items():
+            # 1e-13: the round-off with which reduced assembly tells constants, too
+            if what := difference(arrays[name], reference, 1e-13 * largest_entry(reference)):
+                yield f"{name} is declared `constant` but depends on mu: {what} ({where} and {first})"
+                break
+    # A parameter has an effect if anything changes from the centre of the box to a side of it.
+    box = case.plugin.parameters
+    centre = 0.5 * (box.lower + box.upper)
+    for number, name in enumerate(box.names if case.points == 7 else ()):
+        moved = np.where(np.arange(box.dim) == number, box.upper, centre)
+        if box.upper[number] > box.lower[number] and not any(
+            differences(case.evaluate(moved), case.evaluate(centre), case.round_off)
+        ):
+            yield Doubt(f"nothing depends on the parameter '{name}'")
+
+
+def continuity(case: ProblemCase) -> Iterator[str]:
+    """Members do not jump on lines in the box: a diagonal, one between random points, one along every axis."""
+    if case.points < 7:
+        yield Note("not looked for, for lack of time")
+        return
+    # A member that vanishes has no scale, and constant ones were compared already.
+    largest = {name: max(largest_entry(arrays[name]) for arrays in case.results.values()) for name in MEMBERS}
+    scales = {name: s for name, s in largest.items() if s > 0.0 and name not in case.plugin.constant}
+
+    def point(start: Array, end: Array, t: float) -> Arrays:
+        return case.evaluate(start + t * (end - start))
+
+    lower, upper, centre, *others = case.mus
+    # A jump may follow one parameter, or a combination of several that only a random line crosses.
+    lines = [(lower, upper), (others[0], others[1])]
+    if len(lower) > 1:
+        along = np.eye(len(lower), dtype=bool)
+        lines += [(np.where(axis, lower, centre), np.where(axis, upper, centre)) for axis in along]
+    for number, (start, end) in enumerate(lines if scales else []):
+        if case.late:
+            yield Note(f"looked for on {number} of {len(lines)} lines, for lack of time")
+            return
+        if jump := find_jump(partial(point, start, end), scales, lambda: case.late):
+            first, _, last = (arrays[jump.name] for arrays in jump.values)
+            step = (jump.right - jump.left) * float(np.linalg.norm(end - start))
+            where = at(start + jump.right * (end - start))
+            raise ConformanceError(f"{jump.name} jumps {where}: {difference(first, last)} over a step of {step:.0e}")
+
+
+def on_contact(case: ProblemCase) -> Iterator[str]:
+    """`contact_dofs`, `contact` and `constraint` agree with B and g."""
+    problem, dofs = case.plugin, case.plugin.contact_dofs
+    defined = type(problem).contact is not Problem.contact
+    if dofs is None:
+        yield Note("not declared")
+        if defined and problem.contact(case.mus[0].copy()) is not None:
+            yield "`contact` is defined but `contact_dofs` is not, so it is never used; name the unknowns B may touch"
+    elif fault := _dofs_fault(dofs, problem.V.dim):
+        raise ConformanceError(f"`contact_dofs` {fault}")
+    for where, mu in case.arguments.items():
+        full = case.results[where]
+        if dofs is not None:
+            outside = np.setdiff1d(full["B"].indices[full["B"].data != 0.0], dofs)
+            if len(outside):
+                what = f"{len(outside)} unknowns outside `contact_dofs` {where}; the first is {outside[0]}"
+                raise ConformanceError(f"B touches {what}")
+            if defined:
+                _check_contact(case, dofs, mu, full)
+        B, g = problem.constraint(mu.copy())
+        _compare(case, "constraint", mu, {"B": B, "g": g}, full)
+
+
+def _dofs_fault(dofs: object, n: int) -> str:
+    if not isinstance(dofs, np.ndarray) or dofs.ndim != 1 or not np.issubdtype(dofs.dtype, np.integer):
+        return f"is {getattr(dofs, 'dtype', type(dofs).__name__)}; expected a vector of indices"
+    if len(dofs) and (dofs.min() < 0 or dofs.max() >= n):
+        return f"ranges from {dofs.min()} to {dofs.max()}; the unknowns are 0 to {n - 1}"
+    increasing = bool(np.all(np.diff(dofs) > 0))
+    return "" if increasing else "is not strictly increasing; expected sorted indices without repetition"
+
+
+def _check_contact(case: ProblemCase, dofs: Indices, mu: Array, full: Arrays) -> None:
+    given, columns = mu.copy(), "B[:, contact_dofs]"
+    contact = unmutated("contact", {"its argument mu": given}, partial(case.plugin.contact, given))
+    if not isinstance(contact, Contact):
+        raise ConformanceError(f"contact returns a {type(contact).__name__} {at(mu)}; expected a vibench.Contact")
+    _compare(case, "contact", mu, {columns: contact.B, "g": contact.g}, full | {columns: full["B"][:, dofs]})
+    if type(case.plugin).contact_loads is Problem.contact_loads:
+        return
+    # Loads of multipliers on all rows, on the first half of them, and on none are those of B and g.
+    eta = np.random.default_rng(0).random((len(full["g"]), 3)) * [1.0, 1.0, 0.0]
+    eta[len(eta) // 2 :, 1] = 0.0
+    for chosen in (eta, eta[:, 1:]):
+        loads = case.plugin.contact_loads(chosen)
+        varying, bounds = loads.varying(mu.copy())
+        if len(varying) > loads.reached.stop - loads.reached.start:
+            raise ConformanceError(f"loads vary on {len(varying)} rows {at(mu)}, more than `reach` of `contact_loads`")
+        B_eta = loads.fixed.copy()
+        B_eta[loads.first : loads.first + len(varying)] += varying
+        expected = {"Bᵀη": full["B"][:, dofs].T @ chosen, "ηᵀg": chosen.T @ full["g"]}
+        _compare(case, "contact_loads", mu, {"Bᵀη": B_eta, "ηᵀg": bounds}, expected)
+
+
+def affine(case: ProblemCase) -> Iterator[str]:
+    """Sums declared in `affine` agree with `assemble`."""
+    problem = case.plugin
+    yield from _undeclarable("affine", problem.affine)
+    declared = {name: each for name, each in problem.affine.items() if name in MEMBERS}
+    if not declared:
+        yield Note("not declared")
+        return
+    yield Note(", ".join(f"{name}: {len(each.terms)} terms" for name, each in declared.items()))
+    for where, mu in case.arguments.items():
+        for name, each in declared.items():
+            try:
+                summed = each.at(mu.copy())
+            except NumericalError as error:
+                raise ConformanceError(f"the affine sum of {name} {where}: {error}") from error
+            _compare(case, "affine", mu, {name: summed}, case.results[where])
+
+
+def by_entries(case: ProblemCase) -> Iterator[str]:
+    """`sampler` agrees with `assemble` on entries of every member alone, and of all at once."""
+    problem = case.plugin
+    yield from _undeclarable("entrywise", problem.entrywise)
+    names = [name for name in MEMBERS if name in problem.entrywise]
+    if not names:
+        yield Note("not declared")
+        if type(problem).sampler is not Problem.sampler:
+            yield "`sampler` is defined but `entrywise` names no member, so it is never used"
+        return
+    rng, pattern = np.random.default_rng(0), case.results[at(case.mus[0])]
+    places = {name: _places(name, pattern[name], rng) for name in names}
+    # A run samples one member or several in one call.
+    for chosen in [*([name] for name in names), names]:
+        wanted = {name: places[name] for name in chosen}
+        sample = problem.sampler(wanted)
+        for where, mu in case.arguments.items():
+            full, given = case.results[where], mu.copy()
+            samples = unmutated("the sampler", {"its argument mu": given}, partial(sample, given))
+            for name, (rows, columns) in wanted.items():
+                if name not in samples:
+                    raise ConformanceError(f"the sampler returns no {name}, which `entrywise` names")
+                if fault := array_fault(f"{name} of the sampler", samples[name], rows.shape):
+                    raise ConformanceError(f"{fault} ({at(mu)})")
+                # A full copy with the sampled entries, so that the message names their place in the member.
+                sampled = copies({name: full[name]})
+                sampled[name][(rows, columns) if name in "AB" else rows] = samples[name]
+                _compare(case, "sampler", mu, sampled, full)
+
+
+def by_elements(case: ProblemCase) -> Iterator[str]:
+    """`element_sampler` agrees with `assemble`: summed over all elements, and on some of them with those of all."""
+    problem = case.plugin
+    yield from _undeclarable("elementwise", problem.elementwise)
+    names = [name for name in MEMBERS if name in problem.elementwise]
+    if not names:
+        yield Note("not declared")
+        return
+    if set(names) - {"A", "f"}:
+        yield f"`elementwise` names {', '.join(names)}; only A and f are integrated element by element"
+        return
+    dofs, n = problem.element_dofs, problem.V.dim
+    if dofs.ndim != 2 or dofs.dtype.kind not in "iu" or dofs.min(initial=0) < -1 or dofs.max(initial=0) >= n:
+        yield f"element_dofs has shape {dofs.shape} and dtype {dofs.dtype}; expected (k, e), whole, from -1 to {n - 1}"
+        return
+    k, count = dofs.shape
+    some = np.arange(0, count, max(2, count // 40))
+    of_all, of_some = problem.element_sampler(np.arange(count)), problem.element_sampler(some)
+    for where, mu in case.arguments.items():
+        full, parts = of_all(mu.copy()), of_some(mu.copy())
+        for name in names:
+            shape = (k, k) if name == "A" else (k,)
+            for sampled, number in ((full, count), (parts, len(some))):
+                if name not in sampled:
+                    raise ConformanceError(f"the element sampler returns no {name}, which `elementwise` names")
+                if fault := array_fault(f"{name} of the element sampler", sampled[name], (number, *shape)):
+                    raise ConformanceError(f"{fault} ({at(mu)})")
+            _compare(case, "element_sampler", mu, {name: _summed(name, full[name], dofs, n)}, case.results[where])
+            if what := difference(parts[name], full[name][some], case.round_off * largest_entry(full[name])):
+                raise ConformanceError(f"{name} on some elements differs from that on all of them {at(mu)}: {what}")
+
+
+def _summed(name: str, parts: Array, dofs: Indices, n: int) -> object:
+    """The matrix (n×n) or the vector (n,) of parts (e×k×k) or (e×k) on elements."""
+    if name == "f":
+        kept = dofs.T >= 0
+        return np.bincount(dofs.T[kept], weights=parts[kept], minlength=n)
+    rows, columns = np.broadcast_arrays(dofs.T[:, :, None], dofs.T[:, None, :])
+    # −1 stands for a node without an unknown.
+    kept = (rows >= 0) & (columns >= 0)
+    return sp.csr_array(sp.coo_array((parts[kept], (rows[kept], columns[kept])), shape=(n, n)))
+
+
+def _places(name: str, values: object, rng: np.random.Generator) -> tuple[Indices, Indices]:
+    """Rows and columns of entries in the pattern of a member; of the symmetric A on and above the diagonal."""
+    if isinstance(values, np.ndarray):
+        rows, columns = np.arange(len(values)), np.zeros(len(values), dtype=np.intp)
+    else:
+        pattern = sp.coo_array(sp.triu(values) if name == "A" else values)
+        rows, columns = (np.asarray(axis, dtype=np.intp) for axis in pattern.coords)
+    chosen = np.sort(rng.choice(len(rows), min(40, len(rows)), replace=False))
+    return rows[chosen], columns[chosen]
+
+
+def _compare(case: ProblemCase, function: str, mu: Array, arrays: Arrays, full: Arrays) -> None:
+    """Raise a `ConformanceError` for the first array whose type, shape or values are not those of `assemble` at mu."""
+    for name, array in arrays.items():
+        if fault := array_fault(f"{name} of `{function}`", array, full[name].shape, sparse=sp.issparse(full[name])):
+            raise ConformanceError(f"{fault} ({at(mu)})")
+    for name, what in differences(copies(arrays), {name: full[name] for name in arrays}, case.round_off):
+        raise ConformanceError(f"{name} of `{function}` differs from that of `assemble` {at(mu)}: {what}")
+
+
+def _undeclarable(declaration: str, names: Iterable[str]) -> Iterator[str]:
+    """Faults of `constant`, `entrywise` or `elementwise`: names that are not members."""
+    if isinstance(names, str):
+        raise ConformanceError(f"`{declaration}` is the string {names!r}; expected a set: frozenset({{{names!r}}})")
+    for name in sorted(set(names) - set(MEMBERS)):
+        yield f"`{declaration}` names '{name}'; expected {', '.join(MEMBERS)}"
+
+
+def spaces(case: ProblemCase) -> Iterator[str]:
     """X_V and X_W are symmetric positive definite; the integrals of the multiplier basis are positive."""
     for name in ("V", "W"):
         space = getattr(case.plugin, name, None)
@@ -43,13 +396,11 @@ def spaces(case: AssemblyCase) -> Iterator[str]:
         yield fault
     elif np.any(integrals <= 0.0):
         k = int(np.argmin(integrals))
-        yield (
-            f"multiplier_integrals has the value {integrals[k]:.2g} at entry {k}; expected the positive integrals of "
-            "the multiplier basis: override the method if the basis does not sum to one"
-        )
+        advice = "override the method if the basis does not sum to one"
+        yield f"multiplier_integrals is {integrals[k]:.2g} at entry {k}; expected positive integrals: {advice}"
 
 
-def parameters(case: AssemblyCase) -> Iterator[str]:
+def parameters(case: ProblemCase) -> Iterator[str]:
     """`parameters` is a box with names, units and ordered bounds."""
     box = case.plugin.parameters
     if not isinstance(box, ParameterBox):
@@ -67,7 +418,7 @@ def parameters(case: AssemblyCase) -> Iterator[str]:
             yield f"the lower bound {low:g} of the parameter '{name}' is above its upper bound {high:g}"
 
 
-def training_set(case: AssemblyCase) -> Iterator[str]:
+def training_set(case: ProblemCase) -> Iterator[str]:
     """Training parameters lie in the box, are reproducible, and there are at least two."""
     mus = training_parameters(case.plugin)
     yield from _outside("training_set", mus, case.plugin.parameters)
@@ -78,7 +429,7 @@ def training_set(case: AssemblyCase) -> Iterator[str]:
     yield Note(f"{len(mus)} parameters")
 
 
-def validation_set(case: AssemblyCase) -> Iterator[str]:
+def validation_set(case: ProblemCase) -> Iterator[str]:
     """Validation parameters lie in the box and are reproducible."""
     mus = validation_parameters(case.plugin, 5, seed=0)
     yield from _outside("validation_set", mus, case.plugin.parameters)
@@ -92,25 +443,20 @@ def _outside(name: str, mus: Array, box: ParameterBox) -> Iterator[str]:
         yield f"{name} leaves the box: parameter {k}, {at(mus[k])}, has '{box.names[i]}' outside {interval}"
 
 
-def constants(case: AssemblyCase) -> Iterator[str]:
-    """α and γ_a of A, β_HF and γ_b of B are of a moderate ratio.
-
-    Norms of V that bound A from both sides, such as energy and H¹ norms, have a ratio γ_a/α that does not depend on the
-    mesh. Diagonal matrices in their place have one of O(h⁻²), and so have a mass matrix and any norm without gradients;
-    one in another order of the unknowns has a larger one. The ratio is compared with that of the diagonal of A.
-    """
+def constants(case: ProblemCase) -> Iterator[str]:
+    """α and γ_a of A, β_HF and γ_b of B are of a moderate ratio."""
     where, arrays = next(iter(case.results.items()))
     A, V, W = arrays["A"], case.plugin.V, case.plugin.W
     lowest, highest = extreme_quotients(A, V)
     yield Note(f"{where}: α = {lowest:.3g}, γ_a = {highest:.3g}")
     low, high = extreme_quotients(A, InnerProduct(sp.diags_array(A.diagonal(), format="csc")))
     ratio, diagonal = highest / lowest, high / low
-    # A good norm stays below this fraction already on coarse meshes; a ratio up to 10 is never doubted.
+    # The ratio of a norm that bounds A from both sides does not depend on the mesh; that of diagonal matrices, of a
+    # mass matrix and of any norm without gradients is O(h⁻²), and another order of the unknowns makes it larger still.
+    # A good norm stays below 0.8 of the diagonal's ratio on coarse meshes; a ratio up to 10 is never doubted.
     if ratio > max(10.0, 0.8 * diagonal):
-        yield Doubt(
-            f"γ_a/α = {ratio:.2g}, as large as with the diagonal of A in place of X_V ({diagonal:.2g}): probably X_V "
-            "has the unknowns in another order than A, or is a norm without gradients, such as a mass matrix"
-        )
+        why = "the unknowns in another order than A, or is a norm without gradients, such as a mass matrix"
+        yield Doubt(f"γ_a/α = {ratio:.2g}, as with the diagonal of A as X_V ({diagonal:.2g}): probably X_V has {why}")
     if W.dim > 1000:
         yield Note("β_HF is not computed for more than 1000 constraints")
         return
@@ -124,7 +470,7 @@ def constants(case: AssemblyCase) -> Iterator[str]:
         yield Doubt(f"β_HF/γ_b = {beta / values[0]:.1g}: {dependent} rows of B depend linearly on the others")
 
 
-def high_fidelity_solution(case: AssemblyCase) -> Iterator[str]:
+def high_fidelity_solution(case: ProblemCase) -> Iterator[str]:
     """High-fidelity solutions exist; their multipliers lie in W⁺ and are not all zero."""
     mus, solver = training_parameters(case.plugin), active_set.HighFidelitySolver(case.plugin)
     solved: list[active_set.HighFidelitySolution] = []
@@ -146,20 +492,17 @@ def high_fidelity_solution(case: AssemblyCase) -> Iterator[str]:
         solved.append(answer)
         contacts += bool(np.any(answer.lam > 0.0))
     if not contacts:
-        yield (
-            f"no constraint is active at any of {len(solved)} training parameters, so that all multipliers are zero; "
-            "check that B u ≤ g is the admissible side"
-        )
+        yield f"no constraint is active at any of {len(solved)} training parameters; is B u ≤ g the admissible side?"
     elif all(np.all(each.lam > 0.0) for each in solved):
         yield Doubt(
-            f"every constraint is active at each of {len(solved)} training parameters; check the signs of B and g"
+            f"every constraint is active at each of {len(solved)} training parameters; are B and g signed right?"
         )
     worst, fallbacks = max(each.residuals.worst for each in solved), sum(bool(each.fallback) for each in solved)
     initial = f", {fallbacks} started from an interior-point solution" if fallbacks else ""
     yield Note(f"residuals up to {worst:.0e}, contact at {contacts} of {len(solved)} parameters{initial}")
 
 
-def interpolation(case: AssemblyCase) -> Iterator[str]:
+def interpolation(case: ProblemCase) -> Iterator[str]:
     """Interpolated members are also right at parameters outside the training set."""
     problem, mus = case.plugin, training_parameters(case.plugin)
     names = [name for name in MEMBERS if name in problem.entrywise - problem.constant - set(problem.affine)]
@@ -176,13 +519,11 @@ def interpolation(case: AssemblyCase) -> Iterator[str]:
         error = held_out_error(name, member, values[len(mus) :], problem.V)
         yield Note(f"{name}: {len(member.terms)} terms, error {error:.0e}")
         if error > MISSED * INTERPOLATION_RTOL:
-            yield Doubt(
-                f"{name}, interpolated over {len(mus)} training parameters to {INTERPOLATION_RTOL:g}, has an error of "
-                f"{error:.1e} at validation parameters: reduced assembly needs more training parameters"
-            )
+            where = f"interpolated over {len(mus)} training parameters"
+            yield Doubt(f"{name}, {where}, has an error of {error:.1e} at validation parameters: it needs more of them")
 
 
-def pictures(case: AssemblyCase) -> Iterator[str]:
+def pictures(case: ProblemCase) -> Iterator[str]:
     """`diagnostics` are finite numbers; `picture` and `mesh_fields` are well formed and leave the solution as it is."""
     mu = training_parameters(case.plugin)[0]
     for name, value in case.plugin.diagnostics(mu.copy()).items():
@@ -220,7 +561,7 @@ def _picture_faults(picture: Picture, m: int) -> Iterator[str]:
         yield f"picture.triangles refers to points {triangles.min()} to {triangles.max()}; there are {count}"
 
 
-def quantities_of_interest(case: AssemblyCase) -> Iterator[str]:
+def quantities_of_interest(case: ProblemCase) -> Iterator[str]:
     """Quantities of interest have names and units, and finite values that a second call repeats."""
     declared, mu = case.plugin.outputs, training_parameters(case.plugin)[:1]
     strange = [type(one).__name__ for one in declared if not isinstance(one, Output)]
@@ -243,36 +584,27 @@ def quantities_of_interest(case: AssemblyCase) -> Iterator[str]:
     yield Note(f"{', '.join(names)}" if names else "no outputs")
 
 
-class ProblemCase(AssemblyCase):
-    """A problem under examination."""
-
-    checks = (
-        Check("construction", AssemblyCase.construction),
-        Check("options", AssemblyCase.options, ("construction",)),
-        Check("spaces", spaces, ("construction",)),
-        Check("parameters", parameters, ("construction",)),
-        Check("training set", training_set, ("parameters",)),
-        Check("validation set", validation_set, ("parameters",)),
-        Check("one assembly", assembly.one_assembly, ("spaces", "parameters")),
-        Check("assembly", assembly.assembly, ("one assembly",)),
-        Check("no mutation", assembly.no_mutation, ("assembly",)),
-        Check("symmetry of A", assembly.symmetry, ("assembly",)),
-        Check("definiteness of A", assembly.definiteness, ("symmetry of A",)),
-        Check("determinism", AssemblyCase.determinism, ("assembly",)),
-        Check("another process", AssemblyCase.another_process, ("determinism",)),
-        Check("coercivity and inf-sup", constants, ("definiteness of A", "determinism")),
-        Check("independence of mu", assembly.independence, ("determinism",)),
-        Check("continuity in mu", assembly.continuity, ("independence of mu",)),
-        Check("assembly on the contact", assembly.on_contact, ("determinism",)),
-        Check("affine sums", assembly.affine, ("determinism",)),
-        Check("assembly by entries", assembly.by_entries, ("determinism",)),
-        Check("assembly by elements", assembly.by_elements, ("determinism",)),
-        Check("interpolation", interpolation,
-              ("training set", "validation set", "independence of mu", "assembly by entries")),
-        Check("pickling", AssemblyCase.pickling, ("determinism",)),
-        Check("high-fidelity solution", high_fidelity_solution,
-              ("training set", "definiteness of A", "independence of mu", "assembly on the contact")),
-        Check("picture and diagnostics", pictures, ("high-fidelity solution",)),
-        Check("outputs", quantities_of_interest, ("high-fidelity solution",)),
-        Check("time", AssemblyCase.duration, ("assembly",)),
-    )  # fmt: skip
+ProblemCase.checks = (
+    Check("construction", ProblemCase.construction), Check("options", ProblemCase.options, ("construction",)),
+    Check("spaces", spaces, ("construction",)), Check("parameters", parameters, ("construction",)),
+    Check("training set", training_set, ("parameters",)), Check("validation set", validation_set, ("parameters",)),
+    Check("one assembly", one_assembly, ("spaces", "parameters")), Check("assembly", assembly, ("one assembly",)),
+    Check("no mutation", no_mutation, ("assembly",)), Check("symmetry of A", symmetry, ("assembly",)),
+    Check("definiteness of A", definiteness, ("symmetry of A",)),
+    Check("determinism", ProblemCase.determinism, ("assembly",)),
+    Check("another process", ProblemCase.another_process, ("determinism",)),
+    Check("coercivity and inf-sup", constants, ("definiteness of A", "determinism")),
+    Check("independence of mu", independence, ("determinism",)),
+    Check("continuity in mu", continuity, ("independence of mu",)),
+    Check("assembly on the contact", on_contact, ("determinism",)), Check("affine sums", affine, ("determinism",)),
+    Check("assembly by entries", by_entries, ("determinism",)),
+    Check("assembly by elements", by_elements, ("determinism",)),
+    Check("interpolation", interpolation,
+          ("training set", "validation set", "independence of mu", "assembly by entries")),
+    Check("pickling", ProblemCase.pickling, ("determinism",)),
+    Check("high-fidelity solution", high_fidelity_solution,
+          ("training set", "definiteness of A", "independence of mu", "assembly on the contact")),
+    Check("picture and diagnostics", pictures, ("high-fidelity solution",)),
+    Check("outputs", quantities_of_interest, ("high-fidelity solution",)),
+    Check("time", ProblemCase.duration, ("assembly",)),
+)  # fmt: skip

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import KW_ONLY, dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from types import FrameType
 from typing import ClassVar
 
@@ -87,14 +86,10 @@ class SolverCase:
     # Largest error of a solution whose residuals are below the accuracy: the conditions of the programs are below 1e3.
     rtol: ClassVar[float] = 1e-3
 
-    @cached_property
-    def programs(self) -> dict[str, KnownProgram]:
-        return known_programs()
-
-    @cached_property
-    def typical(self) -> VariationalInequality:
-        """The program with some active constraints, scaled as it is when a solver gets it."""
-        return _scaled(next(iter(self.programs.values())).program)
+    def __post_init__(self) -> None:
+        self.programs = known_programs()
+        # The program with some active constraints, scaled as it is when a solver gets it.
+        self.typical = _scaled(self.programs["some constraints are active"].program)
 
     def solve(self, program: VariationalInequality, accuracy: float = ACCURACY) -> QPSolution:
         """The answer as a run gets it: the data scaled, the answer scaled back."""
@@ -116,10 +111,8 @@ class SolverCase:
         """Multipliers α ≥ 0 are those of A x + Bᵀα = f."""
         program, answer = self.typical, self.create(self.typical, ACCURACY)
         assert answer.x is not None and answer.alpha is not None  # noqa: PT018  the check "answer" passed
-        off = [
-            float(np.max(np.abs(program.A @ answer.x - program.f + sign * program.B.T @ answer.alpha)))
-            for sign in (1, -1)
-        ]
+        rest, forces = program.A @ answer.x - program.f, program.B.T @ answer.alpha
+        off = [float(np.max(np.abs(rest + sign * forces))) for sign in (1, -1)]
         if off[0] > 1e-3 > off[1]:
             yield f"multipliers have the other sign: ‖A x + Bᵀα − f‖ is {off[0]:.1g}, with −α {off[1]:.1g}"
         elif np.min(answer.alpha) < -self.rtol * np.max(np.abs(answer.alpha)):
@@ -214,10 +207,8 @@ class SolverCase:
         fast, slow = map(min, zip(*seconds, strict=True))
         # Calls and seconds together: an early end of the iterations saves calls, a busy machine changes seconds.
         if kept < solved and slow > 5.0 * fast:
-            yield (
-                f"a program solved before takes {fast:.1g} s of CPU, a new one {slow:.1g} s: solutions are kept, and "
-                "their times say nothing"
-            )
+            times = f"a program solved before takes {fast:.1g} s of CPU, a new one {slow:.1g} s"
+            yield f"{times}: solutions are kept, and their times say nothing"
 
     def _calls(self, program: VariationalInequality) -> int:
         """Number of Python and C functions that the solver calls for a program."""
@@ -236,31 +227,23 @@ class SolverCase:
 
     def duration(self) -> Iterator[str]:
         """A solution is much quicker than the time limit."""
-        seconds = self._solution_seconds()
+        seconds = timed(partial(self.create, self.typical, ACCURACY))[1].wall
         if seconds > self.seconds:
             yield f"a solution takes {seconds:.3g} s, above the limit of {self.seconds:g} s"
         elif seconds > 1.0:
-            seconds = min(seconds, self._solution_seconds())  # the machine may have been busy with something else
+            # The machine may have been busy with something else.
+            seconds = min(seconds, timed(partial(self.create, self.typical, ACCURACY))[1].wall)
             if seconds > 1.0:
                 yield Doubt(f"a solution of a program of 6 unknowns takes {seconds:.3g} s")
         yield Note(f"a solution takes {seconds:.2g} s")
 
-    def _solution_seconds(self) -> float:
-        begin = time.perf_counter()
-        self.create(self.typical, ACCURACY)
-        return time.perf_counter() - begin
-
     checks = (
-        Check("answer", answer),
-        Check("signs of multipliers", signs, ("answer",)),
+        Check("answer", answer), Check("signs of multipliers", signs, ("answer",)),
         Check("known solutions", solutions, ("signs of multipliers",)),
-        Check("accuracy", accuracies, ("signs of multipliers",)),
-        Check("infeasible program", infeasible, ("answer",)),
-        Check("no mutation", no_mutation, ("answer",)),
-        Check("determinism", determinism, ("answer",)),
+        Check("accuracy", accuracies, ("signs of multipliers",)), Check("infeasible program", infeasible, ("answer",)),
+        Check("no mutation", no_mutation, ("answer",)), Check("determinism", determinism, ("answer",)),
         Check("independent calls", independence, ("known solutions", "no mutation")),
-        Check("repeated programs", repetition, ("answer",)),
-        Check("time", duration, ("answer",)),
+        Check("repeated programs", repetition, ("answer",)), Check("time", duration, ("answer",)),
     )  # fmt: skip
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
@@ -43,11 +43,7 @@ from vibench.testing.sample_problem import arrays_of, copy_of, sample_offline, s
 
 @dataclass(eq=False)
 class DualCase(Case[DualStrategy, Stop, Cone]):
-    """A dual strategy, tolerances and sizes, and the cones it makes of snapshots (m×P).
-
-    A cone with R + 1 errors claims that its generators are nested, and every error is computed again; a construction
-    that is not nested returns its last error alone.
-    """
+    """A dual strategy, tolerances and sizes, and the cones it makes of snapshots (m×P)."""
 
     base = DualStrategy
     snapshots: Array | None = None
@@ -92,11 +88,8 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
     def _missed(self, tolerance: float, cone: Cone, snapshots: Array) -> Iterator[str]:
         errors = self._errors(cone, cone.size, snapshots)
         if errors.max(initial=0.0) > tolerance + _round_off(tolerance):
-            yield (
-                f"tolerance {tolerance:g} is missed: with {cone.size} generators the projection error of snapshot "
-                f"{errors.argmax()} is {errors.max():.3g}, relative to the largest norm of a snapshot; "
-                f"the claimed error is {cone.errors[-1]:.3g}"
-            )
+            missed = f"tolerance {tolerance:g} is missed by {cone.size} generators, which claim {cone.errors[-1]:.3g}"
+            yield f"{missed}: the relative projection error of snapshot {errors.argmax()} is {errors.max():.3g}"
 
     def size(self) -> Iterator[str]:
         """The cone has the prescribed number of generators, fewer only if it contains all snapshots."""
@@ -116,10 +109,8 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
             for r, claimed in enumerate(cone.errors, first):
                 error = self._errors(cone, r, self.lam).max(initial=0.0)
                 if abs(error - claimed) > _round_off(error):
-                    yield (
-                        f"{stop}: the claimed error e({r}) is {claimed:.6g}; the projection error of the snapshots is "
-                        f"{error:.6g} for r = {r} (a construction that is not nested returns its last error alone)"
-                    )
+                    advice = "a construction that is not nested returns its last error alone"
+                    yield f"{stop}: the projection error e({r}) is {error:.6g}, not {claimed:.6g} as claimed; {advice}"
                     break
 
     def no_mutation(self) -> None:
@@ -157,17 +148,12 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
         return np.array([project_on_cone(chi, theta, self.space).distance for theta in snapshots.T]) / largest
 
     checks = (
-        Check("construction", Case.construction),
-        Check("options", Case.options, ("construction",)),
-        Check("cone", cone, ("construction",)),
-        Check("tolerance", tolerance, ("cone",)),
-        Check("size", size, ("cone",)),
-        Check("errors", errors, ("cone",)),
-        Check("determinism", Case.determinism, ("cone",)),
-        Check("no mutation", no_mutation, ("cone",)),
+        Check("construction", Case.construction), Check("options", Case.options, ("construction",)),
+        Check("cone", cone, ("construction",)), Check("tolerance", tolerance, ("cone",)),
+        Check("size", size, ("cone",)), Check("errors", errors, ("cone",)),
+        Check("determinism", Case.determinism, ("cone",)), Check("no mutation", no_mutation, ("cone",)),
         Check("snapshots without contact", without_contact, ("cone", "tolerance")),
-        Check("pickling", Case.pickling, ("determinism",)),
-        Check("time", Case.duration, ("cone",)),
+        Check("pickling", Case.pickling, ("determinism",)), Check("time", Case.duration, ("cone",)),
     )  # fmt: skip
 
 
@@ -321,18 +307,13 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
             yield f"with a cone without generators: {fault}"
 
     checks = (
-        Check("construction", Case.construction),
-        Check("options", Case.options, ("construction",)),
-        Check("tolerance", tolerance, ("construction",)),
-        Check("enrichment", enrichment, ("tolerance",)),
-        Check("kind", kind, ("enrichment",)),
-        Check("determinism", Case.determinism, ("enrichment",)),
+        Check("construction", Case.construction), Check("options", Case.options, ("construction",)),
+        Check("tolerance", tolerance, ("construction",)), Check("enrichment", enrichment, ("tolerance",)),
+        Check("kind", kind, ("enrichment",)), Check("determinism", Case.determinism, ("enrichment",)),
         Check("tighter tolerances", tighter, ("kind", "determinism")),
-        Check("nested growth", nested, ("tighter tolerances",)),
-        Check("no mutation", no_mutation, ("enrichment",)),
+        Check("nested growth", nested, ("tighter tolerances",)), Check("no mutation", no_mutation, ("enrichment",)),
         Check("model without contact", without_contact, ("enrichment",)),
-        Check("pickling", Case.pickling, ("determinism",)),
-        Check("time", Case.duration, ("enrichment",)),
+        Check("pickling", Case.pickling, ("determinism",)), Check("time", Case.duration, ("enrichment",)),
     )  # fmt: skip
 
 
@@ -347,11 +328,7 @@ def sample_boxes() -> Mapping[str, ParameterBox]:
 
 @dataclass(eq=False)
 class SamplingCase(Case[Sampling, ParameterBox, Array]):
-    """A sampling strategy, boxes, and its points (P×d) in those that its options fit.
-
-    An option called `size` is the number of points, one called `seed` determines whatever is random; both are tried
-    with other values. A strategy may refuse some boxes by a `RequestError`, where its options do not fit.
-    """
+    """A sampling strategy, boxes, and its points (P×d) in those that it does not refuse by a `RequestError`."""
 
     base = Sampling
     boxes: Mapping[str, ParameterBox] = field(default_factory=sample_boxes)
@@ -369,14 +346,15 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
 
     @property
     def arguments(self) -> dict[str, ParameterBox]:
-        return {name: self.boxes[name] for name, points in self.tried.items() if not isinstance(points, RequestError)}
+        return {name: self.boxes[name] for name in self.results}
 
     @cached_property
     def results(self) -> dict[str, Array]:
         return {name: points for name, points in self.tried.items() if not isinstance(points, RequestError)}
 
     def evaluate(self, argument: ParameterBox, plugin: Sampling | None = None) -> Array:
-        return self.clocked("a sample", partial(_points, plugin or self.plugin, argument))
+        points = self.clocked("a sample", lambda: (plugin or self.plugin).parameters(deepcopy(argument)))
+        return np.array(points, float)
 
     def arrays(self, result: Array) -> Arrays:
         return {"the points": result}
@@ -401,10 +379,11 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
         if not self._takes("size"):
             yield Note("no option is called 'size'")
             return
-        for size in dict.fromkeys([1, 5, 16, *([self._given["size"]] if "size" in self._given else [])]):
+        given = getattr(self.create, "keywords", {}).get("size", 16)
+        for size in dict.fromkeys([1, 5, 16, given]):
             for name, box in self.arguments.items():
                 try:
-                    points = self.evaluate(box, self._variant(size=size))
+                    points = self.evaluate(box, self._with(size=size))
                 except RequestError as error:
                     yield Note(f"{name}: size {size} is refused, {error}")
                     continue
@@ -416,7 +395,7 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
         if not self._takes("seed"):
             yield Note("no option is called 'seed'")
             return
-        seeds = [self._variant(seed=seed) for seed in range(4)]
+        seeds = [self._with(seed=seed) for seed in range(4)]
         for name, box in self.arguments.items():
             samples = [self.evaluate(box, plugin) for plugin in seeds]
             # One point may be a rule of its own, such as the centre.
@@ -427,7 +406,7 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
         """Neither the box nor NumPy's global random numbers are changed."""
         for name, box in self.arguments.items():
             # A strategy that seeds the global generator would fix the random numbers of all others.
-            given, state = _copy(box), np.random.get_state()  # noqa: NPY002  the state that others share
+            given, state = deepcopy(box), np.random.get_state()  # noqa: NPY002  the state that others share
             self.plugin.parameters(given)
             for what in ("lower", "upper"):
                 if not np.array_equal(getattr(given, what), getattr(box, what)):
@@ -451,34 +430,24 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
                 yield f"{name}: train: {error}"
                 continue
             same = len(first) == len(again) and all(map(np.array_equal, first, again))
-            yield (
-                Note(f"{name}: {len(first)} solutions") if same else f"{name}: a second call solves at other parameters"
-            )
+            fault = f"{name}: a second call solves at other parameters"
+            yield Note(f"{name}: {len(first)} solutions") if same else fault
 
-    @property
-    def _given(self) -> dict[str, Any]:
-        return dict(getattr(self.create, "keywords", {}))
+    def _with(self, **options: int) -> Sampling:
+        create: Callable[..., Sampling] = self.create
+        return create(**options)
 
     def _takes(self, option: str) -> bool:
         constructor = getattr(self.create, "func", self.create)
         return isinstance(constructor, type) and option in inspect.signature(constructor).parameters
 
-    def _variant(self, **options: Any) -> Sampling:
-        constructor: Callable[..., Sampling] = getattr(self.create, "func", self.create)
-        return constructor(**self._given | options)
-
     checks = (
-        Check("construction", Case.construction),
-        Check("options", Case.options, ("construction",)),
-        Check("parameters", parameters, ("construction",)),
-        Check("size", size, ("parameters",)),
-        Check("determinism", Case.determinism, ("parameters",)),
-        Check("seed", seed, ("determinism",)),
+        Check("construction", Case.construction), Check("options", Case.options, ("construction",)),
+        Check("parameters", parameters, ("construction",)), Check("size", size, ("parameters",)),
+        Check("determinism", Case.determinism, ("parameters",)), Check("seed", seed, ("determinism",)),
         Check("another process", Case.another_process, ("determinism",)),
-        Check("no mutation", no_mutation, ("parameters",)),
-        Check("training", training, ("determinism",)),
-        Check("pickling", Case.pickling, ("determinism",)),
-        Check("time", Case.duration, ("parameters",)),
+        Check("no mutation", no_mutation, ("parameters",)), Check("training", training, ("determinism",)),
+        Check("pickling", Case.pickling, ("determinism",)), Check("time", Case.duration, ("parameters",)),
     )  # fmt: skip
 
 
@@ -500,19 +469,11 @@ class DistanceTrainer(Trainer):
         return float(min(gaps, default=np.inf))
 
 
-def _points(plugin: Sampling, box: ParameterBox) -> Array:
-    return np.array(plugin.parameters(_copy(box)), float)
-
-
-def _copy(box: ParameterBox) -> ParameterBox:
-    return replace(box, lower=box.lower.copy(), upper=box.upper.copy())
-
-
 def _train(plugin: Sampling, box: ParameterBox) -> list[Array]:
     assert isinstance(plugin, AdaptiveSampling)  # its caller asks for no other
     trainer = DistanceTrainer(box)
     try:
-        plugin.train(_copy(box), trainer)
+        plugin.train(deepcopy(box), trainer)
     except ConformanceError:
         raise
     except Exception as error:
