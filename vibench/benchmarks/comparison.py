@@ -21,33 +21,19 @@ AXES = ("problem", "dual", "primal", "formulation", "size", "solver", "accuracy"
 
 @dataclass(frozen=True)
 class Measured:
-    """One benchmark of a file.
-
-    Attributes
-    ----------
-    seconds, q1, q3
-        Median and quartiles over the rounds of all passes, in CPU seconds of one call.
-    low, high
-        The smallest lower and the largest upper quartile of a pass.
-    accuracy
-        Errors and residuals; `None` where one was not finite.
-    status
-        Status of the answer of a QP solver, "" where none was asked.
-    calibration
-        CPU seconds of fixed work beside it, median over the passes: how fast the machine was then; NaN where unknown.
-    """
+    """One benchmark of a file; times are CPU seconds of one call."""
 
     group: str
     axes: Mapping[str, str]
-    seconds: float
+    seconds: float  # median over the rounds of all passes
     q1: float
     q3: float
-    low: float
-    high: float
+    low: float  # the smallest lower quartile of a pass
+    high: float  # the largest upper quartile of a pass
     rounds: int
-    accuracy: Mapping[str, float | None]
-    status: str
-    calibration: float
+    accuracy: Mapping[str, float | None]  # errors and residuals; `None` where one was not finite
+    status: str  # of the answer of a QP solver, "" where none was asked
+    calibration: float  # seconds of fixed work beside it, which say how fast the machine was; NaN where unknown
 
 
 @dataclass(frozen=True)
@@ -98,16 +84,13 @@ def _measured(name: str, entry: Mapping[str, Any]) -> Measured:
     return Measured(
         group=unbroken(str(entry.get("group") or name.partition("[")[0])),
         axes={axis: axes[axis] for axis in AXES if axes.get(axis)},
-        seconds=_seconds(stats, "median"),
-        q1=_seconds(stats, "q1"),
-        q3=_seconds(stats, "q3"),
+        seconds=_seconds(stats, "median"), q1=_seconds(stats, "q1"), q3=_seconds(stats, "q3"),
         low=min(_seconds(one, "q1") for one in passes),
-        high=max(_seconds(one, "q3") for one in passes),
-        rounds=int(stats["rounds"]),
+        high=max(_seconds(one, "q3") for one in passes), rounds=int(stats["rounds"]),
         accuracy={unbroken(str(figure)): None if value is None else float(value) for figure, value in accuracy},
         status=unbroken(str(extra.get("status", ""))),
         calibration=statistics.median(calibrations) if calibrations else math.nan,
-    )
+    )  # fmt: skip
 
 
 def _seconds(stats: Mapping[str, Any], name: str) -> float:
@@ -131,16 +114,10 @@ def table_of(timed: Timed, earlier: Timed | None, limit: float) -> pd.DataFrame:
 
 def _row(name: str, one: Measured) -> dict[str, Any]:
     return {
-        "benchmark": name,
-        "group": one.group,
-        **{axis: one.axes.get(axis, "") for axis in AXES},
-        "median_s": one.seconds,
-        "q1_s": one.q1,
-        "q3_s": one.q3,
-        "rounds": one.rounds,
-        "status": one.status,
+        "benchmark": name, "group": one.group, **{axis: one.axes.get(axis, "") for axis in AXES},
+        "median_s": one.seconds, "q1_s": one.q1, "q3_s": one.q3, "rounds": one.rounds, "status": one.status,
         **{f"reached_{figure}": value for figure, value in one.accuracy.items()},
-    }
+    }  # fmt: skip
 
 
 def _change(name: str, was: Measured, now: Measured, limit: float) -> dict[str, Any]:
@@ -151,18 +128,12 @@ def _change(name: str, was: Measured, now: Measured, limit: float) -> dict[str, 
     changes += ["less accurate"] if figure.is_worse else []
     changes += [f"{was.status}, now {now.status or 'nothing'}"] if was.status == "ok" != now.status else []
     return {
-        "benchmark": name,
-        "group": was.group,
-        **{axis: was.axes.get(axis, "") for axis in AXES},
-        "before_s": was.seconds,
-        "after_s": now.seconds,
+        "benchmark": name, "group": was.group, **{axis: was.axes.get(axis, "") for axis in AXES},
+        "before_s": was.seconds, "after_s": now.seconds,
         "ratio": now.seconds / was.seconds if was.seconds > 0.0 else math.nan,
         "apart": "yes" if now.low > was.high or was.low > now.high else "no",
-        "figure": figure.name,
-        "before": figure.before,
-        "after": figure.after,
-        "verdict": ", ".join(changes),
-    }
+        "figure": figure.name, "before": figure.before, "after": figure.after, "verdict": ", ".join(changes),
+    }  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -145,7 +145,7 @@ class Passes:
             raise RuntimeError(in_a_line(error)) from error
 
     @pytest.hookimpl(wrapper=True)
-    def pytest_runtest_makereport(self, item: pytest.Item, call: Any) -> Generator[None, Any, pytest.TestReport]:
+    def pytest_runtest_makereport(self, item: pytest.Item, call: Any) -> Generator[None, Any, Any]:
         """Attach to the report of a benchmark its rounds and what it reached, or why it was not timed."""
         report = yield
         if call.excinfo is not None:
@@ -156,13 +156,9 @@ class Passes:
         benchmark: Any = getattr(item, "funcargs", {}).get("benchmark")
         if report.when == "call" and report.passed and benchmark.stats:
             parameters = item.callspec.params  # type: ignore[attr-defined]
-            entry = {
-                "group": benchmark.group,
-                "axes": {name: str(value) for name, value in parameters.items() if name != "number"},
-                "data": benchmark.stats.stats.data,
-                "iterations": benchmark.stats.iterations,
-                "extra_info": benchmark.extra_info,
-            }
+            axes = {name: str(value) for name, value in parameters.items() if name != "number"}
+            entry = {"group": benchmark.group, "axes": axes, "data": benchmark.stats.stats.data}
+            entry |= {"iterations": benchmark.stats.iterations, "extra_info": benchmark.extra_info}
             report.user_properties.append(("benchmark", entry))
         return report
 

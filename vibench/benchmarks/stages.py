@@ -112,7 +112,7 @@ class StageInputs:
     @property
     @_once
     def most_modes(self) -> int:
-        return pod(self.snapshots.u, self.problem.V, Stop(tolerance=1e-8)).basis.shape[1]
+        return len(pod(self.snapshots.u, self.problem.V, Stop(tolerance=1e-8)).basis.T)
 
     @property
     @_once
@@ -346,7 +346,7 @@ def errors_of(inputs: StageInputs, query: ValidationQuery, u: Array, lam: Array)
     """Relative errors of u and λ, scaled ones where the high-fidelity u or λ is zero."""
     energy = assemblies(inputs.problem).energy_at(query.mu)
     (error,) = errors(inputs.problem, [query.vi], [energy], query.exact, u[:, None], lam[:, None])
-    figures = {}
+    figures: dict[str, float] = {}
     for name in ("error_u", "error_lambda"):
         relative = getattr(error, name)
         scaled = f"{name}_scaled"

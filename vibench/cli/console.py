@@ -61,26 +61,10 @@ def print_frame(
 ) -> None:
     """Print a table that fits the width; nothing is cut, and no number is wrapped.
 
-    Text columns with the same value in every row go into the title, and empty ones are left out. Where there is not
-    room for all others, those of the smallest priority are left out, and a line below names them. What tells rows apart
-    is never left out: where it would take the room of the first three other columns, it becomes one column of several
-    lines.
-
-    Parameters
-    ----------
-    table
-        The table, or its columns as texts.
-    title
-        Its title.
-    priority
-        Columns, those that matter most first; the order of the table by default.
-    axes
-        Columns that tell rows apart: those of numbers go into the title, too, where they are the same in every row, and
-        of a single row they alone do. They come first in `priority`.
-    every
-        Print columns with the same value in every row, too, as columns.
-    rest
-        The command, or its option, that prints the columns that are left out, if there is one.
+    Text columns with the same value in every row go into the title, unless `every` column is printed. Where there is
+    not room for all others, those that come last in `priority` are left out; a line below names them, and the command
+    that prints the `rest`. The `axes`, which tell rows apart and come first in `priority`, are never left out: where
+    they would take the room of the first three other columns, they become one column of several lines.
     """
     from rich import box
     from rich.table import Table

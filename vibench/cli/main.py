@@ -240,10 +240,7 @@ def renamed(arguments: list[str]) -> list[str] | None:
 
 
 def run_command_line() -> None:
-    """Run the command that `sys.argv` gives.
-
-    An expected error is one line; the exit code is 2 for a wrong request, 1 for anything else.
-    """
+    """Run the command of `sys.argv`; an expected error is one line, with exit code 2 for a wrong request or else 1."""
     # click's ClickException, whichever copy of click typer brings.
     usage_error = typer.BadParameter.__mro__[2]
     arguments = sys.argv[1:] or ["--help"]

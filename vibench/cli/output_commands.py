@@ -73,10 +73,8 @@ def draw_run(path: Path, folder: Path, jobs: int, formats: tuple[str, ...] = ("p
         with DrawingDisplay() as display:
             drawn = figures.draw_all(path, folder, formats, min(jobs or cores, cores), display.show)
     except KeyboardInterrupt:
-        echo(
-            "interrupted while drawing: results and tables are complete, some figures are missing; "
-            f"`vibench figures {run_argument(path.parent)}` draws them"
-        )
+        missing = f"some figures are missing; `vibench figures {run_argument(path.parent)}` draws them"
+        echo(f"interrupted while drawing: results and tables are complete, {missing}")
         raise Exit(130) from None
     echo(f"{len(drawn)} figures: {folder}")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Option
 
@@ -48,7 +48,14 @@ def pack(
     if len(problem) > 1 or (problem and cones):
         raise RequestError("expected FOLDER, a pack to check, or PROBLEM FOLDER, the new pack of a problem")
     if problem:
-        _write(problem[0], folder, dict(map(key_value, option or [])), validation, seed, solutions)
+        from vibench.packs.writer import write_pack
+        from vibench.plugins.registry import find
+
+        plugin = find(PROBLEM, problem[0])
+        made, source = plugin.create(dict(map(key_value, option or []))), f"{plugin} of {plugin.origin}"
+        write_pack(made, folder, name=plugin.name, source=source, validation=validation, seed=seed, solutions=solutions)
+        counts = f"{len(made.training_set())} training and {validation} validation parameters (seed {seed})"
+        echo(f"{folder}: the problem '{plugin.name}' at {counts}", f"  vibench pack {folder}")
     elif cones:
         _reduce_cones(folder, dual or [], dual_tol, out)
     else:
@@ -56,23 +63,6 @@ def pack(
 
         checked = read_model_pack(folder)
         echo(*_contents(checked), *_uses(checked, folder))
-
-
-def _write(problem: str, folder: Path, options: dict[str, Any], validation: int, seed: int, solutions: bool) -> None:
-    """Write a pack of a problem.
-
-    Members that the problem declares constant are written once, the others at every training and validation parameter.
-    """
-    from vibench.packs import writer
-    from vibench.plugins.registry import find
-
-    plugin = find(PROBLEM, problem)
-    created, source = plugin.create(options), f"{plugin} of {plugin.origin}"
-    writer.write_pack(
-        created, folder, name=problem, source=source, validation=validation, seed=seed, solutions=solutions
-    )
-    echo(f"{folder}: the problem '{problem}' at {len(created.training_set())} training and {validation} validation "
-         f"parameters (seed {seed})", f"  vibench pack {folder}")  # fmt: skip
 
 
 def _reduce_cones(folder: Path, dual: list[str], dual_tol: float, out: Path) -> None:
@@ -150,11 +140,9 @@ def _uses(pack: ModelPack, folder: Path) -> Iterator[str]:
         # Members that are interpolated between few listed parameters may be wrong in between.
         for name, error in pack.interpolation_errors(INTERPOLATION_RTOL).items():
             if error > MISSED * INTERPOLATION_RTOL:
-                yield (
-                    f"warning: {name}, interpolated over {len(pack.training)} training parameters to "
-                    f"{INTERPOLATION_RTOL:g}, has an error of {error:.1e} at the listed validation parameters: "
-                    "use full assembly, or list more"
-                )
+                where = f"{name}, interpolated over {len(pack.training)} training parameters to {INTERPOLATION_RTOL:g}"
+                wrong = f"has an error of {error:.1e} at the listed validation parameters"
+                yield f"warning: {where}, {wrong}: use full assembly, or list more"
     if pack.reference is not None:
         yield f"its multipliers give cones: vibench pack {folder} --cones"
     if not pack.members:

@@ -212,10 +212,7 @@ def _solver_rows() -> Iterator[Row]:
 
 
 def _find(text: str) -> RegisteredPlugin:
-    """The plugin that NAME, KIND:NAME or MODULE:NAME refers to, loaded.
-
-    Raises a `RequestError` if there is no such plugin, or several.
-    """
+    """The plugin that NAME, KIND:NAME or MODULE:NAME refers to, loaded; a `RequestError` for none or several."""
     from vibench.plugins.registry import find_named, registered
     from vibench.qp.solve import installed_solvers
 

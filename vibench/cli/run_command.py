@@ -109,7 +109,9 @@ def _conclude(name: str, outcome: RunResult, folder: Path, *, draw: int | None, 
 
         figures.remove(folder / "figures")
     if nothing_ran:
-        raise VibenchError(f"no cell could run here: {reasons(outcome.rows)}")
+        reasons = list(dict.fromkeys(str(row["reason"]) for row in outcome.rows))
+        more = [f"{len(reasons) - REASONS} other reasons"] if len(reasons) > REASONS else []
+        raise VibenchError(f"no cell could run here: {'; '.join([*reasons[:REASONS], *more])}")
     if draw is not None:
         output_commands.draw_run(path, folder / "figures", draw)
     table = "this table again" if whole else f"all {len(statuses)} cells"
@@ -146,14 +148,12 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 def print_summary(study: str, path: Path, rows: Rows) -> bool:
-    """Print the summary of a run, why cells are not ok, and violated invariants.
-
-    Returns whether the summary has all cells; of more than 20 cells only the best are printed.
-    """
+    """Print the summary, failures and violated invariants of a run; returns whether the summary has all cells."""
     from vibench.results import consistency, show
     from vibench.results.read import read_in_parts, read_table
 
     cells = read_table(path, "cells")
+    # A table of more cells is longer than a screen: only the best are printed.
     whole = len(cells) <= 20
     table = show.look_up(path, "summary" if whole else "best")
     if len(table.rows):
@@ -185,8 +185,7 @@ def print_summary(study: str, path: Path, rows: Rows) -> bool:
 def failures(rows: Rows, run: str) -> Iterator[str]:
     """A line for every reason why cells are not ok; reasons that differ in their numbers alone are one.
 
-    A solver that has missed its accuracy has a remedy: those that are ok on the same model, or the command, with the
-    run as its argument, that tries them.
+    For an inaccurate solver it names those that are ok on the same model, or the command that tries them.
     """
     from vibench.library.progress import kind_of_failure
     from vibench.results import formats
@@ -218,13 +217,6 @@ def failures(rows: Rows, run: str) -> Iterator[str]:
         yield f"{others} cells not ok for {len(ranked) - REASONS} other reasons"
 
 
-def reasons(rows: Rows) -> str:
-    """The reasons of cells, each once."""
-    distinct = list(dict.fromkeys(str(row["reason"]) for row in rows))
-    more = [f"{len(distinct) - REASONS} other reasons"] if len(distinct) > REASONS else []
-    return "; ".join([*distinct[:REASONS], *more])
-
-
 def next_steps(folder: Path, table: str, *, all_ok: bool, figures: bool) -> None:
     """Print the commands that show more of a run, each with its purpose; the first one prints a `table`."""
     run = run_argument(folder)
@@ -238,5 +230,6 @@ def next_steps(folder: Path, table: str, *, all_ok: bool, figures: bool) -> None
     width = max((len(command) for command, _ in steps if len(command) <= 36), default=36)
     echo("next:")
     for command, purpose in steps:
-        first = f"  {command:<{width}}" if len(command) <= 36 else f"  {command}\n  {'':<{width}}"
-        echo(*f"{first}  {purpose}".split("\n"))
+        lines = [f"{command:<{width}}"] if len(command) <= 36 else [command, " " * width]
+        lines[-1] += f"  {purpose}"
+        echo(*(f"  {line}" for line in lines))

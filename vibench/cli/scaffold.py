@@ -18,10 +18,7 @@ from vibench.provenance import distribution_version
 def write_package(kind: PluginKind, name: str, parent: Path) -> Path:
     """Write a package with one plugin, completely or not at all; returns its folder `parent/vibench-NAME`.
 
-    The parent folder is created if necessary.
-
-    Raises a `RequestError` if the name is invalid or taken, or the folder exists, and a `StorageError` if a file cannot
-    be written.
+    Raises a `RequestError` if the name is invalid or taken, or the folder exists, a `StorageError` if a write fails.
     """
     check_name(kind, name)
     package, word = _package(name), kind.cli_name
@@ -88,10 +85,8 @@ def check_name(kind: PluginKind, name: str) -> None:
 
 def _check_words(name: str, what: str, such_as: str) -> None:
     if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", name) or len(name) > 40:
-        raise RequestError(
-            f"'{name}' cannot be the name of a {what}: expected lower case letters and digits, in words joined by '-', "
-            f"a letter first, 40 characters at most, such as 'my-{such_as}'"
-        )
+        expected = "lower case letters and digits, in words joined by '-', a letter first, 40 characters at most"
+        raise RequestError(f"'{name}' cannot be the name of a {what}: expected {expected}, such as 'my-{such_as}'")
 
 
 def module_file(folder: Path, kind: PluginKind, name: str) -> Path:

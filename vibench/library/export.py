@@ -1,10 +1,10 @@
-"""Export of a reduced model: one file with its operators, and a runtime that needs no vibench."""
+"""Export of a reduced model: one file with its operators, its bounds in C, and a runtime that needs no vibench."""
 
 from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import PackageNotFoundError, metadata
@@ -14,15 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from vibench.arrays import Array
+from vibench.arrays import Array, Indices
 from vibench.errors import RequestError, requested
 from vibench.files import write_atomically, writing
-from vibench.interfaces.problem import MEMBERS
-from vibench.library import exported_certificate
+from vibench.interfaces.outputs import Output
+from vibench.interfaces.problem import MEMBERS, Problem
 from vibench.library.reduced_model import FORMAT, SOLVERS
-from vibench.model.certificates.base import Guarantee, contact_unknowns
+from vibench.model.certificates.base import Guarantee, contact_unknowns, output_coefficients
+from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.chebyshev import AffinePolynomial
-from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel
+from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline import c_source
 from vibench.offline.c_source import ExactMember
 from vibench.offline.models import Model
@@ -33,16 +34,6 @@ from vibench.study.cells import Cell
 
 # The script that is written beside exported files.
 RUNTIME = "reduced_model.py"
-
-# Columns of the cell that an exported model repeats.
-RECORDED = (
-    "cell", "problem", "problem_options", "training", "training_options", "dual", "dual_options", "primal",
-    "primal_options", "pod_tol", "pod_size", "dual_tol", "dual_size", "primal_tol", "solver", "accuracy", "assembly",
-    "bounds",
-    "correction", "queries", "queries_ok", "snapshots", "N", "R", "enrichment", "error_u_mean", "error_u_max",
-    "error_lambda_mean", "error_lambda_max", "assembly_error_max", "seed", "validation", "validation_options", "code",
-    "versions", "definition",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -146,12 +137,14 @@ def exported(
 ) -> ExportedModel:
     """The model as `export_model` writes it."""
     box = model.parameters
-    why = exported_certificate.reason_for_none(model.certificate)
+    why = _reason_for_none(model.certificate)
     if not why and not c:
         why = "only C programs have them; export to a name that ends in .c"
     certificate = None if why else model.certificate
-    beside = None if certificate is None else partial(exported_certificate.thetas, certificate)
-    rotated = {} if certificate is None else exported_certificate.rotated(certificate)
+    beside = None if certificate is None else partial(_certificate_thetas, certificate)
+    rotation = None if certificate is None else certificate.base.rotation
+    # The matrix from the θ of A as a query evaluates them to those of the certificate; none of a constant A.
+    rotated = {} if rotation is None else {"theta_A": rotation}
     try:
         queried, polynomials = member_polynomials(
             model.reduced, tolerance, evaluations, fixed=c, beside=beside, rotated=rotated
@@ -169,25 +162,33 @@ def exported(
     basis = queried.basis if isinstance(queried, HyperReducedModel) else queried.fixed_basis
     if bases:
         arrays |= {"basis": basis, "generators": queried.generators}
-    arrays |= exported_certificate.output_arrays(model, basis, queried.generators, certificate)
-    exact = exact_members(queried, members) if c else {}
+    arrays |= _output_arrays(model, basis, queried.generators, certificate)
+    exact: dict[str, ExactMember] = {}
+    # The members that the model evaluates by declared sums whose coefficients are all expressions.
+    for name in declared_terms(queried) if c else ():
+        if (member := ExactMember.from_sum(queried.problem.affine[name], members[name].terms)) is not None:
+            exact[name] = member
     if certificate is not None:
-        exact |= exported_certificate.exact_thetas(certificate, exact)
+        terms = {name: np.eye(len(member.thetas)) for name, member in exact.items()}
+        if rotation is not None and "A" in terms:
+            terms["A"] = rotation.T
+        exact |= {f"theta_{name}": ExactMember(exact[name].thetas, matrix) for name, matrix in terms.items()}
         unknowns = contact_unknowns(model.problem) if bases else None
-        arrays |= exported_certificate.arrays(certificate, polynomials | members, exact, unknowns)
-        about["certificate"] = exported_certificate.guarantee(certificate, {*model.problem.constant, *exact}).value
+        arrays |= _certificate_arrays(certificate, polynomials | members, exact, unknowns)
+        about["certificate"] = guarantee(certificate, {*model.problem.constant, *exact}).value
     return ExportedModel(members, arrays, about, polynomials, exact)
 
 
-def exact_members(queried: AnyReducedModel, members: Mapping[str, AffinePolynomial]) -> dict[str, ExactMember]:
-    """The members that a model evaluates by declared sums whose coefficients are all expressions."""
-    sums = ((name, queried.problem.affine[name]) for name in declared_terms(queried))
-    found = ((name, ExactMember.from_sum(declared, members[name].terms)) for name, declared in sums)
-    return {name: member for name, member in found if member is not None}
-
-
 def _about(model: Model, members: Mapping[str, AffinePolynomial]) -> dict[str, Any]:
-    """What the file says in words: parameters, solver, errors, provenance."""
+    """The texts of the file: parameters, solver, errors, provenance."""
+    # Columns of the cell that are repeated.
+    recorded = (
+        "cell", "problem", "problem_options", "training", "training_options", "dual", "dual_options", "primal",
+        "primal_options", "pod_tol", "pod_size", "dual_tol", "dual_size", "primal_tol", "solver", "accuracy",
+        "assembly", "bounds", "correction", "queries", "queries_ok", "snapshots", "N", "R", "enrichment",
+        "error_u_mean", "error_u_max", "error_lambda_mean", "error_lambda_max", "assembly_error_max", "seed",
+        "validation", "validation_options", "code", "versions", "definition",
+    )  # fmt: skip
     box, row, accuracy, solver = model.parameters, model.row, model.accuracy, model.solver
     # A model that belongs to no run has no definition.
     definition = row.get("definition")
@@ -201,8 +202,12 @@ def _about(model: Model, members: Mapping[str, AffinePolynomial]) -> dict[str, A
             name: {"degrees": list(member.degrees), "terms": len(member.terms), "error": member.error}
             for name, member in members.items()
         },
-        "outputs": exported_certificate.output_descriptions(model.problem),
-        "cell": {name: _plain(row[name]) for name in RECORDED if name in row},
+        # The file cannot hold outputs that code computes: it names them.
+        "outputs": {
+            "linear": [{"name": output.name, "unit": output.unit} for output in _linear(model.problem)],
+            "left_out": [output.name for output in model.problem.outputs if not output.linear],
+        },
+        "cell": {name: _plain(row[name]) for name in recorded if name in row},
         "exported_by": f"vibench {distribution_version('vibench')}",
         "source": {"distribution": origin, "licence": model.problem.licence or _licence(origin.partition(" ")[0])},
     }
@@ -238,3 +243,120 @@ def _npz(model: ExportedModel) -> bytes:
     content = io.BytesIO()
     np.savez_compressed(content, **arrays)
     return content.getvalue()
+
+
+def _reason_for_none(certificate: OnlineCertificate | None) -> str:
+    """Reason why an exported model cannot bound its errors; "" if it can."""
+    if certificate is None:
+        return "its cell has no bounds: they need bounds = true"
+    if certificate.prepared is None or certificate.base.bound_terms is None:
+        return (
+            "they need B(mu) and g(mu) on all contact unknowns, which the code of the problem evaluates unless B is "
+            "declared to be one matrix times a function of mu and g an affine sum"
+        )
+    return ""
+
+
+def _certificate_thetas(certificate: OnlineCertificate, samples: Mapping[str, Array]) -> dict[str, Array]:
+    """Coefficients θ (Q,) of A, f, B and g in the terms of the certificate, from those that a query evaluates."""
+    found = certificate.base.coefficients(samples) | {"g": samples.get("g", np.ones(1))}
+    return {f"theta_{name}": value for name, value in found.items()}
+
+
+def _certificate_arrays(
+    certificate: OnlineCertificate,
+    polynomials: Mapping[str, AffinePolynomial],
+    exact: Mapping[str, ExactMember],
+    unknowns: Indices | None,
+) -> dict[str, Array]:
+    """The arrays of a certificate for which there is no `reason_for_none`.
+
+    With the positions of the contact `unknowns`, those that take ν to a corrected u at mesh size are among them.
+    Bounds grow by what the measured errors of the polynomials, of A and of all θ, may add.
+    """
+    base, residual, corrections, terms = (
+        certificate.base, certificate.residual, certificate.prepared, certificate.base.bound_terms
+    )  # fmt: skip
+    assert corrections is not None  # there is no reason for none
+    assert terms is not None
+    responses = np.zeros((len(corrections.basis), len(corrections.rows)))
+    responses[corrections.moved] = corrections.responses
+    found = {
+        "generators": certificate.generators, "bounds": terms, "rows": corrections.rows, "inverse": corrections.inverse,
+        "diagonal": corrections.compliance.diagonal(), "reach": corrections.reach, "basis": corrections.basis,
+        "responses": responses, "sizes": corrections.sizes, "directions": corrections.directions,
+        "terms": np.array(corrections.terms), "kept": residual.kept, "factor": residual.factor,
+        "inverse_scale": residual.inverse_scale, "remainder": np.array(residual.remainder), "norms": residual.norms,
+    }  # fmt: skip
+    if unknowns is not None:
+        loads = np.zeros((base.X.dim, len(corrections.rows)))
+        loads[unknowns] = base.constraint[corrections.rows].toarray().T
+        found["lift"] = base.X.riesz(loads)
+    error = {name: 0.0 if name in exact else _error(polynomial) for name, polynomial in polynomials.items()}
+    sizes = residual.norms.copy()  # of all terms of residuals
+    sizes[residual.kept] = np.hypot(
+        np.linalg.norm(residual.factor, axis=0), residual.remainder * residual.inverse_scale
+    )
+    of_f, of_lam = sizes[: polynomials["theta_f"].terms.shape[1]], sizes[-certificate.generators.shape[1] :]
+    stiffness = 0.0
+    if base.spectral is not None:  # terms whose norms are not needed otherwise are taken to have the largest one
+        norms = base.spectral.norms
+        stiffness = error["theta_A"] * float(np.linalg.norm(np.where(norms > 0.0, norms, norms.max())))
+    found |= {
+        "load_error": np.array(base.load_error + error["theta_f"] * np.linalg.norm(of_f)),
+        "stiffness_error": np.array(base.stiffness_error + stiffness),
+        "energy_error": np.array(np.sqrt(2.0) * error["A"]),  # off the diagonal every entry counts twice
+        "constraint_error": np.array(error["theta_B"]), "multiplier_norms": of_lam,
+        "bound_errors": error["theta_g"] * np.linalg.norm(terms, axis=1),
+    }  # fmt: skip
+    if (spectral := base.spectral) is not None:
+        found |= {
+            "anchors": np.column_stack([spectral.alpha, spectral.gamma, spectral.theta.T]),
+            "lower": spectral.lower, "upper": spectral.upper, "count": np.array(spectral.count),
+            "term_norms": spectral.norms, "spectral_error": np.array(spectral.error + stiffness),
+        }  # fmt: skip
+    return {f"certificate_{name}": array for name, array in found.items()}
+
+
+def _error(polynomial: AffinePolynomial) -> float:
+    """Absolute error to expect of a polynomial; none where it is the function that it replaces."""
+    # below 1e-14 it is the function up to round-off; other parameters may have twice the measured error
+    return 0.0 if polynomial.error <= 1e-14 else 2.0 * polynomial.error * polynomial.scale
+
+
+def guarantee(certificate: OnlineCertificate, exact: Set[str]) -> Guarantee:
+    """Worth of the bounds: that of the certificate if all members are exact, constant or declared by expressions.
+
+    Where a polynomial takes the place of a function they are verified at most: its error was measured at some
+    parameters, which proves nothing about others, however small it is there.
+    """
+    return certificate.base.guarantee if exact >= set(MEMBERS) else Guarantee.VERIFIED
+
+
+def _linear(problem: Problem) -> list[Output]:
+    return [output for output in problem.outputs if output.linear]
+
+
+def _output_arrays(
+    model: Model, basis: Array, generators: Array, certificate: OnlineCertificate | None
+) -> dict[str, Array]:
+    """Coefficients of x (O×N') and α (O×R), none without linear outputs.
+
+    With a certificate also of λ on all rows (O×m), of a in u = u_N − lift · a (O×j), and the `output_weights` (O×2).
+    """
+    problem, outputs = model.problem, _linear(model.problem)
+    if not outputs:
+        return {}
+    of_u, of_lam = (
+        np.array(rows) for rows in zip(*(output_coefficients(problem, output) for output in outputs), strict=True)
+    )
+    found = {"outputs_x": of_u @ basis, "outputs_alpha": of_lam @ generators}
+    if certificate is not None and certificate.prepared is not None:
+        B, X = certificate.base.constraint[certificate.prepared.rows], certificate.base.X
+        lifted = np.array([X.riesz(row)[contact_unknowns(problem)] for row in of_u])
+        found |= {
+            "certificate_outputs_lam": of_lam,
+            "certificate_outputs_shift": lifted @ B.T,
+            "certificate_outputs_weights": np.array([model.output_weights[output.name] for output in outputs]),
+        }
+    return found

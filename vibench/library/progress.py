@@ -128,14 +128,6 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
 
 
-def progress_bar(console: Console) -> Progress:
-    """A bar that fits 80 columns: what is being done, how much of it is done, and the time left."""
-    # A bar of 16 columns leaves room for the longest label and the time left.
-    bar = BarColumn(bar_width=16)
-    what, left = (TextColumn(text, markup=False) for text in ("{task.description}", "{task.fields[left]}"))
-    return Progress(what, bar, MofNCompleteColumn(), TimeElapsedColumn(), left, console=console)
-
-
 class _Display:
     """A bar on a terminal, lines elsewhere; the bar is stopped at the end of a `with` statement."""
 
@@ -152,7 +144,10 @@ class _Display:
 
     def _draw(self, task: str, total: int | None) -> None:
         if self._console.is_terminal:
-            self._bar = progress_bar(self._console)
+            # A bar of 16 columns leaves room in 80 for the longest label and the time left.
+            bar = BarColumn(bar_width=16)
+            what, left = (TextColumn(text, markup=False) for text in ("{task.description}", "{task.fields[left]}"))
+            self._bar = Progress(what, bar, MofNCompleteColumn(), TimeElapsedColumn(), left, console=self._console)
             self._task = self._bar.add_task(task, total=total, left="")
             self._bar.start()
 

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 FORMAT = "vibench reduced model 1"
 Residuals = tuple[float, float, float]
-DEGREE, ROUND_OFF, SMALL = 2**20, 1e-13, 1e-3
 
 
 class Solution(NamedTuple):
@@ -90,7 +89,7 @@ class Model:
         for name in [key.removesuffix("_indices") for key in self.data if key.endswith("_indices")]:
             of = [self.data.get(f"{name}_{part}", np.zeros(0)) for part in ("indices", "coefficients", "terms")]
             fits = [array.ndim for array in of] == [2, 2, 2] and of[0].shape == (len(of[1]), lower.size)
-            whole = fits and of[0].size and of[0].dtype.kind in "iu" and 0 <= of[0].min() <= of[0].max() <= DEGREE
+            whole = fits and of[0].size and of[0].dtype.kind in "iu" and 0 <= of[0].min() <= of[0].max() <= 2**20
             if not whole or of[1].shape[1] != len(of[2]):
                 raise ValueError(
                     f"'{file}' is damaged: the arrays of {name} are no polynomial in {lower.size} variables"
@@ -167,10 +166,11 @@ class Model:
         y, z = SOLVERS[self.solver](A * (length / force), f / force, B, g / length, settings)
         if not np.isfinite(y.sum() + z.sum()):
             y, z = (np.nan_to_num(vector, nan=0.0, posinf=0.0, neginf=0.0) for vector in (y, z))
-        # small forces are often those of rows that touch without any: those that are missing come back
-        best = _polished(of, f, g, (z > g / length - B @ y) & (z > SMALL * z.max(initial=0.0)))
+        # forces below 1e-3 are often those of rows that touch without any: those that are missing come back
+        best = _polished(of, f, g, (z > g / length - B @ y) & (z > 1e-3 * z.max(initial=0.0)))
         found = residuals(A, f, B, g, *best, of.inverse)
-        if not all(residual <= ROUND_OFF for residual in found):  # NaN is not
+        # residuals of some 1e-13 are round-off; NaN is not
+        if not all(residual <= 1e-13 for residual in found):
             given = length * y, force * np.maximum(z, 0.0)
             of_given = residuals(A, f, B, g, *given, of.inverse)
             if _worst(of_given) <= _worst(found):

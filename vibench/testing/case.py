@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import scipy.sparse as sp
@@ -262,18 +262,14 @@ def _place(value: Any, k: int) -> tuple[int, ...] | int:
     return tuple(int(index) for index in axes) if len(axes) > 1 else int(axes[0])
 
 
-@dataclass(frozen=True, eq=False)
-class Segment:
-    """A segment of the line, and the arrays at its left end, in its middle and at its right end.
-
-    In the middle the array `name` deviates most from the mean of both ends, relative to its largest entry.
-    """
+class Segment(NamedTuple):
+    """A segment, its arrays at the left end, in the middle and at the right end, and the one that bends most there."""
 
     left: float
     right: float
     values: tuple[Arrays, Arrays, Arrays]
     name: str
-    deviation: float
+    deviation: float  # in the middle from the mean of both ends, relative to the largest entry
 
 
 def find_jump(

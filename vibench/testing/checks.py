@@ -49,11 +49,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Result of one check: its name, its outcome, and a message.
-
-    The message gives every fault and its place, the reason why a check was skipped, or the figures of a passed one and
-    what is doubtful.
-    """
+    """Result of one check: its name, its outcome, and a message with all faults, remarks, or why it was skipped."""
 
     check: str
     verdict: Verdict
@@ -247,8 +243,7 @@ class Examination:
 
 def _check_here(kind: str, pickled: bytes, name: str, earlier: list[CheckResult]) -> tuple[CheckResult, float]:
     """Make a check in this process; returns its result and the wall seconds that it took."""
-    begin = time.monotonic()
-    case = _case(kind, pickled)
+    begin, case = time.monotonic(), _case(kind, pickled)
     result = next(one for one in case.checks if one.name == name).result(case, earlier)
     return result, time.monotonic() - begin
 

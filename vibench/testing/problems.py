@@ -494,9 +494,7 @@ def high_fidelity_solution(case: ProblemCase) -> Iterator[str]:
     if not contacts:
         yield f"no constraint is active at any of {len(solved)} training parameters; is B u ≤ g the admissible side?"
     elif all(np.all(each.lam > 0.0) for each in solved):
-        yield Doubt(
-            f"every constraint is active at each of {len(solved)} training parameters; are B and g signed right?"
-        )
+        yield Doubt(f"every constraint is active at each of {len(solved)} training parameters; are the signs right?")
     worst, fallbacks = max(each.residuals.worst for each in solved), sum(bool(each.fallback) for each in solved)
     initial = f", {fallbacks} started from an interior-point solution" if fallbacks else ""
     yield Note(f"residuals up to {worst:.0e}, contact at {contacts} of {len(solved)} parameters{initial}")

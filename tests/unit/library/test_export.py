@@ -23,7 +23,7 @@ from running import Main, refused
 from samples import with_ways
 
 import vibench
-from vibench.library import exported_certificate, reduced_model
+from vibench.library import export, reduced_model
 from vibench.library.export import RUNTIME, export_model
 from vibench.library.export import exported as exported_model
 from vibench.library.reduced_model import Model as Exported
@@ -530,7 +530,7 @@ def test_exported_members_and_their_certificate(run: vibench.Run) -> None:
     assert found.about["certificate"] == "certified"
     assert exported_model(obstacle, c=True).about["certificate"] == "verified"
     for exact, worth in (("Af", "verified"), ("AfB", "verified"), ("AfBg", "certified")):
-        assert exported_certificate.guarantee(model.certificate, set(exact)).value == worth
+        assert export.guarantee(model.certificate, set(exact)).value == worth
 
 
 def test_the_code_of_the_page_runs(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
