@@ -20,11 +20,8 @@ from vibench.qp.solve import installed_solvers
 from vibench.study.matrix import read_study
 from vibench.timing import ONE_THREAD
 
-Resolution = str | int
-"""A name that a problem knows, or a number of nodes."""
-
-Timing = Callable[..., None]
-"""The fixture `timing`: see `vibench.benchmarks.plugin`."""
+Resolution = str | int  # a name that a problem knows, or a number of nodes
+Timing = Callable[..., None]  # the fixture `timing`: see `vibench.benchmarks.plugin`
 
 
 @dataclass(frozen=True)

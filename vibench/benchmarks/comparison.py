@@ -15,8 +15,8 @@ from vibench.errors import RequestError
 from vibench.files import read_regular
 from vibench.text import parsed_json, unbroken
 
+# Columns of a benchmark: the plugins that it is timed with.
 AXES = ("problem", "dual", "primal", "formulation", "size", "solver", "accuracy")
-"""Columns of a benchmark: the plugins that it is timed with."""
 
 
 @dataclass(frozen=True)

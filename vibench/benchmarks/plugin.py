@@ -259,10 +259,9 @@ class Passes:
 
     def _report(self, report: pytest.TestReport, number: int) -> None:
         """Pass a report of the other process on."""
-        line, count = self._note(report), len({_name(item.nodeid) for item in self._items})
-        ended = len({*self._failed, *self._left_out, *self._timed})
-        if line:
-            self._tell(f"[{ended}/{count}] {line}")
+        if line := self._note(report):
+            ended, names = {*self._failed, *self._left_out, *self._timed}, {_name(item.nodeid) for item in self._items}
+            self._tell(f"[{len(ended)}/{len(names)}] {line}")
         if number > self._number:
             self._number = number
             self._tell(f"pass {number + 1} of {PASSES}")
@@ -276,7 +275,7 @@ class Passes:
     def _entry(self, name: str) -> Any:
         """The entry of pytest-benchmark for the rounds of all passes of a benchmark, or for one that failed."""
         passes = self._timed.get(name, [])
-        first = passes[0] if passes else {"group": None, "iterations": 1, "extra_info": {}, "axes": {}}
+        first = passes[0] if passes else {"group": None, "extra_info": {}, "axes": {}}
         several = []
         for one in passes:
             stats = Stats()  # type: ignore[no-untyped-call]
@@ -288,7 +287,7 @@ class Passes:
             name=f"test_{name}", fullname=f"vibench/benchmarks::test_{name}", param=name.partition("[")[2].rstrip("]"),
             group=first["group"], params=None, extra_info=extra, cprofile_stats=None, has_error=name in self._failed,
         )  # fmt: skip
-        entry = Metadata(fixture, first["iterations"], {"timer": time.process_time})  # type: ignore[no-untyped-call]
+        entry = Metadata(fixture, first.get("iterations", 1), {"timer": time.process_time})  # type: ignore[no-untyped-call]
         entry.stats.data.extend(seconds for one in passes for seconds in one["data"])
         return entry
 

@@ -156,8 +156,7 @@ class StageInputs:
 
 
 def solve_all(problem: Problem, mus: Array) -> list[HighFidelitySolution]:
-    solver = HighFidelitySolver(problem)
-    return [solver.solve(mu) for mu in mus]
+    return list(map(HighFidelitySolver(problem).solve, mus))
 
 
 def test_high_fidelity_solution(timing: Timing, inputs: StageInputs) -> None:
@@ -241,13 +240,11 @@ def test_separation(timing: Timing, inputs: StageInputs) -> None:
 
     def judge(members: Mapping[str, AffineMember]) -> Info:
         sampled = {name: m for name, m in members.items() if m.way is Evaluation.INTERPOLATED}
-        # Affine members are exact.
-        if not sampled:
-            return {"accuracy": {"interpolation_error": 0.0}}
-        sampler = problem.sampler({name: (m.rows, m.columns) for name, m in sampled.items()})
+        places = {name: (m.rows, m.columns) for name, m in sampled.items()}
         largest = 0.0
-        for query in inputs.queries:
-            for name, theta in sampler(query.mu).items():
+        # Affine members are exact.
+        for query in inputs.queries if places else ():
+            for name, theta in problem.sampler(places)(query.mu).items():
                 summed = sum(value * term for value, term in zip(theta, sampled[name].terms, strict=True))
                 largest = max(largest, relative_difference(summed, getattr(query.vi, name)))
         return {"accuracy": {"interpolation_error": largest}}

@@ -47,7 +47,7 @@ def draw_figures(
     names: RunsArgument,
     out: Annotated[Path | None, Option(metavar="DIR", help="Folder; RUN/figures by default.")] = None,
     formats: Annotated[list[FigureFormat] | None, Option("--format", help="Default: png and svg (repeatable).")] = None,
-    jobs: Annotated[int, Option("--jobs", "-j", min=0, help="Processes; 0 for one per core.")] = 0,
+    jobs: Annotated[int | None, Option("--jobs", "-j", min=0, help="Processes; one per core by default.")] = None,
 ) -> None:
     """Draw the figures of runs, with captions."""
     from vibench.results.read import results_file
@@ -61,7 +61,7 @@ def draw_figures(
         draw_run(path, out or path.parent / "figures", jobs, forms)
 
 
-def draw_run(path: Path, folder: Path, jobs: int, formats: tuple[str, ...] = ("png", "svg")) -> None:
+def draw_run(path: Path, folder: Path, jobs: int | None, formats: tuple[str, ...] = ("png", "svg")) -> None:
     """Draw all figures of a results file; Ctrl-C leaves the results and the figures that are drawn."""
     from vibench import provenance
     from vibench.library.progress import DrawingDisplay

@@ -52,7 +52,7 @@ def show(
     sort: Annotated[
         str, Option(metavar="NAME,…", help="Columns to sort by; -NAME: largest first.", autocompletion=column_names)
     ] = "",
-    limit: Annotated[int, Option(min=0, metavar="N", help="Print the first N rows; 0 for all.")] = 0,
+    limit: Annotated[int | None, Option(min=0, metavar="N", help="Print the first N rows; all by default.")] = None,
     error: Annotated[
         str, Option(help="Compare models by solution, u, lambda, output:NAME.", autocompletion=error_measures)
     ] = "",
@@ -72,7 +72,7 @@ def show(
     path = results_file(run)
     view = show.look_up(
         path, table, cell=cell, error=error, largest=within, queries=queries,
-        columns=parts(columns), where=where, sort=parts(sort), limit=limit,
+        columns=parts(columns), where=where, sort=parts(sort), limit=limit or 0,
     )  # fmt: skip
     # A cell alone is a list of all its columns: no table is as wide.
     if form == "terminal" and cell and table == "summary" and not columns and len(view.rows):

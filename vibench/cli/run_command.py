@@ -43,8 +43,8 @@ def run_study_command(
     primal_tol: Annotated[Tolerances, Option(help="Replace the tolerances of the primal strategies.")] = None,
     at: At = None,
     out: Annotated[Path | None, Option(help="Results folder; runs/STUDY by default.")] = None,
-    jobs: Annotated[int, Option("--jobs", "-j", min=0, help="Worker processes; 0 for one per core.")] = 0,
-    repeats: Annotated[int, Option(min=0, metavar="K", help="Cold processes that measure seconds, at least.")] = 0,
+    jobs: Annotated[int | None, Option("--jobs", "-j", min=0, help="Worker processes; default: one per core.")] = None,
+    repeats: Annotated[int | None, Option(min=0, metavar="K", help="Cold processes that measure, at least.")] = None,
     dry_run: Annotated[bool, Option("--dry-run", help="List the cells of the matrix and stop.")] = False,
     fresh: Annotated[bool, Option("--fresh", help="Remove earlier results and recompute everything.")] = False,
     retry: Annotated[bool, Option("--retry", help="Also rerun cells that did not end ok.")] = False,
@@ -78,7 +78,7 @@ def run_study_command(
             reason = "the connection is not authenticated: others who reach the scheduler can run code on its workers"
             warn(f"{unbroken(scheduler)}: {reason}")
     folder = out or Path("runs") / loaded.name
-    options = Options(jobs, fresh, retry, executor, scheduler, repeats)
+    options = Options(jobs or 0, fresh, retry, executor, scheduler, repeats or 0)
     with ProgressDisplay() as progress:
         outcome = run_study(loaded, folder, progress, options)
     _conclude(loaded.name, outcome, folder, draw=options.workers if draw else None, fresh=fresh, strict=strict)

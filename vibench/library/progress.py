@@ -31,7 +31,6 @@ class _Running:
         self.first = self.last = (0.0, 0.0)
 
     def note(self, fraction: float, now: float) -> None:
-        """Note a fraction that is done."""
         if fraction > self.last[0]:
             self.last = fraction, now - self.began
             self.first = self.first if self.first[0] else self.last

@@ -22,7 +22,7 @@ import numpy as np
 import scipy
 
 import vibench
-from vibench.errors import in_a_line
+from vibench.errors import VibenchError, in_a_line
 from vibench.execution.isolated import NotImportableError, call_isolated
 from vibench.execution.supervisor import Supervisor
 from vibench.plugins.kinds import CHECKED
@@ -285,7 +285,9 @@ def _supervisor(**environment: str) -> Supervisor:
 def raised(error: BaseException) -> str:
     """Describe an exception in one line, with the last line of the plugin's own code that it passed through."""
     place = plugin_line(error)
-    return in_a_line(error) + (f" ({place})" if place else "")
+    # Errors of vibench say what is wrong; their type adds nothing.
+    text = str(error) if isinstance(error, VibenchError) else in_a_line(error)
+    return text + (f" ({place})" if place else "")
 
 
 def plugin_line(error: BaseException) -> str:

@@ -96,9 +96,9 @@ class _Supremizers(PrimalStrategy):
         return Enrichment(Kind.FIXED, vectors=V.orthonormalise(supremizers(V, B, offline.span), offline.basis))
 
 
-def sample_reduction(modes: float = 1e-3, generators: float = 1e-2) -> Reduction:
-    """An offline phase of the sample problem with all its steps, for formulations: tolerances of V_N and the cone."""
-    stops = Stop(tolerance=modes), Stop(tolerance=generators)
+def sample_reduction() -> Reduction:
+    """An offline phase of the sample problem with all its steps, for formulations: V_N of 1e-3, a cone of 1e-2."""
+    stops = Stop(tolerance=1e-3), Stop(tolerance=1e-2)
     return Reduction(MovingSupport(), _Greedy(), _Supremizers(), *stops).given(snapshots=_snapshots())
 
 

@@ -126,14 +126,11 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
         some, stop = self.lam, Stop(tolerance=tolerance)
         # Greedy constructions divide by norms of remainders, which vanish for these snapshots.
         largest = some[:, [np.linalg.norm(some, axis=0).argmax()]]
-        for name, snapshots in {
-            "with a zero snapshot": np.hstack([np.zeros((len(some), 1)), some]),
-            "with a repeated snapshot": np.hstack([some, largest]),
-            "with one snapshot": largest,
-        }.items():
+        zero, repeated = np.hstack([np.zeros_like(largest), some]), np.hstack([some, largest])
+        for what, snapshots in (("a zero snapshot", zero), ("a repeated snapshot", repeated), ("one", largest)):
             cone = self.evaluate(stop, snapshots=snapshots)
             if fault := _cone_fault(cone, self.space) or "".join(self._missed(tolerance, cone, snapshots)):
-                yield f"{name}: {fault}"
+                yield f"with {what}: {fault}"
         try:
             cone = self.evaluate(stop, snapshots=np.zeros_like(some))
         except VibenchError:  # a strategy may refuse them in one line
@@ -184,9 +181,9 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
     _: KW_ONLY
     tolerances: Sequence[float] = (0.9, 0.5, 0.1)
 
-    @cached_property
-    def model(self) -> Offline:
-        return self.offline or sample_offline()
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.model = self.offline or sample_offline()
 
     @cached_property
     def arguments(self) -> dict[str, float | None]:
