@@ -146,7 +146,7 @@ class _Figure:
 
     @property
     def is_worse(self) -> bool:
-        """Whether it grew by more than round-off may: ten times, and beyond 1e-9."""
+        """True if it grew by more than round-off may: ten times, and beyond 1e-9."""
         if self.before is None or self.after is None:
             return self.before is not None
         return self.after > 1e-9 and self.after > 10.0 * self.before
@@ -161,7 +161,7 @@ class _Figure:
 
 
 def _is_slower(was: Measured, now: Measured, limit: float) -> bool:
-    """Whether the seconds grew beyond a limit, beyond their spread, and beyond what the machine was slower by.
+    """Return if the seconds grew beyond a limit, beyond their spread, and beyond what the machine was slower by.
 
     The calibration is fixed work that was timed beside both.
     """

@@ -70,7 +70,13 @@ def print_frame(
     from rich.table import Table
 
     # Rich is imported only where a table is printed: help and completion do without.
-    columns = table if isinstance(table, list) else _columns_of(table)
+    if isinstance(table, list):
+        columns = table
+    else:
+        from vibench.results.formats import cell_text
+
+        texts = ((str(name), tuple(map(cell_text, table[name])), table[name].dtype) for name in table.columns)
+        columns = [PrintedColumn(name, cells, dtype.kind in "iufb") for name, cells, dtype in texts]
     console = new_console()
     count = len(columns[0].cells) if columns else 0
     # A single row would have all of its columns in the title; there only the axes go into it.
@@ -97,15 +103,6 @@ def print_frame(
     if left_out := [column.heading for column in own if column not in kept]:
         text = f"not shown at {console.width} columns: {', '.join(left_out)}" + f" (`{rest}`)" * bool(rest)
         console.print(shown(text), overflow="fold")
-
-
-def _columns_of(frame: pd.DataFrame) -> list[PrintedColumn]:
-    from vibench.results.formats import cell_text
-
-    return [
-        PrintedColumn(str(name), tuple(map(cell_text, frame[name])), frame[name].dtype.kind in "iufb")
-        for name in frame.columns
-    ]
 
 
 def print_rows(rows: Iterable[Sequence[str]], headings: Sequence[str], title: str) -> None:

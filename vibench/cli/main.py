@@ -220,7 +220,7 @@ for _name, _command in COMMANDS.items():
 
 
 def renamed(arguments: list[str]) -> list[str] | None:
-    """What to write in place of a command of version 0.1; `None` for the commands of today."""
+    """The command that replaces one of version 0.1; `None` for the commands of today."""
     old, *rest = arguments
     # Each old line is rewritten as text; what it means is checked by the command of today.
     if old == "diff":

@@ -37,7 +37,7 @@ class _Running:
 
     @property
     def has_pace(self) -> bool:
-        """Whether two fractions are known: the first one includes the set-up."""
+        """True if two fractions are known: the first one includes the set-up."""
         return self.last != self.first
 
     @property

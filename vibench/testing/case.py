@@ -80,7 +80,7 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
 
     @property
     def late(self) -> bool:
-        """Whether a search for faults has to end: the checks after it need the rest of the time."""
+        """True once a search for faults has to end: the checks after it need the rest of the time."""
         return time.monotonic() - self._began > 0.7 * self.seconds
 
     def clocked(self, what: str, work: Callable[[], T]) -> T:
