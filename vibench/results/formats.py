@@ -183,7 +183,9 @@ def between_formulations(break_even_rows: pd.DataFrame) -> pd.Series:
 
 
 def _for_reading(frame: pd.DataFrame, table: Mapping[str, Column]) -> pd.DataFrame:
-    return under_headings(frame, [name for name in shown_columns(table) if says_something(frame, name)], table)
+    # Committed tables have no column `bounds`: their assembly says it.
+    names = [name for name in shown_columns(table) if name in frame and says_something(frame, name)]
+    return under_headings(frame, names, table)
 
 
 def says_something(frame: pd.DataFrame, name: str) -> bool:
