@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,7 +17,6 @@ from vibench.report.differences import (
     AXES,
     ERRORS,
     MOVED,
-    UNKNOWN,
     Agreement,
     ChangeKind,
     ComparedRun,
@@ -33,14 +32,6 @@ from vibench.results.schema import STORED
 from vibench.timing import median_interval
 
 
-class RunPair(NamedTuple):
-    """All differences of a run from an earlier one."""
-
-    run: str
-    against: str
-    differences: list[Difference]
-
-
 @dataclass(frozen=True)
 class Comparison:
     """The differences of runs from earlier ones.
@@ -50,14 +41,14 @@ class Comparison:
     """
 
     runs: tuple[ComparedRun, ...]
-    pairs: tuple[RunPair, ...]
+    pairs: Mapping[tuple[str, str], Sequence[Difference]]  # by the names of a run and of the earlier one
     notes: tuple[str, ...]
 
     @cached_property
     def changes(self) -> pd.DataFrame:
         """Changes for better or worse, a row per column of a cell, in the order of the cells."""
         columns = ["run", "against", *AXES, "what", "before", "after", "ratio", "ratio_low", "ratio_high", "verdict"]
-        rows = [_row(pair, one) for pair in self.pairs for one in pair.differences if one.verdict in MOVED]
+        rows = [_row(*names, one) for names, found in self.pairs.items() for one in found if one.verdict in MOVED]
         return pd.DataFrame(rows, columns=[*columns, "cell"])
 
     @property
@@ -78,18 +69,18 @@ class Comparison:
         The interval is that of the median over the cells (order statistics, `timing.median_interval`).
         """
         rows = []
-        for pair in self.pairs:
+        for (run, against), found in self.pairs.items():
             by_what = defaultdict[str, list[Difference]](list)
-            for one in pair.differences:
+            for one in found:
                 by_what[one.what].append(one)
             for what, differences in by_what.items():
                 counts = {verdict.value: sum(d.verdict == verdict for d in differences) for verdict in ChangeKind}
                 ratios = [d.ratio for d in differences if np.isfinite(d.ratio) and d.ratio > 0.0]
-                low, high = median_interval(ratios) if len(ratios) >= FEWEST_ROUNDS else UNKNOWN
+                low, high = median_interval(ratios) if len(ratios) >= FEWEST_ROUNDS else (float("nan"), float("nan"))
                 middle = float(np.median(ratios)) if ratios else float("nan")
                 farthest = max(ratios, key=lambda ratio: abs(np.log(ratio)), default=float("nan"))
                 numbers = {"ratio": middle, "ratio_low": low, "ratio_high": high, "farthest_ratio": farthest}
-                about = {"what": what, "run": pair.run, "against": pair.against, "cells": len(differences)}
+                about = {"what": what, "run": run, "against": against, "cells": len(differences)}
                 rows.append(about | counts | numbers)
         # The order in which columns are compared; break-even is last.
         order = ["cell", "queries_ok", "status", "N", "R", "rank", "enrichment", "beta_span_min", "beta_cone_lower_min"]
@@ -202,8 +193,7 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
         if compared < len([key for key in run.cells if any(key in earlier.cells for earlier in runs[:k])]):
             notes.append(f"{of_run}times and break-even of different machines or protocols are not compared")
     notes += _agreements(runs)
-    pairs = tuple(RunPair(*names, differences) for names, differences in by_pair.items())
-    return Comparison(tuple(runs), pairs, tuple(notes))
+    return Comparison(tuple(runs), dict(by_pair), tuple(notes))
 
 
 def _agreements(runs: Sequence[ComparedRun]) -> list[str]:
@@ -222,8 +212,7 @@ def _agreements(runs: Sequence[ComparedRun]) -> list[str]:
     ]
 
 
-Means = dict[str, dict[str, float]]
-"""Columns of cells, by key."""
+Means = dict[str, dict[str, float]]  # columns of cells, by key
 
 
 def _on_common_queries(one: ComparedRun, two: ComparedRun, shared: Sequence[str]) -> tuple[Means, Means]:
@@ -239,10 +228,11 @@ def _on_common_queries(one: ComparedRun, two: ComparedRun, shared: Sequence[str]
     return both_means[0], both_means[1]
 
 
-def _row(pair: RunPair, one: Difference) -> dict[str, Any]:
+def _row(run: str, against: str, one: Difference) -> dict[str, Any]:
     shown = {"before": formats.cell_text(one.before), "after": formats.cell_text(one.after)}
-    ratio = {"ratio": one.ratio, "ratio_low": one.interval[0], "ratio_high": one.interval[1]}
-    about = {"run": pair.run, "against": pair.against, "what": one.what, "verdict": one.verdict.value}
+    low, high = one.interval or (float("nan"), float("nan"))
+    ratio = {"ratio": one.ratio, "ratio_low": low, "ratio_high": high}
+    about = {"run": run, "against": against, "what": one.what, "verdict": one.verdict.value}
     return about | _named(one.cell) | shown | ratio
 
 

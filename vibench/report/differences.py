@@ -70,12 +70,9 @@ class ComparedRun:
         queries = read_table(self.path, "queries")
         return queries[queries["status"] == Status.OK].set_index(["cell", "query"])
 
-    def rounds(self, cell: str) -> Sequence[float]:
-        """Seconds of a query in every round of timing of a cell."""
-        return self._rounds.get(cell, [])
-
     @cached_property
-    def _rounds(self) -> Mapping[str, list[float]]:
+    def rounds(self) -> Mapping[str, list[float]]:
+        """Seconds of a query in every round of timing, by cell."""
         timings = read_table(self.path, "timings").sort_values(["cell", "round"])
         return {str(cell): list(rows["total_s"]) for cell, rows in timings.groupby("cell")}
 
@@ -134,7 +131,6 @@ ERRORS = {
     "violation_max": ("violation", "max"),
 }
 Interval = tuple[float, float]
-UNKNOWN: Interval = (float("nan"), float("nan"))
 
 
 class ChangeKind(StrEnum):
@@ -161,7 +157,7 @@ class Difference(NamedTuple):
     before: Any
     after: Any
     verdict: ChangeKind
-    interval: Interval = UNKNOWN
+    interval: Interval | None = None
 
     @property
     def ratio(self) -> float:
@@ -237,11 +233,17 @@ def timing_differences(one: ComparedRun, two: ComparedRun, shared: Sequence[str]
     for key in shared:
         before, after = one.cells[key], two.cells[key]
         for name in ("offline_s", "online_s"):
-            verdict, interval = _verdict(before[name], after[name], limit), UNKNOWN
+            verdict = _verdict(before[name], after[name], limit)
+            interval: Interval | None = None
             if verdict in (ChangeKind.WORSE, ChangeKind.BETTER) and pd.notna(after[name]):
-                rounds = (one.rounds(key), two.rounds(key))
-                interval = _online_interval(*rounds) if name == "online_s" else _offline_interval(before, after)
-                decided = key not in disturbed and (interval[0] > 1.0 or interval[1] < 1.0)
+                if name == "online_s":
+                    interval = _online_interval(one.rounds.get(key, []), two.rounds.get(key, []))
+                else:
+                    # Offline seconds are measured once: the slowdowns of the two runs bound their ratio.
+                    low, high = (float(after[f"offline_{end}_s"]) for end in ("low", "high"))
+                    interval = low / float(before["offline_high_s"]), high / float(before["offline_low_s"])
+                clear = interval is not None and (interval[0] > 1.0 or interval[1] < 1.0)
+                decided = clear and key not in disturbed
                 verdict = verdict if decided else ChangeKind.UNDECIDED
             if verdict is not None:
                 yield Difference(before, name, before[name], after[name], verdict, interval)
@@ -249,16 +251,10 @@ def timing_differences(one: ComparedRun, two: ComparedRun, shared: Sequence[str]
     yield from _break_evens(one.thresholds_of(calm), two.thresholds_of(calm), limit)
 
 
-def _offline_interval(before: Mapping[str, Any], after: Mapping[str, Any]) -> Interval:
-    """Interval of the ratio of offline seconds from the slowdowns of the two runs; these seconds are measured once."""
-    low, high = (float(after[f"offline_{end}_s"]) for end in ("low", "high"))
-    return low / float(before["offline_high_s"]), high / float(before["offline_low_s"])
-
-
-def _online_interval(before: Sequence[float], after: Sequence[float]) -> Interval:
-    """Bootstrap interval of the ratio of medians over rounds, resampled in each of the runs."""
+def _online_interval(before: Sequence[float], after: Sequence[float]) -> Interval | None:
+    """Bootstrap interval of the ratio of medians over rounds, resampled in each of the runs; `None` for few rounds."""
     if min(len(before), len(after)) < FEWEST_ROUNDS:
-        return UNKNOWN
+        return None
     # A fixed seed: the same runs always get the same verdict.
     rng = np.random.default_rng(0)
     drawn = [np.array(some)[rng.integers(len(some), size=(DRAWS, len(some)))] for some in (before, after)]
@@ -287,48 +283,39 @@ def _break_evens(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator
         elif ChangeKind.WORSE in own and verdict is ChangeKind.CHANGED and after.meaning == Meaning.NEVER:
             verdict = ChangeKind.WORSE
         # A break-even belongs to the cell of its model b.
-        cell = row | {
-            name: row[f"{name}_b"] for name in ("cell", "formulation", "primal", "assembly", "bounds", "primal_tol")
-        }
+        of_b = ("cell", "formulation", "primal", "assembly", "bounds", "primal_tol")
+        cell = row | {name: row[f"{name}_b"] for name in of_b}
         other = row["primal_a"] if row["formulation_a"] == row["formulation_b"] else row["formulation_a"]
         if verdict is not None:
             yield Difference(cell, f"break-even against {other}", str(before), str(after), verdict)
 
 
 class Agreement(NamedTuple):
-    """Agreement of the break-evens that two runs have.
+    """Agreement of the break-evens that two runs have."""
 
-    Attributes
-    ----------
-    both, overlapping
-        Numbers with an interval in both runs, and those whose intervals have a number in common.
-    opposite, decided
-        Contradictions among the comparisons that both runs decide, and the number of all of these.
-    """
-
-    both: int
-    overlapping: int
-    opposite: int
+    both: int  # numbers with an interval in both runs
+    overlapping: int  # those whose intervals have a number in common
+    opposite: int  # contradictions among the comparisons that both runs decide
     decided: int
 
 
 def agreement(one: pd.DataFrame, two: pd.DataFrame) -> Agreement:
     """Agreement of the break-evens of two runs, rows of their thresholds, on any machines."""
     rows = one.merge(two, on=["cell_a", "cell_b"], suffixes=("_one", "_two")).to_dict("records")
-    pairs = [(row, _break_even(row, "one"), _break_even(row, "two")) for row in rows]
-    decided = [pair for pair in pairs if Meaning.UNDECIDED not in (pair[1].meaning, pair[2].meaning)]
-    numbers = [(a, b) for _, a, b in decided if a.meaning == b.meaning and a.number is not None]
-    overlapping = sum(a.overlaps(b) for a, b in numbers)
-    return Agreement(len(numbers), overlapping, sum(_opposite(*pair) for pair in decided), len(decided))
-
-
-def _opposite(row: Mapping[Any, Any], a: BreakEven, b: BreakEven) -> bool:
-    """Whether one break-even contradicts the other."""
-    # "As fast" and a small difference only do if the intervals of the gains are disjoint.
-    if Meaning.AS_FAST not in (a.meaning, b.meaning):
-        return a.meaning != b.meaning
-    apart = row["gain_high_one"] < row["gain_low_two"] or row["gain_high_two"] < row["gain_low_one"]
-    return a.meaning != b.meaning and apart
+    both = overlapping = opposite = decided = 0
+    for row in rows:
+        a, b = _break_even(row, "one"), _break_even(row, "two")
+        if Meaning.UNDECIDED in (a.meaning, b.meaning):
+            continue
+        decided += 1
+        if a.meaning == b.meaning:
+            both += a.number is not None
+            overlapping += a.number is not None and a.overlaps(b)
+            continue
+        # "As fast" and a small difference contradict each other only if the intervals of the gains are disjoint.
+        apart = row["gain_high_one"] < row["gain_low_two"] or row["gain_high_two"] < row["gain_low_one"]
+        opposite += apart or Meaning.AS_FAST not in (a.meaning, b.meaning)
+    return Agreement(both, overlapping, opposite, decided)
 
 
 def _break_even(row: Mapping[Any, Any], run: str) -> BreakEven:

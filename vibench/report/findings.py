@@ -74,20 +74,17 @@ def all_findings(
     for weight, text in _whole_run(read):
         yield Finding("", text, weight)
     for name, data in by_problem:
-        yield from _about(name, Weight.ANSWER, _answer(data, paired))
+        about = [(name, Weight.ANSWER, _answer(data, paired))]
         for title, cells in by_dimensions(best_solver(data.cells)):
             compared = on_common_queries(cells, data.queries)
-            yield from _about(f"{name}, {title}", Weight.COMPARISON, _stability(cells, compared))
-            yield from _about(f"{name}, {title}", Weight.COMPARISON, _costs(cells, data.thresholds))
-        yield from _about(f"{name}, corrections", Weight.COMPARISON, _corrections(data))
-        yield from _about(f"{name}, training", Weight.COMPARISON, _training(data.cells))
-        yield from _about(f"{name}, enrichments", Weight.DETAIL, _off_training(data))
-        yield from _about(f"{name}, zero solutions", Weight.DETAIL, _zero_solutions(data))
-        yield from _about(f"{name}, solvers", Weight.DETAIL, _solvers(data))
-
-
-def _about(subject: str, weight: Weight, sentences: Iterable[str]) -> Iterator[Finding]:
-    return (Finding(subject, text, weight) for text in sentences)
+            about.append((f"{name}, {title}", Weight.COMPARISON, _stability(cells, compared)))
+            about.append((f"{name}, {title}", Weight.COMPARISON, _costs(cells, data.thresholds)))
+        about.append((f"{name}, corrections", Weight.COMPARISON, _corrections(data)))
+        about.append((f"{name}, training", Weight.COMPARISON, _training(data.cells)))
+        about.append((f"{name}, enrichments", Weight.DETAIL, _off_training(data)))
+        about.append((f"{name}, zero solutions", Weight.DETAIL, _zero_solutions(data)))
+        about.append((f"{name}, solvers", Weight.DETAIL, _solvers(data)))
+        yield from (Finding(subject, text, weight) for subject, weight, texts in about for text in texts)
 
 
 def leading(findings: Iterable[Finding], most: int) -> list[Finding]:

@@ -37,29 +37,15 @@ from vibench.text import printable
 
 @dataclass(frozen=True)
 class TableGrid:
-    """A table of the report.
+    """A table of the report."""
 
-    Attributes
-    ----------
-    name
-        Its identifier in the page.
-    title, caption
-        Heading, and the text below it.
-    frame
-        Its rows as they are shown, under their headings; the first column names a row.
-    axes, hidden
-        Headings that rows can be filtered by, and those that are not shown at first.
-    disturbed
-        Numbers of the rows whose seconds were measured on a disturbed machine.
-    """
-
-    name: str
+    name: str  # identifier in the page
     title: str
     caption: str
-    frame: pd.DataFrame
-    axes: tuple[str, ...] = ()
-    hidden: tuple[str, ...] = ()
-    disturbed: tuple[int, ...] = ()
+    frame: pd.DataFrame  # rows as they are shown, under their headings; the first column names a row
+    axes: tuple[str, ...]  # headings that rows can be filtered by
+    hidden: tuple[str, ...]  # headings that are not shown at first
+    disturbed: tuple[int, ...] = ()  # rows whose seconds were measured on a disturbed machine
 
     def meaning(self, heading: str) -> str:
         """Meaning and unit of the column with a heading; "" if it is no recorded one."""
@@ -154,13 +140,10 @@ def _column(name: str, values: pd.Series) -> dict[str, Any]:
     """A column as numbers, as texts, or as codes of texts if most of them recur; a constant value is written once."""
     heading = printable(name)
     # Tolerances are texts, since a dimension may replace them.
-    numeric = pd.api.types.is_numeric_dtype(values) or (
-        name != "cell"
-        and len(values) > 0
-        and all(isinstance(value, str) for value in values)
-        and pd.to_numeric(values.drop_duplicates(), errors="coerce").notna().all()
-    )
-    if numeric:
+    texts_only = name != "cell" and len(values) > 0 and all(isinstance(value, str) for value in values)
+    if pd.api.types.is_numeric_dtype(values) or (
+        texts_only and pd.to_numeric(values.drop_duplicates(), errors="coerce").notna().all()
+    ):
         numbers = [short(value, 6) for value in values]
         return {"name": heading, "numbers": numbers if len(set(numbers)) > 1 else numbers[:1]}
     texts = [printable(formats.cell_text(value)) for value in values]
@@ -171,10 +154,6 @@ def _column(name: str, values: pd.Series) -> dict[str, Any]:
         return {"name": heading, "levels": levels}
     number = {text: k for k, text in enumerate(levels)}
     return {"name": heading, "levels": levels, "codes": [number[text] for text in texts]}
-
-
-# Findings that can be unfolded; nobody would read the thousands of a large study.
-FOLDED = 300
 
 
 def write(path: Path, target: Path, jobs: int, *, figures: bool = True) -> Path:
@@ -205,7 +184,8 @@ def page(path: Path, pool: ProcessPoolExecutor | None = None, *, figures: bool =
     del read["histories"]
     grids = list(_grids({**read, "cells": cells}))
     everything = list(findings.all_findings(read, data_of.items()))
-    first, listed = (findings.leading(everything, most) for most in (10, 10 + FOLDED))
+    # Ten are shown and 300 can be unfolded; nobody would read the thousands of a large study.
+    first, listed = (findings.leading(everything, most) for most in (10, 310))
     rest = [one for one in everything if one in set(listed) - set(first)]
     key_length = short_keys(cells["cell"])
     rows = {str(cell): k for k, cell in enumerate(cells["cell"])}
@@ -216,6 +196,8 @@ def page(path: Path, pool: ProcessPoolExecutor | None = None, *, figures: bool =
     tasks = [task for name, data in data_of.items() for task in tasks_of(name, data)] if figures else []
     rendered = render(tasks, image_of, pool)
     images = [image for pages in rendered for image in pages]
+    templates = files("vibench.report") / "templates"
+    style, script = ((templates / f"report.{end}").read_text(encoding="utf-8").strip() for end in ("css", "js"))
     template = environment("templates", trim_blocks=True, lstrip_blocks=True).get_template("report.html.j2")
     return template.render(
         study=study.get("name", path.parent.name),
@@ -242,29 +224,19 @@ def page(path: Path, pool: ProcessPoolExecutor | None = None, *, figures: bool =
         table_data=Markup(script_safe({grid.name: _columnar(grid) for grid in grids})),
         plot_data=Markup(script_safe({plot.name: plot.data for plot in (*first_plots, *live)})),
         library=Markup(plots.library()) if live or first_plots else "",
-        style=Markup(_asset("report.css")),
-        script=Markup(_asset("report.js")),
+        style=Markup(style),
+        script=Markup(script),
     )
 
 
 def environment(folder: str, **options: Any) -> Environment:
     """The templates of a folder, in which a text from others is printable and no markup."""
-    return Environment(
-        loader=PackageLoader("vibench.report", folder),
-        autoescape=True,
-        undefined=StrictUndefined,
-        finalize=_printable,
-        **options,
-    )
 
+    def finalize(value: Any) -> Any:
+        return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
-def _asset(name: str) -> str:
-    return (files("vibench.report") / "templates" / name).read_text(encoding="utf-8").strip()
-
-
-def _printable(value: Any) -> Any:
-    """Any text in a template made printable; markup stays as it is."""
-    return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+    loader = PackageLoader("vibench.report", folder)
+    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, finalize=finalize, **options)
 
 
 def tasks_of(name: str, data: ProblemTables) -> Iterator[FigureTask]:

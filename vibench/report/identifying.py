@@ -77,23 +77,20 @@ def left(paths: Sequence[Path], names: Sequence[str], authors: Sequence[str]) ->
         if values:
             yield f"{title}: {brief('; '.join(sorted(map(unbroken, values))), 500)}"
     texts = {str(value) for row in rows for value in row.values() if isinstance(value, str)}
-    for what, name in _identities():
-        if any(_word(name).search(text) for text in texts):
+    for what, name, pattern in _identities():
+        if any(pattern.search(text) for text in texts):
             yield f"the {what} '{name}', in a name or an option"
 
 
-def _identities() -> list[tuple[str, str]]:
-    """Kind and text of the names of user and machine, the longest first."""
+def _identities() -> list[tuple[str, str, re.Pattern[str]]]:
+    """Kind, text and pattern of the names of user and machine, the longest first."""
     found = [("name of the host", platform.node())]
     with contextlib.suppress(RuntimeError):
         found.append(("home directory", str(Path.home())))
     with contextlib.suppress(OSError, KeyError):
         found.append(("user's name", getpass.getuser()))
-    return sorted(((what, name) for what, name in found if len(name) > 1), key=lambda one: -len(one[1]))
-
-
-def _word(name: str) -> re.Pattern[str]:
-    return re.compile(rf"(?<!\w){re.escape(name)}(?!\w)")
+    long = sorted((one for one in found if len(one[1]) > 1), key=lambda one: -len(one[1]))
+    return [(what, name, re.compile(rf"(?<!\w){re.escape(name)}(?!\w)")) for what, name in long]
 
 
 def _places(path: Path) -> Iterator[str]:
@@ -114,7 +111,7 @@ def _clean(db: sqlite3.Connection, table: str, column: str, folders: Sequence[re
     ).fetchall()
     # Values that identify rows must stay different, so that names in them stay.
     identifies = column in {*KEYS, "cell", "solver_a", "solver_b", "status"}
-    names = [] if identifies else [_word(name) for _, name in _identities()]
+    names = [] if identifies else [pattern for *_, pattern in _identities()]
     changed = 0
     for (value,) in values:
         text = value.decode(errors="surrogateescape")

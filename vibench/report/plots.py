@@ -40,22 +40,14 @@ def library() -> str:
 
 @dataclass(frozen=True)
 class PlotPanel:
-    """A panel of a plot: its columns and their labels.
-
-    Attributes
-    ----------
-    logarithmic
-        Whether both axes are.
-    line
-        Abscissa of the high-fidelity model, which has no error.
-    """
+    """A panel of a plot: its columns and their labels."""
 
     x: str
     y: str
     x_label: str
     y_label: str
-    logarithmic: bool = True
-    line: float | None = None
+    logarithmic: bool = True  # both axes
+    line: float | None = None  # abscissa of the high-fidelity model, which has no error
 
 
 @dataclass(frozen=True)
@@ -142,14 +134,10 @@ def _costs(
         low, high = np.quantile(drawn, (TAIL, 1.0 - TAIL), axis=0)
         look = None if key is None else looks[ways[key]]
         name = HIGH_FIDELITY if key is None else label(one.row["primal"], one.row["primal_tol"], str(one.row["way"]))
-        curves.append(
-            {"name": printable(name), "row": None if key is None else rows[key]}
-            | {"colour": "#000000" if look is None else look.colour, "dashed": key is None}
-            | {
-                side: [short(value, 4) for value in values]
-                for side, values in (("y", one.offline + numbers * one.online), ("low", low), ("high", high))
-            }
-        )
+        drawn_as = {"colour": "#000000" if look is None else look.colour, "dashed": key is None}
+        bounds = {"y": one.offline + numbers * one.online, "low": low, "high": high}
+        ordinates = {side: [short(value, 4) for value in values] for side, values in bounds.items()}
+        curves.append({"name": printable(name), "row": None if key is None else rows[key]} | drawn_as | ordinates)
     return {"x": [short(value, 4) for value in numbers], "curves": curves}
 
 
@@ -169,7 +157,18 @@ def _plot(
         "of": [places.index(way) for way in ways],
         # Opacity distinguishes the dual strategies.
         "fills": [(0.85, 0.0, 0.4)[duals.index(dual) % 3] for dual in cells["dual"]],
-        "panels": [_panel(panel, points) for panel, points in drawn],
+        "panels": [
+            {
+                "x_label": panel.x_label,
+                "y_label": panel.y_label,
+                "scale": "log" if panel.logarithmic else "linear",
+                # Four digits are more than a screen shows.
+                "line": None if panel.line is None else short(panel.line, 4),
+                "x": [short(value, 4) for value in points[panel.x]],
+                "y": [short(value, 4) for value in points[panel.y]],
+            }
+            for panel, points in drawn
+        ],
     }
     yield Plot(name, printable(title), data)
 
@@ -192,40 +191,16 @@ def _coordinates(cells: pd.DataFrame, panel: PlotPanel) -> pd.DataFrame:
     return values.where(fine)
 
 
-def _panel(panel: PlotPanel, points: pd.DataFrame) -> dict[str, Any]:
-    return {
-        "x_label": panel.x_label,
-        "y_label": panel.y_label,
-        "scale": "log" if panel.logarithmic else "linear",
-        # Four digits are more than a screen shows.
-        "line": None if panel.line is None else short(panel.line, 4),
-        "x": [short(value, 4) for value in points[panel.x]],
-        "y": [short(value, 4) for value in points[panel.y]],
-    }
-
-
 @dataclass(frozen=True)
 class FigureImage:
-    """The picture of a figure.
-
-    Attributes
-    ----------
-    cut
-        Whether it is only the beginning of the figure.
-    alternative
-        Alternative text.
-    source
-        Its data URI.
-    width, height
-        Size in pixels.
-    """
+    """The picture of a figure."""
 
     name: str
     caption: str
-    cut: bool
-    alternative: str
-    source: str
-    width: int
+    cut: bool  # only the beginning of the figure is shown
+    alternative: str  # text for readers who do not see it
+    source: str  # data URI
+    width: int  # pixels
     height: int
 
 

@@ -137,19 +137,11 @@ def _written(site: Path) -> dict[str, list[str]]:
 
 @dataclass(frozen=True, eq=False)
 class PublishedRun:
-    """A run on the site.
-
-    Attributes
-    ----------
-    folder
-        Name of its folder below `runs/`: letters, digits, "-", "_" and "." only.
-    note
-        A remark on the origin of the file.
-    """
+    """A run on the site, with a remark on the origin of its file."""
 
     run: ComparedRun
-    folder: str
-    note: str = ""
+    folder: str  # name of its folder below `runs/`: letters, digits, "-", "_" and "." only
+    note: str
 
     @cached_property
     def values(self) -> dict[str, list[str]]:
@@ -343,11 +335,8 @@ def _section(site: Path, number: int, study: str, comparison: Comparison) -> dic
     """Section of the page of comparisons on the runs of one study; writes their changes to a file, too."""
     file = f"comparison-{number}.csv"
     _write(site / file, formats.to_csv(comparison.changes))
-    frames = {
-        "runs": comparison.by_run,
-        "cells by column": comparison.by_column,
-        "changes": comparison.changes.head(500),
-    }
+    changes = comparison.changes.head(500)
+    frames = {"runs": comparison.by_run, "cells by column": comparison.by_column, "changes": changes}
     return {"study": study, "file": file, "notes": comparison.notes, "count": len(comparison.changes), "tables": frames}
 
 

@@ -50,8 +50,8 @@ OF_PROBLEM: dict[str, DrawPages] = {
 # Figures of every problem and dual strategy.
 OF_DUAL: dict[str, DrawPages] = {"enrichment": enrichment, "inf-sup": inf_sup}
 
+# A figure to be drawn: name of its first file, function that draws its pages, and their data.
 FigureTask = tuple[str, DrawPages, ProblemTables]
-"""A figure to be drawn: name of its first file, function that draws its pages, and their data."""
 Made = TypeVar("Made")
 
 

@@ -40,16 +40,12 @@ from vibench.stability.infsup import VANISHES
 
 
 class _Panel(NamedTuple):
-    """What one panel over the span and the one below it over the cone show."""
+    """Content of one panel over the span and of the one below it over the cone."""
 
     title: str
     strategies: list[tuple[Series, str, pd.DataFrame]]
     reference: pd.DataFrame
-    order: pd.Series
-
-    def along(self, rows: pd.DataFrame) -> pd.DataFrame:
-        """The rows of a strategy in the order of the abscissae."""
-        return rows.set_index("query").reindex(self.order)
+    order: pd.Series  # queries along the abscissa
 
 
 def inf_sup(data: ProblemTables) -> Pages:
@@ -68,12 +64,14 @@ def inf_sup(data: ProblemTables) -> Pages:
         looks = Looks(one for panel in panels for one, _, _ in panel.strategies)
         zeros: list[list[str]] = []
         for panel, span, cone in zip(panels, over, below, strict=True):
-            reference, both = panel.along(panel.reference), (span, cone)
+            reference, both = panel.reference.set_index("query").reindex(panel.order), (span, cone)
             # Without a single parameter the abscissae are places in the order.
             x = reference["mu_1"].to_numpy(float) if axis else np.arange(1, len(reference) + 1)
             _draw_constants(both, x, reference, "beta_hf_", HIGH_FIDELITY_LOOK, "high-fidelity")
-            named = [(name, panel.along(rows), looks[one]) for one, name, rows in panel.strategies]
-            drawn = {name: _draw_constants(both, x, rows, "beta_", look, name) for name, rows, look in named}
+            drawn = {
+                name: _draw_constants(both, x, rows.set_index("query").reindex(panel.order), "beta_", looks[one], name)
+                for one, name, rows in panel.strategies
+            }
             zeros.append([name for name, zero in drawn.items() if zero])
             span.set_title(panel.title)
             for axes, generated in ((span, "span"), (cone, "cone")):

@@ -35,7 +35,10 @@ ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean
 
 def dimension(data: ProblemTables) -> Pages:
     """Errors against the dimension of the reduced problem, N + S + R; means over the queries that all cells solved."""
-    cells = _of_one_assembly(best_solver(data.cells))
+    cells = best_solver(data.cells)
+    # Reduced assembly changes no dimension: it is shown only where a correction has no full assembly.
+    full = cells["assembly"] == "full"
+    cells = cells[full | ~full.groupby(cells["correction"]).transform("any")]
     size = cells["N"] + cells["enrichment"].fillna(0) + cells["R"]
     return _errors_against(data, cells, size, "dimension N + S + R", "errors against dimension")
 
@@ -90,12 +93,6 @@ def _points(panel: Axes, cells: pd.DataFrame, x: pd.Series, y: pd.Series, names:
 def _name_points(sheet: Sheet, panel: Axes, cells: pd.DataFrame, x: pd.Series, y: pd.Series) -> None:
     for index, text in point_names(cells).items():
         sheet.label(panel, x[index], y[index], text)
-
-
-def _of_one_assembly(cells: pd.DataFrame) -> pd.DataFrame:
-    """Cells of full assembly, where a correction has any: reduced assembly changes no dimension."""
-    full = cells["assembly"] == "full"
-    return cells[full | ~full.groupby(cells["correction"]).transform("any")]
 
 
 def _ways(cells: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
@@ -197,13 +194,14 @@ def total_cost(data: ProblemTables) -> Pages:
     ]
     for shown, part in data.pages(panels, 12):
         sheet = Sheet.with_panels(len(shown), f"{data.problem}, {cells['solver'].iloc[0]}: total cost", share="all")
-        looks = Looks(_model(cell) for _, mine in shown for cell in mine.itertuples())
+        drawn = [cell for _, mine in shown for cell in mine.itertuples()]
+        looks = Looks(series(cell.primal, cell.primal_tol, cell.way) for cell in drawn)
         for panel, (title, mine) in zip(sheet.panels, shown, strict=False):
             model = mine.iloc[0]
             plot(panel, queries, model["hf_setup_s"] + queries * model["hf_s"], HIGH_FIDELITY_LOOK, HIGH_FIDELITY)
             for cell in mine.itertuples():
-                name = label(cell.primal, cell.primal_tol, cell.way)
-                plot(panel, queries, cell.offline_s + queries * cell.online_s, looks[_model(cell)], name)
+                key = (cell.primal, cell.primal_tol, cell.way)
+                plot(panel, queries, cell.offline_s + queries * cell.online_s, looks[series(*key)], label(*key))
             _marks(panel, mine, data.thresholds, queries[-1])
             panel.set(xlabel="number of queries", ylabel="offline + online [s]", title=title)
             panel.set(xlim=(1.0, queries[-1]), xscale="log", yscale="log")
@@ -224,10 +222,6 @@ def _most_vectors(cells: pd.DataFrame) -> pd.DataFrame:
         ["added", "primal_tol"], ascending=[False, True], kind="stable"
     )
     return added.drop_duplicates(["primal", "primal_options", "way"]).sort_index()
-
-
-def _model(cell: Any) -> Series:
-    return series(cell.primal, cell.primal_tol, cell.way)
 
 
 def _marks(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame, most: float) -> None:
@@ -297,15 +291,9 @@ def precision(data: ProblemTables) -> Pages:
             for column, name in enumerate(("u", "lambda")):
                 # A logarithmic axis has no zero.
                 error = np.maximum(medians[f"solver_error_{name}"], 1e-16)
+                panel, look = sheet.panel(row, column), looks[Series(solver)]
                 # Every point is an accuracy, and has a marker.
-                plot(
-                    sheet.panel(row, column),
-                    1e3 * medians["solve_s"],
-                    error,
-                    looks[Series(solver)],
-                    solver,
-                    markevery=1,
-                )
+                plot(panel, 1e3 * medians["solve_s"], error, look, solver, markevery=1)
         for column, name in enumerate(("u", "λ")):
             panel = sheet.panel(row, column)
             panel.set(xlabel="median time of a program [ms]", ylabel=f"median error of {name} made by the solver")

@@ -24,8 +24,6 @@ from vibench.results.schema import KEYS
 from vibench.study.cells import NO_SUCH_AXIS
 from vibench.text import json_object
 
-TABLES = ("cells", "queries", "histories", "thresholds", "outputs")
-
 PRIMAL = ["primal", "primal_options", "primal_tol"]
 
 Panel = TypeVar("Panel")
@@ -86,7 +84,7 @@ class ProblemTables:
 
     def restrict_to_dual(self, dual: str) -> ProblemTables:
         """The rows of one dual strategy."""
-        frames = {name: getattr(self, name) for name in TABLES}
+        frames = {name: value for name, value in vars(self).items() if isinstance(value, pd.DataFrame)}
         return replace(self, **{name: frame[frame["dual"] == dual] for name, frame in frames.items()})
 
     @property
@@ -118,7 +116,8 @@ def problem_tables(
 
     Tables that are `known` are not read again.
     """
-    read = {name: in_order(known[name] if name in known else read_table(path, name)) for name in TABLES}
+    names = ("cells", "queries", "histories", "thresholds", "outputs")
+    read = {name: in_order(known[name] if name in known else read_table(path, name)) for name in names}
     if read["queries"].empty:
         return
     for axis in ("training", "formulation", "dual", "primal"):
@@ -362,21 +361,11 @@ def program_columns() -> list[str]:
 
 @dataclass(frozen=True)
 class Comparable:
-    """Cells of one problem whose errors can be compared.
+    """Cells of one problem whose errors can be compared."""
 
-    Attributes
-    ----------
-    cells
-        Cells with enough ok queries; their means of errors are over the common ones.
-    common
-        Number of queries that are ok in all of them.
-    asked
-        Number of all queries.
-    """
-
-    cells: pd.DataFrame
-    common: int
-    asked: int
+    cells: pd.DataFrame  # those with enough ok queries; their means of errors are over the common ones
+    common: int  # queries that are ok in all of them
+    asked: int  # all queries
 
     @property
     def over(self) -> str:

@@ -36,12 +36,7 @@ Box = tuple[float, float, float, float]
 class Look:
     """Colour and marker of a series, and its rank among the series of a figure that share these.
 
-    Attributes
-    ----------
-    colour, marker
-        Determined by the name of the strategy or solver.
-    rank
-        Place among the series with the same colour and marker in a figure; sets line style and filling.
+    The name of the strategy or solver determines colour and marker; the rank sets line style and filling.
     """
 
     colour: str
@@ -279,7 +274,7 @@ def scatter(axes: Axes, x: Any, y: Any, look: Look, label: str | None = None, **
 
 
 def _legend_label(text: str | None) -> str | None:
-    """A label for the legend; Matplotlib leaves out one that begins with an underscore."""
+    # Matplotlib leaves out a label that begins with an underscore.
     return f" {text}" if text is not None and text.startswith("_") else text
 
 
