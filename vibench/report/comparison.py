@@ -64,10 +64,7 @@ class Comparison:
 
     @property
     def by_column(self) -> pd.DataFrame:
-        """A row per column and pair of runs: how many cells have which verdict; the median ratio and its 95 % interval.
-
-        The interval is that of the median over the cells (order statistics, `timing.median_interval`).
-        """
+        """A row per column and pair of runs: how many cells have which verdict; the median ratio and its interval."""
         rows = []
         for (run, against), found in self.pairs.items():
             by_what = defaultdict[str, list[Difference]](list)
@@ -91,10 +88,7 @@ class Comparison:
 
     @property
     def by_run(self) -> pd.DataFrame:
-        """A row per run: its study, cells and machine, and the versions in which the runs differ.
-
-        "same code" counts the cells that the code of the first run computed.
-        """
+        """A row per run: its study, cells (those of the first run's code, too), machine, and versions that differ."""
         first, everywhere = self.runs[0], set.intersection(*(set(run.cells) for run in self.runs))
         names = dict.fromkeys(name for run in self.runs for name in run.versions)
         differing = [name for name in names if len({run.versions.get(name, "") for run in self.runs}) > 1]

@@ -202,10 +202,7 @@ def _verdict(
     allowed: float | None = None,
     more_is_better: bool = False,
 ) -> ChangeKind | None:
-    """Verdict on a number that should be small, or large; `None` if neither run has it.
-
-    `floor` replaces smaller numbers in the ratio; a difference `allowed` is within the accuracy.
-    """
+    """Verdict on a number, `None` if neither run has it; `floor` replaces smaller ones, `allowed` is the accuracy."""
     if pd.isna(after):
         # A number that is gone is worse than any other.
         return None if pd.isna(before) else ChangeKind.WORSE
@@ -224,11 +221,8 @@ def _verdict(
 
 
 def timing_differences(one: ComparedRun, two: ComparedRun, shared: Sequence[str], limit: float) -> Iterator[Difference]:
-    """Differences in seconds and break-even of cells that one machine measured in both runs.
-
-    They are undecided if a row is marked as disturbed.
-    """
-    # Other work on the machine slowed down what a disturbed row measured.
+    """Differences in seconds and break-even of cells that one machine measured in both runs."""
+    # Undecided: other work on the machine slowed down what a disturbed row measured.
     disturbed = {key for key in shared if one.cells[key]["disturbed"] == 1 or two.cells[key]["disturbed"] == 1}
     for key in shared:
         before, after = one.cells[key], two.cells[key]

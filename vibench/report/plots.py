@@ -52,23 +52,15 @@ class PlotPanel:
 
 @dataclass(frozen=True)
 class Plot:
-    """A plot of one problem: its name, which is that of the picture that it replaces, its title, and its data.
+    """A plot of one problem."""
 
-    `data` has the names, colours and markers of the series; the row in the table of cells, the series and the filling
-    of every point; and the panels with the coordinates of the points, null for a point that a panel does not have.
-    """
-
-    name: str
+    name: str  # that of the picture that it replaces
     title: str
-    data: dict[str, Any]
+    data: dict[str, Any]  # series, points with their rows in the table of cells, panels with coordinates or null
 
 
 def plots(name: str, data: ProblemTables, rows: Mapping[str, int]) -> Iterator[Plot]:
-    """The plots of one problem.
-
-    The names of its pictures begin with `name`; `rows` has the row of every cell in the table of cells, from which the
-    page takes what a point says.
-    """
+    """Plots of one problem, whose names begin with `name`; `rows` has the row of every cell in the table of cells."""
     compared = on_common_queries(best_solver(data.cells), data.queries)
     cells = compared.cells
     shown = cells.assign(
@@ -92,10 +84,7 @@ def plots(name: str, data: ProblemTables, rows: Mapping[str, int]) -> Iterator[P
 def overview(
     name: str, data: ProblemTables, rows: Mapping[str, int], paired: PairedTiming, certified: pd.Series
 ) -> Iterator[Plot]:
-    """Errors, and certified ones, against the seconds of a query, and total costs over the number of queries.
-
-    All models are in it, with the high-fidelity model as a line; names and rows are those of `plots`.
-    """
+    """Errors, and certified ones, of all models against the seconds of a query, and total costs over the queries."""
     cells = data.cells[ranking.eligible(data.cells) & data.cells["online_s"].notna()]
     if cells.empty:
         return

@@ -40,10 +40,7 @@ CATALOGUE = "vibench-site.json"
 
 
 def check(site: Path) -> None:
-    """Refuse a folder that a site cannot be written into.
-
-    Raises a `RequestError` if it is a file, or holds files and is no site, or its list of files cannot be read.
-    """
+    """Refuse a folder that is a file, or holds files and is no site, or whose list of files cannot be read."""
     if site.is_dir():
         if any(site.iterdir()):
             _written(site)
@@ -54,10 +51,8 @@ def check(site: Path) -> None:
 def write(site: Path, fill: Callable[[Path], None]) -> None:
     """Write a site: a new one appears whole, the files of an earlier one are replaced one by one, its first page last.
 
-    The folder is new, empty, or written by this function; `fill` writes the files into one that it is given.
-
-    Raises a `RequestError` if the folder holds files of others under names of the site, or cannot be written; nothing
-    is changed then.
+    The callback `fill` writes the files into a new folder. Raises a `RequestError`, with nothing changed, if the folder
+    holds files of others under names of the site, or cannot be written.
     """
     check(site)
     try:

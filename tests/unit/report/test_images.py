@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
-from vibench.report.figures import OF_DUAL, OF_PROBLEM, convergence, drawings, processes, render
+from vibench.report.figures import processes, render
 from vibench.report.figures.data import problem_tables
 from vibench.report.html import tasks_of
 from vibench.report.plots import image_of
@@ -21,16 +20,3 @@ def test_several_processes_draw_the_same_pictures_in_the_same_order(quick_run: P
         together = render(tasks, image_of, pool)
     assert [len(pages) for pages in alone] == [1] * 4
     assert alone == together
-
-
-def test_figures_read_histories_if_and_only_if_they_are_listed(quick_run: Path) -> None:
-    """Those that are not listed are drawn by other processes, which have none."""
-    reading = set()
-    for _, draw, data in drawings(quick_run / FILE):
-        if draw in {*OF_PROBLEM.values(), *OF_DUAL.values()}:
-            try:
-                list(draw(replace(data, histories=None)))
-            except TypeError:  # None has no rows
-                reading.add(draw)
-    every = (*OF_PROBLEM.values(), *OF_DUAL.values())
-    assert reading == {draw for draw in every if draw.__module__ == convergence.__name__}

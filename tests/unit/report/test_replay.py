@@ -69,9 +69,8 @@ def test_stages_whose_artefacts_are_gone_are_run_again(run: Path, artefacts: Pat
     before = recorded_cell(str(run), key(run)).rows("queries")[1]["primal_residual"]
     recorded = recorded_cell(str(run), key(run))
     x, alpha = (np.frombuffer(recorded.rows("solutions")[1][name]) for name in ("x", "alpha"))
-    assert verification.kkt_residuals(recorded.program(1), x, alpha).primal == pytest.approx(
-        before, rel=1e-6, abs=1e-15
-    )
+    again = verification.kkt_residuals(recorded.program(1), x, alpha).primal
+    assert again == pytest.approx(before, rel=1e-6, abs=1e-15)
 
 
 def test_replay_names_every_solver_and_keeps_the_program(run: Path, tmp_path: Path) -> None:
@@ -111,9 +110,8 @@ def test_the_exported_set_is_rechecked_by_a_script_that_knows_nothing_of_vibench
     assert "from vibench" not in script.read_text()
 
     def check() -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-I", str(script)], cwd=tmp_path, capture_output=True, text=True, check=False
-        )
+        command = [sys.executable, "-I", str(script)]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
 
     fine = check()
     assert (fine.returncode, fine.stdout.strip()) == (0, "24 solutions, 24 claimed ok, 0 wrong")

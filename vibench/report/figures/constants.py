@@ -49,11 +49,7 @@ class _Panel(NamedTuple):
 
 
 def inf_sup(data: ProblemTables) -> Pages:
-    """Inf-sup constants β of every primal strategy and of the high-fidelity pair over the validation set.
-
-    First row: over the span; second row: over the cone, with the certified interval as a band. Fixed enrichments are
-    shown at the tolerance of the smallest mean, the same in every panel.
-    """
+    """Inf-sup constants β of every primal strategy and of the high-fidelity pair over the validation set."""
     # Without the other columns: a run may have thousands of pairs, each with a copy of its rows.
     needed = ["pair", "query", "cell", "mu_1", "enrichment_kind", *PRIMAL]
     needed += [name for name in data.queries if name.startswith("beta_")]
@@ -149,11 +145,7 @@ def _caption(data: ProblemTables, constants: pd.DataFrame, shown: pd.DataFrame, 
 
 
 def shares(data: ProblemTables) -> Pages:
-    """Smallest shares of β over the span in that of the whole of V: over the validation against the training set.
-
-    One point per fixed enrichment. Below the diagonal, validation parameters are less stable than the training set; the
-    tick on the left of a point is √(1 − σ²), which bounds the share on the training set.
-    """
+    """Smallest shares of β over the span in that of the whole of V: over the validation against the training set."""
     cells = data.cells[data.cells["share_training"].notna()].drop_duplicates([*PRIMAL, "dual", "pair"])
     panels = [
         (title, rows[rows["primal"].isin(names)])

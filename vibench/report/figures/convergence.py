@@ -128,11 +128,7 @@ def _cones(axes: Axes, cones: Mapping[str, pd.DataFrame], xlabel: str, ylabel: s
 
 
 def enrichment(data: ProblemTables) -> Pages:
-    """Fixed enrichments: σ and min β against the vectors added, β over the validation set (paper, Figures 7 and 14).
-
-    One row of panels for every pair; the histories are those of the tolerance that went farthest, which contain the
-    others.
-    """
+    """Fixed enrichments: σ and min β against the vectors added, β over the validation set (paper, Figures 7 and 14)."""
     fixed = data.queries[data.queries["enrichment_kind"] == Kind.FIXED]
     strategies = fixed.drop_duplicates(["primal", "primal_tol"])
     # Sines below this are round-off.

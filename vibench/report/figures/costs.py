@@ -44,10 +44,7 @@ def dimension(data: ProblemTables) -> Pages:
 
 
 def work_precision(data: ProblemTables) -> Pages:
-    """Errors against the time of a query; no cell is both faster and more accurate than those on the line.
-
-    Errors are means over the queries that all of these cells solved; a cell that solved fewer than half has no point.
-    """
+    """Errors against the time of a query; no cell is both faster and more accurate than those on the line."""
     cells = best_solver(data.cells)
     seconds = 1e3 * cells["online_s"]
     return _errors_against(data, cells, seconds, "mean time of a query [ms]", "work and precision", front=True)
@@ -240,9 +237,7 @@ def _marks(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame, most: flo
 def solvers(data: ProblemTables) -> Pages:
     """Time of every solver against the accuracy it achieves, and its performance profile (Dolan and Moré, 2002).
 
-    A profile is the share of programs solved to the prescribed accuracy within a factor of the time of the fastest
-    solver of that program. Failures count as infinite times, so that a curve ends at the share its solver solved. One
-    solver has no profile.
+    Failures count as infinite times, so that a curve ends at the fraction its solver solved. One solver has no profile.
     """
     queries = of_solvers(data.queries)
     if not queries["solve_s"].notna().any():
@@ -271,11 +266,7 @@ def solvers(data: ProblemTables) -> Pages:
 
 
 def precision(data: ProblemTables) -> Pages:
-    """Median time of a program against the part of the error of u and of λ that the solver makes, over the accuracy.
-
-    Each point is one accuracy of one solver: median over the programs that are ok in all of these ways. A solver that
-    has fewer than half of its queries ok at an accuracy has no point there.
-    """
+    """Median time of a program against the part of the error of u and of λ that the solver makes, over the accuracy."""
     shared = common_programs(data.queries)
     if shared["accuracy"].nunique() < 2:
         return

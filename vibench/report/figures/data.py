@@ -242,10 +242,8 @@ def some(values: Any) -> str:
 
 
 def parts(items: list[Any], *, beside_reference: bool = False) -> list[list[Any]]:
-    """Series in groups of about the same size, for panels of at most ten series.
-
-    With `beside_reference`, one of the ten is that of the high-fidelity model.
-    """
+    """Series in groups of about the same size, for panels of at most ten series."""
+    # One of the ten may be the series of the high-fidelity model.
     most = 9 if beside_reference else 10
     count = -(-len(items) // most)
     ends = [round(k * len(items) / count) for k in range(count + 1)] if count else []
@@ -290,19 +288,14 @@ def point_names(cells: pd.DataFrame) -> dict[Any, str]:
 
 
 def one_solver(queries: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFrame:
-    """One row per strategy, tolerance, query and values on the `axes`, sorted by these.
-
-    Inf-sup constants depend on no solver, assembly or correction.
-    """
+    """One row per strategy, tolerance, query and values on the `axes`, sorted by these."""
+    # Inf-sup constants depend on no solver, assembly or correction.
     rows = queries.drop_duplicates([*axes, *PRIMAL, "query"])
     return rows.iloc[np.argsort(rows.groupby(list(axes), sort=False).ngroup(), kind="stable")] if axes else rows
 
 
 def best_solver(cells: pd.DataFrame) -> pd.DataFrame:
-    """The timed cells of the solver and accuracy with the most ok queries, without those that are `too_loose`.
-
-    Of several such solvers, the fastest.
-    """
+    """Timed cells, not `too_loose`, of the solver and accuracy with the most ok queries; the fastest of several."""
     timed = cells[cells["online_s"].notna() & ~too_loose(cells, "solver") & ~too_loose(cells, "assembly")]
     if timed.empty:
         return timed
@@ -312,10 +305,7 @@ def best_solver(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def at_best_tolerance(rows: pd.DataFrame, score: pd.Series) -> pd.DataFrame:
-    """Rows of every primal strategy at the tolerance of its largest score, and all rows without a tolerance.
-
-    `score` has the index (primal, primal_tol).
-    """
+    """Rows of every primal strategy at the tolerance of its largest score by (primal, primal_tol), or without one."""
     scores = score.dropna().rename("score").reset_index()
     top = scores.groupby("primal")["score"].transform("max")
     # The largest tolerance of scores equal up to 1e-6: figures do not depend on the last digits of a run.
@@ -333,10 +323,8 @@ def common_tolerances(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def longest(histories: pd.DataFrame) -> Iterator[tuple[Any, pd.DataFrame]]:
-    """The longest history for each dual strategy.
-
-    It contains the others: POD and cones are nested, so a looser tolerance stops at an earlier step.
-    """
+    """The longest history for each dual strategy."""
+    # It contains the others: POD and cones are nested, so a looser tolerance stops at an earlier step.
     for dual, group in histories.groupby("dual", dropna=False):
         yield dual, group[group["artefact"] == group.groupby("artefact")["step"].max().idxmax()]
 
@@ -391,10 +379,8 @@ def on_common_queries(cells: pd.DataFrame, queries: pd.DataFrame) -> Comparable:
 
 
 def common_programs(queries: pd.DataFrame) -> pd.DataFrame:
-    """Rows of the programs of one problem that are ok with every solver at every accuracy.
-
-    Solvers that have fewer than half of their programs ok at an accuracy are left out there.
-    """
+    """Rows of the programs of one problem that are ok with every solver at every accuracy."""
+    # Solvers that have fewer than half of their programs ok at an accuracy are left out there.
     queries, by = of_solvers(queries), ["solver", "accuracy"]
     fine = queries[queries["status"] == Status.OK]
     solved, asked = fine.groupby(by).size(), queries.groupby(by).size()
