@@ -62,10 +62,9 @@ T = TypeVar("T")
 
 
 def requested(function: Callable[P, T]) -> Callable[P, T]:
-    """Check the arguments of a public function against their annotations; nothing is converted.
+    """Check the arguments of a public function against their annotations, by a `RequestError`; nothing is converted.
 
-    An argument that does not fit raises a `RequestError` with its name, its value and the expected type. Arguments that
-    the function does not have remain a `TypeError`, as Python's own.
+    Arguments that the function does not have remain a `TypeError`, as Python's own.
     """
     signature = inspect.signature(function)
 
@@ -117,11 +116,10 @@ def unknown_name(kind: str, name: str, choices: Iterable[str]) -> RequestError:
     choices = sorted(choices)
     near = difflib.get_close_matches(name, choices, n=5)
     hint = f"; did you mean '{near[0]}'?" if near else ""
+    listed = f"known: {', '.join(choices) or 'none'}"
     # A longer list helps nobody.
     if len(choices) > 30:
         listed = f"{len(choices)} are known{', such as ' * bool(near[1:])}{', '.join(near[1:])}"
-    else:
-        listed = f"known: {', '.join(choices) or 'none'}"
     return RequestError(f"no {kind} is called '{name}'{hint} ({listed})")
 
 
@@ -135,9 +133,8 @@ def fault_line(fault: ValidationError, root: type[BaseModel], named: Collection[
     outer = error["loc"][:-1] if error["type"] == "extra_forbidden" else error["loc"]
     # Parts with brackets are validators and types of unions, no keys.
     where = [part for part in outer if isinstance(part, int) or not {*"<["} & {*part}]
-    message, shown = error["msg"].removeprefix("Value error, "), ""
-    if isinstance(error["input"], str | int | float):
-        shown = f" (found {error['input']!r:.80})"
+    message = error["msg"].removeprefix("Value error, ")
+    shown = f" (found {error['input']!r:.80})" if isinstance(error["input"], str | int | float) else ""
     match error["type"]:
         case "extra_forbidden":
             fields = _model_at(root, where).model_fields

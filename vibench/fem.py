@@ -125,12 +125,7 @@ def unilateral(basis: Basis, sense: Sense, *, free: Indices | None = None, lumpe
 
 
 def normal_constraint(
-    basis: Basis,
-    facets: Indices,
-    *,
-    direction: Array | None = None,
-    free: Indices | None = None,
-    lumped: bool = True,
+    basis: Basis, facets: Indices, *, direction: Array | None = None, free: Indices | None = None, lumped: bool = True
 ) -> Unilateral:
     """The constraint n·u ≤ gap of a displacement field on a part of the boundary, such as contact with a rigid body.
 
@@ -219,10 +214,8 @@ def _positive(integrals: Array, dofs: Indices) -> Array:
     """The integrals (m,) of chosen functions; refused unless all are positive."""
     weights = integrals[dofs]
     if np.min(weights, initial=np.inf) <= 1e-14 * np.max(integrals, initial=0.0):
-        raise NumericalError(
-            f"a basis function has the integral {weights.min():.1e}; multipliers need nonnegative functions: linear or "
-            "bilinear elements"
-        )
+        needed = "multipliers need nonnegative functions: linear or bilinear elements"
+        raise NumericalError(f"a basis function has the integral {weights.min():.1e}; {needed}")
     return weights
 
 

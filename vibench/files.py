@@ -15,21 +15,19 @@ from typing import TextIO
 
 from vibench.errors import RequestError
 
+# Prefix and suffix of the names of temporary files; what is between is random.
 TEMPORARY, PART = "vibench-", ".part"
-"""Prefix and suffix of the names of temporary files; what is between is random."""
 
 
 def write_atomically(path: Path, content: bytes | Iterable[bytes], *, durable: bool = False) -> None:
     """Write a file under a random name in the same folder and rename it; a link under its name is replaced.
 
-    The content may come in parts. Permissions follow the user's mask. `durable` content is on the disk when the
-    function returns.
-
-    Raises an `OSError` if it cannot be written; nothing is left behind.
+    `durable` content is on the disk when the function returns. Raises an `OSError` if it cannot be written; nothing is
+    left behind.
     """
     part = path.parent / f"{TEMPORARY}{secrets.token_hex(8)}{PART}"
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-    handle = os.open(part, flags, 0o666)
+    # Permissions follow the user's mask.
+    handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
     try:
         with os.fdopen(handle, "wb") as file:
             file.writelines([content] if isinstance(content, bytes) else content)
@@ -51,10 +49,7 @@ def writing(target: Path) -> Iterator[None]:
 
 
 def read_regular(path: Path) -> bytes:
-    """The content of a regular file.
-
-    Raises an `OSError` if it is not a regular file, or cannot be read.
-    """
+    """The content of a regular file; raises an `OSError` if it is none, or cannot be read."""
     # A pipe or a device in its place would block here, or have no end.
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -64,12 +59,10 @@ def read_regular(path: Path) -> bytes:
 
 @contextlib.contextmanager
 def locked(path: Path, *, busy: str, shared: bool = False) -> Iterator[None]:
-    """Hold a lock file; the system releases it when the process ends.
+    """Hold a lock file, which is created and never deleted; the system releases it when the process ends.
 
-    The file is created in an existing folder and never deleted. Several processes may hold a `shared` lock.
-
-    Raises a `RequestError`, with the text `busy` and the holder if another process holds the lock, or if the file
-    cannot be written.
+    Several processes may hold a `shared` lock. Raises a `RequestError`, with the text `busy` and the holder if another
+    process holds the lock, or if the file cannot be written.
     """
     try:
         # Refuse symbolic links, which would lock, and overwrite, the file of somebody else.

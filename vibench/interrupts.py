@@ -11,8 +11,8 @@ import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
+# Exit code of a command that Ctrl-C ended.
 INTERRUPTED = 130
-"""Exit code of a command that Ctrl-C ended."""
 
 Handler = Callable[[int, FrameType | None], object] | int | None
 

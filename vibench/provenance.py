@@ -12,12 +12,9 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
 
+# Version of the benchmark protocol, recorded in results; docs/benchmark.md has a line for each. It changes with every
+# change after which seconds, or the meaning of a number, can no longer be compared with earlier ones.
 PROTOCOL = "4"
-"""Version of the benchmark protocol, recorded in results; docs/benchmark.md has a line for each.
-
-It changes with every change after which seconds, or the meaning of a number, can no longer be compared with earlier
-ones. Names, formats and new columns do not change it.
-"""
 
 
 @cache
@@ -28,18 +25,14 @@ def machine() -> str:
 
 
 def processor(info: Path = Path("/proc/cpuinfo")) -> str:
-    """The name of the processor, with family and model where the system has them.
-
-    Virtual machines may have a name such as "AMD EPYC", which many processors share.
-    """
+    """The name of the processor, with family and model: that of virtual machines is one that many processors share."""
     if not info.is_file():
         return platform.processor() or platform.machine()
     first, *_ = info.read_text().split("\n\n")
     fields = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in first.splitlines())}
     name = fields.get("model name", platform.processor() or platform.machine())
-    numbers = [
-        f"{words} {fields[key]}" for words, key in (("family", "cpu family"), ("model", "model")) if key in fields
-    ]
+    words = {"cpu family": "family", "model": "model"}
+    numbers = [f"{word} {fields[key]}" for key, word in words.items() if key in fields]
     return f"{name} ({' '.join(numbers)})" if numbers else name
 
 
@@ -162,11 +155,10 @@ def libraries() -> str:
 
 def source_hash(source: Path) -> str:
     """Short hash of a source, or of all sources and templates in a folder and below it."""
-    content = hashlib.sha256()
-    folder = source if source.is_dir() else source.parent
-    for path in (
-        sorted(p for p in source.rglob("*") if p.suffix in (".py", ".template")) if source.is_dir() else [source]
-    ):
+    content, is_folder = hashlib.sha256(), source.is_dir()
+    folder = source if is_folder else source.parent
+    paths = (p for p in source.rglob("*") if p.suffix in (".py", ".template")) if is_folder else (source,)
+    for path in sorted(paths):
         content.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     return content.hexdigest()[:12]
 

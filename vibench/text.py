@@ -11,15 +11,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.console import Console
 
+# Longest message or status, in characters.
 LONGEST = 2000
-"""Longest message or status, in characters."""
 
 
 def parsed_json(text: str | bytes) -> Any:
-    """The value of an untrusted JSON text.
-
-    Raises a `ValueError` if it is no JSON, or nested too deeply.
-    """
+    """The value of an untrusted JSON text; raises a `ValueError` if it is no JSON, or nested too deeply."""
     try:
         return json.loads(text)
     except RecursionError:
@@ -36,10 +33,7 @@ def json_object(text: object) -> dict[str, Any] | None:
 
 
 def printable(text: str) -> str:
-    r"""A text with JSON escapes, such as ``\u001b``, ``\n``, ``\ud800``, in place of unprintable characters.
-
-    These are control and format characters, lone surrogates and all white space but the blank.
-    """
+    r"""A text with JSON escapes, such as ``\u001b``, ``\n``, ``\ud800``, in place of unprintable characters."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
@@ -86,10 +80,7 @@ def normal_name(name: str) -> str:
 
 
 def new_console() -> Console:
-    """A console for the standard output that interprets no markup, with 10,000 columns if that is not a terminal.
-
-    A positive integer in `COLUMNS` sets the width.
-    """
+    """A console for the standard output that interprets no markup; a positive integer in `COLUMNS` sets its width."""
     from rich.console import Console  # noqa: PLC0415  most commands and the library print without it
 
     # Rich would take 0 for a width, and fail on some other texts.
@@ -98,7 +89,7 @@ def new_console() -> Console:
     environment = {name: value for name, value in os.environ.items() if prescribed or name != "COLUMNS"}
     console = Console(highlight=False, markup=False, emoji=False, _environ=environment)
     if not console.is_terminal and not prescribed:
-        console.width = 10_000
+        console.width = 10_000  # files and pipes have no width at which lines would be broken
     return console
 
 

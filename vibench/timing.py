@@ -18,17 +18,17 @@ import numpy as np
 
 T = TypeVar("T")
 
+# Upper limit of timed runs after one warm-up; the median counts.
 REPEATS = 5
-"""Upper limit of timed runs after one warm-up; the median counts."""
 
+# Seconds after which runs are not repeated; work that takes longer is timed once.
 SLOW = 1.0
-"""Seconds after which runs are not repeated; work that takes longer is timed once."""
 
+# Slowdown of the calibration, relative to a calm machine, above which a row is marked as disturbed.
 DISTURBED = 1.3
-"""Slowdown of the calibration, relative to a calm machine, above which a row is marked as disturbed."""
 
+# Environment in which numerical libraries start with one thread.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
-"""Environment in which numerical libraries start with one thread."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,9 @@ NO_TIME = Seconds(0.0, 0.0)
 
 
 class Stopwatch:
-    """Seconds since its creation, of all threads of the process and of children that have ended.
+    """Seconds since its creation, of all threads of the process and of the children that have ended.
 
-    Work in a thread or in a child process counts. A child that outlives the work does not; the wall seconds then exceed
-    the CPU seconds.
+    A child that outlives the work does not count; the wall seconds then exceed the CPU seconds.
     """
 
     def __init__(self) -> None:
@@ -87,17 +86,13 @@ def median_seconds(
     of the `arguments`, if any, whose computation is not timed.
     """
     each = repeat(()) if arguments is None else ((argument,) for argument in arguments)
-
-    def once() -> tuple[T, Seconds]:
-        return timed(partial(work, *next(each)))
-
-    result, first = once()
+    result, first = timed(partial(work, *next(each)))
     # Slow work has no warm-up to speak of.
     if first.wall > enough:
         return result, first
     runs: list[Seconds] = []
     while len(runs) < REPEATS and sum(run.wall for run in runs) < enough:
-        runs.append(once()[1])
+        runs.append(timed(partial(work, *next(each)))[1])
     return result, median_of(runs)
 
 
@@ -113,10 +108,9 @@ def median_interval(values: Sequence[float]) -> tuple[float, float]:
     range, which has a smaller probability.
     """
     ordered, n = sorted(values), len(values)
-    # Values left out on each side, and the probability that the median is among or below them. It is a sum of binomial
+    # Values left out on each side, and the probability that the median is among or below them: a sum of binomial
     # coefficients over 2^n, in integers because 2^n overflows a float.
-    outside, below = 0, 0.0
-    ways, every = 1, 2**n
+    outside, below, ways, every = 0, 0.0, 1, 2**n
     while (below := below + ways / every) <= 0.025:
         ways = ways * (n - outside) // (outside + 1)
         outside += 1

@@ -21,8 +21,7 @@ from fake_stages import InItems, OfAPlugin, Whole
 from running import PATIENCE
 
 from vibench.execution import supervisor
-from vibench.execution.jobs import Begun, CurrentItem, Job
-from vibench.execution.supervisor import StoppedError, Supervisor
+from vibench.execution.supervisor import Begun, CurrentItem, Job, StoppedError, Supervisor
 from vibench.plugins.kinds import PROBLEM
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find
@@ -284,7 +283,7 @@ def test_a_worker_does_not_outlive_its_supervisor(tmp_path: Path) -> None:
     """Not even one that sleeps in a plugin, nor what that started, when the supervisor's process is killed."""
     diary, seconds = tmp_path / "diary", unique()
     code = (
-        "from vibench.execution.jobs import Job; from vibench.execution.supervisor import Supervisor\n"
+        "from vibench.execution.supervisor import Job; from vibench.execution.supervisor import Supervisor\n"
         "from fake_stages import InItems, Whole\n"
         f"one = Supervisor(); one.run(Job({str(tmp_path)!r}, InItems(('daemon {seconds}',)), 1.0, 600.0, 8.0))\n"
         f"one.run(Job({str(tmp_path)!r}, Whole('sleep', {str(diary)!r}), 1.0, 600.0, 8.0))"

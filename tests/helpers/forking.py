@@ -247,7 +247,7 @@ def _load() -> None:
             import_module(module.name)
     sys.path.append(str(Path(__file__).parent))  # only here: what is forked has a path of its own
     import_module("unsynced").leave_syncing_to_the_system()
-    import_module("vibench.execution.jobs").code_here()
+    import_module("vibench.execution.supervisor").code_here()
     _hash_stages(import_module("vibench.stages.base").Stage)
     typer = import_module("typer.main")
     typer.get_command = cache(typer.get_command)

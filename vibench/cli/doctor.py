@@ -104,7 +104,7 @@ def required_distributions() -> dict[str, list[str]]:
 
 def check_solvers() -> Iterator[Diagnosis]:
     """All known QP solvers; the installed ones solve a small program each, at the default accuracy of studies."""
-    trials = solver_trials(wire(), 1e-7, installed_solvers(registered(SOLVER)))
+    trials = solver_trials(wire(), 1e-7, installed_solvers(registered(SOLVER)), 60.0)
     for name in sorted({*SETTINGS, *registered(SOLVER)}):
         version = provenance.solver_version(name) if name in SETTINGS else find(SOLVER, name).origin
         if name not in trials:

@@ -16,8 +16,7 @@ from typing import Any, TypeAlias
 
 from vibench import interrupts
 from vibench.errors import ExecutorError, RequestError, in_a_line
-from vibench.execution.jobs import Job, code_here
-from vibench.execution.supervisor import Supervisor
+from vibench.execution.supervisor import Job, Supervisor, code_here
 from vibench.provenance import machine
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, Unstored
@@ -40,10 +39,7 @@ class Executor(ABC):
         return {}
 
     def check(self) -> None:  # noqa: B027  nothing to check where jobs run in our own threads
-        """Check that submitted jobs can still finish.
-
-        Raises an `ExecutorError` if the processes that run them were lost.
-        """
+        """Raise an `ExecutorError` if the processes that run the submitted jobs were lost."""
 
     @abstractmethod
     def close(self) -> None:
@@ -90,14 +86,11 @@ class Dask(Executor):
     """The workers of a dask cluster, one job at a time on each.
 
     They must have the same vibench installed and see the folder of the artefacts under the same path. Another worker
-    repeats the job of a worker that dies, which is safe because stages are pure functions.
+    repeats the job of a worker that dies, which is safe because stages are pure functions. Without a `scheduler`, a
+    cluster of `slots` processes on this machine is started, which use TLS with temporary credentials. The credentials
+    for a scheduler tls://… come from the configuration of dask. `store` is the folder of the artefacts.
 
-    Without a `scheduler`, a cluster of `slots` processes on this machine is started, which use TLS with temporary
-    credentials. The credentials for a scheduler tls://… come from the configuration of dask. `store` is the folder of
-    the artefacts.
-
-    Raises a `RequestError` if dask.distributed is not installed, this process may not open enough files, the scheduler
-    does not answer, or a worker cannot run the jobs.
+    Raises a `RequestError` if dask cannot be used, does not answer, or has a worker that cannot run the jobs.
     """
 
     def __init__(self, scheduler: str | None, slots: int, store: Path) -> None:
@@ -181,7 +174,7 @@ class Dask(Executor):
 def _greet(scheduler: str, seconds: float) -> None:
     """Shake hands with a scheduler, since a client would wait for ever for an answer, and trust any size it receives.
 
-    Raises a `RequestError` if no scheduler answers within so many seconds.
+    Raises a `RequestError` if none answers within some seconds.
     """
     from distributed.comm.core import connect  # noqa: PLC0415
     from distributed.security import Security  # noqa: PLC0415
@@ -220,34 +213,22 @@ def is_authenticated(scheduler: str) -> bool:
 
 
 def _hand_over(theirs: Any, ours: Future[StageOutcome]) -> None:
-    """Pass the result of a dask future to a standard one, which `concurrent.futures.wait` needs."""
-    try:
-        ours.set_result(_result(theirs))
-    except BaseException as error:  # noqa: BLE001  this thread is dask's: pass it to the waiting thread
-        line = in_a_line(error)
-        # The job has killed several workers in turn: it fails, and the run goes on.
-        if type(error).__name__ == "KilledWorker":
-            ours.set_result(Failed(Status.CRASHED, f"dask does not repeat the job again: {line}"))
-        else:
-            ours.set_exception(
-                ExecutorError(f"the dask cluster was lost: {line}; run the same command again to continue")
-            )
-
-
-def _result(theirs: Any) -> StageOutcome:
-    """The result of a dask future that is done, unless its client closes.
-
-    A client that closes meanwhile never answers, and would block the thread that runs the callbacks of all clients.
-    """
-    while True:
+    """Pass the result of a dask future that is done to a standard one, which `concurrent.futures.wait` needs."""
+    while not ours.done():
         try:
-            outcome: StageOutcome = theirs.result(timeout=5.0)
-        except TimeoutError:
-            # The error may be the job's own.
-            if theirs.status == "error" or theirs.client.status != "running":
-                raise
-        else:
-            return outcome
+            # A client that closes never answers: do not block the thread of the callbacks of all clients.
+            ours.set_result(theirs.result(timeout=5.0))
+        except BaseException as error:  # noqa: BLE001  this thread is dask's: pass it to the waiting thread
+            # A `TimeoutError` may be the job's own.
+            if isinstance(error, TimeoutError) and theirs.status != "error" and theirs.client.status == "running":
+                continue
+            line = in_a_line(error)
+            # The job has killed several workers in turn: it fails, and the run goes on.
+            if type(error).__name__ == "KilledWorker":
+                ours.set_result(Failed(Status.CRASHED, f"dask does not repeat the job again: {line}"))
+            else:
+                why = f"the dask cluster was lost: {line}; run the same command again to continue"
+                ours.set_exception(ExecutorError(why))
 
 
 _supervisors: dict[tuple[str, int], Supervisor] = {}

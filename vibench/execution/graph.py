@@ -13,9 +13,8 @@ from vibench.stages.base import Stage
 class Graph:
     """The stages of a run, by key: the goals, and the stages that they need.
 
-    A stage that begins, ends or is lost costs as many steps as it has neighbours, however many others wait.
-
-    `stages` are all that were planned; `waiting` has the inputs that are not done of each stage that has not begun.
+    A stage that begins, ends or is lost costs as many steps as it has neighbours, however many others wait. `waiting`
+    has the inputs that are not done of each stage that has not begun.
     """
 
     stages: dict[str, Stage] = field(default_factory=dict)
@@ -80,15 +79,12 @@ class Graph:
             more = self._needed.pop(ahead.pop(), {}).keys() - gone
             gone |= more
             ahead += more
-        self._drop(gone - {stage.key})
-        return [self.stages[key] for key in sorted(gone & self._goals, key=self._numbers.__getitem__)]
-
-    def _drop(self, keys: set[str]) -> None:
-        ahead = list(keys)
+        ahead = list(gone - {stage.key})
         while ahead:
             key = ahead.pop()
             for needed in self.waiting.pop(key):
                 others = self._needed.get(needed, {})
                 others.pop(key, None)
-                if needed in self.waiting and not others and needed not in self._goals and needed not in keys:
+                if needed in self.waiting and not others and needed not in self._goals and needed not in gone:
                     ahead.append(needed)
+        return [self.stages[key] for key in sorted(gone & self._goals, key=self._numbers.__getitem__)]

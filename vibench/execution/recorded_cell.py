@@ -16,8 +16,7 @@ import pandas as pd
 from vibench.arrays import Array
 from vibench.errors import RequestError
 from vibench.execution.graph import Graph
-from vibench.execution.jobs import Job
-from vibench.execution.supervisor import Supervisor
+from vibench.execution.supervisor import Job, Supervisor
 from vibench.interfaces.problem import VariationalInequality
 from vibench.offline.models import Model
 from vibench.plugins.plugin import Plugin
@@ -60,9 +59,8 @@ class RecordedCell:
             )
         store, queries = usable_store(), cell_queries(self.cell, query_seconds=1e6)
         certificate, built = queries.certificate, queries.built
-        _provide(
-            built.model_inputs if certificate is None else (*built.model_inputs, certificate.base, certificate), store
-        )
+        needed = () if certificate is None else (certificate.base, certificate)
+        _provide((*built.model_inputs, *needed), store)
         return replace(
             built.model(store, queries.solver, queries.accuracy),
             certificate=None if certificate is None else certificate.certificate(store),

@@ -12,21 +12,14 @@ from typing import Any
 
 from vibench import provenance
 from vibench.errors import RequestError
-from vibench.execution.jobs import OUT_OF_MEMORY
+from vibench.execution.supervisor import OUT_OF_MEMORY
 from vibench.files import locked
 from vibench.plugins.plugin import Plugin
 from vibench.qp.status import Status
 from vibench.results.database import ResultsDatabase
 from vibench.results.schema import KEYS
 from vibench.results.show import exported_files
-from vibench.results.sqlite import (
-    DAMAGED,
-    FILE,
-    DamagedResultsError,
-    read_meta,
-    set_aside,
-    study_of,
-)
+from vibench.results.sqlite import DAMAGED, FILE, DamagedResultsError, read_meta, set_aside, study_of
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Row, Stage, value_of
 from vibench.stages.cell_queries import CellRows
@@ -35,16 +28,15 @@ from vibench.study.cells import NO_SUCH_AXIS, Axes, Cell, digest
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.spec import Limits, Study
 
+# Files of a run folder: the output of plugins and solvers, and the report of `vibench report`.
 LOG, REPORT = "workers.log", "report.html"
-"""Files of a run folder: the output of plugins and solvers, and the report of `vibench report`."""
 
 
 @contextlib.contextmanager
 def claimed(folder: Path) -> Iterator[None]:
     """Lock a run folder, which is created if it does not exist.
 
-    Raises a `RequestError` if the folder is a file, holds files but no results file, cannot be written, or is locked by
-    another run.
+    Raises a `RequestError` if it is no run folder, cannot be written, or is locked by another run.
     """
     try:
         if folder.exists() and not folder.is_dir():
@@ -131,14 +123,9 @@ class ResultWriter:
         return self.database.write_cell(row, queries, solutions, outputs, rows.parameters)
 
     def seconds(
-        self,
-        cell: Cell,
-        rows: Sequence[Row],
-        rounds: Sequence[TimedRound],
-        machines: Set[str],
-        lost: str,
+        self, cell: Cell, rows: Sequence[Row], rounds: Sequence[TimedRound], machines: Set[str], lost: str
     ) -> None:
-        """Write the seconds of a cell that has its rows; more may follow until `timed` is called."""
+        """Write the seconds of a cell that has its rows; more may follow until it has the column `timing_rounds`."""
         row = self.database.cell(cell.key)
         # Cells are timed only when they have their rows.
         assert row is not None
@@ -147,13 +134,6 @@ class ResultWriter:
             own["machine"] = "; ".join(sorted({*row["machine"].split("; "), *machines}))
         keys = {"cell": cell.key, **cell_columns(cell)}
         self.database.write_seconds(cell.key, own, seconds_of_queries(rounds), [keys | row for row in rows])
-
-    def timed(self, cell: Cell, limit: int) -> None:
-        """Mark the seconds of a cell as complete; `limit` is the upper limit of its rounds."""
-        self.database.write_columns(cell.key, {"timing_rounds": limit})
-
-    def offline(self, cell: Cell, columns: Row) -> None:
-        self.database.write_columns(cell.key, columns)
 
     def stage(self, stage: Stage, histories: Iterable[History], store: Store) -> None:
         """Write the histories and rows of a stage whose value is stored."""

@@ -13,7 +13,6 @@ from vibench import interrupts, provenance
 from vibench.errors import ExecutorError, RequestError, StorageError, VibenchError, in_a_line
 from vibench.execution.executors import Dask, Executor, Local
 from vibench.execution.graph import Graph
-from vibench.execution.jobs import Job
 from vibench.execution.recording import (
     LOG,
     ResultWriter,
@@ -23,6 +22,7 @@ from vibench.execution.recording import (
     keep_limits,
     labels_of,
 )
+from vibench.execution.supervisor import Job
 from vibench.execution.timing_plan import OfflinePlan, TimingPlan
 from vibench.linalg.factorisations import DEFAULT, implementation
 from vibench.plugins.kinds import SAMPLING, SOLVER
@@ -46,10 +46,7 @@ from vibench.study.spec import Study
 
 @dataclass(frozen=True)
 class Agenda:
-    """The work of a run, as numbers of cells in the matrix, of those without a row, and of those not available here.
-
-    `stages` are those that the other cells need, `workers` is the number of worker processes.
-    """
+    """Numbers of cells in the matrix, to run and not available here, the stages of the others, and worker processes."""
 
     cells: int
     to_run: int
@@ -127,9 +124,8 @@ class Options:
         # More than one process per core makes a run slower, and thousands stop the machine.
         most = 16 * provenance.cores()
         if not 0 <= self.jobs <= most:
-            raise RequestError(
-                f"jobs is {self.jobs}, expected at most {most} worker processes, 16 per core, or 0 for one per core"
-            )
+            what = f"at most {most} worker processes, 16 per core, or 0 for one per core"
+            raise RequestError(f"jobs is {self.jobs}, expected {what}")
 
     @property
     def workers(self) -> int:
@@ -139,8 +135,8 @@ class Options:
 def run_study(study: Study, folder: Path, observer: Observer, options: Options = Options()) -> RunResult:
     """Run the missing cells of a study and write every result into its folder, beside earlier ones of the same study.
 
-    Raises a `RequestError` if the folder, the store of artefacts or the executor cannot be used, and a `StorageError`
-    if something cannot be written; earlier results are kept.
+    Raises a `RequestError` if the folder, the store or the executor cannot be used, a `StorageError` if nothing can be
+    written; earlier results are kept.
     """
     cells, store = expand(study), usable_store()
     with claimed(folder), store.used():
@@ -148,8 +144,11 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
             clear(folder, study.name, observer.note)
         database = ResultsDatabase(folder, identity(study), anew=options.fresh)
         try:
-            finished, raised = database.finished(), ended_by_smaller_limits(database, study.limits)
-            todo = [cell for cell in cells if cell.key in raised or _to_do(cell, finished, options.retry)]
+            repeated, finished = ended_by_smaller_limits(database, study.limits), database.finished()
+            if options.retry:
+                repeated |= {key for key, (status, _) in finished.items() if status != Status.OK}
+            kept = {key: code for key, (_, code) in finished.items() if key not in repeated}
+            todo = [cell for cell in cells if kept.get(cell.key) != cell.code]
             writer = ResultWriter(study, database, labels_of(cells))
             keep_limits(database, writer.study_hash, study.limits)
             run = _Run(study, folder, store, writer, observer, options)
@@ -165,18 +164,9 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
     return RunResult(rows, len(cells) - len(rows), interrupted, database.damaged)
 
 
-def _to_do(cell: Cell, finished: Mapping[str, tuple[str, str]], retry: bool) -> bool:
-    status, code = finished.get(cell.key, (None, None))
-    return code != cell.code or (retry and status != Status.OK)
-
-
 @dataclass
 class _Run:
-    """One execution of a study: the graph of its stages, and the recording of their results.
-
-    `cells` are those that get their rows from a goal, by its key: several cells may share a goal. `lost` are the
-    dispensable stages that failed, by key.
-    """
+    """One execution of a study: the graph of its stages, and the recording of their results."""
 
     study: Study
     folder: Path
@@ -185,7 +175,9 @@ class _Run:
     observer: Observer
     options: Options
     graph: Graph = field(default_factory=Graph)
+    # Several cells may get their rows from one goal, by its key.
     cells: dict[str, list[Cell]] = field(default_factory=dict)
+    # The dispensable stages that failed, by key.
     lost: dict[str, Failed] = field(default_factory=dict)
     timing: TimingPlan = field(init=False)
     offline: OfflinePlan = field(init=False)
@@ -236,10 +228,9 @@ class _Run:
         return interrupted
 
     def _workers(self) -> Executor:
-        options = self.options
-        if options.executor == "dask":
-            return Dask(options.scheduler, options.workers, self.store.folder)
-        return Local(options.workers, self.folder / LOG)
+        if self.options.executor == "dask":
+            return Dask(self.options.scheduler, self.options.workers, self.store.folder)
+        return Local(self.options.workers, self.folder / LOG)
 
     def _is_available(self, stage: Stage) -> bool:
         """Whether the artefact of a stage can be reused; its histories are recorded if so.
@@ -266,9 +257,8 @@ class _Run:
                 self.observer.begin(stage)
                 running[workers.submit(job)] = stage
             if not running:
-                raise ExecutorError(
-                    f"{len(self.graph.waiting)} stages wait for inputs that are not running: this is a bug in vibench"
-                )
+                waiting = f"{len(self.graph.waiting)} stages wait for inputs that are not running"
+                raise ExecutorError(f"{waiting}: this is a bug in vibench")
             # Wake up now and then: an executor that was lost completes nothing.
             done, _ = wait(running, timeout=5.0, return_when=FIRST_COMPLETED)
             workers.check()
@@ -305,8 +295,7 @@ class _Run:
             self._ended(cell)
 
     def _ended(self, cell: Cell) -> None:
-        group = self.timing.ended(cell)
-        if group is not None:
+        if (group := self.timing.ended(cell)) is not None:
             self._time(group)
 
     def _time(self, group: TimingRounds, *, plan: bool = True) -> None:
@@ -319,14 +308,13 @@ class _Run:
                 self.observer.plan(stage)
 
     def _timed(self, stage: Stage, outcome: Any) -> None:
-        following = self.timing.record(stage, outcome)
-        if following is not None:
+        if (following := self.timing.record(stage, outcome)) is not None:
             self.graph.add_goal(following, self._is_available)
             self.observer.plan(following)
 
     def _fail_cell(self, cell: Cell, failed: Failed) -> None:
-        queries = {"queries": cell.validation.count, "queries_ok": 0}
-        row = {"status": failed.status.value, "reason": failed.reason, **queries}
+        ended = {"status": failed.status.value, "reason": failed.reason}
+        row = ended | {"queries": cell.validation.count, "queries_ok": 0}
         self.observer.cell(cell, self.writer.cell(cell, CellRows(row, ())))
 
 
@@ -336,14 +324,13 @@ def unavailable(cell: Cell) -> str:
     for plugin in (*plugins, *([] if cell.solver is None else [find(SOLVER, cell.solver)])):
         if plugin.conflict:
             return plugin.conflict
-    for plugin in plugins:
-        if missing := plugin.missing:
-            what = f"the {plugin} needs {', '.join(missing)}, which is not installed"
-            return f"{what}: `pip install {' '.join(missing)}`"
     chosen = implementation(cell.problem.arguments.get(FACTORISATION, DEFAULT))
-    if not chosen.is_installed:
-        what = f"the factorisation '{chosen.name}' needs {chosen.distribution}, which is not installed"
-        return f"{what}: `pip install {chosen.distribution}`"
+    needs = [(str(plugin), plugin.missing) for plugin in plugins]
+    needs += [] if chosen.is_installed else [(f"factorisation '{chosen.name}'", [chosen.distribution])]
+    for name, missing in needs:
+        if missing:
+            what = f"the {name} needs {', '.join(missing)}, which is not installed"
+            return f"{what}: `pip install {' '.join(missing)}`"
     if cell.solver is None or cell.solver in installed_solvers(registered(SOLVER)):
         return ""
     return f"the QP solver '{cell.solver}' is not installed: `pip install {solver_distribution(cell.solver)}`"

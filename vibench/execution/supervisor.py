@@ -8,6 +8,7 @@ items loses only the current item.
 from __future__ import annotations
 
 import contextlib
+import mmap
 import os
 import secrets
 import signal
@@ -18,29 +19,135 @@ import tempfile
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import groupby
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from vibench.execution.jobs import (
-    Batch,
-    BatchDone,
-    Begun,
-    CurrentItem,
-    FractionDone,
-    ItemDone,
-    Job,
-    OutOfMemory,
-    Progress,
-    batches,
-)
+from vibench.provenance import libraries, numerical_code
 from vibench.qp.status import Status
-from vibench.stages.base import Done, Failed, ItemwiseStage, Unstored
+from vibench.stages.base import Done, Failed, ItemwiseStage, Stage, Unstored
 from vibench.timing import ONE_THREAD
 
+# Prefix of the reason of a job that exceeds the memory limit; the limit follows.
+OUT_OF_MEMORY = "out of memory: the limit is memory_gib"
+
+
+def code_here() -> str:
+    """The code of vibench that determines numbers, and the libraries, in this process."""
+    return f"{numerical_code()}; {libraries()}"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A stage to be run: the folder of artefacts, the limits of a query and of the stage, and the code expected.
+
+    `lost` are dispensable stages that failed, by key.
+    """
+
+    store: str
+    stage: Stage
+    query_seconds: float
+    cell_seconds: float
+    memory_gib: float
+    lost: Mapping[str, Failed] = field(default_factory=dict)
+    code: str = field(default_factory=code_here)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Work of one process: items of a stage by their numbers, or a stage without items, which may end with it.
+
+    Third-party packages share no process: the items of a stage may need several.
+    """
+
+    packages: frozenset[str]
+    numbers: tuple[int, ...]
+    ends: bool
+
+
+def batches(stage: Stage, done: Container[int]) -> Iterator[Batch]:
+    """The rest of a stage, in the order of its items without those in `done`."""
+    if not isinstance(stage, ItemwiseStage):
+        yield Batch(stage.packages, (), ends=True)
+        return
+    left = [number for number in range(stage.items) if number not in done]
+    grouped = [(packages, tuple(ks)) for packages, ks in groupby(left, lambda k: stage.stage_of(k).packages)]
+    grouped = grouped or [(stage.packages, ())]
+    for k, (packages, numbers) in enumerate(grouped, 1):
+        yield Batch(packages, numbers, ends=k == len(grouped))
+
+
+@dataclass
+class Progress:
+    """Values of the items of a stage that are done, and reasons of those that are lost, by their numbers."""
+
+    done: dict[int, Any] = field(default_factory=dict)
+    lost: dict[int, Failed] = field(default_factory=dict)
+
+
+class CurrentItem:
+    """The current item of a worker, in memory shared with its supervisor by an open file of 8 bytes.
+
+    A message would wake the supervisor before and after every query, which takes longer than a small query.
+    """
+
+    def __init__(self, file: int) -> None:
+        # One number, because it is written at once: count of changes (31 bits), item (31), has a time limit (1).
+        self._memory = memoryview(mmap.mmap(file, 8)).cast("q")
+
+    def leave(self) -> None:
+        """Reset: the worker is in no item."""
+        self._memory[0] = 0
+
+    def enter(self, number: int, *, limited: bool) -> None:
+        """Set the item; `limited` inside an operation that has a time limit of its own."""
+        # The supervisor sees from the count that an operation has ended, although the next one looks the same.
+        changes = (self._memory[0] >> 32) % 2**30 + 1
+        self._memory[0] = changes << 32 | number << 1 | limited
+
+    def read(self) -> tuple[int, int | None, bool]:
+        """Count of changes, the item, and whether its current operation has a time limit."""
+        state = self._memory[0]
+        return state >> 32, state % 2**32 >> 1 if state else None, bool(state & 1)
+
+
+@dataclass(frozen=True)
+class Begun:
+    """The worker has received its job."""
+
+
+@dataclass(frozen=True)
+class FractionDone:
+    """The worker has done this fraction of its stage."""
+
+    fraction: float
+
+
+@dataclass(frozen=True)
+class ItemDone:
+    """The worker has done an item."""
+
+    number: int
+    value: Any
+
+
+@dataclass(frozen=True)
+class BatchDone:
+    """The worker has done a batch that does not end its stage."""
+
+
+@dataclass(frozen=True)
+class OutOfMemory:
+    """The worker has to be replaced: it has no memory left for its work (`failed`) or for another job."""
+
+    failed: Failed | None
+
+
+# Variable in the environment of a worker process and of whatever is started in it; its value is unique.
 MARK = "VIBENCH_WORKER"
-"""Variable in the environment of a worker process and of whatever is started in it; its value is unique."""
 
 
 class StoppedError(Exception):
@@ -56,13 +163,11 @@ class _WorkerLostError(Exception):
 
 
 class _JobState:
-    """Reports of workers on a job: finished items, the fraction done, the deadline of the current item.
+    """Reports of workers on a job: finished items, the fraction done, the deadline of the current item."""
 
-    `grace` are seconds allowed beyond the limit of a query, for the work before and after the solver. `start_seconds`
-    limit the start of a worker process and its imports; on a busy machine that may exceed the limit of a job.
-    """
-
+    # Seconds beyond the limit of a query, for the work before and after the solver.
     grace = 2.0
+    # Seconds of the start of a worker process and its imports; on a busy machine that may exceed the limit of a job.
     start_seconds = 300.0
 
     def __init__(self, job: Job, observe: Callable[[Any], None]) -> None:
@@ -127,18 +232,15 @@ class _JobState:
         return None
 
 
+# The connection to a worker process, the process, the mark of its descendants, and its current item.
 _Worker = tuple[Connection, "subprocess.Popen[bytes]", str, CurrentItem]
-"""The connection to a worker process, the process, the mark of its descendants, and its current item."""
 
 
 class Supervisor:
     """Runs stages, one at a time, in worker processes that it starts, monitors and replaces.
 
-    Every set of third-party packages has a process of its own: whatever they do to it concerns no others. Items of one
-    stage that need several processes are done by these in turn.
-
-    The output of plugins goes to the file `log`, if any. `environment` has variables of worker processes beside those
-    of this one.
+    Every set of third-party packages has a process of its own: whatever they do to it concerns no others. The output of
+    plugins goes to the file `log`, if any. `environment` has variables of worker processes beside those of this one.
     """
 
     def __init__(self, log: Path | None = None, environment: Mapping[str, str] | None = None) -> None:
@@ -278,52 +380,34 @@ def _beyond(name: str, limit: float) -> Failed:
 
 def _cause_of_death(process: subprocess.Popen[bytes]) -> str:
     try:
-        code = process.wait(timeout=5.0)
+        return f"the worker process died with {manner_of_death(process.wait(timeout=5.0))}"
     except subprocess.TimeoutExpired:
         return "the worker process closed its connection"
-    return f"the worker process died with {manner_of_death(code)}"
 
 
 def manner_of_death(code: int) -> str:
-    if code >= 0:
-        return f"exit code {code}"
     names = {number.value: number.name for number in signal.Signals}
-    return f"signal {names.get(-code, -code)}"
+    return f"exit code {code}" if code >= 0 else f"signal {names.get(-code, -code)}"
 
 
 def _environment(parent: Mapping[str, str]) -> dict[str, str]:
     """Environment with one thread for numerical libraries, freed memory kept, and the import path of this process."""
-    path = os.pathsep.join(folder for folder in sys.path if folder)
-    # With these glibc keeps up to 1 GiB of freed memory: large arrays are not mapped page by page every time.
-    kept_memory = {
-        "MALLOC_MMAP_THRESHOLD_": "33554432",
-        "MALLOC_TRIM_THRESHOLD_": "1073741824",
-        "MALLOC_TOP_PAD_": "67108864",
-    }
-    return {**parent, **ONE_THREAD, **kept_memory, "PYTHONPATH": path}
+    # With these (bytes) glibc keeps up to 1 GiB of freed memory: large arrays are not mapped page by page every time.
+    memory = {"MMAP_THRESHOLD": "33554432", "TRIM_THRESHOLD": "1073741824", "TOP_PAD": "67108864"}
+    kept_memory = {f"MALLOC_{name}_": size for name, size in memory.items()}
+    return {**parent, **ONE_THREAD, **kept_memory, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
 
 def kill_marked(mark: str) -> None:
-    """Kill all processes with this value of `MARK` but the calling one.
-
-    A process that became a daemon is in no group or session of the worker, and after the worker's death not among its
-    children. On systems without /proc only the process group ends with a worker.
-    """
+    """Kill all processes with this value of `MARK` but the calling one, daemons included, on systems with /proc."""
+    entry, found = f"{MARK}={mark}".encode(), True
     # Processes may be started during a search. The number is bounded in case one multiplies for ever.
     for _ in range(100):
-        processes = list(_marked(mark))
-        if not processes:
-            return
-        for process in processes:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process, signal.SIGKILL)
-
-
-def _marked(mark: str) -> Iterator[int]:
-    entry = f"{MARK}={mark}".encode()
-    for folder in Path("/proc").glob("[0-9]*"):
-        # Processes of others cannot be read; those that have just ended are not there, or have no environment.
-        with contextlib.suppress(OSError):
-            # Compare whole entries: the mark could be a part of another variable.
-            if int(folder.name) != os.getpid() and entry in (folder / "environ").read_bytes().split(b"\0"):
-                yield int(folder.name)
+        found, searched = False, found
+        for folder in Path("/proc").glob("[0-9]*") if searched else ():
+            # Processes of others cannot be read; those that have just ended are not there, or have no environment.
+            with contextlib.suppress(OSError):
+                # Compare whole entries: the mark could be a part of another variable.
+                if int(folder.name) != os.getpid() and entry in (folder / "environ").read_bytes().split(b"\0"):
+                    found = True
+                    os.kill(int(folder.name), signal.SIGKILL)

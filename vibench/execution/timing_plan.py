@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 
 from vibench.execution.recording import ResultWriter
-from vibench.results.break_even import FEWEST_ROUNDS, BreakEvenComparison, Meaning, compared
+from vibench.results.break_even import FEWEST_ROUNDS, Meaning, compared
 from vibench.results.paired_timing import PairedTiming
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Failed, Row, Stage
@@ -18,11 +18,7 @@ from vibench.timing import Seconds
 
 
 class OfflinePlan:
-    """Repeats of the offline stages of a run: of short ones within a budget, or of all as often as requested.
-
-    `requested` is the number of repeats of every stage at any cost; 0 for two repeats of short stages, within the
-    budget.
-    """
+    """Repeats of the offline stages of a run: of all as often as `requested`, or two of short ones within a budget."""
 
     def __init__(self, store: Store, writer: ResultWriter, requested: int) -> None:
         self._store, self._writer, self._requested = store, writer, requested
@@ -49,22 +45,19 @@ class OfflinePlan:
         self._sources |= stages.keys() & self._costs.keys()
         # Begin with the cheapest: the same budget then repeats most stages.
         known = sorted((key for key in stages if key in self._costs), key=self._costs.__getitem__)
-        planned = []
+        # Repeats may take 30 % of the offline seconds of a run.
+        planned, budget = [], 0.3 * sum(self._costs[key] for key in self._sources)
         for number in self._numbers:
             for key in known:
                 repeat = OfflineRepeat(stages[key], number)
-                if repeat.key not in self._planned and self._afford(self._costs[key]):
+                cost = self._costs[key]
+                # The scatter of a stage above 3 s is that of the others.
+                affordable = self._requested or (cost <= 3.0 and self._spent + cost <= budget)
+                if repeat.key not in self._planned and affordable:
                     self._planned.add(repeat.key)
                     planned.append(repeat)
+                    self._spent += cost
         return planned
-
-    def _afford(self, cost: float) -> bool:
-        # Repeats may take 30 % of the offline seconds of a run. The scatter of a stage above 3 s is that of the others.
-        budget = 0.3 * sum(self._costs[key] for key in self._sources)
-        if not self._requested and (cost > 3.0 or self._spent + cost > budget):
-            return False
-        self._spent += cost
-        return True
 
     def finish(self) -> None:
         phases = [some for goal in self._cells.values() for some in goal.offline_stages.values()]
@@ -75,7 +68,8 @@ class OfflinePlan:
         for cell, goal in self._cells.items():
             row = self._writer.database.cell(cell.key)
             if row is not None and all(one.key in known for some in goal.offline_stages.values() for one in some):
-                self._writer.offline(cell, offline_columns(goal, row["hf_setup_s"], known, deviation))
+                columns = offline_columns(goal, row["hf_setup_s"], known, deviation)
+                self._writer.database.write_columns(cell.key, columns)
 
     def _runs(self, stage: Stage) -> list[Seconds]:
         """The seconds of the first run of a stage and of its repeats; none where its artefact is gone."""
@@ -181,23 +175,20 @@ class TimingPlan:
         for cell, goal in group.members.items():
             # Other cells have no new seconds.
             if goal.key in timed_here:
-                self._write(group, cell, goal)
-                self._paired.add(cell.key, group.rows[goal.key])
+                rows, rounds, failures = group.rows[goal.key], group.rounds[goal.key], group.failures[goal.key]
+                count, everything = len(failures), len(rows) + len(failures)
+                missing = "all" if count == everything else f"{count} of {everything}"
+                lost = f"{missing} rounds: {failures[0].reason}" if failures else ""
+                self._writer.seconds(cell, rows, rounds, group.machines[goal.key], lost)
+                self._paired.add(cell.key, rows)
         # A goal without a single round in this block would fail again.
         timed_now = {goal.key for goal, timed in zip(stage.cells, outcome, strict=True) if timed.rounds}
         following = [goal for goal in self._undecided(group) if goal.key in timed_now]
         if following and group.blocks < len(block_sizes(self._rounds)):
             return self._block(group, stage.session + 1, following)
         for cell in group.members:
-            self._writer.timed(cell, self._rounds)
+            self._writer.database.write_columns(cell.key, {"timing_rounds": self._rounds})
         return None
-
-    def _write(self, group: _Group, cell: Cell, goal: CellQueries) -> None:
-        rows, rounds, failures = group.rows[goal.key], group.rounds[goal.key], group.failures[goal.key]
-        count, everything = len(failures), len(rows) + len(failures)
-        missing = "all" if count == everything else f"{count} of {everything}"
-        lost = f"{missing} rounds: {failures[0].reason}" if failures else ""
-        self._writer.seconds(cell, rows, rounds, group.machines[goal.key], lost)
 
     def _undecided(self, group: _Group) -> list[CellQueries]:
         """The goals with a comparison that further rounds may decide."""
@@ -208,16 +199,14 @@ class TimingPlan:
         undecided: dict[str, CellQueries] = {}
         # A comparison that is tested after every block reaches 5 % only if each test is stricter (Pocock 1977).
         for one in compared(rows, self._paired, tail=0.005):
-            if one.result.meaning is Meaning.UNDECIDED and self._would_help(one, group.first):
+            # Only the seconds of queries, and no offline ones, may be decided by more rounds; their number is an
+            # estimate, for which twice the limit allows.
+            more = one.result.rounds
+            would_help = one.gain is None or (more is not None and group.first + more <= 2.0 * self._rounds)
+            if one.result.meaning is Meaning.UNDECIDED and would_help:
                 both = [one.b["cell"]] if one.a is None else [one.a["cell"], one.b["cell"]]
                 undecided |= {key: cells[key] for key in both}
         return list(undecided.values())
-
-    def _would_help(self, one: BreakEvenComparison, done: int) -> bool:
-        """Whether more rounds may decide a comparison, since it is the seconds of queries that leave it undecided."""
-        # The number of rounds still needed is an estimate, for which twice the limit allows.
-        more = one.result.rounds
-        return one.gain is None or (more is not None and done + more <= 2.0 * self._rounds)
 
 
 def block_sizes(rounds: int) -> list[int]:

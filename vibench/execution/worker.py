@@ -23,7 +23,8 @@ from threadpoolctl import threadpool_limits
 
 from vibench import interrupts
 from vibench.errors import NumericalError, StorageError, UnsupportedError, VibenchError, in_a_line, message_of
-from vibench.execution.jobs import (
+from vibench.execution.supervisor import (
+    MARK,
     OUT_OF_MEMORY,
     Batch,
     BatchDone,
@@ -35,8 +36,8 @@ from vibench.execution.jobs import (
     OutOfMemory,
     Progress,
     code_here,
+    kill_marked,
 )
-from vibench.execution.supervisor import MARK, kill_marked
 from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
 from vibench.stages.base import FAILED_STAGES, PROGRESS, Done, Failed, Items, ItemwiseStage, Unstored
@@ -125,7 +126,10 @@ def perform(
         store = _store(job.store, min(2**30, int(0.125 * job.memory_gib * 2**30)))
         FAILED_STAGES.set(job.lost)
         if isinstance(job.stage, ItemwiseStage):
-            items = _begun(job.stage, store)
+            if job.stage.key not in _last:
+                _last.clear()
+                _last[job.stage.key] = job.stage.begin(store)
+            items = _last[job.stage.key]
             earlier = {number: items.failed(number, failed) for number, failed in progress.lost.items()} | progress.done
             items.resume(earlier)
             done = earlier | _done(job, items, batch, send, enter)
@@ -164,15 +168,8 @@ def _check_code(job: Job, batch: Batch) -> None:
         raise NumericalError(f"{changed[0]} was changed since the run began; run the study again")
 
 
+# Items of the stage that this process has begun and not ended, by its key; other processes may do batches of it.
 _last: dict[str, Items] = {}
-"""Items of the stage that this process has begun and not ended, by its key; other processes may do batches of it."""
-
-
-def _begun(stage: ItemwiseStage, store: Store) -> Items:
-    if stage.key not in _last:
-        _last.clear()
-        _last[stage.key] = stage.begin(store)
-    return _last[stage.key]
 
 
 def _done(job: Job, items: Items, batch: Batch, send: Send, enter: Enter) -> dict[int, Any]:

@@ -24,21 +24,12 @@ from vibench.qp.solve import solve_qp
 # Largest natural residual of a snapshot (`vibench.qp.verification`).
 ACCURACY = 1e-10
 
-FALLBACK_SOLVER = "piqp"
-
 
 @dataclass(frozen=True)
 class ActiveSetSolution:
-    """Solution of (7) at one parameter, not verified yet.
+    """Displacement u (n,) and multiplier λ (m,) at one parameter, not verified yet; λ is exactly zero off contact.
 
-    Attributes
-    ----------
-    u, lam
-        Displacement (n,) and multiplier (m,); the multiplier is exactly zero off the contact set.
-    fallback
-        What was used besides the active set method; "" if nothing.
-    iterations
-        Linear systems solved by the active set method.
+    `fallback` says what was used besides the active set method, "" if nothing; `iterations` counts its linear systems.
     """
 
     u: Array
@@ -49,13 +40,7 @@ class ActiveSetSolution:
 
 @dataclass(frozen=True)
 class HighFidelitySolution(ActiveSetSolution):
-    """Verified solution of (7) at one parameter.
-
-    Attributes
-    ----------
-    residuals
-        Natural KKT residuals, at most `ACCURACY`.
-    """
+    """Verified solution of (7) at one parameter; its natural KKT residuals are at most `ACCURACY`."""
 
     residuals: verification.Residuals
 
@@ -136,7 +121,11 @@ class HighFidelitySolver:
 
     def _start(self, mu: Array) -> Mask | None:
         """The initial active set, which the problem derives from the contact set of the nearest parameter."""
-        start, m = self._problem.start(mu.copy(), self._nearest_contact_set(mu)), self._problem.W.dim
+        nearest: Mask | None = None
+        if self._active:
+            distances = np.linalg.norm((np.array(self._solved) - mu) / self._width, axis=1)
+            nearest = self._active[int(np.argmin(distances))]
+        start, m = self._problem.start(mu.copy(), nearest), self._problem.W.dim
         if isinstance(start, NestedStart):
             if self._coarse is None or self._coarse._problem is not start.coarse:
                 self._coarse = HighFidelitySolver(start.coarse)
@@ -147,12 +136,6 @@ class HighFidelitySolver:
             got = f"the shape {np.shape(start)} and the type {np.asarray(start).dtype}"
             raise NumericalError(f"start returns an array of {got}; expected ({m},) and bool, a NestedStart, or None")
         return start
-
-    def _nearest_contact_set(self, mu: Array) -> Mask | None:
-        if not self._active:
-            return None
-        distances = np.linalg.norm((np.array(self._solved) - mu) / self._width, axis=1)
-        return self._active[int(np.argmin(distances))]
 
     def condensed(self, vi: VariationalInequality) -> CondensedStiffness:
         """The stiffness of `vi` condensed on the constrained unknowns; one object where A is constant."""
@@ -275,13 +258,13 @@ def _without_cycling(
     vi: VariationalInequality, equal: Mask, system: ActiveSetSystem
 ) -> tuple[tuple[Array, Array, int], str]:
     """The solution where active sets cycle, or are linearly dependent, and the name of the fallback."""
-    answer, guess = solve_qp(vi, FALLBACK_SOLVER, ACCURACY), np.zeros(len(vi.g), bool)
+    answer, guess = solve_qp(vi, "piqp", ACCURACY), np.zeros(len(vi.g), bool)
     if not equal.any() and answer.alpha is not None and np.all(np.isfinite(answer.alpha)):
         weights = answer.alpha * row_norms(vi.B)
         guess = weights > 1e-8 * np.max(weights, initial=0.0)
         settled = _solution_everywhere(system, guess)
         if settled is not None:
-            return settled, f"the active set cycled; first guess by {FALLBACK_SOLVER}"
+            return settled, "the active set cycled; first guess by piqp"
     exact = least_distance_solution(vi, SparseCholesky(vi.A, "A"), equal, guess)
     if exact is None:
         raise NumericalError("no active set solves the high-fidelity problem; is it feasible?")

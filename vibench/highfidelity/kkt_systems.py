@@ -89,17 +89,10 @@ ActiveSolver = Callable[[Indices], tuple[Array, Array]]
 
 
 class CondensedStiffness:
-    """A stiffness matrix A, condensed on the unknowns that constraints involve.
+    """A stiffness matrix A (n×n), sparse SPD, condensed on the unknowns that constraints involve.
 
-    Parameters
-    ----------
-    A
-        Sparse SPD (n×n).
-    pattern
-        Retains at least all unknowns that B touches; by default every unknown is retained.
-    factorisation
-        Implementation that eliminates the others (`vibench.linalg.factorisations`); the sparse systems of active sets
-        are SuperLU's.
+    The pattern retains at least all unknowns that B touches; by default every unknown is retained. The `factorisation`
+    eliminates the others; the sparse systems of active sets are SuperLU's.
     """
 
     def __init__(
@@ -250,15 +243,9 @@ class CondensedStiffness:
 class ZoneStiffness(CondensedStiffness):
     """A stiffness matrix A, condensed on the zone that contact reaches, which is found and enlarged as needed.
 
-    Programs are solved on the zone, right-hand sides with a factor of A. All retained unknowns are condensed only where
-    they are asked for.
-
-    Parameters
-    ----------
-    A, pattern, factorisation
-        As for `CondensedStiffness`; the interface is all that is retained.
-    zone
-        Unknowns of the zone, where another stiffness of the problem has found them.
+    Programs are solved on the zone, right-hand sides with a factor of A. All retained unknowns, which are the interface
+    of the pattern, are condensed only where they are asked for. `zone` has the unknowns of the zone, where another
+    stiffness of the problem has found them.
     """
 
     def __init__(
@@ -330,20 +317,12 @@ def condensed_stiffness(
 
 @dataclass(frozen=True)
 class Beyond:
-    """Constraints beyond the zone of a system.
-
-    Attributes
-    ----------
-    vi
-        The variational inequality in all unknowns.
-    watched
-        Rows (m,) that touch no unknown beyond the zone; only these are active.
-    enlarged
-        Gives the system of a larger zone in which some rows (m,) are watched, too.
-    """
+    """Constraints beyond the zone of a system: the variational inequality in all unknowns."""
 
     vi: VariationalInequality
+    # Rows (m,) that touch no unknown beyond the zone; only these are active.
     watched: Mask
+    # Gives the system of a larger zone in which some rows (m,) are watched, too.
     enlarged: Callable[[Mask], ActiveSetSystem]
 
 
@@ -382,17 +361,10 @@ class SaddlePointSolver:
     The system of one active set is factorised. Active sets that differ from it in few constraints reuse the factor,
     bordered by a column per added constraint (its row of B) or removed one (a slack that sets its multiplier to zero).
 
-    Parameters
-    ----------
-    A, f
-        Stiffness, sparse SPD (c×c), and load (c,).
-    B, g
-        Constraints, B sparse (m×c), and their bounds (m,).
-    ordered
-        Extracts A in an elimination order. Where it is given, systems are factorised in this order, with the
-        multipliers last, without pivoting: of A that is a Cholesky factorisation, and what is left for the multipliers
-        is −B_a A⁻¹B_aᵀ, negative definite where the rows are independent. Where it is not, as without an order, rows
-        are exchanged.
+    A is sparse SPD (c×c), B sparse (m×c). Where `ordered`, which extracts A in an elimination order, is given, systems
+    are factorised in this order, with the multipliers last, without pivoting: of A that is a Cholesky factorisation,
+    and what is left for the multipliers is −B_a A⁻¹B_aᵀ, negative definite where the rows are independent. Where it is
+    not, as without an order, rows are exchanged.
     """
 
     def __init__(
@@ -554,14 +526,8 @@ def _regular(schur: Array, sizes: Array) -> bool:
 class ComplianceSolver:
     """Solutions for active sets through the dense compliance B_a C B_aᵀ of their rows; multipliers are refined once.
 
-    Parameters
-    ----------
-    compliance, unconstrained
-        C (c×c), and the unknowns (c,) without constraints.
-    B, g
-        Constraints, B sparse (m×c), and their bounds (m,).
-    rows
-        The constraints (m,) that may be active; all by default.
+    C is (c×c), `unconstrained` are the unknowns (c,) without constraints, B is sparse (m×c). Only some `rows` (m,) may
+    be active, all by default.
     """
 
     def __init__(

@@ -44,21 +44,10 @@ def few_at_once(solve: Callable[[Array], Array], right: Array) -> Array:
 
 
 class SparseCholesky(Factor):
-    """X = FᵀF for a sparse symmetric positive definite X (n×n), in minimum degree order, without pivoting.
+    """X = FᵀF for a sparse symmetric positive definite X (n×n), without pivoting; its symmetry is not checked.
 
-    Parameters
-    ----------
-    matrix
-        X; its symmetry is assumed and not checked.
-    name
-        Its name in error messages.
-
-    Attributes
-    ----------
-    order
-        Unknowns in elimination order, in which F is upper triangular.
-
-    Raises a `NumericalError` if X is not positive definite.
+    F is upper triangular in the minimum degree `order`. Raises a `NumericalError` that calls X by `name` if X is not
+    positive definite.
     """
 
     def __init__(self, matrix: SparseMatrix, name: str = "the matrix") -> None:
@@ -89,11 +78,9 @@ class SparseCholesky(Factor):
         return few_at_once(self._lu.solve, np.ascontiguousarray(right))
 
     def apply_factor(self, u: Array) -> Array:
-        """The product F u for u (n,) or (n, k)."""
         return _scale_rows(self._root, self._lower.T @ u[self.order])
 
     def solve_factor(self, y: Array) -> Array:
-        """The solution F⁻¹ y for y (n,) or (n, k)."""
         u = np.empty_like(y, dtype=float)
         if y.size:
             scaled = _scale_rows(1.0 / self._root, y)
@@ -101,7 +88,6 @@ class SparseCholesky(Factor):
         return u
 
     def solve_factor_transposed(self, right: Array) -> Array:
-        """The solution F⁻ᵀ r for r (n,) or (n, k)."""
         permuted = np.ascontiguousarray(right[self.order])
         if not permuted.size:
             return permuted
@@ -116,18 +102,8 @@ class PartialCholesky(FactoredElimination):
     S = X_cc − L_ci D L_ciᵀ is a dense matrix of its own, and products and factors of it are those of LAPACK. A sparse
     factorisation of all of X would spend most of its time there.
 
-    Parameters
-    ----------
-    matrix
-        X; its symmetry is assumed and not checked.
-    order
-        Elimination order (n,), from `elimination_order`.
-    last
-        How many unknowns c at the end of `order` are not eliminated.
-    name
-        X in error messages.
-
-    Raises a `NumericalError` if X_ii is not positive definite; an indefinite S is detected where it is factorised.
+    The `last` unknowns c of an elimination `order` (n,) are not eliminated. Raises a `NumericalError` if X_ii is not
+    positive definite; an indefinite S is detected where it is factorised.
     """
 
     def __init__(self, matrix: SparseMatrix, order: Indices, last: int, name: str = "the matrix") -> None:
@@ -220,18 +196,16 @@ class PartialCholesky(FactoredElimination):
         if last.size:
             last = scipy.linalg.solve_triangular(self.trailing_factor, last, check_finite=False)
         u[self.order[split:]] = last
-        corner, coupling = self._corner_factor, self._coupling_factor.T
-        first = _scale_rows(1.0 / self._root, y[:split]) - coupling @ last
+        first = _scale_rows(1.0 / self._root, y[:split]) - self._coupling_factor.T @ last
         if first.size:
-            u[self.order[:split]] = _triangular_solutions(corner, first, lower=False)
+            u[self.order[:split]] = _triangular_solutions(self._corner_factor, first, lower=False)
         return u
 
     def solve_factor_transposed(self, right: Array) -> Array:
         right, split = np.ascontiguousarray(right[self.order], dtype=float), self._split
         first, last = right[:split], right[split:]
         if first.any():
-            first = _triangular_solutions(self._corner_factor.T, first, lower=True)
-            first = _scale_rows(1.0 / self._root, first)
+            first = _scale_rows(1.0 / self._root, _triangular_solutions(self._corner_factor.T, first, lower=True))
             last = last - self._coupling_factor @ _scale_rows(self._root, first)
         if last.size:
             last = scipy.linalg.solve_triangular(self.trailing_factor, last, trans="T", check_finite=False)

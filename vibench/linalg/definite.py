@@ -1,7 +1,4 @@
-"""Symmetric positive definite matrices: dense ones of blocks, and the interface of sparse factorisations.
-
-Bodies that do not touch have a block each.
-"""
+"""Symmetric positive definite matrices: dense ones, with a block for each body, and the interface of sparse factors."""
 
 from __future__ import annotations
 
@@ -24,14 +21,9 @@ MANY_UNKNOWNS = 1500
 
 @dataclass(frozen=True)
 class BlockDiagonal:
-    """A matrix (c×c) that is zero between sets of unknowns.
+    """A matrix (c×c), c being its `size`, that is zero between disjoint sets of unknowns.
 
-    Attributes
-    ----------
-    size
-        c.
-    blocks
-        Disjoint sets of unknowns (k,), rising, that are all of them together, and the blocks (k×k) of the matrix there.
+    `blocks` are the sets (k,), rising, which cover all unknowns, and the blocks (k×k) of the matrix there.
     """
 
     size: int

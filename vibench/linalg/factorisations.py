@@ -1,7 +1,6 @@
 """Factorisations of sparse symmetric positive definite matrices: one interface and its implementations.
 
-A factor solves; an elimination condenses a matrix on some unknowns. Every implementation that factorises without
-pivoting proves that a matrix is positive definite, see `vibench.linalg.proofs`.
+A factor solves; an elimination condenses a matrix on some unknowns.
 """
 
 from __future__ import annotations
@@ -29,16 +28,10 @@ class _Empty(Factor):
 
 
 class Implementation(ABC):
-    """A library that factorises without pivoting.
+    """A library that factorises without pivoting, with its `name` in studies and a line about it.
 
-    All methods raise a `NumericalError` that calls the matrix by `name` if it is not positive definite.
-
-    Attributes
-    ----------
-    name, summary
-        Name in studies, and one line about it.
-    distribution
-        The distribution it needs; "" if vibench needs that anyway.
+    `distribution` is what it needs; "" if vibench needs that anyway. All methods raise a `NumericalError` that calls
+    the matrix by a name if it is not positive definite.
     """
 
     name: ClassVar[str]
@@ -185,18 +178,16 @@ class EliminationBySolutions(Elimination):
         for body in np.unique(bodies[split:]):
             inside = np.flatnonzero(bodies == body)
             unknowns = inside[inside >= split] - split
-            blocks.append((unknowns, self._schur(sp.csc_array(self._matrix[inside][:, inside]), len(unknowns))))
+            matrix, eliminated = sp.csc_array(self._matrix[inside][:, inside]), len(inside) - len(unknowns)
+            schur = matrix[eliminated:, eliminated:].toarray(order="F")
+            if eliminated:
+                coupling = matrix[:eliminated, eliminated:]
+                factor = self._chosen.factorise(matrix[:eliminated, :eliminated], self._name)
+                # Solve for some columns at once: the dense right-hand side of all may not fit in memory.
+                for columns in (slice(first, first + 128) for first in range(0, len(unknowns), 128)):
+                    schur[:, columns] -= coupling.T @ factor.solve(coupling[:, columns].toarray())
+            blocks.append((unknowns, np.asarray(0.5 * (schur + schur.T))))
         return BlockDiagonal(len(self._order) - split, tuple(blocks))
-
-    def _schur(self, matrix: SparseMatrix, count: int) -> Array:
-        split = matrix.shape[0] - count
-        schur = matrix[split:, split:].toarray(order="F")
-        if split:
-            factor, coupling = self._chosen.factorise(matrix[:split, :split], self._name), matrix[:split, split:]
-            # Columns of a dense right-hand side that are solved for at once: all of them may not fit in memory.
-            for columns in (slice(first, first + 128) for first in range(0, count, 128)):
-                schur[:, columns] -= coupling.T @ factor.solve(coupling[:, columns].toarray())
-        return np.asarray(0.5 * (schur + schur.T))
 
     def eliminate(self, right: Array) -> tuple[Array, Array]:
         first, last = np.asarray(right[self._order[: self._split]], float), right[self._order[self._split :]]

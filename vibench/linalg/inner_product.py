@@ -1,7 +1,4 @@
-"""Inner products with a sparse Gram matrix: norms, Riesz representers, orthonormal bases, numerical rank.
-
-Bases and ranks are those of small dense matrices, often nearly rank-deficient, in coordinates of Euclidean norm.
-"""
+"""Inner products with a sparse Gram matrix: norms, Riesz representers, orthonormal bases, numerical rank."""
 
 from __future__ import annotations
 
@@ -20,9 +17,6 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.definite import Factor
 from vibench.linalg.factorisations import DEFAULT, implementation
 from vibench.text import brief
-
-# Differences of two entries of a symmetric matrix, relative to its largest entry, up to this are round-off.
-SYMMETRY_RTOL = 1e-12
 
 RANK_RTOL = 1e-12
 """Directions below this fraction of the largest one are round-off and are dropped from every orthonormal basis."""
@@ -119,11 +113,10 @@ class InnerProduct:
 
     def _refuse_others(self, u: Array) -> None:
         """Refuse an array without one row for each dimension of the space."""
-        shape = getattr(u, "shape", ())
-        if shape[:1] != self.matrix.shape[:1] or len(shape) > 2:
+        shape, n = getattr(u, "shape", ()), self.dim
+        if shape[:1] != (n,) or len(shape) > 2:
             what = f"an array of the shape {shape}" if shape else brief(repr(u), 80)
-            right = f"({self.dim},) or ({self.dim}, k)"
-            raise RequestError(f"{what} is not of a space of dimension {self.dim}, expected the shape {right}")
+            raise RequestError(f"{what} is not of a space of dimension {n}, expected the shape ({n},) or ({n}, k)")
 
     def apply(self, u: Array) -> Array:
         """The product X u for u (n,) or (n, k)."""
@@ -188,9 +181,9 @@ def orthogonal_factorisation(X: SparseMatrix, y: Array) -> tuple[Array, Array]:
 
 def asymmetry(matrix: SparseMatrix) -> float:
     """Largest difference of an entry of a square matrix from that of its transpose; 0.0 if it is round-off."""
-    scale = abs(matrix).max() if matrix.nnz else 0.0
     off = float(abs(matrix - matrix.T).max()) if matrix.nnz else 0.0
-    return off if off > SYMMETRY_RTOL * scale else 0.0
+    # Assembly sums the two entries in different orders: differences relative to the largest entry are round-off.
+    return off if off and off > 1e-12 * abs(matrix).max() else 0.0
 
 
 def check_symmetric(matrix: SparseMatrix, name: str) -> None:

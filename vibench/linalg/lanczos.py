@@ -19,14 +19,8 @@ class Lanczos:
     """Lanczos iterations that continue where they ended.
 
     A more accurate eigenvalue costs only the missing iterations, and the other end of the spectrum often none. After 60
-    vectors the iterations start again from the Ritz vector, at most 20 times.
-
-    Parameters
-    ----------
-    apply
-        From v (n,) to T v, self-adjoint in the inner product of M.
-    M
-        Sparse symmetric positive definite (n×n).
+    vectors the iterations start again from the Ritz vector, at most 20 times. `apply` maps v (n,) to T v, self-adjoint
+    in the inner product of a sparse symmetric positive definite M (n×n).
     """
 
     def __init__(self, apply: Callable[[Array], Array], M: SparseMatrix) -> None:

@@ -67,7 +67,7 @@ class _Factorised:
 
 
 class PardisoFactor(_Factorised, Factor):
-    """A factor; a `NumericalError` says that the matrix is not positive definite."""
+    """A factor by PARDISO."""
 
     def __init__(self, matrix: SparseMatrix, name: str) -> None:
         super().__init__(matrix, name, 0)
@@ -80,11 +80,7 @@ class PardisoFactor(_Factorised, Factor):
 
 
 class PardisoElimination(_Factorised, FactoredElimination):
-    """One factorisation for the Schur complement and for solutions.
-
-    The solution with L gives the loads of the Schur complement, that with Lᵀ begins there. Vectors L⁻¹ℓ of functionals
-    have the inner products of these in X_ii⁻¹.
-    """
+    """One factorisation for the Schur complement and for solutions: with L until its loads, with Lᵀ from there."""
 
     def __init__(self, matrix: SparseMatrix, order: Indices, last: int, name: str) -> None:
         self._matrix = checked(sp.csr_array(matrix)[order][:, order], name)
@@ -98,7 +94,7 @@ class PardisoElimination(_Factorised, FactoredElimination):
 
     def schur_blocks(self) -> BlockDiagonal:
         bodies = connected_components(self._matrix, directed=False)[1][self._split :]
-        if np.all(bodies == bodies[0]):
+        if np.all(bodies == bodies[0]):  # saves a copy of a large matrix
             return BlockDiagonal(len(bodies), ((np.arange(len(bodies)), self._schur),))
         sets = [np.flatnonzero(bodies == body) for body in np.unique(bodies)]
         return BlockDiagonal(len(bodies), tuple((each, self._schur[np.ix_(each, each)]) for each in sets))

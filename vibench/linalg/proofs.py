@@ -39,12 +39,10 @@ from vibench.linalg.factorisations import DEFAULT, Implementation
 def is_proved_definite(parts: Sequence[SparseMatrix], chosen: Implementation, order: Indices | None = None) -> bool:
     """Prove that a sum of symmetric matrices (n×n) is positive definite, whatever the round-off.
 
-    By default a narrow band is factorised, or the inertia is computed, with SuperLU in an `order` (n,) if given. All
-    that is known of other implementations is that they compute a Cholesky factorisation. If it succeeds for the
-    computed D⁻¹XD⁻¹ − cI, D² being the diagonal of X, then X is definite. Here c is the sum of the round-off of
-    summing and scaling and of the factorisation, Σ_j γ / (1 − γ) with γ_k of k = t_j + 1 and t_j entries in column j of
-    the factor (Rump 2006, §2): about u times the number of all entries. An LU factorisation has no such bound, since
-    its two factors differ by round-off.
+    By default a narrow band is factorised, or the inertia is computed, with SuperLU in an `order` (n,) if given. Other
+    implementations are only known to compute a Cholesky factorisation. If it succeeds for the computed D⁻¹XD⁻¹ − cI,
+    D² being the diagonal of X, then X is definite. Here c is the sum of the round-off of summing and scaling and of the
+    factorisation, Σ_j γ / (1 − γ) with γ_k of k = t_j + 1 and t_j entries in column j of the factor (Rump 2006, §2).
     """
     if chosen.name == DEFAULT:
         if (proved := _proved_by_band(parts)) is not None:
@@ -73,10 +71,8 @@ def is_proved_definite(parts: Sequence[SparseMatrix], chosen: Implementation, or
 def _proved_by_band(parts: Sequence[SparseMatrix]) -> bool | None:
     """Prove by a banded Cholesky factorisation that a sum of matrices (n×n) is definite; `None` if its band is wide.
 
-    If the factorisation of the computed D⁻¹XD⁻¹ − cI succeeds, D² being about the diagonal of X, then X is definite.
-    Here c is at least the sum of the round-off of summing and scaling and of the factorisation, γ_k / (1 − γ_k) times
-    the diagonal, about 1, for each of the n columns, with k = b + 2 for b diagonals beside the main
-    one (Rump 2006, §2).
+    As for Cholesky factors of other implementations, c being the sum of the round-off of summing and scaling and of the
+    factorisation, with k = b + 2 in each of the n columns for b diagonals beside the main one.
     """
     # Use the transpose of CSC matrices: the symmetric part is the same and a conversion would cost more than the proof.
     rows = [part.T if part.format == "csc" else sp.csr_array(part) for part in parts]
@@ -132,16 +128,10 @@ def _band_places(pointers: bytes, indices: bytes, kind: str) -> _Places | None:
 
 
 def proved_positive(parts: Sequence[SparseMatrix], scale: Array, order: Indices | None = None) -> int:
-    """Number of positive eigenvalues that a sum of symmetric matrices (n×n) has at least; 0 where nothing is proved.
+    """Number of positive eigenvalues that a sum of symmetric parts (n×n) has at least; 0 where nothing is proved.
 
-    Parameters
-    ----------
-    parts
-        Q₁, …, Q_p; the sum is that of their symmetric parts.
-    scale
-        s > 0 (n,): roots of typical diagonal entries. The proof needs eigenvalues of S⁻¹QS⁻¹ away from round-off.
-    order
-        Elimination order (n,); by default minimum degree.
+    `scale` is s > 0 (n,), the roots of typical diagonal entries: the proof needs eigenvalues of S⁻¹QS⁻¹ away from
+    round-off. The elimination `order` (n,) is minimum degree by default.
     """
     columns = [sp.csc_array(part) for part in parts]
     if not all(np.all(np.isfinite(part.data)) for part in columns):

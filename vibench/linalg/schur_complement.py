@@ -21,18 +21,11 @@ FEW_PER_UNKNOWN = 0.25
 
 @dataclass(frozen=True)
 class EliminationPattern:
-    """Retained unknowns, and the elimination order of the others, for one sparsity pattern.
+    """Retained unknowns (c,), rising, and the elimination order of the others, for one sparsity pattern.
 
-    Attributes
-    ----------
-    retained
-        Unknowns (c,) that the system is condensed on, rising.
-    order
-        Elimination order of all others, followed by the interface: the retained unknowns that couple to others.
-    interface
-        Positions of the interface among the retained unknowns.
-    whole
-        Extracts the whole matrix in an elimination order, where no unknown is eliminated; `None` elsewhere.
+    The `order` of all others ends with the interface: the retained unknowns that couple to others. `interface` are its
+    positions among the retained unknowns. `whole` extracts the whole matrix in an elimination order, where no unknown
+    is eliminated.
     """
 
     retained: Indices
@@ -87,14 +80,9 @@ class EliminationPattern:
 
 
 class PrincipalSubmatrix:
-    """Extracts the rows and columns of chosen unknowns from many square matrices.
+    """Extracts the rows and columns of chosen unknowns, in their order, from many square matrices.
 
     The positions of the entries are found once per sparsity pattern; after that, extraction copies entries.
-
-    Parameters
-    ----------
-    chosen
-        Unknowns, in the order they have in the submatrix.
     """
 
     def __init__(self, chosen: Indices) -> None:
@@ -119,15 +107,7 @@ class PrincipalSubmatrix:
 
 
 class StaticCondensation:
-    """A stiffness matrix A condensed on the retained unknowns of a pattern.
-
-    Parameters
-    ----------
-    A, pattern
-        The matrix (n×n) and its elimination pattern.
-    factorisation
-        Implementation that eliminates (`vibench.linalg.factorisations`).
-    """
+    """A stiffness matrix A (n×n) condensed on the retained unknowns of a pattern, by a named factorisation."""
 
     def __init__(self, A: SparseMatrix, pattern: EliminationPattern, factorisation: str = DEFAULT) -> None:
         self._pattern, self._size = pattern, A.shape[0]

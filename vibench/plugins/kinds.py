@@ -28,20 +28,12 @@ class PluginKind(StrEnum):
         kind.cli_name, kind.module, kind._base = cli_name, module, base
         return kind
 
-    PROBLEM = "problem", "problems", "problems", "problem", "problem", "vibench.interfaces.problem:Problem"
-    SAMPLING = (
-        "sampling strategy", "sampling", "sampling", "sampling", "sampling", "vibench.interfaces.strategies:Sampling",
-    )  # fmt: skip
-    PRIMAL = (
-        "primal strategy", "primal", "primal_strategies", "primal", "strategy",
-        "vibench.interfaces.strategies:PrimalStrategy",
-    )  # fmt: skip
-    DUAL = (
-        "dual strategy", "dual", "dual_strategies", "dual", "strategy", "vibench.interfaces.strategies:DualStrategy",
-    )  # fmt: skip
+    PROBLEM = "problem", "problems", "problems", "problem", "problem", "problem:Problem"
+    SAMPLING = "sampling strategy", "sampling", "sampling", "sampling", "sampling", "strategies:Sampling"
+    PRIMAL = "primal strategy", "primal", "primal_strategies", "primal", "strategy", "strategies:PrimalStrategy"
+    DUAL = "dual strategy", "dual", "dual_strategies", "dual", "strategy", "strategies:DualStrategy"
     FORMULATION = (
-        "formulation", "formulations", "formulations", "formulation", "formulation",
-        "vibench.interfaces.formulations:Formulation",
+        "formulation", "formulations", "formulations", "formulation", "formulation", "formulations:Formulation",
     )  # fmt: skip
     STUDY = "study", "studies", "studies"
     SOLVER = "QP solver", "solvers", "qp_solvers", "solver", "solver"
@@ -49,10 +41,10 @@ class PluginKind(StrEnum):
     @cached_property
     def base(self) -> type | None:
         """Abstract base class of its plugins; `None` where they are not classes."""
-        return resolve_name(self._base) if self._base else None
+        return resolve_name(f"vibench.interfaces.{self._base}") if self._base else None
 
 
 PROBLEM, SAMPLING, PRIMAL, DUAL, FORMULATION, STUDY, SOLVER = PluginKind
 
+# Kinds that `vibench check` and `vibench new` know, by their names on the command line.
 CHECKED = {kind.cli_name: kind for kind in PluginKind if kind.cli_name}
-"""Kinds that `vibench check` and `vibench new` know, by their names on the command line."""

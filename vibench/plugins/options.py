@@ -83,10 +83,7 @@ def named_path(path: Any) -> tuple[Any, Any]:
 
 @cache
 def options_of(plugin: Any) -> Mapping[str, Option]:
-    """The options of a class, by name.
-
-    Raises a `RequestError` if an annotation cannot be evaluated.
-    """
+    """The options of a class, by name; raises a `RequestError` if an annotation cannot be evaluated."""
     constructor = inspect.getattr_static(plugin, "__init__")
     if constructor is object.__init__:
         return {}
@@ -101,7 +98,7 @@ def options_of(plugin: Any) -> Mapping[str, Option]:
 
 
 def checked_arguments(plugin: type, what: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of a class, converted to the types of its constructor's annotations; `what` names it in messages.
+    """Options of a class, called `what` in messages, converted to the types of its constructor's annotations.
 
     Raises a `RequestError` if an option is unknown, missing, or not of its type.
     """
@@ -162,8 +159,13 @@ def keys(schema: Mapping[str, Any], link: Callable[[str], str] = lambda _: "tabl
     for table, model in {"": schema, **schema["$defs"]}.items():
         required = model.get("required", [])
         for name, field in model["properties"].items():
-            words = _expected(field, link)
-            yield Key(table, name, words, name in required, _preset(field.get("default")), field["description"])
+            words, preset = _expected(field, link), field.get("default")
+            # A name may stand for an entry.
+            if isinstance(preset, list) and preset and isinstance(preset[0], dict):
+                preset = [entry["name"] for entry in preset]
+            absent = preset in (None, "", {}) or (isinstance(preset, dict) and "query_seconds" in preset)
+            default = "" if absent else json.dumps(preset)
+            yield Key(table, name, words, name in required, default, field["description"])
 
 
 def places(schema: Mapping[str, Any], model: str) -> list[str]:
@@ -172,15 +174,6 @@ def places(schema: Mapping[str, Any], model: str) -> list[str]:
     tables = [schema, *schema["$defs"].values()]
     holders = [key for table in tables for key, field in table["properties"].items() if reference in json.dumps(field)]
     return list(dict.fromkeys(holders))
-
-
-def _preset(value: Any) -> str:
-    if value in (None, "", {}) or (isinstance(value, dict) and "query_seconds" in value):
-        return ""
-    # A name may stand for an entry.
-    if isinstance(value, list) and value and isinstance(value[0], dict):
-        value = [entry["name"] for entry in value]
-    return json.dumps(value)
 
 
 def _expected(schema: Mapping[str, Any], link: Callable[[str], str]) -> str:

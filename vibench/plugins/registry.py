@@ -26,16 +26,15 @@ if TYPE_CHECKING:
     from vibench.qp.verification import QPSolver
 
 
+# Option of every problem, in addition to those of its constructor.
 FACTORISATION = "factorisation"
-"""Option of every problem, in addition to those of its constructor."""
 
 
 @dataclass(frozen=True)
 class RegisteredPlugin:
-    """The entry points of a name.
+    """The entry points of a name: several if packages register different objects, none if nobody does.
 
-    There are several if packages register different objects, and none if nobody does, as for the QP solvers of
-    qpsolvers. Both are refused only when the plugin is loaded.
+    Both are refused only when the plugin is loaded; QP solvers of qpsolvers have none.
     """
 
     kind: PluginKind
@@ -48,10 +47,9 @@ class RegisteredPlugin:
     @property
     def origins(self) -> list[str]:
         """Distributions that provide it, with version: "vibench 0.1.0"."""
-        registered = [
-            f"{one.dist.name} {one.dist.version}" if one.dist is not None else "unknown" for one in self.entries
-        ]
-        return ["qpsolvers", *registered] if self._in_qpsolvers else registered
+        owners = (one.dist for one in self.entries)
+        named = ["unknown" if owner is None else f"{owner.name} {owner.version}" for owner in owners]
+        return ["qpsolvers", *named] if self._in_qpsolvers else named
 
     @property
     def origin(self) -> str:
@@ -130,9 +128,7 @@ class RegisteredPlugin:
 
     @cached_property
     def code(self) -> str:
-        """Version with a hash of its outermost package, or of its module outside packages.
-
-        For an ambiguous name these are all versions: nothing is computed with it.
+        """Version with a hash of its outermost package or module; all versions for an ambiguous name.
 
         Raises a `RequestError` if no plugin has the name.
         """
@@ -176,10 +172,7 @@ class RegisteredPlugin:
         return checked_arguments(self.load(), str(self), own) | chosen
 
     def _without_factorisation(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
-        """Options without `factorisation`, and this option if it is not the default.
-
-        Raises a `RequestError` for an unknown factorisation.
-        """
+        """Options without `factorisation`, which has to exist, and this option if it is not the default."""
         if self.kind is not PROBLEM or FACTORISATION not in given or FACTORISATION in self.options:
             return dict(given), {}
         from vibench.linalg.factorisations import DEFAULT, implementation
@@ -198,19 +191,13 @@ class RegisteredPlugin:
         )
 
     def data_digest(self, options: Mapping[str, Any]) -> str:
-        """Digest of the files that it reads with these options; "" if it reads none, or is not available here.
-
-        Raises a `RequestError` if one of the files cannot be read.
-        """
+        """Digest of the files that it reads with these options; "" if it reads none, or is not available here."""
         if self.kind not in (PROBLEM, SAMPLING) or self.conflict or self.missing:
             return ""
         return str(self.load().data_digest(**self._without_factorisation(self.check_options(options))[0]))
 
     def create(self, options: Mapping[str, Any]) -> Any:
-        """An instance, its options checked.
-
-        Raises a `RequestError` if there is no such plugin, or it does not take these options.
-        """
+        """An instance; raises a `RequestError` if there is no such plugin, or it does not take these options."""
         own, chosen = self._without_factorisation(self.check_options(options))
         if not chosen:
             return self.load()(**own)
@@ -241,9 +228,7 @@ def registered(kind: PluginKind) -> dict[str, RegisteredPlugin]:
 def default_formulation() -> str:
     """Name of the formulation of studies that name none: the one whose class says `is_default = True`; "" without any.
 
-    The class is read, not imported: results are shown by this name.
-
-    Raises a `RequestError` if there are several.
+    The class is read, not imported: results are shown by this name. Raises a `RequestError` if there are several.
     """
     names = [
         name
@@ -264,9 +249,7 @@ def _is_default(module: str, name: str) -> bool:
 
 
 def find_named(text: str, kinds: Mapping[str, PluginKind], solvers: Sequence[str]) -> RegisteredPlugin:
-    """The plugin that NAME or KIND:NAME refers to, of kinds by their names on the command line.
-
-    `solvers` are the installed QP solvers, including plugins.
+    """The plugin that NAME or KIND:NAME refers to, of kinds by their command line names and of installed QP solvers.
 
     Raises a `RequestError` if there is no such plugin, or several.
     """

@@ -2,11 +2,10 @@
 
 Rows b u ≤ g and −c b u ≤ g', c > 0, with c g + g' = 0 are the equality b u = g. No u satisfies both by a margin, and
 they are linearly dependent. An equality in their place, with a multiplier of any sign, has neither defect: its positive
-part belongs to the one row, its negative part to the other. Rows that are absent constrain nothing.
+part belongs to the one row, its negative part to the other.
 
-Programs are solved as least distance problems. Reduced ones are solved as a whole: the part of an error that a QP
-solver makes is measured against these solutions. For large sparse ones, constraints are added that the solution so far
-violates.
+Programs are solved as least distance problems: reduced ones as a whole, as a reference for QP solvers; large sparse
+ones with the constraints that the solution so far violates.
 """
 
 from __future__ import annotations
@@ -33,24 +32,14 @@ ROUND_OFF = 1e-12
 
 @dataclass(frozen=True)
 class Rows:
-    """The rows that matter.
-
-    Attributes
-    ----------
-    kept
-        Their numbers (k,), rising.
-    equal
-        Which of them are equalities (k,).
-    opposite, ratio
-        For equalities the row on the other side (k,), and the length of this row over that of the other.
-    implied
-        Rows (m,) that need no check of their own: equalities, those parallel to them, and absent ones.
-    """
+    """The rows that matter: their numbers `kept` (k,), rising, and which of them are equalities (k,)."""
 
     kept: Indices
     equal: Mask
+    # For equalities the row on the other side (k,), and the length of this row over that of the other.
     opposite: Indices
     ratio: Array
+    # Rows (m,) that need no check of their own: equalities, those parallel to them, and absent ones.
     implied: Mask
 
     @property
@@ -74,17 +63,11 @@ class Rows:
 
 @dataclass(frozen=True)
 class Directions:
-    """Rows of one matrix that are parallel.
+    """Rows of one matrix that are parallel."""
 
-    Attributes
-    ----------
-    lengths
-        Euclidean norms (m,) of all rows.
-    members, group, side
-        The rows (p,) that are parallel to others, the number of the direction of each, and its sign in it.
-    """
-
+    # Euclidean norms (m,) of all rows.
     lengths: Array
+    # The rows (p,) that are parallel to others, the number of the direction of each, and its sign in it.
     members: Indices
     group: Indices
     side: Array
@@ -122,14 +105,9 @@ def rows_that_matter(
 ) -> Rows:
     """Find the rows of B (m×n) and g (m,) that matter: the tightest of parallel ones, one equality for opposite ones.
 
-    Parameters
-    ----------
-    room
-        Opposite rows are an equality where there is at most this room (m,) between them, in the unit of g.
-    preferred
-        An equality is represented by the row with the larger of these (m,), in units of its length.
-    directions
-        Those of the rows that are not absent, where they are known.
+    Opposite rows are an equality where there is at most some `room` (m,) between them, in the unit of g. It is
+    represented by the row with the larger entry of `preferred` (m,), in units of its length. `directions` are those of
+    the rows that are not absent, where they are known.
     """
     m = len(g)
     dropped, equal, opposite, ratio = is_absent(g), np.zeros(m, bool), np.arange(m), np.ones(m)
@@ -224,15 +202,10 @@ def least_distance_solution(
 ) -> tuple[Array, Array] | None:
     """Find the solution u (n,) and λ (m,) of a sparse program whose constraints may be dependent; `None` if it fails.
 
-    Parameters
-    ----------
-    vi, factor
-        A, f, B and g, and the Cholesky factor of A.
-    equal, start
-        Constraints that hold as equalities (m,), with multipliers of any sign, and those to begin with (m,).
+    `factor` is that of A. Constraints that are `equal` (m,) have multipliers of any sign; those in `start` (m,) come
+    first.
     """
     B, lengths = sp.csr_array(vi.B), row_norms(vi.B)
-    tolerance = ROUND_OFF * lengths
     chosen, load = start | equal, factor.solve_factor_transposed(vi.f)
     for _ in range(20):  # constraints are added so often; each time all violated ones are
         rows = np.flatnonzero(chosen)
@@ -244,7 +217,7 @@ def least_distance_solution(
         lam = np.zeros(len(vi.g))
         lam[rows] = forces / lengths[rows]
         u = factor.solve(vi.f - B.T @ lam)
-        violated = ~chosen & (B @ u - vi.g > tolerance * (size(u) + np.abs(vi.g) / lengths))
+        violated = ~chosen & (B @ u - vi.g > ROUND_OFF * lengths * (size(u) + np.abs(vi.g) / lengths))
         if not violated.any():
             return u, lam
         chosen |= violated

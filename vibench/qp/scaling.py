@@ -47,16 +47,10 @@ def ratio(value: float, scale: float) -> float:
 
 
 class Drive(NamedTuple):
-    """Whether the load or the constraints determine the size of the solution, and this size in the units of the data.
+    """Sizes of x and of the forces on its entries, as the load or the violated constraints prescribe them.
 
-    Constraints that are satisfied at 0 have no part in it, however far they are.
-
-    Attributes
-    ----------
-    length, force
-        Sizes of x and of forces on its entries: those of the load, or of what violated constraints prescribe.
-    loaded
-        Whether there is a load beyond round-off, such as −A·lift for a rigid lift.
+    Constraints that are satisfied at 0 have no part in it, however far they are. `loaded` is true for a load beyond
+    round-off, such as −A·lift for a rigid lift.
     """
 
     length: float
@@ -108,14 +102,7 @@ class Units:
     """Units in which the data of a program are of order one: absolute tolerances of solvers are relative ones there.
 
     With y = x / length and multipliers in units of force, a program reads min ½ yᵀA'y − f'ᵀy, B'y ≤ g', where
-    A' = A·length/force, f' = f/force, B'_i = B_i/‖B_i‖ and g'_i = g_i/(‖B_i‖·length).
-
-    Attributes
-    ----------
-    rows
-        Norms ‖B_i‖ (m,).
-    length, force
-        Units of x and of f.
+    A' = A·length/force, f' = f/force, B'_i = B_i/‖B_i‖ and g'_i = g_i/(‖B_i‖·length); `rows` are the ‖B_i‖ (m,).
     """
 
     rows: Array

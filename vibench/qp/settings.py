@@ -18,24 +18,15 @@ if TYPE_CHECKING:  # completion asks for the list of solvers, which needs no Num
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """Settings of one solver.
+    """Settings of one solver; `status` and `iterations` are paths into `solution.extras`, "" where there are none."""
 
-    Attributes
-    ----------
-    at
-        From a relative accuracy to keyword arguments.
-    status, iterations
-        Paths into `solution.extras`, as "info.status"; "" where the solver reports none.
-    start
-        Keyword arguments for a warm start from x (n,), α (m,), if the solver has one.
-    bounds
-        Whether bounds of the unknowns take it less time than rows of a matrix.
-    """
-
+    # From a relative accuracy to keyword arguments.
     at: Callable[[float], dict[str, Any]]
     status: str = ""
     iterations: str = ""
+    # Keyword arguments for a warm start from x (n,), α (m,), if the solver has one.
     start: Callable[[Array, Array], Mapping[str, Any]] | None = None
+    # Bounds of the unknowns take some solvers less time than rows of a matrix.
     bounds: bool = False
 
     def report(self, solution: Any) -> tuple[str, int | None]:
@@ -43,9 +34,8 @@ class SolverSettings:
         status = _follow(solution.extras, self.status)
         text = ("found" if solution.found else "not found") if status is None else str(status)
         count = _follow(solution.extras, self.iterations)
-        if isinstance(
-            count, int
-        ):  # first, because the tests for abstract classes below cost as much as a small program
+        # First, because the tests for abstract classes below cost as much as a small program.
+        if isinstance(count, int):
             return text, count
         while isinstance(count, Sequence) or getattr(count, "shape", None):
             count = count[0]

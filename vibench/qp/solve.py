@@ -69,14 +69,11 @@ def _daqp(
     return DirectSolution(x, -info["lam"] if bounds else info["lam"], found=True, extras={})
 
 
+# Solvers that take dense programs without qpsolvers, whose checks and conversions cost a third of a small program.
+# Every program gets a solver object of its own: updated in place, it would keep what it adapted to the program before
+# (step sizes, equilibration), and answers would depend on earlier programs of the process, by up to 1e-5. Where
+# `bounds` is set B is minus the identity, and bounds take these solvers less time than rows.
 DIRECT: Mapping[str, Callable[..., DirectSolution]] = {"piqp": _piqp, "daqp": _daqp}
-"""Solvers that take dense programs without qpsolvers, whose checks and conversions cost a third of a small program.
-
-Every program gets a solver object of its own. Updating one object in place would save 3 of 215 µs with PIQP, but OSQP,
-Clarabel and PIQP would keep what they adapted to the program before (step sizes, equilibration): their answers would
-depend on earlier programs of the process, by up to 1e-5. Settings and a start are keywords. Where `bounds` is set B is
-minus the identity, and bounds take these solvers less time than rows.
-"""
 
 
 def solve_qp(
@@ -212,10 +209,8 @@ def _solve_dual(
 
 def _solve_factor(L: Array, right: Array, *, transposed: bool = False) -> Array:
     """The solution L⁻¹ r or L⁻ᵀ r for r (n,) or (n×k), which may be overwritten, without a copy of L."""
-    by_column = L.flags.f_contiguous
-    solution, _ = dtrtrs(
-        L if by_column else L.T, right, lower=by_column, trans=transposed is by_column, overwrite_b=True
-    )
+    lower = L.flags.f_contiguous
+    solution, _ = dtrtrs(L if lower else L.T, right, lower=lower, trans=transposed is lower, overwrite_b=True)
     return np.asarray(solution)
 
 

@@ -72,15 +72,6 @@ class QPSolver(Protocol):
 class Residuals:
     """Natural KKT residuals, recomputed from the solution; see above.
 
-    Attributes
-    ----------
-    primal
-        Largest energy norm that the correction of one violated row takes, over S.
-    dual
-        ‖f − A x − Bᵀα‖_{A⁻¹} over S.
-    gap
-        |αᵀ(B x − g)| over S².
-
     The solution 0 of a program without load, whose constraints are satisfied there, has the residuals 0.
     """
 
@@ -145,12 +136,8 @@ def _extended(array: Any) -> Any:
     return type(array)((array.data.astype(np.longdouble), array.indices, array.indptr), shape=array.shape)
 
 
-def solution_energy(program: VariationalInequality, x: Array, alpha: Array, norms: DualNorms) -> float:
-    """The energy S of a solution x (n,), α (m,)."""
-    return _energy(program, x, float(norms((program.B.T @ alpha)[:, None])[0]))
-
-
 def _energy(program: VariationalInequality, x: Array, force: float) -> float:
+    """The energy S of a solution x (n,) from the norm ‖Bᵀα‖ of its forces in A⁻¹."""
     return float(np.hypot(np.sqrt(max(float(x @ (program.A @ x)), 0.0)), force))
 
 
@@ -220,10 +207,7 @@ RECOGNISED = 30.0
 
 
 def check_answer(program: VariationalInequality, answer: QPSolution, accuracy: float) -> None:
-    """Refuse the answer of a timed repetition that does not solve its program to `RECOGNISED` times the accuracy.
-
-    Raises a `NumericalError` naming the residual.
-    """
+    """Refuse, by a `NumericalError`, the answer of a timed repetition that does not solve its program."""
     status, reason, _ = verify(program, answer, RECOGNISED * accuracy)
     if status is not Status.OK:
         raise NumericalError(f"timed in other units of the unknowns, {reason}; does the solver remember answers?")
@@ -269,7 +253,8 @@ def slack(program: VariationalInequality, x: Array, alpha: Array, accuracy: floa
     if not smallest > 0.0:
         return Slack(float("inf"), float("inf"))
     norms = dual_norms(program.A)
-    energy, pressed = solution_energy(program, x, alpha, norms), float(norms(program.B.T) @ alpha)
+    energy = _energy(program, x, float(norms((program.B.T @ alpha)[:, None])[0]))
+    pressed = float(norms(program.B.T) @ alpha)
     constant = accuracy * (1.5 * energy**2 + 0.5 * pressed**2)
     return Slack(accuracy * energy / np.sqrt(smallest), constant / smallest)
 

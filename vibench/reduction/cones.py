@@ -15,29 +15,20 @@ from vibench.interfaces.strategies import Cone, Stop, no_free, rays
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import InnerProduct
 
+# A snapshot whose relative distance from the cone is below this is reproduced up to round-off.
 REPRODUCED = 1e-12
-"""A snapshot whose relative distance from the cone is below this is reproduced up to round-off."""
 
+# Values within this fraction of the largest first value count as equal, and the smallest index wins: duplicated or
+# mirrored snapshots must not let round-off choose.
 TIE = 1e-9
-"""Values within this fraction of the largest first value count as equal, and the smallest index wins: duplicated or
-mirrored snapshots must not let round-off choose."""
 
 
 class LazyMaximum:
     """Argmax over indicators that are non-increasing from one greedy step to the next.
 
     A value computed at an earlier step bounds the present one from above, so only indices whose bound reaches the
-    maximum are evaluated again (Minoux 1978). The choice, ties included, is that of evaluating all indicators.
-
-    Parameters
-    ----------
-    first
-        Indicators (P,) at the first step.
-
-    Attributes
-    ----------
-    evaluations
-        Number of evaluations of an indicator.
+    maximum are evaluated again (Minoux 1978). The choice, ties included, is that of evaluating all indicators; `first`
+    are those (P,) of the first step. `evaluations` counts evaluations of an indicator.
     """
 
     def __init__(self, first: Array) -> None:
@@ -130,13 +121,6 @@ class GrowingCone:
     Greedy algorithms with the relative maximum criterion (paper, equations (13) and (34)) are a loop over `farthest`
     and `add`. Cones are nested, so distances only fall and the maximum is taken lazily.
 
-    Parameters
-    ----------
-    snapshots
-        θ_q (m×Q), coefficientwise nonnegative.
-    W
-        Inner product of the multiplier space.
-
     Attributes
     ----------
     generators
@@ -146,7 +130,7 @@ class GrowingCone:
     error
         Its distance, relative to the largest norm of a snapshot.
 
-    Raises a `NumericalError` if a snapshot has a negative coefficient: it would not be in W⁺.
+    Raises a `NumericalError` if a snapshot θ_q (m×Q) has a negative coefficient: it would not be in W⁺.
     """
 
     def __init__(self, snapshots: Array, W: InnerProduct) -> None:
@@ -216,17 +200,9 @@ class LazyDistances:
 
     Any point of the cone bounds the distance from above. One point is stored for every snapshot. When the cone grows,
     the point is replaced by its best combination with the new generator and improved by one sweep of coordinate
-    descent. A projection is computed only where these bounds do not decide the maximum.
+    descent. A projection is computed only where these bounds do not decide the `maximum`, which counts them.
 
-    Parameters
-    ----------
-    whitened
-        Snapshots (m×Q) in coordinates in which the norm is Euclidean; not all zero.
-
-    Attributes
-    ----------
-    maximum
-        The lazy maximum; it counts the projections.
+    The snapshots (m×Q), not all zero, are `whitened`: in coordinates in which the norm is Euclidean.
     """
 
     def __init__(self, whitened: Array) -> None:

@@ -11,10 +11,7 @@ from vibench.arrays import Array, Indices
 class Cubature:
     """The conditions of a cubature, each with a random sign in one of few sums, which keep its residual.
 
-    Parameters
-    ----------
-    size, count
-        Number N' of conditions that are added at a time, and number e of columns that the cubature chooses from.
+    `size` conditions, N', are added at a time; the cubature chooses from `count` columns, e.
     """
 
     def __init__(self, size: int, count: int) -> None:
@@ -49,7 +46,11 @@ def cubature(conditions: Array, tolerance: float) -> tuple[Indices, Array]:
         best = int(np.argmax(slopes))
         if not slopes[best] > 0.0:
             break  # the least residual there is
-        Q, R = _with_column(Q, R, conditions[:, best])
+        column = conditions[:, best]
+        if chosen:
+            Q, R = scipy.linalg.qr_insert(Q, R, column, len(chosen), which="col")
+        else:  # LAPACK inserts nothing into an empty factorisation
+            Q, R = column[:, None] / np.linalg.norm(column), np.array([[np.linalg.norm(column)]])
         chosen.append(best)
         while (solved := scipy.linalg.solve_triangular(R, Q.T @ total)).min() <= 0.0:
             present, falling = weights[chosen], np.flatnonzero(solved <= 0.0)
@@ -62,10 +63,3 @@ def cubature(conditions: Array, tolerance: float) -> tuple[Indices, Array]:
         residual = total - conditions[:, chosen] @ solved
     columns = np.sort(np.array(chosen, int))
     return columns, weights[columns]
-
-
-def _with_column(Q: Array, R: Array, column: Array) -> tuple[Array, Array]:
-    if not R.size:
-        return column[:, None] / np.linalg.norm(column), np.array([[np.linalg.norm(column)]])
-    extended: tuple[Array, Array] = scipy.linalg.qr_insert(Q, R, column, R.shape[1], which="col")
-    return extended

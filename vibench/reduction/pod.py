@@ -14,14 +14,9 @@ from vibench.linalg.inner_product import RANK_RTOL, InnerProduct, svd
 
 @dataclass(frozen=True)
 class POD:
-    """A nested orthonormal basis.
+    """A nested basis of V-orthonormal modes (n×N), the first k of which are the POD basis of dimension k.
 
-    Attributes
-    ----------
-    basis
-        V-orthonormal modes (n×N); the first k of them are the POD basis of dimension k.
-    errors
-        Relative tails e_POD(k) for k = 0 … number of snapshots (equation (11)).
+    `errors` are the relative tails e_POD(k) for k = 0 … number of snapshots (equation (11)).
     """
 
     basis: Array

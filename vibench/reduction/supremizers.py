@@ -33,16 +33,9 @@ def proportionality(B: SparseMatrix, reference: SparseMatrix) -> float | None:
 
 @dataclass(frozen=True)
 class ConstraintClasses:
-    """Constraint matrices B(mu_p) sorted into classes of proportional ones, which share their supremizer space.
+    """Constraint matrices B(mu_p) = c_p · representatives[members[p]] of classes that share their supremizer space.
 
-    Attributes
-    ----------
-    representatives
-        One matrix per class, the first one.
-    members
-        Class of every p (P,).
-    factors
-        Factors c_p (P,) with B(mu_p) = c_p · representatives[members[p]].
+    The representative of a class is its first matrix; `members` are the classes of all p (P,), `factors` the c_p (P,).
     """
 
     representatives: tuple[SparseMatrix, ...]
@@ -139,13 +132,7 @@ class LoadCoordinates:
 
     V_N has the first coordinates, then come the fixed loads, then the reached unknowns one by one: what loads on the
     first j of these give needs no coordinates of the others. `plain` are the coordinates (d×N) of the basis of V_N.
-
-    Parameters
-    ----------
-    V, basis, dofs
-        As for `ContactCoordinates`.
-    loads
-        The loads of some multipliers.
+    `loads` are those of some multipliers; other arguments are as for `ContactCoordinates`.
     """
 
     def __init__(self, V: InnerProduct, basis: Array, dofs: Indices, loads: ContactLoads) -> None:
@@ -202,7 +189,6 @@ def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[Elimination, BlockDia
 
 
 Coordinates = SpannedCoordinates | ContactCoordinates
-
 # Those in which V_N has the first coordinates.
 PlainCoordinates = SpannedCoordinates | LoadCoordinates
 

@@ -65,7 +65,7 @@ def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
         by = recorded.cell.solver or recorded.cell.formulation_label
         table.append({"solver": f"{by} (recorded)"} | line)
     solvers = installed_solvers(registered(SOLVER))
-    for solver, trial in solver_trials(program, accuracy, solvers).items():
+    for solver, trial in solver_trials(program, accuracy, solvers, 60.0).items():
         table.append({"solver": solver} | _line(trial, recorded_x))
     return pd.DataFrame(table)
 

@@ -49,17 +49,7 @@ class Constant:
 
 @dataclass(frozen=True)
 class Stability:
-    """Constants of the high-fidelity problem at one parameter.
-
-    Attributes
-    ----------
-    inf_sup
-        β_HF in the norms of V and W.
-    coercivity, continuity
-        Lower bound of α, and upper bound of γ_a.
-    energy_inf_sup
-        Lower bound of β_A, the inf-sup constant over the span with the norm of A instead of that of V.
-    """
+    """β_HF in the norms of V and W, and bounds of α, γ_a and β_A, at one parameter of the high-fidelity problem."""
 
     inf_sup: InfSup
     coercivity: Constant

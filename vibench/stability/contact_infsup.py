@@ -62,18 +62,9 @@ Products = tuple[Array, Array, Array]
 class ContactInfSup:
     """Lower bounds of β_A for constraints with one A.
 
-    Parameters
-    ----------
-    schur
-        Ŝ (c×c), computed; or A, for constraints on all unknowns, c = n.
-    squares
-        The diagonal of A on these unknowns (c,).
-    lost
-        δ/σ; 0 for A.
-    extend
-        From liftings (·, k) on the unknowns that constraints involve to columns (c, k) of D; for A these are more.
-    inverse
-        Ĉ (c×c), symmetric, where `of_inverse` is used.
+    `schur` is the computed Ŝ (c×c), `squares` the diagonal of A there (c,), and `lost` is δ/σ; for constraints on all
+    unknowns these are A, its diagonal, and 0. `extend` maps liftings (·, k) on the unknowns that constraints involve to
+    columns (c, k) of D; for A these are more. `inverse` is Ĉ (c×c), symmetric, where `of_inverse` is used.
     """
 
     def __init__(

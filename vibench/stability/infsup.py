@@ -44,26 +44,17 @@ class ConeBasis:
 
     One instance serves every constant of a cone, so that all share one rank decision: constants of different primal
     spaces would not be comparable otherwise.
-
-    Attributes
-    ----------
-    chi
-        Generators (m×R), unit norm in W.
-    span
-        W-orthonormal basis of span χ (m×rank): the leading left singular vectors.
-    gram
-        G (R×R).
-    free
-        Which generators may be used with either sign (R,).
-    singular_values
-        Singular values of χ in W, falling; those above `RANK_RTOL` of the largest count for the rank. Empty for the
-        high-fidelity cone, whose generators are independent.
     """
 
+    # Generators (m×R), unit norm in W.
     chi: Array
+    # W-orthonormal basis of span χ (m×rank): the leading left singular vectors.
     span: Array
+    # G (R×R), and which generators may be used with either sign (R,).
     gram: Array
     free: Mask
+    # Those of χ in W, falling; those above `RANK_RTOL` of the largest count for the rank. Empty for the high-fidelity
+    # cone, whose generators are independent.
     singular_values: Array
 
     @property
@@ -120,16 +111,8 @@ def cone_basis(chi: Array, W: InnerProduct, free: Mask | None = None) -> ConeBas
 def inf_sup(on_span: Array, on_generators: Array, cone: ConeBasis) -> InfSup:
     """Span constant and cone interval from coordinates of the supremizers projected on the primal space.
 
-    The constants are zero without primal vectors and infinite without multipliers.
-
-    Parameters
-    ----------
-    on_span
-        ZᵀBᵀ times `cone.span` (N'×rank), Z orthonormal; or any isometric image of it.
-    on_generators
-        ZᵀBᵀχ (N'×R), likewise.
-    cone
-        The reduced cone.
+    The coordinates are ZᵀBᵀ times `cone.span` (N'×rank), Z orthonormal, and ZᵀBᵀχ (N'×R), or any isometric image of
+    both. The constants are zero without primal vectors and infinite without multipliers.
     """
     span = beta_span(on_span)
     if np.any(cone.free) and np.all(cone.free):  # the cone is its span
@@ -244,15 +227,8 @@ def cone_interval(C: Array, G: Array, span: float) -> tuple[float, float, str]:
     """Certified lower and upper bounds on min ‖Cα‖/√(αᵀGα) over α ≥ 0, and the names of the sharpest ones, "L½/U0".
 
     The interval is reported as it is where it stays wider than one percent. The bounds are infinite without generators.
-
-    Parameters
-    ----------
-    C
-        Projected supremizers (N'×R) of the generators.
-    G
-        Gram matrix (R×R), unit diagonal. Only L0 and L1 are known to hold where it has negative entries.
-    span
-        The same minimum over all α: β_span.
+    C (N'×R) are the projected supremizers of the generators, G (R×R) has a unit diagonal. Only L0 and L1 are known to
+    hold where G has negative entries. `span` is the same minimum over all α: β_span.
     """
     if not len(G):
         return float("inf"), float("inf"), ""
@@ -320,14 +296,8 @@ def semidefinite_bounds(M: Array, G: Array, upper: float, fraction: float) -> tu
     αᵀ(M − tG)α ≥ −δ‖α‖² ≥ −δ αᵀGα certifies t − δ. The matrix of multipliers X is ααᵀ where the relaxation is exact;
     the quotient at the nonnegative part of its leading eigenvector is an upper bound in any case.
 
-    Parameters
-    ----------
-    M, G
-        Symmetric (R×R), M positive semidefinite; G ≥ 0 entrywise, unit diagonal.
-    upper
-        Known upper bound on the quotient.
-    fraction
-        Stop where the lower bound reaches this fraction of the upper one.
+    M and G are symmetric (R×R), M positive semidefinite; G ≥ 0 entrywise has a unit diagonal. `upper` is a known bound
+    of the quotient. Iterations end where the lower bound reaches a `fraction` of the upper one.
     """
     scale = float(np.diag(M).max(initial=0.0))
     if scale <= 0.0:

@@ -25,15 +25,14 @@ def digest(content: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+# Corrections of cells that answer with reduced solutions as they are, and with corrected pairs alone.
 UNCORRECTED, FEASIBLE = "none", "feasible"
-"""Corrections of cells that answer with reduced solutions as they are, and with corrected pairs alone."""
 
-
+# Names of plugins in the definition of a cell; all but the first may be `None`.
 PLUGINS = ("problem", "dual", "primal", "formulation", "training", "validation_sampling")
-"""Names of plugins in the definition of a cell; all but the first may be `None`."""
 
+# Entry of tables on an axis that the formulation of a cell does not have.
 NO_SUCH_AXIS = "–"
-"""Entry of tables on an axis that the formulation of a cell does not have."""
 
 
 @dataclass(frozen=True)
@@ -115,12 +114,9 @@ class Cell:
 
     @classmethod
     def from_definition(cls, text: str, places: Mapping[str, str] = {}) -> Cell:
-        """The cell of a definition, with the code of its plugins as installed.
+        """The cell of a definition, with the code of its plugins as installed, and new `places` of files by name.
 
-        `places` are new paths of files and folders of its plugins, by their names in results.
-
-        Raises a `RequestError` if a plugin is not installed, a file in its options cannot be read, or a name in
-        `places` is unknown.
+        Raises a `RequestError` if a plugin is not installed, or a file cannot be read or is unknown.
         """
         content = json.loads(text)
         # Older definitions do not have all of them.
@@ -170,20 +166,13 @@ class Cell:
         problem, dual, primal = self.labels
         problem += f" ({self.training.label})" if self.training.sampling is not None else ""
         tolerance = "" if self.primal_tol is None else f" {self.primal_tol:g}"
-        stops = ", ".join(
-            f"{size}={stop.size}" if stop.tolerance is None else f"{stop.tolerance:g}"
-            for size, stop in (("N", self.pod), ("R", self.cone))
-            if stop is not None
-        )
-        solver = " ".join([*filter(None, [self.solver]), *([] if self.accuracy is None else [f"{self.accuracy:g}"])])
-        chosen = [
-            problem,
-            "" if self.formulation_label == default_formulation() else self.formulation_label,
-            "" if self.dual is None else dual,
-            "" if self.primal is None else f"{primal}{tolerance}",
-            stops,
-            solver,
-        ]
+        given = [(size, stop) for size, stop in (("N", self.pod), ("R", self.cone)) if stop is not None]
+        stops = [f"{size}={one.size}" if one.tolerance is None else f"{one.tolerance:g}" for size, one in given]
+        accuracy = "" if self.accuracy is None else f"{self.accuracy:g}"
+        formulation = "" if self.formulation_label == default_formulation() else self.formulation_label
+        cone, enriched = "" if self.dual is None else dual, "" if self.primal is None else f"{primal}{tolerance}"
+        solver = " ".join(filter(None, [self.solver, accuracy]))
+        chosen = [problem, formulation, cone, enriched, ", ".join(stops), solver]
         way = "" if self.assembly == "full" else f" · {self.assembly}{' with bounds' * self.bounds}"
         way += "" if self.correction == UNCORRECTED else f" · corrected: {self.correction}"
         return " · ".join(filter(None, chosen)) + way

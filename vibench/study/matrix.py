@@ -25,10 +25,7 @@ from vibench.study.spec import Study, ToleranceTable
 
 
 def find_study(request: str) -> Path:
-    """File of a study, from its path or the name under which it is registered.
-
-    Raises a `RequestError` if there is no such file or registered study.
-    """
+    """File of a study, from its path or registered name; raises a `RequestError` if there is none."""
     path = Path(request)
     # Methods of Path raise an OSError if a name is too long for a file.
     is_file, exists = os.path.isfile(path), os.path.exists(path)  # noqa: PTH110, PTH113
@@ -75,22 +72,16 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
     # The fault may be in either of them.
     source += " with the options of the command line" if given else ""
     content = _replace_axes(content, given)
-    _anchor(content, path.absolute().parent)
+    # Paths in the options of problems and sampling strategies are relative to the folder of the file.
+    problems = _tables(content.get("problem"))
+    samplings = [table.get(key) for table in [content, *problems] for key in ("training", "validation")]
+    for kind, entries in ((PROBLEM, problems), *((SAMPLING, _tables(some)) for some in samplings)):
+        for entry in entries:
+            _anchor_options(kind, entry, path.absolute().parent)
     try:
         return Study.model_validate(content)
     except RequestError as error:
         raise RequestError(f"{source}: {error}") from None
-
-
-def _anchor(content: dict[str, Any], folder: Path) -> None:
-    """Make paths in the options of problems and sampling strategies relative to a folder, in unchecked content."""
-    problems = _tables(content.get("problem"))
-    for entry in problems:
-        _anchor_options(PROBLEM, entry, folder)
-    for table in [content, *problems]:
-        for key in ("training", "validation"):
-            for entry in _tables(table.get(key)):
-                _anchor_options(SAMPLING, entry, folder)
 
 
 def _tables(entries: Any) -> list[dict[str, Any]]:
@@ -117,9 +108,7 @@ def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> di
     tables = content.get("tolerances")
     if isinstance(tables, list) and all(isinstance(table, dict) for table in tables):
         primal = content.get("primal")
-        names = (
-            [_title_of_entry(entry) for entry in primal if _takes_tolerance(entry)] if isinstance(primal, list) else []
-        )
+        titles = [_tolerant_title(entry) for entry in (primal if isinstance(primal, list) else ())]
         for table in tables:
             for key, tolerance, size in (("pod", "pod", "N"), ("dual_tol", "dual", "R")):
                 if key in given:
@@ -127,18 +116,16 @@ def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> di
                     table.pop(size, None)
                     table[tolerance] = given[key]
             if "primal_tol" in given:
-                table["primal"] = dict.fromkeys(names, given["primal_tol"])
+                table["primal"] = dict.fromkeys(filter(None, titles), given["primal_tol"])
     return content
 
 
-def _title_of_entry(entry: Any) -> str:
-    return str(entry.get("label", entry.get("name")) if isinstance(entry, dict) else entry)
-
-
-def _takes_tolerance(entry: Any) -> bool:
-    """Whether an unchecked entry of the primal axis names a strategy that takes a tolerance."""
-    plugin = find(PRIMAL, str(entry.get("name") if isinstance(entry, dict) else entry))
-    return bool(plugin.entries and not plugin.conflict and plugin.load().takes_tolerance)
+def _tolerant_title(entry: Any) -> str:
+    """Title of an unchecked entry of the primal axis if its strategy takes a tolerance, else ""."""
+    table = entry if isinstance(entry, dict) else {"name": entry}
+    plugin = find(PRIMAL, str(table.get("name")))
+    takes_tolerance = plugin.entries and not plugin.conflict and plugin.load().takes_tolerance
+    return str(table.get("label", table.get("name"))) if takes_tolerance else ""
 
 
 def _entries_in(axis: Any, name: str) -> list[Any]:
@@ -258,13 +245,6 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
 
     Raises a `RequestError` if a plugin of the cell is not installed, or the name is not one of a study.
     """
-    axes = {"problem": cell.problem, "dual": cell.dual, "primal": cell.primal}
-    chosen = {
-        axis: [_plugin_entry(plugin, label)]
-        for (axis, plugin), label in zip(axes.items(), cell.labels, strict=True)
-        if plugin is not None
-    }
-    chosen["formulation"] = [_plugin_entry(cell.formulation, cell.formulation_label)]
     tolerances: dict[str, Any] = dict([_stop("pod", "N", cell.pod), _stop("dual", "R", cell.cone)])
     if cell.primal_tol is not None:
         tolerances["primal"] = {cell.labels[2]: [cell.primal_tol]}
@@ -273,26 +253,27 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
         "name": name,
         "seed": cell.validation.seed,
         "validation": _entry_of_set(cell.validation) or cell.validation.count,
-        **({} if cell.accuracy is None else {"accuracy": [cell.accuracy]}),
-        **({} if cell.solver is None else {"solvers": [cell.solver]}),
-        **chosen,
+        "formulation": [_plugin_entry(cell.formulation, cell.formulation_label)],
         "assembly": [cell.assembly],
         "bounds": [cell.bounds],
         "correction": [cell.correction],
         "warm_start": cell.warm_start,
         "tolerances": [tolerances],
     }
-    if cell.interpolation is not None:
-        content["interpolation"] = cell.interpolation
+    axes = {"problem": cell.problem, "dual": cell.dual, "primal": cell.primal}
+    for (axis, plugin), label in zip(axes.items(), cell.labels, strict=True):
+        content |= {} if plugin is None else {axis: [_plugin_entry(plugin, label)]}
+    content |= {} if cell.accuracy is None else {"accuracy": [cell.accuracy]}
+    content |= {} if cell.solver is None else {"solvers": [cell.solver]}
+    content |= {} if cell.interpolation is None else {"interpolation": cell.interpolation}
     return Study(**content, **settings)
 
 
 def _plugin_entry(plugin: Plugin, label: str) -> Any:
     given = plugin.registered
     name = given.given if isinstance(given, GivenPlugin) else plugin.name
-    entries: dict[PluginKind, type[Entry]] = {
-        PROBLEM: ProblemEntry, SAMPLING: SamplingEntry, FORMULATION: FormulationEntry,
-    }  # fmt: skip
+    entries: dict[PluginKind, type[Entry]]
+    entries = {PROBLEM: ProblemEntry, SAMPLING: SamplingEntry, FORMULATION: FormulationEntry}
     content = {"name": name, "label": label, "options": json.loads(plugin.options)}
     return entries.get(plugin.kind, Entry).model_validate(content).at(json.loads(plugin.places))
 

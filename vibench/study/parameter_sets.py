@@ -15,20 +15,20 @@ from vibench.interfaces.strategies import AdaptiveSampling, Sampling
 from vibench.interfaces.validation import training_parameters, validation_parameters
 from vibench.plugins.plugin import Plugin
 
+# Name of the training and the validation set of the problem itself.
 OWN = "own"
-"""Name of the training and the validation set of the problem itself."""
 
+# Number of chunks of a parameter set, each a stage of its own; fixed, so that keys do not depend on the workers.
 CHUNKS = 4
-"""Number of chunks of a parameter set, each a stage of its own; fixed, so that keys do not depend on the workers."""
 
 
 @dataclass(frozen=True)
 class ParameterSet:
     """The training or the validation set of a problem: its own, or that of a sampling strategy.
 
-    `count` is the number of parameters of a validation set, 0 for training sets, whose size the problem or the strategy
-    chooses. `seed` is that of a problem's own validation set, and of random numbers in timings; 0 for training sets.
-    `sampling` is `None` for the problem's own set. Sets that differ only in their labels are the same set.
+    `count` is the number of parameters of a validation set, and `seed` that of a problem's own one, and of random
+    numbers in timings; both are 0 for training sets. `sampling` is `None` for the problem's own set. Sets that differ
+    only in their labels are the same set.
     """
 
     role: Literal["training", "validation"]
@@ -55,17 +55,11 @@ class ParameterSet:
 
     def strategy(self) -> Sampling | None:
         """A new instance of the sampling strategy; `None` for the problem's own set."""
-        strategy = None if self.sampling is None else self.sampling.create()
-        # `RegisteredPlugin.load` refuses anything else.
-        assert strategy is None or isinstance(strategy, Sampling)
+        strategy: Sampling | None = None if self.sampling is None else self.sampling.create()
         return strategy
 
     def of(self, problem: Problem) -> Array:
-        """The parameters (P×d) of a problem.
-
-        Raises a `NumericalError` if the problem's own set has the wrong shape, or values that are not finite, and a
-        `RequestError` if the sampling strategy makes no set in the box of the problem.
-        """
+        """The parameters (P×d) of a problem; raises a `NumericalError` or a `RequestError` if there is no valid set."""
         if self.role == "training":
             return training_parameters(problem, self.strategy())
         return validation_parameters(problem, self.count, self.seed, self.strategy())
@@ -77,8 +71,8 @@ class ParameterSet:
         return replace(self, count=len(parameters_of(problem, self)))
 
 
+# A problem's own training set.
 OWN_TRAINING = ParameterSet("training")
-"""A problem's own training set."""
 
 
 def is_available(*plugins: Plugin) -> bool:
@@ -89,11 +83,9 @@ def is_available(*plugins: Plugin) -> bool:
 @lru_cache(maxsize=4)
 def _problem(plugin: Plugin) -> Problem:
     try:
-        problem = plugin.create()
+        problem: Problem = plugin.create()
     except NumericalError as error:
         raise RequestError(f"problem '{plugin.name}': {error}") from None
-    # `RegisteredPlugin.load` refuses anything else.
-    assert isinstance(problem, Problem)
     return problem
 
 
@@ -112,12 +104,10 @@ def parameters_of(problem: Plugin, parameters: ParameterSet) -> Array:
 
 
 def check_sets(problem: Plugin, training: ParameterSet, validation: ParameterSet) -> None:
-    """Check that a problem has its sets, and that not all validation parameters are training parameters.
+    """Raise a `RequestError` if a problem has no such sets, or all validation parameters are training parameters.
 
     Errors there would say nothing of other parameters, and two strategies with one seed draw the same points. Only the
     problem itself may choose equal sets.
-
-    Raises a `RequestError` otherwise.
     """
     if validation.is_adaptive and validation.sampling is not None:
         raise RequestError(
@@ -125,19 +115,18 @@ def check_sets(problem: Plugin, training: ParameterSet, validation: ParameterSet
             "makes no validation set"
         )
     mus = parameters_of(problem, validation)
-    # The problem itself may have equal sets.
     if training.sampling is None and validation.sampling is None:
         return
-    if np.isin(_rows(mus), _rows(parameters_of(problem, training))).all():
+    # Every row is one value, equal only if all bits are.
+    trained, validated = (
+        np.ascontiguousarray(rows, float).view(f"V{8 * mus.shape[1]}").ravel()
+        for rows in (parameters_of(problem, training), mus)
+    )
+    if np.isin(validated, trained).all():
         raise RequestError(
             f"all validation parameters of problem '{problem.name}' are training parameters, so that errors would say "
             "nothing of others: give one of the two sets another seed, or other parameters"
         )
-
-
-def _rows(mus: Array) -> Array:
-    """Every row as one value, equal only if all bits are."""
-    return np.ascontiguousarray(mus, float).view(f"V{8 * mus.shape[1]}").ravel()
 
 
 def chunk_edges(count: int) -> list[int]:

@@ -44,12 +44,15 @@ from vibench.study.parameter_sets import OWN, ParameterSet, check_sets, is_avail
 
 Tolerance: TypeAlias = Annotated[float, Gt(0.0), Lt(1.0), AllowInfNan(False)]
 Seconds: TypeAlias = Annotated[float, Gt(0.0), Le(1e7), AllowInfNan(False)]
+Gibibytes: TypeAlias = Annotated[float, Gt(0.0), Lt(1e6), AllowInfNan(False)]
+Rounds: TypeAlias = Annotated[int, Ge(1), Lt(1000)]
 Tolerances: TypeAlias = Annotated[list[Tolerance], MinLen(1)]
 Sizes: TypeAlias = Annotated[list[Size], MinLen(1)]
 Names: TypeAlias = Annotated[list[Name], MinLen(1)]
 
 
 Accuracy: TypeAlias = Annotated[float, Ge(1e-14), Le(1e-2), AllowInfNan(False)]
+Bounds: TypeAlias = Annotated[list[bool], MinLen(1), BeforeValidator(as_list)]
 Accuracies: TypeAlias = Annotated[list[Accuracy], MinLen(1), BeforeValidator(as_list)]
 
 
@@ -139,10 +142,7 @@ class Limits(_Model):
     query_seconds: Annotated[Seconds, Field(description="Wall seconds of one solution of a query.")] = 20.0
     cell_seconds: Annotated[Seconds, Field(description="Wall seconds of a stage.")] = 600.0
     memory_gib: Annotated[
-        float,
-        Gt(0.0),
-        Lt(1e6),
-        AllowInfNan(False),
+        Gibibytes,
         Field(description="Address space of a worker process in GiB; kept artefacts take an eighth, at most 1 GiB."),
     ] = 8.0
 
@@ -182,15 +182,10 @@ class Study(_Model):
     dual: Annotated[list[Entry], MinLen(1), Field(description="Dual strategies. Required by `mixed`.")] = []
     primal: Annotated[list[Entry], MinLen(1), Field(description="Primal strategies. Required by `mixed`.")] = []
     assembly: Annotated[
-        list[Literal["full", "reduced"]],
-        MinLen(1),
-        Field(description="How queries are assembled."),
+        list[Literal["full", "reduced"]], MinLen(1), Field(description="How queries are assembled.")
     ] = ["full"]
     bounds: Annotated[
-        list[bool],
-        MinLen(1),
-        BeforeValidator(as_list),
-        Field(description="Whether queries have error bounds at online cost, with reduced assembly: an axis."),
+        Bounds, Field(description="Whether queries have error bounds at online cost, with reduced assembly: an axis.")
     ] = [False]
     correction: Annotated[
         list[Literal["none", "feasible", "auto"]],
@@ -208,15 +203,11 @@ class Study(_Model):
         ),
     ] = False
     timing_rounds: Annotated[
-        int,
-        Ge(1),
-        Lt(1000),
+        Rounds,
         Field(description="Maximal number of timing rounds of a cell; with fewer than six, break-even is undecided."),
     ] = 18
     timing_rounds_min: Annotated[
-        int,
-        Ge(1),
-        Lt(1000),
+        Rounds,
         Field(description="Minimal number of timing rounds, after which a cell with decided comparisons ends."),
     ] = 6
     factorisation: Annotated[
@@ -232,12 +223,11 @@ class Study(_Model):
     @model_validator(mode="wrap")
     @classmethod
     def _checked(cls, given: Any, build: ModelWrapValidatorHandler[Study]) -> Study:
+        named = ("problem", "formulation", "dual", "primal", "training", "validation")
         try:
             study = build(_in_present_words(given))
         except ValidationError as error:
-            raise RequestError(
-                fault_line(error, cls, named=("problem", "formulation", "dual", "primal", "training", "validation"))
-            ) from None
+            raise RequestError(fault_line(error, cls, named)) from None
         if study.factorisation != DEFAULT:
             # A factorisation in the options of a problem wins.
             study.problem[:] = (
@@ -288,11 +278,8 @@ def _sampling(entry: SamplingEntry) -> Plugin | None:
 
 def _check_names(study: Study) -> None:
     """Check names and options of plugins, and that exactly the strategies that take a tolerance have one."""
-    axes: tuple[tuple[PluginKind, Sequence[Entry]], ...] = (
-        (PROBLEM, study.problem), (DUAL, study.dual), (PRIMAL, study.primal),
-        (FORMULATION, study.formulation),
-    )  # fmt: skip
-    for kind, axis in axes:
+    axes: dict[PluginKind, Sequence[Entry]] = {PROBLEM: study.problem, DUAL: study.dual, PRIMAL: study.primal}
+    for kind, axis in (*axes.items(), (FORMULATION, study.formulation)):
         for entry in axis:
             entry.registered(kind).check_options(entry.options)
         _check_given(kind, axis)
@@ -328,17 +315,12 @@ def _check_given(kind: PluginKind, axis: Sequence[Entry]) -> None:
     names = [(plugin.name, plugin.options) for plugin in plugins]
     for plugin in plugins:
         if names.count((plugin.name, plugin.options)) > 1:
-            raise RequestError(
-                f"several plugins of the study are called {plugin}: give each a label, as in "
-                "{'name': …, 'label': 'coarse'}"
-            )
+            remedy = "give each a label, as in {'name': …, 'label': 'coarse'}"
+            raise RequestError(f"several plugins of the study are called {plugin}: {remedy}")
 
 
 def _check_sets(study: Study, entry: ProblemEntry) -> None:
-    """Check the parameter sets of a problem before a run, so that a fault does not appear in each of its cells.
-
-    The problem is built only if it reads files or a strategy samples its box.
-    """
+    """Check the parameter sets of a problem before a run, so that a fault does not appear in each of its cells."""
     entries = [*(entry.training or study.training), entry.validation or study.validation]
     samplings = [one for one in entries if isinstance(one, SamplingEntry) and one.name != OWN]
     for sampling in samplings:
@@ -354,11 +336,8 @@ def _check_sets(study: Study, entry: ProblemEntry) -> None:
 
 
 def _check_tolerances(study: Study, table: ToleranceTable) -> None:
-    for kind, axis, tolerances in (
-        (DUAL, study.dual, table.dual),
-        (DUAL, study.dual, table.R),
-        (PRIMAL, study.primal, table.primal),
-    ):
+    given = (DUAL, study.dual, table.dual), (DUAL, study.dual, table.R), (PRIMAL, study.primal, table.primal)
+    for kind, axis, tolerances in given:
         # A tolerance may name a plugin that an option of the command line has removed from the axis.
         names = {name for entry in axis for name in (entry.name, entry.title)}
         for name in tolerances if isinstance(tolerances, dict) else ():

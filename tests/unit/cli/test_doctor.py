@@ -30,7 +30,7 @@ FINE = Trial(Status.OK, "", residuals=Residuals(0.0, 2e-9, 0.0))
 def trials(monkeypatch: pytest.MonkeyPatch) -> dict[str, Trial]:
     """What trials are to end with, by solver; the others are fine, and nothing is solved."""
     found: dict[str, Trial] = {}
-    monkeypatch.setattr(doctor, "solver_trials", lambda _, __, names: {name: found.get(name, FINE) for name in names})
+    monkeypatch.setattr(doctor, "solver_trials", lambda _, __, names, ___: {n: found.get(n, FINE) for n in names})
     return found
 
 

@@ -31,8 +31,8 @@ from samples import wire_study, write_study
 from vibench.errors import ExecutorError, RequestError
 from vibench.execution import executors
 from vibench.execution.executors import Dask, Local
-from vibench.execution.jobs import Job
 from vibench.execution.run import Observer, Options, run_study
+from vibench.execution.supervisor import Job
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Stage
 from vibench.study.spec import Study

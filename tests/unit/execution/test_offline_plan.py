@@ -16,7 +16,6 @@ from vibench.stages.assembly import ExactSolutions
 from vibench.stages.base import Stage
 from vibench.stages.cell_queries import CellQueries, cell_queries
 from vibench.stages.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
-from vibench.study.cells import Cell
 from vibench.study.matrix import expand, read_study
 from vibench.timing import Seconds
 
@@ -115,9 +114,9 @@ def test_an_interval_narrows_with_the_repeats_of_what_takes_long() -> None:
 
 
 def test_seconds_of_cells_whose_artefacts_are_gone_stay_as_they_are() -> None:
-    written: list[Cell] = []
-    database = SimpleNamespace(cell=lambda _: {"hf_setup_s": 1.0})
-    writer = SimpleNamespace(database=database, offline=lambda cell, _: written.append(cell))
+    written: list[str] = []
+    database = SimpleNamespace(cell=lambda _: {"hf_setup_s": 1.0}, write_columns=lambda key, _: written.append(key))
+    writer = SimpleNamespace(database=database)
     for there in (False, True):
         artefact = SimpleNamespace(seconds=spent(1.0), value={"": [1.0, 1.0]}) if there else None
         plan = OfflinePlan(SimpleNamespace(get=lambda _, found=artefact: found), writer, 0)  # type: ignore[arg-type]
@@ -126,5 +125,5 @@ def test_seconds_of_cells_whose_artefacts_are_gone_stay_as_they_are() -> None:
         if there:
             plan._runs = lambda stage: [spent(1.0)]  # type: ignore[method-assign]
         plan.finish()
-    assert written == [CELL]
+    assert written == [CELL.key]
     assert isinstance(GOAL, CellQueries)

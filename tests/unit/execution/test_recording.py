@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from vibench.errors import RequestError
-from vibench.execution.jobs import OUT_OF_MEMORY
 from vibench.execution.recording import LOG, REPORT, claimed, clear, ended_by_smaller_limits, keep_limits
+from vibench.execution.supervisor import OUT_OF_MEMORY
 from vibench.results.database import ResultsDatabase
 from vibench.results.sqlite import FILE
 from vibench.study.spec import Limits

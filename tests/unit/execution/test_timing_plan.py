@@ -241,8 +241,9 @@ def test_a_group_costs_the_same_however_many_there_are() -> None:
         goals = {cell: cell_queries(cell, 20.0) for cell in cells}
         assert all(goal.key for goal in goals.values())  # hashed before the count
         rows = {"queries_ok": 4, "timing_rounds": None}
-        database = SimpleNamespace(cell=lambda _: rows, fine_queries=lambda _: (0, 1))
-        writer: Any = SimpleNamespace(database=database, seconds=lambda *_: None, timed=lambda *_: None)
+        reading = {"cell": lambda _: rows, "fine_queries": lambda _: (0, 1)}
+        database = SimpleNamespace(**reading, write_columns=lambda *_: None)
+        writer: Any = SimpleNamespace(database=database, seconds=lambda *_: None)
 
         def work() -> None:
             plan = TimingPlan(goals, 1, writer, 0)

@@ -20,9 +20,8 @@ from fake_plugins import Wire
 import vibench
 from vibench.errors import RequestError
 from vibench.plugins import plugin as module
-from vibench.plugins.fingerprint import fingerprint_of
 from vibench.plugins.kinds import PROBLEM
-from vibench.plugins.plugin import give
+from vibench.plugins.plugin import fingerprint_of, give
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, study_of_cell
 
@@ -114,7 +113,7 @@ def test_processes_with_other_hash_seeds_agree(tmp_path: Path) -> None:
     """A script, `__main__`, and here a cell of a notebook in another file: one class, one fingerprint."""
     script = tmp_path / "script.py"
     script.write_text(
-        f"{dedent(SOURCE)}\nfrom vibench.plugins.fingerprint import fingerprint_of\nprint(fingerprint_of(Shape())[0])\n"
+        f"{dedent(SOURCE)}\nfrom vibench.plugins.plugin import fingerprint_of\nprint(fingerprint_of(Shape())[0])\n"
     )
     seeds = ({"PYTHONHASHSEED": seed} for seed in ("1", "2"))
     run = [sys.executable, str(script)]

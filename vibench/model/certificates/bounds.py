@@ -35,7 +35,6 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.errors import UnsupportedError
-from vibench.highfidelity.active_set import FALLBACK_SOLVER
 from vibench.interfaces.problem import Contact, Problem
 from vibench.linalg import EPS
 from vibench.linalg.factorisations import implementation
@@ -365,7 +364,7 @@ def _sampled(
     # up to 200 samples, and a correction of every eighth: only medians and maxima of them are used
     for number, mu in enumerate(training[:: -(-len(training) // 200)]):
         reduced = model.assemble(mu)
-        answer = solve_qp(reduced.program, FALLBACK_SOLVER, 1e-8, factor=reduced.factor)
+        answer = solve_qp(reduced.program, "piqp", 1e-8, factor=reduced.factor)
         if answer.x is None or answer.alpha is None or not np.all(np.isfinite(answer.x)):
             continue
         evaluated, alpha = reduced.evaluated, np.maximum(answer.alpha, 0.0)
