@@ -12,7 +12,7 @@ import vibench
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
 PACKAGES = re.findall(r"^    (\w+)/ ", TEXT, re.MULTILINE)
-WALK = re.findall(r"^\d\. `vibench\.([\w.]+)`", TEXT, re.MULTILINE)
+WALK = re.findall(r"^\d\. `vibench\.([\w.]+)`", TEXT.partition("From `vibench run STUDY`")[2], re.MULTILINE)
 LAYERS = [
     name.strip()
     for layer in tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]["layers"]

@@ -1,6 +1,6 @@
 """Plugin of pytest for `vibench.benchmarks.stages`: parameters, several passes, and another process.
 
-    pytest -p vibench.benchmarks.plugin --pyargs vibench.benchmarks.stages --plugin obstacle --benchmark-json a.json
+    pytest -p vibench.benchmarks.plugin --pyargs vibench.benchmarks.stages --plugin NAME --benchmark-json a.json
 
 Statistics, files and tables are those of pytest-benchmark. It has no passes: rounds in succession do not see how a
 machine changes within minutes, so that everything is timed once, then all once more, and so on, and the rounds are put
