@@ -183,7 +183,7 @@ def test_a_problem_with_matrices_at_listed_parameters_alone_takes_no_others(tmp_
     np.savez(folder / "listed.npz", **{f"g{k}": Cable().at(*mu).g for k, mu in enumerate(listed)})
     problem = [{"name": "pack", "options": {"path": str(folder)}}]
     study = changed(changed(STUDY, "problem", to=problem), "validation", to=1)
-    with pytest.raises(RequestError, match="is none of the 5 listed ones, and the problem has matrices at these only"):
+    with pytest.raises(RequestError, match="has matrices only at its 5 listed parameters; choose among those"):
         cells_of(changed(study, "training", to=SOBOL), tmp_path)
     chosen = {"name": "list", "points": listed[:2]}
     assert len(cells_of(changed(study, "training", to=chosen), tmp_path)) == len(cells_of(STUDY, tmp_path))
