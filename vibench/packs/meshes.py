@@ -30,6 +30,9 @@ FORMATS = {
     ".obj": "obj",
 }  # fmt: skip
 
+SECONDS = 60
+"""Seconds of the processor that reading a mesh may take."""
+
 
 def format_of(path: Path) -> str:
     """The name that meshio has for the format of a file.
@@ -54,7 +57,7 @@ def read_mesh(path: Path, limit: int) -> tuple[Array, Array]:
     form = format_of(path)
     if importlib.util.find_spec("meshio") is None:
         raise RequestError("it needs meshio: pip install 'vibench[mesh]'")
-    command = [sys.executable, "-P", "-m", __name__, form, str(path.absolute()), str(limit)]
+    command = [sys.executable, "-P", "-m", __name__, form, str(path.absolute()), str(limit), str(SECONDS)]
     try:
         # A busy machine takes longer than the seconds of the processor; a process that sleeps ends, too.
         done = subprocess.run(
@@ -69,7 +72,7 @@ def read_mesh(path: Path, limit: int) -> tuple[Array, Array]:
     said = done.stderr.decode(errors="replace").strip().splitlines() or ["it is damaged"]
     why = {
         3: f"it takes more than the {limit / 2**30:.3g} GiB of memory that are allowed",
-        -signal.SIGXCPU: "it takes more than 60 s",
+        -signal.SIGXCPU: f"it takes more than {SECONDS} s",
     }
     raise RequestError(f"'{path.name}' cannot be read: {why.get(done.returncode, one_line(said[-1]))}")
 
@@ -83,8 +86,8 @@ def triangles_of(form: str, path: str) -> dict[str, np.ndarray]:
     return {"points": np.asarray(mesh.points, float)[:, :2], "triangles": corners}
 
 
-def main(out: BinaryIO, form: str, path: str, size: str) -> None:
-    """Read a mesh and write its arrays, within bytes of memory beyond those taken, and a minute of the processor."""
+def main(out: BinaryIO, form: str, path: str, size: str, seconds: str) -> None:
+    """Read a mesh and write its arrays, within bytes of memory beyond those taken and seconds of the processor."""
     # Imported before the limit of memory, which is for the mesh.
     import xml.etree.ElementTree  # noqa: F401, PLC0415
 
@@ -92,7 +95,7 @@ def main(out: BinaryIO, form: str, path: str, size: str) -> None:
 
     statm = Path("/proc/self/statm")
     taken = int(statm.read_text().split()[0]) * resource.getpagesize() if statm.is_file() else 2**30
-    for limit, most in ((resource.RLIMIT_AS, taken + int(size)), (resource.RLIMIT_CPU, 60)):
+    for limit, most in ((resource.RLIMIT_AS, taken + int(size)), (resource.RLIMIT_CPU, int(seconds))):
         hard = resource.getrlimit(limit)[1]
         resource.setrlimit(limit, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
     try:

@@ -106,8 +106,10 @@ def solve_qp(
     start
         Warm start of the same dimensions, for solvers with `takes_start`.
 
-    Raises a `NumericalError` if the solver does not return a `QPSolution` of the right shapes, with a text as its
-    status.
+    Raises
+    ------
+    NumericalError
+        If the solver does not return a `QPSolution` of the right shapes, with a text as its status.
     """
     if not program.f.any() and (program.g >= 0.0).all():
         return QPSolution(np.zeros_like(program.f), np.zeros_like(program.g), "nothing to solve: 0 is the solution")

@@ -97,7 +97,10 @@ def kkt_residuals(program: VariationalInequality, x: Array, alpha: Array, norms:
     norms
         Norms in A⁻¹ where A is factorised already.
 
-    Raises a `NumericalError` if A is not positive definite.
+    Raises
+    ------
+    NumericalError
+        If A is not positive definite.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # a diverging solver returns infinite residuals
         return _residuals(program, x, alpha, norms or dual_norms(program.A))

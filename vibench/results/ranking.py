@@ -422,7 +422,10 @@ def cheapest(
     certified
         Bounds of the mean errors, by cell.
 
-    Raises a `RequestError` if the number of queries or the error is not positive.
+    Raises
+    ------
+    RequestError
+        If the number of queries or the error is not positive.
     """
     for what, value in (("number of queries", queries), ("largest error", within)):
         if value is not None and not 0.0 < value < math.inf:

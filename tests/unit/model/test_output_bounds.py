@@ -42,7 +42,7 @@ def test_there_is_no_bound_without_those_of_u_and_lambda(model: vibench.Model) -
     assert output_error_bound((2.0, 1.0), base, replace(bound, inf_sup=0.0, lam=np.inf)) == np.inf
     assert output_error_bound((2.0, 0.0), base, replace(bound, inf_sup=0.0, lam=np.inf)) < np.inf
     assert output_error_bound((0.0, 0.0), base, OnlineBound.none("why")) == np.inf
-    unproved = replace(base, inf_sup=replace(base.inf_sup, value=0.0, reason="why"))
+    unproved = replace(base, inf_sup=replace(base.inf_sup, value=0.0, note="why"))
     assert output_weights(model.problem, unproved, Output("s", "1", lam=np.ones(model.problem.W.dim)))[1] == np.inf
     with pytest.raises(NumericalError, match="coefficients of λ of shape"):
         output_weights(model.problem, base, Output("s", "1", lam=np.ones(1)))
