@@ -25,6 +25,9 @@ def write_atomically(path: Path, content: bytes | Iterable[bytes], *, durable: b
     `durable` content is on the disk when the function returns. Raises an `OSError` if it cannot be written; nothing is
     left behind.
     """
+    # The name of a device, as /dev/null, would be that of an ordinary file from then on.
+    if os.path.lexists(path) and stat.S_IFMT(path.lstat().st_mode) not in {stat.S_IFREG, stat.S_IFDIR, stat.S_IFLNK}:
+        raise OSError(errno.EINVAL, "it is no regular file")
     part = path.parent / f"{TEMPORARY}{secrets.token_hex(8)}{PART}"
     # Permissions follow the user's mask.
     handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)

@@ -241,6 +241,14 @@ def test_who_may_read_a_file_is_decided_by_the_mask(tmp_path: Path) -> None:
         assert (tmp_path / "report.html").stat().st_mode & 0o777 == mode
 
 
+def test_a_pipe_or_a_device_is_not_replaced_by_a_file(tmp_path: Path) -> None:
+    """As /dev/null would be, for an administrator."""
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OSError, match="it is no regular file"):
+        write_atomically(tmp_path / "pipe", b"")
+    assert (tmp_path / "pipe").is_fifo()
+
+
 def test_what_cannot_be_written_whole_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target = tmp_path / "table.csv"
     target.write_text("before")
