@@ -93,7 +93,7 @@ class Assemblies:
         return self._quotients[key]
 
     def _stiffness_at(self, mu: Array) -> bytes:
-        """What all parameters with the A of mu (d,) have in common: A often depends on a few of them alone."""
+        """Key of all parameters with the A of mu (d,): A often depends on a few components alone."""
         return self._digest_at(mu, "A")
 
     def _digest_at(self, mu: Array, member: str) -> bytes:

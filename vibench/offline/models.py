@@ -87,7 +87,7 @@ class CellSolver:
         return solution
 
     def verdict(self, slackened: float = 1.0) -> tuple[Status, str, Residuals | None]:
-        """What verification says of the last solution, to some multiple of the accuracy; ok if there is none."""
+        """The verdict of verification on the last solution, to some multiple of the accuracy; ok if there is none."""
         if self.last is None:
             return Status.OK, "", None
         return verify(*self.last, slackened * self._accuracy)

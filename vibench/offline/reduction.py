@@ -213,12 +213,12 @@ class Reduction:
 
     @cached_property
     def offline(self) -> Offline:
-        """What the primal strategy is given."""
+        """The input of the primal strategy."""
         return Offline(self.problem, self.pod.basis, self.cone, self.multipliers.span, self.parameters)
 
     @cached_property
     def enrichment(self) -> Enrichment:
-        """What the primal strategy adds to V_N."""
+        """The vectors that the primal strategy adds to V_N."""
         if self.primal is None:
             return Enrichment(Kind.NONE)
         return check_enrichment(self.primal.build(self.offline, self.tolerance), self.problem.V, self.pod.basis)
@@ -253,7 +253,7 @@ class Reduction:
 
     @cached_property
     def certificate_base(self) -> CertificateBase:
-        """What the certificates of all reduced models of the problem have in common."""
+        """Offline data shared by the certificates of all reduced models of the problem."""
         return certificate_base(self.problem, self.members, self.decomposed)
 
     def certificate_of(self, reduced: AnyReducedModel) -> OnlineCertificate:

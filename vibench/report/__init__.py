@@ -1,4 +1,4 @@
-"""What a run found: findings, HTML report, figures, comparison of runs, replay and export of programs."""
+"""Evaluation of runs: findings, HTML report, figures, comparison of runs, replay and export of programs."""
 
 import lazy_loader
 
