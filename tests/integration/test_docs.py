@@ -6,6 +6,7 @@ import contextlib
 import copy
 import importlib
 import importlib.util
+import inspect
 import io
 import json
 import pkgutil
@@ -293,6 +294,20 @@ def test_the_api_reference_has_every_public_name_once() -> None:
     listed = re.findall(r"^::: vibench\.([\w.]+)$", (DOCS / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
     grouped = [f"{group}.{name}" for group in vibench.GROUPS for name in getattr(vibench, group).__all__]
     assert sorted(listed) == sorted([*(set(vibench.__all__) - set(vibench.GROUPS)), *grouped])
+
+
+def test_described_parameters_exist() -> None:
+    """Those of numpydoc sections are in the signature."""
+    modules = [getattr(vibench, group) for group in vibench.GROUPS]
+    described = 0
+    for name, public in [(name, getattr(one, name)) for one in (vibench, *modules) for name in one.__all__]:
+        section = re.search(r"^Parameters\n-+\n(.*?)(?=^\w+\n-+$|\Z)", inspect.getdoc(public) or "", re.M | re.S)
+        if section and (inspect.isfunction(public) or inspect.isclass(public)):
+            heads = re.findall(r"^(\S.*)$", section[1], re.MULTILINE)
+            names = {one.strip() for head in heads for one in head.split(",")}
+            assert names <= set(inspect.signature(public).parameters), name
+            described += 1
+    assert described > 10
 
 
 @pytest.fixture

@@ -7,18 +7,31 @@ from itertools import product
 
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
 from numerics import exact, spd
 from samples import SOLVERS_OF_TESTS
 
+from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.qp import verification
-from vibench.qp.scaling import drive, near_rows, row_norms, stiffness, units_of, units_of_dual
+from vibench.qp.scaling import (
+    drive,
+    in_units,
+    near_rows,
+    nearby,
+    random_units,
+    row_norms,
+    stiffness,
+    units_of,
+    units_of_dual,
+)  # fmt: skip
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution
+from vibench.stages.query import ProgramQuery
 
 seeds = st.integers(0, 10_000)
 exponents = st.integers(-12, 12)
@@ -161,3 +174,43 @@ def test_a_start_without_load_is_in_the_same_units(solver: str, form: str) -> No
     warm = solve_qp(vi, solver, 1e-8, factor=factor, start=cold)
     assert verification.verify(vi, warm, 1e-8)[0] is Status.OK
     assert warm.iterations <= cold.iterations
+
+
+@given(st.integers(1, 6), st.integers(0, 5), st.sampled_from([1e-4, 1e-7, 1e-10]), st.integers(0, 2**32))
+def test_in_other_units_it_is_the_same_program(n: int, m: int, accuracy: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    root, B, g = rng.standard_normal((2 * n, n)), rng.standard_normal((m, n)), rng.random(m)
+    A = root.T @ root
+    program = VariationalInequality(A, rng.standard_normal(n), np.vstack([B, -B]), np.hstack([g, -g]))
+    d, again, other = (random_units(n, accuracy, seed, k) for k in (1, 1, 2))
+    assert np.array_equal(d, again)
+    assert not np.array_equal(d, other)
+    assert 0.0 < np.abs(d - 1.0).max() <= 1e3 * accuracy
+    scaled = in_units(program, d)
+    assert np.array_equal(scaled.A, scaled.A.T)
+    assert np.array_equal(scaled.B[:m], -scaled.B[m:])
+    x = rng.standard_normal(n)
+    assert np.allclose(scaled.A @ x, d * (A @ (d * x)), rtol=1e-12, atol=1e-12)
+    assert np.allclose(scaled.B @ x, program.B @ (d * x), rtol=1e-12, atol=1e-12)
+    assert scaled.f @ x == pytest.approx(program.f @ (d * x), abs=1e-12)
+    assert np.array_equal(scaled.g, program.g)
+    repeated = ProgramQuery(program, np.linalg.cholesky(A), "piqp", accuracy).repeated(seed)
+    assert np.allclose(repeated.factor @ repeated.factor.T, repeated.program.A, rtol=1e-12, atol=1e-12)
+
+
+@given(st.integers(0, 2**32), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_a_parameter_nearby_is_in_the_box(seed: int, one: float, other: float) -> None:
+    box = ParameterBox(("a", "b"), np.array([-1.0, 1e6]), np.array([0.0, 3e6]), ("1", "1"))
+    mu = box.lower + np.array([one, other]) * (box.upper - box.lower)
+    found = nearby(box, mu, seed)
+    assert np.all(box.lower <= found)
+    assert np.all(found <= box.upper)
+    assert not np.array_equal(found, mu)
+    assert np.allclose(found, mu, rtol=1e-9, atol=1e-9)
+
+
+def test_the_factor_of_a_program_in_other_units_is_lower_triangular() -> None:
+    A = np.array([[2.0, 1.0], [1.0, 3.0]])
+    program = VariationalInequality(A, np.ones(2), np.eye(2), np.ones(2))
+    repeated = ProgramQuery(program, scipy.linalg.cholesky(A, lower=True), "piqp", 1e-7).repeated(5)
+    assert repeated.factor[0, 1] == 0.0

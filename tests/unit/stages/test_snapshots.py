@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal
 
 import broken_variants
 import numpy as np
@@ -19,9 +20,10 @@ from vibench import NumericalError, Problem, VariationalInequality
 from vibench.interfaces.validation import AGREEMENT_RTOL, Fingerprint, ReferenceAssembly, fingerprint
 from vibench.model.error_bounds import REFERENCE
 from vibench.plugins.plugin import Plugin
+from vibench.stages import snapshots
 from vibench.stages.artefacts import Store
 from vibench.stages.base import build_problem
-from vibench.stages.snapshots import fingerprint_here, gather, solution_stages
+from vibench.stages.snapshots import SnapshotStage, fingerprint_here, gather, solution_stages
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.testing.checks import call_in_other_process
 
@@ -138,3 +140,27 @@ def test_references_are_verified_by_their_error_bounds(
     monkeypatch.setattr("vibench.model.error_bounds.first_margin", np.zeros_like)
     with pytest.raises(NumericalError, match=r"at mu = \[.*\]: the error bound of the high-fidelity solution is "):
         chunks[1].run(store)
+
+
+@pytest.mark.parametrize("role", ["training", "validation"])
+def test_a_high_fidelity_solution_is_repeated_next_to_its_parameter(
+    role: Literal["training", "validation"], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    visited, plain = list[tuple[float, ...]](), snapshots.checked_assembly
+    monkeypatch.setattr(
+        snapshots, "checked_assembly", lambda problem, mu: (visited.append(tuple(mu)), plain(problem, mu))[1]
+    )
+    problem = Plugin("problem", "obstacle", '{"resolution": 150}', "repeats")
+    snapshots._set_up.cache_clear()  # with the set-up, beside which a training solution is repeated
+    found = SnapshotStage(problem, ParameterSet(role, 6, 3), 0).run(Store(tmp_path)).value
+    repeated = {mu for mu in visited if visited.count(mu) > 1}
+    repeated -= {tuple(problem.create().training_set()[0])}  # where the fingerprint is taken
+    for mu in repeated:  # once more for verification, when all that is timed there has been
+        last = len(visited) - 1 - visited[::-1].index(mu)
+        assert visited.count(mu) == 2
+        assert not any(np.allclose(later, mu, rtol=0.0, atol=1e-8) for later in visited[last + 1 :])
+    assert len(set(visited)) > len(found.mu)
+    assert {tuple(mu) for mu in found.mu} <= set(visited)
+    for mu, u, lam in zip(found.mu, found.u.T, found.lam.T, strict=True):
+        vi = problem.create().assemble(mu)
+        assert np.abs(vi.A @ u - vi.f + vi.B.T @ lam).max() < 1e-12 * np.abs(vi.A @ u).max()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import SampleStore, carry_out, program_queries
 
+from vibench.errors import NumericalError
+from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.interfaces.strategies import Stop
 from vibench.model.galerkin import ReducedModel
+from vibench.model.hyperreduced import HyperReducedModel
+from vibench.plugins import registry
 from vibench.plugins.plugin import Plugin
+from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
+from vibench.qp.verification import QPSolution
 from vibench.stages import marginal_solutions, timing_rounds
 from vibench.stages.base import Failed
 from vibench.stages.cell_queries import CellQueries
@@ -40,21 +47,29 @@ PROBLEM = Plugin("problem", "obstacle", '{"resolution": 200}', "test")
 VALIDATION = 6
 
 
-def cell(primal: str = "decorrelated", solver: str = "piqp", interpolation: float | None = None) -> CellQueries:
+def cell(
+    primal: str = "decorrelated", solver: str = "piqp", interpolation: float | None = None, count: int = VALIDATION,
+    accuracy: float = 1e-7,
+) -> CellQueries:  # fmt: skip
     cone = ConeStage(PROBLEM, Plugin("dual strategy", "cpg", "{}", "test"), Stop(size=4))
     strategy = Plugin("primal strategy", primal, "{}", "test")
     enrichment = SingleEnrichment(PODStage(PROBLEM, Stop(size=4)), cone, strategy, None)
-    return program_queries(enrichment, interpolation, ParameterSet("validation", VALIDATION, 1), solver, 1e-7)
+    return program_queries(enrichment, interpolation, ParameterSet("validation", count, 1), solver, accuracy)
 
 
 CELLS = (cell(), cell(solver="osqp"), cell("online-supremizers"), cell(interpolation=1e-6))
 EVERY = tuple(range(VALIDATION))
+OF_THREE = tuple(
+    cell(solver=solver, interpolation=interpolation, count=3, accuracy=1e-8)
+    for interpolation in (None, 1e-6) for solver in ("remembers", "other")
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
     store = SampleStore(tmp_path_factory.mktemp("artefacts"))
-    for stage in TimingRounds(CELLS, (EVERY,) * len(CELLS), 1, first=0).inputs():
+    stages = [stage for cells in (CELLS, OF_THREE) for stage in TimingRounds(cells, (EVERY,) * 4, 1, first=0).inputs()]
+    for stage in stages:
         if store.get(stage.key) is None:
             carry_out(stage, store)
     return store
@@ -316,3 +331,71 @@ def test_a_slow_machine_marks_the_row_and_waiting_for_a_core_does_not(wall: floa
 def test_the_limit_of_the_stage_is_that_of_all_its_cells(tmp_path: Path) -> None:
     assert TimingRounds(CELLS, (EVERY,) * 4, 12, first=0).weight == 4
     assert CELLS[0].weight == 1
+
+
+class Remembers:
+    """A solver that returns an earlier answer to a program that is the same to so many digits, or to the last bit."""
+
+    def __init__(self, digits: int | None = None) -> None:
+        self.known: dict[bytes, QPSolution] = {}
+        self.digits, self.solved, self.remembered = digits, 0, 0
+
+    def __call__(self, program: VariationalInequality, accuracy: float) -> QPSolution:
+        data = (np.asarray(getattr(program, name)) for name in MEMBERS)
+        key = b"".join((one if self.digits is None else one.round(self.digits) + 0.0).tobytes() for one in data)
+        if key in self.known:
+            self.remembered += 1
+        else:
+            self.solved += 1
+            self.known[key] = solve_qp(program, "piqp", accuracy)
+        return self.known[key]
+
+
+def test_a_solver_that_remembers_programs_never_meets_one_again(
+    store: SampleStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two cells of one problem and solver are in the rounds, whose programs are the same."""
+    solver = Remembers()
+    monkeypatch.setattr(registry, "qp_solver", lambda name: {name: solver})
+    timed = TimingRounds(OF_THREE, (EVERY[:3],) * 4, 12, first=0).run(store).value
+    assert [len(one.rounds) for one in timed] == [12] * 4
+    assert solver.solved == 4 * (12 + 1)  # a query in every round, and the warm-up
+    assert solver.remembered == 0
+
+
+@pytest.mark.parametrize("which", [0, 2])
+def test_an_answer_to_a_similar_program_is_not_timed(
+    which: int, store: SampleStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solver = Remembers(digits=1)
+    monkeypatch.setattr(registry, "qp_solver", lambda name: {name: solver})
+    # which queries a round begins with depends on measured seconds; units of some let the first answer pass
+    monkeypatch.setattr(timing_rounds, "parts_alike", lambda _, parts: (EVERY[:3],) * parts)
+    with pytest.raises(NumericalError, match=r"residual .* above 3e-07.*does the solver remember answers"):
+        TimingRounds(OF_THREE[which : which + 1], (EVERY[:3],), 12, first=0).run(store)
+    assert solver.remembered == 1
+
+
+def test_reduced_programs_are_assembled_nowhere_twice(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A problem may keep what it computed for a parameter."""
+    monkeypatch.setattr(registry, "qp_solver", lambda name: {name: Remembers()})
+    visited: list[tuple[float, ...]] = []
+    plain = HyperReducedModel.assemble
+    monkeypatch.setattr(
+        HyperReducedModel, "assemble", lambda model, mu: (visited.append(tuple(mu)), plain(model, mu))[1]
+    )
+    TimingRounds(OF_THREE, (EVERY[:3],) * 4, 12, first=0).run(store)
+    assert len(visited) == len(set(visited)) == 2 * (12 + 1)
+    assert len({tuple(np.round(mu, 6)) for mu in visited}) == 3
+
+
+@pytest.mark.parametrize("reduced", [False, True], ids=["primal", "dual"])
+def test_a_warm_start_is_in_the_units_of_its_program(reduced: bool, store: SampleStore) -> None:
+    """Started from its own solution, a query is solved at once; from the one in other units it would not be."""
+    queries = CELLS[3 if reduced else 0].queries(store)
+    plain = queries.query(1, "osqp", 1e-8, warm_start=False)
+    started = ProgramQuery(plain.program, plain.factor, "osqp", 1e-8, (1, plain.program)).repeated(1, 2)
+    assert np.array_equal(started.start[1].A, started.program.A)
+    answer, _ = started.prepare(nullcontext)()
+    cold, _ = plain.repeated(1, 2).prepare(nullcontext)()
+    assert answer.iterations <= cold.iterations

@@ -215,3 +215,5 @@ def test_a_trainer_counts_bounds_and_seconds() -> None:
     assert trainer.solved[1].bound == first
     assert trainer.bound(np.array([0.9])) < 1e-5 < first
     assert trainer.selecting.cpu > 0.0
+    exact = HighFidelitySolver(problem).solve(np.array([0.9]))
+    np.testing.assert_allclose(trainer.solved[1].solution.u, exact.u, rtol=1e-10)
