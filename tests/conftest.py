@@ -1,7 +1,5 @@
 """What all tests share, and fixtures of those that run vibench."""
 
-from __future__ import annotations
-
 import fcntl
 import gc
 import os

@@ -6,8 +6,6 @@ Tests that mirror the changed file run first, all others if those pass. Prints w
 1 if one survives, or if the tests fail on the copy as it is.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

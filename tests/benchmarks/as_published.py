@@ -6,8 +6,6 @@ Both sides do the same stages one after the other, K times in turn, each with th
 one BLAS thread; CPU seconds, medians. Exit code 1 unless both come to the same models: sizes, σ, snapshots and errors.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import statistics

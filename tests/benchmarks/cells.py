@@ -8,8 +8,6 @@ imports count. Then `show`, `report` and `compare` read the run. Exit code 1 if 
 1.5 times one of the smallest, the runner takes 1 GiB, or one of the commands 30 CPU seconds.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import resource

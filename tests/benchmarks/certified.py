@@ -15,8 +15,6 @@ strip of nodes on its lower edge: the mesh grows away from it. Its members are d
 of the obstacle vary. COUNT parameters (200 by default), taken in turns; violations and effectivities, too.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

@@ -7,8 +7,6 @@ absolute difference is printed, of texts how many differ, of both how many are t
 the same to the last bit are not listed.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from pathlib import Path

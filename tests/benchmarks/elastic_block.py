@@ -8,8 +8,6 @@ factorisation and active sets at a parameter at which nothing is known; what doe
 factors of X_V, is known before both. On one thread.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import statistics

@@ -3,8 +3,6 @@
 Usage: python tests/benchmarks/exported.py RUN CELL [TOLERANCE]
 """
 
-from __future__ import annotations
-
 import ctypes
 import subprocess
 import sys

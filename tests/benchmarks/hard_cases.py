@@ -9,8 +9,6 @@ in V, of λ in the natural norm and in W, at online cost and at that of the mesh
 With model packs, as that of examples/freefem/signorini.edp, it has these and nothing else.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Iterator

@@ -8,8 +8,6 @@ and after each part of the measurement. CPU seconds on one thread. Exit code 1 i
 than 5 %, or the intervals of two numbers of parameters have no point in common.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import statistics

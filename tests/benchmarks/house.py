@@ -6,8 +6,6 @@
 entries and defaults of arguments. The beginnings What, Whom, Of and So many of docstrings are counted as `odd`.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 import sys

@@ -5,8 +5,6 @@ Gram-Schmidt, every indicator is evaluated at every step, a query assembles and 
 with care for speed within that (sparse matrices, one factorisation of X_V, array operations), by nothing of vibench's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import cvxopt

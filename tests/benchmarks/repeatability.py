@@ -7,8 +7,6 @@ over all pairs of runs, by how much gains differ between the runs that had a cor
 by `--loaded`, and the scatter of the gains over all runs beyond what their blocks show.
 """
 
-from __future__ import annotations
-
 import argparse
 from itertools import combinations
 from pathlib import Path

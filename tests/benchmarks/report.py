@@ -8,8 +8,6 @@ largest process. The command ends with exit code 1 if the report of 704 cells ta
 megabytes, or two seconds to open, or if one of the pages does not open.
 """
 
-from __future__ import annotations
-
 import os
 import resource
 import subprocess

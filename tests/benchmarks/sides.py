@@ -1,7 +1,5 @@
 """The two sides that `as_published.py` compares: the algorithms as published, and vibench's own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 

@@ -5,8 +5,6 @@ Usage: python tests/benchmarks/site_widths.py SITE
 Prints every page that is wider than its window, or has an element that ends beyond it; then the exit code is 1.
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from collections.abc import Iterator

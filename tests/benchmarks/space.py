@@ -14,8 +14,6 @@ Bounds at online cost of four certified models of one mesh (decorrelated and off
 the bounds of u in the energy norm and of λ in the natural one, and median and largest effectivities.
 """
 
-from __future__ import annotations
-
 import resource
 import sys
 import time

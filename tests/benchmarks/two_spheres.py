@@ -5,8 +5,6 @@
 by default coarse, medium and paper; smaller contacts are computed on the first of them alone.
 """
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

@@ -6,8 +6,6 @@ Every run begins from nothing, in a folder of its own below FOLDER. Exit code 1 
 two workers take more than 65 % of the wall time of one.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

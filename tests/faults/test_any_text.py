@@ -1,7 +1,5 @@
 """Any text and any count go from a solver through the results file to every output, and act in none of them."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

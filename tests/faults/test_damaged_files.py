@@ -1,7 +1,5 @@
 """Damaged results files and artefacts: any bit, any length; it is found, or without effect on any number."""
 
-from __future__ import annotations
-
 import random
 import shutil
 import sqlite3

@@ -1,7 +1,5 @@
 """Model packs drawn at random, valid and broken, read by one process: no crash, no traceback, no file elsewhere."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

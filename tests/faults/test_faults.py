@@ -1,7 +1,5 @@
 """Runs that are killed at random moments, and full disks: nothing is lost, and a later run completes the rest."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import random

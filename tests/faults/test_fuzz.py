@@ -1,7 +1,5 @@
 """Five hundred study files, each broken somewhere: a line and exit code 2, or a matrix; never a traceback."""
 
-from __future__ import annotations
-
 import copy
 import random
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Runs that are stopped in the middle, and go on."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A matrix of plugins of a third party that misbehave in every way."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The seeded faults still fit the sources; that the tests catch them is what `python tests/mutations.py` shows."""
 
-from __future__ import annotations
-
 from mutations import FAULTS, ROOT, changed
 
 

@@ -1,7 +1,5 @@
 """Packages that meddle with their process, or take the names of others: it costs their own cells, and is told."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import fake_plugins

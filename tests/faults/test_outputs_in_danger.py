@@ -1,7 +1,5 @@
 """Sites, exports and reports that are killed, that find a full disk, links in a circle, or folders of another user."""
 
-from __future__ import annotations
-
 import os
 import random
 import shutil

@@ -1,7 +1,5 @@
 """Files of strangers: artefacts, results and links that somebody else has put in place do no harm."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import pickle

@@ -1,7 +1,5 @@
 """Worker processes that hang, die or are told to stop: what is kept, what is said, and how soon."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os

@@ -1,7 +1,5 @@
 """Text from others is data: whatever plugins, solvers, studies and results files say, a run ends and nothing acts."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

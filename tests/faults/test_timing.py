@@ -1,7 +1,5 @@
 """Runs in which something goes wrong while seconds are measured: answers are kept, and so are the other seconds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Formulations that are _wrong, each in one way; what `vibench check` has to find, and nothing else."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """Strategies that are wrong, each in one way; what `vibench check` has to find, and nothing else."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """A Chromium that tests drive, without a network: what it shows at a width, in the light or in the dark."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Problems that write every result into the same arrays, as a careful programmer of large systems might."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

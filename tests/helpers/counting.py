@@ -1,7 +1,5 @@
 """What work costs, counted: seconds depend on what else the machine does."""
 
-from __future__ import annotations
-
 import gc
 import sys
 from collections.abc import Callable

@@ -3,8 +3,6 @@
 It has imported vibench and read its sources, and the worker processes of dask's workers are forked as well.
 """
 
-from __future__ import annotations
-
 import os
 
 import fake_stages  # noqa: F401  what these worker processes run

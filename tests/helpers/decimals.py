@@ -4,8 +4,6 @@ Data are taken as the doubles that they are. What is returned satisfies the opti
 that it is the solution, however the guess of the active set was found.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from decimal import Decimal, localcontext
 from itertools import product

@@ -1,7 +1,5 @@
 """Test data of the primal strategies: a reduced setting, and greedy choices without laziness."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Plugins of a third party that the runner is tried on: a small problem, and one plugin for every way to misbehave."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import signal

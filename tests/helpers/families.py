@@ -1,7 +1,5 @@
 """Families of multiplier snapshots, degenerate ones included, for tests of dual strategies."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.sparse as sp
 from hypothesis import strategies as st

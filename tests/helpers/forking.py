@@ -6,8 +6,6 @@ itself. Tests of how processes start and what belongs to them take new interpret
 `new_workers`.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import faulthandler

@@ -1,7 +1,5 @@
 """Formulations that are right, for tests: the mixed one as a plugin, and one that has no multiplier."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """Problems that are hard for solvers and bounds: stiff ones, and ones with dependent rows and equalities."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Results files of any size, made of a small run: its cells again and again under other names, with other numbers."""
 
-from __future__ import annotations
-
 import hashlib
 import random
 import shutil

@@ -1,7 +1,5 @@
 """Plugins that change the process they run in, or remember answers; their package must be the only one to suffer."""
 
-from __future__ import annotations
-
 import os
 import resource
 import time

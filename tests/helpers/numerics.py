@@ -1,7 +1,5 @@
 """Test data shared by the numerical tests: random spaces and a small problem whose constraints vary."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Plugins of a third party whose names, messages and numbers are odd; where they solve anything they solve it right."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Problems of another nature than the built-in ones: plastic torsion, a perpetual put, a block on a rigid obstacle."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np

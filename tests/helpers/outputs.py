@@ -1,7 +1,5 @@
 """What an output may not hold, control characters and HTML that is not its own; and where it leads."""
 
-from __future__ import annotations
-
 from html.parser import HTMLParser
 
 

@@ -1,7 +1,5 @@
 """A small model pack, and packs with one thing changed."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 from collections.abc import Mapping

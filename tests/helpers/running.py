@@ -1,7 +1,5 @@
 """Running the command as a user would, and looking at what it leaves behind."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -1,7 +1,5 @@
 """A made-up run: columns are filled, a cell failed, and values are missing."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from itertools import product

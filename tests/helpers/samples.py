@@ -1,7 +1,5 @@
 """Test data of the tests that do no numerics: study files, rows of the results, third-party packages."""
 
-from __future__ import annotations
-
 import copy
 import json
 import shutil

@@ -1,7 +1,5 @@
 """The sources of the core, and where a name stands in them."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

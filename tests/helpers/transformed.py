@@ -1,7 +1,5 @@
 """Problems written down in another way: other units, rows, unknowns and inner products, and rows that are far away."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

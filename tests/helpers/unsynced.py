@@ -1,7 +1,5 @@
 """Files that tests write are not waited for: no test is about a machine that loses its power."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 

@@ -1,7 +1,5 @@
 """The algorithms as published, written around cvxopt, and vibench's own come to the same models."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The benchmarks time whatever is registered and keep what it reached; two of their files are compared by both."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import math

@@ -1,7 +1,5 @@
 """The core knows no plugin: it imports none and names none."""
 
-from __future__ import annotations
-
 import ast
 import importlib.metadata
 

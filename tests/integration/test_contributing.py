@@ -1,7 +1,5 @@
 """The map of the code in CONTRIBUTING is that of the code."""
 
-from __future__ import annotations
-
 import importlib
 import re
 import tomllib

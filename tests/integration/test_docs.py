@@ -1,7 +1,5 @@
 """The documentation is true: its code runs, its tables are complete, its rules are those that studies are held to."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import importlib

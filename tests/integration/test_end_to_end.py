@@ -1,7 +1,5 @@
 """The whole matrix through the command line, judged by the invariants that every row must keep."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

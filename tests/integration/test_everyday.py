@@ -1,7 +1,5 @@
 """Everyday tasks of a new user, an author of a model and an engineer: a few commands at 80 columns each."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """The example package: installed as a third party's, found by its entry points, run beside the built-in ones."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Formulations in studies: the mixed one as a plugin gives its numbers, and misbehaviour costs its own rows."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Packs are found beside the study, wherever vibench is started; moved ones where the user says, edited ones never."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Models of other codes: the examples are exported by these codes' own programs, where they are installed."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -4,8 +4,6 @@ A bar below and above its yield stress, where λ = 0 at some parameters; a perpe
 alone, without load, and one that it does not reach everywhere.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Classes of a script run through a study without any package, and run again when they are edited."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A study on the packs of problems gives the numbers of the problems, in full and in reduced assembly."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Running a matrix through the command line."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re

@@ -1,7 +1,5 @@
 """Degenerate input through the whole chain: nothing to reduce, no contact, contact everywhere, copies, near copies."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from fake_plugins import Wire

@@ -1,7 +1,5 @@
 """Generators that may be used with either sign, from the cone to the rows of a run."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

@@ -1,7 +1,5 @@
 """Stiff problems, dependent rows and equalities: short versions of `tests/benchmarks/hard_cases.py`."""
 
-from __future__ import annotations
-
 from unittest import mock
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Results do not depend on how a problem is written down: units, scales of rows and unknowns, their order, far rows."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from functools import cache

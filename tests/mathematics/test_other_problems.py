@@ -1,7 +1,5 @@
 """The problems that stand for a stranger's are what they claim to be: checked by closed forms before they are run."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from other_problems import Block, Put, Torsion

@@ -1,7 +1,5 @@
 """The obstacle problem at the paper's size: dimensions and stability beside what the paper reports."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Products of sparse and dense matrices, whatever their rows."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.sparse as sp

@@ -1,7 +1,5 @@
 """What problems share around scikit-fem: Gram matrices, masses, constraints, Dirichlet data."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

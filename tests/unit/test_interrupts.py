@@ -1,7 +1,5 @@
 """What Ctrl-C does outside of commands, in them, and where it was ignored; with signals: tests/faults."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Iterator

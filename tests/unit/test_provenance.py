@@ -1,7 +1,5 @@
 """Where numbers come from: machine, versions and the code."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import os
 import platform

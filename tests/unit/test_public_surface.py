@@ -1,7 +1,5 @@
 """What authors of plugins and users of the library import: from `vibench` or a named submodule of it, and lazily."""
 
-from __future__ import annotations
-
 import inspect
 import re
 import subprocess

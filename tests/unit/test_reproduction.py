@@ -1,7 +1,5 @@
 """The page that compares the paper claim by claim: its predicates, and that it lists every row and every figure."""
 
-from __future__ import annotations
-
 import html
 import importlib
 import math

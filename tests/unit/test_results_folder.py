@@ -1,7 +1,5 @@
 """The folder `results/` is light: it holds pages, their scripts, and the files that pages show or link."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import re

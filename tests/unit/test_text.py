@@ -1,7 +1,5 @@
 """Text from others: printable, in one line, of bounded length, and the same text where it was all that before."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Seconds: which clock, how many repeats, one thread, and how disturbed the machine is."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import subprocess

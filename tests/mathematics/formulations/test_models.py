@@ -1,7 +1,5 @@
 """Formulations as models of whole problems: the identities with the mixed one, and what each says of itself."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Formulations of one reduced program against the mixed one: their limits, rates and certificates, in any units."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The Hertz problem with the approach as its second parameter."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The obstacle problem whose disc may bulge: a map that is not affine on the disc."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The quantities of interest of the built-in problems: equilibrium of forces, areas in closed form."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

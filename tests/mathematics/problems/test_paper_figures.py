@@ -1,7 +1,5 @@
 """Twins of the paper's figures: they show the numbers of the run and of the paper, and judge by both."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

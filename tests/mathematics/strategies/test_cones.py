@@ -1,7 +1,5 @@
 """Dual strategies beside the plain and the modified greedy: what all of them promise, and what each one is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

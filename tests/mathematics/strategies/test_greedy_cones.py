@@ -1,7 +1,5 @@
 """What the plain and the modified greedy promise for every family of snapshots, degenerate ones included."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from families import W, families

@@ -1,7 +1,5 @@
 """Greedy training: it solves where the bound is worst until the candidates meet the tolerance, as the rows say."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

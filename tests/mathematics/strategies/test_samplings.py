@@ -1,7 +1,5 @@
 """Sampling strategies: points of the box, the same in every call, with the property that gives each its name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

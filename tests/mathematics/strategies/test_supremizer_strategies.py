@@ -1,7 +1,5 @@
 """Fixed enrichments by supremizers that look at the inf-sup constant, or at all supremizers at once."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Words that a shell completes, and the examples of `--help`."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import subprocess

@@ -1,7 +1,5 @@
 """What the doctor says, and when something counts as broken."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import sys
 from pathlib import Path

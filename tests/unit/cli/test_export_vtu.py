@@ -1,7 +1,5 @@
 """The command that exports a solution for ParaView."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tables fit the terminal: nothing is cut, no number is wrapped, and what is left out is named."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import re

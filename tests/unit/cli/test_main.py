@@ -1,7 +1,5 @@
 """The command line: what is wrong with a request is one line and exit code 2, and nothing is started."""
 
-from __future__ import annotations
-
 import csv
 import importlib.metadata
 import io

@@ -1,7 +1,5 @@
 """What is printed: text from others acts neither on the terminal nor on the tables, and lines stay lines."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 from collections.abc import Callable

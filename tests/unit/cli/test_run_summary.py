@@ -1,7 +1,5 @@
 """The end of a run: reasons are grouped, cells are named wholly, and what to do next are commands."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 from typing import Any

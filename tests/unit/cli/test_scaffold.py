@@ -1,7 +1,5 @@
 """`vibench new`: packages that install, pass their own tests and give rows as they are; bad names leave nothing."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Help imports none of the libraries that take most of the time to start, and completion of names none but pydantic."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Runs on a dask cluster whose workers die, come late, are many, or whose scheduler disappears: rows as locally."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

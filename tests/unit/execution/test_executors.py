@@ -1,7 +1,5 @@
 """Where stages run: the same numbers on a dask cluster, and what becomes of workers that die or are of no use."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

@@ -1,7 +1,5 @@
 """QP solvers on the small program: accurate, wrong, failing, hanging, and ending their process."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 

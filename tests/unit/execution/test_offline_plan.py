@@ -1,7 +1,5 @@
 """Which offline stages are timed again, and what their seconds become."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """The folder of a run: one run at a time, nothing of others, and which cells a larger limit runs again."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path

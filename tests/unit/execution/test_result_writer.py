@@ -1,7 +1,5 @@
 """The columns that name a cell or a history."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which cells are timed together, when, and when again."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Affine sums and problems that consist of them."""
 
-from __future__ import annotations
-
 import math
 import pickle
 from typing import Any

@@ -1,7 +1,5 @@
 """Expressions of θ: the values are Python's; what is not arithmetic is refused and never run."""
 
-from __future__ import annotations
-
 import math
 import pickle
 

@@ -1,7 +1,5 @@
 """Every implementation of factorisations against dense matrices; and what it has to refuse."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.sparse as sp

@@ -1,7 +1,5 @@
 """What a problem assembles, kept while there is room for it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Queries that answer with the pair that their certificate corrects: rows, bounds, models."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

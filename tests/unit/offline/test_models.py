@@ -1,7 +1,5 @@
 """Reduced models of a run: queries at any parameter."""
 
-from __future__ import annotations
-
 import warnings
 from itertools import product
 

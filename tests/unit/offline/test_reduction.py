@@ -1,7 +1,5 @@
 """The offline phase as an object."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

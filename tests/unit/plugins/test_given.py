@@ -1,7 +1,5 @@
 """Classes and objects on the axes of a study: what identifies them, what is refused, and how they reach workers."""
 
-from __future__ import annotations
-
 import json
 import linecache
 import os

@@ -1,7 +1,5 @@
 """Plugins: found through entry points, refused with a reason, created from checked options."""
 
-from __future__ import annotations
-
 import datetime
 import importlib.metadata
 import sys

@@ -1,7 +1,5 @@
 """Reduced programs solved to round-off: KKT conditions, uniqueness of the multipliers, and what cannot be solved."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Units of quadratic programs: scaling loses nothing, and without load a program is solved in any units of its data."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 

@@ -1,7 +1,5 @@
 """Natural KKT residuals: what they are, what they do not depend on, and what they find."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

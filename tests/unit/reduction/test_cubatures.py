@@ -1,7 +1,5 @@
 """Cubatures: few nonnegative weights, the tolerance that they keep, and what sums with random signs know of it."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.optimize import nnls
 

@@ -1,7 +1,5 @@
 """Artefacts: whole or not there, and only those of this machine."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

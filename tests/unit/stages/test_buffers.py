@@ -1,7 +1,5 @@
 """Problems that write every result into the same arrays have the numbers of those which do not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import partial
 

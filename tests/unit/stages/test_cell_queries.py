@@ -1,7 +1,5 @@
 """Queries that start from the solution before them on a path through the parameters."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Cells whose queries a compiled program answers: judged as all others, and unavailable where there is no program."""
 
-from __future__ import annotations
-
 import shutil
 from contextlib import nullcontext
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Keys of stages change with all code that determines their numbers, and with no other code."""
 
-from __future__ import annotations
-
 import inspect
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """Values of stages as bytes: the same to the last bit, and nothing but data."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Rounds of timing: what is timed in which order, and what becomes of it."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The matrix of a study: how many cells, which ones, and what identifies them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Who factorises is chosen by a study, part of the identity of its problem, and changes no number."""
 
-from __future__ import annotations
-
 from unittest import mock
 
 import numpy as np

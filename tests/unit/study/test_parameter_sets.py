@@ -1,7 +1,5 @@
 """Training and validation sets in study files: what a cell gets, and one line for what cannot be."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Study files: what is refused, with which words, and what the options of the command line replace."""
 
-from __future__ import annotations
-
 import contextlib
 import datetime
 import tomllib

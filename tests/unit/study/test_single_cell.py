@@ -1,7 +1,5 @@
 """A study of one cell has that cell: a row can be made again from what is recorded of it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

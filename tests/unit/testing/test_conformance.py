@@ -1,7 +1,5 @@
 """Conformance checks of the plugins that come with vibench, their rules, the search for jumps, and the command."""
 
-from __future__ import annotations
-
 import importlib.metadata
 from collections.abc import Iterator
 from functools import partial

@@ -1,7 +1,5 @@
 """Every fault of a plugin is found by the check made for it; plugins that are right pass."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import partial
 from importlib import import_module

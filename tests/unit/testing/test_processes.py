@@ -1,7 +1,5 @@
 """Checks in other processes: those that hang or die are told; another process has other hashes; tests of pytest."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

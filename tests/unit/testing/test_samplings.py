@@ -1,7 +1,5 @@
 """Sampling strategies that are wrong, each in one way: the check made for it finds it, and no other does."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
