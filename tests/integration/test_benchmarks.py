@@ -122,7 +122,6 @@ def test_what_cannot_be_made_fails_with_its_reason_and_is_not_timed(third_party:
         assert name not in third_party.benchmarks
 
 
-@pytest.mark.long
 def test_a_benchmark_that_hangs_costs_itself_and_where_all_fail_there_is_a_file_of_none(tmp_path: Path) -> None:
     """In tests of pytest that somebody runs without the command."""
     path = os.pathsep.join([str(install_fakes(tmp_path / "site")), *filter(None, sys.path)])
@@ -131,18 +130,18 @@ def test_a_benchmark_that_hangs_costs_itself_and_where_all_fail_there_is_a_file_
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist"]
     command += ["-p", "vibench.benchmarks.plugin", "--pyargs", "vibench.benchmarks.stages", "--seconds=0.001"]
     command += ["--study=short.toml", "-k", "high_fidelity_solution", "--plugin=wire-sleeps"]
-    for plugins in ["--plugin=wire"], []:
-        done = subprocess.run(
-            [*command, *plugins, "--benchmark-json=a.json"],
-            cwd=tmp_path, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        assert done.returncode == 1, done.stdout + done.stderr
-        assert " 1 failed" in done.stdout
-        file = json.loads((tmp_path / "a.json").read_text())
-        assert file["failed"] == {"high_fidelity_solution[wire-sleeps]": "stopped after 5 s"}
-        names = [entry["name"] for entry in file["benchmarks"]]
-        assert names == ["test_high_fidelity_solution[wire]"] * bool(plugins)
-        assert ("test_high_fidelity_solution[wire]" in done.stdout) == bool(plugins)  # the table of pytest-benchmark
+    settings: Any = {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": path}, "text": True}
+    settings |= {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    both = [["--plugin=wire", "--benchmark-json=both.json"], ["--benchmark-json=none.json"]]
+    running = [subprocess.Popen([*command, *more], **settings) for more in both]
+    for process, names, file in zip(running, (["test_high_fidelity_solution[wire]"], []), ("both", "none"), strict=True):
+        out, _ = process.communicate()
+        assert process.returncode == 1, out
+        assert " 1 failed" in out
+        content = json.loads((tmp_path / f"{file}.json").read_text())
+        assert content["failed"] == {"high_fidelity_solution[wire-sleeps]": "stopped after 3 s"}
+        assert [entry["name"] for entry in content["benchmarks"]] == names
+        assert ("test_high_fidelity_solution[wire]" in out) == bool(names)  # the table of pytest-benchmark
 
 
 SHORT = """
@@ -152,7 +151,7 @@ problem = ["obstacle"]
 dual = ["cpg"]
 primal = ["decorrelated"]
 solvers = ["piqp"]
-limits = { cell_seconds = 5.0 }
+limits = { cell_seconds = 3.0 }
 
 [[tolerances]]
 pod = [1e-3]

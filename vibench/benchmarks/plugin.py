@@ -23,6 +23,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Mapping
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -186,12 +187,12 @@ class Passes:
         limit, parent = self._plan.setting.seconds, os.getppid()
         try:
             while True:
-                deadline = time.monotonic() + limit
+                deadline = limit + time.monotonic() - _queued(process)
                 while not ours.poll(1.0):
                     # The command was killed.
                     if os.getppid() != parent:
                         raise KeyboardInterrupt
-                    if time.monotonic() > deadline:
+                    if time.monotonic() - _queued(process) > deadline:
                         raise TimeoutError(f"stopped after {limit:g} s")
                 message = ours.recv()
                 if isinstance(message, int):
@@ -301,6 +302,14 @@ class Passes:
     def pytest_benchmark_update_json(self, output_json: dict[str, Any]) -> None:
         """Add the reasons of benchmarks that failed."""
         output_json["failed"] = self._failed
+
+
+def _queued(process: int) -> float:
+    """Seconds in which a process waited for a core, which are no fault of its work; 0 where the system does not tell."""
+    try:
+        return int(Path(f"/proc/{process}/schedstat").read_text().split()[1]) / 1e9
+    except (OSError, IndexError):
+        return 0.0
 
 
 def _pass(item: pytest.Item) -> Any:
