@@ -25,7 +25,7 @@ from vibench.cli import start
 from vibench.execution import supervisor
 from vibench.library import runs
 from vibench.plugins import registry
-from vibench.plugins.kinds import STUDY
+from vibench.plugins.kinds import PluginKind
 from vibench.results.sqlite import FILE
 from vibench.stages.artefacts import CACHE_VARIABLE
 
@@ -157,7 +157,7 @@ def quick_run(shared: Shared) -> Path:
     """Folder of one run of the study `quick`, timed in half the rounds, through the command line; not drawn."""
 
     def run(folder: Path) -> None:
-        study = Path(registry.registered(STUDY)["quick"].load()).read_text(encoding="utf-8")
+        study = Path(registry.registered(PluginKind.STUDY)["quick"].load()).read_text(encoding="utf-8")
         path = folder.with_suffix(".toml")
         path.write_text(f"timing_rounds = {QUICK_ROUNDS}\n{study}", encoding="utf-8")
         arguments = ["run", str(path), "--out", str(folder), "--jobs", "2", "--no-figures"]

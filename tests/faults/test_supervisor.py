@@ -20,7 +20,7 @@ from running import PATIENCE
 
 from vibench.execution import supervisor
 from vibench.execution.supervisor import Begun, CurrentItem, Job, StoppedError, Supervisor
-from vibench.plugins.kinds import PROBLEM
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find
 from vibench.qp.status import Status
@@ -175,7 +175,7 @@ def test_a_plugin_or_a_vibench_that_is_not_the_one_planned_with_is_refused(
     run: Run, watcher: Supervisor, tmp_path: Path
 ) -> None:
     """Its result would be stored under the hash of the other."""
-    known = Plugin("problem", "obstacle", "{}", find(PROBLEM, "obstacle").code)
+    known = Plugin("problem", "obstacle", "{}", find(PluginKind.PROBLEM, "obstacle").code)
     assert isinstance(run(OfAPlugin(OfAPlugin(problem=known))), Done)
     other = replace(known, code="older")
     found = run(OfAPlugin(OfAPlugin(problem=other)))

@@ -134,7 +134,8 @@ def test_a_benchmark_that_hangs_costs_itself_and_where_all_fail_there_is_a_file_
     settings |= {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     both = [["--plugin=wire", "--benchmark-json=both.json"], ["--benchmark-json=none.json"]]
     running = [subprocess.Popen([*command, *more], **settings) for more in both]
-    for process, names, file in zip(running, (["test_high_fidelity_solution[wire]"], []), ("both", "none"), strict=True):
+    expected = {"both": ["test_high_fidelity_solution[wire]"], "none": []}
+    for process, (file, names) in zip(running, expected.items(), strict=True):
         out, _ = process.communicate()
         assert process.returncode == 1, out
         assert " 1 failed" in out

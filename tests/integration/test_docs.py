@@ -31,7 +31,7 @@ from vibench.errors import RequestError
 from vibench.execution import run as execution
 from vibench.execution.timing_plan import TimingPlan
 from vibench.plugins import registry
-from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, SAMPLING, STUDY, PluginKind
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import registered
 from vibench.results import formats, schema
 from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
@@ -118,7 +118,7 @@ def test_the_plugins_of_the_pages_run_through_the_whole_benchmark(
 ) -> None:
     study = tomllib.loads((package / "mine.toml").read_text())
     registered = tomllib.loads((package / "pyproject.toml").read_text())["project"]["entry-points"]
-    assert {*registered, STUDY.entry_points} == {kind.entry_points for kind in PluginKind}
+    assert {*registered, PluginKind.STUDY.entry_points} == {kind.entry_points for kind in PluginKind}
     for axis, group in (("dual", "vibench.dual_strategies"), ("primal", "vibench.primal_strategies")):
         assert set(study[axis]) == set(registered[group])
     (tmp_path / "mine.toml").write_text(toml(study | {"timing_rounds": ROUNDS}), encoding="utf-8")
@@ -255,7 +255,7 @@ CITED = re.compile(r"\b([A-Z][a-z][\w'’]+)(?:, [A-Z][\w'’]+)* and [A-Z][\w'�
 def test_every_strategy_has_its_formula_source_and_snippet() -> None:
     sections = re.split(r"^##+ (.+)$", METHODS.read_text(encoding="utf-8"), flags=re.MULTILINE)
     described = {name: text for title, text in pairwise(sections[1:]) for name in title.split(", ")}
-    kinds = DUAL, FORMULATION, PRIMAL, SAMPLING
+    kinds = PluginKind.DUAL, PluginKind.FORMULATION, PluginKind.PRIMAL, PluginKind.SAMPLING
     names = [name for kind in kinds for name, plugin in registered(kind).items() if not plugin.package]
     assert len(names) > 16
     for name in names:

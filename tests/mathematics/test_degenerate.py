@@ -9,7 +9,7 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Stop
-from vibench.plugins.kinds import PROBLEM
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find
 from vibench.stages.base import value_of
@@ -110,7 +110,7 @@ def rows(register, store):
     register(*EVERYTHING)
 
     def run(case: type[Wire], dual: str, primal: str) -> CellRows:
-        problem = Plugin("problem", case.__name__, "{}", find(PROBLEM, case.__name__).code)
+        problem = Plugin("problem", case.__name__, "{}", find(PluginKind.PROBLEM, case.__name__).code)
         stop = Stop(tolerance=1e-3 if dual == "nmf" else 1e-6)  # an iteration, which ends long before round-off
         cone = ConeStage(problem, Plugin("dual strategy", dual, "{}", "test"), stop)
         tolerance = None if primal in {"decorrelated", "online-supremizers"} else 0.5

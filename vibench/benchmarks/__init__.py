@@ -14,7 +14,7 @@ from typing import Any
 from vibench.errors import RequestError, VibenchError
 from vibench.execution.supervisor import manner_of_death
 from vibench.interfaces.strategies import Stop
-from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SOLVER
+from vibench.plugins.kinds import CHECKED, PluginKind
 from vibench.plugins.registry import find, find_named, registered
 from vibench.qp.solve import installed_solvers
 from vibench.study.matrix import read_study
@@ -91,11 +91,12 @@ def chosen_plugins(plugins: Sequence[str]) -> dict[str, list[str]]:
 
     Raises a `RequestError` if there is no such plugin, several have the name, or a solver is not installed.
     """
-    kinds = {kind.cli_name: kind for kind in (PROBLEM, PRIMAL, DUAL, FORMULATION, SOLVER)}
-    chosen, solvers = dict[str, list[str]](), installed_solvers(registered(SOLVER))
+    # Samplings and studies are no part of what is timed.
+    kinds = {word: kind for word, kind in CHECKED.items() if kind is not PluginKind.SAMPLING}
+    chosen, solvers = dict[str, list[str]](), installed_solvers(registered(PluginKind.SOLVER))
     for text in plugins:
         plugin = find_named(text, kinds, solvers)
-        if plugin.kind is PROBLEM and not _takes_no_option(plugin.name):
+        if plugin.kind is PluginKind.PROBLEM and not _takes_no_option(plugin.name):
             raise RequestError(f"the {plugin} needs options, which `vibench bench` has no place for")
         chosen.setdefault(plugin.kind.cli_name, []).append(plugin.name)
     return chosen
@@ -105,7 +106,7 @@ def resolutions(texts: Sequence[str]) -> list[Resolution]:
     """Read resolutions; raises a `RequestError` for the first one that no problem has."""
     wanted: list[Resolution] = [int(text) if text.isdigit() else text for text in texts]
     for resolution in wanted:
-        if not any(_knows(problem, resolution) for problem in registered(PROBLEM)):
+        if not any(_knows(problem, resolution) for problem in registered(PluginKind.PROBLEM)):
             raise RequestError(f"no problem has the resolution {str(resolution)!r}")
     return wanted
 
@@ -125,17 +126,17 @@ class Plan:
         """Problems and choices of a benchmark with these axes."""
         if self.chosen and not self.chosen.keys() & {"problem", *axes}:
             return []
-        chosen, primals = self.chosen, self.chosen.get("primal", registered(PRIMAL))
+        chosen, primals = self.chosen, self.chosen.get("primal", registered(PluginKind.PRIMAL))
         choices: dict[str, Iterable[Any]] = {
             "size": [Size(5, 5), Size(10, 12), Size(20, 30), Size(46, 60), Size(80, 70)],
-            "dual": chosen.get("dual", registered(DUAL)),
+            "dual": chosen.get("dual", registered(PluginKind.DUAL)),
             "primal": [one for name in primals for one in _at_tolerances(name)] if "primal" in axes else [],
-            "formulation": chosen.get("formulation", registered(FORMULATION)),
-            "solver": chosen.get("solver", installed_solvers(registered(SOLVER))),
+            "formulation": chosen.get("formulation", registered(PluginKind.FORMULATION)),
+            "solver": chosen.get("solver", installed_solvers(registered(PluginKind.SOLVER))),
             "accuracy": [1e-6, 1e-10],
         }
         # Whoever names a plugin waits for it: two problems of a study are enough then.
-        every = self.setting.problems if self.chosen else filter(_takes_no_option, registered(PROBLEM))
+        every = self.setting.problems if self.chosen else filter(_takes_no_option, registered(PluginKind.PROBLEM))
         cases = []
         for name in self.chosen.get("problem", every):
             known = [TimedProblem(name, one) for one in self.resolutions if _knows(name, one)]
@@ -160,7 +161,7 @@ def run_pytest(options: Sequence[str]) -> None:
 def _knows(problem: str, resolution: Resolution) -> bool:
     """Return if a problem has such a resolution; one that cannot be loaded has none."""
     try:
-        find(PROBLEM, problem).check_options({"resolution": resolution})
+        find(PluginKind.PROBLEM, problem).check_options({"resolution": resolution})
     except RequestError:
         return False
     return True
@@ -169,14 +170,14 @@ def _knows(problem: str, resolution: Resolution) -> bool:
 def _takes_no_option(problem: str) -> bool:
     """Return if a problem needs no option, as a folder; one that cannot be loaded counts: its benchmarks then fail."""
     try:
-        return not any(option.required for option in find(PROBLEM, problem).options.values())
+        return not any(option.required for option in find(PluginKind.PROBLEM, problem).options.values())
     except RequestError:
         return True
 
 
 def _at_tolerances(primal: str) -> list[PrimalChoice]:
     try:
-        tolerances = (0.5, 0.1) if find(PRIMAL, primal).load().takes_tolerance else (None,)
+        tolerances = (0.5, 0.1) if find(PluginKind.PRIMAL, primal).load().takes_tolerance else (None,)
     except RequestError:  # its benchmarks fail, and say why
         tolerances = (None,)
     return [PrimalChoice(primal, tolerance) for tolerance in tolerances]

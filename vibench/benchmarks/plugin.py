@@ -305,7 +305,7 @@ class Passes:
 
 
 def _queued(process: int) -> float:
-    """Seconds in which a process waited for a core, which are no fault of its work; 0 where the system does not tell."""
+    """Seconds in which a process waited for a core, through no fault of its work; 0 where the system does not tell."""
     try:
         return int(Path(f"/proc/{process}/schedstat").read_text().split()[1]) / 1e9
     except (OSError, IndexError):

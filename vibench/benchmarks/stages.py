@@ -39,7 +39,7 @@ from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel, hyper
 from vibench.offline.assemblies import assemblies
 from vibench.offline.models import Model, Solution
 from vibench.offline.reduction import Reduction, Snapshots, high_fidelity_sweep
-from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import find, qp_solver
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
@@ -96,7 +96,7 @@ class StageInputs:
     @_once
     def problem(self) -> Problem:
         options = {} if self.case.resolution is None else {"resolution": self.case.resolution}
-        created: Problem = find(PROBLEM, self.case.problem).create(options)
+        created: Problem = find(PluginKind.PROBLEM, self.case.problem).create(options)
         return created
 
     @property
@@ -134,8 +134,8 @@ class StageInputs:
 
         `given()` makes the same reduction anew, whose models have nothing in store from earlier queries.
         """
-        dual = find(DUAL, spaces.dual).create({})
-        strategy = None if primal is None else find(PRIMAL, primal.name).create({})
+        dual = find(PluginKind.DUAL, spaces.dual).create({})
+        strategy = None if primal is None else find(PluginKind.PRIMAL, primal.name).create({})
         tolerance = None if primal is None else primal.tolerance
         reduction = Reduction(
             self.problem, dual, strategy, spaces.modes, spaces.generators, tolerance,
@@ -199,7 +199,7 @@ def orthonormality(Z: Array, V: InnerProduct) -> float:
 def test_cone(timing: Timing, inputs: StageInputs, dual: str) -> None:
     """A cone by one dual strategy; reached is the largest distance of a snapshot, relative to the largest norm."""
     W, lam, stop = inputs.problem.W, inputs.snapshots.lam, inputs.usual.generators
-    strategy = find(DUAL, dual).create({})
+    strategy = find(PluginKind.DUAL, dual).create({})
 
     def judge(cone: Cone) -> Info:
         rays = check_cone(cone, W).rays
@@ -212,7 +212,7 @@ def test_cone(timing: Timing, inputs: StageInputs, dual: str) -> None:
 
 def test_enrichment(timing: Timing, inputs: StageInputs, primal: PrimalChoice) -> None:
     """An enrichment by one primal strategy; reached is σ of equation (21), at some of the training parameters."""
-    reduction, strategy = inputs.reduction(inputs.usual), find(PRIMAL, primal.name).create({})
+    reduction, strategy = inputs.reduction(inputs.usual), find(PluginKind.PRIMAL, primal.name).create({})
     offline = reduction.offline
 
     def judge(enrichment: Enrichment) -> Info:
@@ -400,7 +400,7 @@ def test_formulated_query(timing: Timing, inputs: StageInputs, formulation: str)
 
 def _formulated(inputs: StageInputs, formulation: str) -> Callable[[], Model]:
     """Return a function that builds a formulation on the offline phase of the setting, where it can be built."""
-    offline, made = inputs.online(inputs.usual, inputs.primal), find(FORMULATION, formulation).create({})
+    offline, made = inputs.online(inputs.usual, inputs.primal), find(PluginKind.FORMULATION, formulation).create({})
 
     def build() -> Model:
         model = offline.with_formulation(made).model

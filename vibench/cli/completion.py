@@ -17,7 +17,7 @@ from pathlib import Path
 import typer
 
 from vibench.errors import VibenchError
-from vibench.plugins.kinds import CHECKED, FORMULATION, SOLVER, STUDY, PluginKind
+from vibench.plugins.kinds import CHECKED, PluginKind
 from vibench.results.schema import STORED, TABLES
 
 # Tables that `vibench show` prints.
@@ -87,7 +87,7 @@ def _solvers() -> Iterable[str]:
     """QP solvers, installed or not."""
     from vibench.qp.settings import SETTINGS
 
-    return {*SETTINGS, *_registered(SOLVER)}
+    return {*SETTINGS, *_registered(PluginKind.SOLVER)}
 
 
 def _runs() -> Iterable[str]:
@@ -102,7 +102,9 @@ def _error_measures() -> Iterable[str]:
     return [*columns_of_measures(), "output:"]
 
 
-formulations = names(FORMULATION)
+problems, primals, duals, formulations = map(
+    names, (PluginKind.PROBLEM, PluginKind.PRIMAL, PluginKind.DUAL, PluginKind.FORMULATION)
+)
 solvers, runs, error_measures = map(words, (_solvers, _runs, _error_measures))
 corrections = words(lambda: ("none", "feasible", "auto"))
 lists = words(lambda: (kind.plural for kind in PluginKind))
@@ -133,7 +135,7 @@ def studies(incomplete: str) -> list[str]:
     """Registered studies, and study files in the current folder or in the folder of the word."""
     folder, slash, _ = incomplete.rpartition("/")
     found = (f"{folder}{slash}{path.name}" for path in Path(folder + slash).glob("*.toml"))
-    return sorted([*_beginning(incomplete, _registered(STUDY)), *_beginning(incomplete, found)])
+    return sorted([*_beginning(incomplete, _registered(PluginKind.STUDY)), *_beginning(incomplete, found)])
 
 
 def cells(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:

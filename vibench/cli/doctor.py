@@ -30,7 +30,7 @@ from vibench.execution.isolated import solver_trials
 from vibench.files import locked
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.factorisations import IMPLEMENTATIONS
-from vibench.plugins.kinds import SOLVER, STUDY, PluginKind
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import RegisteredPlugin, find, registered, unreadable
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
@@ -104,9 +104,9 @@ def required_distributions() -> dict[str, list[str]]:
 
 def check_solvers() -> Iterator[Diagnosis]:
     """All known QP solvers; the installed ones solve a small program each, at the default accuracy of studies."""
-    trials = solver_trials(wire(), 1e-7, installed_solvers(registered(SOLVER)), 60.0)
-    for name in sorted({*SETTINGS, *registered(SOLVER)}):
-        version = provenance.solver_version(name) if name in SETTINGS else find(SOLVER, name).origin
+    trials = solver_trials(wire(), 1e-7, installed_solvers(registered(PluginKind.SOLVER)), 60.0)
+    for name in sorted({*SETTINGS, *registered(PluginKind.SOLVER)}):
+        version = provenance.solver_version(name) if name in SETTINGS else find(PluginKind.SOLVER, name).origin
         if name not in trials:
             yield _unavailable(name, version)
         elif (trial := trials[name]).status is Status.OK and trial.residuals is not None:
@@ -174,9 +174,9 @@ def check_plugins() -> Iterator[Diagnosis]:
 def _load_error(plugin: RegisteredPlugin) -> str:
     """The error of loading a plugin; "" if it loads."""
     try:
-        if plugin.kind is STUDY:
+        if plugin.kind is PluginKind.STUDY:
             read_study(plugin.name)
-        elif plugin.kind is SOLVER:
+        elif plugin.kind is PluginKind.SOLVER:
             plugin.load()
         else:
             list(map(str, plugin.options.values()))  # loads it and evaluates its annotations

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Option
 
-from vibench.cli.completion import names
+from vibench.cli.completion import duals, problems
 from vibench.cli.console import echo
 from vibench.cli.plugin_commands import key_value
 from vibench.errors import NumericalError, RequestError
 from vibench.files import write_atomically
-from vibench.plugins.kinds import DUAL, PROBLEM
+from vibench.plugins.kinds import PluginKind
 
 if TYPE_CHECKING:
     from vibench.packs.pack import ModelPack
@@ -26,7 +26,7 @@ def pack(
         Argument(
             metavar="[PROBLEM] FOLDER",
             help="FOLDER alone is a pack to check; with a registered PROBLEM it is the new pack of that.",
-            autocompletion=names(PROBLEM),
+            autocompletion=problems,
         ),
     ],
     option: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="Option of the problem (repeatable).")] = None,
@@ -34,7 +34,7 @@ def pack(
     seed: Annotated[int, Option(min=0, help="Seed of the validation parameters, as in a study.")] = 0,
     solutions: Annotated[bool, Option("--solutions", help="Add the high-fidelity solutions, as references.")] = False,
     cones: Annotated[bool, Option("--cones", help="Build cones from the multipliers of the pack.")] = False,
-    dual: Annotated[list[str] | None, Option(help="Dual strategies; default: all.", autocompletion=names(DUAL))] = None,
+    dual: Annotated[list[str] | None, Option(help="Dual strategies; default: all.", autocompletion=duals)] = None,
     dual_tol: Annotated[float, Option(min=1e-12, max=1.0, help="Tolerance of --cones.")] = 1e-2,
     out: Annotated[Path, Option(metavar="DIR", help="Folder of the table and the figure of --cones.")] = Path("cones"),
 ) -> None:
@@ -51,7 +51,7 @@ def pack(
         from vibench.packs.writer import write_pack
         from vibench.plugins.registry import find
 
-        plugin = find(PROBLEM, problem[0])
+        plugin = find(PluginKind.PROBLEM, problem[0])
         made, source = plugin.create(dict(map(key_value, option or []))), f"{plugin} of {plugin.origin}"
         write_pack(made, folder, name=plugin.name, source=source, validation=validation, seed=seed, solutions=solutions)
         counts = f"{len(made.training_set())} training and {validation} validation parameters (seed {seed})"
@@ -82,11 +82,11 @@ def _reduce_cones(folder: Path, dual: list[str], dual_tol: float, out: Path) -> 
     # A pack without multipliers is refused by name before any strategy runs.
     with naming(folder):
         pack_multipliers(pack)
-    wanted = dual or [name for name, plugin in registered(DUAL).items() if not plugin.missing]
+    wanted = dual or [name for name, plugin in registered(PluginKind.DUAL).items() if not plugin.missing]
     rows, errors = [], {}
     for name in wanted:
         try:
-            cone, other_error = reduce_multipliers(pack, find(DUAL, name).create({}), dual_tol)
+            cone, other_error = reduce_multipliers(pack, find(PluginKind.DUAL, name).create({}), dual_tol)
         # One strategy that fails, as some do at small tolerances, leaves the others.
         except NumericalError as error:
             echo(f"failed: {name}: {error}")

@@ -15,7 +15,7 @@ from typer import Argument, Exit, Option
 from vibench.cli.completion import lists, plugin_options, plugins
 from vibench.cli.console import echo
 from vibench.errors import RequestError, VibenchError, in_a_line, unknown_name
-from vibench.plugins.kinds import CHECKED, PROBLEM, SAMPLING, SOLVER, STUDY, PluginKind
+from vibench.plugins.kinds import CHECKED, PluginKind
 from vibench.text import parsed_json
 
 # The list of QP solvers also has those that are no plugins.
@@ -39,19 +39,21 @@ def list_plugins(
 
     Plugins are listed with their options; a list of one kind has the values of the options, too.
     """
-    if sizes and what != PROBLEM.plural:
-        raise RequestError(f"--sizes is for `vibench list {PROBLEM.plural}`")
+    if sizes and what != PluginKind.PROBLEM.plural:
+        raise RequestError(f"--sizes is for `vibench list {PluginKind.PROBLEM.plural}`")
     from vibench.cli.console import print_rows
     from vibench.plugins.registry import unreadable
 
     headings = ("name", "from", "what", "options")
     if what is None:
         for kind in PluginKind:
-            print_rows(_solvers_by_version() if kind is SOLVER else _read_rows(kind), headings, kind.plural)
+            print_rows(_solvers_by_version() if kind is PluginKind.SOLVER else _read_rows(kind), headings, kind.plural)
         echo("", "what the options of one kind are, and whether its plugins can be loaded:")
-        echo(f"  vibench list KIND, such as {PROBLEM.plural}")
+        echo(f"  vibench list KIND, such as {PluginKind.PROBLEM.plural}")
     elif what in LISTS:
-        print_rows(_solver_rows() if LISTS[what] is SOLVER else _loaded_rows(LISTS[what], sizes), headings, what)
+        print_rows(
+            _solver_rows() if LISTS[what] is PluginKind.SOLVER else _loaded_rows(LISTS[what], sizes), headings, what
+        )
     else:
         raise unknown_name("list", what, LISTS)
     for distribution, reason in unreadable().items():
@@ -94,17 +96,17 @@ def check_plugin(
 
 def _chosen_options(checked: RegisteredPlugin, given: dict[str, Any]) -> tuple[dict[str, Any], str]:
     """Options of a plugin, and what its title says of them: those that `vibench check` chooses where none are given."""
-    if checked.kind is SOLVER:
+    if checked.kind is PluginKind.SOLVER:
         if given:
             raise RequestError(f"{checked} has no options")
         return {}, ""
-    if checked.kind is PROBLEM and "resolution" not in given:
+    if checked.kind is PluginKind.PROBLEM and "resolution" not in given:
         # A problem without a coarse resolution is checked at its default.
         with suppress(RequestError):
             options = checked.check_options({"resolution": "coarse", **given})
             return options, ", at resolution coarse (--option resolution=… for another)"
     chosen = {}
-    if checked.kind is SAMPLING:
+    if checked.kind is PluginKind.SAMPLING:
         needed = {name for name, option in checked.options.items() if option.required}
         chosen = {name: value for name, value in (("size", 16), ("seed", 0)) if name in needed and name not in given}
     told = " and ".join(f"{name} = {value}" for name, value in chosen.items())
@@ -156,12 +158,12 @@ def _loaded_rows(kind: PluginKind, sizes: bool = False) -> Iterator[Row]:
     for name, plugin in registered(kind).items():
         lines: list[str] = []
         try:
-            if kind is STUDY:
+            if kind is PluginKind.STUDY:
                 description = f"{len(expand(read_study(name)))} cells"
             else:
                 description = (plugin.load().__doc__ or "").strip().split("\n")[0]
                 lines += map(str, plugin.options.values())
-            if kind is PROBLEM:
+            if kind is PluginKind.PROBLEM:
                 lines += _parameters(plugin.load())
                 needed = ", ".join(name for name, option in plugin.options.items() if option.required)
                 if sizes and needed:
@@ -191,7 +193,7 @@ def _solvers_by_version() -> list[Row]:
     from vibench import provenance
     from vibench.qp.settings import SETTINGS
 
-    rows = list(_read_rows(SOLVER))
+    rows = list(_read_rows(PluginKind.SOLVER))
     for name in SETTINGS:
         version, package = provenance.solver_version(name), provenance.solver_distribution(name)
         rows.append((name, version, "" if version else f"not installed: `pip install {package}`", ""))
@@ -205,9 +207,9 @@ def _solver_rows() -> Iterator[Row]:
     from vibench.qp.settings import SETTINGS
     from vibench.qp.solve import installed_solvers
 
-    installed = installed_solvers(registered(SOLVER))
-    for name in sorted({*SETTINGS, *registered(SOLVER)}):
-        state = find(SOLVER, name).conflict or ("installed" if name in installed else "not installed")
+    installed = installed_solvers(registered(PluginKind.SOLVER))
+    for name in sorted({*SETTINGS, *registered(PluginKind.SOLVER)}):
+        state = find(PluginKind.SOLVER, name).conflict or ("installed" if name in installed else "not installed")
         yield name, provenance.solver_version(name), state, ""
 
 
@@ -219,7 +221,7 @@ def _find(text: str) -> RegisteredPlugin:
     prefix, colon, rest = text.partition(":")
     if colon and prefix not in CHECKED:
         return _find_object(prefix, rest)
-    plugin = find_named(text, CHECKED, installed_solvers(registered(SOLVER)))
+    plugin = find_named(text, CHECKED, installed_solvers(registered(PluginKind.SOLVER)))
     if plugin.entries:
         plugin.load()
     return plugin
@@ -252,7 +254,7 @@ def _find_object(module: str, name: str) -> RegisteredPlugin:
         names = ", ".join(base.__name__ for base in bases.values())
         raise RequestError(f"{title} is no subclass of {names}, and no QP solver")
     if callable(plugin):
-        return RegisteredPlugin(SOLVER, where, (EntryPoint(where, where, SOLVER.entry_points),))
+        return RegisteredPlugin(PluginKind.SOLVER, where, (EntryPoint(where, where, PluginKind.SOLVER.entry_points),))
     # Suggest only classes of this module, not those that it imports.
     classes = [value for value in contents.values() if isinstance(value, type)]
     own = [one.__name__ for one in classes if issubclass(one, tuple(bases.values())) and one.__module__ == module]

@@ -10,12 +10,11 @@ import typer
 from typer import Argument, Option
 
 from vibench.cli import output_commands
-from vibench.cli.completion import corrections, formulations, names, solvers, studies
+from vibench.cli.completion import corrections, duals, formulations, primals, problems, solvers, studies
 from vibench.cli.console import echo, print_frame, run_argument, warn
 from vibench.cli.result_commands import At, places_of
 from vibench.errors import RequestError, VibenchError
 from vibench.interrupts import INTERRUPTED, interrupted_at_once
-from vibench.plugins.kinds import DUAL, PRIMAL, PROBLEM
 from vibench.qp.status import Status
 from vibench.text import unbroken
 
@@ -32,10 +31,10 @@ def run_study_command(
         str, Argument(help="A study, or a TOML file; with --cell a results file, too.", autocompletion=studies)
     ] = "quick",
     cell: Annotated[str, Option(metavar="KEY", help="Run one cell alone, by its key or the beginning of that.")] = "",
-    problem: Annotated[Names, Option(help="Replace the problems (repeatable).", autocompletion=names(PROBLEM))] = None,
+    problem: Annotated[Names, Option(help="Replace the problems (repeatable).", autocompletion=problems)] = None,
     formulation: Annotated[Names, Option(help="Replace the formulations.", autocompletion=formulations)] = None,
-    dual: Annotated[Names, Option(help="Replace the dual strategies.", autocompletion=names(DUAL))] = None,
-    primal: Annotated[Names, Option(help="Replace the primal strategies.", autocompletion=names(PRIMAL))] = None,
+    dual: Annotated[Names, Option(help="Replace the dual strategies.", autocompletion=duals)] = None,
+    primal: Annotated[Names, Option(help="Replace the primal strategies.", autocompletion=primals)] = None,
     solver: Annotated[Names, Option(help="Replace the QP solvers.", autocompletion=solvers)] = None,
     correction: Annotated[Names, Option(help="Replace the corrections.", autocompletion=corrections)] = None,
     pod_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the POD.")] = None,

@@ -10,7 +10,7 @@ from pathlib import Path
 from string import Template
 
 from vibench.errors import RequestError, StorageError
-from vibench.plugins.kinds import SOLVER, STUDY, PluginKind
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import find
 from vibench.provenance import distribution_version
 
@@ -25,7 +25,7 @@ def write_package(kind: PluginKind, name: str, parent: Path) -> Path:
     camel, snake = "".join(word.capitalize() for word in name.split("-")), name.replace("-", "_")
     words = {
         "name": name, "package": package, "module": kind.module, "kind": word, "title": str(kind),
-        "cls": f"solve_{snake}" if kind is SOLVER else camel + word.capitalize(),
+        "cls": f"solve_{snake}" if kind is PluginKind.SOLVER else camel + word.capitalize(),
         "group": kind.entry_points, "test": snake, "version": distribution_version("vibench"),
     }  # fmt: skip
     sources = {
@@ -43,7 +43,7 @@ def write_start(what: str, name: str, parent: Path) -> Path:
     _check_words(name, what, what)
     words = {"name": name, "file": f"{name}.toml"}
     if what == "study":
-        if find(STUDY, name).entries:
+        if find(PluginKind.STUDY, name).entries:
             raise RequestError(f"there is a study '{name}' already; choose another name")
         return _write(parent / f"{name}.toml", {"": _filled("study.toml", words)})
     return _write(parent / name, {"pack.toml": _filled("pack.toml", words), "write.py": _filled("pack.py", words)})

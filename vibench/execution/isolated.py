@@ -15,7 +15,7 @@ from vibench.errors import in_a_line
 from vibench.execution.supervisor import Job, Supervisor
 from vibench.interfaces.problem import VariationalInequality
 from vibench.plugins import registry
-from vibench.plugins.kinds import SOLVER
+from vibench.plugins.kinds import PluginKind
 from vibench.qp.scaling import in_units, random_units
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
@@ -119,7 +119,7 @@ def solver_trials(
     trials: dict[str, Trial] = {}
     with closing(Supervisor()) as supervisor:
         for name in solvers:
-            owners = (registry.find(SOLVER, name).package,)
+            owners = (registry.find(PluginKind.SOLVER, name).package,)
             limits: Any = {"seconds": seconds, "supervisor": supervisor, "owners": owners}
             outcome = call_isolated(_tried, program, accuracy, name, **limits)
             trials[name] = outcome if isinstance(outcome, Trial) else Trial(outcome.status, outcome.reason)

@@ -25,7 +25,7 @@ from vibench.execution.recording import (
 from vibench.execution.supervisor import Job
 from vibench.execution.timing_plan import OfflinePlan, TimingPlan
 from vibench.linalg.factorisations import DEFAULT, implementation
-from vibench.plugins.kinds import SAMPLING, SOLVER
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import FACTORISATION, find, registered
 from vibench.provenance import solver_distribution
@@ -94,7 +94,7 @@ def identity(study: Study) -> dict[str, Any]:
     """The settings that all numbers of a study depend on; a run folder holds results of one identity only."""
     validation: Any = study.validation
     if not isinstance(validation, int):
-        plugin = validation.plugin(SAMPLING)
+        plugin = validation.plugin(PluginKind.SAMPLING)
         validation = {"name": plugin.name, "options": json.loads(plugin.options)}
     return {"name": study.name, "seed": study.seed, "validation": validation}
 
@@ -321,7 +321,7 @@ class _Run:
 def unavailable(cell: Cell) -> str:
     """Reason why a cell cannot be run here: something is not installed, or a name is ambiguous; "" if none."""
     plugins = [plugin.registered for plugin in cell.plugins]
-    for plugin in (*plugins, *([] if cell.solver is None else [find(SOLVER, cell.solver)])):
+    for plugin in (*plugins, *([] if cell.solver is None else [find(PluginKind.SOLVER, cell.solver)])):
         if plugin.conflict:
             return plugin.conflict
     chosen = implementation(cell.problem.arguments.get(FACTORISATION, DEFAULT))
@@ -331,7 +331,7 @@ def unavailable(cell: Cell) -> str:
         if missing:
             what = f"the {name} needs {', '.join(missing)}, which is not installed"
             return f"{what}: `pip install {' '.join(missing)}`"
-    if cell.solver is None or cell.solver in installed_solvers(registered(SOLVER)):
+    if cell.solver is None or cell.solver in installed_solvers(registered(PluginKind.SOLVER)):
         return ""
     return f"the QP solver '{cell.solver}' is not installed: `pip install {solver_distribution(cell.solver)}`"
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from vibench.execution.run import Agenda, Observer
-from vibench.plugins.kinds import PROBLEM
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.qp.status import Status
 from vibench.stages.base import Stage
@@ -115,7 +115,7 @@ class TimeLeft:
 
 
 def _sort(stage: Stage) -> _Sort:
-    return next((plugin for plugin in stage.plugins if plugin.kind is PROBLEM), None), stage.kind_of_work
+    return next((plugin for plugin in stage.plugins if plugin.kind is PluginKind.PROBLEM), None), stage.kind_of_work
 
 
 def duration(seconds: float) -> str:

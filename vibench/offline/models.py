@@ -40,7 +40,7 @@ from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel
 from vibench.offline.assemblies import assemblies
 from vibench.offline.correction import Answer, Corrector
 from vibench.plugins import registry
-from vibench.plugins.kinds import SOLVER
+from vibench.plugins.kinds import PluginKind
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers, solve_qp, takes_start
 from vibench.qp.status import Status
@@ -465,11 +465,11 @@ class Model:
         mode = self.correction if corrected is None else CorrectionMode("feasible" if corrected else "none")
         if solver is not None and self.solver is None:
             raise RequestError(f"the formulation {type(self.formulation).__name__} uses no QP solver")
-        name, own = solver or self.solver, registry.registered(SOLVER)
+        name, own = solver or self.solver, registry.registered(PluginKind.SOLVER)
         if name is not None and name not in installed_solvers(own):
             if name in SETTINGS:
                 raise RequestError(f"the QP solver '{name}' is not installed")
-            raise unknown_name(SOLVER, name, {*SETTINGS, *own})
+            raise unknown_name(PluginKind.SOLVER, name, {*SETTINGS, *own})
         return _Settings(name, self.accuracy if accuracy is None else accuracy, tolerance, mode)
 
     def _answered(self, at: Array, settings: _Settings) -> Solution:

@@ -41,7 +41,7 @@ from vibench.model.hyperreduced import (
 )
 from vibench.offline.models import Model, check_built
 from vibench.plugins import registry
-from vibench.plugins.kinds import FORMULATION
+from vibench.plugins.kinds import PluginKind
 from vibench.reduction.pod import POD, pod
 from vibench.stability.infsup import ConeBasis, cone_basis
 from vibench.text import brief
@@ -285,7 +285,7 @@ class Reduction:
         """
         formulation = self.formulation
         if formulation is None:
-            formulation = registry.find(FORMULATION, registry.default_formulation()).create({})
+            formulation = registry.find(PluginKind.FORMULATION, registry.default_formulation()).create({})
         name = type(formulation).__qualname__
         uses = axes_of(formulation, f"formulation {name}")
         for axis, step, what in (("pod", self.modes, "modes"), ("dual", self.dual, "a dual strategy")):

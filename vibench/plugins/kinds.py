@@ -44,7 +44,5 @@ class PluginKind(StrEnum):
         return resolve_name(f"vibench.interfaces.{self._base}") if self._base else None
 
 
-PROBLEM, SAMPLING, PRIMAL, DUAL, FORMULATION, STUDY, SOLVER = PluginKind
-
 # Kinds that `vibench check` and `vibench new` know, by their names on the command line.
 CHECKED = {kind.cli_name: kind for kind in PluginKind if kind.cli_name}

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vibench.errors import RequestError, in_a_line, requested, unknown_name
-from vibench.plugins.kinds import FORMULATION, PROBLEM, SAMPLING, SOLVER, STUDY, PluginKind
+from vibench.plugins.kinds import PluginKind
 from vibench.provenance import distribution_version, package_hash, solver_version
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ class RegisteredPlugin:
     def _in_qpsolvers(self) -> bool:
         from vibench.qp.settings import SETTINGS
 
-        return self.kind is SOLVER and self.name in SETTINGS
+        return self.kind is PluginKind.SOLVER and self.name in SETTINGS
 
     @cached_property
     def conflict(self) -> str:
@@ -96,7 +96,7 @@ class RegisteredPlugin:
     @property
     def summary(self) -> str:
         """First line of its docstring, or first sentence of the comment at the top of a study."""
-        if self.kind is not STUDY:
+        if self.kind is not PluginKind.STUDY:
             return docstring(self._entry.module, self._entry.attr)
         try:
             return top_comment(Path(self.load()))
@@ -120,9 +120,9 @@ class RegisteredPlugin:
         base = self.kind.base
         if base is not None and not (isinstance(plugin, type) and issubclass(plugin, base)):
             raise RequestError(f"{where} is not a subclass of {base.__qualname__}")
-        if self.kind is SOLVER and not callable(plugin):
+        if self.kind is PluginKind.SOLVER and not callable(plugin):
             raise RequestError(f"{where} is not callable")
-        if self.kind is STUDY and not isinstance(plugin, str | Path):
+        if self.kind is PluginKind.STUDY and not isinstance(plugin, str | Path):
             raise RequestError(f"{where} is not the path of a study file")
         return plugin
 
@@ -134,7 +134,7 @@ class RegisteredPlugin:
         """
         if self.conflict:
             return self.origin
-        if self.kind is SOLVER and not self.entries:
+        if self.kind is PluginKind.SOLVER and not self.entries:
             return solver_version(self.name)
         needed = "".join(f" {required} {distribution_version(required)}" for required in self.requirements)
         return f"{self.origin} {package_hash(self._entry.module)}{needed}"
@@ -173,7 +173,7 @@ class RegisteredPlugin:
 
     def _without_factorisation(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
         """Options without `factorisation`, which has to exist, and this option if it is not the default."""
-        if self.kind is not PROBLEM or FACTORISATION not in given or FACTORISATION in self.options:
+        if self.kind is not PluginKind.PROBLEM or FACTORISATION not in given or FACTORISATION in self.options:
             return dict(given), {}
         from vibench.linalg.factorisations import DEFAULT, implementation
 
@@ -192,7 +192,7 @@ class RegisteredPlugin:
 
     def data_digest(self, options: Mapping[str, Any]) -> str:
         """Digest of the files that it reads with these options; "" if it reads none, or is not available here."""
-        if self.kind not in (PROBLEM, SAMPLING) or self.conflict or self.missing:
+        if self.kind not in (PluginKind.PROBLEM, PluginKind.SAMPLING) or self.conflict or self.missing:
             return ""
         return str(self.load().data_digest(**self._without_factorisation(self.check_options(options))[0]))
 
@@ -232,7 +232,7 @@ def default_formulation() -> str:
     """
     names = [
         name
-        for name, plugin in registered(FORMULATION).items()
+        for name, plugin in registered(PluginKind.FORMULATION).items()
         if not plugin.conflict and _is_default(plugin.entries[0].module, plugin.entries[0].attr)
     ]
     if len(names) > 1:
@@ -256,7 +256,10 @@ def find_named(text: str, kinds: Mapping[str, PluginKind], solvers: Sequence[str
     prefix, colon, rest = text.partition(":")
     name = rest if colon else text
     searched = {word: kind for word, kind in kinds.items() if not colon or word == prefix}
-    names = {word: solvers if kind is SOLVER else [*registered(kind)] for word, kind in (searched or kinds).items()}
+    names = {
+        word: solvers if kind is PluginKind.SOLVER else [*registered(kind)]
+        for word, kind in (searched or kinds).items()
+    }
     matching = [word for word in searched if name in names[word]]
     if not matching:
         what = kinds.get(prefix, "plugin") if colon else "plugin"
@@ -291,7 +294,7 @@ def create(kind: str, name: str, options: Mapping[str, Any] | None = None) -> An
 
 def qp_solver(name: str) -> dict[str, QPSolver]:
     """The solver of a plugin, by its name; empty for a solver of qpsolvers."""
-    return {name: find(SOLVER, name).load()} if name in registered(SOLVER) else {}
+    return {name: find(PluginKind.SOLVER, name).load()} if name in registered(PluginKind.SOLVER) else {}
 
 
 def entry_points(*, group: str) -> list[EntryPoint]:

@@ -21,7 +21,7 @@ from vibench.execution.isolated import Trial, solver_trials
 from vibench.execution.recorded_cell import RecordedCell, recorded_cells
 from vibench.files import PART, TEMPORARY, write_atomically, writing
 from vibench.interfaces.problem import VariationalInequality
-from vibench.plugins.kinds import SOLVER
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import registered
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
@@ -64,7 +64,7 @@ def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
         line = _line(Trial(status, reason, solution, residuals), None) | {"seconds": rows[query]["solve_s"]}
         by = recorded.cell.solver or recorded.cell.formulation_label
         table.append({"solver": f"{by} (recorded)"} | line)
-    solvers = installed_solvers(registered(SOLVER))
+    solvers = installed_solvers(registered(PluginKind.SOLVER))
     for solver, trial in solver_trials(program, accuracy, solvers, 60.0).items():
         table.append({"solver": solver} | _line(trial, recorded_x))
     return pd.DataFrame(table)

@@ -18,7 +18,7 @@ import pandas as pd
 
 from vibench.errors import RequestError
 from vibench.files import PART, TEMPORARY
-from vibench.plugins.kinds import STUDY
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import default_formulation, registered
 from vibench.provenance import distribution_version
 from vibench.report import html
@@ -192,7 +192,7 @@ class PublishedRun:
         """Commands in the folder of the results file, each with its effect."""
         study = str(self.run.identity["study"])
         commands = [("pip install -r requirements.txt", "the versions that computed it")]
-        if study in registered(STUDY):
+        if study in registered(PluginKind.STUDY):
             commands.append((f"vibench run {shlex.quote(study)}", "the whole study, on your machine"))
         commands.append((f"vibench compare {FILE} YOUR-RUN", "your run beside this one"))
         return commands

@@ -20,7 +20,7 @@ from vibench.model.certificates.base import Guarantee
 from vibench.model.errors import ReferenceSolutions, output_scales, summarise_outputs, zeros
 from vibench.offline.assemblies import assemblies
 from vibench.offline.correction import Corrector
-from vibench.plugins.kinds import SOLVER
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find
 from vibench.provenance import machine
@@ -99,7 +99,7 @@ class CellQueries(ItemwiseStage):
     def packages(self) -> frozenset[str]:
         # A QP solver is no `Plugin` of the fields: it is looked up by its name.
         own = super().packages
-        return own if self.solver is None else own | {find(SOLVER, self.solver).package} - {""}
+        return own if self.solver is None else own | {find(PluginKind.SOLVER, self.solver).package} - {""}
 
     @property
     def reference(self) -> ReferenceConstants:

@@ -21,7 +21,7 @@ from vibench.model.certificates.greedy import GreedyTrainer
 from vibench.model.error_bounds import reference_bound
 from vibench.offline.assemblies import assemblies
 from vibench.offline.reduction import Snapshots
-from vibench.plugins.kinds import PROBLEM
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.qp.scaling import nearby
 from vibench.stages.artefacts import History, Store
@@ -295,7 +295,7 @@ def gather(store: Store, chunks: tuple[Stage, ...]) -> TimedSnapshots:
     Raises a `NumericalError` if the problem was assembled otherwise for a chunk than it is in this process.
     """
     parts = [value_of(store, chunk) for chunk in chunks]
-    (problem,) = {plugin for chunk in chunks for plugin in chunk.plugins if plugin.kind is PROBLEM}
+    (problem,) = {plugin for chunk in chunks for plugin in chunk.plugins if plugin.kind is PluginKind.PROBLEM}
     with faults_of(problem):
         here = fingerprint_here(problem)
         for deviation in (text for part in parts for text in part.fingerprint.deviations(here)):

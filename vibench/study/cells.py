@@ -11,7 +11,7 @@ from typing import Any
 
 from vibench.errors import RequestError, unknown_name
 from vibench.interfaces.strategies import Stop
-from vibench.plugins.kinds import FORMULATION, SOLVER
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import default_formulation, find
 from vibench.provenance import numerical_code
@@ -127,7 +127,7 @@ class Cell:
         # In older files `mixed` and `compiled` were no plugins.
         if content.get("formulation") is None:
             name = "compiled" if content["assembly"] == "compiled" else default_formulation()
-            plugins["formulation"] = Plugin.of(find(FORMULATION, name), {}, {})
+            plugins["formulation"] = Plugin.of(find(PluginKind.FORMULATION, name), {}, {})
             content["formulation_label"] = name
         if content["assembly"] in ("certified", "compiled"):  # these were assemblies
             content["bounds"], content["assembly"] = content["assembly"] == "certified", "reduced"
@@ -159,7 +159,7 @@ class Cell:
     def code(self) -> str:
         """Hash of the code that computes the cell: of vibench, its plugins and its solver."""
         codes = [plugin.code for plugin in self.plugins]
-        codes += [] if self.solver is None else [find(SOLVER, self.solver).code]
+        codes += [] if self.solver is None else [find(PluginKind.SOLVER, self.solver).code]
         return digest([numerical_code(), *codes])
 
     def __str__(self) -> str:

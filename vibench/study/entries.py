@@ -21,7 +21,7 @@ from pydantic import (
 )
 
 from vibench.interfaces.formulations import Formulation, axes_of
-from vibench.plugins.kinds import FORMULATION, PluginKind
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import GivenPlugin, Plugin, give
 from vibench.plugins.registry import RegisteredPlugin, default_formulation, find
 from vibench.study.parameter_sets import OWN
@@ -117,7 +117,7 @@ class FormulationEntry(Entry):
     @property
     def kind(self) -> type[Formulation]:
         """The class; a formulation that has all axes where several packages use its name: its cells cannot be run."""
-        plugin = self.registered(FORMULATION)
+        plugin = self.registered(PluginKind.FORMULATION)
         kind: type[Formulation] = Formulation if plugin.conflict else plugin.load()
         return kind
 
@@ -127,7 +127,7 @@ class FormulationEntry(Entry):
 
         Raises a `RequestError` if it declares axes that there are not.
         """
-        return axes_of(self.kind, str(self.registered(FORMULATION)))
+        return axes_of(self.kind, str(self.registered(PluginKind.FORMULATION)))
 
 
 class SamplingEntry(Entry):

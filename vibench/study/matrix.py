@@ -13,7 +13,7 @@ from typing import Any, TypeAlias, TypeVar
 from vibench.errors import RequestError, requested
 from vibench.files import read_regular
 from vibench.interfaces.strategies import Stop
-from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SAMPLING, STUDY, PluginKind
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.options import inside
 from vibench.plugins.plugin import GivenPlugin, Plugin
 from vibench.plugins.registry import find, registered
@@ -31,9 +31,9 @@ def find_study(request: str) -> Path:
     is_file, exists = os.path.isfile(path), os.path.exists(path)  # noqa: PTH110, PTH113
     # A registered name wins over a folder, such as the one of a run of that study.
     if path.suffix != ".toml" and not is_file:
-        if exists and request not in registered(STUDY):
+        if exists and request not in registered(PluginKind.STUDY):
             raise RequestError(f"study '{request}' is not a file")
-        return Path(find(STUDY, request).load())
+        return Path(find(PluginKind.STUDY, request).load())
     if not is_file:
         raise RequestError(f"study file '{request}' {'is not a file' if exists else 'does not exist'}")
     return path
@@ -75,7 +75,10 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
     # Paths in the options of problems and sampling strategies are relative to the folder of the file.
     problems = _tables(content.get("problem"))
     samplings = [table.get(key) for table in [content, *problems] for key in ("training", "validation")]
-    for kind, entries in ((PROBLEM, problems), *((SAMPLING, _tables(some)) for some in samplings)):
+    for kind, entries in (
+        (PluginKind.PROBLEM, problems),
+        *((PluginKind.SAMPLING, _tables(some)) for some in samplings),
+    ):
         for entry in entries:
             _anchor_options(kind, entry, path.absolute().parent)
     try:
@@ -123,7 +126,7 @@ def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> di
 def _tolerant_title(entry: Any) -> str:
     """Title of an unchecked entry of the primal axis if its strategy takes a tolerance, else ""."""
     table = entry if isinstance(entry, dict) else {"name": entry}
-    plugin = find(PRIMAL, str(table.get("name")))
+    plugin = find(PluginKind.PRIMAL, str(table.get("name")))
     takes_tolerance = plugin.entries and not plugin.conflict and plugin.load().takes_tolerance
     return str(table.get("label", table.get("name"))) if takes_tolerance else ""
 
@@ -142,10 +145,10 @@ def expand(study: Study) -> list[Cell]:
     cells: dict[str, Cell] = {}
     problems = [
         (entry, plugin, study.training_sets(entry), study.validation_set(entry).sized(plugin))
-        for entry, plugin in _made(PROBLEM, study.problem)
+        for entry, plugin in _made(PluginKind.PROBLEM, study.problem)
     ]
-    duals, primals = _made(DUAL, study.dual), _made(PRIMAL, study.primal)
-    formulations = _made(FORMULATION, study.formulation)
+    duals, primals = _made(PluginKind.DUAL, study.dual), _made(PluginKind.PRIMAL, study.primal)
+    formulations = _made(PluginKind.FORMULATION, study.formulation)
     for (problem, plugin, sets, validation), table in product(problems, study.tolerances):
         # Nested enrichments of one table are grown once, to the smallest of their tolerances.
         nested = {entry.title: _nested_tolerances(entry, table) for entry in study.primal}
@@ -196,7 +199,7 @@ def _made(kind: PluginKind, entries: Sequence[EntryT]) -> list[_Made[EntryT]]:
 
 
 def _nested_tolerances(primal: Entry, table: ToleranceTable) -> tuple[float, ...]:
-    plugin = primal.registered(PRIMAL)
+    plugin = primal.registered(PluginKind.PRIMAL)
     if plugin.conflict or not issubclass(plugin.load(), NestedStrategy):
         return ()
     return tuple(sorted({value for value in table.of_primal(primal) if value is not None}, reverse=True))
@@ -273,7 +276,11 @@ def _plugin_entry(plugin: Plugin, label: str) -> Any:
     given = plugin.registered
     name = given.given if isinstance(given, GivenPlugin) else plugin.name
     entries: dict[PluginKind, type[Entry]]
-    entries = {PROBLEM: ProblemEntry, SAMPLING: SamplingEntry, FORMULATION: FormulationEntry}
+    entries = {
+        PluginKind.PROBLEM: ProblemEntry,
+        PluginKind.SAMPLING: SamplingEntry,
+        PluginKind.FORMULATION: FormulationEntry,
+    }
     content = {"name": name, "label": label, "options": json.loads(plugin.options)}
     return entries.get(plugin.kind, Entry).model_validate(content).at(json.loads(plugin.places))
 

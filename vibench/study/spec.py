@@ -24,7 +24,7 @@ from pydantic import (
 from vibench.errors import RequestError, fault_line, unknown_name
 from vibench.interfaces.strategies import Stop
 from vibench.linalg.factorisations import DEFAULT
-from vibench.plugins.kinds import DUAL, FORMULATION, PRIMAL, PROBLEM, SAMPLING, SOLVER, PluginKind
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import FACTORISATION, default_formulation, find, registered
 from vibench.qp.settings import SETTINGS
@@ -117,7 +117,7 @@ class ToleranceTable(_Model):
 
     def of_primal(self, entry: Entry) -> list[float | None]:
         """Tolerances of one primal strategy; [`None`] for a strategy that takes none."""
-        plugin = entry.registered(PRIMAL)
+        plugin = entry.registered(PluginKind.PRIMAL)
         # The cells of an ambiguous name cannot be run, whether it takes a tolerance or not.
         if plugin.conflict:
             return list(self.primal.get(entry.title, self.primal.get(entry.name, [None])))
@@ -250,7 +250,7 @@ class Study(_Model):
         return ParameterSet("validation", 0, self.seed, _sampling(entry), entry.title)
 
     def solver_names(self) -> list[str]:
-        return installed_solvers(registered(SOLVER)) if self.solvers == "available" else list(self.solvers)
+        return installed_solvers(registered(PluginKind.SOLVER)) if self.solvers == "available" else list(self.solvers)
 
 
 def _in_present_words(given: Any) -> Any:
@@ -273,24 +273,28 @@ def _in_present_words(given: Any) -> Any:
 
 
 def _sampling(entry: SamplingEntry) -> Plugin | None:
-    return None if entry.name == OWN else entry.plugin(SAMPLING)
+    return None if entry.name == OWN else entry.plugin(PluginKind.SAMPLING)
 
 
 def _check_names(study: Study) -> None:
     """Check names and options of plugins, and that exactly the strategies that take a tolerance have one."""
-    axes: dict[PluginKind, Sequence[Entry]] = {PROBLEM: study.problem, DUAL: study.dual, PRIMAL: study.primal}
-    for kind, axis in (*axes.items(), (FORMULATION, study.formulation)):
+    axes: dict[PluginKind, Sequence[Entry]] = {
+        PluginKind.PROBLEM: study.problem,
+        PluginKind.DUAL: study.dual,
+        PluginKind.PRIMAL: study.primal,
+    }
+    for kind, axis in (*axes.items(), (PluginKind.FORMULATION, study.formulation)):
         for entry in axis:
             entry.registered(kind).check_options(entry.options)
         _check_given(kind, axis)
     _check_axes(study)
     for problem in study.problem:
         _check_sets(study, problem)
-    solvers = {*SETTINGS, *registered(SOLVER)}
-    for plugin in (find(SOLVER, name) for name in study.solver_names()):
+    solvers = {*SETTINGS, *registered(PluginKind.SOLVER)}
+    for plugin in (find(PluginKind.SOLVER, name) for name in study.solver_names()):
         # A known solver need not be installed: its cells are unavailable then.
         if plugin.name not in solvers:
-            raise unknown_name(SOLVER, plugin.name, solvers)
+            raise unknown_name(PluginKind.SOLVER, plugin.name, solvers)
         if plugin.entries and not plugin.conflict:
             plugin.load()
     for table in study.tolerances:
@@ -324,11 +328,11 @@ def _check_sets(study: Study, entry: ProblemEntry) -> None:
     entries = [*(entry.training or study.training), entry.validation or study.validation]
     samplings = [one for one in entries if isinstance(one, SamplingEntry) and one.name != OWN]
     for sampling in samplings:
-        sampling.registered(SAMPLING).check_options(sampling.options)
+        sampling.registered(PluginKind.SAMPLING).check_options(sampling.options)
     # Without files and samplings nothing can be wrong with them, and building a problem takes seconds.
-    if not samplings and not entry.registered(PROBLEM).data_digest({**entry.options, **entry.places}):
+    if not samplings and not entry.registered(PluginKind.PROBLEM).data_digest({**entry.options, **entry.places}):
         return
-    problem, validation = entry.plugin(PROBLEM), study.validation_set(entry)
+    problem, validation = entry.plugin(PluginKind.PROBLEM), study.validation_set(entry)
     training = study.training_sets(entry)
     if is_available(problem, *(one.sampling for one in (validation, *training) if one.sampling is not None)):
         for trained in training:
@@ -336,7 +340,11 @@ def _check_sets(study: Study, entry: ProblemEntry) -> None:
 
 
 def _check_tolerances(study: Study, table: ToleranceTable) -> None:
-    given = (DUAL, study.dual, table.dual), (DUAL, study.dual, table.R), (PRIMAL, study.primal, table.primal)
+    given = (
+        (PluginKind.DUAL, study.dual, table.dual),
+        (PluginKind.DUAL, study.dual, table.R),
+        (PluginKind.PRIMAL, study.primal, table.primal),
+    )
     for kind, axis, tolerances in given:
         # A tolerance may name a plugin that an option of the command line has removed from the axis.
         names = {name for entry in axis for name in (entry.name, entry.title)}

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from vibench import Array, ParameterBox, RequestError, Sampling, create
 from vibench.interfaces.strategies import check_sample
-from vibench.plugins.kinds import SAMPLING
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import registered
 
 BOX = ParameterBox(("a", "b", "c"), np.array([1e-3, -2.0, 5.0]), np.array([1e3, 3.0, 5.5]), ("m", "1", "N"))
@@ -122,5 +122,5 @@ def test_a_loading_rises_in_equal_steps_while_the_other_parameters_stay() -> Non
 
 
 def test_only_paths_are_ordered() -> None:
-    ordered = {name for name, plugin in registered(SAMPLING).items() if plugin.load().ordered}
+    ordered = {name for name, plugin in registered(PluginKind.SAMPLING).items() if plugin.load().ordered}
     assert ordered == {"sweep", "random-walk", "load-steps"}

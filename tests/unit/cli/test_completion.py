@@ -14,7 +14,7 @@ from running import Main, Register
 from vibench.cli import completion
 from vibench.cli.main import COMMANDS, app
 from vibench.cli.plugin_commands import LISTS
-from vibench.plugins.kinds import DUAL, STUDY
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import find, first_sentence, registered
 from vibench.qp.settings import SETTINGS
 from vibench.results.read import read_table
@@ -48,7 +48,7 @@ def completed(line: str) -> list[str]:
 def test_values_are_completed_with_what_there_is() -> None:
     for line, *words in (
         ("run quick --problem ob", "obstacle"),
-        ("run quick --dual ", *registered(DUAL)),
+        ("run quick --dual ", *registered(PluginKind.DUAL)),
         ("run quick --primal o", "offline-pga", "online-supremizers"), ("run quick --solver ", *sorted(SETTINGS)),
         ("run quick --correction ", "auto", "feasible", "none"),
         ("check o", "obstacle", "offline-pga", "online-supremizers", "orthant"), ("check sol", "solver:"),
@@ -152,7 +152,7 @@ def test_help_ends_with_examples_that_are_commands(main: Main, monkeypatch: pyte
 
 def test_the_overview_of_studies_has_whole_sentences() -> None:
     """A point of an abbreviation ends none."""
-    assert find(STUDY, "benefit").summary.endswith("of Niakh et al. (2022)")
+    assert find(PluginKind.STUDY, "benefit").summary.endswith("of Niakh et al. (2022)")
     assert first_sentence("A. of B et al. (2022), i.e. this. More. And") == "A. of B et al. (2022), i.e. this"
     assert first_sentence("All of it.") == "All of it"
 

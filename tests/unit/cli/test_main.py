@@ -16,7 +16,7 @@ from samples import STUDY, changed, write_study
 from vibench.cli.main import renamed
 from vibench.cli.plugin_commands import LISTS
 from vibench.plugins import kinds, registry
-from vibench.plugins.kinds import DUAL, PROBLEM
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import find, registered
 from vibench.qp.settings import SETTINGS
 from vibench.qp.status import Status
@@ -99,7 +99,7 @@ class TestOutputFolder:
         for fresh in ([], ["--fresh"]):
             refused(main("run", write_study(tmp_path), "--out", "other", *fresh), "other", "study", "quick", "sample")
             assert len(read_table(Path("other", FILE), "cells")) == len(expand(read_study("quick")))
-        text = Path(find(kinds.STUDY, "quick").load()).read_text(encoding="utf-8")
+        text = Path(find(kinds.PluginKind.STUDY, "quick").load()).read_text(encoding="utf-8")
         path = tmp_path / "seeded.toml"
         path.write_text(text.replace("seed = 2022", "seed = 2023"), encoding="utf-8")
         refused(main("run", str(path), "--out", "other"), "seed 2022 instead of 2023")
@@ -137,7 +137,7 @@ def test_list_shows_every_plugin_and_its_options(main: Main) -> None:
     code, out, err = main("list")
     assert (code, err) == (0, "")
     assert [name for kind in LISTS.values() for name in registered(kind) if name not in out] == []
-    options = [option.name for option in find(kinds.PROBLEM, "obstacle").options.values()]
+    options = [option.name for option in find(kinds.PluginKind.PROBLEM, "obstacle").options.values()]
     assert ", ".join(options) in out
     _, out, _ = main("list", "problems")
     assert [name for name in options if f"{name}: " not in out] == []
@@ -230,7 +230,7 @@ def test_help_knows_every_word_that_people_see(main: Main) -> None:
     }  # fmt: skip
     for word, line in said.items():
         assert any(one.startswith(line) for one in main("help", word)[1].splitlines()), word
-    for word in [*Status, *ChangeKind, *Meaning, *registered(DUAL), *TABLES]:
+    for word in [*Status, *ChangeKind, *Meaning, *registered(PluginKind.DUAL), *TABLES]:
         assert main("help", word)[0] == 0, word
 
 
@@ -257,9 +257,9 @@ def test_a_command_of_before_still_works(main: Main, quick_run: Path) -> None:
 
 
 def test_sizes_of_problems_are_said_where_they_are_asked_for(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
-    known = registry.registered(PROBLEM)
+    known = registry.registered(PluginKind.PROBLEM)
     few = {name: known[name] for name in ("radial-obstacle", "pack")}
-    monkeypatch.setattr(registry, "registered", lambda kind: few if kind is PROBLEM else {})
+    monkeypatch.setattr(registry, "registered", lambda kind: few if kind is PluginKind.PROBLEM else {})
     _, out, _ = main("list", "problems", "--sizes")
     text, problem = " ".join(out.split()), known["radial-obstacle"].load()()
     assert f"n = {problem.V.dim} unknowns, m = {problem.W.dim} constraints" in text

@@ -18,7 +18,7 @@ from samples import wire_study, write_study
 from vibench import HighFidelitySolver, create
 from vibench.cli import scaffold
 from vibench.errors import RequestError
-from vibench.plugins.kinds import CHECKED, DUAL, PROBLEM
+from vibench.plugins.kinds import CHECKED, PluginKind
 from vibench.plugins.registry import registered
 from vibench.testing.checks import case_of
 
@@ -123,7 +123,7 @@ BAD = ["", "Rope", "1rope", "rope_1", "rope-", "-rope", "my--rope", "ro pe", "..
 @given(st.from_regex(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", fullmatch=True) | st.text(max_size=12))
 def test_a_name_that_is_accepted_is_good_everywhere(name: str) -> None:
     try:
-        scaffold.check_name(DUAL, name)
+        scaffold.check_name(PluginKind.DUAL, name)
     except RequestError:
         return
     assert f"vibench_{name.replace('-', '_')}".isidentifier()
@@ -132,7 +132,7 @@ def test_a_name_that_is_accepted_is_good_everywhere(name: str) -> None:
 
 
 def test_names_and_places_that_are_taken_are_refused(main: Main) -> None:
-    taken = next(iter(registered(PROBLEM)))
+    taken = next(iter(registered(PluginKind.PROBLEM)))
     refused(main("new", "problem", taken), f"there is a problem '{taken}' already", "choose another name")
     refused(main("new", "solver", "piqp"), "there is a QP solver 'piqp' already", "choose another name")
     refused(main("new", "primal", "strategies"), "vibench itself has a package of that name")

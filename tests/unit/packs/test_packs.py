@@ -24,7 +24,7 @@ from vibench.packs import writer
 from vibench.packs.checks import read_model_pack
 from vibench.packs.pack import ModelPack, reduce_multipliers
 from vibench.packs.reader import pack_digest
-from vibench.plugins.kinds import PROBLEM
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import create, find
 from vibench.testing import check
@@ -69,7 +69,7 @@ def test_the_problem_of_a_pack_conforms(tmp_path: Path) -> None:
     folder, content = write_cable(tmp_path / "pack"), manifest()
     del content["parameters"]["validation"]
     write_manifest(folder, content)
-    check(partial(find(PROBLEM, "pack").load(), str(folder)))
+    check(partial(find(PluginKind.PROBLEM, "pack").load(), str(folder)))
 
 
 def test_triplets_count_from_the_index_base_and_matrix_market_from_one(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from fake_plugins import Wire
 import vibench
 from vibench.errors import RequestError
 from vibench.plugins import plugin as module
-from vibench.plugins.kinds import PROBLEM
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import fingerprint_of, give
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, study_of_cell
@@ -247,7 +247,7 @@ def test_a_pickled_plugin_brings_what_was_given(names: dict[str, Any], monkeypat
 
 
 def test_what_a_worker_cannot_import_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    lost = give(PROBLEM, "wire", Wire)
+    lost = give(PluginKind.PROBLEM, "wire", Wire)
     monkeypatch.setitem(sys.modules, "fake_plugins", None)
     monkeypatch.delitem(lost.__dict__, "given")
     with pytest.raises(RequestError, match="problem 'wire' cannot be received by a worker process: ModuleNotFound"):

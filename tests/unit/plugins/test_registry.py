@@ -20,7 +20,7 @@ from vibench.errors import RequestError
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
 from vibench.plugins import registry
-from vibench.plugins.kinds import DUAL, PRIMAL, PROBLEM, SOLVER, STUDY, PluginKind
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find, registered
 from vibench.study.matrix import read_study
@@ -90,7 +90,7 @@ def no_strategy() -> None:
     """A function where a class is asked for."""
 
 
-GROUP = DUAL.entry_points
+GROUP = PluginKind.DUAL.entry_points
 
 
 @pytest.fixture
@@ -107,7 +107,11 @@ def refusal(action: Callable[..., Any], *arguments: Any) -> str:
     return line
 
 
-BASES: Mapping[PluginKind, type] = {PROBLEM: Problem, DUAL: DualStrategy, PRIMAL: PrimalStrategy}
+BASES: Mapping[PluginKind, type] = {
+    PluginKind.PROBLEM: Problem,
+    PluginKind.DUAL: DualStrategy,
+    PluginKind.PRIMAL: PrimalStrategy,
+}
 
 
 @pytest.mark.parametrize("kind", BASES)
@@ -121,9 +125,9 @@ def test_the_built_in_plugins_are_found_through_their_entry_points(kind: str) ->
 
 
 def test_registered_studies_are_files_that_load() -> None:
-    assert "quick" in registered(STUDY)
-    for name in (name for name, study in registered(STUDY).items() if not study.package):
-        assert Path(find(STUDY, name).load()).is_file()
+    assert "quick" in registered(PluginKind.STUDY)
+    for name in (name for name, study in registered(PluginKind.STUDY).items() if not study.package):
+        assert Path(find(PluginKind.STUDY, name).load()).is_file()
         assert read_study(name).name == name
 
 
@@ -139,13 +143,13 @@ def test_every_built_in_plugin_has_a_summary_and_options_with_defaults(kind: str
 
 def test_names_are_sorted_groups_separate_and_unknown_names_refused_with_the_nearest(register: Register) -> None:
     register(*((GROUP, name, f"{HERE}:Plain") for name in ("plain", "other")))
-    assert list(registered(DUAL)) == ["other", "plain"]
-    assert registered(PROBLEM) == {}
-    assert "known: none" in refusal(find(PROBLEM, "plain").load)
-    line = refusal(find(DUAL, "plian").load)
+    assert list(registered(PluginKind.DUAL)) == ["other", "plain"]
+    assert registered(PluginKind.PROBLEM) == {}
+    assert "known: none" in refusal(find(PluginKind.PROBLEM, "plain").load)
+    line = refusal(find(PluginKind.DUAL, "plian").load)
     assert "no dual strategy is called 'plian'; did you mean 'plain'? (known: other, plain)" in line
-    assert "did you mean" not in refusal(find(DUAL, "xyzzy").load)
-    assert find(DUAL, "plain").origin == "unknown"  # it is in no distribution
+    assert "did you mean" not in refusal(find(PluginKind.DUAL, "xyzzy").load)
+    assert find(PluginKind.DUAL, "plain").origin == "unknown"  # it is in no distribution
 
 
 def test_a_name_that_two_packages_use_is_refused_and_no_other(register: Register) -> None:
@@ -153,15 +157,15 @@ def test_a_name_that_two_packages_use_is_refused_and_no_other(register: Register
         *((GROUP, "plain", f"{HERE}:{one}") for one in ("Plain", "Choosy")),
         *((GROUP, "heir", f"{HERE}:Heir") for _ in range(2)),  # one entry point that is found twice is no conflict
     )
-    line = refusal(find(DUAL, "plain").load)
+    line = refusal(find(PluginKind.DUAL, "plain").load)
     assert line.startswith("two packages provide the dual strategy 'plain'")
     assert f"{HERE}:Plain" in line
     assert f"{HERE}:Choosy" in line
-    assert find(DUAL, "plain").conflict == line
-    assert find(DUAL, "heir").load() is Heir
-    assert list(registered(DUAL)) == ["heir", "plain"]
-    assert "two packages" in refusal(lambda: find(DUAL, "plain").missing)
-    plugin = Entry(name="plain", options={"mode": "slow"}).plugin(DUAL)
+    assert find(PluginKind.DUAL, "plain").conflict == line
+    assert find(PluginKind.DUAL, "heir").load() is Heir
+    assert list(registered(PluginKind.DUAL)) == ["heir", "plain"]
+    assert "two packages" in refusal(lambda: find(PluginKind.DUAL, "plain").missing)
+    plugin = Entry(name="plain", options={"mode": "slow"}).plugin(PluginKind.DUAL)
     assert plugin.options == '{"mode": "slow"}'
     assert "two packages" in refusal(plugin.create)
 
@@ -174,7 +178,7 @@ def test_a_plugin_cannot_take_the_name_of_a_solver_of_qpsolvers(register: Regist
         assert line.startswith(f"two packages provide the QP solver '{name}'")
         assert f"qpsolvers, unknown ({HERE}:no_strategy)" in line
     assert registry.qp_solver("mine") == {"mine": no_strategy}
-    assert find(SOLVER, "osqp").conflict == ""
+    assert find(PluginKind.SOLVER, "osqp").conflict == ""
 
 
 def test_a_distribution_that_is_found_in_two_folders_is_one(
@@ -182,18 +186,18 @@ def test_a_distribution_that_is_found_in_two_folders_is_one(
 ) -> None:
     for folder in ("one", "other"):
         monkeypatch.syspath_prepend(str(install(tmp_path / folder, fake_plugins, FAKES)))
-    assert find(SOLVER, "careful").conflict == ""
-    assert find(SOLVER, "careful").origin == "fake-plugins 1.0"
+    assert find(PluginKind.SOLVER, "careful").conflict == ""
+    assert find(PluginKind.SOLVER, "careful").origin == "fake-plugins 1.0"
 
 
 UNLOADABLE = [
-    (DUAL, "no_such_module:Plain", "no_such_module"),
-    (DUAL, f"{HERE}:NoSuchClass", "NoSuchClass"),
-    (DUAL, f"{HERE}:no_strategy", "not a subclass of DualStrategy"),
-    (DUAL, f"{HERE}:HERE", "not a subclass of DualStrategy"),
-    (DUAL, "vibench.interfaces.strategies:PrimalStrategy", "not a subclass of DualStrategy"),
-    (SOLVER, f"{HERE}:HERE", "is not callable"),
-    (STUDY, f"{HERE}:no_strategy", "is not the path of a study file"),
+    (PluginKind.DUAL, "no_such_module:Plain", "no_such_module"),
+    (PluginKind.DUAL, f"{HERE}:NoSuchClass", "NoSuchClass"),
+    (PluginKind.DUAL, f"{HERE}:no_strategy", "not a subclass of DualStrategy"),
+    (PluginKind.DUAL, f"{HERE}:HERE", "not a subclass of DualStrategy"),
+    (PluginKind.DUAL, "vibench.interfaces.strategies:PrimalStrategy", "not a subclass of DualStrategy"),
+    (PluginKind.SOLVER, f"{HERE}:HERE", "is not callable"),
+    (PluginKind.STUDY, f"{HERE}:no_strategy", "is not the path of a study file"),
 ]
 
 
@@ -204,7 +208,7 @@ def test_what_cannot_be_loaded_is_refused_with_its_entry_point(
     failing = {"raises": "raise OSError('no licence')", "divides": "1 / 0", "syntax": "def f(:"}
     for name, code in failing.items():
         (tmp_path / f"plugin_that_{name}.py").write_text(f"{code}\n")
-    cases = [*UNLOADABLE, *((DUAL, f"plugin_that_{name}:Plain", "cannot be loaded") for name in failing)]
+    cases = [*UNLOADABLE, *((PluginKind.DUAL, f"plugin_that_{name}:Plain", "cannot be loaded") for name in failing)]
     register(*((kind.entry_points, f"broken-{number}", value) for number, (kind, value, _) in enumerate(cases)))
     for number, (kind, value, words) in enumerate(cases):
         line = refusal(find(kind, f"broken-{number}").load)
@@ -250,11 +254,11 @@ ACCEPTED = [
 def test_options_that_fit_reach_the_constructor() -> None:
     """TOML knows neither tuples nor enumerations; a float may be written as an integer."""
     for options in ACCEPTED:
-        made = find(DUAL, "choosy").create(options)
+        made = find(PluginKind.DUAL, "choosy").create(options)
         assert {name: made.given[name] for name in options} == options
-    made = Plugin(DUAL, "choosy", '{"weight": 0.5, "point": [1.0, 2.0], "colour": "blue"}', "").create()
+    made = Plugin(PluginKind.DUAL, "choosy", '{"weight": 0.5, "point": [1.0, 2.0], "colour": "blue"}', "").create()
     assert (made.given["point"], made.given["colour"]) == ((1.0, 2.0), Colour.BLUE)
-    assert isinstance(find(DUAL, "record").check_options({"width": 2})["width"], float)
+    assert isinstance(find(PluginKind.DUAL, "record").check_options({"width": 2})["width"], float)
 
 
 REFUSED = [
@@ -282,25 +286,25 @@ REFUSED = [
 @pytest.mark.usefixtures("_own")
 def test_options_that_do_not_fit_are_refused_with_what_is_expected() -> None:
     for options, words in REFUSED:
-        line = refusal(find(DUAL, "choosy").check_options, options)
+        line = refusal(find(PluginKind.DUAL, "choosy").check_options, options)
         assert [word for word in ("'choosy'", *words) if word not in line] == [], line
 
 
 @pytest.mark.usefixtures("_own")
 def test_constructors_may_be_missing_inherited_generated_or_open() -> None:
-    assert find(DUAL, "plain").options == {}
-    assert isinstance(find(DUAL, "plain").create({}), Plain)
-    assert "known: none" in refusal(find(DUAL, "plain").check_options, {"x": 1})
-    assert find(DUAL, "heir").options == find(DUAL, "choosy").options
-    assert find(DUAL, "heir").create({"weight": 0.5}).given["weight"] == 0.5
-    assert find(DUAL, "record").create({"width": 2.0}) == Record(2.0)
-    assert "float > 0" in refusal(find(DUAL, "record").check_options, {"width": -1.0})
-    assert find(DUAL, "open").create({"width": 2.0}).given == {"width": 2.0}
+    assert find(PluginKind.DUAL, "plain").options == {}
+    assert isinstance(find(PluginKind.DUAL, "plain").create({}), Plain)
+    assert "known: none" in refusal(find(PluginKind.DUAL, "plain").check_options, {"x": 1})
+    assert find(PluginKind.DUAL, "heir").options == find(PluginKind.DUAL, "choosy").options
+    assert find(PluginKind.DUAL, "heir").create({"weight": 0.5}).given["weight"] == 0.5
+    assert find(PluginKind.DUAL, "record").create({"width": 2.0}) == Record(2.0)
+    assert "float > 0" in refusal(find(PluginKind.DUAL, "record").check_options, {"width": -1.0})
+    assert find(PluginKind.DUAL, "open").create({"width": 2.0}).given == {"width": 2.0}
 
 
 @pytest.mark.usefixtures("_own")
 def test_options_are_listed_in_words() -> None:
-    options = find(DUAL, "choosy").options
+    options = find(PluginKind.DUAL, "choosy").options
     listed = {name: (option.expected, str(option).partition(" = ")[2]) for name, option in options.items()}
     assert listed["weight"] == ("float > 0 and < 1", "")
     assert listed["count"] == ("int ≥ 1 and ≤ 9", "3")
@@ -319,8 +323,8 @@ def test_the_code_of_a_plugin_follows_its_sources(
     (package / "helper.py").write_text("x = 1\n")
     monkeypatch.syspath_prepend(tmp_path)
     register((GROUP, "edited", "edited_plugin:Plain"), (GROUP, "plain", f"{HERE}:Plain"))
-    codes = [find(DUAL, "edited").code, find(DUAL, "plain").code]
+    codes = [find(PluginKind.DUAL, "edited").code, find(PluginKind.DUAL, "plain").code]
     (package / "helper.py").write_text("x = 2\n")
     registry.registered.cache_clear()
-    assert find(DUAL, "edited").code != codes[0]
-    assert find(DUAL, "plain").code == codes[1]
+    assert find(PluginKind.DUAL, "edited").code != codes[0]
+    assert find(PluginKind.DUAL, "plain").code == codes[1]

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from matplotlib.backends.backend_agg import RendererAgg
 from matplotlib.figure import Figure
 
-from vibench.plugins.kinds import DUAL, PRIMAL
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import registered
 from vibench.report.figures.data import file_names
 from vibench.report.figures.style import COLOURS, Looks, Series, Sheet, caption_of, look_of, plot, styled, write_figure
@@ -106,7 +106,7 @@ def test_no_two_series_of_a_figure_look_the_same(names: list[str], tolerances: l
 
 
 def test_what_is_shipped_has_colours_and_markers_of_its_own() -> None:
-    for names in (registered(PRIMAL), registered(DUAL), SOLVERS):
+    for names in (registered(PluginKind.PRIMAL), registered(PluginKind.DUAL), SOLVERS):
         looks = [look_of(name) for name in names]
         assert len(set(looks)) == len(looks)
         if len(names) <= len(COLOURS):

@@ -13,7 +13,7 @@ from samples import SampleStore, carry_out, program_queries
 
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import Stop
-from vibench.plugins.kinds import PROBLEM
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find
 from vibench.stages.base import Row, value_of
@@ -23,7 +23,7 @@ from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.pictures import PictureStage
 from vibench.study.parameter_sets import ParameterSet
 
-OBSTACLE = find(PROBLEM, "obstacle").load()
+OBSTACLE = find(PluginKind.PROBLEM, "obstacle").load()
 PROBLEMS: Mapping[str, Callable[[], Problem]] = {
     "wire": Declared,
     "wire, buffered": buffered(Declared),

@@ -12,7 +12,7 @@ from vibench.highfidelity import kkt_systems
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.linalg import factorisations, inner_product
 from vibench.linalg.factorisations import IMPLEMENTATIONS
-from vibench.plugins.kinds import PROBLEM
+from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find
 from vibench.reduction import supremizers
@@ -65,11 +65,11 @@ def test_only_who_is_chosen_factorises_a_problem_that_is_made(factorisation: str
 def test_a_study_chooses_for_its_problems_and_a_problem_for_itself() -> None:
     problems = ["obstacle", {"name": "hertz", "options": {"factorisation": "cholmod"}}]
     study = Study.model_validate(STUDY | {"problem": problems, "factorisation": "pardiso"})
-    chosen = [problem.plugin(PROBLEM).arguments["factorisation"] for problem in study.problem]
+    chosen = [problem.plugin(PluginKind.PROBLEM).arguments["factorisation"] for problem in study.problem]
     assert chosen == ["pardiso", "cholmod"]
-    default = Study.model_validate(STUDY | {"factorisation": "superlu"}).problem[0].plugin(PROBLEM)
-    assert default == Study.model_validate(STUDY).problem[0].plugin(PROBLEM)  # and so are its keys
-    assert default != study.problem[0].plugin(PROBLEM)
+    default = Study.model_validate(STUDY | {"factorisation": "superlu"}).problem[0].plugin(PluginKind.PROBLEM)
+    assert default == Study.model_validate(STUDY).problem[0].plugin(PluginKind.PROBLEM)  # and so are its keys
+    assert default != study.problem[0].plugin(PluginKind.PROBLEM)
     with pytest.raises(RequestError, match=r"factorisation.*superlo"):
         Study.model_validate(STUDY | {"factorisation": "superlo"})
     with pytest.raises(RequestError, match=r"superlo.*superlu"):
@@ -78,7 +78,7 @@ def test_a_study_chooses_for_its_problems_and_a_problem_for_itself() -> None:
 
 def test_available_is_the_name_of_what_is_there() -> None:
     def plugin() -> Plugin:
-        return Plugin.of(find(PROBLEM, "hertz"), {"factorisation": "available"})
+        return Plugin.of(find(PluginKind.PROBLEM, "hertz"), {"factorisation": "available"})
 
     with mock.patch.object(factorisations, "distribution_version", return_value=""):
         assert "factorisation" not in plugin().arguments  # SuperLU, the default
