@@ -12,15 +12,7 @@ import pytest
 
 import vibench
 from vibench import provenance
-from vibench.provenance import (
-    core_code,
-    cores,
-    distribution_version,
-    machine,
-    solver_version,
-    source_hash,
-    versions,
-)
+from vibench.provenance import core_code, cores, distribution_version, machine, solver_version, source_hash, versions
 
 
 @pytest.mark.parametrize(

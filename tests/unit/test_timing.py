@@ -12,16 +12,7 @@ import pytest
 from scipy.stats import binom
 
 from vibench import timing
-from vibench.timing import (
-    NO_TIME,
-    ONE_THREAD,
-    REPEATS,
-    Calibration,
-    Seconds,
-    median_interval,
-    median_seconds,
-    timed,
-)
+from vibench.timing import NO_TIME, ONE_THREAD, REPEATS, Calibration, Seconds, median_interval, median_seconds, timed
 
 
 @pytest.fixture

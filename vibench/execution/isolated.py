@@ -69,11 +69,7 @@ class IsolatedCall(ItemwiseStage, Items):
 
 
 def call_isolated(
-    function: Callable[..., Any],
-    *arguments: Any,
-    seconds: float,
-    supervisor: Supervisor,
-    owners: tuple[str, ...] = (),
+    function: Callable[..., Any], *arguments: Any, seconds: float, supervisor: Supervisor, owners: tuple[str, ...] = ()
 ) -> Any:
     """Call a function in the process of a supervisor for some packages, for some wall seconds at most.
 

@@ -128,9 +128,7 @@ def test_clusters_name_their_fallbacks_and_take_no_vectors_that_are_supplied() -
         replace(STRING, primal=Supplied()).with_formulation(Local(clusters=1)).model  # noqa: B018
 
 
-def test_processes_are_those_of_scikit_learn_and_multipliers_are_projected_on_the_cone_in_w(
-    processes: Model,
-) -> None:
+def test_processes_are_those_of_scikit_learn_and_multipliers_are_projected_on_the_cone_in_w(processes: Model) -> None:
     from sklearn.gaussian_process import GaussianProcessRegressor  # noqa: PLC0415
     from sklearn.gaussian_process.kernels import ConstantKernel, Matern  # noqa: PLC0415
 
@@ -154,9 +152,7 @@ def test_processes_are_those_of_scikit_learn_and_multipliers_are_projected_on_th
     assert np.abs(slope[alpha > 0.0]).max() <= 1e-8 * W.norm(predicted)
 
 
-def test_regression_interpolates_the_snapshots_and_its_uncertainty_has_the_size_of_the_error(
-    processes: Model,
-) -> None:
+def test_regression_interpolates_the_snapshots_and_its_uncertainty_has_the_size_of_the_error(processes: Model) -> None:
     problem, V, W = STRING.problem, STRING.problem.V, STRING.problem.W
     fitted = processes
     for k in (0, 7):

@@ -87,10 +87,7 @@ def test_what_is_assembled_in_parts_is_the_whole(seed: int) -> None:
     assert np.array_equal(contact.g, vi.g)
     A = vi.A.tocoo()
     chosen, zero = rng.integers(A.nnz, size=30), np.zeros(30, dtype=np.intp)
-    wanted = {
-        "A": (A.coords[0][chosen], A.coords[1][chosen]),
-        "f": (rng.integers(EGG.V.dim, size=30), zero),
-    }
+    wanted = {"A": (A.coords[0][chosen], A.coords[1][chosen]), "f": (rng.integers(EGG.V.dim, size=30), zero)}
     found = EGG.sampler(wanted)(mu)
     for name, (i, j) in wanted.items():
         exact = getattr(vi, name)

@@ -24,10 +24,7 @@ def printed(action: Callable[[], object]) -> list[str]:
 
 @given(ANYTHING, ANYTHING)
 def test_every_line_is_one_printable_line(one: str, other: str) -> None:
-    for lines, count in (
-        (printed(lambda: echo(one, other)), 3),
-        (printed(lambda: print_line(new_console(), one)), 2),
-    ):
+    for lines, count in ((printed(lambda: echo(one, other)), 3), (printed(lambda: print_line(new_console(), one)), 2)):
         assert len(lines) == count
         assert all(line.isprintable() for line in lines)
 

@@ -13,14 +13,7 @@ from hypothesis import strategies as st
 from samples import cell_row
 
 from vibench.results import paired_timing
-from vibench.results.break_even import (
-    FEWEST_ROUNDS,
-    MARGIN,
-    BreakEven,
-    Meaning,
-    break_even,
-    break_even_rows,
-)
+from vibench.results.break_even import FEWEST_ROUNDS, MARGIN, BreakEven, Meaning, break_even, break_even_rows
 from vibench.results.schema import STORED
 
 OTHER_RUNS = float(np.exp(1.96 * paired_timing.CONDITIONS))

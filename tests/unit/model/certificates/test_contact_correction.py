@@ -11,11 +11,7 @@ from numerics import exact, spd
 
 from vibench.interfaces.problem import Contact, VariationalInequality
 from vibench.model.certificates import contact_correction
-from vibench.model.certificates.contact_correction import (
-    ContactCompliance,
-    ContactCorrection,
-    find_contact_correction,
-)
+from vibench.model.certificates.contact_correction import ContactCompliance, ContactCorrection, find_contact_correction
 
 K, M = 7, 6
 EVERY = np.arange(K)

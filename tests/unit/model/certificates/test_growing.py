@@ -17,10 +17,7 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.model.certificates.greedy import GreedyTrainer, IncrementalModel
 from vibench.reduction import subtract_cone_component
 
-PROBLEMS = {
-    "B and A vary": Varying,
-    "A is constant": lambda: create("problem", "hertz", {"resolution": 300}),
-}
+PROBLEMS = {"B and A vary": Varying, "A is constant": lambda: create("problem", "hertz", {"resolution": 300})}
 
 
 def grown(problem: Problem, mus: Array) -> tuple[HighFidelitySolver, IncrementalModel]:
