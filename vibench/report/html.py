@@ -24,7 +24,6 @@ from vibench.report.figures import FigureTask, figures_of, processes, render
 from vibench.report.figures.data import Extent, ProblemTables, label_of, problem_tables, whole
 from vibench.report.plots import image_of, script_safe, short
 from vibench.results import formats, pictures, ranking, show
-from vibench.results.break_even import MARGIN
 from vibench.results.paired_timing import PairedTiming
 from vibench.results.ranking import LARGEST_BAND, Criterion, Winner, leaderboard
 from vibench.results.read import in_order, read_table
@@ -294,7 +293,7 @@ def _grids(read: Mapping[str, pd.DataFrame]) -> Iterator[TableGrid]:
     formulations = formats.between_formulations(thresholds)
     caption = (
         "When b is cheaper than a, offline and online together, by the number of queries, with its 95 % interval; "
-        f"as fast where the seconds of queries differ by less than a factor of {MARGIN:g}; undecided where the rounds "
+        "as fast where the seconds of queries differ by less than a factor of 1.25; undecided where the rounds "
         "do not tell."
     )
     for name, title, rows in (

@@ -14,22 +14,15 @@ from vibench.arrays import Array
 from vibench.errors import requested
 from vibench.interfaces.strategies import Kind
 from vibench.plugins.registry import default_formulation
-from vibench.results.paired_timing import CONDITIONS, PairedTiming
+from vibench.results.paired_timing import CONDITIONS, DRAWS, PairedTiming
 from vibench.results.schema import KEYS, STORED
 from vibench.study.cells import NO_SUCH_AXIS
-
-# Draws of seconds that other runs might measure, from which intervals are taken.
-DRAWS = 2000
 
 # Probability left out on each side of a 95 % interval.
 TAIL = 0.025
 
 # Rounds of two blocks; fewer do not show the scatter between blocks, so that nothing is decided.
 FEWEST_ROUNDS = 6
-
-# Queries whose seconds differ by less than this factor are "as fast": other load of a machine changes their ratio by
-# about as much, and another run would not find a threshold that rests on it.
-MARGIN = 1.25
 
 # Standard deviation of the logarithm of offline seconds measured once, where a run repeats no stage.
 SCATTER = 0.2
@@ -54,9 +47,9 @@ class BreakEven:
     """Number n* of queries, `None` where the total costs are never equal, and on which side of it b is cheaper.
 
     `low` and `high` are the ends of the 95 % interval of n*, where seconds were measured in rounds. Where the queries
-    are as fast, within `MARGIN`, no number is claimed. Where it is undecided, `rounds` is how many more of them would
-    decide it at the present scatter, `None` where none would since it is the offline seconds that do not differ by more
-    than theirs.
+    are as fast, within a factor of 1.25, no number is claimed. Where it is undecided, `rounds` is how many more of them
+    would decide it at the present scatter, `None` where none would since it is the offline seconds that do not differ
+    by more than theirs.
     """
 
     number: float | None
@@ -116,8 +109,8 @@ def compared(
 ) -> Iterator[BreakEvenComparison]:
     """Break-even of the models that are compared, undecided where more than `tail` of the draws deny it.
 
-    It is "as fast" where it would be undecided, but the seconds of both queries differ by less than `MARGIN`, with the
-    probability `tail` of either to be wrong.
+    It is "as fast" where it would be undecided, but the seconds of both queries differ by a factor of less than 1.25,
+    with the probability `tail` of either to be wrong.
 
     Every per-parameter enrichment (a) is compared with every fixed one (b) of the same problem, formulation, cone,
     tolerances and solver; every reduced cell (a) with that of the same model with certificates (b); every cell of the
@@ -125,36 +118,28 @@ def compared(
     model (a, whose offline phase is its set-up) with every cell (b). One machine measured both, and but for the second
     of these pairs both or none have certificates. Cells without an ok query are left out.
     """
-    timed = [cell for cell in cells if cell["online_s"] is not None]
-    alike = _Groups(timed)
-    usual = default_formulation()
-    default = _Groups([cell for cell in timed if cell["formulation"] == usual])
+    timed, usual = [cell for cell in cells if cell["online_s"] is not None], default_formulation()
+    default = [cell for cell in timed if cell["formulation"] == usual]
+    indices: dict[tuple[str, ...], dict[tuple[Any, ...], list[Mapping[str, Any]]]] = {}
+
+    def equal_to(cell: Mapping[str, Any], columns: tuple[str, ...], among: list[Mapping[str, Any]]) -> Iterable[Any]:
+        # Cells are indexed by their values in the columns: comparing every cell with all others would be quadratic.
+        if (index := indices.get(columns)) is None:
+            index = indices[columns] = {}
+            for one in among:
+                index.setdefault(tuple(one[name] for name in columns), []).append(one)
+        return index.get(tuple(cell[name] for name in columns), [])
+
     # Seconds of a query are means over the queries of a validation set, and of a machine.
     measured = ("validation", "validation_options", "machine")
     everything = (*_shared_axes(), "formulation", "formulation_options", *measured)
     for b in timed:
         yield _comparison(paired, None, b, tail)
-        yield from (_comparison(paired, a, b, tail) for a in alike.equal_to(b, everything) if _compared(a, b))
+        yield from (_comparison(paired, a, b, tail) for a in equal_to(b, everything, timed) if _compared(a, b))
         if b["formulation"] != usual:
             axes = (*_axes(b), *measured)
-            yield from (_comparison(paired, a, b, tail) for a in default.equal_to(b, axes) if _as_certified(a, b))
-
-
-class _Groups:
-    """Cells indexed by their values in some columns: comparing every cell with all others would be quadratic."""
-
-    def __init__(self, cells: Iterable[Mapping[str, Any]]) -> None:
-        self._cells = list(cells)
-        self._groups: dict[tuple[str, ...], dict[tuple[Any, ...], list[Mapping[str, Any]]]] = {}
-
-    def equal_to(self, cell: Mapping[str, Any], columns: tuple[str, ...]) -> Iterable[Mapping[str, Any]]:
-        """The cells with the same values in these columns."""
-        groups = self._groups.get(columns)
-        if groups is None:
-            groups = self._groups[columns] = {}
-            for one in self._cells:
-                groups.setdefault(tuple(one[name] for name in columns), []).append(one)
-        return groups.get(tuple(cell[name] for name in columns), [])
+            alike = (a for a in equal_to(b, axes, default) if a["bounds"] == b["bounds"])
+            yield from (_comparison(paired, a, b, tail) for a in alike)
 
 
 def _shared_axes() -> tuple[str, ...]:
@@ -179,14 +164,10 @@ def _axes(cell: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _compared(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     """Whether b replaces a: fixed enrichment a per-parameter one, or a certified query the same without certificate."""
-    if _as_certified(a, b):
+    if a["bounds"] == b["bounds"]:
         return bool(a["enrichment_kind"] == Kind.PER_PARAMETER and b["enrichment_kind"] == Kind.FIXED)
     same = all(a[name] == b[name] for name in ("primal", "primal_options", "primal_tol"))
     return a["assembly"] == "reduced" and not a["bounds"] and same
-
-
-def _as_certified(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
-    return bool(a["bounds"] == b["bounds"])
 
 
 def _comparison(
@@ -200,7 +181,7 @@ def _comparison(
         return BreakEvenComparison(a, b, BreakEven(None, Meaning.UNDECIDED), online, None)
     rng = np.random.default_rng(0)
     shared = b["hf_setup_s"] if a is None else shared_offline(a, b)
-    seconds, quotients = paired.draws(key, b["cell"], rng, DRAWS)
+    seconds, quotients = paired.draws(key, b["cell"], rng)
     online_a = float(np.exp(level.mean))
     online_b = online_a * float(np.exp(ratio.mean))
     # Seconds that other runs might measure, beside those that this run has measured.
@@ -220,22 +201,24 @@ def _comparison(
     if np.mean(drawn[measured.meaning]) < 1.0 - tail:
         result = BreakEven(None, Meaning.UNDECIDED, low)
     if result.meaning is Meaning.UNDECIDED:
-        margin = math.log(MARGIN)
+        # Other load of a machine changes the ratio of seconds by about a factor of 1.25, and another run would not find
+        # a threshold that rests on less.
+        margin = math.log(1.25)
         if all(abs(end) <= margin for end in ratio.interval(tail)):
             result = BreakEven(None, Meaning.AS_FAST)
         # More rounds decide nothing where it is only the offline seconds that do not differ enough.
         elif tail < float(np.mean(quotients < 1.0)) < 1.0 - tail:
-            result = replace(result, rounds=_rounds_missing(paired, key, b["cell"]))
+            result = replace(result, rounds=_rounds_missing(paired, key, b["cell"], margin))
     least, most = ratio.interval(TAIL)
     return BreakEvenComparison(a, b, result, (online_a, online_b), (math.exp(-most), math.exp(-least)))
 
 
-def _rounds_missing(paired: PairedTiming, a: str | None, b: str) -> int | None:
+def _rounds_missing(paired: PairedTiming, a: str | None, b: str, margin: float) -> int | None:
     """Number of further rounds that would decide which of two queries is faster, or neither, at the present scatter."""
     within, done = paired.ratio_within(a, b), paired.rounds(a, b)
     if within is None:
         return None
-    distance = max(abs(within.mean), math.log(MARGIN) - abs(within.mean))
+    distance = max(abs(within.mean), margin - abs(within.mean))
     # Student's quantile for 95 % with the degrees of freedom that further rounds would lead to.
     allowed = (distance / 2.1) ** 2 - CONDITIONS**2
     needed = done * within.error**2 / allowed if allowed > 0.0 else math.inf
@@ -264,7 +247,10 @@ def offline_draws(cell: Mapping[str, Any], shared: float, rng: np.random.Generat
 
 
 def _row(one: BreakEvenComparison) -> dict[str, Any]:
-    a, b, result = one.a or _high_fidelity(one.b), one.b, one.result
+    b, result = one.b, one.result
+    model = {"primal": HIGH_FIDELITY, "formulation": default_formulation(), "assembly": ""}
+    absent = dict.fromkeys(("cell", "primal_tol", "bounds"))
+    a = one.a or {**b, **model, **absent, "offline_s": b["hf_setup_s"]}
     row = {name: a[name] if _is_blank(b[name]) else b[name] for name in _shared_axes()}
     for side, cell, online in zip("ab", (a, b), one.online, strict=True):
         own = ("cell", "formulation", "primal", "primal_tol", "assembly", "bounds")
@@ -274,8 +260,3 @@ def _row(one: BreakEvenComparison) -> dict[str, Any]:
     low, high = one.gain or (None, None)
     gains = {"gain": one.online[0] / one.online[1], "gain_low": low, "gain_high": high}
     return row | gains | numbers | {"meaning": result.meaning.value, "rounds_missing": result.rounds}
-
-
-def _high_fidelity(b: Mapping[str, Any]) -> Mapping[str, Any]:
-    model = {"primal": HIGH_FIDELITY, "formulation": default_formulation(), "assembly": ""}
-    return {**b, **model, **dict.fromkeys(("cell", "primal_tol", "bounds")), "offline_s": b["hf_setup_s"]}

@@ -168,13 +168,7 @@ def compare(answers: Iterable[Recorded]) -> Iterator[dict[str, Any]]:
         sizes = np.array([float(np.linalg.norm(x.x)) for x, _ in pairs])
         relative, far = apart / np.where(sizes > 0.0, sizes, 1.0), apart > limits
         worst = int(np.argmax(relative))
-        yield {
-            "solver_a": a,
-            "solver_b": b,
-            "queries": len(common),
-            "difference_max": float(relative[worst]),
-            "query_worst": common[worst],
-            "allowed_worst": float(limits[worst] / (sizes[worst] or 1.0)),
-            "flagged": int(far.sum()),
-            "query_flagged": common[int(np.argmax(far))] if far.any() else None,
-        }
+        row = {"solver_a": a, "solver_b": b, "queries": len(common), "query_worst": common[worst]}
+        row |= {"difference_max": float(relative[worst]), "flagged": int(far.sum())}
+        row |= {"allowed_worst": float(limits[worst] / (sizes[worst] or 1.0))}
+        yield row | {"query_flagged": common[int(np.argmax(far))] if far.any() else None}

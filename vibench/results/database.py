@@ -199,13 +199,10 @@ class ResultsDatabase:
         return self._db.execute(f"{own} UNION ALL {queries}")
 
     def write_cell(
-        self,
-        cell: Mapping[str, Any],
-        queries: Sequence[Mapping[str, Any]],
-        solutions: Sequence[Mapping[str, Any]] = (),
-        outputs: Sequence[Mapping[str, Any]] = (),
+        self, cell: Mapping[str, Any], queries: Sequence[Mapping[str, Any]],
+        solutions: Sequence[Mapping[str, Any]] = (), outputs: Sequence[Mapping[str, Any]] = (),
         parameters: Sequence[tuple[str, str]] = (),
-    ) -> dict[str, Any]:
+    ) -> dict[str, Any]:  # fmt: skip
         """Write a cell, its queries, solutions and outputs in one transaction; its earlier rows are replaced.
 
         `parameters` are names and units of the parameters of its problem, which are kept in the table `meta`.
@@ -225,8 +222,8 @@ class ResultsDatabase:
                 "threads", "versions", "definition",
             )  # fmt: skip
             row = {name: cell[name] for name in identity if name in cell}
-            reason = f"the results cannot be stored: {error}"
-            return self._write_cell(row | {"status": Status.ERROR.value, "reason": reason, "queries_ok": 0})
+            row.update(status=Status.ERROR.value, reason=f"the results cannot be stored: {error}", queries_ok=0)
+            return self._write_cell(row)
 
     def keep(self, key: str, value: str) -> None:
         """Keep a text in the table `meta`, in place of an earlier one with the same key."""
@@ -256,12 +253,9 @@ class ResultsDatabase:
         return storable("cells", cell)
 
     def write_seconds(
-        self,
-        cell: str,
-        own: Mapping[str, Any],
-        queries: Mapping[int, Mapping[str, Any]],
+        self, cell: str, own: Mapping[str, Any], queries: Mapping[int, Mapping[str, Any]],
         rounds: Sequence[Mapping[str, Any]],
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Write the seconds of a cell that has its rows, in one transaction; earlier ones are replaced.
 
         `own` are columns of the cell, `queries` those of its queries by their number, `rounds` rows of timings.
@@ -393,7 +387,6 @@ def _refuse_other(path: Path, study: Mapping[str, Any]) -> None:
         raise RequestError(f"'{path}' has schema {meta.get('schema')}, this vibench writes {VERSION}; use --out")
     there = study_of(path, meta)
     if there != json.loads(json.dumps(study)):
-        what = ", ".join(
-            f"{key} {there.get(key)!r} instead of {study[key]!r}" for key in study if there.get(key) != study[key]
-        )
+        other = [key for key in study if there.get(key) != study[key]]
+        what = ", ".join(f"{key} {there.get(key)!r} instead of {study[key]!r}" for key in other)
         raise RequestError(f"'{path.parent}' holds results of another study ({what}); use another --out, or --fresh")

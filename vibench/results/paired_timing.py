@@ -29,6 +29,9 @@ from vibench.arrays import Array
 # under different loads (docs/measurement.md).
 CONDITIONS = 0.05
 
+# Draws of seconds that other runs might measure, from which intervals are taken.
+DRAWS = 2000
+
 
 class MeanEstimate(NamedTuple):
     """A mean with its standard error and the degrees of freedom of that error."""
@@ -42,10 +45,10 @@ class MeanEstimate(NamedTuple):
         half = self.error * float(stdtrit(self.freedom, 1.0 - tail))
         return self.mean - half, self.mean + half
 
-    def draws(self, rng: np.random.Generator, count: int) -> Array:
-        """Means (`count`,) that other runs might measure."""
+    def draws(self, rng: np.random.Generator) -> Array:
+        """Means (`DRAWS`,) that other runs might measure."""
         # These are logarithms, and with one degree of freedom some draws lie where exponentials overflow.
-        return self.mean + np.clip(self.error * rng.standard_t(self.freedom, count), -50.0, 50.0)
+        return self.mean + np.clip(self.error * rng.standard_t(self.freedom, DRAWS), -50.0, 50.0)
 
     def minus(self, other: MeanEstimate) -> MeanEstimate:
         """Difference of independent means with the degrees of freedom of Welch and Satterthwaite."""
@@ -140,24 +143,13 @@ class Block(NamedTuple):
     ratio: float
 
 
-# block of a round, seconds of a query in it at its pace, and their ratio to those of a high-fidelity solution
-Measured = tuple[str, float, float]
-
-
-def _measured(row: Mapping[str, Any]) -> Measured:
-    high_fidelity = math.nan if row["hf_s"] is None else row["hf_s"]
-    return row["block"], row["total_s"] / row["pace"], row["total_s"] / high_fidelity
-
-
 def blocks_of(rounds: Iterable[Mapping[str, Any]]) -> dict[str, Block]:
     """The blocks of a cell by their names, from its rows of the timings table."""
-    return _blocks(map(_measured, rounds))
-
-
-def _blocks(rounds: Iterable[Measured]) -> dict[str, Block]:
     by_block: dict[str, list[tuple[float, float]]] = {}
-    for block, *measured in rounds:
-        by_block.setdefault(block, []).append((measured[0], measured[1]))
+    for row in rounds:
+        high_fidelity = math.nan if row["hf_s"] is None else row["hf_s"]
+        measured = row["total_s"] / row["pace"], row["total_s"] / high_fidelity
+        by_block.setdefault(row["block"], []).append(measured)
     with np.errstate(all="ignore"):
         return {name: Block(*map(_median, np.log(np.array(rows)).T)) for name, rows in by_block.items()}
 
@@ -183,19 +175,16 @@ class PairedTiming:
         # Every group has a first block; the others are the independent ones that a common variance rests on.
         self._names: set[str] = set()
         self._first: set[str] = set()
-        by_cell: dict[str, list[Measured]] = {}
+        by_cell: dict[str, list[Mapping[str, Any]]] = {}
         for row in timings:
-            by_cell.setdefault(row["cell"], []).append(_measured(row))
-        for cell, measured in by_cell.items():
-            self._add(cell, measured)
+            by_cell.setdefault(row["cell"], []).append(row)
+        for cell, rounds in by_cell.items():
+            self.add(cell, rounds)
 
-    def add(self, cell: str, rounds: Iterable[Mapping[str, Any]]) -> None:
+    def add(self, cell: str, rounds: Sequence[Mapping[str, Any]]) -> None:
         """Add all rounds of a cell, rows of the timings table, in place of earlier ones."""
-        self._add(cell, list(map(_measured, rounds)))
-
-    def _add(self, cell: str, rounds: Sequence[Measured]) -> None:
-        blocks = self._blocks[cell] = _blocks(rounds)
-        self._rounds[cell] = Counter(block for block, *_ in rounds)
+        blocks = self._blocks[cell] = blocks_of(rounds)
+        self._rounds[cell] = Counter(row["block"] for row in rounds)
         self._names.update(blocks)
         self._first.update(list(blocks)[:1])
         self._ratios.add(cell, [b.ratio for b in blocks.values() if math.isfinite(b.ratio)])
@@ -244,17 +233,17 @@ class PairedTiming:
             values = [x.online for name, x in others.items() if name in mine] or [x.online for x in others.values()]
         return self._estimate(self._levels, values)
 
-    def draws(self, a: str | None, b: str, rng: np.random.Generator, count: int) -> tuple[Array, Array]:
-        """Seconds (`count`,) of a query of a, and their quotients b over a, that other runs might measure.
+    def draws(self, a: str | None, b: str, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Seconds (`DRAWS`,) of a query of a, and their quotients b over a, that other runs might measure.
 
         They are NaN where they were not measured in two blocks.
         """
         level, ratio = self.level(a, b), self.ratio_within(a, b)
         if level is None or ratio is None:
-            return np.full(count, np.nan), np.full(count, np.nan)
+            return np.full(DRAWS, np.nan), np.full(DRAWS, np.nan)
         # One draw for both: conditions that slow down a make the quotient b over a smaller.
-        conditions = CONDITIONS * rng.standard_normal(count)
-        return np.exp(level.draws(rng, count) + conditions), np.exp(ratio.draws(rng, count) - conditions)
+        conditions = CONDITIONS * rng.standard_normal(DRAWS)
+        return np.exp(level.draws(rng) + conditions), np.exp(ratio.draws(rng) - conditions)
 
     def _estimate(self, common: CommonVariance, values: Sequence[float]) -> MeanEstimate | None:
         count = len(values)

@@ -14,10 +14,11 @@ import pandas as pd
 from vibench.arrays import Array
 from vibench.errors import RequestError, unknown_name
 from vibench.qp.status import Status
-from vibench.results.break_even import DRAWS, HIGH_FIDELITY, TAIL, offline_draws, shared_offline
-from vibench.results.paired_timing import MeanEstimate, PairedTiming
+from vibench.results.break_even import HIGH_FIDELITY, TAIL, offline_draws, shared_offline
+from vibench.results.paired_timing import DRAWS, MeanEstimate, PairedTiming
 from vibench.results.schema import STORED, Column, integer, real
 from vibench.stability.infsup import VANISHES
+from vibench.study.cells import UNCORRECTED
 
 
 def columns_of_measures() -> dict[str, tuple[str, ...]]:
@@ -184,8 +185,8 @@ def reached_errors(errors: pd.Series) -> list[float]:
 
 
 def _digits(errors: pd.Series) -> pd.Series:
-    exponents = np.log10(errors.clip(lower=np.finfo(float).tiny))
-    return np.ceil(exponents - 1e-12)  # by round-off the logarithm of 1e-3 may be above -3
+    # By round-off the logarithm of 1e-3 may be above -3.
+    return np.ceil(np.log10(errors.clip(lower=np.finfo(float).tiny)) - 1e-12)
 
 
 def bands(
@@ -323,15 +324,12 @@ def _winners(
 ) -> Iterator[Winner]:
     for criterion in Criterion:
         column = criterion.column
-        if column not in smallest:
-            continue
-        if criterion is Criterion.QUERY:
+        if column in smallest and criterion is Criterion.QUERY:
             yield _fastest(rows.drop(columns=Criterion.ERROR.column), smallest[column], paired)
-            continue
-        first = rows.loc[smallest[column]]
-        others = rows.drop(index=smallest[column])
-        alike = tuple(other["cell"] for _, other in others.iterrows() if _as_good(criterion, first, other))
-        yield Winner(criterion, float(first[column]), cells.loc[smallest[column]], alike)
+        elif column in smallest:
+            first, others = rows.loc[smallest[column]], rows.drop(index=smallest[column])
+            alike = tuple(other["cell"] for _, other in others.iterrows() if _as_good(criterion, first, other))
+            yield Winner(criterion, float(first[column]), cells.loc[smallest[column]], alike)
 
 
 def _as_good(criterion: Criterion, first: pd.Series, other: pd.Series) -> bool:
@@ -348,17 +346,13 @@ def _as_good(criterion: Criterion, first: pd.Series, other: pd.Series) -> bool:
 
 def model_row(cell: Mapping[str, Any], setup: float, solution: float) -> dict[str, Any]:
     """A row of the cells table for the high-fidelity model of a cell, which has no errors."""
-    same = ("problem", "problem_options", "machine", "status", "queries", "queries_ok", "accuracy")
+    same = ("problem", "problem_options", "machine", "status", "queries", "queries_ok", "accuracy", "training")
     row = dict.fromkeys(cell) | {name: cell.get(name) for name in same}
-    row |= {"N": cell.get("dim_V"), "R": cell.get("dim_W"), "primal_options": "{}", "training_options": "{}"}
-    row |= {"formulation": "", "formulation_options": "{}"}
-    row |= {"dual_options": "{}", "cell": "", "primal": HIGH_FIDELITY, "dual": "", "training": cell.get("training")}
-    row |= dict.fromkeys(("error_u_mean", "error_lambda_mean"), 0.0) | {
-        "offline_s": setup,
-        "online_s": solution,
-        "hf_s": solution,
-    }
-    return row | {"solver": "", "assembly": "", "bounds": None, "correction": "none", "disturbed": 0}
+    row |= dict.fromkeys(("cell", "formulation", "dual", "solver", "assembly"), "")
+    row |= dict.fromkeys((f"{axis}_options" for axis in ("formulation", "training", "dual", "primal")), "{}")
+    row.update(N=cell.get("dim_V"), R=cell.get("dim_W"), offline_s=setup, online_s=solution, hf_s=solution)
+    row.update(error_u_mean=0.0, error_lambda_mean=0.0, bounds=None, disturbed=0)
+    return row | {"primal": HIGH_FIDELITY, "correction": UNCORRECTED}
 
 
 def _fastest(cells: pd.DataFrame, index: Any, paired: PairedTiming | None) -> Winner:
@@ -398,13 +392,9 @@ class Candidate(NamedTuple):
 
 
 def cheapest(
-    cells: pd.DataFrame,
-    paired: PairedTiming,
-    queries: float,
-    errors: pd.Series | None = None,
-    within: float | None = None,
-    certified: pd.Series | None = None,
-) -> pd.DataFrame:
+    cells: pd.DataFrame, paired: PairedTiming, queries: float, errors: pd.Series | None = None,
+    within: float | None = None, certified: pd.Series | None = None,
+) -> pd.DataFrame:  # fmt: skip
     """The model with the smallest total costs for a number of queries, for every problem and level of error.
 
     Parameters
@@ -449,9 +439,7 @@ def cheapest(
     others = [*cells.columns.drop("problem"), *(name for name in added_columns() if name != "error_below")]
     # Without the rows whose model is that of the next smaller error of the same problem.
     models = [(row["problem"], row["cell"]) for row in rows]
-    different = [
-        row for row, mine, following in zip(rows, models, [*models[1:], None], strict=True) if mine != following
-    ]
+    different = [row for row, mine, after in zip(rows, models, [*models[1:], None], strict=True) if mine != after]
     return pd.DataFrame(different, columns=["problem", "error_below", *others])
 
 
@@ -465,12 +453,11 @@ def candidates(cells: pd.DataFrame, paired: PairedTiming) -> Iterator[Candidate]
     rng, rows = np.random.default_rng(0), [dict(row) for row in cells.to_dict("records")]
     solution = float(np.exp(np.mean(np.log([row["hf_s"] for row in rows]))))
     setup = float(np.median([row["hf_setup_s"] for row in rows]))
-    yield Candidate(
-        model_row(rows[0], setup, solution), setup, solution, np.full(DRAWS, setup), np.full(DRAWS, solution)
-    )
+    row = model_row(rows[0], setup, solution)
+    yield Candidate(row, setup, solution, np.full(DRAWS, setup), np.full(DRAWS, solution))
     for row in rows:
         ratio = paired.ratio(None, row["cell"]) or MeanEstimate(math.log(row["online_s"] / row["hf_s"]), 0.0, 1.0)
-        online = solution * np.exp(ratio.draws(rng, DRAWS))
+        online = solution * np.exp(ratio.draws(rng))
         yield Candidate(row, row["offline_s"], solution * math.exp(ratio.mean), offline_draws(row, setup, rng), online)
 
 
@@ -504,7 +491,7 @@ def _ties(best: Candidate, other: Candidate, paired: PairedTiming, queries: floa
         shared = shared_offline(best.row, other.row)
         ratio = paired.ratio(best.key, other.key) or MeanEstimate(math.log(other.online / best.online), 0.0, 1.0)
         more = offline_draws(other.row, shared, rng) - offline_draws(best.row, shared, rng)
-        difference = more + queries * best.online * (np.exp(ratio.draws(rng, DRAWS)) - 1.0)
+        difference = more + queries * best.online * (np.exp(ratio.draws(rng)) - 1.0)
     return float(np.mean(difference <= 0.0)) > TAIL
 
 
@@ -519,9 +506,8 @@ def relative_bounds(queries: pd.DataFrame) -> pd.DataFrame:
 
     A query without a relative error, where the solution is zero, has no relative bound.
     """
-    sizes = {
-        name: queries[f"error_{name}_absolute"] / queries[f"error_{name}"] for name in ("u_energy", "lambda_natural")
-    }
-    return pd.DataFrame(
-        {name: queries[f"bound_online_{name}"].astype(float) / size.astype(float) for name, size in sizes.items()}
-    )
+    relative = {}
+    for name in ("u_energy", "lambda_natural"):
+        size = queries[f"error_{name}_absolute"] / queries[f"error_{name}"]
+        relative[name] = queries[f"bound_online_{name}"].astype(float) / size.astype(float)
+    return pd.DataFrame(relative)

@@ -109,8 +109,7 @@ KEYS: Mapping[str, Column] = {
     "dual_size": integer("Prescribed R; empty where the study gives a tolerance."),
     "primal_tol": real("1", "Tolerance δ of the primal strategy; empty for strategies that take none.", "δ", 6),
     "solver": text("QP solver; – stands for that of a formulation.", "solver", 7),
-    "accuracy": real("1", "Relative accuracy prescribed to the solver; empty for formulations that reach none.",
-        "accuracy", 8),
+    "accuracy": real("1", "Relative accuracy prescribed to the solver; empty if there is none.", "accuracy", 8),
     "assembly": text("Assembly of queries: full or reduced.", "assembly", 9),
     "bounds": integer("1 if queries have error bounds at online cost, else 0.", "bounds", 9),
     "correction": text("Which solutions are corrected: none, feasible (all), auto (where ω > ρ); errors are of the "
@@ -149,54 +148,42 @@ STORED: Mapping[str, Mapping[str, Column]] = {
             "beginning.", "cell", 0, constraint="PRIMARY KEY"),
         **KEYS,
         "model": text("Hash of the reduced model; cells that differ only in the solver share it."),
-        "status": text("Worst status of its queries, or of a stage that they need.",
-            "status", 10, constraint="NOT NULL"),
+        "status": text("Worst status of its queries, or of a stage they need.", "status", 10, constraint="NOT NULL"),
         "reason": text("Why the cell is not ok: the first query with this status, and its fault."),
         "queries": integer("Number of queries, one per validation parameter."),
         "queries_ok": integer("Number of queries with status ok; means and maxima are over these.", "ok", 10),
-        "snapshots": integer("Number of high-fidelity solutions of the training, one per parameter of the training "
-            "set.", "solved", 11),
+        "snapshots": integer("High-fidelity solutions of the training, one per training parameter.", "solved", 11),
         "dim_V": integer("Dimension n of V."),
         "dim_W": integer("Dimension m of W."),
         "N": integer("Dimension N of V_N; of other formulations most coefficients of u, those added apart.", "N", 11),
         "R": integer("Number R of generators of the cone; of other formulations most coefficients of λ.", "R", 12),
         "rank": integer("Numerical rank of the generators: dimension of their span."),
-        "rank_gap": real("1", "Smallest singular value that counts towards the rank, divided by the next one or the "
-            "threshold; near 1 the rank is doubtful."),
-        "gram_condition": real("1", "Condition number of the Gram matrix of the generators in W, from their singular "
-            "values."),
-        "enrichment": integer("Vectors added to V_N; for an enrichment per parameter, the rank of the generators.",
-            "added", 13),
+        "rank_gap": real("1", "Smallest singular value in the rank over the next or the threshold; doubtful near 1."),
+        "gram_condition": real("1", "Condition number of the Gram matrix of the generators in W, by singular values."),
+        "enrichment": integer("Vectors added to V_N; for an enrichment per parameter, the rank.", "added", 13),
         "enrichment_kind": text("none, fixed or per-parameter."),
         "multiplier": text("Where λ comes from: solved (unknowns of the query), recovered from u, or residual: the λ ≥ "
             "0 with the smallest residual, found outside the seconds of the query."),
         "interpolation_tol": real("1", "Tolerance of the interpolation in reduced assembly; empty with full assembly."),
         "interpolation_error": real("1", "Largest relative interpolation error of a member over the training set."),
-        "terms_A": integer("Terms of A in a reduced query, each with a coefficient to evaluate; 0 if A is constant, "
-            "empty if assembled."),
+        "terms_A": integer("Terms of A in a query, each with a coefficient; 0 if constant, empty if assembled."),
         "terms_f": integer("Likewise for f."),
         "terms_B": integer("Likewise for B; empty if B is assembled on the contact unknowns."),
         "terms_g": integer("Likewise for g."),
-        "correction_cost": text("What a correction costs: online, with a certificate, or high-fidelity; empty without "
-            "corrections."),
+        "correction_cost": text("Cost of a correction: online, with a certificate, or high-fidelity; empty without."),
         "corrected_share": real("1", "Share of the ok queries that are corrected; empty without corrections."),
         "offline_snapshots_s": real("s", "High-fidelity solutions at the training parameters, with one set-up."),
-        "offline_selection_s": real("s", "Choice of the training parameters by error bounds, a part of "
-            "offline_snapshots_s; 0 for fixed sets."),
+        "offline_selection_s": real("s", "Greedy choice of parameters, part of offline_snapshots_s; 0 for fixed sets."),
         "offline_pod_s": real("s", "POD."),
         "offline_cone_s": real("s", "Dual strategy, with the orthonormal basis of the span."),
         "offline_enrichment_s": real("s", "Primal strategy."),
         "offline_formulation_s": real("s", "What a formulation builds; 0 for mixed."),
-        "offline_assembly_s": real("s", "Preparation of reduced assembly, and of a compiled program; 0 with full "
-            "assembly."),
+        "offline_assembly_s": real("s", "Preparation of reduced assembly or a compiled program; 0 with full assembly."),
         "offline_certificate_s": real("s", "Preparation of certificates at online cost; 0 without."),
-        "offline_s": real("s", "Offline time of this cell alone: the sum of these without `offline_selection_s`, a "
-            "part of the first.", "offline [s]", 22),
-        "offline_low_s": real("s", "Lower end of its 95 % interval: from the scatter of the offline stages of the run "
-            "that were repeated."),
+        "offline_s": real("s", "Offline time of the cell: sum of these but `offline_selection_s`.", "offline [s]", 22),
+        "offline_low_s": real("s", "Lower end of its 95 % interval, from the scatter of repeated stages of the run."),
         "offline_high_s": real("s", "Upper end of this interval."),
-        "offline_repeats": integer("Offline stages of the cell, of at least a millisecond, that were timed more than "
-            "once."),
+        "offline_repeats": integer("Offline stages of the cell, of at least a millisecond, timed more than once."),
         "offline_wall_s": real("s", "The same sum in wall seconds."),
         "online_s": real("s", "One query with assembly, certificate and correction, mean over the ok queries: "
             "geometric mean over the blocks of the median over their rounds, each divided by its pace.",
@@ -206,34 +193,27 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "online_wall_s": real("s", "The same as online_s, in wall seconds."),
         "online_assemble_s": real("s", "Assembly of a query: median over the rounds."),
         "online_solve_s": real("s", "Solution of a query by the solver: median over the rounds."),
-        "online_certify_s": real("s", "Certificate and correction of a query: median over the rounds; empty without "
-            "either."),
-        "timing_rounds": integer("Maximal number of timing rounds of the study; empty if the timing of the cell is not "
-            "finished."),
+        "online_certify_s": real("s", "Certificate and correction of a query: median over the rounds; empty without."),
+        "timing_rounds": integer("Maximal number of timing rounds of the study; empty if the timing is not finished."),
         "timed_rounds": integer("Rounds that were timed: they end when all comparisons of the cell are decided."),
         "timing_reason": text("Why rounds are missing."),
         "hf_setup_s": real("s", "Set-up of the high-fidelity solver, once: the time by which the first solution "
             "exceeds its repetition from a known contact set."),
         "hf_s": real("s", "One high-fidelity solution after the set-up, mean over the validation parameters: online_s "
             "times the gain in the rounds; where none was timed in them, in the sweep over these parameters."),
-        "beta_span_min": real("b/VW", "Smallest β over the span of the generators, over the validation parameters.",
-            "min β span", 14),
+        "beta_span_min": real("b/VW", "Smallest β over the span, over the validation parameters.", "min β span", 14),
         "beta_cone_lower_min": real("b/VW", "Smallest certified lower bound of β over their cone.", "min β cone", 15),
         "beta_cone_upper_min": real("b/VW", "Smallest upper bound of β over their cone."),
-        "share_training": real("1", "Smallest ratio of β over the span to that of the whole of V, over the training "
-            "parameters."),
+        "share_training": real("1", "Smallest ratio of β over the span to that of V, over the training parameters."),
         "share_validation": real("1", "The same over the validation parameters."),
-        "share_guaranteed": real("1", "√(1 − σ²), which bounds the share at training parameters where the strategy "
-            "records σ."),
+        "share_guaranteed": real("1", "√(1 − σ²), which bounds the share at training parameters where σ is recorded."),
         "error_u_mean": real("1", "Mean relative error of u in V over the ok queries with u ≠ 0.", "error u", 16),
         "error_u_max": real("1", "Largest relative error of u in V over these queries."),
-        "queries_zero_u": integer("Ok queries with zero_u = 1, which means and maxima of the error of u leave out.",
-            "u = 0", 17),
+        "queries_zero_u": integer("Ok queries with zero_u = 1, left out of means and maxima of error_u.", "u = 0", 17),
         "error_u_zero_max": real("1", "Largest error_u_scaled of these queries.", "error, u = 0", 18),
         "error_lambda_mean": real("1", "Mean relative error of λ in W over the ok queries with λ ≠ 0.", "error λ", 19),
         "error_lambda_max": real("1", "Largest relative error of λ in W over these queries."),
-        "queries_zero_lambda": integer("Ok queries with zero_lambda = 1, which means and maxima of the error of λ "
-            "leave out.", "λ = 0", 20),
+        "queries_zero_lambda": integer("Ok queries with zero_lambda = 1, likewise for the error of λ.", "λ = 0", 20),
         "error_lambda_zero_max": real("1", "Largest error_lambda_scaled of these queries.", "error, λ = 0", 21),
         **{f"effectivity_{name}_median": real("1", f"Median effectivity of bound_{name} over the ok queries.")
            for name in (
@@ -246,22 +226,19 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "solver_error_u_max": real("1", "Largest contribution of the QP solver to the relative error of u."),
         "solver_error_lambda_max": real("1", "Largest contribution of the QP solver to the relative error of λ."),
         "solver_share_max": real("1", "Largest ratio of this contribution to the error, over the queries."),
-        "solver_share_mean": real("1", "Mean contribution of the QP solver divided by the mean error of u or λ; cells "
-            "are compared only below 0.1."),
+        "solver_share_mean": real("1", "Mean contribution over mean error of u or λ; cells are compared below 0.1."),
         "assembly_error_max": real("1", "Largest difference of a member of a reduced program from its projection."),
         "assembly_error_u_max": real("1", "Largest contribution of reduced assembly to the relative error of u."),
         "assembly_error_lambda_max": real("1", "Largest contribution of reduced assembly to the relative error of λ."),
         "assembly_share_max": real("1", "Largest ratio of this contribution to the error, over the queries."),
-        "assembly_share_mean": real("1", "Mean contribution of reduced assembly divided by the mean error of u or λ; "
-            "cells are compared only below 0.1."),
+        "assembly_share_mean": real("1", "Mean contribution over mean error of u or λ; cells are compared below 0.1."),
         "violation_max": real("u", "Largest constraint violation of a reduced solution."),
         "residual_max": real("1", "Largest of all natural residuals of quadratic programs."),
         "hf_residual_max": real("1", "Largest natural residual of the high-fidelity problem over the ok queries."),
         "error_u_predicted_mean": real("V", "Mean of error_u_predicted over the ok queries."),
         "fallbacks": text("Steps that deviate from their algorithm, and what was done instead."),
         "peak_memory_mib": real("MiB", "Peak resident memory of the worker process."),
-        "slowdown": real("1", "CPU time of the calibration next to the rounds, divided by the lowest tenth of it in "
-            "that process."),
+        "slowdown": real("1", "CPU time of the calibration next to the rounds, over its lowest tenth in that process."),
         "disturbed": integer("1 if the slowdown exceeds 1.3, else 0."),
         "seed": integer("Seed of the study."),
         "validation": text("Validation set: own, or the label or name of its sampling strategy."),
@@ -285,14 +262,12 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "certify_s": real("s", "The certificate and the correction: median over the rounds; empty without either."),
         "total_s": real("s", "Sum of the three."),
         "total_wall_s": real("s", "The same in wall seconds."),
-        "corrected": integer("1 if the corrected pair is returned, 0 if the reduced solution; empty without "
-            "corrections."),
+        "corrected": integer("1 if the corrected pair is returned, 0 if the reduced one; empty without corrections."),
         "correction_share": real("1", "ω/ρ of the reduced solution, above which auto corrects at 1; empty if unknown."),
         "correction_note": text("Why the solution is not corrected although a correction was requested."),
         "reference_bound": real("1", "Bound of the energy error of the high-fidelity solution, relative to ‖u‖_A and "
             "‖Bᵀλ‖_A⁻¹; at most 1e-6, or what round-off of B u − g leaves open; empty where no correction is found."),
-        "hf_s": real("s", "High-fidelity solution at this parameter, with assembly but without set-up: median of the "
-            "repetitions."),
+        "hf_s": real("s", "High-fidelity solution, with assembly but without set-up: median of the repetitions."),
         "zero_u": integer("1 if the high-fidelity ‖u‖ is at most 1e-8 of the largest in the training set, else 0."),
         "zero_lambda": integer("Likewise for ‖λ‖; 1 means that there is no contact."),
         "error_u": real("1", "‖u − u_N‖ / ‖u‖ in V; empty where zero_u is 1."),
@@ -302,21 +277,17 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "error_u_absolute": real("V", "‖u − u_N‖ in V."),
         "error_lambda_absolute": real("W", "‖λ − λ_N‖ in W."),
         "error_u_energy_absolute": real("A", "‖u − u_N‖ in the norm of A(µ)."),
-        "error_lambda_natural_absolute": real("A", "‖Bᵀ(λ − λ_N)‖ in the norm of A(µ)⁻¹, which has the unit of the "
-            "energy norm."),
+        "error_lambda_natural_absolute": real("A", "‖Bᵀ(λ − λ_N)‖ in the norm of A(µ)⁻¹; unit of the energy norm."),
         "error_u_scaled": real("1", "‖u − u_N‖ over the largest ‖u‖ of the training set."),
         "error_lambda_scaled": real("1", "‖λ − λ_N‖ over the largest ‖λ‖ of the training set."),
         "solver_error_u": real("1", "Distance of u from the solution of the reduced program to round-off, relative to "
             "‖u‖; empty if error_u is empty or there is no such solution."),
-        "solver_error_lambda": real("1", "Likewise for λ; also empty if the tight constraints are dependent, so that λ "
-            "is not unique."),
-        "solver_share": real("1", "The larger of these two, each divided by its error of u or λ; empty if both errors "
-            "are at most 1e-8."),
+        "solver_error_lambda": real("1", "Likewise for λ; also empty where tight constraints are dependent."),
+        "solver_share": real("1", "The larger of these over the error of u or λ; empty if both are at most 1e-8."),
         "assembly_error_u": real("1", "Distance of u from that with assembly in full, both solved to round-off, "
             "relative to ‖u‖; empty with full assembly, or if error_u is empty or there are no such solutions."),
         "assembly_error_lambda": real("1", "Likewise for λ; also empty if λ is not unique."),
-        "assembly_share": real("1", "The larger of these two, each divided by its error of u or λ; empty if both "
-            "errors are at most 1e-8."),
+        "assembly_share": real("1", "The larger of these over the error of u or λ; empty if both are at most 1e-8."),
         "bound_u_energy": real("A", "Bound √(ρ² + ω² + 2κ) of error_u_energy_absolute."),
         "bound_u": real("V", "Bound of error_u_absolute: bound_u_energy divided by √α; see bound_note."),
         "bound_lambda_natural": real("A", "Bound of error_lambda_natural_absolute."),
@@ -324,14 +295,11 @@ STORED: Mapping[str, Mapping[str, Column]] = {
             "β_A > 0 is proved."),
         **_effectivities("u_energy", "u", "lambda_natural", "lambda"),
         "bound_rho": real("A", "ρ, the residual in the norm of A(µ)⁻¹."),
-        "bound_rho_range": real("A", "ρ_B, the part of ρ in the range of Bᵀ, which bounds λ; ρ itself where "
-            "constraints are dependent."),
+        "bound_rho_range": real("A", "ρ_B, the part of ρ in the range of Bᵀ, for λ; ρ if constraints are dependent."),
         "bound_omega": real("A", "ω, the norm of the correction w of the constraint violation."),
         "bound_kappa": real("A²", "κ = λ_Nᵀ(B w − s), the complementarity of w and λ_N."),
-        "bound_note": text("Why there are no bounds, or none of λ in W, or which constant is estimated; empty if all "
-            "are proved."),
-        "certificate": text("Bounds at online cost: certified, verified up to interpolation errors that were measured, "
-            "or none."),
+        "bound_note": text("Why there are no bounds, or none of λ in W, or which constant is estimated; else empty."),
+        "certificate": text("Bounds at online cost: certified, verified up to measured interpolation errors, or none."),
         "bound_online_u_energy": real("A", "Bound of error_u_energy_absolute at online cost."),
         "bound_online_lambda_natural": real("A", "Bound of error_lambda_natural_absolute at online cost."),
         "bound_online_lambda": real("W", "Bound of error_lambda_absolute at online cost; empty where "
@@ -340,16 +308,13 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "bound_online_rho": real("A", "Its bound of ρ."),
         "bound_online_omega": real("A", "Its bound of ω."),
         "bound_online_kappa": real("A²", "Its κ."),
-        "coercivity_online": real("1", "Lower bound of A(µ) against A at the centre of the parameters; 1 where A is "
-            "constant."),
+        "coercivity_online": real("1", "Lower bound of A(µ) against A at the central parameter; 1 if A is constant."),
         "beta_energy_online": real("b/AW", "Lower bound of β_A at online cost; 0 where there is none."),
         "beta_energy_online_note": text("Which lower bound of β_A this is, or why there is none."),
-        "bound_online_violated": integer("1 where an error is above its bound by more than 1e-10 of the solution, else "
-            "0; empty without."),
+        "bound_online_violated": integer("1 if an error exceeds its bound by more than 1e-10 of the solution, else 0."),
         "bound_online_note": text("Why there are no bounds at online cost, or no prepared correction was feasible and "
             "the best one was computed."),
-        "bound_hsw_u": real("V", "Bound Δ_u of Haasdonk, Salomon and Wohlmuth with an estimated β_HF; infinite if β_HF "
-            "over the span is 0."),
+        "bound_hsw_u": real("V", "Bound Δ_u of Haasdonk, Salomon and Wohlmuth with an estimated β_HF; infinite if 0."),
         "bound_hsw_lambda": real("W", "Their bound Δ_λ of the error of λ, with the same constant."),
         **_effectivities("hsw_u", "hsw_lambda"),
         "coercivity": real("A/V²", "α, a lower bound of the smallest vᵀA(µ)v / ‖v‖²."),
@@ -358,8 +323,7 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "continuity_proved": integer("1 if a factorisation proves it, 0 if it is a Lanczos estimate."),
         "beta_energy": real("b/AW", "β_A, proved lower bound of the inf-sup constant of V in the norm of A(µ) and W "
             "over the span."),
-        "outputs": as_json("Quantities of interest as JSON: value, high-fidelity reference, relative error, error over "
-            "the scale."),
+        "outputs": as_json("Quantities of interest as JSON: value, reference, relative error, error over the scale."),
         "violation": real("u", "Largest (B u_N − g)₊, each row divided by the integral of its multiplier function."),
         "complementarity": real("b", "λᵀ(B u_N − g), λ the high-fidelity multiplier."),
         **_infsup_constants("beta_", "of the reduced pair"),
@@ -374,12 +338,10 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "primal_residual": real("1", "Natural primal residual: a correction of one row over the solution, in energy."),
         "dual_residual": real("1", "Natural dual residual: its norm in A⁻¹ over the energy norm of the solution."),
         "gap": real("1", "Natural gap: |αᵀs| over the energy of the solution."),
-        "hf_primal_residual": real("1", "Natural primal residual of u_N in the high-fidelity problem, whatever the "
-            "formulation."),
+        "hf_primal_residual": real("1", "Natural primal residual of u_N in the high-fidelity problem."),
         "hf_dual_residual": real("1", "Natural dual residual of u_N and λ_N in the high-fidelity problem."),
         "hf_gap": real("1", "Natural gap of u_N and λ_N in the high-fidelity problem."),
-        "error_u_predicted": real("V", "The formulation's own estimate of error_u_absolute; empty where it makes none."
-            ),
+        "error_u_predicted": real("V", "Estimate of error_u_absolute by the formulation; empty where it makes none."),
         "iterations": integer("Iterations reported by the solver."),
         "repeatable": integer("1 if a second solution was identical to the last bit, else 0; empty if there was none."),
     },
@@ -402,22 +364,18 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "certify_s": real("s", "Certificate and correction of a query: mean over these; empty without either."),
         "total_s": real("s", "Sum of the three."),
         "total_wall_s": real("s", "The same in wall seconds."),
-        "block": text("Block of rounds, which cells that were timed together share; each block is a process of its "
-            "own."),
+        "block": text("Block of rounds, which cells timed together share; each block is a process of its own."),
         "hf_s": real("s", "High-fidelity solution, mean over the parameters of the round: that of the block, at the "
             "pace of the round."),
-        "pace": real("1", "Factor by which the timings of this round exceed those of the other rounds of the block: "
-            "the median."),
-        "slowdown": real("1", "CPU time of the calibration next to the round, divided by the lowest tenth of it in "
-            "that process."),
+        "pace": real("1", "Median factor by which timings of this round exceed those of the block's other rounds."),
+        "slowdown": real("1", "CPU time of the calibration next to the round, over its lowest tenth in that process."),
     },
     "thresholds": {
         **_keys_without("formulation", "formulation_options", "primal", "primal_options", "primal_tol", "assembly",
             "bounds"),
         "cell_a": text("Cell of model a; empty for the high-fidelity model."),
         "cell_b": text("Cell of model b."),
-        "formulation_a": text("Formulation of a; mixed for the high-fidelity model, too, which is the program of V and "
-            "W.", "formulation of a", 10),
+        "formulation_a": text("Formulation of a; mixed for the high-fidelity model, too.", "formulation of a", 10),
         "formulation_b": text("Formulation of b.", "formulation of b", 10),
         "primal_a": text("Model a: its primal strategy, or high-fidelity.", "a", 11),
         "primal_tol_a": real("1", "Tolerance of the primal strategy of a."),
@@ -428,22 +386,18 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "assembly_b": text("Assembly of the queries of b.", "assembly b", 14),
         "bounds_b": integer("1 if the queries of b have bounds.", "bounds b", 14),
         "offline_a_s": real("s", "Offline seconds of a.", "offline a [s]", 16),
-        "online_a_s": real("s", "Seconds of a query of a, in the blocks of rounds that both share.",
-            "online a [ms]", 17),
+        "online_a_s": real("s", "Seconds of a query of a, in the blocks of rounds both share.", "online a [ms]", 17),
         "offline_b_s": real("s", "Offline seconds of b.", "offline b [s]", 18),
         "online_b_s": real("s", "Seconds of a query of b, in these blocks.", "online b [ms]", 19),
         "gain": real("1", "Seconds of a query of a divided by those of b, paired within rounds.", "gain", 19),
         "gain_low": real("1", "Lower end of the 95 % interval of the gain."),
         "gain_high": real("1", "Upper end of this interval."),
-        "benefit_threshold": real("1", "Number n* of queries at break-even; empty if there is none, or none is "
-            "claimed.", "break-even", 20),
+        "benefit_threshold": real("1", "Queries n* at break-even; empty if none are claimed.", "break-even", 20),
         "threshold_low": real("1", "Lower end of the 95 % interval of n*; if undecided, the smallest n*."),
-        "threshold_high": real("1", "Upper end of the 95 % interval of n*; tables for reading show both.",
-            "interval", 21),
+        "threshold_high": real("1", "Upper end of the 95 % interval of n*; tables to read show both.", "interval", 21),
         "meaning": text("When b is cheaper than a in total: from n* on, until n*, never or at once; as fast where the "
             "seconds of their queries differ by less than a factor of 1.25; or undecided."),
-        "rounds_missing": integer("If undecided, how many more rounds would decide it; empty where the offline seconds "
-            "are too close.", "more rounds", 22),
+        "rounds_missing": integer("Further rounds that would decide it; empty if none would.", "more rounds", 22),
     },
     "disagreements": {
         **_keys_without("solver", "correction"),

@@ -16,15 +16,8 @@ from vibench.files import write_atomically
 from vibench.results import formats, ranking, selection
 from vibench.results.formats import cell_text, csv_lines, summary, to_markdown
 from vibench.results.paired_timing import PairedTiming
-from vibench.results.read import (
-    cells_with_errors,
-    checked,
-    in_order,
-    read_table,
-    terms_in_order,
-    whole_numbers,
-)
-from vibench.results.schema import STORED, TABLES, Column
+from vibench.results.read import cells_with_errors, checked, in_order, read_table, terms_in_order, whole_numbers
+from vibench.results.schema import STORED, TABLES, Column, shown_columns
 from vibench.results.sqlite import parameters_of, read_parts
 from vibench.text import json_object
 
@@ -91,11 +84,9 @@ def _views() -> dict[str, View]:
     cells, thresholds = STORED["cells"], STORED["thresholds"]
     of_best = ("problem", "error_below", *of_cells[:14], "ties", *of_cells[14:])
     return {
-        "summary": View("cells", (*of_cells, *(name for name in cells if cells[name].heading)), cells),
+        "summary": View("cells", (*of_cells, *shown_columns(cells)), cells),
         "best": View("cells", of_best, ranking.fastest_columns(), ranking.fastest, ranking.no_best_cell()),
-        "benefits": View(
-            "thresholds", (*of_break_even, *(name for name in thresholds if thresholds[name].heading)), thresholds
-        ),
+        "benefits": View("thresholds", (*of_break_even, *shown_columns(thresholds)), thresholds),
         "cells": View("cells", (*of_cells, "reason")),
         "queries": View("queries", of_queries),
         "histories": View("histories", of_histories),
@@ -180,11 +171,10 @@ class Table:
     @property
     def _placed(self) -> list[str]:
         headings = self.view.headings
+        if self.chosen:
+            return list(self.columns)
         order = list(headings or self.rows.columns)
-        by_place = sorted(
-            self.columns, key=lambda name: (headings[name].place or 0 if headings else 0, order.index(name))
-        )
-        return list(self.columns) if self.chosen else by_place
+        return sorted(self.columns, key=lambda n: (headings[n].place or 0 if headings else 0, order.index(n)))
 
     @property
     def priority(self) -> list[str]:
@@ -202,18 +192,9 @@ class Table:
 
 
 def look_up(
-    path: Path,
-    name: str,
-    *,
-    cell: str = "",
-    columns: Sequence[str] = (),
-    where: str = "",
-    sort: Sequence[str] = (),
-    limit: int | None = None,
-    error: str = "",
-    largest: float | None = None,
-    queries: float | None = None,
-) -> Table:
+    path: Path, name: str, *, cell: str = "", columns: Sequence[str] = (), where: str = "", sort: Sequence[str] = (),
+    limit: int | None = None, error: str = "", largest: float | None = None, queries: float | None = None,
+) -> Table:  # fmt: skip
     """A table of a results file: the rows that satisfy a condition, sorted, the first `limit` of them.
 
     With an error measure (`ranking`) models are compared by it: `best` has its bands, tables of break-even have the
@@ -289,10 +270,8 @@ def _cells_needed(
         return (_key_of(path, cell),)
     if not limit or not set(STORED[view.source]).issuperset(named):  # a parameter, or no column at all
         return ()
-    first = [
-        f'"{name}" IS NULL, "{name}" {"DESC" if key.startswith("-") else "ASC"}'
-        for key, name in zip(sort, named, strict=True)
-    ]
+    falls = ("DESC" if key.startswith("-") else "ASC" for key in sort)
+    first = [f'"{name}" IS NULL, "{name}" {way}' for name, way in zip(named, falls, strict=True)]
     order = [*first, *terms_in_order(STORED[view.source])]
     cells = selection.cells_of_first(path, view.source, where, order, limit)
     # Reading rows by their cells pays only for few of them.
@@ -325,10 +304,7 @@ def _options(text: str | None) -> dict[str, str]:
     options = json_object(text)
     if options is None:
         return {"options": text}
-    return {
-        key: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-        for key, value in options.items()
-    }
+    return {key: one if isinstance(one, str) else json.dumps(one, ensure_ascii=False) for key, one in options.items()}
 
 
 def _measured(

@@ -23,9 +23,6 @@ from vibench.qp.status import Status
 from vibench.results.schema import STORED, VERSION
 from vibench.text import brief, json_object, one_line, printable
 
-# Rows read at a time: a large table has more than memory should hold.
-PART = 4096
-
 
 class DigestError(Exception):
     """Rows differ from those that were written; the message names the table, and the cell if it has cells."""
@@ -74,11 +71,11 @@ class Digests:
         Raises a `DigestError`, after the last part, if they are not those that were written.
         """
         names, cursor = self._opened(table, cells, order)
-        totals, rows = Counter[Any](), cursor.fetchmany(PART)
+        totals, rows = Counter[Any](), cursor.fetchmany()
         yield names, rows
         while rows:
             totals.update(_totals(names, rows))
-            if rows := cursor.fetchmany(PART):
+            if rows := cursor.fetchmany():
                 yield names, rows
         if changed := self._compared(table, totals, cells):
             whose = f" of the cell {changed[0]}" if changed[0] else ""
@@ -93,6 +90,8 @@ class Digests:
             cursor = self._db.execute(f"{query} ORDER BY {', '.join(order)}" if order else query, cells)
         except UnicodeDecodeError:  # of the name of a column
             raise DigestError(f"the columns of the table '{table}' are not those that were written") from None
+        # Rows read at a time: a large table has more than memory should hold.
+        cursor.arraysize = 4096
         names = [column[0] for column in cursor.description]
         declared = ("key", "value") if table == "meta" else tuple(STORED[table])
         if names != [*declared, *(f"mu_{k + 1}" for k in range(len(names) - len(declared)))]:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from samples import cell_row
 
 from vibench.results import paired_timing
-from vibench.results.break_even import FEWEST_ROUNDS, MARGIN, BreakEven, Meaning, break_even, break_even_rows
+from vibench.results.break_even import FEWEST_ROUNDS, BreakEven, Meaning, break_even, break_even_rows
 from vibench.results.schema import STORED
 
 OTHER_RUNS = float(np.exp(1.96 * paired_timing.CONDITIONS))
@@ -347,7 +347,7 @@ def test_what_another_run_may_reverse_is_as_fast_if_it_is_small(gain: float, noi
     row = noisy(0.1 * gain, 0.1, noise)
     assert row["meaning"] == meaning
     assert (row["rounds_missing"] is None) == (meaning != "undecided")
-    within = max(1.0 / row["gain_low"], row["gain_high"]) <= MARGIN
+    within = max(1.0 / row["gain_low"], row["gain_high"]) <= 1.25
     assert within or meaning != "as fast"
     exchanged = {"from": "never", "never": "from"}
     assert noisy(0.1, 0.1 * gain, noise)["meaning"] == exchanged.get(meaning, meaning)

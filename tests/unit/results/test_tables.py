@@ -119,7 +119,14 @@ def test_everything_is_exported(run: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rows", [1, 3, 4096])
 def test_large_tables_are_read_and_written_in_parts(run: Path, rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sqlite, "PART", rows)
+    opened = sqlite.Digests._opened
+
+    def smaller(self: sqlite.Digests, *asked: Any) -> Any:
+        names, cursor = opened(self, *asked)
+        cursor.arraysize = rows
+        return names, cursor
+
+    monkeypatch.setattr(sqlite.Digests, "_opened", smaller)
     path = results_file(str(run))
     assert [len(part) for part in read.read_in_parts(path, "queries")] == {1: [1] * 4, 3: [3, 1], 4096: [4]}[rows]
     export(path, run / "tables")
