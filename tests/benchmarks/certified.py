@@ -7,12 +7,6 @@ the model has not seen, compared with high-fidelity solutions, which the models 
 corrected pairs, how many times more accurate λ is in W (at online cost, and at high-fidelity cost), and how often it is
 at all, in the queries where ω > ρ and in the others. Every tenth query is timed, and corrected at high-fidelity cost.
 `--table` also writes the numbers, without seconds, as CSV.
-
-Usage: python tests/benchmarks/certified.py --meshes [COUNT]
-
-What a certificate of a square membrane costs with N and with at least 4 N unknowns and the same contact unknowns, a
-strip of nodes on its lower edge: the mesh grows away from it. Its members are declared affine: tension, load and depth
-of the obstacle vary. COUNT parameters (200 by default), taken in turns; violations and effectivities, too.
 """
 
 import argparse
@@ -24,24 +18,18 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import scipy.sparse as sp
 
 import vibench
-from vibench import AffineProblem, Array, InnerProduct, ParameterBox
+from vibench import Array
 from vibench.execution.recorded_cell import recorded_cells
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
-from vibench.interfaces.strategies import Enrichment, Kind
-from vibench.model.affine import affine_decomposition
 from vibench.model.bound_terms import CorrectionMode
-from vibench.model.certificates.base import Guarantee, certificate_base
-from vibench.model.certificates.bounds import OnlineCertificate, prepare
-from vibench.model.galerkin import ReducedModel
-from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
+from vibench.model.certificates.base import Guarantee
+from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.offline.assemblies import Assemblies
 from vibench.offline.correction import Answer, Corrector
 from vibench.offline.models import Model
 from vibench.plugins.plugin import Plugin
-from vibench.qp.solve import solve_qp
 from vibench.stages.assessment import is_violated
 
 SEED = 2027
@@ -219,129 +207,11 @@ def main(run: str, count: int, only: str = "", table: str | None = None) -> int:
     return sum(tally.violations > 0 for tally in every)
 
 
-class Membrane(AffineProblem):
-    """A membrane whose edge lies on a line of nodes above an obstacle; all members are exactly affine.
-
-    Parameters
-    ----------
-    rows
-        Rows of nodes above the line.
-    """
-
-    parameters = ParameterBox(
-        ("tension", "load", "depth"), np.array([0.5, 2.0, 0.01]), np.array([2.0, 4.0, 0.03]), ("1", "1", "1")
-    )
-
-    def __init__(self, rows: int) -> None:
-        width = 160
-        across = sp.diags_array(
-            [np.full(width - 1, -1.0), np.full(width, 2.0), np.full(width - 1, -1.0)], offsets=[-1, 0, 1]
-        )
-        below = np.full(rows, 2.0)
-        below[0] = 1.0  # the free edge
-        up = sp.diags_array([np.full(rows - 1, -1.0), below, np.full(rows - 1, -1.0)], offsets=[-1, 0, 1])
-        h, dy = 1.0 / (width + 1), 1.0 / rows
-        share = np.ones(rows)
-        share[0] = 0.5
-        x = sp.kron(sp.diags_array(share), across) * (dy / h)
-        y = sp.kron(up, sp.eye_array(width)) * (h / dy)
-        soft = np.tile(np.arange(1, width + 1) * h < 0.5, rows).astype(float)
-        stiff = sp.csr_array(x + y)
-        left = sp.csr_array(sp.diags_array(soft) @ stiff @ sp.diags_array(soft))
-        n = width * rows
-        self.V, self.W = InnerProduct(sp.csc_array(stiff)), InnerProduct(sp.eye_array(width, format="csc") * h)
-        B = sp.csr_array((np.full(width, -h), (np.arange(width), np.arange(width))), shape=(width, n))
-        at = np.arange(1, width + 1) * h
-        self.declare(
-            A=[(1.0, stiff), ("tension", left)],
-            f=[("load", -np.repeat(share, width) * h * dy)],
-            B=B,
-            g=[("depth", np.full(width, h)), (1.0, 0.05 * h * (at - 0.5) ** 2)],
-        )
-
-    def training_set(self) -> np.ndarray:
-        """The 4×4×3 grid."""
-        return self.parameters.grid(4, 4, 3)
-
-
-def reduced_membrane(rows: int) -> tuple[Membrane, HyperReducedModel, OnlineCertificate]:
-    """A membrane, its model with 12 snapshots of displacements and multipliers, and its certificate."""
-    problem = Membrane(rows)
-    training = problem.training_set()
-    members = affine_decomposition(problem, training, 1e-8)
-    solved = [solve_membrane(problem, mu) for mu in training[::4]]
-    chi = np.column_stack([lam / np.linalg.norm(lam) for _, lam in solved if np.any(lam)])
-    supremizers = problem.V.riesz(np.asarray(problem.assemble(training[0]).B.T @ chi))
-    basis = problem.V.orthonormalise(np.column_stack([*(u for u, _ in solved), supremizers]))
-    model = ReducedModel(problem, basis, Enrichment(Kind.NONE), chi, np.linalg.qr(chi)[0])
-    reduced = HyperReducedModel(model, hyper_reduce(model, members))
-    return problem, reduced, prepare(reduced, members, certificate_base(problem, members, training), training)
-
-
-def solve_membrane(problem: Membrane, mu: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The high-fidelity solution."""
-    found = HighFidelitySolver(problem).solve(mu)
-    return found.u, found.lam
-
-
-def meshes(count: int) -> int:
-    """Print seconds and violations of two meshes, and the ratio; the number of violations."""
-    found = [reduced_membrane(rows) for rows in (30, 120)]
-    mus, violations, effectivities = Membrane.parameters.sample(count, SEED), 0, []
-    seconds = np.zeros((2, 3, count))
-    for at, mu in enumerate(mus):
-        for which, (problem, model, certificate) in enumerate(found):
-            times = [time.perf_counter_ns()]
-            reduced = model.assemble(mu)
-            answer = solve_qp(reduced.program, "piqp", 1e-10, factor=reduced.factor)
-            times.append(time.perf_counter_ns())
-            alpha = np.maximum(answer.alpha, 0.0)
-            bounds = []
-            for _ in range(2):  # the second one finds its arrays in the caches, of either mesh
-                bounds.append(certificate.evaluate(problem, mu, reduced, answer.x, alpha))
-                times.append(time.perf_counter_ns())
-            seconds[which, :, at] = 1e-6 * np.diff(times)
-            if which or at % 10:
-                continue
-            u, lam = solve_membrane(problem, mu)
-            vi = problem.assemble(mu)
-            energy = InnerProduct(vi.A)
-            errors = (
-                energy.norm(u - reduced.reconstruct(answer.x[:, None])[:, 0]),
-                float(np.linalg.norm(energy.whiten_functional(vi.B.T @ (lam - model.generators @ alpha)))),
-            )
-            limits = bounds[0].u_energy, bounds[0].lambda_natural
-            size = energy.norm(u)
-            violations += any(is_violated(e, b, size) for e, b in zip(errors, limits, strict=True))
-            effectivities.append([b / e for e, b in zip(errors, limits, strict=True)])
-    query, first, again = np.median(seconds, axis=2).T
-    sizes = [problem.V.dim for problem, *_ in found]
-    guarantee = found[0][2].base.guarantee.value
-    print(
-        f"membrane {guarantee}, {sizes[0]} and {sizes[1]} unknowns, {len(found[0][2].contact_basis)} on the contact: "
-        f"query {query[0]:.3f} and {query[1]:.3f} ms, certificate {first[0]:.3f} and {first[1]:.3f} ms, ratio "
-        f"{first[1] / first[0]:.3f} (repeated at once {again[1] / again[0]:.3f}); {violations} violations of "
-        f"{len(effectivities)}, effectivities {np.median(effectivities, axis=0).round(2).tolist()}"
-    )
-    return violations
-
-
-def asked() -> argparse.Namespace:
-    """What the command line says."""
+if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", nargs="?")
+    parser.add_argument("run")
     parser.add_argument("count", nargs="?", type=int, default=10_000)
     parser.add_argument("problem", nargs="?", default="")
     parser.add_argument("--table")
-    parser.add_argument("--meshes", nargs="?", type=int, const=200)
     given = parser.parse_args()
-    if (given.run is None) == (given.meshes is None):
-        parser.error("either a run or --meshes is needed")
-    return given
-
-
-if __name__ == "__main__":
-    given = asked()
-    if given.meshes is not None:
-        sys.exit(meshes(given.meshes))
     sys.exit(main(given.run, given.count, given.problem, given.table))

@@ -88,9 +88,7 @@ def refusal(path: Path) -> str:
 
 
 @pytest.mark.parametrize("damages", [flips(1, 210, HEAD), truncations(2, 60)], ids=["flips", "truncations"])
-def test_damage_of_a_results_file_is_found_or_has_no_effect(
-    damages: Iterator[Damage], made: Path, results: Path
-) -> None:
+def test_damage_of_a_results_file_is_found_or_harmless(damages: Iterator[Damage], made: Path, results: Path) -> None:
     """As the file itself says it is: its digests are those that were written with it."""
     content, original = results.read_bytes(), everything(results)
     harmless, lines = 0, list[str]()

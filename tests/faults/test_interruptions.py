@@ -115,9 +115,7 @@ def test_two_runs_do_not_write_into_one_folder(plugins_folder: Path, vibench: Vi
 
 
 @pytest.mark.parametrize("swapped", [False, True], ids=["removed", "swapped"])
-def test_a_run_folder_that_is_gone_ends_the_run_with_a_line(
-    swapped: bool, plugins_folder: Path, vibench: Vibench, waiting: Path
-) -> None:
+def test_a_run_whose_folder_is_gone_ends(swapped: bool, plugins_folder: Path, vibench: Vibench, waiting: Path) -> None:
     """At the next commit; what was computed is in the store of artefacts, from which the next run takes it."""
     folder = waiting / "runs" / "wire"
     with forked(RUN, waiting, plugins_folder) as process:

@@ -29,9 +29,7 @@ def run(tmp_path: Path) -> Path:
     return write_sample_run(tmp_path / "run").parent
 
 
-def test_a_site_that_is_killed_while_it_is_written_is_whole_or_not_there(
-    run: Path, vibench: Vibench, tmp_path: Path
-) -> None:
+def test_a_site_killed_while_written_is_whole_or_not_there(run: Path, vibench: Vibench, tmp_path: Path) -> None:
     rng, site = random.Random(8), tmp_path / "site"
     arguments = ["publish", str(run), str(site), "--no-figures", "--yes"]
     start = time.monotonic()
@@ -85,9 +83,7 @@ LOOPS = (
 )  # fmt: skip
 
 
-def test_links_in_a_circle_are_one_line_and_replaced_by_a_report(
-    run: Path, main: Main, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_links_in_a_circle_are_replaced(run: Path, main: Main, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(run.parent)
     write_study(tmp_path, wire_study())
     Path("loop").symlink_to("again")
@@ -113,7 +109,7 @@ def of_another_user(path: Path) -> Iterator[None]:
         path.chmod(0o755)
 
 
-def test_a_folder_of_another_user_is_one_line(
+def test_a_folder_of_another_user_is_named(
     run: Path, main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -51,7 +51,7 @@ def run(shared: Supervisor, tmp_path: Path) -> Run:
     return go
 
 
-def test_a_stage_that_goes_well_is_stored_and_says_which_share_of_it_is_done(
+def test_a_stage_that_goes_well_is_stored_and_reports_its_progress(
     run: Run, shared: Supervisor, tmp_path: Path
 ) -> None:
     for how, share in (("third", 1.0 / 3.0), ("fine", 0.0)):
@@ -171,7 +171,7 @@ def sleepers(seconds: int) -> list[str]:
     return found
 
 
-def test_a_plugin_or_a_vibench_that_is_not_the_one_planned_with_is_refused(
+def test_a_plugin_or_a_vibench_that_was_not_planned_with_is_refused(
     run: Run, watcher: Supervisor, tmp_path: Path
 ) -> None:
     """Its result would be stored under the hash of the other."""
@@ -211,7 +211,7 @@ def test_limits_begin_when_the_work_begins(monkeypatch: pytest.MonkeyPatch, tmp_
 
 
 @pytest.mark.usefixtures("new_workers")
-def test_a_process_that_never_begins_is_given_up(
+def test_a_process_never_begun_is_given_up(
     watcher: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervisor._JobState, "start_seconds", 0.1)
@@ -305,9 +305,7 @@ def test_a_worker_does_not_outlive_its_supervisor(tmp_path: Path) -> None:
     assert not sleepers(seconds)
 
 
-def test_an_operation_that_raised_has_no_limit_afterwards(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_operation_that_raised_has_no_limit(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervisor._JobState, "grace", 0.1)
     found = run(InItems(("fine", "interrupt"), at_end=f"linger {tmp_path / 'diary'}"), query=1.0)
     assert isinstance(found, Done)

@@ -19,7 +19,7 @@ import published
 
 
 @pytest.mark.parametrize(("problem", "nodes"), [("obstacle", 200), pytest.param("hertz", 700, marks=pytest.mark.long)])
-def test_both_sides_come_to_the_same_models(
+def test_both_sides_make_one_model(
     problem: str, nodes: int, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(timing, "REPEATS", 1)  # the seconds do not matter here

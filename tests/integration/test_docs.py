@@ -113,9 +113,7 @@ def test_the_membrane_of_fenicsx_is_a_problem() -> None:
     check(partial(membrane, cells=8))
 
 
-def test_the_plugins_of_the_pages_run_through_the_whole_benchmark(
-    package: Path, vibench: Vibench, tmp_path: Path
-) -> None:
+def test_the_plugins_of_the_pages_run_through_a_benchmark(package: Path, vibench: Vibench, tmp_path: Path) -> None:
     study = tomllib.loads((package / "mine.toml").read_text())
     registered = tomllib.loads((package / "pyproject.toml").read_text())["project"]["entry-points"]
     assert {*registered, PluginKind.STUDY.entry_points} == {kind.entry_points for kind in PluginKind}
@@ -227,7 +225,7 @@ def test_the_example_of_the_reference_is_a_study_and_its_rules_are_rules(tmp_pat
         ("methods.md", 35, {"runs", "points.npy"}),
     ],
 )
-def test_a_page_prints_what_it_says(
+def test_a_page_is_true(
     page: str, texts: int, written: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its examples build on each other; what one prints is in the block that follows it."""

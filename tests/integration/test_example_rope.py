@@ -84,7 +84,7 @@ def test_the_package_is_found_through_its_entry_points_alone(python: Python, com
     ] == []
 
 
-def test_every_cell_of_the_rope_is_ok_and_has_its_row_and_its_line(
+def test_every_cell_of_the_rope_has_its_row_and_line(
     cells: tuple[pd.DataFrame, pd.DataFrame, str], example: Path
 ) -> None:
     found, queries, printed = cells
@@ -109,7 +109,7 @@ def test_every_cell_of_the_rope_is_ok_and_has_its_row_and_its_line(
     assert {("online-supremizers", OWN), ("online-supremizers", "offline-pga")} <= pairs
 
 
-def test_what_is_added_once_is_as_stable_on_the_rope_as_what_is_added_at_every_query(
+def test_fixed_enrichment_is_as_stable_on_the_rope_as_at_every_query(
     cells: tuple[pd.DataFrame, pd.DataFrame, str],
 ) -> None:
     found, queries, _ = cells
@@ -126,9 +126,7 @@ def test_what_is_added_once_is_as_stable_on_the_rope_as_what_is_added_at_every_q
     assert (plain["beta_span"] < ours["beta_span"]).any()
 
 
-def test_the_checks_and_the_tests_of_the_package_pass_where_it_is_installed(
-    python: Python, command: str, example: Path
-) -> None:
+def test_checks_and_tests_of_the_package_pass_where_installed(python: Python, command: str, example: Path) -> None:
     assert " passed, 0 failed, 0 skipped" in python(command, "check", FORMULATION).stdout
     done = python("-m", "pytest", "-p", "no:cacheprovider", where=example)
     assert " passed" in done.stdout

@@ -161,9 +161,7 @@ def test_a_recorded_formulation_answers_and_is_refused_where_it_makes_no_sense(f
         nearest.solve([5.0], solver="piqp")
 
 
-def test_the_study_of_a_cell_is_the_same_cell_and_the_report_and_the_figures_take_it(
-    found: Run, tmp_path: Path
-) -> None:
+def test_the_study_of_a_cell_is_the_same_cell_and_report_and_figures_take_it(found: Run, tmp_path: Path) -> None:
     for row in found.table("cells").to_dict("records"):
         cell = Cell.from_definition(row["definition"])
         assert [one.key for one in expand(study_of_cell(cell, "again"))] == [row["cell"]]

@@ -39,9 +39,7 @@ def again(first: Path, tmp_path: Path) -> Path:
     return tmp_path / "again"
 
 
-def test_the_results_are_where_the_study_is_named_and_a_second_run_does_nothing_new(
-    vibench: Vibench, again: Path
-) -> None:
+def test_results_are_where_the_study_is_named_and_a_second_run_does_nothing_new(vibench: Vibench, again: Path) -> None:
     folder = again / "runs" / "wire"
     assert {path.name for path in (folder / "tables").iterdir()} == {
         *(f"{table}.csv" for table in TABLES),
@@ -112,9 +110,7 @@ def test_strict_fails_where_a_cell_is_not_ok(vibench: Vibench, again: Path) -> N
         assert (done.returncode, done.stderr) == (code, "")
 
 
-def test_a_plugin_that_was_edited_is_run_again(
-    vibench: Vibench, again: Path, plugins_folder: Path, tmp_path: Path
-) -> None:
+def test_an_edited_plugin_is_run_again(vibench: Vibench, again: Path, plugins_folder: Path, tmp_path: Path) -> None:
     """Problem and solvers come from the package that was edited, and one of them now does its work."""
     shutil.copytree(plugins_folder, tmp_path / "edited")
     with (tmp_path / "edited" / "fake_plugins.py").open("a", encoding="utf-8") as source:
@@ -198,7 +194,7 @@ def test_a_run_of_which_nothing_can_run_here_is_an_error(vibench: Vibench, tmp_p
     assert {row["reason"] for row in rows(tmp_path / "runs" / "wire")} == {reason}
 
 
-def test_only_an_edit_of_what_computes_numbers_runs_anything_again(
+def test_edits_beside_numbers_run_nothing(
     plugins_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Figures, help texts, the report and the tables may change: the run is complete, and its models open."""
@@ -286,7 +282,7 @@ def test_artefacts_are_shared_by_studies_and_seconds_only_on_their_machine(
     assert rows(tmp_path / "here")[0]["machine"] == rows(tmp_path / "again")[0]["machine"]
 
 
-def test_clean_shows_and_frees_what_artefacts_take_and_nothing_unasked(
+def test_clean_shows_and_frees_artefacts_asked(
     vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))

@@ -123,9 +123,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
 
 
 @pytest.mark.parametrize("interpolation", [None, 1e-8], ids=["full", "reduced"])
-def test_rows_of_a_negative_control_are_ok_and_keep_the_invariants(
-    store: SampleStore, interpolation: float | None
-) -> None:
+def test_rows_of_a_negative_control_keep_the_invariants(store: SampleStore, interpolation: float | None) -> None:
     def plugin(kind: str, name: str, options: str = "{}") -> Plugin:
         return Plugin(PluginKind(kind), name, options, find(PluginKind(kind), name).code)
 

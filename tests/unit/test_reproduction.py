@@ -77,7 +77,7 @@ def test_numbers_agree_within_a_relative_difference(paper: float, ours: float, w
         ("undecided", 90.0, None, "cannot be compared"),
     ],
 )
-def test_a_break_even_agrees_where_the_interval_contains_it(
+def test_a_break_even_agrees_in_the_interval(
     meaning: str, low: float | None, high: float | None, expected: str
 ) -> None:
     assert claims.break_even_verdict(102.0, meaning, low, high).value == expected
@@ -136,9 +136,7 @@ def test_what_was_put_in_is_no_outcome() -> None:
     ("anew", "kept", "expected"),
     [(25.1, 19.5, "agrees"), (152.0, 25.8, "cannot be compared"), (200.0, 100.0, "differs")],
 )
-def test_a_ratio_that_depends_on_what_the_paper_does_not_say_is_not_confirmed(
-    anew: float, kept: float, expected: str
-) -> None:
+def test_a_ratio_that_the_paper_leaves_open_is_not_confirmed(anew: float, kept: float, expected: str) -> None:
     seconds = {"snapshots": 20.0, "POD": 0.1, "mCPG": 10.0, "PGA": anew, "PGA, residuals kept": kept}
     pair = HERTZ.pairs[2] if expected != "agrees" else OBSTACLE.pairs[0]  # 1.68 and 2.06
     claim = paper_tables.transcribed(seconds, pair, "Table")

@@ -9,9 +9,7 @@ TRIANGULATIONS: tuple[Triangulation, ...] = ("staggered", "aligned", "irregular"
 
 @pytest.mark.parametrize("triangulation", TRIANGULATIONS)
 @pytest.mark.parametrize(("edges", "angle", "growth"), [(40, 0.5, 1.3), (90, np.pi / 6.0, 1.36), (60, 0.83, 1.1)])
-def test_the_mesh_is_a_triangulation_of_the_quarter_disc(
-    edges: int, angle: float, growth: float, triangulation: Triangulation
-) -> None:
+def test_the_mesh_fills_the_quarter_disc(edges: int, angle: float, growth: float, triangulation: Triangulation) -> None:
     disc = quarter_disc(edges, angle, growth, triangulation)
     p, t = disc.mesh.p, disc.mesh.t
     a, b, c = (p[:, t[k]] for k in range(3))

@@ -70,9 +70,7 @@ def settled(contact: EllipticContact, modulus: float, x: float, y: float) -> flo
 
 @pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (0.5, 0.3), (-0.2, 0.8), (0.9, 0.0)])
 @pytest.mark.parametrize("radii", [(1.3, 0.7), (0.7, 1.3), (30.0, 1.0)])
-def test_the_pressure_on_the_ellipse_pushes_the_surface_onto_the_paraboloid(
-    radii: tuple[float, float], x: float, y: float
-) -> None:
+def test_the_pressure_pushes_the_surface_onto_the_paraboloid(radii: tuple[float, float], x: float, y: float) -> None:
     approach, modulus = 0.002, 3.0
     contact = elliptic_contact(*radii, approach, modulus)
     x, y = x * contact.a, y * contact.b

@@ -125,9 +125,7 @@ def test_a_violated_inequality_differs(changed: Changed) -> None:
 
 
 @pytest.mark.parametrize(("factor", "verdict"), [(0.5, "differs"), (1.5, "differs"), (None, "agrees")])
-def test_there_is_no_order_only_where_the_panels_of_the_figure_have_none(
-    factor: float | None, verdict: str, changed: Changed
-) -> None:
+def test_orders_are_missing_where_panels_have_none(factor: float | None, verdict: str, changed: Changed) -> None:
     """All tolerances of a run together say nothing of a figure that shows some of them."""
     other = f"beta_hf_span = {factor or 0.5} * beta_span" + " * (1.0 + 2.0 * (query % 2))" * (factor is None)
     path = changed(*OBSTACLE, f"UPDATE queries SET {other} WHERE primal_tol = 0.5")
@@ -137,9 +135,7 @@ def test_there_is_no_order_only_where_the_panels_of_the_figure_have_none(
 @pytest.mark.parametrize(
     ("lower", "upper", "verdict"), [(0.01, 0.02, "differs"), (0.0, 0.02, "cannot be compared"), (0.0, 0.0, "agrees")]
 )
-def test_a_constant_vanishes_over_the_cone_where_an_upper_bound_says_so(
-    lower: float, upper: float, verdict: str, changed: Changed
-) -> None:
+def test_a_constant_vanishes_by_its_upper_bound(lower: float, upper: float, verdict: str, changed: Changed) -> None:
     bounds = f"beta_plain_cone_lower = {lower}, beta_plain_cone_upper = {upper}"
     path = changed(*OBSTACLE, f"UPDATE queries SET {bounds}")
     statement = "N < R implies β_dec = 0, (19, 50), over the cone as in (14)"
@@ -247,9 +243,7 @@ def test_the_command_draws_the_figures_of_runs_and_a_page(
     assert {file.stem for file in (tmp_path / "drawn").glob("*.svg")} >= {"figure-5", "figure-5-again", "figure-9"}
 
 
-def test_a_run_of_no_problem_of_the_paper_is_refused(
-    tmp_path: Path, changed: Changed, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_of_no_paper_is_refused(tmp_path: Path, changed: Changed, capsys: pytest.CaptureFixture[str]) -> None:
     remaining = (f"DELETE FROM {table} WHERE problem = 'hertz'" for table in TABLES)
     others = (f"UPDATE {table} SET problem_options = '{{\"bulge\": true}}'" for table in TABLES)
     assert main([str(changed(*remaining, *others)), "--out", str(tmp_path / "drawn")]) == 2

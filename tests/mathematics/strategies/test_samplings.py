@@ -23,9 +23,7 @@ def points(name: str, box: ParameterBox = BOX, **options: object) -> Array:
 @pytest.mark.parametrize("name", DRAWN)
 @settings(max_examples=20, deadline=None)
 @given(size=st.integers(1, 70), seed=st.integers(0, 2**63 - 1), log=st.sampled_from([[], ["a"], ["c", "a"]]))
-def test_drawn_points_are_in_the_box_and_the_same_for_the_same_seed(
-    name: str, size: int, seed: int, log: list[str]
-) -> None:
+def test_drawn_points_are_in_the_box_and_follow_the_seed(name: str, size: int, seed: int, log: list[str]) -> None:
     found = points(name, size=size, seed=seed, log=log)
     assert found.shape == (size, 3)
     assert found.tobytes() == points(name, size=size, seed=seed, log=log).tobytes()

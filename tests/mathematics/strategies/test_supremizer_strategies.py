@@ -101,9 +101,7 @@ def test_the_share_is_kept_at_every_training_parameter_and_not_with_a_vector_les
 )
 @example(n=12, m=9, count=4, modes=2, generators=4, rho=0.5)  # β_on vanishes at the last parameter
 @settings(max_examples=15)
-def test_the_share_is_kept_on_any_small_problem(
-    n: int, m: int, count: int, modes: int, generators: int, rho: float
-) -> None:
+def test_the_share_is_kept_anywhere(n: int, m: int, count: int, modes: int, generators: int, rho: float) -> None:
     data = offline(Varying(n, m, count), count, modes, min(generators, count))
     for strategy in (InfSupGreedy(), OfflinePGA(stop="beta")):
         found = check_enrichment(strategy.build(data, rho), data.problem.V, data.basis)
@@ -166,9 +164,7 @@ def test_lazy_and_plain_choose_the_same_vectors_and_lazy_looks_less_often(
 
 
 @pytest.mark.parametrize("setting", ["varying", "obstacle"])
-def test_pod_supremizers_are_the_modes_of_all_supremizers_and_the_tail_is_a_sum_of_squared_sines(
-    request, setting: str
-) -> None:
+def test_pod_supremizers_are_modes_of_all_supremizers_and_the_tail_sums_squared_sines(request, setting: str) -> None:
     data: Offline = request.getfixturevalue(setting)
     V, bases = data.problem.V, whitened_supremizers(request.getfixturevalue(setting))
     left = project_out(V.whiten(data.basis), np.hstack(bases))
@@ -216,7 +212,7 @@ def test_they_conform(create: Callable[[], NestedStrategy]) -> None:
         ),
     ],
 )
-def test_what_nobody_can_reach_ends_with_a_reason(
+def test_the_unreachable_has_a_reason(
     varying: Offline, strategy: NestedStrategy, tolerance: float, reason: str
 ) -> None:
     with pytest.raises(NumericalError, match=reason):

@@ -104,9 +104,7 @@ def test_a_worker_that_dies_changes_no_row(command: str, plugins_folder: Path, w
     assert_same_numbers(tmp_path / "local", tmp_path / "dask")
 
 
-def test_a_worker_that_joins_late_does_what_is_left(
-    command: str, plugins_folder: Path, waiting: str, tmp_path: Path
-) -> None:
+def test_a_late_worker_does_what_is_left(command: str, plugins_folder: Path, waiting: str, tmp_path: Path) -> None:
     with scheduled(tmp_path / "cluster", plugins_folder) as (address, _, workers):
         (first,) = workers(1)
         until(lambda: arrived(address) == 1)
@@ -139,9 +137,7 @@ def test_a_scheduler_that_disappears_ends_the_run_which_goes_on_here(
     assert_same_numbers(tmp_path / "local", tmp_path / "dask")
 
 
-def test_twenty_workers_on_two_cores_change_no_row(
-    command: str, plugins_folder: Path, vibench: Vibench, tmp_path: Path
-) -> None:
+def test_twenty_workers_change_no_row(command: str, plugins_folder: Path, vibench: Vibench, tmp_path: Path) -> None:
     axes: dict[str, Any] = {"dual": ["cpg", "mcpg", "nmf"], "solvers": ["piqp", "proxqp"]}
     path = write_study(tmp_path, wire_study(primal=["online-supremizers", "decorrelated"], **axes))
     here(vibench, tmp_path, path)

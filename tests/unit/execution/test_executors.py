@@ -161,15 +161,13 @@ def test_a_client_that_closes_while_it_is_asked_holds_up_nobody(client: str, job
         assert len(asked) == 3
 
 
-def test_workers_with_another_vibench_are_refused(
-    cluster: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_vibench_is_refused(cluster: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(executors, "code_here", lambda: "mine")
     with pytest.raises(RequestError, match=r"the dask worker tcp://.* has other code: .* instead of mine"):
         Dask(cluster.scheduler_address, 1, tmp_path)
 
 
-def test_workers_that_do_not_see_the_artefacts_are_refused(
+def test_workers_without_artefacts_refused(
     cluster: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(executors, "_describe", elsewhere)

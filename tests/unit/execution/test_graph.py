@@ -48,9 +48,7 @@ def graphs(draw: st.DrawFn) -> tuple[list[Node], list[Node]]:
 
 
 @given(graphs(), st.data())
-def test_what_fails_takes_its_goals_along_and_nothing_else(
-    graph: tuple[list[Node], list[Node]], data: st.DataObject
-) -> None:
+def test_a_failure_takes_its_goals_alone_along(graph: tuple[list[Node], list[Node]], data: st.DataObject) -> None:
     nodes, goals = graph
     there = {node.name for node in nodes if data.draw(st.booleans())}
     bad = {node.name for node in nodes if data.draw(st.integers(0, 3)) == 0} - there

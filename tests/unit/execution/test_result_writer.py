@@ -83,9 +83,7 @@ CONE = TRAINED | {"dual", "dual_options", "dual_tol", "dual_size"}
         (EnergyConstants, set()),
     ],
 )
-def test_a_history_is_named_by_what_its_stage_depends_on(
-    sort: type, names: set[str], cell: Cell, stages: list[Stage]
-) -> None:
+def test_a_history_is_named_by_its_dependences(sort: type, names: set[str], cell: Cell, stages: list[Stage]) -> None:
     columns = axis_columns(first(stages, sort).axes, labels_of([cell]))
     assert set(columns) == names
     assert set(columns) <= set(STORED["histories"])

@@ -88,9 +88,7 @@ def test_rows_say_what_a_correction_costs_and_its_seconds_are_those_of_the_query
 
 
 @pytest.mark.parametrize("problem", ["obstacle", "hertz"])
-def test_models_answer_as_their_cells_do_and_bounds_hold_at_unseen_parameters(
-    corrected: vibench.Run, problem: str
-) -> None:
+def test_models_answer_as_their_cells_and_bounds_hold_where_unseen(corrected: vibench.Run, problem: str) -> None:
     cells = with_ways(corrected.cells[corrected.cells["problem"] == problem]).set_index(
         ["pod_tol", "assembly", "correction"]
     )

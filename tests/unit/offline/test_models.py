@@ -163,9 +163,7 @@ def test_solvers_that_are_not_there(model: vibench.Model, mus: np.ndarray, monke
         model.solve(mus[0], solver="proxqp")
 
 
-def test_a_solver_without_an_answer_has_no_solution(
-    model: vibench.Model, mus: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_answer_is_no_solution(model: vibench.Model, mus: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     nothing = vibench.QPSolution(None, None, "gave up")
     monkeypatch.setattr("vibench.offline.models.solve_qp", lambda *_: nothing)
     solution = model.solve(mus[0])

@@ -102,9 +102,7 @@ class Centre(vibench.AdaptiveSampling):
         trainer.solve(max(others, key=trainer.bound))
 
 
-def test_given_steps_are_kept_and_what_follows_is_computed_from_them(
-    reduce: partial[vibench.Reduction], snapshots: vibench.Snapshots
-) -> None:
+def test_steps_after_given_ones_follow_them(reduce: partial[vibench.Reduction], snapshots: vibench.Snapshots) -> None:
     first = reduce().given(snapshots=snapshots)
     assert first.snapshots is snapshots
     whole = first.cone.size

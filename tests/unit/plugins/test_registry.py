@@ -181,7 +181,7 @@ def test_a_plugin_cannot_take_the_name_of_a_solver_of_qpsolvers(register: Regist
     assert find(PluginKind.SOLVER, "osqp").conflict == ""
 
 
-def test_a_distribution_that_is_found_in_two_folders_is_one(
+def test_a_distribution_in_two_folders_is_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, register: Register
 ) -> None:
     for folder in ("one", "other"):
@@ -201,7 +201,7 @@ UNLOADABLE = [
 ]
 
 
-def test_what_cannot_be_loaded_is_refused_with_its_entry_point(
+def test_the_entry_point_is_named_if_broken(
     register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(tmp_path)
@@ -314,9 +314,7 @@ def test_options_are_listed_in_words() -> None:
     assert listed["anything"][0] == "any value"
 
 
-def test_the_code_of_a_plugin_follows_its_sources(
-    register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_code_follows_sources(register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package = tmp_path / "edited_plugin"
     package.mkdir()
     (package / "__init__.py").write_text("from vibench import DualStrategy\nclass Plain(DualStrategy): ...\n")

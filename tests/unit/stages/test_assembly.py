@@ -107,9 +107,7 @@ def test_rows_of_an_interpolated_problem(store: SampleStore) -> None:
     assert rows.cell["fallbacks"] == ""
 
 
-def test_what_interpolation_misses_between_training_parameters_is_measured_noted_and_not_compared(
-    register: Register, tmp_path: Path
-) -> None:
+def test_what_interpolation_misses_is_measured_noted_and_not_compared(register: Register, tmp_path: Path) -> None:
     register(
         ("vibench.problems", "uneven", "fake_plugins:UnevenWire"),
         ("vibench.dual_strategies", "mcpg", "vibench_strategies.mcpg:ModifiedCPG"),

@@ -62,9 +62,7 @@ def rows(stage: CellQueries, store: SampleStore) -> list[Row]:
 @pytest.mark.parametrize("primal", ["decorrelated", "online-supremizers"])
 @pytest.mark.parametrize("interpolation", [None, 1e-6], ids=["full", "reduced"])
 @pytest.mark.parametrize("problem", ["wire", "string", "obstacle"])
-def test_arrays_that_are_used_again_change_no_number(
-    problem: str, primal: str, interpolation: float | None, store: SampleStore
-) -> None:
+def test_reused_arrays_keep_numbers(problem: str, primal: str, interpolation: float | None, store: SampleStore) -> None:
     plain, other = (rows(cell(name, primal, interpolation), store) for name in (problem, f"{problem}, buffered"))
     assert plain[0]["status"] == "ok"
     for one, same in zip(plain, other, strict=True):

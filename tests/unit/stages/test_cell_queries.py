@@ -97,7 +97,7 @@ def test_a_query_whose_assessment_fails_costs_itself(tmp_path: Path, monkeypatch
 
 
 @pytest.mark.parametrize("certified", [False, True])
-def test_a_cell_whose_factors_do_not_fit_is_assessed_in_parts(
+def test_a_cell_too_large_is_assessed_in_parts(
     certified: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Factors of as many parameters as fit are held at a time; rows are those of all at once."""

@@ -65,9 +65,7 @@ def test_a_compiled_cell_has_the_rows_of_the_reduced_one(run: vibench.Run) -> No
         assert np.allclose(rows[name], expected[name], rtol=1e-3, atol=1e-7)  # PIQP solves to 1e-7
 
 
-def test_a_crash_of_the_program_costs_its_query_alone(
-    run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_crash_costs_its_query_alone(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     heights = run.table("queries").groupby("query")["mu_1"].first().sort_values()
     crash = f"if (mu[0] > {heights.iloc[-2]:.17g}) __builtin_trap();"
     edit = rf"sed -i '/^int model_solve/,$ s/    Set set;/    Set set; {crash}/' model.c"
@@ -129,9 +127,7 @@ def test_a_program_answers_and_says_what_it_cannot() -> None:
         ("exit 0", r"failed \(0\): it says nothing$"),  # and makes no file
     ],
 )
-def test_a_compiler_that_fails_is_quoted(
-    text: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failing_compiler_is_quoted(text: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", script(tmp_path, text))
     with pytest.raises(UnsupportedError, match=reason):
         small_model().program()
@@ -147,7 +143,7 @@ def test_compilers_are_looked_for_by_name(tmp_path: Path, monkeypatch: pytest.Mo
         compiler()
 
 
-def test_there_is_no_program_of_a_model_that_is_too_large_or_not_smooth_enough(
+def test_no_program_of_a_model_that_is_too_large_or_not_smooth(
     run: vibench.Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reduced = run.model(str(run.cells["cell"].iloc[0])).reduced

@@ -125,9 +125,7 @@ def counts_for(stage: Stage, module: str) -> bool:
 
 
 @pytest.mark.parametrize("study", [TRAINED, ADAPTIVE], ids=lambda study: study.name)
-def test_what_runs_in_a_stage_is_what_its_code_is_read_from(
-    study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_stage_runs_is_in_its_code(study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every stage is run with a note of the functions that are called; little is taken from what others have cached."""
     monkeypatch.setattr(timing_rounds, "QUERY_SUBSETS", 1)
     store, missing = SampleStore(tmp_path), dict[str, set[str]]()

@@ -120,9 +120,7 @@ def test_a_constant_member_that_is_the_same_object_costs_no_product(monkeypatch:
     assert products == []
 
 
-def test_references_are_verified_by_their_error_bounds(
-    register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_references_are_verified_by_bounds(register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Training solutions are none: their error would be that of a snapshot."""
     register(("vibench.problems", "it", "broken_variants:Bar"))
     store, problem = Store(tmp_path / "artefacts"), Plugin("problem", "it", "{}", "")

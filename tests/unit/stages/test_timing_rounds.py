@@ -149,9 +149,7 @@ def test_reduced_assembly_is_timed_at_every_query_and_full_assembly_at_as_many_a
     assert all(each.assemble.keys() == each.solve.keys() for each in timed[3].rounds.values())
 
 
-def test_high_fidelity_solutions_start_where_those_of_the_sweep_do(
-    store: SampleStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_high_fidelity_solutions_start_as_in_the_sweep(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
     """From the contact set of the nearest parameter before; the first one of a part from that of the nearest after."""
     stage = TimingRounds(CELLS, (EVERY,) * len(CELLS), 1, first=0)
     reference = gather(store, stage.cells[0].validation)
@@ -184,9 +182,7 @@ class Given(MarginalSolutions):
 
 
 @pytest.mark.parametrize(("taken", "numbers"), [(0.01, [7, 5, 8]), (0.03, [7, 5]), (0.06, [7])])
-def test_solutions_come_before_amid_and_after_the_queries_until_they_are_enough(
-    taken: float, numbers: list[int]
-) -> None:
+def test_solutions_come_before_amid_and_after_queries_until_enough(taken: float, numbers: list[int]) -> None:
     marginal, done = Given(taken), list[MarginalSolution]()
     beside = SolutionsBeside(marginal, [1.0] * 9)
     steps = list(beside.alternated([7, 3, 5, 8], done, 4, 1))
@@ -234,7 +230,7 @@ def test_parts_of_a_pass_have_all_queries_once_and_take_about_as_long(seconds: l
     assert max(sums) - min(sums) <= 2.0 * max(seconds)
 
 
-def test_matrices_in_full_are_those_of_the_solutions_and_none_is_assembled_twice(
+def test_full_matrices_are_those_of_solutions_assembled_once(
     store: SampleStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[float] = []
@@ -349,9 +345,7 @@ class Remembers:
         return self.known[key]
 
 
-def test_a_solver_that_remembers_programs_never_meets_one_again(
-    store: SampleStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_solver_with_memory_meets_no_program_again(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two cells of one problem and solver are in the rounds, whose programs are the same."""
     solver = Remembers()
     monkeypatch.setattr(registry, "qp_solver", lambda name: {name: solver})
@@ -362,7 +356,7 @@ def test_a_solver_that_remembers_programs_never_meets_one_again(
 
 
 @pytest.mark.parametrize("which", [0, 2])
-def test_an_answer_to_a_similar_program_is_not_timed(
+def test_answers_to_similar_programs_are_not_timed(
     which: int, store: SampleStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     solver = Remembers(digits=1)

@@ -141,9 +141,7 @@ def test_every_strategy_that_takes_a_tolerance_must_be_given_one(cells_of: Expan
         ),
     ],
 )
-def test_words_of_before_are_translated_and_a_line_says_what_to_write(
-    before: dict[str, Any], now: dict[str, Any], cells_of: Expand
-) -> None:
+def test_former_words_are_translated_and_named(before: dict[str, Any], now: dict[str, Any], cells_of: Expand) -> None:
     with pytest.warns(UserWarning, match=r"^assembly = .* is of before; write now: .*") as noted:
         translated = cells_of(STUDY | before)
     assert len(noted) == 1
@@ -237,9 +235,7 @@ def test_the_code_changes_with_every_plugin_the_core_and_the_solver(monkeypatch:
     assert len(set(codes)) == len(codes)
 
 
-def test_the_code_changes_with_a_solver_of_a_plugin(
-    register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_code_changes_with_a_solver(register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "own_solver.py").write_text("def solve(program, accuracy): ...\n")
     register(("vibench.qp_solvers", "mine", "own_solver:solve"))

@@ -66,9 +66,7 @@ def test_a_cell_is_restored_with_its_sets(tmp_path: Path) -> None:
     assert (alone.training.label, alone.validation.label) == ("sobol", "random")
 
 
-def test_a_file_is_beside_the_study_and_its_content_is_part_of_the_code(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_is_beside_the_study_and_part_of_the_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir("/")
     (tmp_path / "sets").mkdir()
     file = tmp_path / "sets" / "points.csv"

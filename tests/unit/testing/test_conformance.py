@@ -81,9 +81,7 @@ def sampling_options(name: str, folder: Path) -> dict[str, object]:
          "passed, 1 warning, 0 failed, 0 skipped"),
     ],
 )  # fmt: skip
-def test_the_command_prints_a_line_for_every_check(
-    plugin: str, code: int, title: str, lines: list[str], counts: str, main: Main
-) -> None:
+def test_every_check_has_a_line(plugin: str, code: int, title: str, lines: list[str], counts: str, main: Main) -> None:
     found, out, err = main("check", plugin)
     assert (found, err) == (code, "")
     assert out.splitlines()[0] == title
