@@ -34,7 +34,7 @@ TEXTS = ["", ":", "..", "../A.npz", "/etc/passwd", "A.npz:", "A.npz:no", "A{}.np
 MESHES = ["xdmf", "inp", "ele", "e", "xml", "med", "VTU", *(end[1:] for end in meshes.FORMATS)]
 
 
-def read_mesh(path, limit):
+def read_mesh(path, limit, seconds):
     '''In this process, whose files are watched; otherwise in one of its own.'''
     form = meshes.format_of(path)
     try:

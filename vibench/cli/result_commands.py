@@ -161,10 +161,10 @@ PRIORITY = (
 
 def _print_changes(compared: Comparison, limit: float) -> None:
     """Print what changed between runs, the worst first, and how many changes there are."""
-    from vibench.report.differences import MOVED
+    from vibench.report.differences import ChangeKind
 
     # By verdict, then by how far the ratio is from 1: a factor of 2 is as far as one of 1/2.
-    order = compared.changes["verdict"].map([verdict.value for verdict in MOVED].index)
+    order = -compared.changes["verdict"].map([verdict.value for verdict in ChangeKind].index)
     far = compared.changes["ratio"].map(lambda ratio: max(ratio, 1.0 / ratio) if ratio > 0.0 else 1.0)
     weighed = compared.changes.assign(order=order, far=-far).sort_values(["order", "far"], kind="stable")
     changes = readable(weighed.drop(columns=["order", "far"]), len(compared.runs))

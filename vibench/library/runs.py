@@ -179,7 +179,7 @@ class Run:
 
         target = self.path.parent / "figures" if folder is None else Path(folder)
         with writing(target):
-            return draw_all(self.path, target, tuple(formats))
+            return draw_all(self.path, target, tuple(formats), 1)
 
     @requested
     def report(self, path: Path | str | None = None, *, figures: bool = True) -> Path:

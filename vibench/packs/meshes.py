@@ -30,9 +30,6 @@ FORMATS = {
     ".obj": "obj",
 }  # fmt: skip
 
-SECONDS = 60
-"""Seconds of the processor that reading a mesh may take."""
-
 
 def format_of(path: Path) -> str:
     """The name that meshio has for the format of a file.
@@ -46,8 +43,8 @@ def format_of(path: Path) -> str:
     return form
 
 
-def read_mesh(path: Path, limit: int) -> tuple[Array, Array]:
-    """The points (p×2) and triangles (t×3) of a mesh; `limit` are the bytes of memory that reading it may take.
+def read_mesh(path: Path, limit: int, seconds: int) -> tuple[Array, Array]:
+    """The points (p×2) and triangles (t×3) of a mesh, read within bytes of memory and seconds of the processor.
 
     The numbers of the triangles are of any type and any value.
 
@@ -57,7 +54,7 @@ def read_mesh(path: Path, limit: int) -> tuple[Array, Array]:
     form = format_of(path)
     if importlib.util.find_spec("meshio") is None:
         raise RequestError("it needs meshio: pip install 'vibench[mesh]'")
-    command = [sys.executable, "-P", "-m", __name__, form, str(path.absolute()), str(limit), str(SECONDS)]
+    command = [sys.executable, "-P", "-m", __name__, form, str(path.absolute()), str(limit), str(seconds)]
     try:
         # A busy machine takes longer than the seconds of the processor; a process that sleeps ends, too.
         done = subprocess.run(
@@ -72,7 +69,7 @@ def read_mesh(path: Path, limit: int) -> tuple[Array, Array]:
     said = done.stderr.decode(errors="replace").strip().splitlines() or ["it is damaged"]
     why = {
         3: f"it takes more than the {limit / 2**30:.3g} GiB of memory that are allowed",
-        -signal.SIGXCPU: f"it takes more than {SECONDS} s",
+        -signal.SIGXCPU: f"it takes more than {seconds} s",
     }
     raise RequestError(f"'{path.name}' cannot be read: {why.get(done.returncode, one_line(said[-1]))}")
 

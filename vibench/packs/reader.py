@@ -280,7 +280,7 @@ class PackReader:
 
     def _mesh(self, given: schema.Mesh, n: int, m: int) -> PackMesh:
         try:
-            points, triangles = read_mesh(safe_path(self._folder, given.file), self._files.left)
+            points, triangles = read_mesh(safe_path(self._folder, given.file), self._files.left, 60)
         except RequestError as error:
             raise RequestError(f"mesh.file: {error}") from None
         points = points.T

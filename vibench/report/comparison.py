@@ -16,7 +16,6 @@ from vibench.errors import RequestError, unknown_name
 from vibench.report.differences import (
     AXES,
     ERRORS,
-    MOVED,
     Agreement,
     ChangeKind,
     ComparedRun,
@@ -48,7 +47,7 @@ class Comparison:
     def changes(self) -> pd.DataFrame:
         """Changes for better or worse, a row per column of a cell, in the order of the cells."""
         columns = ["run", "against", *AXES, "what", "before", "after", "ratio", "ratio_low", "ratio_high", "verdict"]
-        rows = [_row(*names, one) for names, found in self.pairs.items() for one in found if one.verdict in MOVED]
+        rows = [_row(*names, one) for names, found in self.pairs.items() for one in found if one.verdict.is_change]
         return pd.DataFrame(rows, columns=[*columns, "cell"])
 
     @property

@@ -135,7 +135,7 @@ Interval = tuple[float, float]
 
 
 class ChangeKind(StrEnum):
-    """Verdict on a difference between two numbers."""
+    """Verdict on a difference between two numbers, the changes that matter most last."""
 
     EQUAL = "equal"
     WITHIN_ACCURACY = "within accuracy"
@@ -145,9 +145,10 @@ class ChangeKind(StrEnum):
     BETTER = "better"
     WORSE = "worse"
 
-
-# Verdicts that are listed as changes, those first that matter most.
-MOVED = (ChangeKind.WORSE, ChangeKind.BETTER, ChangeKind.CHANGED)
+    @property
+    def is_change(self) -> bool:
+        """Whether it is listed as a change."""
+        return self in (ChangeKind.CHANGED, ChangeKind.BETTER, ChangeKind.WORSE)
 
 
 class Difference(NamedTuple):

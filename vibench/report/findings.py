@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from vibench.interfaces.strategies import Kind
+from vibench.model.bound_terms import CorrectionMode
 from vibench.model.errors import UNMEASURABLE
 from vibench.qp.status import Status
 from vibench.report.figures.data import (
@@ -35,7 +36,6 @@ from vibench.results.ranking import LARGEST_BAND, Criterion, eligible, leaderboa
 from vibench.results.read import read_table
 from vibench.results.schema import KEYS, TABLES
 from vibench.stability.infsup import VANISHES
-from vibench.study.cells import FEASIBLE, UNCORRECTED
 
 
 class Weight(IntEnum):
@@ -189,7 +189,7 @@ def _stability(cells: pd.DataFrame, compared: Comparable) -> Iterator[str]:
     """Effect of the enrichments on the inf-sup constant over the span and on the error of the multiplier."""
     errors = dict(zip(compared.cells["cell"], compared.cells["error_lambda_mean"], strict=True))
     # Constants do not depend on corrections: uncorrected models say more of the enrichment.
-    if (plain := cells["correction"] == UNCORRECTED).any():
+    if (plain := cells["correction"] == CorrectionMode.NONE).any():
         cells = cells[plain]
     for row in cells[cells["enrichment_kind"] == Kind.NONE].head(1).itertuples():
         if np.isfinite(row.beta_span_min):
@@ -210,8 +210,10 @@ def _stability(cells: pd.DataFrame, compared: Comparable) -> Iterator[str]:
 def _corrections(data: ProblemTables) -> Iterator[str]:
     """Effect of the correction of all solutions on errors and seconds, against the same models without it."""
     model = [name for name in KEYS if name != "correction"]
-    both = data.cells.merge(data.cells[data.cells["correction"] == UNCORRECTED], on=model, suffixes=("", "_without"))
-    for (how, bounds), cells in both[both["correction"] == FEASIBLE].groupby(["assembly", "bounds"], sort=False):
+    plain = data.cells[data.cells["correction"] == CorrectionMode.NONE]
+    both = data.cells.merge(plain, on=model, suffixes=("", "_without"))
+    corrected = both[both["correction"] == CorrectionMode.FEASIBLE]
+    for (how, bounds), cells in corrected.groupby(["assembly", "bounds"], sort=False):
         assembly = f"{how} assembly{' and bounds' * bool(bounds)}"
         ratios = {
             name: cells[f"{column}_without"] / cells[column]

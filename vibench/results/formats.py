@@ -13,12 +13,13 @@ from typing import Any
 
 import pandas as pd
 
+from vibench.model.bound_terms import CorrectionMode
 from vibench.plugins.registry import default_formulation
 from vibench.qp.status import Status
 from vibench.results.break_even import Meaning
 from vibench.results.read import in_order
 from vibench.results.schema import STORED, Column, SqlType, shown_columns
-from vibench.study.cells import NO_SUCH_AXIS, UNCORRECTED
+from vibench.study.cells import NO_SUCH_AXIS
 from vibench.text import printable_lines, unbroken
 
 
@@ -193,7 +194,7 @@ def says_something(frame: pd.DataFrame, name: str) -> bool:
     if name == "accuracy":
         return bool(frame[name].nunique() > 1)
     # Values that mean nothing where all cells have them.
-    usual = {"correction": UNCORRECTED, "certificate": "none", "formulation": default_formulation()}
+    usual = {"correction": CorrectionMode.NONE, "certificate": "none", "formulation": default_formulation()}
     if (axis := re.sub("_[ab]$", "", name)) in usual:
         return bool((~frame[name].dropna().isin([usual[axis], ""])).any())
     if name in ("training", "snapshots"):

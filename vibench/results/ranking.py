@@ -13,12 +13,12 @@ import pandas as pd
 
 from vibench.arrays import Array
 from vibench.errors import RequestError, unknown_name
+from vibench.model.bound_terms import CorrectionMode
 from vibench.qp.status import Status
 from vibench.results.break_even import HIGH_FIDELITY, TAIL, offline_draws, shared_offline
 from vibench.results.paired_timing import DRAWS, MeanEstimate, PairedTiming
 from vibench.results.schema import STORED, Column, integer, real
 from vibench.stability.infsup import VANISHES
-from vibench.study.cells import UNCORRECTED
 
 
 def columns_of_measures() -> dict[str, tuple[str, ...]]:
@@ -352,7 +352,7 @@ def model_row(cell: Mapping[str, Any], setup: float, solution: float) -> dict[st
     row |= dict.fromkeys((f"{axis}_options" for axis in ("formulation", "training", "dual", "primal")), "{}")
     row.update(N=cell.get("dim_V"), R=cell.get("dim_W"), offline_s=setup, online_s=solution, hf_s=solution)
     row.update(error_u_mean=0.0, error_lambda_mean=0.0, bounds=None, disturbed=0)
-    return row | {"primal": HIGH_FIDELITY, "correction": UNCORRECTED}
+    return row | {"primal": HIGH_FIDELITY, "correction": CorrectionMode.NONE.value}
 
 
 def _fastest(cells: pd.DataFrame, index: Any, paired: PairedTiming | None) -> Winner:

@@ -10,11 +10,11 @@ from types import NoneType
 import pandas as pd
 
 from vibench.errors import RequestError
+from vibench.model.bound_terms import CorrectionMode
 from vibench.results import ranking
 from vibench.results.break_even import Meaning
 from vibench.results.schema import KEYS, STORED, TABLES, VERSION, Column, SqlType, column_of
 from vibench.results.sqlite import FILE, Part, read_meta, read_parts, read_rows
-from vibench.study.cells import UNCORRECTED
 from vibench.text import brief, json_object
 
 
@@ -108,7 +108,7 @@ def in_order(frame: pd.DataFrame) -> pd.DataFrame:
     by = _order(frame.columns)
 
     def uncorrected_first(column: pd.Series) -> pd.Series:
-        return column != UNCORRECTED if column.name == "correction" else column
+        return column != CorrectionMode.NONE if column.name == "correction" else column
 
     return frame.sort_values(
         by, ascending=list(map(_rises, by)), kind="stable", na_position="first", ignore_index=True,
@@ -120,7 +120,7 @@ def terms_in_order(names: Collection[str]) -> list[str]:
     """The order of `in_order` as terms of SQL, for a table with columns of these names."""
     return [
         *(
-            f"correction IS NOT '{UNCORRECTED}'"
+            f"correction IS NOT '{CorrectionMode.NONE}'"
             if name == "correction"
             else f'"{name}" IS NOT NULL, "{name}" {"ASC" if _rises(name) else "DESC"}'
             for name in _order(names)

@@ -11,6 +11,7 @@ from typing import Any
 
 from vibench.errors import RequestError, unknown_name
 from vibench.interfaces.strategies import Stop
+from vibench.model.bound_terms import CorrectionMode
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import default_formulation, find
@@ -24,12 +25,6 @@ def digest(content: Any) -> str:
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
-
-# Corrections of cells that answer with reduced solutions as they are, and with corrected pairs alone.
-UNCORRECTED, FEASIBLE = "none", "feasible"
-
-# Names of plugins in the definition of a cell; all but the first may be `None`.
-PLUGINS = ("problem", "dual", "primal", "formulation", "training", "validation_sampling")
 
 # Entry of tables on an axis that the formulation of a cell does not have.
 NO_SUCH_AXIS = "–"
@@ -75,7 +70,7 @@ class Cell:
     nested_tolerances: tuple[float, ...] = ()
     training: ParameterSet = OWN_TRAINING
     bounds: bool = False
-    correction: str = UNCORRECTED
+    correction: str = CorrectionMode.NONE.value
     formulation_label: str = ""
 
     @cached_property
@@ -84,12 +79,13 @@ class Cell:
         content = self._content()
         del content["labels"], content["nested_tolerances"], content["set_labels"]
         # Labels and places change no number, and the code is compared by itself.
-        content.pop("formulation_label", None)
-        for name in PLUGINS:
-            if content.get(name) is None:
-                content.pop(name, None)
-            else:
-                del content[name]["code"], content[name]["places"]
+        del content["formulation_label"]
+        for name in ("dual", "primal", "training", "validation_sampling"):
+            if content[name] is None:
+                del content[name]
+        for part in content.values():
+            if isinstance(part, dict) and "code" in part:
+                del part["code"], part["places"]
         return digest(content)
 
     @property
@@ -102,7 +98,7 @@ class Cell:
         content = asdict(self)
         training, validation = content.pop("training"), content.pop("validation")
         # Keys of cells without correction are those from before there was a choice.
-        if self.correction == UNCORRECTED:
+        if self.correction == CorrectionMode.NONE:
             del content["correction"]
         return content | {
             "seed": validation["seed"],
@@ -119,8 +115,8 @@ class Cell:
         Raises a `RequestError` if a plugin is not installed, or a file cannot be read or is unknown.
         """
         content = json.loads(text)
-        # Older definitions do not have all of them.
-        plugins = {name: Plugin(**content[name]) for name in PLUGINS if content.get(name)}
+        recorded = ((name, part) for name, part in content.items() if isinstance(part, dict) and "code" in part)
+        plugins = {name: Plugin(**part) for name, part in recorded}
         known = {name for one in plugins.values() if places for name in one.paths.values()}
         for name in places.keys() - known:
             raise unknown_name("file or folder of the cell", name, known)
@@ -131,17 +127,17 @@ class Cell:
             content["formulation_label"] = name
         if content["assembly"] in ("certified", "compiled"):  # these were assemblies
             content["bounds"], content["assembly"] = content["assembly"] == "certified", "reduced"
-        for name in PLUGINS:
-            content[name] = _installed(plugins[name].moved(places)) if name in plugins else None
+        content |= {name: _installed(plugin.moved(places)) for name, plugin in plugins.items()}
         for axis in ("pod", "cone"):
             content[axis] = None if content[axis] is None else Stop(**content[axis])
         for name in ("labels", "nested_tolerances"):
             content[name] = tuple(content.get(name, ()))
         trained, validated = content.pop("set_labels", (OWN, OWN))
-        content["training"] = ParameterSet("training", sampling=content["training"], label=trained)
-        content["validation"] = ParameterSet(
-            "validation", content["validation"], content.pop("seed"), content.pop("validation_sampling"), validated
-        )
+        content["training"] = ParameterSet("training", 0, 0, content.get("training"), trained)
+        count, seed = content["validation"], content.pop("seed")
+        # Older definitions do not have all of them.
+        sampling = content.pop("validation_sampling", None)
+        content["validation"] = ParameterSet("validation", count, seed, sampling, validated)
         return cls(**content)
 
     @property
@@ -174,7 +170,7 @@ class Cell:
         solver = " ".join(filter(None, [self.solver, accuracy]))
         chosen = [problem, formulation, cone, enriched, ", ".join(stops), solver]
         way = "" if self.assembly == "full" else f" · {self.assembly}{' with bounds' * self.bounds}"
-        way += "" if self.correction == UNCORRECTED else f" · corrected: {self.correction}"
+        way += "" if self.correction == CorrectionMode.NONE else f" · corrected: {self.correction}"
         return " · ".join(filter(None, chosen)) + way
 
 

@@ -13,12 +13,13 @@ from typing import Any, TypeAlias, TypeVar
 from vibench.errors import RequestError, requested
 from vibench.files import read_regular
 from vibench.interfaces.strategies import Stop
+from vibench.model.bound_terms import CorrectionMode
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.options import inside
 from vibench.plugins.plugin import GivenPlugin, Plugin
 from vibench.plugins.registry import find, registered
 from vibench.reduction.nested import NestedStrategy
-from vibench.study.cells import NO_SUCH_AXIS, UNCORRECTED, Cell
+from vibench.study.cells import NO_SUCH_AXIS, Cell
 from vibench.study.entries import Entry, FormulationEntry, ProblemEntry, SamplingEntry
 from vibench.study.parameter_sets import OWN, ParameterSet
 from vibench.study.spec import Study, ToleranceTable
@@ -235,7 +236,7 @@ def _solved(study: Study, entry: FormulationEntry) -> list[tuple[tuple[str, bool
     bounded = study.bounds if kind.has_certificate else [False]
     # Queries in full have no bounds at online cost, whatever is asked for.
     ways = dict.fromkeys((how, bounds and how == "reduced") for how in assemblies for bounds in bounded)
-    corrections = study.correction if kind.has_program else [UNCORRECTED]
+    corrections = study.correction if kind.has_program else [CorrectionMode.NONE.value]
     solvers = study.solver_names() if "solvers" in uses else [None]
     accuracies = study.accuracy if "accuracy" in uses else [None]
     return list(product(ways, corrections, solvers, accuracies))

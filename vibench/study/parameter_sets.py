@@ -32,8 +32,8 @@ class ParameterSet:
     """
 
     role: Literal["training", "validation"]
-    count: int = 0
-    seed: int = 0
+    count: int
+    seed: int
     sampling: Plugin | None = None
     label: str = field(default=OWN, compare=False)
 
@@ -72,7 +72,7 @@ class ParameterSet:
 
 
 # A problem's own training set.
-OWN_TRAINING = ParameterSet("training")
+OWN_TRAINING = ParameterSet("training", 0, 0)
 
 
 def is_available(*plugins: Plugin) -> bool:

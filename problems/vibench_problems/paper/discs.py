@@ -105,7 +105,7 @@ def configuration_claims(evidence: Evidence) -> Iterator[Claim]:
 def configuration(evidence: Evidence) -> CaptionedFigure:
     """Figure 9: the two quarter discs before they touch, with their meshes, boundaries and potential contact zones."""
     problem, mu = evidence.problem, np.array([1.0])
-    sheet = Sheet(1, 1, "Figure 9: configuration, §5.2, Hertz contact", Layout(width=3.6, height=5.2))
+    sheet = Sheet(1, 1, "Figure 9: configuration, §5.2, Hertz contact", Layout(3.6, 5.2))
     (panel,) = sheet.panels
     discs = ((problem.slave, "Ω₁", 0.5), (problem.master, "Ω₂(µ)", -0.5))
     for points, (disc, name, height) in zip(problem.points(mu), discs, strict=True):
@@ -211,7 +211,7 @@ def solution_claims(evidence: Evidence, contacts: Sequence[Pressed]) -> Iterator
 def solution(evidence: Evidence) -> CaptionedFigure:
     """Figure 10: deformed discs for µ = 0.9 m, and the contact pressure for five radii with Hertz's ellipses."""
     problem, contacts = evidence.problem, pressed(evidence.problem)
-    sheet = Sheet(1, 2, "Figure 10: solution, §5.2, Hertz contact", Layout(width=3.6, height=4.0, right=0.95))
+    sheet = Sheet(1, 2, "Figure 10: solution, §5.2, Hertz contact", Layout(3.6, 4.0, "every"))
     left, right = sheet.panels
     deformed = contacts[-1].solution
     picture = problem.picture(np.array([DEFORMED]), deformed.u, deformed.lam)

@@ -123,7 +123,7 @@ def aspect_ratios(evidence: Evidence) -> CaptionedFigure | None:
     rows = histories[histories["quantity"] == "aspect_ratio"].drop_duplicates(["stage", "step"])
     if rows.empty:
         return None
-    sheet = Sheet(1, 1, "Figure 3: largest aspect ratio, §5.1, obstacle", Layout(width=4.2))
+    sheet = Sheet(1, 1, "Figure 3: largest aspect ratio, §5.1, obstacle", Layout(4.2, 2.5))
     (panel,) = sheet.panels
     looks, first = Looks(map(Series, SETS)), 1
     for stage, name in SETS.items():
@@ -179,7 +179,7 @@ def solution(evidence: Evidence) -> CaptionedFigure:
     problem, mu = evidence.problem, np.array(MEMBRANE)
     solved = membrane_solution(evidence)
     picture = problem.picture(mu, solved.u, solved.lam)
-    sheet = Sheet(1, 2, "Figure 4: solution, §5.1, obstacle", Layout(width=3.2, height=2.9, right=0.95))
+    sheet = Sheet(1, 2, "Figure 4: solution, §5.1, obstacle", Layout(3.2, 2.9, "every"))
     left, right = sheet.panels
     draw_field(left, picture, (float(picture.values.min()), float(picture.values.max())))
     draw_multiplier(right, picture, (0.0, float(picture.multiplier.max())))

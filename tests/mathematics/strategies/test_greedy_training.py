@@ -157,7 +157,7 @@ def test_what_ends_the_training_is_random() -> None:
 
 PROBLEM = Plugin("problem", "obstacle", '{"resolution": 160}', "test")
 SAMPLING = Plugin("sampling strategy", "greedy", '{"candidates": 200, "tolerance": 0.1, "checked": 20}', "test")
-GREEDY = ParameterSet("training", sampling=SAMPLING)
+GREEDY = ParameterSet("training", 0, 0, SAMPLING)
 
 
 @pytest.fixture(scope="module")

@@ -63,7 +63,7 @@ def drawn_from(results: Path, folder: Path, *kinds: str, rendered: bool = False)
         for group in ("OF_PROBLEM", "OF_DUAL"):
             chosen = {kind: draw for kind, draw in getattr(figures, group).items() if not kinds or kind in kinds}
             patch.setattr(figures, group, chosen)
-        files = draw_all(results, folder)
+        files = draw_all(results, folder, ("png", "svg"), 1)
     assert [path.stem for path in files] == [name for name in kept for _ in ("png", "svg")]
     captions = ["captions.json"] * bool(files)
     assert sorted([path.name for path in files] + captions) == sorted(path.name for path in folder.glob("*"))
@@ -267,7 +267,7 @@ def test_figures_read_histories_if_and_only_if_they_are_listed(quick_run: Path) 
 
 def test_without_queries_nothing_is_drawn(change: Callable[..., None], results: Path, tmp_path: Path) -> None:
     change("DELETE FROM queries")
-    assert draw_all(results, tmp_path / "figures") == []
+    assert draw_all(results, tmp_path / "figures", ("png", "svg"), 1) == []
 
 
 def test_cells_that_failed_do_not_stop_the_others(change: Callable[..., None], draw: Draw) -> None:

@@ -121,12 +121,9 @@ def read_captions(folder: Path) -> dict[str, str]:
 
 
 def draw_all(
-    path: Path,
-    folder: Path,
-    formats: tuple[str, ...] = ("png", "svg"),
-    jobs: int = 1,
+    path: Path, folder: Path, formats: tuple[str, ...], jobs: int,
     progress: Callable[[str, int, int], None] = lambda *_: None,
-) -> list[Path]:
+) -> list[Path]:  # fmt: skip
     """Draw every figure that a results file has data for, in every format; returns the files written to the folder.
 
     Beside them is `captions.json`, with the caption of every figure by the name of its files.

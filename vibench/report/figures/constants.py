@@ -154,7 +154,7 @@ def shares(data: ProblemTables) -> Pages:
     ]
     for shown, part in data.pages(panels, 12):
         title = f"{data.problem}: shares of the inf-sup constant"
-        sheet = Sheet.with_panels(len(shown), title, Layout(width=4.0, height=3.2), "all")
+        sheet = Sheet.with_panels(len(shown), title, Layout(4.0, 3.2), "all")
         looks = Looks(Series(str(name)) for _, rows in shown for name in rows["primal"].unique())
         for panel, (dual, rows) in zip(sheet.panels, shown, strict=False):
             panel.axline((1.0, 1.0), slope=1.0, color="0.6", linewidth=0.8, zorder=0)

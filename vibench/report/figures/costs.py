@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
+from vibench.model.bound_terms import CorrectionMode
 from vibench.qp.status import Status
 from vibench.report.figures.data import (
     ProblemTables,
@@ -28,7 +29,6 @@ from vibench.report.figures.data import (
 from vibench.report.figures.style import HIGH_FIDELITY_LOOK, Layout, Looks, Pages, Series, Sheet, plot, scatter
 from vibench.results import ranking
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
-from vibench.study.cells import UNCORRECTED
 
 ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
 
@@ -62,7 +62,7 @@ def _errors_against(
     looks = Looks(Series(str(primal)) for primal in cells["primal"].unique())
     for rows, part in data.pages(list(_ways(cells)), 4):
         heading = f"{data.problem}, {cells['solver'].iloc[0]}: {title}{compared.over}"
-        sheet = Sheet(len(rows), 2, heading, Layout(width=4.4, height=3.3), "all", "col")
+        sheet = Sheet(len(rows), 2, heading, Layout(4.4, 3.3), "all", "col")
         for row, (way, mine, names) in enumerate(rows):
             for place, (column, ylabel) in enumerate(ERRORS.items()):
                 panel, drawn = sheet.panel(row, place), mine[mine[column].notna()]
@@ -97,7 +97,7 @@ def _ways(cells: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
     ways = cells.groupby(["dual", "assembly", "bounds", "correction"], sort=False)
     for (dual, assembly, bounds, correction), mine in ways:
         title = f"{dual}{f', {assembly} assembly' * (assembly != 'full')}{' with bounds' * bool(bounds)}"
-        title += f", {correction_in_words(correction)}" * (correction != UNCORRECTED)
+        title += f", {correction_in_words(correction)}" * (correction != CorrectionMode.NONE)
         for part, names in titled_parts(title, [str(name) for name in mine["primal"].unique()]):
             yield part, mine, names
 
@@ -136,7 +136,7 @@ def break_even(data: ProblemTables) -> Pages:
     against = data.thresholds[data.thresholds["cell_a"].isna()].set_index("cell_b")[numbers]
     models = cells.merge(against, "inner", left_on="cell", right_index=True)
     decided = models[models["meaning"] == Meaning.FROM]
-    if (decided["correction"] != UNCORRECTED).any():
+    if (decided["correction"] != CorrectionMode.NONE).any():
         # Strategies are distinguished by their names: a corrected one needs another.
         named = [label(row.primal, None, correction_in_words(row.correction)) for row in decided.itertuples()]
         decided = decided.assign(primal=named)

@@ -29,8 +29,7 @@ def solutions(data: ProblemTables) -> Pages:
 def draw_solutions(title: str, shown: Sequence[tuple[str, Picture]]) -> CaptionedFigure:
     """A column for each of some titled pictures of one problem: the solution above, the multiplier below."""
     pictures = [picture for _, picture in shown]
-    layout = Layout(width=2.7, height=2.4, tail=0.9)
-    sheet = Sheet(2, len(shown), title, layout)
+    sheet = Sheet(2, len(shown), title, Layout(2.7, 2.4, "last"))
     ranges = (_range([one.values for one in pictures]), _range([one.multiplier for one in pictures]))
     for column, (heading, picture) in enumerate(shown):
         field, multiplier = sheet.panel(0, column), sheet.panel(1, column)

@@ -106,12 +106,11 @@ class Looks:
 
 @dataclass(frozen=True)
 class Layout:
-    """Size of a panel, the margin right of it, and the room right of the last ones for a colour bar, in inches."""
+    """Size of a panel in inches, and the panels that have room for a colour bar right of them."""
 
-    width: float = 3.1
-    height: float = 2.5
-    right: float = 0.16
-    tail: float = 0.0
+    width: float
+    height: float
+    bars: Literal["none", "every", "last"] = "none"
 
 
 class CaptionedFigure(Figure):
@@ -171,14 +170,9 @@ class Sheet:
     """
 
     def __init__(
-        self,
-        rows: int,
-        columns: int,
-        title: str = "",
-        layout: Layout = Layout(),
-        sharex: Share = "none",
+        self, rows: int, columns: int, title: str = "", layout: Layout = Layout(3.1, 2.5), sharex: Share = "none",
         sharey: Share = "none",
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._rows, self._columns, self._title, self._layout = rows, columns, title, layout
         self.figure = CaptionedFigure()
         made = self.figure.subplots(rows, columns, squeeze=False, sharex=sharex, sharey=sharey)
@@ -189,7 +183,7 @@ class Sheet:
             panel.tick_params(labelbottom=True, labelleft=True)
 
     @classmethod
-    def with_panels(cls, count: int, title: str = "", layout: Layout = Layout(), share: Share = "none") -> Sheet:
+    def with_panels(cls, count: int, title: str, layout: Layout = Layout(3.1, 2.5), share: Share = "none") -> Sheet:
         """A sheet with at least `count` panels, at most three in a row; those beyond `count` are not shown."""
         columns = max(1, min(count, 3))
         sheet = cls(-(-count // columns) or 1, columns, title, layout, share, share)
@@ -211,10 +205,10 @@ class Sheet:
         The caption says, too, which part of a figure it is, and how many labels of points have no room.
         """
         layout = self._layout
-        # Room in inches left of and below a panel for ticks and labels, and for the title above it.
-        left, below = 0.88, 0.55
-        column, row = left + layout.width + layout.right, below + layout.height + 0.34
-        wide = self._columns * column + layout.tail
+        # Room in inches left of and below a panel for ticks and labels, right of it, and for the title above it.
+        left, below, right = 0.88, 0.55, 0.95 if layout.bars == "every" else 0.16
+        column, row = left + layout.width + right, below + layout.height + 0.34
+        wide = self._columns * column + (0.9 if layout.bars == "last" else 0.0)
         legend = self._legend(wide)
         # A character of the title has an average width of 0.085 inches.
         lines = textwrap.wrap(self._title, int(wide / 0.085))
