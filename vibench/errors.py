@@ -70,27 +70,25 @@ def requested(function: Callable[P, T]) -> Callable[P, T]:
 
     @functools.wraps(function)
     def call(*arguments: P.args, **named: P.kwargs) -> T:
+        from pydantic import ValidationError  # noqa: PLC0415  slow to import
+
         for name, value in signature.bind(*arguments, **named).arguments.items():
-            if name != "self" and not _fits(function, name, value):
+            # In strict mode pydantic refuses scalars of NumPy.
+            is_scalar = type(value).__module__ == "numpy" and getattr(value, "shape", None) == ()
+            try:
+                if name != "self":
+                    _adapters(function)[name].validate_python(value.item() if is_scalar else value)
+                # No path and no name holds this character.
+                fits = not (isinstance(value, str) and "\0" in value)
+            except ValidationError:
+                fits = False
+            if not fits:
                 expected = str(signature.parameters[name].annotation)
                 shown = brief(repr(value), 80)
                 raise RequestError(f"{name} of {function.__qualname__} is {shown}, expected {expected}")
         return function(*arguments, **named)
 
     return call
-
-
-def _fits(function: Callable[..., Any], name: str, value: Any) -> bool:
-    from pydantic import ValidationError  # noqa: PLC0415  slow to import
-
-    # In strict mode pydantic refuses scalars of NumPy.
-    value = value.item() if type(value).__module__ == "numpy" and getattr(value, "shape", None) == () else value
-    try:
-        _adapters(function)[name].validate_python(value)
-    except ValidationError:
-        return False
-    # No path and no name holds this character.
-    return not (isinstance(value, str) and "\0" in value)
 
 
 @functools.cache

@@ -11,9 +11,6 @@ import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-# Exit code of a command that Ctrl-C ended.
-INTERRUPTED = 130
-
 Handler = Callable[[int, FrameType | None], object] | int | None
 
 
@@ -99,4 +96,4 @@ def _leave(number: int, frame: FrameType | None) -> None:  # noqa: ARG001  the s
     sys.stdout.flush()
     os.write(2, b"vibench: interrupted\n")
     # No handlers at exit: the interpreter may be in the middle of an import.
-    os._exit(INTERRUPTED)
+    os._exit(130)

@@ -33,7 +33,7 @@ def bench_plugins(
     study: Annotated[
         str, Option(help="Study whose strategies complete what is timed.", autocompletion=studies)
     ] = "quick",
-    seconds: Annotated[float, Option(min=0.001, help="Seconds for each benchmark, about.")] = 1.0,
+    seconds: Annotated[float | None, Option(min=0.001, help="Seconds for each benchmark, about; 1 by default.")] = None,
     limit: Annotated[float, Option(min=1.0, help="Factor by which a median may grow.")] = 1.25,
     form: FormOption = "terminal",
 ) -> None:
@@ -61,7 +61,7 @@ def bench_plugins(
         raise Exit(1)
 
 
-def _timed(plugins: list[str], out: Path | None, resolutions: list[str], study: str, seconds: float) -> Timed:
+def _timed(plugins: list[str], out: Path | None, resolutions: list[str], study: str, seconds: float | None) -> Timed:
     """Time plugins by pytest-benchmark, and keep its file if asked to."""
     from importlib.util import find_spec
     from tempfile import TemporaryDirectory
@@ -79,7 +79,8 @@ def _timed(plugins: list[str], out: Path | None, resolutions: list[str], study: 
     with TemporaryDirectory() as folder:
         file = Path(folder) / "benchmarks.json"
         options = [f"--plugin={name}" for name in plugins] + [f"--resolution={name}" for name in resolutions]
-        benchmarks.run_pytest([*options, f"--study={study}", f"--seconds={seconds}", f"--benchmark-json={file}"])
+        options += [f"--study={study}", *([] if seconds is None else [f"--seconds={seconds}"])]
+        benchmarks.run_pytest([*options, f"--benchmark-json={file}"])
         if not file.exists():  # everything was left out
             file.write_text('{"machine_info": {}, "benchmarks": []}')
         if out is not None:

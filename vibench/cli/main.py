@@ -31,7 +31,7 @@ from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
 from vibench.cli.result_commands import compare_runs, replay_query, show
 from vibench.cli.run_command import run_study_command
 from vibench.errors import RequestError, VibenchError, unknown_name
-from vibench.interrupts import INTERRUPTED, Interrupted, interruptible
+from vibench.interrupts import Interrupted, interruptible
 from vibench.plugins.kinds import PluginKind
 from vibench.text import unbroken
 
@@ -263,10 +263,10 @@ def run_command_line() -> None:
         where = f"'{error.filename}' cannot be written or read: " if error.filename else ""
         code = _print_error(f"{where}{error.strerror or error}", 1)
     except Interrupted:
-        code = _print_error("interrupted", INTERRUPTED)
-    # A question was answered with no.
+        # The exit code of shells for what Ctrl-C has ended, and of a question that was answered with no.
+        code = _print_error("interrupted", 130)
     except typer.Abort:
-        code = _print_error("stopped; nothing was changed", INTERRUPTED)
+        code = _print_error("stopped; nothing was changed", 130)
     except Exception as error:
         if not isinstance(error, usage_error):
             raise

@@ -18,9 +18,6 @@ from vibench.errors import RequestError, VibenchError, in_a_line, unknown_name
 from vibench.plugins.kinds import CHECKED, PluginKind
 from vibench.text import parsed_json
 
-# The list of QP solvers also has those that are no plugins.
-LISTS = {kind.plural: kind for kind in PluginKind}
-
 Row = tuple[str, str, str, str]
 
 if TYPE_CHECKING:
@@ -32,7 +29,9 @@ else:
 
 
 def list_plugins(
-    what: Annotated[str | None, Argument(help=f"{', '.join(LISTS)}; default: all.", autocompletion=lists)] = None,
+    what: Annotated[
+        str | None, Argument(help=f"{', '.join(k.plural for k in PluginKind)}; default: all.", autocompletion=lists)
+    ] = None,
     sizes: Annotated[bool, Option("--sizes", help="Build every problem by default, and print its size.")] = False,
 ) -> None:
     """List problems, strategies, studies and QP solvers.
@@ -45,17 +44,18 @@ def list_plugins(
     from vibench.plugins.registry import unreadable
 
     headings = ("name", "from", "what", "options")
+    known = {kind.plural: kind for kind in PluginKind}
     if what is None:
         for kind in PluginKind:
             print_rows(_solvers_by_version() if kind is PluginKind.SOLVER else _read_rows(kind), headings, kind.plural)
         echo("", "what the options of one kind are, and whether its plugins can be loaded:")
         echo(f"  vibench list KIND, such as {PluginKind.PROBLEM.plural}")
-    elif what in LISTS:
-        print_rows(
-            _solver_rows() if LISTS[what] is PluginKind.SOLVER else _loaded_rows(LISTS[what], sizes), headings, what
-        )
+    elif what in known:
+        # The list of QP solvers also has those that are no plugins.
+        rows = _solver_rows() if known[what] is PluginKind.SOLVER else _loaded_rows(known[what], sizes)
+        print_rows(rows, headings, what)
     else:
-        raise unknown_name("list", what, LISTS)
+        raise unknown_name("list", what, known)
     for distribution, reason in unreadable().items():
         echo(f"{distribution}: {reason}")
 
@@ -68,8 +68,9 @@ def check_plugin(
     option: Annotated[
         list[str] | None, Option(metavar="KEY=VALUE", help="Option (repeatable).", autocompletion=plugin_options)
     ] = None,
-    # The default is that of `vibench.testing`, which is too slow to import for a help text.
-    seconds: Annotated[float, Option(min=0.0, help="Time limit for all checks; a slow plugin gets fewer.")] = 120.0,
+    seconds: Annotated[
+        float | None, Option(min=0.0, help="Limit of all checks, 120 by default; a slow plugin gets fewer.")
+    ] = None,
 ) -> None:
     """Check a plugin: shapes, signs, tolerances, repetition, time.
 
@@ -86,7 +87,8 @@ def check_plugin(
     loaded = checked.load() if checked.entries else partial(of_qpsolvers, solver=checked.name)
     create = partial(loaded, **options) if options else loaded
     counts = Counter[Verdict]()
-    for result in Examination(create, checked.kind.cli_name, seconds).results():
+    limit = {} if seconds is None else {"seconds": seconds}
+    for result in Examination(create, checked.kind.cli_name, **limit).results():
         echo(str(result))
         counts[result.verdict] += 1
     echo(", ".join(f"{counts[one]} {one}" for one in Verdict if counts[one] or one is not Verdict.WARNING))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -119,8 +120,8 @@ def compare_runs(
         sys.stdout.write(formats.to_text(whole_numbers(frame), form))
     elif column or table not in (None, "changes"):
         # What a table says of each run, in a column of its own, matters most.
-        first = [*(one.name for one in compared.runs), *PRIORITY]
-        print_frame(frame, f"{column} of the cells" if column else str(table), first, rest="--format csv")
+        names = [one.name for one in compared.runs]
+        _print_compared(frame, f"{column} of the cells" if column else str(table), names)
     else:
         if table is None:
             _print_overview(compared)
@@ -149,16 +150,6 @@ def replay_query(
     echo(f"the program, as qpsolvers reads it: {file}")
 
 
-# Columns of comparisons, those that matter most first.
-PRIORITY = (
-    "run", "what", "verdict", "before", "after", "ratio", "cells", "equal", "worse", "better", "changed", "problem",
-    "formulation", "dual", "primal", "solver", "asked", "interval", "within accuracy", "within limit", "undecided",
-    "farthest ratio", "against", "accuracy", "assembly", "bounds", "correction", "cell", "study", "ok",
-    "only here", "same code",
-    "in all runs", "machine", "seed", "validation",
-)  # fmt: skip
-
-
 def _print_changes(compared: Comparison, limit: float) -> None:
     """Print what changed between runs, the worst first, and how many changes there are."""
     from vibench.report.differences import ChangeKind
@@ -172,7 +163,7 @@ def _print_changes(compared: Comparison, limit: float) -> None:
     if len(changes):
         names = [run.name for run in compared.runs]
         title = " → ".join(names) if len(names) == 2 else f"changes from {names[0]}"
-        print_frame(changes.head(40), title, PRIORITY, rest="--format csv")
+        _print_compared(changes.head(40), title)
     if len(changes) > 40:
         echo(f"{len(changes) - 40} more changes: `--format csv` lists all of them")
     echo(*compared.notes, f"{len(changes)} changes beyond a factor of {limit:g}, {compared.regressions} for the worse")
@@ -182,17 +173,26 @@ def _print_overview(compared: Comparison) -> None:
     """Print the runs, and how many cells moved by column."""
     from vibench.report.differences import ChangeKind
 
-    print_frame(compared.by_run, "runs", PRIORITY, every=True, rest="--format csv")
+    _print_compared(compared.by_run, "runs", every=True)
     echo("")
     names = [run.name for run in compared.runs]
     title = f"{names[1]} against {names[0]}" if len(names) == 2 else f"against {names[0]}"
     by_column = compared.by_column
     # Columns of verdicts that no cell has take room from the others.
     nobody = [verdict.value for verdict in ChangeKind if not by_column[verdict.value].any()]
-    print_frame(
-        readable(by_column.drop(columns=nobody), len(names)), f"cells by column, {title}", PRIORITY, rest="--format csv"
-    )
+    _print_compared(readable(by_column.drop(columns=nobody), len(names)), f"cells by column, {title}")
     echo("")
+
+
+def _print_compared(frame: pd.DataFrame, title: str, first: Sequence[str] = (), *, every: bool = False) -> None:
+    # Columns that matter most come first.
+    priority = [
+        *first, "run", "what", "verdict", "before", "after", "ratio", "cells", "equal", "worse", "better", "changed",
+        "problem", "formulation", "dual", "primal", "solver", "asked", "interval", "within accuracy", "within limit",
+        "undecided", "farthest ratio", "against", "accuracy", "assembly", "bounds", "correction", "cell", "study", "ok",
+        "only here", "same code", "in all runs", "machine", "seed", "validation",
+    ]  # fmt: skip
+    print_frame(frame, title, priority, every=every, rest="--format csv")
 
 
 def readable(frame: pd.DataFrame, runs: int) -> pd.DataFrame:

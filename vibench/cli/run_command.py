@@ -14,7 +14,7 @@ from vibench.cli.completion import corrections, duals, formulations, primals, pr
 from vibench.cli.console import echo, print_frame, run_argument, warn
 from vibench.cli.result_commands import At, places_of
 from vibench.errors import RequestError, VibenchError
-from vibench.interrupts import INTERRUPTED, interrupted_at_once
+from vibench.interrupts import interrupted_at_once
 from vibench.qp.status import Status
 from vibench.text import unbroken
 
@@ -77,7 +77,7 @@ def run_study_command(
             reason = "the connection is not authenticated: others who reach the scheduler can run code on its workers"
             warn(f"{unbroken(scheduler)}: {reason}")
     folder = out or Path("runs") / loaded.name
-    options = Options(jobs or 0, fresh, retry, executor, scheduler, repeats or 0)
+    options = Options(jobs, fresh, retry, executor, scheduler, repeats)
     with ProgressDisplay() as progress:
         outcome = run_study(loaded, folder, progress, options)
     _conclude(loaded.name, outcome, folder, draw=options.workers if draw else None, fresh=fresh, strict=strict)
@@ -96,7 +96,7 @@ def _conclude(name: str, outcome: RunResult, folder: Path, *, draw: int | None, 
         missing = f"{outcome.missing} cells have no row yet" if outcome.missing else "all cells have their rows"
         again = "the same command without --fresh" if fresh else "the same command"
         echo(f"interrupted: {missing}; {again} resumes the run")
-        raise typer.Exit(INTERRUPTED)
+        raise typer.Exit(130)
     # A run without any result still has its tables, but no summary and no figures.
     statuses = [row["status"] for row in outcome.rows]
     nothing_ran = set(statuses) == {Status.UNAVAILABLE}

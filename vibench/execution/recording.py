@@ -27,6 +27,7 @@ from vibench.stages.timing_rounds import TimedRound, seconds_of_cell, seconds_of
 from vibench.study.cells import NO_SUCH_AXIS, Axes, Cell, digest
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.spec import Limits, Study
+from vibench.timing import ONE_THREAD
 
 # Files of a run folder: the output of plugins and solvers, and the report of `vibench report`.
 LOG, REPORT = "workers.log", "report.html"
@@ -113,7 +114,7 @@ class ResultWriter:
             **_set_columns(cell.validation),
             "study_hash": self.study_hash,
             "code": cell.code,
-            "threads": 1,
+            "threads": int(ONE_THREAD["OMP_NUM_THREADS"]),
             "versions": json.dumps(provenance.versions(cell.solver), sort_keys=True),
             "definition": cell.definition,
         }

@@ -101,7 +101,7 @@ class ContactLoads:
 
     fixed: Array
     varying: Callable[[Array], tuple[Array, Array]]
-    first: int = 0
+    first: int
     reach: int | None = None
     from_contact: Callable[[Contact], tuple[Array, Array]] | None = None
 
@@ -217,7 +217,7 @@ class Problem(ABC):
             return from_contact(contact)
 
         fixed = np.zeros((len(self.contact_dofs), eta.shape[1]))
-        return ContactLoads(fixed, varying, from_contact=from_contact)
+        return ContactLoads(fixed, varying, 0, from_contact=from_contact)
 
     def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
         """Function that evaluates chosen entries of the members in `entrywise`, at the cost of these entries alone.

@@ -192,7 +192,13 @@ def give(kind: PluginKind, name: str, given: Any) -> GivenPlugin:
         )
     try:
         # The study is of the present state of the object, even if the user changes it before the run.
-        snapshot = given if given is cls else copy.deepcopy(_without_cache(given))
+        snapshot = given
+        if given is not cls:
+            bare: Any = copy.copy(given)
+            # Values of cached properties are computed again.
+            for one in [one for one in getattr(bare, "__dict__", ()) if is_cached(cls, one)]:
+                del bare.__dict__[one]
+            snapshot = copy.deepcopy(bare)
         _Pickler(file := io.BytesIO()).dump(snapshot)
         needs = {one: distribution_version(one) for one in getattr(cls, "requires", ())}
         code, modules = fingerprint_of([snapshot, needs])
@@ -205,14 +211,6 @@ def give(kind: PluginKind, name: str, given: Any) -> GivenPlugin:
     # Keep the original: unpickled here, a class of a notebook would lose its global names.
     plugin.__dict__["given"] = snapshot
     return _given.setdefault((kind, name, plugin.fingerprint), plugin)
-
-
-def _without_cache(given: Any) -> Any:
-    """A copy of an object without the values of its cached properties."""
-    bare = copy.copy(given)
-    for name in [name for name in getattr(bare, "__dict__", ()) if is_cached(type(bare), name)]:
-        del bare.__dict__[name]
-    return bare
 
 
 class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]

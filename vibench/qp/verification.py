@@ -58,7 +58,7 @@ class QPSolution:
     alpha: Array | None
     solver_status: str
     iterations: int | None = None
-    negative: float = 0.0
+    negative: float | None = None
 
 
 class QPSolver(Protocol):

@@ -18,7 +18,7 @@ class Cubature:
         # Far more sums than a cubature has columns represent all conditions.
         self._sums, self._rng = np.zeros((max(800, 8 * size), count)), np.random.default_rng(0)
 
-    def add(self, conditions: Array, weight: float = 1.0) -> None:
+    def add(self, conditions: Array, weight: float) -> None:
         """Add conditions (N'×e), relative to their sum over all columns."""
         if size := float(np.linalg.norm(conditions.sum(axis=1))):
             signs = self._rng.choice([-1.0, 1.0], len(conditions))

@@ -166,5 +166,5 @@ def reduced_rows(pressures: Array, works: Sequence[Array], tolerance: float) -> 
     sums = Cubature(works[0].shape[1], len(pressures))
     for each in works:
         for pressure in pressures.T:
-            sums.add(each.T * pressure)
+            sums.add(each.T * pressure, 1.0)
     return sums.columns(tolerance)

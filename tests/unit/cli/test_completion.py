@@ -13,7 +13,6 @@ from running import Main, Register
 
 from vibench.cli import completion
 from vibench.cli.main import COMMANDS, app
-from vibench.cli.plugin_commands import LISTS
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import find, first_sentence, registered
 from vibench.qp.settings import SETTINGS
@@ -66,7 +65,7 @@ def test_values_are_completed_with_what_there_is() -> None:
         ("show quick --table s", "summary"),
     ):  # fmt: skip
         assert completed(f"vibench {line}") == words, line
-    assert set(completion.lists("")) == set(LISTS)
+    assert set(completion.lists("")) == {kind.plural for kind in PluginKind}
     assert set(completion.table_names("")) == set(completion.SHOWN) == set(VIEWS) > set(TABLES)
 
 
@@ -130,7 +129,7 @@ def test_the_installed_command_completes_for_bash(command: str, tmp_path: Path) 
 def test_the_overview_reads_the_options_that_the_registry_knows() -> None:
     """Without importing any plugin."""
     for kind in ("problems", "primal", "dual", "sampling"):
-        for plugin in registered(LISTS[kind]).values():
+        for plugin in registered(next(one for one in PluginKind if one.plural == kind)).values():
             assert plugin.names_of_options == list(plugin.options)
             assert plugin.summary == (plugin.load().__doc__ or "").split("\n")[0]
 

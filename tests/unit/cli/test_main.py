@@ -14,7 +14,6 @@ from running import Main, Register, refused
 from samples import STUDY, changed, write_study
 
 from vibench.cli.main import renamed
-from vibench.cli.plugin_commands import LISTS
 from vibench.plugins import kinds, registry
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import find, registered
@@ -136,7 +135,7 @@ def test_a_dry_run_lists_the_matrix_and_does_nothing_else(main: Main, tmp_path: 
 def test_list_shows_every_plugin_and_its_options(main: Main) -> None:
     code, out, err = main("list")
     assert (code, err) == (0, "")
-    assert [name for kind in LISTS.values() for name in registered(kind) if name not in out] == []
+    assert [name for kind in PluginKind for name in registered(kind) if name not in out] == []
     options = [option.name for option in find(kinds.PluginKind.PROBLEM, "obstacle").options.values()]
     assert ", ".join(options) in out
     _, out, _ = main("list", "problems")
@@ -283,12 +282,13 @@ def test_options_replace_axes(main: Main, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_every_list_shows_only_its_own(main: Main) -> None:
-    for what, kind in LISTS.items():
+    lists = [kind.plural for kind in PluginKind]
+    for what, kind in zip(lists, PluginKind, strict=True):
         code, out, _ = main("list", what)
         assert code == 0
         assert out.startswith(what)
         assert all(name in out for name in registered(kind))
-        assert [title for title in LISTS if re.search(rf"^{title}(,|$)", out, re.MULTILINE)] == [what]
+        assert [title for title in lists if re.search(rf"^{title}(,|$)", out, re.MULTILINE)] == [what]
         if what == "studies":
             assert f"{len(expand(read_study('quick')))} cells" in out
         if what == "solvers":
