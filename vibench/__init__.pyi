@@ -26,8 +26,10 @@ from .interfaces.formulations import Formulation as Formulation
 from .interfaces.formulations import FormulationAnswer as FormulationAnswer
 from .interfaces.formulations import FormulationModel as FormulationModel
 from .interfaces.formulations import Multiplier as Multiplier
+from .interfaces.formulations import OfflinePhase as OfflinePhase
 from .interfaces.formulations import Outcome as Outcome
 from .interfaces.formulations import QuerySettings as QuerySettings
+from .interfaces.formulations import Snapshots as Snapshots
 from .interfaces.outputs import MeshFields as MeshFields
 from .interfaces.outputs import Output as Output
 from .interfaces.outputs import Picture as Picture
@@ -71,10 +73,9 @@ from .offline.checked_tools import supremizers as supremizers
 from .offline.compiled import CompiledModel as CompiledModel
 from .offline.compiled import CompiledProgram as CompiledProgram
 from .offline.models import Model as Model
-from .offline.models import Solution as Solution
 from .offline.program_model import ProgramModel as ProgramModel
 from .offline.reduction import Reduction as Reduction
-from .offline.reduction import Snapshots as Snapshots
+from .offline.solution import Solution as Solution
 from .plugins.registry import create as create
 from .qp.status import Status as Status
 from .qp.verification import QPSolution as QPSolution

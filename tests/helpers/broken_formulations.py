@@ -10,7 +10,16 @@ from typing import Any, ClassVar
 import numpy as np
 from formulations import Program, ProgramModel
 
-from vibench import Array, FormulationAnswer, FormulationModel, Multiplier, Outcome, QuerySettings, Reduction, solve_qp
+from vibench import (
+    Array,
+    FormulationAnswer,
+    FormulationModel,
+    Multiplier,
+    OfflinePhase,
+    Outcome,
+    QuerySettings,
+    solve_qp,
+)
 
 
 def _wrong(name: str, **members: Any) -> type[Program]:
@@ -41,26 +50,26 @@ class MultiplierInWords(Program):
 
 
 class BuildsAList(Program):
-    def build(self, offline: Reduction) -> Mapping[str, Any]:
+    def build(self, offline: OfflinePhase) -> Mapping[str, Any]:
         return [offline.snapshots.u]  # type: ignore[return-value]
 
 
 class BuildsAFunction(Program):
-    def build(self, offline: Reduction) -> Mapping[str, Any]:
+    def build(self, offline: OfflinePhase) -> Mapping[str, Any]:
         return {"tangent": lambda mu: mu}
 
 
 class MakesADictionary(Program):
-    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+    def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:
         return {"basis": offline.pod.basis}  # type: ignore[return-value]
 
 
-def _without_dimension(self: Any, offline: Reduction) -> None:
+def _without_dimension(self: Any, offline: OfflinePhase) -> None:
     ProgramModel.__init__(self, offline)
     del self.dimension
 
 
-def _more_than_declared(self: Any, offline: Reduction) -> None:
+def _more_than_declared(self: Any, offline: OfflinePhase) -> None:
     ProgramModel.__init__(self, offline)
     self.generators = 3
 
@@ -103,7 +112,7 @@ WrongSide = _rebuilding("WrongSide", lambda u, lam: (-u, lam))
 class RemembersItsScale(Program):
     """The factor of u is not among the coefficients."""
 
-    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+    def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:
         return _ScaledModel(offline)
 
 
@@ -138,12 +147,12 @@ class Misbehaves(Program):
     def __init__(self, how: str = "nan") -> None:
         self.how = how
 
-    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+    def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:
         return MisbehavingModel(offline, self.how)
 
 
 class MisbehavingModel(ProgramModel):
-    def __init__(self, offline: Reduction, how: str) -> None:
+    def __init__(self, offline: OfflinePhase, how: str) -> None:
         super().__init__(offline)
         box = offline.problem.parameters
         self.how, self.middle = how, 0.5 * (box.lower + box.upper)[0]

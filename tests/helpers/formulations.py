@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 import vibench
-from vibench import Array, Formulation, FormulationAnswer, FormulationModel, Multiplier, QuerySettings, Reduction
+from vibench import Array, Formulation, FormulationAnswer, FormulationModel, Multiplier, OfflinePhase, QuerySettings
 
 
 class Program(Formulation):
@@ -15,15 +15,15 @@ class Program(Formulation):
 
     takes_start: ClassVar[bool] = False
 
-    def build(self, offline: Reduction) -> Mapping[str, Any]:
+    def build(self, offline: OfflinePhase) -> Mapping[str, Any]:
         return {}
 
-    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+    def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:
         return ProgramModel(offline)
 
 
 class ProgramModel(FormulationModel):
-    def __init__(self, offline: Reduction) -> None:
+    def __init__(self, offline: OfflinePhase) -> None:
         self.assembled = offline.assembled
         self.dimension = self.assembled.fixed_basis.shape[1] + offline.multipliers.rank
         self.generators = self.assembled.generators.shape[1]
@@ -48,10 +48,10 @@ class Nearest(Formulation):
     uses: ClassVar[tuple[str, ...]] = ()
     multiplier: ClassVar[Multiplier] = Multiplier.RESIDUAL
 
-    def build(self, offline: Reduction) -> Mapping[str, Any]:
+    def build(self, offline: OfflinePhase) -> Mapping[str, Any]:
         return {"u": offline.snapshots.u, "mus": offline.snapshots.mu}
 
-    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+    def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:
         return NearestModel(built["u"], built["mus"], offline.problem.parameters.widths)
 
 
@@ -75,10 +75,10 @@ class Coarse(Formulation):
 
     has_program = has_certificate = takes_start = True
 
-    def build(self, offline: Reduction) -> Mapping[str, Any]:
+    def build(self, offline: OfflinePhase) -> Mapping[str, Any]:
         return {}
 
-    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+    def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:
         cone = replace(offline.cone, generators=offline.cone.generators[:, ::2], free=offline.cone.free[::2])
         phase = replace(offline).given(pod=offline.pod, cone=cone, enrichment=offline.enrichment)
         return vibench.ProgramModel(phase.assembled)

@@ -21,7 +21,7 @@ from vibench.arrays import Array
 from vibench.benchmarks import PrimalChoice, ReducedSpaces, Setting, Size, TimedProblem, Timing
 from vibench.errors import UnsupportedError
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
-from vibench.interfaces.formulations import FormulationAnswer
+from vibench.interfaces.formulations import FormulationAnswer, Snapshots
 from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment, Stop
 from vibench.interfaces.validation import (
@@ -37,8 +37,9 @@ from vibench.model.errors import ReferenceSolutions, errors
 from vibench.model.galerkin import ReducedModel, ReducedProblem, project
 from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel, hyper_reduce
 from vibench.offline.assemblies import assemblies
-from vibench.offline.models import Model, Solution
-from vibench.offline.reduction import Reduction, Snapshots, high_fidelity_sweep
+from vibench.offline.models import Model
+from vibench.offline.reduction import Reduction, high_fidelity_sweep
+from vibench.offline.solution import Solution
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import find, qp_solver
 from vibench.qp.solve import solve_qp

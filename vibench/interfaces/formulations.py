@@ -26,11 +26,10 @@ from typing import Any, ClassVar, Protocol, TypeAlias
 
 from vibench.arrays import Array
 from vibench.errors import RequestError
-from vibench.interfaces.problem import VariationalInequality
+from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.strategies import Cone, Enrichment, PrimalStrategy, Stop
 
-# The layers above define these classes; nothing here imports them. Plugins annotate with the classes themselves.
-OfflinePhase: TypeAlias = Any
-"""A `vibench.Reduction`."""
+# The layers above define these classes; nothing here imports them.
 AssemblingModel: TypeAlias = Any
 """A reduced model, whose `assemble(mu)` has the reduced `program`."""
 Certificate: TypeAlias = Any
@@ -38,6 +37,72 @@ Certificate: TypeAlias = Any
 
 AXES = ("pod", "dual", "primal", "solvers", "accuracy", "assembly")
 """The axes of a study that a formulation may have; it is not repeated over those that it does not have."""
+
+
+@dataclass(frozen=True)
+class Snapshots:
+    """High-fidelity solutions at some parameters.
+
+    Attributes
+    ----------
+    mu
+        Parameters (P×d).
+    u, lam
+        Columns u(mu) (n×P) and λ(mu) (m×P).
+    """
+
+    mu: Array
+    u: Array
+    lam: Array
+
+
+class _Basis(Protocol):
+    @property
+    def basis(self) -> Array: ...
+
+
+class _Generators(Protocol):
+    @property
+    def span(self) -> Array: ...
+
+
+class _Steps(Protocol):
+    # `dataclasses.replace` makes a phase with other inputs, whose steps are computed again.
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def problem(self) -> Problem: ...
+    @property
+    def modes(self) -> Stop | None: ...
+    @property
+    def accuracy(self) -> float: ...
+    @property
+    def assembly(self) -> str: ...
+    @property
+    def snapshots(self) -> Snapshots: ...
+    @property
+    def pod(self) -> _Basis: ...
+    @property
+    def cone(self) -> Cone: ...
+    @property
+    def multipliers(self) -> _Generators: ...
+    @property
+    def enrichment(self) -> Enrichment: ...
+    @property
+    def members(self) -> Mapping[str, Any]: ...
+    @property
+    def operators(self) -> Any: ...
+    @property
+    def projection(self) -> AssemblingModel: ...
+    @property
+    def assembled(self) -> AssemblingModel: ...
+    def given(self, **steps: Any) -> OfflinePhase: ...
+    def enriched(self, primal: PrimalStrategy, tolerance: float | None) -> OfflinePhase: ...
+    def certificate_of(self, reduced: AssemblingModel) -> Certificate: ...
+
+
+class OfflinePhase(_Steps, Protocol):
+    """The offline phase that a formulation is given, a `vibench.Reduction`: the attributes that formulations use."""
 
 
 class Outcome(StrEnum):

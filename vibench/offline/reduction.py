@@ -12,7 +12,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import RequestError, UnsupportedError
 from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.formulations import Formulation, axes_of
+from vibench.interfaces.formulations import Formulation, Snapshots, axes_of
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import (
     AdaptiveSampling,
@@ -48,23 +48,6 @@ from vibench.text import brief
 
 Assembly: TypeAlias = Literal["full", "reduced"]
 """How a model assembles its programs, as in a study."""
-
-
-@dataclass(frozen=True)
-class Snapshots:
-    """High-fidelity solutions at some parameters.
-
-    Attributes
-    ----------
-    mu
-        Parameters (P×d).
-    u, lam
-        Columns u(mu) (n×P) and λ(mu) (m×P).
-    """
-
-    mu: Array
-    u: Array
-    lam: Array
 
 
 def high_fidelity_sweep(problem: Problem, mus: Array) -> Snapshots:

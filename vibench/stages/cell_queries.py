@@ -313,7 +313,7 @@ class _Queries(Items):
             fallbacks += offline.enrichment.fallbacks
             kind, vectors = offline.enrichment.kind, offline.enrichment.vectors
             fixed = 0 if vectors is None else vectors.shape[1]
-            added = offline.multipliers.rank if kind is Kind.PER_PARAMETER else fixed
+            added = offline.multipliers.span.shape[1] if kind is Kind.PER_PARAMETER else fixed
         # A formulation may count its vectors otherwise than the offline phase.
         added = added if online.enrichment is None else online.enrichment
         row: Row = {

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any
 
 from vibench.arrays import Array
-from vibench.interfaces.formulations import Formulation
+from vibench.interfaces.formulations import Formulation, Snapshots
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import Cone, Enrichment, Kind
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky
@@ -25,7 +25,7 @@ from vibench.model.chebyshev import AffinePolynomial
 from vibench.model.hyperreduced import ProjectedMember, ReducedOperators
 from vibench.offline.compiled import CompiledModel
 from vibench.offline.models import ACCURACY, Model, check_built
-from vibench.offline.reduction import Reduction, Snapshots
+from vibench.offline.reduction import Reduction
 from vibench.plugins.plugin import Plugin
 from vibench.reduction.pod import POD
 from vibench.reduction.supremizers import ContactCoordinates, LoadCoordinates, SpannedCoordinates

@@ -16,6 +16,7 @@ from functools import cache, lru_cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from unittest import SkipTest
 
 import cloudpickle
 import numpy as np
@@ -83,7 +84,8 @@ class ConformanceWarning(UserWarning):
 class Check(Generic[CaseT_contra]):
     """A name, a function from a case to its faults and notes, and the names of checks that must pass before.
 
-    A function that reports its faults by a `ConformanceError` alone returns `None`.
+    A function that reports its faults by a `ConformanceError` alone returns `None`; a `SkipTest` ends the check as
+    skipped, for its reason.
     """
 
     name: str
@@ -99,6 +101,8 @@ class Check(Generic[CaseT_contra]):
         try:
             for line in self.faults(case) or ():
                 lines.append(line)  # noqa: PERF402  what precedes an exception is kept
+        except SkipTest as reason:
+            return CheckResult(self.name, Verdict.SKIPPED, str(reason))
         except (Exception, SystemExit) as error:  # noqa: BLE001  a plugin may raise anything
             lines.append(str(error) if isinstance(error, ConformanceError) else raised(error))
         faults = [line for line in lines if not isinstance(line, Note | Doubt)]

@@ -11,11 +11,12 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.interfaces.formulations import Snapshots
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import Problem, Sampler, VariationalInequality
 from vibench.interfaces.strategies import Cone, DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, Stop
 from vibench.linalg.inner_product import InnerProduct
-from vibench.offline.reduction import Reduction, Snapshots, high_fidelity_sweep
+from vibench.offline.reduction import Reduction, high_fidelity_sweep
 from vibench.reduction.cones import greedy_cone
 from vibench.reduction.supremizers import supremizers
 from vibench.testing.case import Arrays

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Gt
 
-from vibench import Array, Formulation, FormulationAnswer, FormulationModel, QuerySettings, Reduction
+from vibench import Array, Formulation, FormulationAnswer, FormulationModel, OfflinePhase, QuerySettings
 
 
 class Shepard(Formulation):
@@ -28,12 +28,12 @@ class Shepard(Formulation):
     def __init__(self, power: Annotated[float, Gt(0.0)] = 3.0) -> None:
         self.power = power
 
-    def build(self, offline: Reduction) -> Mapping[str, Any]:
+    def build(self, offline: OfflinePhase) -> Mapping[str, Any]:
         """Coefficients (N×P) of the snapshots, the multipliers (m×P), and their parameters (P×d)."""
         snapshots, basis = offline.snapshots, offline.pod.basis
         return {"x": offline.problem.V.gram(basis, snapshots.u), "lam": snapshots.lam, "mus": snapshots.mu}
 
-    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+    def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:
         """The interpolant."""
         return _Interpolant(offline.pod.basis, offline.problem.parameters.widths, self.power, **built)
 

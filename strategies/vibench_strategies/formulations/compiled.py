@@ -19,7 +19,7 @@ from vibench import (
 )
 
 if TYPE_CHECKING:
-    from vibench import Reduction
+    from vibench import OfflinePhase
 
 
 class Compiled(Formulation):
@@ -33,11 +33,11 @@ class Compiled(Formulation):
     assembled: ClassVar[str] = "reduced"
     has_program: ClassVar[bool] = True
 
-    def build(self, offline: Reduction) -> Mapping[str, Any]:
+    def build(self, offline: OfflinePhase) -> Mapping[str, Any]:
         """The polynomials of which the source is made: who loads an artefact runs nothing that is in it."""
         return {"polynomials": CompiledModel.of(offline.assembled, offline.accuracy)}
 
-    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+    def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:
         """The program, compiled for the accuracy of the queries and loaded into this process."""
         return CompiledFormulationModel(offline, replace(built["polynomials"], accuracy=offline.accuracy))
 
@@ -45,7 +45,7 @@ class Compiled(Formulation):
 class CompiledFormulationModel(ProgramModel):
     """Calls the program."""
 
-    def __init__(self, offline: Reduction, made: CompiledModel) -> None:
+    def __init__(self, offline: OfflinePhase, made: CompiledModel) -> None:
         super().__init__(offline.assembled)
         self.call = _loaded(made.source, self.dimension, self.generators)
 

@@ -26,7 +26,7 @@ from vibench_strategies.formulations.reduced_programs import FixedSpacesModel, r
 from vibench_strategies.infsup_greedy import InfSupGreedy
 
 if TYPE_CHECKING:
-    from vibench import Reduction
+    from vibench import OfflinePhase
 
 STABILITY = 0.1
 """Weight of A times a random vector beside A times a snapshot: A has to stay definite where no snapshot is."""
@@ -73,7 +73,7 @@ class HyperReduced(Formulation):
     ) -> None:
         self.tolerance, self.condition, self.integrate = tolerance, condition, integrate
 
-    def build(self, offline: Reduction) -> Mapping[str, Any]:
+    def build(self, offline: OfflinePhase) -> Mapping[str, Any]:
         """The enriched basis, and rows and elements with their weights."""
         problem, snapshots, members = offline.problem, offline.snapshots, self._integrated(offline.problem)
         if missing := " and ".join(sorted(members - problem.elementwise)):
@@ -91,7 +91,7 @@ class HyperReduced(Formulation):
             built["elements"] = whole.cubature(mus, u, self.tolerance)
         return built
 
-    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+    def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:
         """The model on the reduced domain."""
         return HyperReducedContact(offline, built, self._integrated(offline.problem))
 
@@ -104,7 +104,7 @@ class HyperReduced(Formulation):
 class HyperReducedContact(FixedSpacesModel):
     """Assembles on the reduced domain alone, apart from what is projected once."""
 
-    def __init__(self, offline: Reduction, built: Mapping[str, Any], integrated: frozenset[str]) -> None:
+    def __init__(self, offline: OfflinePhase, built: Mapping[str, Any], integrated: frozenset[str]) -> None:
         super().__init__(V := built["vectors"], chi := offline.cone.generators)
         self.enrichment = V.shape[1] - offline.pod.basis.shape[1]
         problem, tests, (rows, shares) = offline.problem, np.zeros_like(chi), built["rows"]

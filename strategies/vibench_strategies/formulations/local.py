@@ -29,7 +29,7 @@ from vibench import (
 from vibench_strategies.formulations.reduced_programs import PhasesModel, largest_dimension, solved
 
 if TYPE_CHECKING:
-    from vibench import Reduction
+    from vibench import OfflinePhase
 
 INDEPENDENT = 1e-10
 """Relative tail of the POD of a cluster below which there are no further modes."""
@@ -63,7 +63,7 @@ class Local(Formulation):
     ) -> None:
         self.clusters, self.by, self.seed = clusters, by, seed
 
-    def build(self, offline: Reduction) -> Mapping[str, Any]:
+    def build(self, offline: OfflinePhase) -> Mapping[str, Any]:
         """The polynomials, and POD, cone and enrichment of every cluster."""
         weights, owners = self._chosen(offline.problem, offline.snapshots)
         steps = []
@@ -79,7 +79,7 @@ class Local(Formulation):
             steps.append({name: getattr(part, name) for name in ("pod", "cone", "enrichment")})
         return {"weights": weights, "owners": owners, "steps": steps}
 
-    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+    def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:
         """The models of the clusters."""
         known = enumerate(built["steps"])
         parts = [_restricted(offline, built["owners"] == number).given(**steps) for number, steps in known]
@@ -106,7 +106,7 @@ class Local(Formulation):
 class LocalModel(PhasesModel):
     """Models of clusters, one of which answers a query."""
 
-    def __init__(self, box: ParameterBox, weights: Array, parts: Sequence[Reduction]) -> None:
+    def __init__(self, box: ParameterBox, weights: Array, parts: Sequence[OfflinePhase]) -> None:
         super().__init__(parts)
         self._box, self._weights = box, weights
         self.enrichment = self.dimension - max(parts, key=largest_dimension).pod.basis.shape[1]
@@ -144,7 +144,7 @@ def _clusters(points: Array, count: int, seed: int) -> tuple[Array, Indices]:
     return centroids[kept], np.searchsorted(kept, labels)
 
 
-def _restricted(offline: Reduction, mask: Any) -> Reduction:
+def _restricted(offline: OfflinePhase, mask: Any) -> OfflinePhase:
     """The reduction for some of the snapshots; sums of terms are those of all."""
     all_of = offline.snapshots
     known: dict[str, Any] = {"snapshots": Snapshots(all_of.mu[mask], all_of.u[:, mask], all_of.lam[:, mask])}

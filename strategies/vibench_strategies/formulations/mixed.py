@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from vibench import Formulation, FormulationModel, ProgramModel
 
 if TYPE_CHECKING:
-    from vibench import Reduction
+    from vibench import OfflinePhase
 
 
 class Mixed(Formulation):
@@ -19,6 +19,6 @@ class Mixed(Formulation):
     has_certificate = True
     is_default = True
 
-    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:  # noqa: ARG002
+    def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:  # noqa: ARG002
         """The Galerkin projection on these spaces, assembled in full or in reduced form."""
         return ProgramModel(offline.assembled)

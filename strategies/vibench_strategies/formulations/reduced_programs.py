@@ -23,7 +23,7 @@ from vibench import (
 from vibench_strategies.formulations.whitened import Whitened
 
 if TYPE_CHECKING:
-    from vibench import Reduction
+    from vibench import OfflinePhase
 
 
 class ProgramFormulation(Formulation):
@@ -38,12 +38,12 @@ class ProgramFormulation(Formulation):
         Raises a `NumericalError` if there is none.
         """
 
-    def build(self, offline: Reduction) -> Mapping[str, Any]:
+    def build(self, offline: OfflinePhase) -> Mapping[str, Any]:
         """Nothing beside the reduced model, whose multipliers have to have signs."""
         refuse_free(offline.cone)
         return {}
 
-    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:  # noqa: ARG002
+    def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:  # noqa: ARG002
         """The reduced model with the algorithm in place of a QP solver."""
         return ProgramModel(offline, self)
 
@@ -51,7 +51,7 @@ class ProgramFormulation(Formulation):
 class PhasesModel(FormulationModel):
     """A model that answers in the spaces of offline phases, of one of them at each parameter."""
 
-    def __init__(self, phases: Sequence[Reduction]) -> None:
+    def __init__(self, phases: Sequence[OfflinePhase]) -> None:
         self._models = [phase.assembled for phase in phases]
         self.dimension = max(largest_dimension(phase) for phase in phases)
         self.generators = max(phase.cone.size for phase in phases)
@@ -75,7 +75,7 @@ class PhasesModel(FormulationModel):
 class ProgramModel(PhasesModel):
     """Assembles the reduced program at a parameter, and solves it by the algorithm of a formulation."""
 
-    def __init__(self, offline: Reduction, formulation: ProgramFormulation) -> None:
+    def __init__(self, offline: OfflinePhase, formulation: ProgramFormulation) -> None:
         super().__init__([offline])
         self._formulation = formulation
 
@@ -120,7 +120,7 @@ def solved(settings: QuerySettings, program: VariationalInequality, factor: Arra
     return FormulationAnswer(found.x, found.alpha, iterations=found.iterations)
 
 
-def largest_dimension(offline: Reduction) -> int:
+def largest_dimension(offline: OfflinePhase) -> int:
     """Largest dimension over all parameters of V_N and its enrichment; of what a strategy supplies it is a guess."""
     added, enrichment = offline.multipliers.span, offline.enrichment
     if enrichment.kind is not Kind.PER_PARAMETER:

@@ -16,7 +16,7 @@ from vibench import Array, Formulation, FormulationAnswer, FormulationModel, Que
 from vibench_strategies.formulations.reduced_programs import FixedSpacesModel, refuse_free
 
 if TYPE_CHECKING:
-    from vibench import Reduction
+    from vibench import OfflinePhase
 
 SMOOTHEST, ROUGHEST = 100.0, 0.05
 """Length scales between which the likelihood is maximised, relative to the widths of the box."""
@@ -58,7 +58,7 @@ class Regression(Formulation):
     ) -> None:
         self.kind, self.length = kind, length
 
-    def build(self, offline: Reduction) -> Mapping[str, Any]:
+    def build(self, offline: OfflinePhase) -> Mapping[str, Any]:
         """What is fitted to u and to λ, and the Gram matrix with which λ is projected."""
         problem, snapshots, cone = offline.problem, offline.snapshots, offline.cone
         refuse_free(cone)
@@ -97,7 +97,7 @@ class Regression(Formulation):
             "inverses": np.reshape(inverses, (len(values), count, count)),
         }
 
-    def model(self, offline: Reduction, built: Mapping[str, Any]) -> FormulationModel:
+    def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:
         """The fitted functions, and the bases of their coefficients."""
         made = RadialFunctions if self.kind == "radial" else Processes
         return RegressionModel(offline, built, made(built["places"], built["u"]), made(built["places"], built["lam"]))
@@ -155,7 +155,7 @@ Fitted = Processes | RadialFunctions
 class RegressionModel(FixedSpacesModel):
     """Evaluates fitted coefficients at a parameter."""
 
-    def __init__(self, offline: Reduction, built: Mapping[str, Any], u: Fitted, lam: Fitted) -> None:
+    def __init__(self, offline: OfflinePhase, built: Mapping[str, Any], u: Fitted, lam: Fitted) -> None:
         super().__init__(offline.pod.basis, offline.cone.generators)
         self._box, self._u, self._lam = offline.problem.parameters, u, lam
         self._left_out, self._rays = built["left_out"], built["rays"]

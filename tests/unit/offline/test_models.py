@@ -15,7 +15,8 @@ from vibench.model.galerkin import ReducedProblem
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline import models
 from vibench.offline.assemblies import assemblies
-from vibench.offline.models import html, parameter_in
+from vibench.offline.models import parameter_in
+from vibench.offline.solution import html
 
 CELLS = list(product(("online-supremizers", "offline-pga"), ("full", "reduced")))
 

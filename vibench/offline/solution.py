@@ -1,0 +1,174 @@
+"""Solutions of reduced models at one parameter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from html import escape
+from math import inf
+from typing import Any, Protocol
+
+from vibench.arrays import Array
+from vibench.errors import RequestError
+from vibench.interfaces.problem import Problem
+from vibench.model.bound_terms import CorrectionMode
+from vibench.model.certificates.base import contact_unknowns
+from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate, OnlineCorrection, output_error_bound
+from vibench.model.error_bounds import ErrorBounds, bound_errors_at
+from vibench.model.errors import high_fidelity_residuals
+from vibench.model.hyperreduced import AnyReducedModel
+from vibench.offline.assemblies import assemblies
+from vibench.offline.correction import Answer, Corrector
+from vibench.qp.status import Status
+from vibench.qp.verification import Residuals
+
+
+class SolvingModel(Protocol):
+    """The parts of a `Model` that its solutions use."""
+
+    @property
+    def problem(self) -> Problem: ...
+    @property
+    def certificate(self) -> OnlineCertificate | None: ...
+    @property
+    def reduced(self) -> AnyReducedModel: ...
+    @property
+    def output_weights(self) -> Mapping[str, tuple[float, float] | None]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The answer of a model at one parameter; the fields are those of a row of the queries table.
+
+    Attributes
+    ----------
+    mu
+        The parameter (d,).
+    status, reason
+        The verdict of verification, and why it is not ok.
+    x, alpha
+        Coefficients of u (N',) and of λ (R,); `None` if there is no answer, or α where λ has no coefficients.
+    residuals
+        Recomputed KKT residuals of the (last) quadratic program; `None` without one.
+    assembly, solution
+        CPU seconds of the assembly of the program, 0 where it is part of the solution, and of the solution.
+    bound, tolerance
+        Error bounds at online cost where the model has a certificate, and the relative error asked for; else `None`.
+    correction
+        The correction at online cost: `u`, `lam` and `bound` are of the corrected pair, x and α are not.
+    mode
+        Whether a correction was asked for. Without a certificate it is made when `u` or `lam` is, at high-fidelity
+        cost.
+    iterations, uncertainty
+        Steps of the solver or the formulation, and the formulation's own estimate of ‖u − u_N‖_V, if it makes one.
+    """
+
+    mu: Array
+    status: Status
+    reason: str
+    x: Array | None
+    alpha: Array | None
+    residuals: Residuals | None
+    assembly: float
+    solution: float
+    _model: SolvingModel = field(repr=False)
+    _pair: Callable[[], tuple[Array, Array] | None] = field(repr=False)
+    bound: OnlineBound | None = None
+    tolerance: float | None = None
+    correction: OnlineCorrection | None = None
+    mode: CorrectionMode = CorrectionMode.NONE
+    iterations: int | None = None
+    uncertainty: float | None = None
+
+    @property
+    def verdict(self) -> str:
+        """Whether the bound is within the tolerance: "certified" or "verified", as its guarantee, or "not certified".
+
+        "no tolerance" where none was asked for. A solution that is not ok is not certified, however small its bound is.
+        """
+        if self.tolerance is None or self.bound is None:
+            return "no tolerance"
+        certified = self.status is Status.OK and self.bound.relative <= self.tolerance
+        return self.bound.guarantee.value if certified else "not certified"
+
+    def _repr_html_(self) -> str:
+        return html("solution", self.columns())
+
+    def columns(self) -> dict[str, Any]:
+        """The solution as a row of the table that `Model.solve_all` makes."""
+        row: dict[str, Any] = dict(zip(self._model.problem.parameters.names, self.mu.tolist(), strict=True))
+        row |= {"status": self.status.value, "reason": self.reason}
+        row["residual"] = None if self.residuals is None else self.residuals.worst
+        if (bound := self.bound) is not None:
+            row |= {"bound_u_energy": bound.u_energy, "bound_lambda_natural": bound.lambda_natural}
+            row |= {"bound_u_relative": bound.relative, "guarantee": bound.guarantee.value, "verdict": self.verdict}
+        if self.x is not None:
+            row |= {f"output:{name}": value for name, value in self.outputs.items()}
+            bounds = self.output_bounds if bound is not None else {}
+            row |= {f"bound:{name}": value for name, value in bounds.items()}
+        return row | {"assembly": self.assembly, "solution": self.solution}
+
+    @property
+    def u(self) -> Array:
+        """The primal solution u (n,)."""
+        return self.answer.u
+
+    @property
+    def lam(self) -> Array:
+        """The multiplier λ (m,)."""
+        return self.answer.lam
+
+    @cached_property
+    def answer(self) -> Answer:
+        """Both of these, whether they are a corrected pair, and why not."""
+        certificate, problem = self._model.certificate, self._model.problem
+        pair = self._pair()
+        if pair is None:
+            raise RequestError(f"there is no solution at mu = {self.mu.tolist()}: {self.status.value}: {self.reason}")
+        if certificate is None and self.mode is not CorrectionMode.NONE:
+            return Corrector(self._model.reduced, None, self.mode).in_full(self.mu, *pair)
+        if certificate is None or self.correction is None:
+            return Answer(*pair, self.bound)
+        v = certificate.corrected(pair[0], self.correction, contact_unknowns(problem))
+        return Answer(v, self.correction.nu, self.bound, is_corrected=True)
+
+    @cached_property
+    def outputs(self) -> dict[str, float]:
+        """Values of the problem's quantities of interest, by name; of the corrected pair where `answer` is one."""
+        pair = self.mu[None], self.u[:, None], self.lam[:, None]
+        return {output.name: float(output.values(*pair)[0]) for output in self._model.problem.outputs}
+
+    @property
+    def output_bounds(self) -> dict[str, float]:
+        """Bounds of the absolute errors of `outputs`, by name, from `bound`; infinite where there are none.
+
+        There are none without `bound`, of outputs that are not linear, and of those of λ without a bound in W.
+        """
+        bound, certificate, found = self.bound, self._model.certificate, self._model.output_weights
+        if bound is None or certificate is None:
+            return dict.fromkeys(found, inf)
+        return {
+            name: inf if weight is None else output_error_bound(weight, certificate.base, bound)
+            for name, weight in found.items()
+        }
+
+    @cached_property
+    def error_bounds(self) -> ErrorBounds:
+        """Proved bounds on the errors of u and λ in four norms, at the cost of high-fidelity factorisations at mu."""
+        cache = assemblies(self._model.problem)
+        alpha, beta = cache.coercivity_at(self.mu), cache.energy_inf_sup_at(self.mu)
+        return bound_errors_at(cache.at(self.mu), cache.energy_at(self.mu), alpha, beta, self.u, self.lam)
+
+    @cached_property
+    def high_fidelity_residuals(self) -> Residuals:
+        """Natural KKT residuals of the high-fidelity problem, at the same cost."""
+        cache = assemblies(self._model.problem)
+        return high_fidelity_residuals(cache.at(self.mu), cache.energy_at(self.mu), self.u, self.lam)
+
+
+def html(title: str, values: Mapping[str, Any]) -> str:
+    """A table of two columns, for notebooks."""
+    texts = ((name, f"{value:.3g}" if isinstance(value, float) else str(value)) for name, value in values.items())
+    body = "".join(f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in texts if text)
+    return f"<table><caption>{escape(title)}</caption><tbody>{body}</tbody></table>"
