@@ -81,9 +81,6 @@ def coarse_contact(solve: Callable[[Array], Array], vi: VariationalInequality) -
 # A factorisation is bordered and reused for active sets that differ from its own in at most so many constraints.
 MAX_BORDER = 16
 
-# Entries of a bordered system below this, relative to their terms, may consist of round-off alone.
-ROUND_OFF = 1e-12
-
 # From the active constraints to u (c,) and λ (m,): these are equalities, all other multipliers vanish.
 ActiveSolver = Callable[[Indices], tuple[Array, Array]]
 
@@ -506,8 +503,8 @@ def _definite_pivots(factor: SuperLU, last: int) -> Array | None:
     """The pivots of a saddle point system in natural order; `None` unless all have their signs beyond round-off."""
     pivots = np.asarray(factor.U.diagonal())
     size = len(pivots) - last
-    # Rows have length 1 and A the diagonal 1.
-    regular = np.all(pivots[:size] > 0.0) and np.all(pivots[size:] < -ROUND_OFF)
+    # Rows have length 1 and A the diagonal 1: smaller pivots may consist of round-off alone.
+    regular = np.all(pivots[:size] > 0.0) and np.all(pivots[size:] < -1e-12)
     natural = np.array_equal(factor.perm_r, np.arange(len(pivots)))
     return pivots if regular and natural else None
 
@@ -516,11 +513,11 @@ def _regular(schur: Array, sizes: Array) -> bool:
     """Whether a symmetric matrix (d×d) is far from singular and its diagonal above the round-off of its terms."""
     if not len(schur):
         return True
-    diagonal = np.abs(np.diag(schur))
-    if np.any(diagonal <= ROUND_OFF * sizes):
+    diagonal, round_off = np.abs(np.diag(schur)), 1e-12
+    if np.any(diagonal <= round_off * sizes):
         return False
     scale = np.sqrt(diagonal)
-    return bool(np.linalg.cond(schur / np.outer(scale, scale)) < 1.0 / np.sqrt(ROUND_OFF))
+    return bool(np.linalg.cond(schur / np.outer(scale, scale)) < 1.0 / np.sqrt(round_off))
 
 
 class ComplianceSolver:
