@@ -46,9 +46,7 @@ def constants(tree: ast.Module) -> Iterator[str]:
                         if is_number(value) or "default" in numbers_of(value))  # fmt: skip
         elif isinstance(node, ast.Dict):
             pairs = zip(node.keys, node.values, strict=True)
-            yield from (
-                f"{{{key.value!r}}}" for key, value in pairs if isinstance(key, ast.Constant) and is_number(value)
-            )
+            yield from (f"{{{key.value!r}}}" for key, one in pairs if isinstance(key, ast.Constant) and is_number(one))
         elif isinstance(node, ast.FunctionDef | ast.Lambda):
             defaults = [*node.args.defaults, *node.args.kw_defaults]
             yield from (f"a default of {getattr(node, 'name', 'lambda')}" for value in defaults if is_number(value))

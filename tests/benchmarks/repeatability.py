@@ -53,9 +53,7 @@ def spread(runs: list[pd.DataFrame], *, others: bool) -> str:
     factors = np.max(gains, axis=1) / np.min(gains, axis=1) - 1.0
     half, most, largest = np.quantile(factors, (0.5, 0.95, 1.0))
     within = np.mean(factors <= 0.15)
-    return (
-        f"{half:.1%}, {most:.1%}, {largest:.1%} (median, 95 %, largest of {len(gains)} rows); {within:.0%} within 15 %"
-    )
+    return f"{half:.1%}, {most:.1%}, {largest:.1%} (median, 95 %, largest of {len(gains)}); {within:.0%} within 15 %"
 
 
 def beyond_blocks(runs: list[PairedTiming], rows: pd.DataFrame, *, others: bool) -> float:

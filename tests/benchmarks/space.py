@@ -37,9 +37,7 @@ def reductions(resolution: str) -> dict[str, vibench.Reduction]:
     problem = vibench.create("problem", "hertz3d", {"resolution": resolution, "factorisation": "pardiso"})
     start, dual = time.process_time(), vibench.create("dual strategy", "mcpg")
     solved = high_fidelity_sweep(problem, problem.parameters.grid(*TRAINING))
-    print(
-        f"{resolution}: {problem.V.dim} unknowns, {len(solved.mu)} solutions in {time.process_time() - start:.1f} CPU s"
-    )
+    print(f"{resolution}: {problem.V.dim} unknowns, {len(solved.mu)} solutions in {time.process_time() - start:.1f} s")
     made = {}
     for name in ("decorrelated", "online-supremizers"):
         primal = vibench.create("primal strategy", name)

@@ -46,9 +46,7 @@ def plugins_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def ended(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     folder = tmp_path_factory.mktemp("odd")
-    done = vibench(
-        folder, "run", write_study(folder, STUDY), "--jobs", "1", "--out", "run", figures=True, timeout=300.0
-    )
+    done = vibench(folder, "run", write_study(folder, STUDY), "--jobs", "1", "--out", "run", figures=True, timeout=300)
     assert (done.returncode, done.stderr) == (0, "")
     return folder, done.stdout
 

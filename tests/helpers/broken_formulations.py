@@ -100,9 +100,7 @@ NeverConverges = _answering(
 SaysNotWhy = _answering(
     "SaysNotWhy", lambda answer, mu: replace(answer, outcome=Outcome.FAILED if mu[0] > 0.0 else Outcome.OK)
 )
-Rolls = _answering(
-    "Rolls", lambda answer, mu: replace(answer, x=answer.x * (1.0 + 1e-9 * np.random.default_rng().random()))
-)
+Rolls = _answering("Rolls", lambda one, mu: replace(one, x=one.x * (1.0 + 1e-9 * np.random.default_rng().random())))
 OfAnotherSize = _rebuilding("OfAnotherSize", lambda u, lam: (u[1:], lam))
 Pulls = _rebuilding("Pulls", lambda u, lam: (u, lam - 1e-12 * lam.max()))
 ForgetsTheMultiplier = _rebuilding("ForgetsTheMultiplier", lambda u, lam: (u, None))

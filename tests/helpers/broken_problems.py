@@ -109,9 +109,7 @@ OutputOfNothing = _variant(
 OutputOfAnotherSize = _variant(
     "OutputOfAnotherSize", outputs=property(lambda self: (Output("force", "N", lam=np.ones(self.W.dim + 1)),))
 )
-OutOfReach = _variant(
-    "OutOfReach", refuse=lambda self, mu, u, lam: "the force is more than the wire bears" if mu[0] > 7.0 else ""
-)
+OutOfReach = _variant("OutOfReach", refuse=lambda self, mu, u, lam: "more than the wire bears" if mu[0] > 7.0 else "")
 ContactOfNothing = _variant(
     "ContactOfNothing", contact=lambda self, mu: Contact(-self.mass, np.full(self.W.dim, self.depth * self.step))
 )

@@ -64,9 +64,7 @@ Boasts = _reducing(
 LastErrorAlone = _reducing(
     "LastErrorAlone", lambda cone, W: replace(cone, generators=cone.generators[:, ::-1].copy(), errors=cone.errors[-1:])
 )
-OneErrorTooFew = _reducing(
-    "OneErrorTooFew", lambda cone, W: replace(cone, errors=cone.errors[1:]) if cone.size > 1 else cone
-)
+OneErrorTooFew = _reducing("OneErrorTooFew", lambda c, W: replace(c, errors=c.errors[1:]) if c.size > 1 else c)
 Long = _reducing("Long", lambda cone, W: replace(cone, generators=cone.generators * 2.0))
 Draws = _reducing("Draws", _drawn)
 # Stops at twice the tolerance, and says so.
@@ -92,9 +90,7 @@ class DividesByZero(DualStrategy):
         count = snapshots.shape[1] if stop.size is None else stop.size
         with np.errstate(invalid="ignore"):
             chi = snapshots[:, :count] / W.norm(snapshots[:, :count])
-        distances = (
-            [project_on_cone(chi, theta, W).distance for theta in snapshots.T] if np.all(np.isfinite(chi)) else [0.0]
-        )
+        distances = [project_on_cone(chi, q, W).distance for q in snapshots.T] if np.all(np.isfinite(chi)) else [0.0]
         error = max(distances) / max(float(W.norm(snapshots).max()), 1e-300)
         return Cone(chi, np.array([error]), np.zeros(chi.shape[1], dtype=bool))
 

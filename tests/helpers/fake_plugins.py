@@ -65,9 +65,7 @@ class UnevenWire(Wire):
 
     def assemble(self, mu: Array) -> VariationalInequality:
         vi, x = super().assemble(mu), np.linspace(0.0, np.pi, self.V.dim)
-        return VariationalInequality(
-            vi.A, vi.f * (1.0 + 0.5 * np.sin(2.0 * np.pi * mu[0]) ** 2 * np.cos(x)), vi.B, vi.g
-        )
+        return VariationalInequality(vi.A, vi.f * (1.0 + 0.5 * np.sin(2 * np.pi * mu[0]) ** 2 * np.cos(x)), vi.B, vi.g)
 
     def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
         return lambda mu: {"f": self.assemble(mu).f[wanted["f"][0]]}

@@ -147,16 +147,12 @@ MEASURED = (
 def numbers(folder: Path) -> dict[str, pd.DataFrame]:
     """The tables of a run without seconds, memory, and what follows from them; in an order of their own."""
     found = {table: pd.read_csv(folder / "tables" / f"{table}.csv") for table in TABLES}
-    return {
-        table: frame[[name for name in frame.columns if not name.endswith(MEASURED)]] for table, frame in found.items()
-    }
+    return {table: rows[[name for name in rows if not name.endswith(MEASURED)]] for table, rows in found.items()}
 
 
 def without_seconds(row: Mapping[str, Any]) -> dict[str, Any]:
     """A row without seconds, memory, and what follows from them."""
-    return {
-        name: value for name, value in row.items() if not name.endswith((*MEASURED, "timing_rounds", "timing_reason"))
-    }
+    return {name: row[name] for name in row if not name.endswith((*MEASURED, "timing_rounds", "timing_reason"))}
 
 
 def assert_same_numbers(one: Path, other: Path) -> None:

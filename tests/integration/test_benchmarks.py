@@ -191,10 +191,7 @@ def test_plugins_are_chosen_by_the_names_of_lists(register: Register) -> None:
     ):  # fmt: skip
         with pytest.raises(RequestError, match=words):
             benchmarks.chosen_plugins([name])
-    register(
-        ("vibench.problems", "same", "fake_plugins:Wire"),
-        ("vibench.dual_strategies", "same", "vibench_strategies.cpg:CPG"),
-    )
+    register(*((f"vibench.{group}", "same", "fake_plugins:Wire") for group in ("problems", "dual_strategies")))
     with pytest.raises(RequestError, match="say problem:same or dual:same"):
         benchmarks.chosen_plugins(["same"])
 

@@ -189,18 +189,14 @@ def test_the_reference_has_a_line_for_every_column_and_the_pages_have_all_its_ta
 
 
 def test_the_site_leads_to_every_page() -> None:
-    listed = set(
-        re.findall(r"^ +- [^:\n]+: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
-    )
+    listed = set(re.findall(r"^ +- [^:\n]+: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.M))
     results = {page.relative_to(ROOT).as_posix() for page in RESULTS[1:]}
     assert listed == {page.relative_to(DOCS).as_posix() for page in PAGES} | results
 
 
 STUDY_PAGE = blocks(DOCS / "study.md")
 EXAMPLE = next(text for _, title, text in STUDY_PAGE if title == "my-study.toml")
-RULES = [
-    (change[2], refused[2]) for change, refused in pairwise(STUDY_PAGE) if change[0] == "toml" and refused[0] == "text"
-]
+RULES = [(one[2], refused[2]) for one, refused in pairwise(STUDY_PAGE) if (one[0], refused[0]) == ("toml", "text")]
 
 
 def test_the_example_of_the_reference_is_a_study_and_its_rules_are_rules(tmp_path: Path) -> None:

@@ -41,10 +41,7 @@ def again(first: Path, tmp_path: Path) -> Path:
 
 def test_results_are_where_the_study_is_named_and_a_second_run_does_nothing_new(vibench: Vibench, again: Path) -> None:
     folder = again / "runs" / "wire"
-    assert {path.name for path in (folder / "tables").iterdir()} == {
-        *(f"{table}.csv" for table in TABLES),
-        "summary.md",
-    }
+    assert {one.name for one in (folder / "tables").iterdir()} == {*(f"{table}.csv" for table in TABLES), "summary.md"}
     assert list((folder / "figures").glob("*.png"))
     before = {table: rows(again / "runs" / "wire", table) for table in TABLES if table != "histories"}
     printed, _ = run_again(vibench, again)
@@ -198,10 +195,7 @@ def test_edits_beside_numbers_run_nothing(
     plugins_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Figures, help texts, the report and the tables may change: the run is complete, and its models open."""
-    package, edited_core = (
-        Path(str(importlib.util.find_spec("vibench").submodule_search_locations[0])),
-        tmp_path / "core",
-    )
+    package, edited_core = Path(importlib.util.find_spec("vibench").submodule_search_locations[0]), tmp_path / "core"
     # First on the path the copy takes the place of what is installed; its bytecode would take seconds to make.
     shutil.copytree(package, edited_core / "vibench")
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))

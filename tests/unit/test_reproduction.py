@@ -219,10 +219,7 @@ def judged_under_figures() -> list[tuple[str, str, str]]:
 def test_both_pages_of_the_paper_agree_on_every_claim_that_they_share(page: str) -> None:
     under_figures = judged_under_figures()
     assert len(under_figures) > 100
-    rows = {
-        (unescaped(row["claim"]).partition(": ")[2], unescaped(row["ours"]), row["verdict"])
-        for row in ROW.finditer(page)
-    }
+    rows = {(unescaped(r["claim"]).partition(": ")[2], unescaped(r["ours"]), r["verdict"]) for r in ROW.finditer(page)}
     assert [claim for claim in under_figures if claim not in rows] == []
 
 

@@ -103,11 +103,7 @@ def test_a_page_made_anew_is_as_light(quick_run: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     written, page = set(folder.iterdir()), folder / "README.md"
     assert written == {page, *linked(page)}
-    assert {path.name for path in written if path.suffix == ".csv"} == {
-        "cells.csv",
-        "thresholds.csv",
-        "disagreements.csv",
-    }
+    assert {one.name for one in written if one.suffix == ".csv"} == {"cells.csv", "thresholds.csv", "disagreements.csv"}
     pictures = [path for path in written if path.suffix == ".png"]
     kinds = ("total-cost", "work-precision", "mcpg-inf-sup", "cpg-inf-sup")
     names = {f"{problem}-{kind}" for problem in ("obstacle", "hertz") for kind in kinds}
@@ -159,9 +155,7 @@ def test_numbers_at_logarithmic_axes_are_text() -> None:
     with styled():
         figure = script.draw(rows[rows["over"] == "mesh"], "n")
         figure.draw_without_rendering()
-        labels = [
-            text.get_text() for axes in figure.axes for text in (*axes.get_xticklabels(), *axes.get_yticklabels())
-        ]
+        labels = [text.get_text() for ax in figure.axes for text in (*ax.get_xticklabels(), *ax.get_yticklabels())]
     assert "10³" in labels
     assert not [label for label in labels if "$" in label]
 

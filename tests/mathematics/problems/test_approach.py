@@ -55,9 +55,7 @@ def test_at_the_approach_of_the_paper_it_is_the_problem_of_the_paper() -> None:
 
 def test_at_a_fixed_approach_nothing_has_changed_to_the_last_bit() -> None:
     mu = np.array([0.8])
-    upper, lower = (
-        side[:, disc.zone] for side, disc in zip(PAPER.points(mu), (PAPER.slave, PAPER.master), strict=True)
-    )
+    upper, lower = (x[:, disc.zone] for x, disc in zip(PAPER.points(mu), (PAPER.slave, PAPER.master), strict=True))
     integrals = Pairing(upper, "exact").couple(lower)
     lift = np.repeat([-0.09, 0.09], [upper.shape[1], lower.shape[1]])
     assert np.array_equal(PAPER.assemble(mu).g, integrals.gap - integrals.jump @ lift)

@@ -176,9 +176,7 @@ def test_the_pressure_is_that_of_the_obstacle_carried_along() -> None:
         exact = 1.0 + 5.0 / (mu[0] * np.abs(1.0 + mu[3] * z / RADIUS)) ** 2
         weights, deep = -problem.contact(mu).B.sum(axis=0), np.abs(z) < 0.3 * RADIUS
         sides = [deep & (mu[3] * z.real < -1e-9), deep & (mu[3] * z.real > 1e-9)]
-        carried, expected = (
-            [weights[side] @ p[side] / weights[side].sum() for side in sides] for p in (found.lam, exact)
-        )
+        carried, expected = ([weights[k] @ p[k] / weights[k].sum() for k in sides] for p in (found.lam, exact))
         assert carried == pytest.approx(expected, rel=0.04)
         assert expected[0] > 1.1 * expected[1]  # lengths are shorter on one side, so the obstacle is steeper
         picture = problem.picture(mu, found.u, found.lam)

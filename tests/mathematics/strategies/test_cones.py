@@ -201,9 +201,7 @@ def test_a_generator_that_the_others_contain_is_dropped(monkeypatch: pytest.Monk
     """CPG itself chooses none; a greedy algorithm that knew the others only later would."""
     a, b, c = np.eye(12)[:, 0], np.eye(12)[:, 4], np.eye(12)[:, 8]
     chi = np.column_stack([a, a + b, b, c])
-    monkeypatch.setattr(
-        enlarged_cpg, "greedy_cone", lambda *_: Cone(chi / W.norm(chi), np.ones(5), np.zeros(4, dtype=bool))
-    )
+    monkeypatch.setattr(enlarged_cpg, "greedy_cone", lambda *_: Cone(chi / W.norm(chi), np.ones(5), np.zeros(4, bool)))
     cone = EnlargedCPG().reduce(chi, W, Stop(size=4))
     assert cone.size == 3
     assert cone.errors[-1] < 1e-9

@@ -103,8 +103,6 @@ def test_a_parameter_has_no_name_of_a_constant_or_function(name: str) -> None:
 
 
 def test_names_are_compared_as_python_compares_them() -> None:
-    assert (
-        Expression.parse("2 * \u00b5", ("\u03bc",))([3.0]) == Expression.parse("2 * \u03bc", ("\u00b5",))([3.0]) == 6.0
-    )
+    assert Expression.parse("2 * \u00b5", ["\u03bc"])([3.0]) == Expression.parse("2 * \u03bc", ["\u00b5"])([3.0]) == 6.0
     with pytest.raises(RequestError, match="two parameters have the same name: \u03bc, \u03bc"):
         Expression.parse("1", ("\u00b5", "\u03bc"))

@@ -72,9 +72,7 @@ def test_steps_are_computed_once_and_only_when_asked_for(reduce: partial[vibench
             calls.append("cone")
             return vibench.greedy_cone(snapshots, W, stop)
 
-    reduction = vibench.Reduction(
-        reduce().problem, Counting(), None, vibench.Stop(size=2), vibench.Stop(size=2), training=Few()
-    )
+    reduction = vibench.Reduction(reduce().problem, Counting(), None, *[vibench.Stop(size=2)] * 2, training=Few())
     assert reduction.pod.basis.shape[1] == 2
     assert not calls
     assert reduction.cone is reduction.cone
@@ -114,9 +112,7 @@ def test_steps_after_given_ones_follow_them(reduce: partial[vibench.Reduction], 
 
 
 def test_training_sets_of_sampling_strategies(reduce: partial[vibench.Reduction]) -> None:
-    drawn = vibench.Reduction(
-        reduce().problem, reduce().dual, None, vibench.Stop(size=2), vibench.Stop(size=2), training=Few()
-    )
+    drawn = vibench.Reduction(reduce().problem, reduce().dual, None, *[vibench.Stop(size=2)] * 2, training=Few())
     assert np.array_equal(drawn.snapshots.mu, drawn.parameters)
     assert len(drawn.parameters) == 2**drawn.problem.parameters.dim
     adaptive = vibench.Reduction(

@@ -37,9 +37,7 @@ PROBLEMS: Mapping[str, Callable[[], Problem]] = {
 @pytest.fixture(autouse=True)
 def _registered(monkeypatch: pytest.MonkeyPatch) -> None:
     create = Plugin.create
-    monkeypatch.setattr(
-        Plugin, "create", lambda plugin: PROBLEMS[plugin.name]() if plugin.kind == "problem" else create(plugin)
-    )
+    monkeypatch.setattr(Plugin, "create", lambda one: PROBLEMS[one.name]() if one.kind == "problem" else create(one))
 
 
 def plugin(kind: str, name: str) -> Plugin:

@@ -106,9 +106,7 @@ def test_a_cell_too_large_is_assessed_in_parts(
     carry_out(stage, store)
     whole, sizes = value_of(store, stage), []
     monkeypatch.setattr(Assemblies, "together", lambda *_: 3)
-    monkeypatch.setattr(
-        cell_queries, "error_columns", lambda *given: (sizes.append(len(given[1])), error_columns(*given))[1]
-    )
+    monkeypatch.setattr(cell_queries, "error_columns", lambda *a: (sizes.append(len(a[1])), error_columns(*a))[1])
     found = stage.run(store).value
     assert sizes == [3, 1]
     online = ("bound_online_u_energy",) if certified else ()

@@ -135,9 +135,7 @@ def test_a_cell_of_a_nested_strategy_is_the_cell_built_alone(store: SampleStore,
     for name in ("error_u_mean", "error_lambda_mean", "beta_span_min", "beta_cone_upper_min"):
         assert found[name] == pytest.approx(expected[name], rel=1e-6), name
     assert found["assembly_error_max"] < 1e-5
-    histories = [
-        {h.quantity: h.values for h in store.get(stage.key).histories} for stage in (alone.built.enrichment, enrichment)
-    ]
+    histories = [{h.quantity: h.values for h in store.get(stage.key).histories} for stage in (parts, enrichment)]
     assert histories[0].keys() == histories[1].keys()
     for quantity, values in histories[0].items():
         assert histories[1][quantity] == pytest.approx(values, rel=1e-9), quantity

@@ -143,9 +143,7 @@ def test_a_high_fidelity_solution_is_repeated_next_to_its_parameter(
     role: Literal["training", "validation"], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     visited, plain = list[tuple[float, ...]](), snapshots.checked_assembly
-    monkeypatch.setattr(
-        snapshots, "checked_assembly", lambda problem, mu: (visited.append(tuple(mu)), plain(problem, mu))[1]
-    )
+    monkeypatch.setattr(snapshots, "checked_assembly", lambda one, mu: (visited.append(tuple(mu)), plain(one, mu))[1])
     problem = Plugin("problem", "obstacle", '{"resolution": 150}', "repeats")
     snapshots._set_up.cache_clear()  # with the set-up, beside which a training solution is repeated
     found = SnapshotStage(problem, ParameterSet(role, 6, 3), 0).run(Store(tmp_path)).value

@@ -155,9 +155,7 @@ def test_high_fidelity_solutions_start_as_in_the_sweep(store: SampleStore, monke
     reference = gather(store, stage.cells[0].validation)
     starts: list[Any] = []
     solve = marginal_solutions.solve_unverified
-    monkeypatch.setattr(
-        marginal_solutions, "solve_unverified", lambda *given: (starts.append(given[2]), solve(*given))[1]
-    )
+    monkeypatch.setattr(marginal_solutions, "solve_unverified", lambda *a: (starts.append(a[2]), solve(*a))[1])
     marginal = MarginalSolutions(PROBLEM.create(), reference, 1)
     assert all(one.seconds and one.seconds.cpu > one.assembly.cpu for one in (marginal.solve(k, 0) for k in EVERY))
     sources = [[1], [0], [2], [3], [5], [4]]  # in parts of two, one, one and two
@@ -373,9 +371,7 @@ def test_reduced_programs_are_assembled_nowhere_twice(store: SampleStore, monkey
     monkeypatch.setattr(registry, "qp_solver", lambda name: {name: Remembers()})
     visited: list[tuple[float, ...]] = []
     plain = HyperReducedModel.assemble
-    monkeypatch.setattr(
-        HyperReducedModel, "assemble", lambda model, mu: (visited.append(tuple(mu)), plain(model, mu))[1]
-    )
+    monkeypatch.setattr(HyperReducedModel, "assemble", lambda one, mu: (visited.append(tuple(mu)), plain(one, mu))[1])
     TimingRounds(OF_THREE, (EVERY[:3],) * 4, 12, first=0).run(store)
     assert len(visited) == len(set(visited)) == 2 * (12 + 1)
     assert len({tuple(np.round(mu, 6)) for mu in visited}) == 3

@@ -104,9 +104,7 @@ def test_an_array_of_points_is_no_larger_than_its_file(shape: tuple[int, ...], t
 def test_the_columns_of_a_file_are_compared_as_names_in_expressions_are(tmp_path: Path) -> None:
     (tmp_path / "points.csv").write_text("\u00b5\n0.5\n", encoding="utf-8")
     box = ParameterBox(("\u03bc",), np.zeros(1), np.ones(1), ("1",))
-    assert plugin("file", json.dumps({"path": str(tmp_path / "points.csv")})).create().parameters(box).tolist() == [
-        [0.5]
-    ]
+    assert plugin("file", json.dumps({"path": f"{tmp_path}/points.csv"})).create().parameters(box).tolist() == [[0.5]]
 
 
 BAD: dict[str, tuple[tuple[str, Any], list[str]]] = {

@@ -33,9 +33,7 @@ def entropy() -> int:
 
 Transposed = variant("Transposed", lambda self, box: box.sample(self.size, self.seed).T)
 Outside = variant("Outside", lambda self, box: box.sample(self.size, self.seed) + (box.upper - box.lower))
-Twice = variant(
-    "Twice", lambda self, box: np.repeat(box.sample((self.size + 1) // 2, self.seed), 2, axis=0)[: self.size]
-)
+Twice = variant("Twice", lambda self, box: box.sample((self.size + 1) // 2, self.seed).repeat(2, axis=0)[: self.size])
 PerAxis = variant("PerAxis", lambda self, box: box.grid(*[self.size] * box.dim))  # takes its size for that of an axis
 Unseeded = variant("Unseeded", lambda self, box: box.sample(self.size, entropy()))
 Deaf = variant("Deaf", lambda self, box: box.sample(self.size, 1))
