@@ -60,16 +60,8 @@ class ArrayFiles:
 
     A sparse matrix is a Matrix Market file, or several arrays: those of `scipy.sparse.save_npz`, or a group NAME of
     `data`, `indices`, `indptr`, `shape` and `format` ("csr" or "csc"), or of `row`, `col`, `data` and `shape`. The
-    sizes that files declare are added up before anything is read.
-
-    Parameters
-    ----------
-    folder
-        The folder.
-    index_base
-        0 or 1, the first index of index arrays, of `row` and of `col`.
-    limit
-        Bytes that all arrays together may take.
+    sizes that files declare are added up before anything is read, and may be `limit` bytes. `index_base`, 0 or 1, is
+    the first index of index arrays, of `row` and of `col`.
     """
 
     def __init__(self, folder: Path, index_base: int, limit: int) -> None:

@@ -179,21 +179,18 @@ def _explained(pack: ModelPack, given: PackSolutions, k: int) -> RequestError:
     solution, tolerance = _Solution.from_pack(pack, given, k), given.tolerance
     title = f"solutions: column {k}, mu = {given.parameters[k].tolist()}, does not solve the problem"
     # Possible mistakes, each with the change that corrects it; a change of one sign comes before one of several.
-    weighted = replace(solution, lam=pack.W.apply(solution.lam))
+    reversed_ = solution.change(B=-1.0, g=-1.0, lam=-1.0)
+    weighted, coefficients = (replace(solution, lam=change(solution.lam)) for change in (pack.W.apply, pack.W.riesz))
     mistakes = {
         "λ has the other sign: with B u ≤ g, A u + Bᵀλ = f and λ ≥ 0": solution.change(lam=-1.0),
         "the constraints are B u ≥ g: write B and g with the other sign": solution.change(B=-1.0, g=-1.0),
-        "the constraints are B u ≥ g and λ ≤ 0: write B, g and λ with the other sign": solution.change(
-            B=-1.0, g=-1.0, lam=-1.0
-        ),
+        "the constraints are B u ≥ g and λ ≤ 0: write B, g and λ with the other sign": reversed_,
         "f has the other sign": solution.change(f=-1.0),
         "g has the other sign": solution.change(g=-1.0),
         "B has the other sign": solution.change(B=-1.0),
         "u has the other sign": solution.change(u=-1.0),
         "the energy has no factor ½: write 2A, or f, g and λ to match": solution.change(A=2.0),
-        "λ are nodal forces or moments ∫ λ·φ: write the coefficients X_W⁻¹ λ": replace(
-            solution, lam=pack.W.riesz(solution.lam)
-        ),
+        "λ are nodal forces or moments ∫ λ·φ: write the coefficients X_W⁻¹ λ": coefficients,
         "λ are coefficients, but B has not been multiplied by X_W, or the other way round": weighted,
     }
     for meant, changed in mistakes.items():

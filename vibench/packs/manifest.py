@@ -34,9 +34,7 @@ class PointSet(_Table):
 
     array: Annotated[str | None, Field(description="An array (P×d).")] = None
     points: Annotated[Points | None, Field(description="A list of points.")] = None
-    grid: Annotated[
-        list[Annotated[int, Ge(1)]] | None, Field(description="Points of a regular grid per parameter.")
-    ] = None
+    grid: Annotated[list[Annotated[int, Ge(1)]] | None, Field(description="Points of a grid per parameter.")] = None
 
     @model_validator(mode="before")
     @classmethod
@@ -80,9 +78,9 @@ class Member(_Table):
 
     constant: Annotated[str | None, Field(description="An array that does not depend on the parameter.")] = None
     affine: Annotated[list[Term] | None, MinLen(1), Field(description="Terms of an affine sum.")] = None
-    each: Annotated[
-        str | None, Field(description="Arrays by listed parameter; {} stands for its number. Vectors: or columns.")
-    ] = None
+    each: Annotated[str | None, Field(description="Arrays by listed parameter, {} its number; vectors: columns.")] = (
+        None
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -100,13 +98,9 @@ class Spaces(_Table):
 
     X_V: Annotated[str | None, Field(description="Gram matrix of the primal space (n×n).")] = None
     X_W: Annotated[str, Field(description="Gram matrix of the multiplier space (m×m).")]
-    free: Annotated[
-        str | None, Field(description="Indices of the free unknowns, if the arrays have those of Dirichlet, too.")
-    ] = None
+    free: Annotated[str | None, Field(description="Indices of the free unknowns, if arrays have others, too.")] = None
     contact: Annotated[str | None, Field(description="Indices of the unknowns B touches; by default found.")] = None
-    integrals: Annotated[
-        str | None, Field(description="Integrals (m,) of the multiplier functions; by default X_W applied to ones.")
-    ] = None
+    integrals: Annotated[str | None, Field(description="Integrals (m,) of multiplier functions; else X_W·1.")] = None
 
 
 class Operators(_Table):
@@ -127,9 +121,7 @@ class Solutions(_Table):
 
     u: Annotated[str | None, Field(description="Solutions (n×P).")] = None
     lam: Annotated[str, Field(description="Multipliers (m×P).")]
-    parameters: Annotated[
-        PointSet | None, Field(description="Their parameters; by default the listed ones, or the training set.")
-    ] = None
+    parameters: Annotated[PointSet | None, Field(description="Their parameters; else the listed, or training.")] = None
     tolerance: Annotated[float, Gt(0.0), AllowInfNan(False), Field(description="Largest relative KKT residual.")] = 1e-6
 
 
@@ -139,7 +131,7 @@ class Mesh(_Table):
     file: Annotated[str, Field(description="A file with the whole mesh that meshio reads, such as .vtu or .msh.")]
     points: Annotated[str, Field(description="Indices (k,) of mesh points.")]
     unknowns: Annotated[
-        str | None, Field(description="Indices (k,) of the unknowns drawn at these points; by default all in order.")
+        str | None, Field(description="Indices (k,) of the unknowns there; by default all in order.")
     ] = None
     positions: Annotated[str, Field(description="Points of the multipliers (m×1 or m×2).")]
     value: Annotated[str, Field(description="Name of the solution, with its unit.")] = "u"

@@ -40,10 +40,7 @@ class Listing:
         return distance <= 1e-8
 
     def number(self, mu: Array) -> int:
-        """Number of the listed parameter that equals mu (d,).
-
-        Raises a `NumericalError` if there is none.
-        """
+        """Number of the listed parameter that equals mu (d,); raises a `NumericalError` if there is none."""
         away = np.abs((self.parameters - mu) / self.widths).max(axis=1)
         nearest = int(away.argmin())
         if not self._are_same(away[nearest]):
@@ -124,7 +121,6 @@ class PackMember:
         return lambda mu: values[0 if listing is None else listing.number(mu)]
 
     def mapped(self, change: Callable[[Any], Any]) -> PackMember:
-        """The member with all its arrays changed."""
         # Linear maps commute with the coefficients of a sum.
         return replace(self, arrays=tuple(map(change, self.arrays)))
 

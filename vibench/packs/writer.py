@@ -26,27 +26,13 @@ _save_arrays: Callable[..., None] = partial(np.savez_compressed, allow_pickle=Fa
 def write_pack(
     problem: Problem, folder: Path, *, name: str, source: str, validation: int, seed: int, solutions: bool = False
 ) -> None:
-    """Write a pack of a problem at its training set and its validation set.
+    """Write a pack of a problem at its training set and its validation set into a new folder, whole or not at all.
 
-    Parameters
-    ----------
-    problem
-        The problem.
-    folder
-        The folder to be made; it is made whole or not at all.
-    name, source
-        What the manifest says about the origin.
-    validation, seed
-        Number of validation parameters, and the seed they are drawn with.
-    solutions
-        Whether to solve at every parameter and add the solutions.
+    The manifest has `name` and `source`. `validation` parameters are drawn with `seed`; with `solutions` the problem is
+    solved at every parameter, and the solutions are added.
 
-    Raises
-    ------
-    RequestError
-        If the folder exists.
-    NumericalError
-        If an assembly is invalid, or a parameter has no solution.
+    Raises a `RequestError` if the folder exists, and a `NumericalError` if an assembly is invalid or a parameter has no
+    solution.
     """
     training = training_parameters(problem)
     listed = np.vstack([training, validation_parameters(problem, validation, seed)])
@@ -54,16 +40,10 @@ def write_pack(
         lines = [f"format = {VERSION}", f"name = {_toml_text(name)}", f"source = {_toml_text(source)}", ""]
         box = problem.parameters
         _save_arrays(part / "parameters.npz", training=training, validation=listed[len(training) :])
-        lines += [
-            "[parameters]",
-            f"names = [{', '.join(map(_toml_text, box.names))}]",
-            f"units = [{', '.join(map(_toml_text, box.units))}]",
-            f"lower = {box.lower.tolist()}",
-            f"upper = {box.upper.tolist()}",
-            'training = "parameters.npz:training"',
-            'validation = "parameters.npz:validation"',
-            "",
-        ]
+        names, units = (", ".join(map(_toml_text, texts)) for texts in (box.names, box.units))
+        lines += ["[parameters]", f"names = [{names}]", f"units = [{units}]"]
+        lines += [f"lower = {box.lower.tolist()}", f"upper = {box.upper.tolist()}"]
+        lines += [f'{role} = "parameters.npz:{role}"' for role in ("training", "validation")] + [""]
         lines += _space_table(problem, part) + _operator_table(problem, listed, part)
         if solutions:
             solver = HighFidelitySolver(problem)

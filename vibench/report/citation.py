@@ -17,23 +17,16 @@ from vibench.text import unbroken
 
 @dataclass(frozen=True)
 class Citation:
-    """Citation of a site.
+    """Citation of a site; raises a `RequestError` if the DOI or the date is none.
 
     Attributes
     ----------
     authors
         Names, "Family, Given" for persons; without a comma the name of a group.
-    doi
-        DOI of the deposit, "" if there is none yet.
-    url
-        Address of the site, "" if it has none yet.
+    doi, url
+        DOI of the deposit and address of the site, "" if there is none yet.
     date
         Date of publication, "2026-11-26" or only the year; "" if it is unknown.
-
-    Raises
-    ------
-    RequestError
-        If the DOI or the date is none.
     """
 
     title: str

@@ -52,7 +52,6 @@ class Comparison:
 
     @property
     def regressions(self) -> int:
-        """Number of changes for the worse."""
         return int((self.changes["verdict"] == ChangeKind.WORSE).sum())
 
     def table(self, name: str) -> pd.DataFrame:
@@ -91,22 +90,15 @@ class Comparison:
         first, everywhere = self.runs[0], set.intersection(*(set(run.cells) for run in self.runs))
         names = dict.fromkeys(name for run in self.runs for name in run.versions)
         differing = [name for name in names if len({run.versions.get(name, "") for run in self.runs}) > 1]
-        rows = [
-            {
-                "run": run.name,
-                **run.identity,
-                "cells": len(run.cells),
-                "ok": run.ok,
-                "in all runs": len(everywhere),
-                "only here": len(set(run.cells).difference(*(o.cells for o in self.runs if o is not run))),
-                "machine": "; ".join(run.machines),
-                "same code": sum(
-                    run.cells[key]["code"] == row["code"] for key, row in first.cells.items() if key in run.cells
-                ),
+        rows = []
+        for run in self.runs:
+            alone = set(run.cells).difference(*(one.cells for one in self.runs if one is not run))
+            same = sum(run.cells[key]["code"] == row["code"] for key, row in first.cells.items() if key in run.cells)
+            rows.append({
+                "run": run.name, **run.identity, "cells": len(run.cells), "ok": run.ok, "in all runs": len(everywhere),
+                "only here": len(alone), "machine": "; ".join(run.machines), "same code": same,
                 **{name: run.versions.get(name, "") for name in differing},
-            }
-            for run in self.runs
-        ]
+            })  # fmt: skip
         return pd.DataFrame(rows)
 
     @property
@@ -130,11 +122,8 @@ class Comparison:
         for run in self.runs:
             for key in run.cells:
                 having[key].append(run)
-        rows = [
-            _named(some[0].cells[key]) | {run.name: value(run, key) for run in self.runs}
-            for key, some in having.items()
-            if len(some) in counts
-        ]
+        chosen = {key: some[0].cells[key] for key, some in having.items() if len(some) in counts}
+        rows = [_named(cell) | {run.name: value(run, key) for run in self.runs} for key, cell in chosen.items()]
         return pd.DataFrame(rows, columns=[*AXES, "cell", *(run.name for run in self.runs)])
 
 

@@ -48,12 +48,10 @@ class ComparedRun:
 
     @property
     def ok(self) -> int:
-        """Number of cells that are ok."""
         return sum(row["status"] == Status.OK for row in self.cells.values())
 
     @property
     def machines(self) -> list[str]:
-        """Machines that measured its seconds."""
         return sorted({str(row["machine"]) for row in self.cells.values() if row["machine"]})
 
     @cached_property
@@ -89,18 +87,14 @@ class ComparedRun:
 
     def measured_beside(self, other: ComparedRun, unless: Sequence[ComparedRun]) -> list[str]:
         """Cells whose seconds compare with those of the other run, and with those of none of the runs `unless`."""
-        found = {key: self.measured_by(key) for key in self.cells}
-        return [
-            key
-            for key, instrument in found.items()
-            if other.measured_by(key) == instrument and all(run.measured_by(key) != instrument for run in unless)
-        ]
+        others = [{run.measured_by(key) for run in unless} for key in self.cells]
+        mine = [(key, self.measured_by(key), several) for key, several in zip(self.cells, others, strict=True)]
+        return [key for key, one, several in mine if other.measured_by(key) == one and one not in several]
 
     def measured_by(self, cell: str) -> tuple[str, str] | None:
         """Machine and version of the benchmark protocol that measured a cell; `None` without it."""
-        if cell not in self.cells:
+        if (row := self.cells.get(cell)) is None:
             return None
-        row = self.cells[cell]
         versions = json.loads(row["versions"]) if isinstance(row["versions"], str) else {}
         return str(row["machine"]), str(versions.get("protocol", ""))
 
@@ -147,7 +141,6 @@ class ChangeKind(StrEnum):
 
     @property
     def is_change(self) -> bool:
-        """Whether it is listed as a change."""
         return self in (ChangeKind.CHANGED, ChangeKind.BETTER, ChangeKind.WORSE)
 
 
@@ -196,14 +189,9 @@ def _solvers_part(cell: Mapping[str, Any], error: str) -> float:
 
 
 def _verdict(
-    before: Any,
-    after: Any,
-    limit: float,
-    *,
-    floor: float | None = None,
-    allowed: float | None = None,
+    before: Any, after: Any, limit: float, *, floor: float | None = None, allowed: float | None = None,
     more_is_better: bool = False,
-) -> ChangeKind | None:
+) -> ChangeKind | None:  # fmt: skip
     """Verdict on a number, `None` if neither run has it; `floor` replaces smaller ones, `allowed` is the accuracy."""
     if pd.isna(after):
         # A number that is gone is worse than any other.

@@ -115,12 +115,10 @@ def _whole_run(read: Mapping[str, pd.DataFrame]) -> Iterator[tuple[Weight, str]]
     if agreement := agreement_sentence(disagreements, cells["solver"].nunique()):
         flagged = bool(disagreements["flagged"].sum())
         yield Weight.ALARM if flagged else Weight.WHOLE_RUN, f"{agreement[:1].upper()}{agreement[1:]}."
+    more = "More training parameters, a smaller interpolation tolerance or full assembly would help."
     remedies: Mapping[Literal["solver", "assembly"], tuple[str, str]] = {
         "solver": ("the QP solver makes", "A smaller accuracy would help."),
-        "assembly": (
-            "reduced assembly makes",
-            "More training parameters, a smaller interpolation tolerance or full assembly would help.",
-        ),
+        "assembly": ("reduced assembly makes", more),
     }
     for source, (what, remedy) in remedies.items():
         if len(loose := cells[too_loose(cells, source)]):

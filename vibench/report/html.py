@@ -123,16 +123,13 @@ def _disturbed(keys: pd.Series, cells: pd.DataFrame) -> tuple[int, ...]:
 
 
 def _columnar(grid: TableGrid) -> dict[str, Any]:
+    named = {str(name): grid.frame[name] for name in grid.frame.columns}
     return {
-        "rows": len(grid.frame),
-        "columns": [
-            {"meaning": grid.meaning(str(name))} | _column(str(name), grid.frame[name]) for name in grid.frame.columns
-        ],
+        "rows": len(grid.frame), "hidden": sorted(set(grid.hidden)), "disturbed": list(grid.disturbed),
+        "columns": [{"meaning": grid.meaning(name)} | _column(name, values) for name, values in named.items()],
         # A list of more than 60 texts is no convenient filter.
         "axes": [name for name in grid.axes if 1 < grid.frame[name].nunique() <= 60],
-        "hidden": sorted(set(grid.hidden)),
-        "disturbed": list(grid.disturbed),
-    }
+    }  # fmt: skip
 
 
 def _column(name: str, values: pd.Series) -> dict[str, Any]:

@@ -42,8 +42,7 @@ def _write_cleaned(path: Path, copy: Path) -> None:
     folders = sorted((str(one) for one in parents if len(one.parts) > 2), key=len, reverse=True)
     inside = [re.compile(rf"(?<!\w){re.escape(folder)}(?![\w-])") for folder in folders]
     texts = {
-        table: [name for name, column in columns.items() if column.kind == SqlType.TEXT]
-        for table, columns in STORED.items()
+        table: [name for name in columns if columns[name].kind == SqlType.TEXT] for table, columns in STORED.items()
     }
     with closing(sqlite3.connect(copy)) as db, db:
         db.text_factory = text_reader()
@@ -106,9 +105,8 @@ def _clean(db: sqlite3.Connection, table: str, column: str, folders: Sequence[re
     """Clean the values of a column; returns the number of changed ones."""
     # An absolute path of two parts at least, in a text or in JSON.
     path = re.compile(r"""(?<![\w./])(?:/[^/\s'"`\\:;,<>|()\[\]{}]+){2,}/?""")
-    values = db.execute(
-        f'SELECT DISTINCT CAST("{column}" AS BLOB) FROM "{table}" WHERE "{column}" IS NOT NULL'
-    ).fetchall()
+    query = f'SELECT DISTINCT CAST("{column}" AS BLOB) FROM "{table}" WHERE "{column}" IS NOT NULL'
+    values = db.execute(query).fetchall()
     # Values that identify rows must stay different, so that names in them stay.
     identifies = column in {*KEYS, "cell", "solver_a", "solver_b", "status"}
     names = [] if identifies else [pattern for *_, pattern in _identities()]
@@ -123,10 +121,8 @@ def _clean(db: sqlite3.Connection, table: str, column: str, folders: Sequence[re
             new = name.sub("…", new)
         if new != text:
             changed += 1
-            db.execute(
-                f'UPDATE "{table}" SET "{column}" = CAST(? AS TEXT) WHERE CAST("{column}" AS BLOB) = ?',
-                (new.encode(errors="surrogateescape"), value),
-            )
+            change = f'UPDATE "{table}" SET "{column}" = CAST(? AS TEXT) WHERE CAST("{column}" AS BLOB) = ?'
+            db.execute(change, (new.encode(errors="surrogateescape"), value))
     return changed
 
 

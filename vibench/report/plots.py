@@ -63,9 +63,8 @@ def plots(name: str, data: ProblemTables, rows: Mapping[str, int]) -> Iterator[P
     """Plots of one problem, whose names begin with `name`; `rows` has the row of every cell in the table of cells."""
     compared = on_common_queries(best_solver(data.cells), data.queries)
     cells = compared.cells
-    shown = cells.assign(
-        dimension=cells["N"] + cells["enrichment"].fillna(0) + cells["R"], online_ms=1e3 * cells["online_s"]
-    )
+    size = cells["N"] + cells["enrichment"].fillna(0) + cells["R"]
+    shown = cells.assign(dimension=size, online_ms=1e3 * cells["online_s"])
     solver = f", {shown['solver'].iloc[0]}" if len(shown) else ""
     kinds = {
         "work-precision": ("work and precision", "online_ms", "time of a query [ms]"),
@@ -89,11 +88,9 @@ def overview(
     if cells.empty:
         return
     errors = ranking.errors_of_solution(cells)
+    solution, bounds = 1e3 * float(np.exp(np.log(cells["hf_s"]).mean())), cells["cell"].map(certified).astype(float)
     relative = cells["online_s"] / cells["hf_s"]
-    solution = 1e3 * float(np.exp(np.log(cells["hf_s"]).mean()))
-    shown = cells.assign(
-        online_ms=solution * relative, error=errors, certified=cells["cell"].map(certified).astype(float)
-    )
+    shown = cells.assign(online_ms=solution * relative, error=errors, certified=bounds)
     panels = [
         PlotPanel("online_ms", column, "time of a query [ms]", label_, line=solution)
         for column, label_ in (("error", "larger mean error of u and λ"), ("certified", "certified error, in energy"))
@@ -153,8 +150,7 @@ def _plot(
                 "scale": "log" if panel.logarithmic else "linear",
                 # Four digits are more than a screen shows.
                 "line": None if panel.line is None else short(panel.line, 4),
-                "x": [short(value, 4) for value in points[panel.x]],
-                "y": [short(value, 4) for value in points[panel.y]],
+                **{end: [short(value, 4) for value in points[getattr(panel, end)]] for end in ("x", "y")},
             }
             for panel, points in drawn
         ],
@@ -194,7 +190,6 @@ class FigureImage:
 
 
 def image_of(name: str, figure: Figure) -> FigureImage:
-    """The picture of a figure."""
     # Sharp enough at the width of a page, and a tenth of the bytes of a vector picture of many lines.
     figure.set_dpi(110)
     canvas: Any = FigureCanvasAgg(figure)
@@ -268,7 +263,6 @@ def _values(line: Line2D) -> Array:
 
 
 def script_safe(value: Any) -> str:
-    """JSON without a "<"."""
     text = json.dumps(value, ensure_ascii=False, separators=(",", ":"))
     return text.replace("<", "\\u003c")
 

@@ -151,7 +151,6 @@ class PublishedRun:
 
     @property
     def code(self) -> str:
-        """Hashes of the code of its cells."""
         return ", ".join(sorted({str(row["code"]) for row in self.run.cells.values() if row["code"]}))
 
     @property
@@ -175,17 +174,10 @@ class PublishedRun:
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """Origin of the numbers as JSON."""
         return {
-            **self.run.identity,
-            "cells": len(self.run.cells),
-            "ok": self.run.ok,
-            "machines": self.run.machines,
-            "versions": self.run.versions,
-            "code": self.code.split(", "),
-            "values": self.values,
-            "note": self.note,
-        }
+            **self.run.identity, "cells": len(self.run.cells), "ok": self.run.ok, "machines": self.run.machines,
+            "versions": self.run.versions, "code": self.code.split(", "), "values": self.values, "note": self.note,
+        }  # fmt: skip
 
     @property
     def commands(self) -> list[tuple[str, str]]:
@@ -232,14 +224,9 @@ def folder_names(names: Sequence[str]) -> list[str]:
 
 
 def publish(
-    paths: Sequence[Path],
-    site: Path,
-    citation: Citation,
-    notes: Mapping[Path, str] | None = None,
-    *,
-    figures: bool = True,
+    paths: Sequence[Path], site: Path, citation: Citation, notes: Mapping[Path, str] = {}, *, figures: bool = True,
     ask: Callable[[Iterator[str]], None] = lambda _: None,
-) -> Path:
+) -> Path:  # fmt: skip
     """Write the site of some results files; the same files give the same site.
 
     The folder is new, empty, or was written by this function: then its files are replaced. Notes are remarks on results
@@ -257,10 +244,8 @@ def publish(
         runs = compared_runs(copies)
         names = [run.name for run in runs]
         ask(left(copies, names, citation.authors))
-        published = [
-            PublishedRun(run, own, (notes or {}).get(path, ""))
-            for run, path, own in zip(runs, paths, folder_names(names), strict=True)
-        ]
+        remarks = [notes.get(path, "") for path in paths]
+        published = list(map(PublishedRun, runs, folder_names(names), remarks))
         write(site, lambda new: _fill(new, published, citation, figures=figures))
     return site / "index.html"
 

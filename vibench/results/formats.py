@@ -210,12 +210,12 @@ def says_something(frame: pd.DataFrame, name: str) -> bool:
 def under_headings(frame: pd.DataFrame, names: Sequence[str], table: Mapping[str, Column]) -> pd.DataFrame:
     """Columns of a table under their headings, in the form and unit that these name; others as they are."""
     headed = {name: column for name, column in table.items() if column.heading}
-    shown = {
-        headed[name].heading if name in headed else name: _shown(frame, name, headed[name])
-        if name in headed
-        else frame[name]
-        for name in names
-    }
+    shown = {}
+    for name in names:
+        column = headed.get(name)
+        shown[name if column is None else column.heading] = (
+            frame[name] if column is None else _shown(frame, name, column)
+        )
     return pd.DataFrame(shown, index=frame.index)
 
 

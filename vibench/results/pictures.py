@@ -50,7 +50,6 @@ class Shown:
 
 
 def read(path: Path) -> Iterator[Shown]:
-    """The pictures of a results file."""
     names, rows = read_rows(path, "pictures")
     for row in (dict(zip(names, values, strict=True)) for values in rows):
         picture = None if row["data"] is None else _unpacked(row["data"], row["names"])

@@ -106,27 +106,19 @@ def _order(names: Collection[str]) -> list[str]:
 def in_order(frame: pd.DataFrame) -> pd.DataFrame:
     """Rows sorted by the columns that identify them, loose tolerances first, whatever order cells finished in."""
     by = _order(frame.columns)
-
-    def uncorrected_first(column: pd.Series) -> pd.Series:
-        return column != CorrectionMode.NONE if column.name == "correction" else column
-
+    # Cells without correction come first.
     return frame.sort_values(
         by, ascending=list(map(_rises, by)), kind="stable", na_position="first", ignore_index=True,
-        key=uncorrected_first,
+        key=lambda column: column != CorrectionMode.NONE if column.name == "correction" else column,
     )  # fmt: skip
 
 
 def terms_in_order(names: Collection[str]) -> list[str]:
     """The order of `in_order` as terms of SQL, for a table with columns of these names."""
-    return [
-        *(
-            f"correction IS NOT '{CorrectionMode.NONE}'"
-            if name == "correction"
-            else f'"{name}" IS NOT NULL, "{name}" {"ASC" if _rises(name) else "DESC"}'
-            for name in _order(names)
-        ),
-        "rowid",
-    ]
+    terms = {name: f'"{name}" IS NOT NULL, "{name}" {"ASC" if _rises(name) else "DESC"}' for name in _order(names)}
+    if "correction" in terms:
+        terms["correction"] = f"correction IS NOT '{CorrectionMode.NONE}'"
+    return [*terms.values(), "rowid"]
 
 
 def _rises(name: str) -> bool:

@@ -24,7 +24,6 @@ class SqlType(StrEnum):
 
     @property
     def is_number(self) -> bool:
-        """Whether the values are numbers."""
         return self in (SqlType.REAL, SqlType.INTEGER)
 
 
@@ -57,27 +56,22 @@ class Column(NamedTuple):
 
 
 def real(unit: str, meaning: str, heading: str = "", place: int | None = None) -> Column:
-    """Column of numbers in a unit."""
     return Column(SqlType.REAL, unit, meaning, heading, place)
 
 
 def integer(meaning: str, heading: str = "", place: int | None = None) -> Column:
-    """Column of numbers that count or name something."""
     return Column(SqlType.INTEGER, "", meaning, heading, place)
 
 
 def text(meaning: str, heading: str = "", place: int | None = None, *, constraint: str = "") -> Column:
-    """Column of texts."""
     return Column(SqlType.TEXT, "", meaning, heading, place, constraint)
 
 
 def as_json(meaning: str) -> Column:
-    """Column of texts that are JSON."""
     return Column(SqlType.TEXT, "", meaning, is_json=True)
 
 
 def blob(unit: str, meaning: str) -> Column:
-    """Column of arrays of numbers as bytes."""
     return Column(SqlType.BLOB, unit, meaning)
 
 

@@ -21,14 +21,9 @@ from vibench.text import printable
 
 
 def matching(
-    path: Path,
-    table: str,
-    expression: str,
-    frame: pd.DataFrame,
-    added: Mapping[str, Column] = MappingProxyType({}),
-    made: Collection[str] = (),
-    cells: Sequence[str] = (),
-) -> Array:
+    path: Path, table: str, expression: str, frame: pd.DataFrame,
+    added: Mapping[str, Column] = MappingProxyType({}), made: Collection[str] = (), cells: Sequence[str] = (),
+) -> Array:  # fmt: skip
     """Mask of the rows of a table that satisfy an expression of SQLite over its columns, in the order of the file.
 
     The expression may use columns, numbers, texts in single quotes and operators. It runs on a connection that cannot
@@ -61,13 +56,9 @@ def cells_of_first(path: Path, table: str, expression: str, order: Sequence[str]
 
 
 def _answers(
-    db: sqlite3.Connection,
-    table: str,
-    expression: str,
-    query: tuple[str, Sequence[str]],
-    columns: Iterable[str],
+    db: sqlite3.Connection, table: str, expression: str, query: tuple[str, Sequence[str]], columns: Iterable[str],
     made: Collection[str],
-) -> list[tuple[Any, ...]]:
+) -> list[tuple[Any, ...]]:  # fmt: skip
     """Rows of a query whose expression is checked first."""
     outside = _text_free(expression)
     if len(expression) > 1000:

@@ -17,7 +17,7 @@ from vibench.results import formats, ranking, selection
 from vibench.results.formats import cell_text, csv_lines, summary, to_markdown
 from vibench.results.paired_timing import PairedTiming
 from vibench.results.read import cells_with_errors, checked, in_order, read_table, terms_in_order, whole_numbers
-from vibench.results.schema import STORED, TABLES, Column, shown_columns
+from vibench.results.schema import STORED, TABLES, Column
 from vibench.results.sqlite import parameters_of, read_parts
 from vibench.text import json_object
 
@@ -84,9 +84,9 @@ def _views() -> dict[str, View]:
     cells, thresholds = STORED["cells"], STORED["thresholds"]
     of_best = ("problem", "error_below", *of_cells[:14], "ties", *of_cells[14:])
     return {
-        "summary": View("cells", (*of_cells, *shown_columns(cells)), cells),
+        "summary": View("cells", (*of_cells, *(n for n in cells if cells[n].heading)), cells),
         "best": View("cells", of_best, ranking.fastest_columns(), ranking.fastest, ranking.no_best_cell()),
-        "benefits": View("thresholds", (*of_break_even, *shown_columns(thresholds)), thresholds),
+        "benefits": View("thresholds", (*of_break_even, *(n for n in thresholds if thresholds[n].heading)), thresholds),
         "cells": View("cells", (*of_cells, "reason")),
         "queries": View("queries", of_queries),
         "histories": View("histories", of_histories),
@@ -348,7 +348,6 @@ def _best(path: Path, view: View, error: str, largest: float | None, queries: fl
 
 
 def exported_files() -> list[str]:
-    """Names of the files that `export` writes."""
     return [*(f"{table}.csv" for table in TABLES), "summary.md"]
 
 

@@ -219,9 +219,8 @@ def parameters_of(path: Path) -> dict[str, list[tuple[str, str]]]:
         try:
             found[key.removeprefix("parameters of ")] = [(str(name), str(unit)) for name, unit in json.loads(text)]
         except (TypeError, ValueError):
-            raise DamagedResultsError(
-                f"'{path}' has {brief(repr(text), 60)} as the {key}, expected pairs of texts"
-            ) from None
+            strange = f"{brief(repr(text), 60)} as the {key}"
+            raise DamagedResultsError(f"'{path}' has {strange}, expected pairs of texts") from None
     return found
 
 
@@ -247,9 +246,8 @@ def read_meta(path: Path) -> dict[str, str]:
         raise DamagedResultsError(f"'{path}' is damaged: {error}") from None
     except sqlite3.Error as error:
         damaged = code_of(error) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
-        raise (DamagedResultsError if damaged else RequestError)(
-            f"'{path}' is not a results file of vibench: {error}"
-        ) from None
+        kind = DamagedResultsError if damaged else RequestError
+        raise kind(f"'{path}' is not a results file of vibench: {error}") from None
 
 
 # Columns and some rows of a table.

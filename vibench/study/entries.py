@@ -172,7 +172,5 @@ Validation: TypeAlias = Annotated[
 class ProblemEntry(Entry):
     """One entry of the axis of problems."""
 
-    training: Annotated[
-        Training | None, Field(description="Training sets of this problem instead of those of all.")
-    ] = None
+    training: Annotated[Training | None, Field(description="Training sets of this problem, not those of all.")] = None
     validation: Annotated[Validation | None, Field(description="Validation set of this problem, likewise.")] = None

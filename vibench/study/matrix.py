@@ -159,26 +159,14 @@ def expand(study: Study) -> list[Cell]:
             for (dual, pod, cone, primal, tolerance), solved in product(offline, _solved(study, entry)):
                 (assembly, bounds), correction, solver, accuracy = solved
                 cell = Cell(
-                    problem=plugin,
-                    dual=None if dual is None else dual[1],
-                    primal=None if primal is None else primal[1],
-                    pod=pod,
-                    cone=cone,
-                    primal_tol=tolerance,
-                    solver=solver,
-                    assembly=assembly,
-                    interpolation=None if assembly == "full" else study.interpolation,
-                    warm_start=study.warm_start and entry.kind.takes_start,
-                    accuracy=accuracy,
-                    bounds=bounds,
-                    correction=correction,
-                    training=training,
-                    validation=validation,
-                    labels=(problem.title, _title(dual), _title(primal)),
-                    nested_tolerances=() if primal is None else nested[primal[0].title],
-                    formulation=formulation,
-                    formulation_label=entry.title,
-                )
+                    problem=plugin, dual=None if dual is None else dual[1],
+                    primal=None if primal is None else primal[1], pod=pod, cone=cone, primal_tol=tolerance,
+                    solver=solver, assembly=assembly, interpolation=None if assembly == "full" else study.interpolation,
+                    warm_start=study.warm_start and entry.kind.takes_start, accuracy=accuracy, bounds=bounds,
+                    correction=correction, training=training, validation=validation,
+                    labels=(problem.title, _title(dual), _title(primal)), formulation=formulation,
+                    nested_tolerances=() if primal is None else nested[primal[0].title], formulation_label=entry.title,
+                )  # fmt: skip
                 # Files are known by their names: two of one name would be one cell.
                 if (same := cells.setdefault(cell.key, cell)) is not cell and same.code != cell.code:
                     raise RequestError(
@@ -253,17 +241,11 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
     if cell.primal_tol is not None:
         tolerances["primal"] = {cell.labels[2]: [cell.primal_tol]}
     content: dict[str, Any] = {
-        "training": _entry_of_set(cell.training) or OWN,
-        "name": name,
-        "seed": cell.validation.seed,
-        "validation": _entry_of_set(cell.validation) or cell.validation.count,
-        "formulation": [_plugin_entry(cell.formulation, cell.formulation_label)],
-        "assembly": [cell.assembly],
-        "bounds": [cell.bounds],
-        "correction": [cell.correction],
-        "warm_start": cell.warm_start,
-        "tolerances": [tolerances],
-    }
+        "name": name, "seed": cell.validation.seed, "training": _entry_of_set(cell.training) or OWN,
+        "validation": _entry_of_set(cell.validation) or cell.validation.count, "warm_start": cell.warm_start,
+        "formulation": [_plugin_entry(cell.formulation, cell.formulation_label)], "tolerances": [tolerances],
+        "assembly": [cell.assembly], "bounds": [cell.bounds], "correction": [cell.correction],
+    }  # fmt: skip
     axes = {"problem": cell.problem, "dual": cell.dual, "primal": cell.primal}
     for (axis, plugin), label in zip(axes.items(), cell.labels, strict=True):
         content |= {} if plugin is None else {axis: [_plugin_entry(plugin, label)]}

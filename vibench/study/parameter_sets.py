@@ -50,7 +50,6 @@ class ParameterSet:
 
     @property
     def options(self) -> str:
-        """Options of the sampling strategy as canonical JSON."""
         return "{}" if self.sampling is None else self.sampling.options
 
     def strategy(self) -> Sampling | None:
@@ -136,7 +135,6 @@ def chunk_edges(count: int) -> list[int]:
 
 
 def chunk_size(count: int, chunk: int) -> int:
-    """Number of parameters in a chunk of `count`."""
     first, end = chunk_edges(count)[chunk : chunk + 2]
     return end - first
 

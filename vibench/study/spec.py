@@ -97,9 +97,7 @@ class ToleranceTable(_Model):
     R: Annotated[
         PerStrategy[Sizes] | None, Field(description="Numbers of generators, in place of `dual`: likewise.")
     ] = None
-    primal: Annotated[
-        dict[str, Tolerances], Field(description="Tolerances δ of the primal strategies, by strategy.")
-    ] = {}
+    primal: Annotated[dict[str, Tolerances], Field(description="Tolerances δ of the primal strategies, by name.")] = {}
 
     @model_validator(mode="after")
     def _one_of_each(self) -> ToleranceTable:
@@ -181,20 +179,16 @@ class Study(_Model):
     ] = []
     dual: Annotated[list[Entry], MinLen(1), Field(description="Dual strategies. Required by `mixed`.")] = []
     primal: Annotated[list[Entry], MinLen(1), Field(description="Primal strategies. Required by `mixed`.")] = []
-    assembly: Annotated[
-        list[Literal["full", "reduced"]], MinLen(1), Field(description="How queries are assembled.")
-    ] = ["full"]
-    bounds: Annotated[
-        Bounds, Field(description="Whether queries have error bounds at online cost, with reduced assembly: an axis.")
-    ] = [False]
+    assembly: Annotated[list[Literal["full", "reduced"]], MinLen(1), Field(description="Assembly of queries.")] = [
+        "full"
+    ]
+    bounds: Annotated[Bounds, Field(description="Error bounds of queries, with reduced assembly: an axis.")] = [False]
     correction: Annotated[
         list[Literal["none", "feasible", "auto"]],
         MinLen(1),
         Field(description="Whether solutions are corrected; `auto` for those whose violation dominates the bound."),
     ] = ["none"]
-    interpolation: Annotated[
-        Tolerance, Field(description="Tolerance of empirical interpolation in reduced assembly.")
-    ] = 1e-6
+    interpolation: Annotated[Tolerance, Field(description="Tolerance of interpolation in reduced assembly.")] = 1e-6
     warm_start: Annotated[
         bool,
         Field(
@@ -230,10 +224,8 @@ class Study(_Model):
             raise RequestError(fault_line(error, cls, named)) from None
         if study.factorisation != DEFAULT:
             # A factorisation in the options of a problem wins.
-            study.problem[:] = (
-                one.model_copy(update={"options": {FACTORISATION: study.factorisation} | one.options})
-                for one in study.problem
-            )
+            given = {FACTORISATION: study.factorisation}
+            study.problem[:] = (one.model_copy(update={"options": given | one.options}) for one in study.problem)
         # After the types: messages about names need valid entries.
         _check_names(study)
         return study

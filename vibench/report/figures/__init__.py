@@ -34,19 +34,10 @@ DrawPages = Callable[[ProblemTables], Pages]
 
 # Figures of every problem, by the end of their file names.
 OF_PROBLEM: dict[str, DrawPages] = {
-    "solutions": solutions,
-    "diagnostics": diagnostics,
-    "errors": projection_errors,
-    "orthogonality": orthogonality,
-    "dimension": dimension,
-    "work-precision": work_precision,
-    "shares": shares,
-    "solvers": solvers,
-    "precision": precision,
-    "total-cost": total_cost,
-    "outputs": outputs,
-    "break-even": break_even,
-}
+    "solutions": solutions, "diagnostics": diagnostics, "errors": projection_errors, "orthogonality": orthogonality,
+    "dimension": dimension, "work-precision": work_precision, "shares": shares, "solvers": solvers,
+    "precision": precision, "total-cost": total_cost, "outputs": outputs, "break-even": break_even,
+}  # fmt: skip
 # Figures of every problem and dual strategy.
 OF_DUAL: dict[str, DrawPages] = {"enrichment": enrichment, "inf-sup": inf_sup}
 
@@ -165,11 +156,9 @@ def processes(jobs: int) -> Iterator[ProcessPoolExecutor | None]:
 
 
 def render(
-    tasks: Sequence[FigureTask],
-    finish: Callable[[str, Figure], Made],
-    pool: ProcessPoolExecutor | None = None,
+    tasks: Sequence[FigureTask], finish: Callable[[str, Figure], Made], pool: ProcessPoolExecutor | None = None,
     progress: Callable[[str, int, int], None] = lambda *_: None,
-) -> list[list[Made]]:
+) -> list[list[Made]]:  # fmt: skip
     """Draw figures here and in the processes of a pool; returns the results of `finish(name, page)` by figure."""
     rendered: dict[int, list[Made]] = {}
     with contextlib.ExitStack() as stack:
@@ -206,9 +195,7 @@ def _submitted(
         except OSError:
             # Without room for it this process draws them all.
             places.clear()
-        yield {
-            places[number]: pool.submit(_render_sent, file, number, finish) for number in reversed(range(len(places)))
-        }
+        yield {places[k]: pool.submit(_render_sent, file, k, finish) for k in reversed(range(len(places)))}
 
 
 def pages_of(task: FigureTask) -> Iterator[tuple[str, Figure]]:

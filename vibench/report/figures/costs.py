@@ -176,8 +176,7 @@ def _front(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     # From left to right, a point is on the front if it is lower than all before it.
     order = np.lexsort((y, x))
     best = np.minimum.accumulate(y[order])
-    kept: np.ndarray = order[np.concatenate([np.ones(min(len(best), 1), dtype=bool), best[1:] < best[:-1]])]
-    return kept
+    return np.asarray(order[np.concatenate([np.ones(min(len(best), 1), dtype=bool), best[1:] < best[:-1]])])
 
 
 def total_cost(data: ProblemTables) -> Pages:
@@ -215,9 +214,8 @@ def total_cost(data: ProblemTables) -> Pages:
 
 def _most_vectors(cells: pd.DataFrame) -> pd.DataFrame:
     """The cells with the most vectors of every strategy and way: a line per tolerance would hide the crossings."""
-    added = cells.assign(added=cells["enrichment"].fillna(0)).sort_values(
-        ["added", "primal_tol"], ascending=[False, True], kind="stable"
-    )
+    by = {"by": ["added", "primal_tol"], "ascending": [False, True], "kind": "stable"}
+    added = cells.assign(added=cells["enrichment"].fillna(0)).sort_values(**by)
     return added.drop_duplicates(["primal", "primal_options", "way"]).sort_index()
 
 

@@ -83,13 +83,11 @@ class ProblemTables:
             yield panels[k * most : (k + 1) * most], f"Part {k + 1} of {count}." * (count > 1)
 
     def restrict_to_dual(self, dual: str) -> ProblemTables:
-        """The rows of one dual strategy."""
         frames = {name: value for name, value in vars(self).items() if isinstance(value, pd.DataFrame)}
         return replace(self, **{name: frame[frame["dual"] == dual] for name, frame in frames.items()})
 
     @property
     def machine(self) -> str:
-        """Machines that measured the seconds."""
         return ", ".join(str(name) for name in self.cells["machine"].dropna().unique())
 
     @property
@@ -266,7 +264,6 @@ def label(name: Any, tolerance: Any = None, way: str = "") -> str:
 
 
 def whole(number: Any) -> str:
-    """A dimension of a model in a text."""
     return NO_SUCH_AXIS if pd.isna(number) else f"{number:.0f}"
 
 

@@ -16,7 +16,6 @@ from vibench.report.figures.data import ProblemTables
 from vibench.report.figures.style import COLOURS, CaptionedFigure, Layout, Pages, Sheet
 
 Limits = tuple[float, float]
-"""Range of the values of a field."""
 
 
 def solutions(data: ProblemTables) -> Pages:
@@ -31,6 +30,7 @@ def draw_solutions(title: str, shown: Sequence[tuple[str, Picture]]) -> Captione
     pictures = [picture for _, picture in shown]
     sheet = Sheet(2, len(shown), title, Layout(2.7, 2.4, "last"))
     ranges = (_range([one.values for one in pictures]), _range([one.multiplier for one in pictures]))
+    ends = [f"{low:.3g} to {high:.3g}" for low, high in ranges]
     for column, (heading, picture) in enumerate(shown):
         field, multiplier = sheet.panel(0, column), sheet.panel(1, column)
         field.set_title(heading, fontsize=8)
@@ -40,11 +40,10 @@ def draw_solutions(title: str, shown: Sequence[tuple[str, Picture]]) -> Captione
     for row, places in enumerate(([one.points for one in pictures], [one.positions for one in pictures])):
         for panel in (sheet.panel(row, column) for column in range(len(shown))):
             name_axes(panel, pictures[0].length_unit, places)
-    first = pictures[0]
-    parameters = "; ".join(heading for heading, _ in shown)
+    first, parameters = pictures[0], "; ".join(heading for heading, _ in shown)
     return sheet.finish(
         f"High-fidelity solutions ({title.partition(':')[0]}) at {parameters}: {first.name} above, from "
-        f"{_ends(ranges[0])}; {first.multiplier_name} below, from {_ends(ranges[1])}. Colours and axes of values have "
+        f"{ends[0]}; {first.multiplier_name} below, from {ends[1]}. Colours and axes of values have "
         "the same range at all parameters. The orange line is the boundary of the contact, where the multiplier "
         "becomes zero."
     )
@@ -100,10 +99,6 @@ def _range(values: Sequence[Array]) -> Limits:
 def _colours(limits: Limits) -> dict[str, Any]:
     # This map has evenly rising lightness: it is legible in grey print and to colour-blind readers.
     return {"vmin": limits[0], "vmax": limits[1], "cmap": "cividis", "rasterized": True}
-
-
-def _ends(limits: Limits) -> str:
-    return f"{limits[0]:.3g} to {limits[1]:.3g}"
 
 
 def _on_mesh(picture: Picture) -> Triangulation | None:

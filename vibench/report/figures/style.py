@@ -59,8 +59,8 @@ class Look:
         return {"color": self.colour, "marker": self.marker, "markersize": size, "markerfacecolor": face}
 
 
+# Dotted black lines.
 HIGH_FIDELITY_LOOK = Look("#000000", "s", 3)
-"""The look of the high-fidelity model: dotted black lines."""
 
 
 class Series(NamedTuple):
