@@ -39,132 +39,89 @@ def mistake(line: str) -> Callable[[Mistake], Mistake]:
     return add
 
 
-def simple(name: str, line: str, *path: str | int, to: Any) -> None:
-    """A mistake in one value of the manifest."""
+def simple(name: str, line: str, path: str, to: Any) -> None:
+    """A mistake in one value of the manifest, at a path of keys and indices."""
 
     def change(content: Content, cable: Cable, folder: Path) -> None:
+        *steps, last = (int(step) if step.isdigit() else step for step in path.split("."))
         place: Any = content
-        for step in path[:-1]:
+        for step in steps:
             place = place[step]
-        place[path[-1]] = to
+        place[last] = to
 
     MISTAKES[name] = (line, change)
 
 
-def later(folder: Path, change: Callable[[Path], None]) -> None:
-    """Change a file once everything is written."""
-    AFTER.append(lambda: change(folder))
+def in_arrays(name: str, line: str, **changes: Callable[[Cable], Any]) -> None:
+    """A mistake in some of the arrays."""
+
+    def change(content: Content, cable: Cable, folder: Path) -> None:
+        vars(cable).update({key: compute(cable) for key, compute in changes.items()})
+
+    MISTAKES[name] = (line, change)
 
 
-AFTER: list[Callable[[], None]] = []
+def in_files(name: str, line: str, change: Callable[[Path], object], A: str = "A.npz") -> None:
+    """A mistake made once everything is written; the manifest names the file of A."""
 
-simple("future format", "format is 2; this version of vibench reads format 1", "format", to=2)
-simple("unknown key", "spaces: no key is called 'X_U'; did you mean 'X_[VW]'", "spaces", "X_U", to="X_V.mtx")
-simple("unknown table", "no key is called 'operatorz'; did you mean 'operators'", "operatorz", to={})
-simple("number for a name", "spaces.X_V: Input should be a valid string", "spaces", "X_V", to=3)
-simple("index base 2", "index_base: Input should be 0 or 1", "index_base", to=2)
-simple("same names", "two parameters have the same name: load, load", "parameters", "names", to=["load", "load"])
-simple("name of a constant", "'e' is a constant of expressions; give the", "parameters", "names", to=["load", "e"])
-simple("name of a function", "'max' is a function of expressions", "parameters", "names", to=["max", "depth"])
-simple("micro and mu", "two parameters have the same name: μ, μ", "parameters", "names", to=["\u00b5", "\u03bc"])
-simple(
-    "a point twice", r"training: the points 0 and 2 are the same, \[4.0, 0.2\]", "parameters", "training",
-    to=[[4.0, 0.2], [6.0, 0.2], [4.0, 0.2]],
-)  # fmt: skip
-simple(
-    "a point nearly twice", "validation: the points 0 and 1 are the same", "parameters", "validation",
-    to=[[5.0, 0.2], [5.0 + 1e-9, 0.2], [6.0, 0.3]],
-)  # fmt: skip
-simple("name with a hyphen", "'my-load' cannot stand in expressions", "parameters", "names", to=["my-load", "depth"])
-simple("units", "parameters.units has 1 entries for 2 parameters", "parameters", "units", to=["m"])
-simple("bounds", "lower bound 9 of 'load' is above its upper bound 8", "parameters", "lower", to=[9.0, 0.1])
-simple(
-    "outside the box",
-    r"point 1 has 'load' = 80, outside the box \[4, 8\]",
-    "parameters",
-    "training",
-    to=[[4, 0.2], [80, 0.2]],
-)
-simple(
-    "point too short", "every point needs 2 values, one for each of load, depth", "parameters", "training", to=[[4.0]]
-)
-simple("grid", "grid has 1 counts for 2 parameters", "parameters", "training", to={"grid": [3]})
-simple(
-    "unknown parameter",
-    "no parameter is called 'laod'; did you mean 'load'",
-    "operators",
-    "f",
-    "affine",
-    0,
-    "theta",
-    to="-laod",
-)
-simple(
-    "call in theta",
-    "no function of expressions is called 'system'",
-    "operators",
-    "f",
-    "affine",
-    0,
-    "theta",
-    to="system('rm')",
-)
-simple("attribute in theta", "contains an attribute", "operators", "f", "affine", 0, "theta", to="load.real")
-simple("broken theta", "is not an expression", "operators", "f", "affine", 0, "theta", to="2 load")
-simple("infinite theta", "division by zero", "operators", "f", "affine", 0, "theta", to="1 / (load - 6)")
-simple(
-    "both ways",
-    r"give exactly one of constant, affine, each \(found constant and each\)",
-    "operators",
-    "A",
-    to={"constant": "A.npz", "each": "A{}.npz"},
-)
-simple(
-    "no theta",
-    r"give exactly one of theta, table \(found none\)",
-    "operators",
-    "f",
-    to={"affine": [{"array": "vectors.npz:mass"}]},
-)
-simple(
-    "outside the folder",
-    "'../A.npz' is not the name of a file inside the pack's folder",
-    "operators",
-    "A",
-    to="../A.npz",
-)
-simple("absolute path", "'/etc/A.npz' is not the name of a file inside", "operators", "A", to="/etc/A.npz")
-simple("missing file", "the file 'K.npz' does not exist", "operators", "A", to="K.npz")
-simple(
-    "missing array",
-    "no array in 'vectors.npz' is called 'masse'; did you mean 'mass'",
-    "operators",
-    "f",
-    to="vectors.npz:masse",
-)
-simple("unread format", "'A.mat' has a format that is not read; expected one of .npz", "operators", "A", to="A.mat")
-simple("several arrays", "has several arrays: name one", "operators", "f", to="solutions.npz")
-simple("each without number", "has no {} that stands for the number", "operators", "A", to={"each": "A.npz"})
-simple(
-    "fewer arrays than parameters",
-    "operators.A, parameter 0: the file 'A0.npz' does not exist",
-    "operators",
-    "A",
-    to={"each": "A{}.npz"},
-)
-simple("columns", r"operators.g.each: an array 12×3; expected 12×5", "operators", "g", to={"each": "solutions.npz:lam"})
-simple(
-    "table",
-    r"affine.0.table: 12; expected 5",
-    "operators",
-    "f",
-    "affine",
-    to=[{"table": "vectors.npz:mass", "array": "vectors.npz:mass"}],
-)
-simple(
-    "B is missing", "operators.B: required, but not given", "operators", to={"A": "A.npz", "f": "f.npz", "g": "g.npz"}
-)
-simple("no X_V", "spaces.X_V: required with", "spaces", to={"X_W": "spaces.npz:X_W"})
+    def plan(content: Content, cable: Cable, folder: Path) -> None:
+        content["operators"]["A"] = A if A != "A.npz" else content["operators"]["A"]
+        AFTER.append(lambda: change(folder))
+
+    MISTAKES[name] = (line, plan)
+
+
+AFTER: list[Callable[[], object]] = []
+
+simple("future format", "format is 2; this version of vibench reads format 1", "format", 2)
+simple("unknown key", "spaces: no key is called 'X_U'; did you mean 'X_[VW]'", "spaces.X_U", "X_V.mtx")
+simple("unknown table", "no key is called 'operatorz'; did you mean 'operators'", "operatorz", {})
+simple("number for a name", "spaces.X_V: Input should be a valid string", "spaces.X_V", 3)
+simple("index base 2", "index_base: Input should be 0 or 1", "index_base", 2)
+simple("same names", "two parameters have the same name: load, load", "parameters.names", ["load", "load"])
+simple("name of a constant", "'e' is a constant of expressions; give the", "parameters.names", ["load", "e"])
+simple("name of a function", "'max' is a function of expressions", "parameters.names", ["max", "depth"])
+simple("micro and mu", "two parameters have the same name: μ, μ", "parameters.names", ["\u00b5", "\u03bc"])
+simple("name with a hyphen", "'my-load' cannot stand in expressions", "parameters.names", ["my-load", "depth"])
+TWICE, NEARLY = [[4.0, 0.2], [6.0, 0.2], [4.0, 0.2]], [[5.0, 0.2], [5.0 + 1e-9, 0.2], [6.0, 0.3]]
+simple("twice", r"training: the points 0 and 2 are the same, \[4.0, 0.2\]", "parameters.training", TWICE)
+simple("nearly twice", "validation: the points 0 and 1 are the same", "parameters.validation", NEARLY)
+simple("units", "parameters.units has 1 entries for 2 parameters", "parameters.units", ["m"])
+simple("bounds", "lower bound 9 of 'load' is above its upper bound 8", "parameters.lower", [9.0, 0.1])
+OUTSIDE = r"point 1 has 'load' = 80, outside the box \[4, 8\]"
+simple("outside the box", OUTSIDE, "parameters.training", [[4, 0.2], [80, 0.2]])
+simple("short point", "every point needs 2 values, one for each of load, depth", "parameters.training", [[4.0]])
+simple("grid", "grid has 1 counts for 2 parameters", "parameters.training", {"grid": [3]})
+simple("grid of a billion points", "pack': too big for memory", "parameters.training", {"grid": [10**6, 10**6]})
+BEYOND = "too big for memory: the arrays of the pack take .*e"
+simple("grid beyond int64", BEYOND, "parameters.training", {"grid": [10**18, 10**18]})
+THETA = "operators.f.affine.0.theta"
+simple("unknown parameter", "no parameter is called 'laod'; did you mean 'load'", THETA, "-laod")
+simple("call in theta", "no function of expressions is called 'system'", THETA, "system('rm')")
+simple("attribute in theta", "contains an attribute", THETA, "load.real")
+simple("broken theta", "is not an expression", THETA, "2 load")
+simple("infinite theta", "division by zero", THETA, "1 / (load - 6)")
+simple("other load", "probably f has the other sign", THETA, "load")
+simple("other gap", "probably g has the other sign", "operators.g.affine.0.theta", "-depth")
+BOTH = r"give exactly one of constant, affine, each \(found constant and each\)"
+simple("both ways", BOTH, "operators.A", {"constant": "A.npz", "each": "A{}.npz"})
+MASS = "vectors.npz:mass"
+simple("no theta", r"give exactly one of theta, table \(found none\)", "operators.f", {"affine": [{"array": MASS}]})
+simple("table", r"affine.0.table: 12; expected 5", "operators.f.affine", [{"table": MASS, "array": MASS}])
+simple("outside the folder", "'../A.npz' is not the name of a file inside the pack's folder", "operators.A", "../A.npz")
+simple("absolute path", "'/etc/A.npz' is not the name of a file inside", "operators.A", "/etc/A.npz")
+simple("missing file", "the file 'K.npz' does not exist", "operators.A", "K.npz")
+MASSE = "no array in 'vectors.npz' is called 'masse'; did you mean 'mass'"
+simple("missing array", MASSE, "operators.f", "vectors.npz:masse")
+simple("unread format", "'A.mat' has a format that is not read; expected one of .npz", "operators.A", "A.mat")
+simple("several arrays", "has several arrays: name one", "operators.f", "solutions.npz")
+simple("each without number", "has no {} that stands for the number", "operators.A", {"each": "A.npz"})
+FEWER = "operators.A, parameter 0: the file 'A0.npz' does not exist"
+simple("fewer arrays than parameters", FEWER, "operators.A", {"each": "A{}.npz"})
+simple("columns", r"operators.g.each: an array 12×3; expected 12×5", "operators.g", {"each": "solutions.npz:lam"})
+NO_B = {"A": "A.npz", "f": "f.npz", "g": "g.npz"}
+simple("B is missing", "operators.B: required, but not given", "operators", NO_B)
+simple("no X_V", "spaces.X_V: required with", "spaces", {"X_W": "spaces.npz:X_W"})
 
 
 @mistake("give both 'lower' and 'upper', or neither")
@@ -177,21 +134,11 @@ def nothing_to_do(content: Content, cable: Cable, folder: Path) -> None:
     del content["operators"], content["solutions"]
 
 
-@mistake("pack.toml' does not exist")
-def no_manifest(content: Content, cable: Cable, folder: Path) -> None:
-    later(folder, lambda folder: (folder / "pack.toml").unlink())
-
-
-@mistake("not valid TOML")
-def no_toml(content: Content, cable: Cable, folder: Path) -> None:
-    later(folder, lambda folder: (folder / "pack.toml").write_text("format = \n"))
-
-
 @mistake("together: the points 1 and 4 are the same")
 def a_point_that_is_trained_and_validated(content: Content, cable: Cable, folder: Path) -> None:
     content["parameters"]["validation"][1] = [6.0, 0.2]
     content["operators"]["g"] = {"each": "g.npz"}
-    later(folder, lambda folder: np.savez(folder / "g.npz", g=np.ones((SIZE, 5))))
+    np.savez(folder / "g.npz", g=np.ones((SIZE, 5)))
 
 
 @mistake("parameters.validation: required, since arrays")
@@ -200,22 +147,14 @@ def nothing_to_validate_on(content: Content, cable: Cable, folder: Path) -> None
     content["operators"]["g"] = {"each": "solutions.npz:lam"}
 
 
-@mistake("'A.npz' is a symbolic link")
-def symbolic_link(content: Content, cable: Cable, folder: Path) -> None:
-    def link(folder: Path) -> None:
-        (folder / "A.npz").rename(folder.parent / "elsewhere.npz")
-        (folder / "A.npz").symlink_to("../elsewhere.npz")
-
-    later(folder, link)
+def link(folder: Path) -> None:
+    (folder / "A.npz").rename(folder.parent / "elsewhere.npz")
+    (folder / "A.npz").symlink_to("../elsewhere.npz")
 
 
-@mistake("is not a regular file")
-def named_pipe(content: Content, cable: Cable, folder: Path) -> None:
-    def pipe(folder: Path) -> None:
-        (folder / "A.npz").unlink()
-        os.mkfifo(folder / "A.npz")
-
-    later(folder, pipe)
+def pipe(folder: Path) -> None:
+    (folder / "A.npz").unlink()
+    os.mkfifo(folder / "A.npz")
 
 
 class Payload:
@@ -223,107 +162,54 @@ class Payload:
         return (os._exit, (3,))
 
 
-@mistake(r"holds Python objects \(a pickle\)")
-def pickled_objects(content: Content, cable: Cable, folder: Path) -> None:
-    later(folder, lambda folder: np.savez(folder / "vectors.npz", mass=np.array([Payload()], dtype=object)))
+def declare(shape: tuple[int, ...], content: bytes, compression: int = zipfile.ZIP_DEFLATED) -> Callable[[Path], None]:
+    """Write an array whose header says what it likes."""
 
-
-@mistake("a .npz that is a pickle|'A.npz' is damaged")
-def bare_pickle(content: Content, cable: Cable, folder: Path) -> None:
-    later(folder, lambda folder: (folder / "A.npz").write_bytes(pickle.dumps(Payload())))
-
-
-@mistake("too big for memory: the arrays of the pack take")
-def zip_bomb(content: Content, cable: Cable, folder: Path) -> None:
-    def bomb(folder: Path) -> None:
+    def write(folder: Path) -> None:
         header = io.BytesIO()
-        np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (2**22,)})
-        with zipfile.ZipFile(folder / "vectors.npz", "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("mass.npy", header.getvalue() + bytes(8 * 2**22))
+        np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": shape})
+        with zipfile.ZipFile(folder / "vectors.npz", "w", compression) as archive:
+            archive.writestr("mass.npy", header.getvalue() + content)
 
-    later(folder, bomb)
-
-
-@mistake("is larger than its file")
-def lying_header(content: Content, cable: Cable, folder: Path) -> None:
-    def lie(folder: Path) -> None:
-        header = io.BytesIO()
-        np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (2**50,)})
-        with zipfile.ZipFile(folder / "vectors.npz", "w") as archive:
-            archive.writestr("mass.npy", header.getvalue())
-
-    later(folder, lie)
+    return write
 
 
-def write_header(folder: Path, shape: tuple[int, ...], content: bytes) -> None:
-    """An array in a compressed file whose header says what it likes."""
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": shape})
-    with zipfile.ZipFile(folder / "vectors.npz", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("mass.npy", header.getvalue() + content)
+def text(content: bytes) -> Callable[[Path], object]:
+    head = b"%%MatrixMarket matrix coordinate real general\n12 12 "
+    return lambda folder: (folder / "A.mtx.gz").write_bytes(gzip.compress(head + content, 1))
 
 
-@mistake("its shape -1 is negative")
-def negative_shape(content: Content, cable: Cable, folder: Path) -> None:
-    later(folder, lambda folder: write_header(folder, (-1,), bytes(2**25)))
+def mass(array: np.ndarray) -> Callable[[Path], object]:
+    return lambda folder: np.savez_compressed(folder / "vectors.npz", mass=array)
 
 
-@mistake("its shape -3×-4 is negative")
-def negative_shape_of_positive_size(content: Content, cable: Cable, folder: Path) -> None:
-    later(folder, lambda folder: write_header(folder, (-3, -4), bytes(96)))
-
-
-@mistake("operators.f.affine.0: too big for memory")
-def bytes_that_become_doubles(content: Content, cable: Cable, folder: Path) -> None:
-    later(folder, lambda folder: np.savez_compressed(folder / "vectors.npz", mass=np.ones(3 * 2**20, np.int8)))
-
-
-@mistake("operators.A: too big for memory")
-def padded_text(content: Content, cable: Cable, folder: Path) -> None:
-    content["operators"]["A"] = "A.mtx.gz"
-    head, line = b"%%MatrixMarket matrix coordinate real general\n12 12 110000\n", b"1 1 1.0" + b" " * 120 + b"\n"
-    later(folder, lambda folder: (folder / "A.mtx.gz").write_bytes(gzip.compress(head + 110_000 * line, 1)))
-
-
-simple("grid of a billion points", "pack': too big for memory", "parameters", "training", to={"grid": [10**6, 10**6]})
-simple("grid beyond int64", "too big for memory: the arrays of the pack take .*e", "parameters", "training",
-       to={"grid": [10**18, 10**18]})  # fmt: skip
-
-
-@mistake("has .* bytes, at most 16777216 are read")
-def manifest_without_end(content: Content, cable: Cable, folder: Path) -> None:
-    later(folder, lambda folder: os.truncate(folder / "pack.toml", 2**40))
-
-
-@mistake("is longer than the 1 entries that it declares")
-def gzip_bomb(content: Content, cable: Cable, folder: Path) -> None:
-    content["operators"]["A"] = "A.mtx.gz"
-    text = b"%%MatrixMarket matrix coordinate real general\n12 12 1\n1 1 1.0\n" + b" " * 10**6
-    later(folder, lambda folder: (folder / "A.mtx.gz").write_bytes(gzip.compress(text)))
-
-
-@mistake("the field 'pattern', it holds no values")
-def pattern_only(content: Content, cable: Cable, folder: Path) -> None:
-    content["operators"]["A"] = "A.mtx"
-    later(folder, lambda folder: scipy.io.mmwrite(folder / "A.mtx", sp.coo_array(cable.A), field="pattern"))
-
-
-@mistake("operators.A: it holds complex numbers")
-def complex_numbers(content: Content, cable: Cable, folder: Path) -> None:
-    cable.A = cable.A * (1.0 + 0j)
-
-
-@mistake("operators.f.affine.0: 1 of its entries are not finite")
-def not_a_number(content: Content, cable: Cable, folder: Path) -> None:
-    cable.mass[3] = np.nan
+in_files("no_manifest", "pack.toml' does not exist", lambda folder: (folder / "pack.toml").unlink())
+in_files("no TOML", "not valid TOML", lambda folder: (folder / "pack.toml").write_text("format = \n"))
+TOO_LONG = "has .* bytes, at most 16777216 are read"
+in_files("manifest without end", TOO_LONG, lambda folder: os.truncate(folder / "pack.toml", 2**40))
+in_files("symbolic link", "'A.npz' is a symbolic link", link)
+in_files("named pipe", "is not a regular file", pipe)
+in_files("pickled objects", r"holds Python objects \(a pickle\)", mass(np.array([Payload()], dtype=object)))
+PICKLE = "a .npz that is a pickle|'A.npz' is damaged"
+in_files("bare pickle", PICKLE, lambda folder: (folder / "A.npz").write_bytes(pickle.dumps(Payload())))
+in_files("zip_bomb", "too big for memory: the arrays of the pack take", declare((2**22,), bytes(8 * 2**22)))
+in_files("lying header", "is larger than its file", declare((2**50,), b"", zipfile.ZIP_STORED))
+in_files("negative shape", "its shape -1 is negative", declare((-1,), bytes(2**25)))
+in_files("negative shape of positive size", "its shape -3×-4 is negative", declare((-3, -4), bytes(96)))
+in_files("small integers", "operators.f.affine.0: too big for memory", mass(np.ones(3 * 2**20, np.int8)))
+PADDED = b"110000\n" + 110_000 * (b"1 1 1.0" + b" " * 120 + b"\n")
+in_files("padded text", "operators.A: too big for memory", text(PADDED), "A.mtx.gz")
+LONGER = "is longer than the 1 entries that it declares"
+in_files("gzip bomb", LONGER, text(b"1\n1 1 1.0\n" + b" " * 10**6), "A.mtx.gz")
+in_files("pattern", "the field 'pattern', it holds no values", lambda folder: scipy.io.mmwrite(
+    folder / "A.mtx", sp.coo_array(Cable().A), field="pattern"), "A.mtx")  # fmt: skip
 
 
 @mistake("they count from 1, so the manifest needs index_base = 1")
 def indices_from_one(content: Content, cable: Cable, folder: Path) -> None:
     content["operators"]["A"] = "triplets.npz"
     A = sp.coo_array(cable.A)
-    parts = {"row": A.coords[0] + 1, "col": A.coords[1] + 1, "data": A.data, "shape": np.array(A.shape)}
-    later(folder, lambda folder: np.savez(folder / "triplets.npz", **parts))
+    np.savez(folder / "triplets.npz", row=A.coords[0] + 1, col=A.coords[1] + 1, data=A.data, shape=np.array(A.shape))
 
 
 @mistake("indices do not fit the shape 12×12")
@@ -331,67 +217,9 @@ def indices_beyond_the_matrix(content: Content, cable: Cable, folder: Path) -> N
     cable.A.indices = cable.A.indices + 5
 
 
-@mistake("has its upper triangle only; store both")
-def one_triangle(content: Content, cable: Cable, folder: Path) -> None:
-    cable.A = sp.csr_array(sp.triu(cable.A))
-
-
-@mistake("operators.A is not symmetric: entries differ by 1.0e-0?3$")
-def not_symmetric(content: Content, cable: Cable, folder: Path) -> None:
-    cable.A = sp.csr_array(cable.A + sp.csr_array(([1e-3], ([0], [5])), shape=cable.A.shape))
-
-
-@mistake("rows of Dirichlet unknowns were replaced and their columns kept")
-def replaced_dirichlet_row(content: Content, cable: Cable, folder: Path) -> None:
-    dense = cable.A.toarray()
-    dense[0] = np.eye(SIZE)[0]
-    cable.A = sp.csr_array(dense)
-
-
-@mistake("couples 1 unknowns with no other, the first is 0.*rows of Dirichlet unknowns were left in")
-def dirichlet_rows_left_in(content: Content, cable: Cable, folder: Path) -> None:
-    dense = cable.A.toarray()
-    dense[0], dense[:, 0] = np.eye(SIZE)[0], np.eye(SIZE)[0]
-    cable.A = sp.csr_array(dense)
-
-
-@mistake("diagonal entries of 1e.30 at 1 unknowns, the first is 0: a penalty for Dirichlet")
-def penalty_left_in(content: Content, cable: Cable, folder: Path) -> None:
-    cable.A = sp.csr_array(cable.A + sp.csr_array(([1e30], ([0], [0])), shape=cable.A.shape))
-
-
-@mistake("constants are in its kernel: Dirichlet conditions were not applied")
-def no_dirichlet_conditions(content: Content, cable: Cable, folder: Path) -> None:
-    dense = cable.A.toarray()
-    dense[0, 0] = dense[-1, -1] = dense[0, 0] / 2.0
-    cable.A = sp.csr_array(dense)
-
-
-@mistake("the sign of A is the opposite one")
-def negative_stiffness(content: Content, cable: Cable, folder: Path) -> None:
-    cable.A = -cable.A
-
-
-@mistake("spaces.X_V .*; it is the product of a seminorm, without the L² part")
-def seminorm(content: Content, cable: Cable, folder: Path) -> None:
-    dense = cable.A.toarray()
-    dense[0, 0] = dense[-1, -1] = dense[0, 0] / 2.0
-    cable.X_V = sp.csr_array(dense)
-
-
-@mistake("spaces.X_W: a matrix 12×11; expected a square one")
-def rectangular_gram_matrix(content: Content, cable: Cable, folder: Path) -> None:
-    cable.X_W = sp.csr_array(cable.X_W[:, 1:])
-
-
-@mistake("operators.A: 14×14; expected 12×12; if it has the Dirichlet unknowns, too")
-def all_unknowns(content: Content, cable: Cable, folder: Path) -> None:
-    cable.A = sp.csr_array(sp.block_diag([[[1.0]], cable.A, [[1.0]]]))
-
-
-@mistake("operators.B: 12×5; expected 5×12; it is transposed")
-def transposed_constraint(content: Content, cable: Cable, folder: Path) -> None:
-    cable.X_W, cable.B = sp.csr_array(cable.X_W[:5, :5]), sp.csr_array(cable.B[:, :5])
+@mistake("operators.f.affine.0: 1 of its entries are not finite")
+def not_a_number(content: Content, cable: Cable, folder: Path) -> None:
+    cable.mass[3] = np.nan
 
 
 @mistake("parameters.training: an array 0×2; expected P×2 with P > 0, a row per parameter$")
@@ -407,14 +235,50 @@ def contact_without_unknowns_of_constraints(content: Content, cable: Cable, fold
     content["spaces"]["contact"] = "contact.npz:few"
 
 
-@mistake("operators.B is zero: no constraint acts")
-def no_constraint(content: Content, cable: Cable, folder: Path) -> None:
-    cable.B = 0.0 * cable.B
+def edited(A: sp.csr_array, place: Any, to: Any) -> sp.csr_array:
+    dense = A.toarray()
+    dense[place] = to
+    return sp.csr_array(dense)
 
 
-@mistake("probably λ has the other sign: with B u ≤ g")
-def other_multiplier(content: Content, cable: Cable, folder: Path) -> None:
-    cable.lam = -cable.lam
+def free(cable: Cable) -> sp.csr_array:
+    """The stiffness without Dirichlet conditions."""
+    return edited(cable.A, ([0, -1], [0, -1]), cable.A[0, 0] / 2.0)
+
+
+FIRST = np.eye(SIZE)[0]
+in_arrays("complex numbers", "operators.A: it holds complex numbers", A=lambda c: c.A * (1.0 + 0j))
+in_arrays("one triangle", "has its upper triangle only; store both", A=lambda c: sp.csr_array(sp.triu(c.A)))
+NOT_SYMMETRIC = "operators.A is not symmetric: entries differ by 1.0e-0?3$"
+in_arrays("not symmetric", NOT_SYMMETRIC, A=lambda c: edited(c.A, (0, 5), 1e-3))
+REPLACED = "rows of Dirichlet unknowns were replaced and their columns kept"
+in_arrays("replaced Dirichlet row", REPLACED, A=lambda c: edited(c.A, 0, FIRST))
+LEFT_IN = "couples 1 unknowns with no other, the first is 0.*rows of Dirichlet unknowns were left in"
+in_arrays("Dirichlet rows left in", LEFT_IN, A=lambda c: edited(edited(c.A, 0, FIRST), (slice(None), 0), FIRST))
+PENALTY = "diagonal entries of 1e.30 at 1 unknowns, the first is 0: a penalty for Dirichlet"
+in_arrays("penalty left in", PENALTY, A=lambda c: edited(c.A, (0, 0), 1e30))
+in_arrays("free", "constants are in its kernel: Dirichlet conditions were not applied", A=free)
+in_arrays("negative stiffness", "the sign of A is the opposite one", A=lambda c: -c.A)
+in_arrays("seminorm", "spaces.X_V .*; it is the product of a seminorm, without the L² part", X_V=free)
+in_arrays("rectangular", "spaces.X_W: a matrix 12×11; expected a square one", X_W=lambda c: sp.csr_array(c.X_W[:, 1:]))
+in_arrays("all unknowns", "operators.A: 14×14; expected 12×12; if it has the Dirichlet unknowns, too",
+          A=lambda c: sp.csr_array(sp.block_diag([[[1.0]], c.A, [[1.0]]])))  # fmt: skip
+in_arrays("transposed B", "operators.B: 12×5; expected 5×12; it is transposed",
+          X_W=lambda c: sp.csr_array(c.X_W[:5, :5]), B=lambda c: sp.csr_array(c.B[:, :5]))  # fmt: skip
+in_arrays("no constraint", "operators.B is zero: no constraint acts", B=lambda c: 0.0 * c.B)
+in_arrays("other_multiplier", "probably λ has the other sign: with B u ≤ g", lam=lambda c: -c.lam)
+in_arrays("other B", "probably B has the other sign", B=lambda c: -c.B)
+in_arrays("other u", "probably u has the other sign", u=lambda c: -c.u)
+in_arrays("energy without half", "probably the energy has no factor ½", A=lambda c: sp.csr_array(0.5 * c.A))
+in_arrays("forces", "probably λ are nodal forces", lam=lambda c: c.X_W @ c.lam)
+ORDER = "but that of parameter 2: the columns are in another order"
+in_arrays("other order", ORDER, u=lambda c: c.u[:, ::-1], lam=lambda c: c.lam[:, ::-1])
+in_arrays("inaccurate", "does not solve the problem: A u . Bᵀλ = f is violated by", lam=lambda c: 1.01 * c.lam)
+TRANSPOSED = "solutions.u: an array 3×12; expected 12×3, a column per parameter; it is transposed"
+in_arrays("transposed solutions", TRANSPOSED, u=lambda c: c.u.T)
+MISSING = "solutions.lam has 2 columns for 5 parameters"
+in_arrays("a solution is missing", MISSING, u=lambda c: c.u[:, :2], lam=lambda c: c.lam[:, :2])
+in_arrays("no contact", "no constraint is active, there is nothing to reduce", lam=lambda c: 0.0 * c.lam)
 
 
 @mistake("probably the constraints are B u ≥ g: write B and g with the other sign")
@@ -429,56 +293,6 @@ def other_constraint_and_multiplier(content: Content, cable: Cable, folder: Path
     cable.lam = -cable.lam
 
 
-@mistake("probably f has the other sign")
-def other_load(content: Content, cable: Cable, folder: Path) -> None:
-    content["operators"]["f"]["affine"][0]["theta"] = "load"
-
-
-@mistake("probably g has the other sign")
-def other_gap(content: Content, cable: Cable, folder: Path) -> None:
-    content["operators"]["g"]["affine"][0]["theta"] = "-depth"
-
-
-@mistake("probably B has the other sign")
-def other_operator(content: Content, cable: Cable, folder: Path) -> None:
-    cable.B = -cable.B
-
-
-@mistake("probably u has the other sign")
-def other_u(content: Content, cable: Cable, folder: Path) -> None:
-    cable.u = -cable.u
-
-
-@mistake("probably the energy has no factor ½")
-def energy_without_half(content: Content, cable: Cable, folder: Path) -> None:
-    cable.A, cable.X_V = sp.csr_array(0.5 * cable.A), sp.csr_array(cable.X_W + cable.A)
-
-
-@mistake("probably λ are nodal forces")
-def forces(content: Content, cable: Cable, folder: Path) -> None:
-    cable.lam = cable.X_W @ cable.lam
-
-
-@mistake("but that of parameter 2: the columns are in another order")
-def other_order(content: Content, cable: Cable, folder: Path) -> None:
-    cable.u, cable.lam = cable.u[:, ::-1], cable.lam[:, ::-1]
-
-
-@mistake("does not solve the problem: A u . Bᵀλ = f is violated by")
-def inaccurate(content: Content, cable: Cable, folder: Path) -> None:
-    cable.lam = 1.01 * cable.lam
-
-
-@mistake("solutions.u: an array 3×12; expected 12×3, a column per parameter; it is transposed")
-def transposed_solutions(content: Content, cable: Cable, folder: Path) -> None:
-    cable.u = cable.u.T
-
-
-@mistake("solutions.lam has 2 columns for 5 parameters")
-def a_solution_is_missing(content: Content, cable: Cable, folder: Path) -> None:
-    cable.u, cable.lam = cable.u[:, :2], cable.lam[:, :2]
-
-
 @mistake("solutions.lam has both signs")
 def both_signs(content: Content, cable: Cable, folder: Path) -> None:
     del content["operators"], content["solutions"]["u"]
@@ -489,11 +303,6 @@ def both_signs(content: Content, cable: Cable, folder: Path) -> None:
 def negative_snapshots(content: Content, cable: Cable, folder: Path) -> None:
     del content["operators"], content["solutions"]["u"]
     cable.lam = -cable.lam
-
-
-@mistake("no constraint is active, there is nothing to reduce")
-def no_contact(content: Content, cable: Cable, folder: Path) -> None:
-    cable.lam = 0.0 * cable.lam
 
 
 @pytest.fixture
