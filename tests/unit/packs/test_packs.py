@@ -96,12 +96,8 @@ def test_hdf5_datasets_groups_and_links(tmp_path: Path) -> None:
         file["elsewhere"] = h5py.ExternalLink("/etc/passwd", "/")
     write_manifest(folder, content)
     assert_cable(read_model_pack(folder))
-    for name, line in (
-        ("soft", "is a link"),
-        ("elsewhere", "is a link"),
-        ("nothing", "no dataset"),
-        ("vectors", "is a group"),
-    ):
+    lines = {"soft": "is a link", "elsewhere": "is a link", "nothing": "no dataset", "vectors": "is a group"}
+    for name, line in lines.items():
         content["operators"]["f"]["affine"][0]["array"] = f"arrays.h5:{name}"
         write_manifest(folder, content)
         with pytest.raises(RequestError, match=line):
@@ -245,13 +241,9 @@ def test_import_says_what_a_pack_can_do(tmp_path: Path, main: Main) -> None:
     code, out, _ = main("pack", str(write_cable(tmp_path / "pack")))
     assert code == 0
     for words in (
-        "12 unknowns",
-        "affine, 1 term",
-        "KKT residuals up to",
-        "anywhere in the box",
-        "validation = 2 at most",
+        "12 unknowns", "affine, 1 term", "KKT residuals up to", "anywhere in the box", "validation = 2 at most",
         "; reduced assembly sums the terms of f, g\n",
-    ):
+    ):  # fmt: skip
         assert words in out
     assert "interpolates" not in out
     assert "outputs" not in out
@@ -322,12 +314,8 @@ def test_the_python_example_of_the_page_exports_a_pack(tmp_path: Path, monkeypat
     code = page.partition('```python title="export.py"\n')[2].partition("```")[0]
     cable, listed = Cable(), np.array([[4.0, 0.2], [8.0, 0.3], [5.0, 0.2]])
     monkeypatch.chdir(tmp_path)
-    given = {
-        "training": listed[:2],
-        "validation": listed[2:],
-        "f": -cable.mass,
-        "g": np.outer(cable.mass, listed[:, 1]),
-    }
+    given = {"training": listed[:2], "validation": listed[2:], "f": -cable.mass}
+    given |= {"g": np.outer(cable.mass, listed[:, 1])}
     exec(code, {"A": cable.A, "B": cable.B, "X_V": cable.X_V, "X_W": cable.X_W, **given})
     assert_cable(read_model_pack("my-model"))
 

@@ -50,13 +50,8 @@ def cells(*changes: dict[str, Any]) -> pd.DataFrame:
 def run(tmp_path: Path) -> Path:
     """A run folder with two cells, one of which never got an answer."""
     journal = ResultsDatabase(tmp_path / "runs" / "sample", STUDY)
-    missing = dict.fromkeys(STORED["cells"]) | {
-        "cell": "c2",
-        "status": "error",
-        "reason": "broke",
-        "queries": 4,
-        "queries_ok": 0,
-    }
+    failed = {"cell": "c2", "status": "error", "reason": "broke", "queries": 4, "queries_ok": 0}
+    missing = dict.fromkeys(STORED["cells"]) | failed
     output = {"cell": "c1", "output": "force", "unit": "N", "scale": 2.0, "queries_ok": 4, "error_mean": 0.1}
     journal.write_cell(CELL | {"cell": "c1"}, query_rows("c1", 4, gap=1.0 / 3.0), outputs=[output])
     journal.write_cell(missing | {name: CELL[name] for name in KEYS} | {"solver": "osqp"}, [])
@@ -77,18 +72,14 @@ def test_a_run_is_found_by_folder_by_file_and_by_name(run: Path, monkeypatch: py
     assert results_file("sample").resolve() == run / FILE
 
 
-def test_where_nothing_was_run_there_is_nothing_to_read(tmp_path: Path) -> None:
+def test_what_is_no_results_file_of_this_schema_is_refused(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(RequestError, match=r"no results in '.*nothing'.*results\.sqlite"):
         results_file(str(tmp_path / "nothing"))
-
-
-def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
     (tmp_path / FILE).write_text("hello")
     with pytest.raises(RequestError, match="not a results file"):
         results_file(str(tmp_path))
-
-
-def test_another_schema_is_refused(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(read, "VERSION", VERSION + 1)
     with pytest.raises(RequestError, match=f"schema {VERSION}.*reads {VERSION + 1}"):
         results_file(str(run))
@@ -174,9 +165,6 @@ def test_the_summary_has_a_line_for_every_cell(run: Path) -> None:
     assert (second["δ_POD"], second["δ_dual"]) == ("0.001", "0.01")
     assert (second["offline [s]"], second["online [ms]"]) == (1.5, 2.5)
     assert pd.isna(first["N"])
-
-
-def test_the_summary_says_prescribed_sizes() -> None:
     frame = summary(cells({"pod_tol": None, "pod_size": 9, "dual_tol": None, "dual_size": 4}))
     assert (frame["δ_POD"][0], frame["δ_dual"][0]) == ("N=9", "R=4")
 
@@ -214,11 +202,8 @@ def test_the_benefits_say_from_when_on_a_strategy_pays() -> None:
 
 def test_benefits_without_a_number_are_words() -> None:
     slow = CELL | {"hf_s": 0.001, "enrichment_kind": "none"}
-    assert list(
-        break_even_table(pd.DataFrame(break_even_rows([slow], rounds([slow])), columns=list(STORED["thresholds"])))[
-            "break-even"
-        ]
-    ) == ["never"]
+    frame = pd.DataFrame(break_even_rows([slow], rounds([slow])), columns=list(STORED["thresholds"]))
+    assert list(break_even_table(frame)["break-even"]) == ["never"]
 
 
 def test_tables_of_nothing_are_empty() -> None:
