@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import shutil
 import sqlite3
@@ -11,13 +12,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from running import execute
 from samples import cell_row
 
 from vibench.errors import RequestError, StorageError
 from vibench.execution.recording import claimed
 from vibench.results.database import ResultsDatabase
 from vibench.results.read import read_table, results_file
-from vibench.results.sqlite import DAMAGED, FILE, DamagedResultsError, open_read_only, read_meta, set_aside
+from vibench.results.schema import STORED, VERSION
+from vibench.results.sqlite import DAMAGED, FILE, DamagedResultsError, open_read_only, read_meta, read_rows, set_aside
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4}
 NOBODY = 65534
@@ -143,3 +146,34 @@ def test_the_file_of_another_application_is_not_damaged(tmp_path: Path) -> None:
     with pytest.raises(RequestError) as caught:
         read_meta(tmp_path / FILE)
     assert not isinstance(caught.value, DamagedResultsError)
+
+
+def test_what_others_have_written_is_printable_when_it_is_read(journal: ResultsDatabase, tmp_path: Path) -> None:
+    journal.write_cell(cell_row(), [])
+    execute(tmp_path / "run", "UPDATE cells SET reason = CAST(x'411b5b324aff' AS TEXT), problem = 'a' || char(10)")
+    with open_read_only(tmp_path / "run" / FILE) as db:
+        assert db.execute("SELECT problem, reason FROM cells").fetchall() == [("a\\n", "A\\u001b[2J\ufffd")]
+
+
+def test_a_text_of_many_rows_is_kept_once(journal: ResultsDatabase, tmp_path: Path) -> None:
+    """The histories of a large study have tens of millions of texts, and hundreds that differ."""
+    for key in ("one", "other"):
+        journal.write_cell(cell_row(cell=key, reason="neither a letter nor a name"), [])
+    names, (one, other) = read_rows(tmp_path / "run" / FILE, "cells")
+    reason = names.index("reason")
+    assert one[reason] == "neither a letter nor a name"
+    assert one[reason] is other[reason]
+
+
+def test_two_slashes_are_no_authority(journal: ResultsDatabase, tmp_path: Path) -> None:
+    assert read_meta(Path(f"/{tmp_path}") / "run" / FILE)["schema"] == str(VERSION)
+
+
+def test_other_columns_are_another_version() -> None:
+    """A file with other columns under the same version would be refused as damaged."""
+    declared = [
+        (table, *((name, f"{column.kind} {column.constraint}".strip()) for name, column in columns.items()))
+        for table, columns in STORED.items()
+    ]
+    # the first digits of the digest of tables and columns, by version
+    assert {VERSION: hashlib.sha256(repr(declared).encode()).hexdigest()[:4]} == {20: "233a"}

@@ -146,19 +146,11 @@ def prepared(
 
 
 KINDS: list[tuple[str, bool, str]] = [
-    ("constant", False, "moving"),
-    ("constant", True, "moving"),
-    ("affine", False, "moving"),
-    ("affine", True, "moving"),
-    ("interpolated", False, "moving"),
-    ("constant", False, "scaled"),
-    ("affine", False, "scaled"),
-    ("affine", True, "scaled"),
-    ("interpolated", False, "scaled"),
-    ("constant", False, "half"),
-    ("constant", True, "half"),
-]
-
+    ("constant", False, "moving"), ("constant", True, "moving"), ("affine", False, "moving"),
+    ("affine", True, "moving"), ("interpolated", False, "moving"), ("constant", False, "scaled"),
+    ("affine", False, "scaled"), ("affine", True, "scaled"), ("interpolated", False, "scaled"),
+    ("constant", False, "half"), ("constant", True, "half"),
+]  # fmt: skip
 TIED = [("constant", False, "tied"), ("affine", True, "tied")]
 
 
@@ -439,7 +431,13 @@ def test_where_interpolation_errors_are_as_large_as_the_coercivity_there_is_no_b
 
 
 def test_outside_the_box_only_exact_models_have_bounds() -> None:
-    """Interpolation errors are measured inside it."""
+    """Interpolation errors are measured inside it: bounds of interpolated models are verified there."""
+    verified = prepared("interpolated")[2].base
+    assert verified.guarantee is Guarantee.VERIFIED
+    assert verified.stiffness_error > 0.0
+    for stiffness in ("constant", "affine"):
+        assert prepared(stiffness)[2].base.guarantee is Guarantee.CERTIFIED
+    assert prepared("constant")[2].base.spectral is None
     mu = np.array([2.3, 0.4])
     for stiffness, has_bound in (("affine", True), ("interpolated", False)):
         given = prepared(stiffness, constraint="scaled")
@@ -448,15 +446,6 @@ def test_outside_the_box_only_exact_models_have_bounds() -> None:
         assert (bound.guarantee is Guarantee.CERTIFIED) == has_bound == np.isfinite(bound.u_energy)
         assert error <= bound.u_energy
         assert natural <= bound.lambda_natural
-
-
-def test_what_bounds_are_worth() -> None:
-    assert prepared("constant")[2].base.guarantee is Guarantee.CERTIFIED
-    assert prepared("affine")[2].base.guarantee is Guarantee.CERTIFIED
-    verified = prepared("interpolated")[2].base
-    assert verified.guarantee is Guarantee.VERIFIED
-    assert verified.stiffness_error > 0.0
-    assert prepared("constant")[2].base.spectral is None
 
 
 class Bump(Family):
