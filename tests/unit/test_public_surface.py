@@ -16,16 +16,11 @@ HEAVY = {"numpy", "scipy", "pandas", "matplotlib", "qpsolvers", "pydantic", "ric
 AUTHORS = sorted(
     path
     for pattern in (
-        "problems/**/*.py",
-        "strategies/**/*.py",
-        "examples/**/*.py",
-        "vibench/cli/templates/*.template",
-        "docs/extend/*.md",
-        "docs/tutorial.md",
-        "README.md",
+        "problems/**/*.py", "strategies/**/*.py", "examples/**/*.py", "vibench/cli/templates/*.template",
+        "docs/extend/*.md", "docs/tutorial.md", "README.md",
     )
     for path in ROOT.glob(pattern)
-)
+)  # fmt: skip
 IMPORTED = re.compile(r"^[ ]*(?:from|import) (vibench(?:\.[a-z_]+)*)\b", re.MULTILINE)
 NAMES = re.compile(r"^[ ]*from (vibench(?:\.[a-z]+)?) import (\([^)]*\)|[^\n]+)", re.MULTILINE)
 PUBLIC = {"vibench": vibench, **{f"vibench.{group}": getattr(vibench, group) for group in vibench.GROUPS}}

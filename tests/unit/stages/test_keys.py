@@ -102,16 +102,9 @@ def traced(stage: Stage, store: Store) -> tuple[Result, set[str]]:
 
 
 CARRIERS = (
-    "stages.artefacts",
-    "stages.serialisation",
-    "plugins",
-    "study",
-    "errors",
-    "text",
-    "provenance",
+    "stages.artefacts", "stages.serialisation", "stages.base", "plugins", "study", "errors", "text", "provenance",
     "files",
-    "stages.base",
-)
+)  # fmt: skip
 """Packages and modules that only hand over what determines numbers."""
 
 

@@ -154,18 +154,10 @@ SAMPLE = Cell(
     problem=Plugin("problem", "p", '{"a": 1}', "package 1"),
     dual=Plugin("dual strategy", "d", "{}", "package 1"),
     primal=Plugin("primal strategy", "q", "{}", "package 1"),
-    pod=Stop(tolerance=1e-3),
-    cone=Stop(size=4),
-    primal_tol=0.5,
-    solver="piqp",
-    assembly="full",
-    interpolation=None,
-    warm_start=False,
-    accuracy=1e-7,
-    validation=ParameterSet("validation", 8, 1),
-    labels=("P", "D", "Q"),
     formulation=Plugin("formulation", "m", "{}", "package 1"),
-)
+    pod=Stop(tolerance=1e-3), cone=Stop(size=4), primal_tol=0.5, solver="piqp", assembly="full", interpolation=None,
+    warm_start=False, accuracy=1e-7, validation=ParameterSet("validation", 8, 1), labels=("P", "D", "Q"),
+)  # fmt: skip
 
 SAMPLING = Plugin("sampling strategy", "s", "{}", "package 1")
 FORMULATION = Plugin("formulation", "f", "{}", "package 1")
