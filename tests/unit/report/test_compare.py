@@ -40,30 +40,26 @@ def steady(changed: Changed, tmp_path: Path) -> Path:
     return changed(*STEADY).rename(tmp_path / "steady.sqlite")
 
 
+WORSE, BETTER, CHANGED = ChangeKind.WORSE, ChangeKind.BETTER, ChangeKind.CHANGED
+
+
 @pytest.mark.parametrize(
-    ("statement", "what", "verdict"),
+    ("change", "what", "verdict"),
     [
-        (f"UPDATE cells SET queries_ok = queries_ok - 1 WHERE {ONE}", "queries_ok", ChangeKind.WORSE),
-        (
-            f"UPDATE cells SET error_lambda_mean = 2 * error_lambda_mean WHERE {ONE}",
-            "error_lambda_mean",
-            ChangeKind.WORSE,
-        ),
-        (f"UPDATE cells SET error_u_max = 0.5 * error_u_max WHERE {ONE}", "error_u_max", ChangeKind.BETTER),
-        (f"UPDATE cells SET beta_span_min = 0.5 * beta_span_min WHERE {ONE}", "beta_span_min", ChangeKind.WORSE),
-        (f"UPDATE cells SET online_s = 2 * online_s WHERE {ONE}", "online_s", ChangeKind.WORSE),
-        (f"UPDATE cells SET offline_s = 0.5 * offline_s WHERE {ONE}", "offline_s", ChangeKind.BETTER),
-        (f"UPDATE cells SET enrichment = 2 * enrichment WHERE {ONE}", "enrichment", ChangeKind.WORSE),
-        (f"UPDATE cells SET enrichment = enrichment + 1 WHERE {ONE}", "enrichment", ChangeKind.CHANGED),
-        (f"UPDATE cells SET error_u_mean = NULL WHERE {ONE}", "error_u_mean", ChangeKind.WORSE),
-        (f"UPDATE cells SET beta_span_min = NULL WHERE {ONE}", "beta_span_min", ChangeKind.WORSE),
-        (f"UPDATE cells SET status = 'crashed' WHERE {ONE}", "status", ChangeKind.WORSE),
-        (f"DELETE FROM cells WHERE {ONE}", "cell", ChangeKind.WORSE),
+        ("queries_ok = queries_ok - 1", "queries_ok", WORSE),
+        ("error_lambda_mean = 2 * error_lambda_mean", "error_lambda_mean", WORSE),
+        ("error_u_max = 0.5 * error_u_max", "error_u_max", BETTER),
+        ("beta_span_min = 0.5 * beta_span_min", "beta_span_min", WORSE),
+        ("online_s = 2 * online_s", "online_s", WORSE), ("offline_s = 0.5 * offline_s", "offline_s", BETTER),
+        ("enrichment = 2 * enrichment", "enrichment", WORSE), ("enrichment = enrichment + 1", "enrichment", CHANGED),
+        ("error_u_mean = NULL", "error_u_mean", WORSE), ("beta_span_min = NULL", "beta_span_min", WORSE),
+        ("status = 'crashed'", "status", WORSE), ("", "cell", WORSE),
     ],
-)
+)  # fmt: skip
 def test_a_change_of_one_cell_is_told_with_its_meaning(
-    statement: str, what: str, verdict: ChangeKind, changed: Changed, steady: Path
+    change: str, what: str, verdict: ChangeKind, changed: Changed, steady: Path
 ) -> None:
+    statement = f"UPDATE cells SET {change} WHERE {ONE}" if change else f"DELETE FROM cells WHERE {ONE}"
     found = compare([steady, changed(statement, *STEADY)], 1.25)
     (row,) = found.changes.to_dict("records")
     assert (row["what"], row["verdict"]) == (what, verdict.value)
@@ -85,11 +81,8 @@ def test_errors_are_compared_on_the_queries_that_are_ok_in_both_runs(changed: Ch
         f"UPDATE queries SET error_u = 2 * error_u WHERE {ONE} AND query < 4",
         f"UPDATE cells SET queries_ok = 4 WHERE {ONE}",
     )
-    assert set(compare([quick_run / FILE, worse], 1.25).changes["what"]) == {
-        "queries_ok",
-        "error_u_mean",
-        "error_u_max",
-    }
+    of_errors = set(compare([quick_run / FILE, worse], 1.25).changes["what"])
+    assert of_errors == {"queries_ok", "error_u_mean", "error_u_max"}
 
 
 def test_changes_within_the_limit_are_not_told(changed: Changed, steady: Path) -> None:
@@ -119,12 +112,10 @@ def test_seconds_have_not_changed_where_the_rounds_do_not_tell(changed: Changed,
     columns = compare([before, after], 1.25).by_column.set_index("what")
     assert columns.loc["online_s", ChangeKind.UNDECIDED.value] == 36
     assert columns.loc["online_s", "ratio"] == pytest.approx(1.5)
-    disturbed = changed("UPDATE cells SET online_s = 9 * online_s", *STEADY, "UPDATE cells SET disturbed = 1")
-    columns = compare([before, disturbed], 1.25).by_column.set_index("what")
-    assert columns.loc["online_s", ChangeKind.UNDECIDED.value] == 36
-    few = changed("UPDATE cells SET online_s = 9 * online_s", "DELETE FROM timings WHERE round >= 5", *STEADY)
-    columns = compare([before, few], 1.25).by_column.set_index("what")
-    assert columns.loc["online_s", ChangeKind.UNDECIDED.value] == 36
+    slower = "UPDATE cells SET online_s = 9 * online_s"
+    for reason in ("UPDATE cells SET disturbed = 1", "DELETE FROM timings WHERE round >= 5"):
+        columns = compare([before, changed(slower, *STEADY, reason)], 1.25).by_column.set_index("what")
+        assert columns.loc["online_s", ChangeKind.UNDECIDED.value] == 36
 
 
 def test_a_ratio_of_seconds_has_the_interval_of_resampled_rounds(changed: Changed, tmp_path: Path) -> None:
@@ -138,24 +129,21 @@ def test_a_ratio_of_seconds_has_the_interval_of_resampled_rounds(changed: Change
     assert ((online["ratio_high"] < 2.2) & (online["ratio_high"] > 2.0)).all()
 
 
-def test_errors_of_round_off_are_not_compared(changed: Changed, tmp_path: Path) -> None:
-    before = changed("UPDATE cells SET error_u_mean = 1e-14").rename(tmp_path / "before.sqlite")
-    after = changed("UPDATE cells SET error_u_mean = 9e-14")
-    assert compare([before, after], 1.25).changes.empty
+def test_errors_and_constants_of_round_off_are_not_compared(changed: Changed, tmp_path: Path) -> None:
+    for one, other in (
+        ("error_u_mean = 1e-14", "error_u_mean = 9e-14"),
+        ("beta_span_min = 9e-17", "beta_span_min = 1e-17"),
+    ):
+        before = changed(f"UPDATE cells SET {one}").rename(tmp_path / "before.sqlite")
+        assert compare([before, changed(f"UPDATE cells SET {other}")], 1.25).changes.empty
 
 
-def test_times_of_another_machine_are_left_out(changed: Changed, quick_run: Path) -> None:
-    found = compare([quick_run / FILE, changed("UPDATE cells SET machine = 'other', online_s = 9 * online_s")], 1.25)
-    assert found.changes.empty
-    assert any("different machines" in note for note in found.notes)
-
-
-def test_times_of_another_version_of_the_benchmark_are_left_out(changed: Changed, quick_run: Path) -> None:
-    other = f'versions = replace(versions, \'"protocol": "{PROTOCOL}"\', \'"protocol": "0"\')'
-    later = changed(f"UPDATE cells SET {other}, online_s = 9 * online_s")
-    found = compare([quick_run / FILE, later], 1.25)
-    assert found.changes.empty
-    assert any("different machines or protocols" in note for note in found.notes)
+def test_times_of_another_machine_or_version_of_the_benchmark_are_left_out(changed: Changed, quick_run: Path) -> None:
+    version = f'versions = replace(versions, \'"protocol": "{PROTOCOL}"\', \'"protocol": "0"\')'
+    for other in ("machine = 'other'", version):
+        found = compare([quick_run / FILE, changed(f"UPDATE cells SET {other}, online_s = 9 * online_s")], 1.25)
+        assert found.changes.empty
+        assert any("different machines or protocols" in note for note in found.notes)
 
 
 THRESHOLD = "WHERE solver = 'piqp' AND problem = 'obstacle' AND dual = 'cpg' AND primal_a = 'high-fidelity'"
@@ -179,17 +167,12 @@ def test_a_threshold_within_the_interval_of_the_other_is_no_change(changed: Chan
 def test_a_threshold_is_worse_where_its_own_side_got_slower(changed: Changed, decided: Path) -> None:
     later = f"{LATER}, offline_b_s = 3 * offline_b_s"
     never = "benefit_threshold = NULL, threshold_low = NULL, threshold_high = NULL, meaning = 'never'"
-    found = compare(
-        [
-            decided,
-            changed(
-                *DECISIVE,
-                f"UPDATE thresholds SET {later} {THRESHOLD} AND primal_b = 'decorrelated'",
-                f"UPDATE thresholds SET {never}, online_b_s = 9 * online_b_s {THRESHOLD} AND primal_b = 'offline-pga'",
-            ),
-        ],
-        1.25,
+    after = changed(
+        *DECISIVE,
+        f"UPDATE thresholds SET {later} {THRESHOLD} AND primal_b = 'decorrelated'",
+        f"UPDATE thresholds SET {never}, online_b_s = 9 * online_b_s {THRESHOLD} AND primal_b = 'offline-pga'",
     )
+    found = compare([decided, after], 1.25)
     assert set(found.changes["primal"]) == {"decorrelated", "offline-pga"}
     assert set(found.changes["what"]) == {"break-even against high-fidelity"}
     assert found.regressions == 2
@@ -205,11 +188,6 @@ def test_a_competitor_that_got_quicker_is_no_regression(changed: Changed, decide
 def test_what_was_missing_and_is_there_is_no_regression(changed: Changed, quick_run: Path) -> None:
     before = changed(f"UPDATE cells SET beta_span_min = NULL, beta_cone_lower_min = NULL WHERE {ONE}")
     assert compare([before, quick_run / FILE], 1.25).regressions == 0
-
-
-def test_constants_of_round_off_are_not_compared(changed: Changed, tmp_path: Path) -> None:
-    before = changed("UPDATE cells SET beta_span_min = 9e-17").rename(tmp_path / "before.sqlite")
-    assert compare([before, changed("UPDATE cells SET beta_span_min = 1e-17")], 1.25).changes.empty
 
 
 def test_columns_without_any_value_are_no_obstacle(changed: Changed, quick_run: Path) -> None:

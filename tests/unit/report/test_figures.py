@@ -174,7 +174,9 @@ def test_lines_that_have_to_be_told_apart_have_names_and_looks_of_their_own(draw
         assert named == shown, name
 
 
-def test_projection_errors_are_those_of_the_histories(drawn: Drawn, results: Path) -> None:
+def test_projection_errors_are_those_of_the_histories_and_dual_strategies_have_orthogonality(
+    drawn: Drawn, results: Path
+) -> None:
     histories = read_table(results, "histories")
     for problem in problems():
         pod, cones = drawn[f"{problem}-errors"].axes
@@ -190,10 +192,6 @@ def test_projection_errors_are_those_of_the_histories(drawn: Drawn, results: Pat
             np.testing.assert_array_equal(line.get_ydata(), cone["value"])
             assert line.get_ydata()[-1] <= 1e-2
         assert {axes.get_yscale() for axes in (pod, cones)} == {"log"}
-
-
-def test_orthogonality_has_a_line_per_dual_strategy(drawn: Drawn) -> None:
-    for problem in problems():
         (axes,) = drawn[f"{problem}-orthogonality"].axes
         assert [line.get_label() for line in axes.get_lines()] == sorted(e.title for e in read_study("quick").dual)
         for values in data_of(axes):
@@ -232,10 +230,7 @@ def test_the_inf_sup_figure_shows_every_strategy_and_the_high_fidelity_pair(draw
             one = exact[(exact["dual"] == dual.title) & (exact["primal_tol"].notna())]
             np.testing.assert_allclose(found, np.sort(one["beta_hf_span"]))
             assert len(cone.get_lines()) == len(labels)
-
-
-def test_a_constant_that_vanishes_is_named_though_it_cannot_be_drawn(drawn: Drawn) -> None:
-    """β over the span of the decorrelated basis is zero in this run, which a logarithmic axis cannot show."""
+    # β over the span of the decorrelated basis is zero in this run, which a logarithmic axis cannot show
     axes = drawn["obstacle-mcpg-inf-sup"].axes[0]
     assert [text.get_text() for text in axes.texts] == ["β = 0: decorrelated"]
     assert "decorrelated" in axes.get_legend_handles_labels()[1]
@@ -615,7 +610,7 @@ def test_a_problem_has_an_abscissa_of_its_own_only_with_one_parameter(results: P
     assert replace(data["hertz"], pictures=()).parameter == "µ"
 
 
-def test_panels_that_are_compared_share_their_axes(drawn: Drawn) -> None:
+def test_panels_that_are_compared_share_their_axes_and_points_are_named(drawn: Drawn, results: Path) -> None:
     span, cone = drawn["hertz-mcpg-inf-sup"].axes
     assert span.get_xlim() == cone.get_xlim()
     for kind in ("dimension", "work-precision"):
@@ -624,8 +619,7 @@ def test_panels_that_are_compared_share_their_axes(drawn: Drawn) -> None:
         assert cpg_lambda.get_ylim() == mcpg_lambda.get_ylim()
         assert cpg_u.get_xlim() == mcpg_lambda.get_xlim()
 
-
-def test_every_point_has_its_dimensions_or_its_tolerance(drawn: Drawn, results: Path) -> None:
+    # a point has its dimensions, or its tolerance
     cells = read_table(results, "cells")
     mine = cells[(cells["problem"] == "obstacle") & (cells["dual"] == "mcpg") & (cells["primal"] == "offline-pga")]
     size = f"({mine['N'].iloc[0]:.0f}, {mine['R'].iloc[0]:.0f}), δ = 0.5"
