@@ -124,7 +124,7 @@ def _contents(pack: ModelPack) -> Iterator[str]:
 
 def _uses(pack: ModelPack, folder: Path) -> Iterator[str]:
     """The table of a study file that names a pack, how it is assembled, and where that is inaccurate."""
-    from vibench.model.affine import INTERPOLATION_RTOL, MISSED
+    from vibench.model.affine import INTERPOLATION_RTOL, is_missed
 
     if pack.members:
         most = "" if pack.validation is None else f", with validation = {len(pack.validation)} at most"
@@ -140,7 +140,7 @@ def _uses(pack: ModelPack, folder: Path) -> Iterator[str]:
         yield f"it is evaluated {where}" + f"; reduced assembly {' and '.join(ways)}" * bool(ways)
         # Members that are interpolated between few listed parameters may be wrong in between.
         for name, error in pack.interpolation_errors(INTERPOLATION_RTOL).items():
-            if error > MISSED * INTERPOLATION_RTOL:
+            if is_missed(INTERPOLATION_RTOL, error):
                 where = f"{name}, interpolated over {len(pack.training)} training parameters to {INTERPOLATION_RTOL:g}"
                 wrong = f"has an error of {error:.1e} at the listed validation parameters"
                 yield f"warning: {where}, {wrong}: use full assembly, or list more"

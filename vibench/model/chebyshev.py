@@ -43,7 +43,7 @@ class AffinePolynomial:
     coefficients: Array
     terms: Array
     error: float
-    scale: float = 1.0
+    scale: float
 
     @property
     def degrees(self) -> tuple[int, ...]:
@@ -119,13 +119,13 @@ def interpolate_on_box(
         polynomials = {}
         for name, given in terms.items():
             theta = _without_smallest(kept[name][1], 0.1 * tolerance) * units[name]
-            polynomials[name] = AffinePolynomial(kept[name][0], theta, given, np.inf)
+            polynomials[name] = AffinePolynomial(kept[name][0], theta, given, np.inf, 1.0)
         for name in kept.keys() - terms.keys():
             indices, c = kept[name]
             count, size = c.shape
             # the coefficients themselves are the terms, or the entries of the array, whichever are fewer
             theta, own = (c, units[name] * np.eye(size)) if size < count else (np.eye(count), units[name] * c)
-            polynomials[name] = AffinePolynomial(indices, theta, own, np.inf)
+            polynomials[name] = AffinePolynomial(indices, theta, own, np.inf, 1.0)
         polynomials = {name: measured(name, polynomials[name]) for name in kept}
         if max(p.error for p in polynomials.values()) <= tolerance:
             # only now: the decomposition of a large array takes minutes
@@ -211,7 +211,7 @@ def _factorised(indices: Indices, coefficients: Array, unit: Any, tolerance: flo
     lost = np.sqrt(len(indices) * np.append(np.cumsum(sigma[::-1] ** 2)[::-1], 0.0))
     count = max(1, int(np.argmax(lost <= tolerance)))
     theta = _without_smallest(left[:, :count] * sigma[:count], tolerance)
-    return AffinePolynomial(indices, theta, right[:count] * unit, np.inf)
+    return AffinePolynomial(indices, theta, right[:count] * unit, np.inf, 1.0)
 
 
 def _without_smallest(coefficients: Array, tolerance: float) -> Array:

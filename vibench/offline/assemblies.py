@@ -29,7 +29,8 @@ class Assemblies:
         self._last: tuple[bytes, EnergyNorm] | None = None
         self._solver = HighFidelitySolver(problem, condensing=True)
         self._contact: ContactInfSup | None = None
-        self._quotients: LRUCache[bytes, Quotients] = LRUCache(1)  # it holds vectors
+        # Quotients hold vectors of mesh size, unlike the constants below: keep one.
+        self._quotients: LRUCache[bytes, Quotients] = LRUCache(1)
         self._alphas: LRUCache[bytes, Constant] = LRUCache(1000)
         self._gammas: LRUCache[bytes, Constant] = LRUCache(1000)
         self._digests: LRUCache[tuple[str, bytes], bytes] = LRUCache(2000)
@@ -49,12 +50,15 @@ class Assemblies:
         vi, key = self.at(mu), _key(mu)
         if self._last is not None and self._last[0] == key:
             return self._last[1]
-        found, self._last = self._energies.get(key), None  # two large ones might not fit in memory
+        # Release the last factorisation first: two large ones may not fit in memory.
+        found, self._last = self._energies.get(key), None
         if found is None:
             found = replace(self.energy_of(vi), shared=True)
-            if "A" not in self._problem.constant:  # else it is factorised once, and timed code uses it, too
+            # A constant A is factorised once, and timed code uses that factorisation, too.
+            if "A" not in self._problem.constant:
                 found.stiffness.serve_many(len(vi.g))
-            found.contact_form(vi)  # is of its size
+            # Made now, since it counts in the size by which the cache decides.
+            found.contact_form(vi)
             if self._own_bytes(found) <= self._energies.maxsize:
                 self._energies[key] = found
         self._last = key, found
@@ -82,6 +86,7 @@ class Assemblies:
         key = self._stiffness_at(mu)
         if key not in self._gammas:
             self._gammas[key] = continuity(self._quotients_at(mu))
+            # γ_a is asked for last, and the vectors are large.
             self._quotients.clear()
         return self._gammas[key]
 
@@ -120,6 +125,7 @@ class Assemblies:
             found = self._contact_at(mu).of_multiple(theta, on.B, W)
             if found is not None:
                 return found
+        # Dense matrices of contact size would be too large here.
         if not on.is_dense:
             return energy_inf_sup(vi.A, vi.B, W)
         if stiffness.has_known_round_off:
@@ -127,6 +133,7 @@ class Assemblies:
             if known.has_inverse:
                 return known.of_inverse(on.B, on.compliance, W)
             return known.energy_inf_sup(on.B, on.liftings, W)
+        # Without a known round-off of the condensation A itself is used, where nothing is lost.
         contact = ContactInfSup(vi.A, vi.A.diagonal(), 0.0, stiffness.extend)
         return contact.energy_inf_sup(vi.B, on.liftings, W)
 

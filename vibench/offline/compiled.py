@@ -56,6 +56,7 @@ class CompiledModel:
         except RequestError as error:
             raise UnsupportedError(f"the model cannot be exported to C: {error}") from None
         box, members = reduced.problem.parameters, {name: polynomials[name] for name in MEMBERS}
+        # Store polynomials and not the source: who loads an artefact runs nothing that is in it.
         return cls(members, box.lower, box.upper, box.names, box.units, accuracy)
 
     @property

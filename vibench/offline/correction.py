@@ -58,6 +58,7 @@ class Corrector:
 
     def in_full(self, mu: Array, u: Array, lam: Array) -> Answer:
         """The answer at high-fidelity cost."""
+        # Corrections are defined for λ_N ≥ 0 only (docs/mathematics.md, "Error bounds").
         if not in_dual_set(lam):
             return Answer(u, lam, note=BoundNote.NOT_IN_CONE)
         cache = assemblies(self.model.problem)

@@ -77,6 +77,7 @@ class CellSolver:
         """The solution of a dense program; see `vibench.interfaces.formulations.SolveQP`."""
         if self._solver is None:
             raise NumericalError("the formulation solves a quadratic program without 'solvers' among its axes (`uses`)")
+        # Other solvers cannot use a start.
         begun = None
         if start is not None and takes_start(self._solver):
             begun = QPSolution(*start, "the start")
@@ -84,7 +85,7 @@ class CellSolver:
         self.last = program, solution
         return solution
 
-    def verdict(self, slackened: float = 1.0) -> tuple[Status, str, Residuals | None]:
+    def verdict(self, slackened: float) -> tuple[Status, str, Residuals | None]:
         """The verdict of verification on the last solution, to some multiple of the accuracy; ok if there is none."""
         if self.last is None:
             return Status.OK, "", None
@@ -210,6 +211,7 @@ class Model:
     def solving(self, solver: str | None, accuracy: float | None = None) -> Model:
         """The same model for another solver and accuracy."""
         other = replace(self, solver=solver, accuracy=self.accuracy if accuracy is None else accuracy)
+        # The model of the formulation depends on neither, and making it may be costly.
         other.__dict__["online"] = self.online
         return other
 
@@ -223,7 +225,7 @@ class Model:
         mu: Array,
         answer: FormulationAnswer,
         solver: CellSolver,
-        slackened: float = 1.0,
+        slackened: float,
         program: VariationalInequality | None = None,
     ) -> QueryStatus:
         """The status of an answer of the formulation at mu (d,), found with this solver, or of its `program`.
@@ -244,6 +246,7 @@ class Model:
         status, reason = Status(answer.outcome.value), answer.reason
         if answer.x is None:
             return QueryStatus(Status.FAILED if status is Status.OK else status, reason or "there is no answer")
+        # A formulation may take a failed program for solved: its own outcome never improves on the verification.
         of_qp, why, residuals = solver.verdict(slackened)
         if of_qp.severity > status.severity:
             status, reason = of_qp, f"its last quadratic program: {why}"
@@ -254,6 +257,7 @@ class Model:
         u, lam = self.pair(mu, answer)
         if not (_finite(u) and _finite(lam)):
             return QueryStatus(Status.NONFINITE, "the reconstructed u or λ is not finite", residuals=residuals)
+        # Even round-off below zero is refused: every bound needs λ ≥ 0.
         if lam.min(initial=0.0) < 0.0:
             worst = f"{lam.min():.1e} in row {int(lam.argmin())}"
             return QueryStatus(Status.FAILED, f"a broken answer: λ has negative coefficients, as {worst}")
@@ -315,6 +319,7 @@ class Model:
         """
         settings = self._settings(solver, accuracy, tolerance, corrected)
         at = parameter_in(self.parameters, mu)
+        # Assembly and solution are timed apart only where the QP solver of the cell solves.
         if not self.solves_programs:
             return self._answered(at, settings)
         assembled, assembly = timed(lambda: self.online.program(at))
@@ -328,8 +333,9 @@ class Model:
             raise RequestError(f"the tolerance is {tolerance:g}, expected a positive finite number")
         if tolerance is not None and self.certificate is None:
             raise RequestError("the model has no error bounds: a tolerance needs one with bounds = true")
+        # Corrections are made of programs: refuse a formulation without them before anything is solved.
         if corrected:
-            self.reduced  # noqa: B018  corrections are made of programs
+            self.reduced  # noqa: B018
         mode = self.correction if corrected is None else CorrectionMode("feasible" if corrected else "none")
         if solver is not None and self.solver is None:
             raise RequestError(f"the formulation {type(self.formulation).__name__} uses no QP solver")
@@ -345,10 +351,11 @@ class Model:
         model, online = self.solving(settings.solver, settings.accuracy), self.online
         query, solver = model.settings()
         answer, seconds = timed(lambda: online.solve(at, query))
+        # An answer to a program is verified against the program, not by what the formulation says of it.
         if self.formulation.has_program:
             found = QPSolution(answer.x, answer.alpha, answer.reason, answer.iterations)
             return self._program_solution(at, online.program(at), found, (0.0, seconds.cpu), settings)
-        judged = model.status_of(at, answer, solver)
+        judged = model.status_of(at, answer, solver, 1.0)
         coefficients = judged.status, judged.reason, answer.x, answer.alpha, judged.residuals
         own = None, settings.mode, answer.iterations, answer.uncertainty
         return Solution(at, *coefficients, 0.0, seconds.cpu, self, lambda: judged.pair, None, None, *own)

@@ -65,6 +65,7 @@ def member_polynomials(
         first = members_of(queried, box.lower, coefficients_of(queried, box.lower))
         if not len(first.f) or not len(first.g):
             raise RequestError("the model has no unknowns or no constraints")
+        # Before the interpolation, which is the expensive part.
         if check is not None:
             check(first)
         terms = declared_terms(queried)

@@ -143,6 +143,7 @@ class Reduction:
         Steps that were given before are kept, steps that were computed are computed again: they may depend on the new.
         """
         other, kept = replace(self), self.__dict__.get("_given", {}) | steps
+        # Cached properties read the dictionary of the instance, so that these steps are never computed.
         other.__dict__.update(kept, _given=kept)
         return other
 
@@ -230,6 +231,7 @@ class Reduction:
     @cached_property
     def assembled(self) -> AnyReducedModel:
         """The model that assembles the programs of queries, in full where that is asked for or nothing else works."""
+        # Do not compute reduced operators for a full assembly: they are costly.
         if self.assembly == "full" or isinstance(self.operators, str):
             return self.projection
         return HyperReducedModel(self.projection, self.operators)
@@ -267,6 +269,7 @@ class Reduction:
             If the problem does not have what it needs.
         """
         formulation = self.formulation
+        # The default is found by its declaration: the core knows no formulation by name.
         if formulation is None:
             formulation = registry.find(PluginKind.FORMULATION, registry.default_formulation()).create({})
         name = type(formulation).__qualname__
@@ -295,8 +298,7 @@ class Reduction:
 
     def with_formulation(self, formulation: Formulation) -> Reduction:
         """The same phase with another formulation: `with_formulation(…).model`; all steps of this one are kept."""
-        steps = {name: value for name, value in self.__dict__.items() if name in _STEPS}
+        # The model belongs to the formulation that is replaced; all other steps are independent of it.
+        names = {name for name, value in vars(Reduction).items() if isinstance(value, cached_property)} - {"model"}
+        steps = {name: value for name, value in self.__dict__.items() if name in names}
         return replace(self, formulation=formulation).given(**self.__dict__.get("_given", {}) | steps)
-
-
-_STEPS = {name for name, value in vars(Reduction).items() if isinstance(value, cached_property)} - {"model"}

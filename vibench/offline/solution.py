@@ -89,6 +89,7 @@ class Solution:
         """
         if self.tolerance is None or self.bound is None:
             return "no tolerance"
+        # A bound holds for any pair, however far it is from solving the program.
         certified = self.status is Status.OK and self.bound.relative <= self.tolerance
         return self.bound.guarantee.value if certified else "not certified"
 
@@ -126,6 +127,7 @@ class Solution:
         pair = self._pair()
         if pair is None:
             raise RequestError(f"there is no solution at mu = {self.mu.tolist()}: {self.status.value}: {self.reason}")
+        # Without a certificate the correction takes factorisations at mu: made only when u or λ is asked for.
         if certificate is None and self.mode is not CorrectionMode.NONE:
             return Corrector(self._model.reduced, None, self.mode).in_full(self.mu, *pair)
         if certificate is None or self.correction is None:

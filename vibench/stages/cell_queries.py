@@ -14,7 +14,7 @@ import numpy as np
 from vibench.errors import in_a_line
 from vibench.interfaces.formulations import FormulationAnswer
 from vibench.interfaces.strategies import Kind
-from vibench.model.affine import MISSED
+from vibench.model.affine import is_missed
 from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import Guarantee
 from vibench.model.errors import ReferenceSolutions, output_scales, summarise_outputs, zeros
@@ -337,7 +337,7 @@ class _Queries(Items):
         if built.reduction is not None and isinstance(why := offline.operators, str):
             fallbacks.append(f"assembled in full: {why}")
         tolerance, error = built.interpolation, max(programs.errors)
-        if tolerance is not None and error > MISSED * tolerance:
+        if tolerance is not None and is_missed(tolerance, error):
             fallbacks.append(
                 f"reduced assembly differs from the Galerkin projection by up to {error:.1e} at validation parameters: "
                 f"the interpolation tolerance {tolerance:g} holds at training parameters only"

@@ -169,7 +169,7 @@ class ModelQuery:
         """The status of an answer, and its columns in the tables of queries and of solutions."""
         answer, solver = answered
         with time_limit():
-            status = self.model.status_of(self.mu, answer, solver, program=self.program)
+            status = self.model.status_of(self.mu, answer, solver, 1.0, self.program)
         # A program of the formulation's own has no QP solver whose words could be recorded.
         words = answer.reason if self.program is not None else solver.last[1].solver_status if solver.last else ""
         row: Row = {"solver_status": words, "iterations": answer.iterations, "error_u_predicted": answer.uncertainty}

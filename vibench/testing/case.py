@@ -114,8 +114,8 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
     def determinism(self) -> Iterator[str]:
         """A second call and another instance give the same results to the last bit."""
         # Results may depend on a state of the instance, or on one that it is made with.
-        again = list(self._deviations("a second call", self._evaluation(self.plugin)))
-        yield from again or self._deviations("another instance", self._evaluation(self.create()))
+        again = list(self._deviations("a second call", self._evaluation(self.plugin), self.arguments, 0.0))
+        yield from again or self._deviations("another instance", self._evaluation(self.create()), self.arguments, 0.0)
 
     def another_process(self) -> Iterator[str]:
         """Another process, whose sets have another order, gives the same results up to `round_off`."""
@@ -141,9 +141,10 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
             after = self.stored(before)
         except NumericalError as error:
             raise ConformanceError(f"the {type(before).__name__} cannot be stored: {error}") from None
-        for array, what in differences(self.arrays(after), self.arrays(before)):
+        for array, what in differences(self.arrays(after), self.arrays(before), 0.0):
             yield f"{name}: storing changes {array}: {what}"
-        yield from self._deviations("a pickled copy", self._evaluation(pickle.loads(pickle.dumps(self.plugin))))
+        copy = pickle.loads(pickle.dumps(self.plugin))
+        yield from self._deviations("a pickled copy", self._evaluation(copy), self.arguments, 0.0)
 
     def stored(self, result: ResultT) -> ResultT:
         """A result as a stage finds it in its artefact."""
@@ -154,12 +155,12 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
         return lambda name: self.arrays(self.evaluate(self.arguments[name], plugin))
 
     def _deviations(
-        self, source: str, again: Callable[[str], Arrays], names: Iterable[str] = (), rtol: float = 0.0
+        self, source: str, again: Callable[[str], Arrays], names: Iterable[str], rtol: float
     ) -> Iterator[str]:
         """Arrays that differ from those of all results, or of some, each named once."""
         named: set[str] = set()
         # The reverse order reveals results that depend on the previous call.
-        for name in reversed([*(names or self.arguments)]):
+        for name in reversed([*names]):
             for array, what in differences(again(name), self.arrays(self.results[name]), rtol):
                 if array not in named:
                     named.add(array)
@@ -194,7 +195,7 @@ def largest_entry(value: Any) -> float:
     return float(np.max(np.abs(_entries(value)), initial=0.0))
 
 
-def difference(one: Any, other: Any, limit: float = 0.0) -> str:
+def difference(one: Any, other: Any, limit: float) -> str:
     """Entry in which two arrays differ most, "entry (3, 4) is 1.0 against 2.0"; "" if by no more than the limit."""
     if one.shape != other.shape:
         return f"the shape is {one.shape} against {other.shape}"
@@ -211,7 +212,7 @@ def difference(one: Any, other: Any, limit: float = 0.0) -> str:
     return f"entry {place} is {first} against {second}"
 
 
-def differences(one: Arrays, other: Arrays, rtol: float = 0.0) -> Iterator[tuple[str, str]]:
+def differences(one: Arrays, other: Arrays, rtol: float) -> Iterator[tuple[str, str]]:
     """Names of the arrays that differ by more than rtol times the largest entry of the other, and the `difference`."""
     for name in {**one, **other}:
         if name not in one or name not in other:
@@ -224,7 +225,7 @@ def unmutated(function: str, arrays: Arrays, call: Callable[[], T]) -> T:
     """Result of a call; a `ConformanceError` names the arrays that it changed, and an entry of each."""
     before = copies(arrays)
     result = call()
-    if changed := [f"{name}: {what} before" for name, what in differences(copies(arrays), before)]:
+    if changed := [f"{name}: {what} before" for name, what in differences(copies(arrays), before, 0.0)]:
         raise ConformanceError(f"{function} changes {'; '.join(changed)}; work on copies and return new arrays")
     return result
 

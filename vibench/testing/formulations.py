@@ -160,7 +160,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
             if answer.outcome is not Outcome.OK:
                 continue
             try:
-                found = of.status_of(mu, answer, solver)
+                found = of.status_of(mu, answer, solver, 1.0)
             except NumericalError as error:
                 yield f"{name}: {error}"
                 continue
@@ -174,7 +174,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
             fresh = self._of(self.plugin, offline, self.model_of(self.plugin).built).online
             kept = FormulationAnswer(result.answer.x, result.answer.alpha)
             again = replace(result, pair=fresh.reconstruct(self.arguments[name].copy(), kept))
-            for array, what in differences(self.arrays(again), self.arrays(result)):
+            for array, what in differences(self.arrays(again), self.arrays(result), 0.0):
                 yield f"{name}: reconstructed from x and alpha by another model, {array} differs: {what}"
 
     def plausible(self) -> Iterator[str]:
@@ -246,7 +246,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
             given = replace(offline, primal=None, tolerance=None).given(**steps)
             of = self._of(self.plugin, given, check_built(self.plugin.build(given)))
             settings, solver = of.settings()
-            found = of.status_of(mu, of.online.solve(mu.copy(), settings), solver)
+            found = of.status_of(mu, of.online.solve(mu.copy(), settings), solver, 1.0)
         except VibenchError:  # a formulation may refuse it in one line
             return
         if found.status in (Status.NONFINITE, Status.ERROR) or "broken" in found.reason:

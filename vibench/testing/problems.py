@@ -19,7 +19,7 @@ from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.interfaces.validation import training_parameters, validation_parameters
 from vibench.linalg.inner_product import InnerProduct, singular_values
-from vibench.model.affine import INTERPOLATION_RTOL, MISSED, assembled_members, decomposed, held_out_error
+from vibench.model.affine import INTERPOLATION_RTOL, assembled_members, decomposed, held_out_error, is_missed
 from vibench.stability.coercivity import extreme_quotients
 from vibench.testing.case import (
     Arrays,
@@ -201,7 +201,9 @@ def continuity(case: ProblemCase) -> Iterator[str]:
             first, _, last = (arrays[jump.name] for arrays in jump.values)
             step = (jump.right - jump.left) * float(np.linalg.norm(end - start))
             where = at(start + jump.right * (end - start))
-            raise ConformanceError(f"{jump.name} jumps {where}: {difference(first, last)} over a step of {step:.0e}")
+            raise ConformanceError(
+                f"{jump.name} jumps {where}: {difference(first, last, 0.0)} over a step of {step:.0e}"
+            )
 
 
 def on_contact(case: ProblemCase) -> Iterator[str]:
@@ -425,7 +427,7 @@ def training_set(case: ProblemCase) -> Iterator[str]:
     yield from _outside("training_set", mus, case.plugin.parameters)
     if len(np.unique(mus, axis=0)) < 2:
         yield f"training_set has mu = {mus[0].tolist()} alone; expected at least two different parameters"
-    if what := difference(training_parameters(case.plugin), mus):
+    if what := difference(training_parameters(case.plugin), mus, 0.0):
         yield f"training_set differs in a second call: {what} before"
     yield Note(f"{len(mus)} parameters")
 
@@ -434,7 +436,7 @@ def validation_set(case: ProblemCase) -> Iterator[str]:
     """Validation parameters lie in the box and are reproducible."""
     mus = validation_parameters(case.plugin, 5, seed=0)
     yield from _outside("validation_set", mus, case.plugin.parameters)
-    if what := difference(validation_parameters(case.plugin, len(mus), seed=0), mus):
+    if what := difference(validation_parameters(case.plugin, len(mus), seed=0), mus, 0.0):
         yield f"validation_set is not the same for the same seed: {what} before; draw from default_rng(seed)"
 
 
@@ -517,7 +519,7 @@ def interpolation(case: ProblemCase) -> Iterator[str]:
             continue
         error = held_out_error(name, member, values[len(mus) :], problem.V)
         yield Note(f"{name}: {len(member.terms)} terms, error {error:.0e}")
-        if error > MISSED * INTERPOLATION_RTOL:
+        if is_missed(INTERPOLATION_RTOL, error):
             where = f"interpolated over {len(mus)} training parameters"
             yield Doubt(f"{name}, {where}, has an error of {error:.1e} at validation parameters: it needs more of them")
 

@@ -168,7 +168,7 @@ class SolverCase:
         first, second = (_vectors(self.create(deepcopy(self.typical), ACCURACY)) for _ in range(2))
         for name, what in differences(second, first, 10.0 * ACCURACY):
             yield f"a second call gives another {name}: {what}"
-        if list(differences(second, first)):
+        if list(differences(second, first, 0.0)):
             yield Note("repeated calls differ by round-off")
 
     def independence(self) -> Iterator[str]:
@@ -184,7 +184,7 @@ class SolverCase:
             return
         if kkt_residuals(program, later.x, np.maximum(later.alpha, 0.0)).worst > self.rtol:
             yield "where the entries of a program were changed, the solution is that of the program before"
-        for name, what in differences(copies(_vectors(earlier)), kept):
+        for name, what in differences(copies(_vectors(earlier)), kept, 0.0):
             yield f"a later call overwrites {name} of an earlier solution: {what} before"
 
     def repetition(self) -> Iterator[str]:

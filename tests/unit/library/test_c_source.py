@@ -343,7 +343,7 @@ def linear(constant: np.ndarray, factors: dict[int, int], dimension: int) -> Aff
     for k, entry in factors.items():
         indices.append(np.eye(dimension, dtype=np.intp)[k])
         terms.append(np.eye(constant.size)[entry])
-    return AffinePolynomial(np.array(indices), np.eye(len(terms)), np.array(terms), 0.0)
+    return AffinePolynomial(np.array(indices), np.eye(len(terms)), np.array(terms), 0.0, 1.0)
 
 
 DEPENDENT = {

@@ -89,7 +89,7 @@ def test_without_a_compiler_a_line_says_why(tmp_path: Path, monkeypatch: pytest.
 
 def polynomial(value: np.ndarray, slope: float = 0.0) -> AffinePolynomial:
     """A polynomial of two parameters: a value times 1 + slope · t in the second one, t from −1 to 1."""
-    return AffinePolynomial(np.array([[0, 0], [0, 1]]), np.array([[1.0], [slope]]), value.reshape(1, -1), 0.0)
+    return AffinePolynomial(np.array([[0, 0], [0, 1]]), np.array([[1.0], [slope]]), value.reshape(1, -1), 0.0, 1.0)
 
 
 LIMITS = np.array([[1.0, 0.0], [0.0, -1.0]])
