@@ -29,7 +29,7 @@ TABLES = ("cells", "thresholds", "disagreements")
 FIGURES = {
     "benefit": ("total-cost", "work-precision", "inf-sup"),
     "hertz-quadrature": ("solutions", "errors"),
-    "solvers": ("solvers", "precision"),
+    "solvers": ("solvers",),
 }
 """Kinds of figures on the page of a study; all of them on other pages."""
 

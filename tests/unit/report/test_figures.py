@@ -114,9 +114,6 @@ def kinds_of_histories() -> list[str]:
 ONE_CONE = "DELETE FROM queries WHERE dual = 'cpg'"
 """All kinds of figures are drawn of one dual strategy, too, with half as many panels."""
 
-SOMETIMES = ("diagnostics", "precision", "break-even")
-"""Figures that need a problem with diagnostics, a study of several accuracies, and seconds that decide something."""
-
 
 def problems() -> list[str]:
     return [entry.title for entry in read_study("quick").problem]
@@ -125,10 +122,9 @@ def problems() -> list[str]:
 def test_a_run_has_its_figures(drawn: Drawn, folder: Path) -> None:
     names = {path.stem for path in folder.glob("*.png")}
     for problem in problems():
-        assert {f"{problem}-{kind}" for kind in OF_PROBLEM if kind not in SOMETIMES} <= names
+        assert {f"{problem}-{kind}" for kind in OF_PROBLEM} <= names
         for dual in read_study("quick").dual:
             assert {f"{problem}-{dual.title}-enrichment", f"{problem}-{dual.title}-inf-sup"} <= names
-    assert "obstacle-diagnostics" in names
     assert {path.stem for path in folder.glob("*.svg")} == names == {*drawn}
 
 
@@ -192,11 +188,6 @@ def test_projection_errors_are_those_of_the_histories_and_dual_strategies_have_o
             np.testing.assert_array_equal(line.get_ydata(), cone["value"])
             assert line.get_ydata()[-1] <= 1e-2
         assert {axes.get_yscale() for axes in (pod, cones)} == {"log"}
-        (axes,) = drawn[f"{problem}-orthogonality"].axes
-        assert [line.get_label() for line in axes.get_lines()] == sorted(e.title for e in read_study("quick").dual)
-        for values in data_of(axes):
-            assert values[0] == pytest.approx(1.0)
-            assert np.all((values > 0.0) & (values <= 1.0 + 1e-12))
 
 
 def test_the_enrichment_shows_sigma_and_beta(drawn: Drawn, results: Path) -> None:
@@ -285,7 +276,7 @@ def test_a_solver_that_failed_takes_no_strategy_out_of_a_figure(change: Callable
 
 def test_without_a_fixed_enrichment_there_is_no_enrichment_figure(change: Callable[..., None], draw: Draw) -> None:
     change("DELETE FROM queries WHERE primal = 'offline-pga'")
-    drawn = draw("enrichment", "inf-sup", "shares", "total-cost", "work-precision")
+    drawn = draw("enrichment", "inf-sup", "total-cost", "work-precision")
     assert not [name for name in drawn if name.endswith("enrichment")]
     assert "obstacle-mcpg-inf-sup" in drawn
 
@@ -355,7 +346,6 @@ def test_every_strategy_is_drawn_ten_to_a_panel(count: int, results: Path) -> No
     cones = replace(data, histories=pd.concat([data.histories[data.histories["stage"] == "pod"],
                                                many(data.histories, "dual", "mcpg")]))  # fmt: skip
     assert in_tens(next(convergence.projection_errors(cones)).axes[1:]) == count
-    assert in_tens(next(convergence.orthogonality(cones)).axes) == count
     mine = data.restrict_to_dual("mcpg")
     fixed = replace(mine, queries=many(mine.queries, "primal", "offline-pga"),
                     histories=many(mine.histories, "primal", "offline-pga"))  # fmt: skip
@@ -404,26 +394,25 @@ def test_errors_in_a_figure_are_those_on_common_queries(change: Callable[..., No
         f"UPDATE queries SET status = 'inaccurate' WHERE {few} = 'decorrelated' AND query < 6",
         f"UPDATE queries SET status = 'inaccurate' WHERE {few} = 'offline-pga' AND query < 9",
     )
-    figures = draw("work-precision", "dimension")
+    figures = draw("work-precision")
     queries = read_table(results, "queries")
     fine = queries[(queries["problem"] == "obstacle") & (queries["query"] >= 6)]
     means = fine.groupby("cell")[["error_u", "error_lambda"]].mean()
-    for kind in ("work-precision", "dimension"):
-        figure = figures[f"obstacle-{kind}"]
-        assert figure.get_suptitle().endswith("over the 10 of 16 queries that all solved")
-        of_mcpg = [axes for axes in figure.axes if axes.get_title() == "mcpg"]
-        labels = of_mcpg[0].get_legend_handles_labels()[1]
-        assert "decorrelated" in labels
-        assert "offline-pga" not in labels
-        for axes, name in zip(of_mcpg, means, strict=True):
-            for line in axes.get_lines():
-                assert np.isin(np.round(line.get_ydata(), 12), np.round(means[name], 12)).all()
-    assert figures["hertz-dimension"].get_suptitle().endswith("errors against dimension")
+    figure = figures["obstacle-work-precision"]
+    assert figure.get_suptitle().endswith("over the 10 of 16 queries that all solved")
+    of_mcpg = [axes for axes in figure.axes if axes.get_title() == "mcpg"]
+    labels = of_mcpg[0].get_legend_handles_labels()[1]
+    assert "decorrelated" in labels
+    assert "offline-pga" not in labels
+    for axes, name in zip(of_mcpg, means, strict=True):
+        for line in axes.get_lines():
+            assert np.isin(np.round(line.get_ydata(), 12), np.round(means[name], 12)).all()
+    assert figures["hertz-work-precision"].get_suptitle().endswith("work and precision")
 
 
 def test_without_contact_errors_of_u_are_drawn_alone(change: Callable[..., None], draw: Draw) -> None:
     change("UPDATE queries SET zero_lambda = 1, error_lambda = NULL", "UPDATE cells SET error_lambda_mean = NULL")
-    for figure in draw("work-precision", "dimension").values():
+    for figure in draw("work-precision").values():
         for left, right in zip(figure.axes[::2], figure.axes[1::2], strict=True):
             assert data_of(left)
             assert not data_of(right)
@@ -461,7 +450,7 @@ def test_several_processes_draw_the_same_files(
 ) -> None:
     """Also those of figures that read tables which are not sent to other processes."""
     change("DELETE FROM queries WHERE problem = 'hertz' OR dual = 'cpg'")
-    kinds = ("errors", "dimension", "shares", "solvers", "outputs")
+    kinds = ("errors", "work-precision", "solvers", "total-cost")
     monkeypatch.setattr(figures, "OF_PROBLEM", {kind: OF_PROBLEM[kind] for kind in kinds})
     shown: list[tuple[str, int, int]] = []
     one, two = (
@@ -492,39 +481,6 @@ def test_one_label_with_two_options_is_two_strategies(change: Callable[..., None
              for table in ("cells", "queries")))  # fmt: skip
     labels = draw("inf-sup")["obstacle-mcpg-inf-sup"].axes[0].get_legend_handles_labels()[1]
     assert {"decorrelated", "decorrelated (k = 1)"} <= set(labels)
-
-
-def test_shares_on_and_off_the_training_set_are_those_of_the_cells(drawn: Drawn, quick_run: Path) -> None:
-    cells = read_table(quick_run / FILE, "cells")
-    for problem in problems():
-        mine = cells[(cells["problem"] == problem) & cells["share_training"].notna()]
-        mine = mine.drop_duplicates(["dual", "primal"])
-        for axes, (dual, group) in zip(drawn[f"{problem}-shares"].axes, mine.groupby("dual"), strict=True):
-            assert axes.get_title() == dual
-            points = line_called(axes, "offline-pga").get_xydata()
-            np.testing.assert_array_equal(points, group[["share_training", "share_validation"]].to_numpy())
-
-
-def test_precision_is_over_the_programs_that_every_solver_solved_at_every_accuracy(
-    change: Callable[..., None], draw: Draw, results: Path
-) -> None:
-    assert not draw("precision")  # with one accuracy
-    loose = "accuracy = 1e-4, solve_s = 0.5 * solve_s, solver_error_u = 1e3 * solver_error_u"
-    change(
-        "CREATE TABLE again AS SELECT * FROM queries WHERE problem = 'obstacle'",
-        f"UPDATE again SET {loose}",
-        "INSERT INTO queries SELECT * FROM again",
-        "DROP TABLE again",
-        "UPDATE queries SET status = 'inaccurate' WHERE solver = 'osqp' AND query < 4 AND accuracy = 1e-4",
-    )
-    (figure,) = draw("precision").values()
-    queries = read_table(results, "queries")
-    kept = queries[(queries["problem"] == "obstacle") & (queries["query"] >= 4)]
-    assert f"{len(kept) // 6} programs" in figure.get_suptitle()
-    for solver, mine in kept.groupby("solver"):
-        expected = mine.groupby("accuracy")[["solve_s", "solver_error_u"]].median()
-        found = line_called(figure.axes[0], solver).get_xydata()
-        np.testing.assert_allclose(found, expected.to_numpy() * [1e3, 1.0])
 
 
 def test_a_caption_says_which_tolerances_are_left_out(change: Callable[..., None], draw: Draw) -> None:
@@ -588,8 +544,8 @@ def test_a_report_has_half_a_page_of_a_long_figure_and_the_whole_of_any_other(re
     found = {one: list(draw(part)) for one, draw, part in tasks}
     assert max(map(len, found.values())) == 1
     cut = {one for one, pages in found.items() for page in pages if page.part}
-    long_ones = {"shares": (6, 3), "dimension": (4, 7), "work-precision": (4, 7), "total-cost": (6, 3)}
-    assert cut - {"obstacle-outputs"} == {f"obstacle-{kind}" for kind in long_ones}
+    long_ones = {"work-precision": (4, 7), "total-cost": (6, 3)}
+    assert cut == {f"obstacle-{kind}" for kind in long_ones}
     for kind, (titles, parts) in long_ones.items():
         (figure,) = found[f"obstacle-{kind}"]
         assert len([axes for axes in figure.axes if axes.get_title()]) == titles
@@ -613,17 +569,16 @@ def test_a_problem_has_an_abscissa_of_its_own_only_with_one_parameter(results: P
 def test_panels_that_are_compared_share_their_axes_and_points_are_named(drawn: Drawn, results: Path) -> None:
     span, cone = drawn["hertz-mcpg-inf-sup"].axes
     assert span.get_xlim() == cone.get_xlim()
-    for kind in ("dimension", "work-precision"):
-        cpg_u, cpg_lambda, mcpg_u, mcpg_lambda = drawn[f"obstacle-{kind}"].axes
-        assert cpg_u.get_ylim() == mcpg_u.get_ylim()
-        assert cpg_lambda.get_ylim() == mcpg_lambda.get_ylim()
-        assert cpg_u.get_xlim() == mcpg_lambda.get_xlim()
+    cpg_u, cpg_lambda, mcpg_u, mcpg_lambda = drawn["obstacle-work-precision"].axes
+    assert cpg_u.get_ylim() == mcpg_u.get_ylim()
+    assert cpg_lambda.get_ylim() == mcpg_lambda.get_ylim()
+    assert cpg_u.get_xlim() == mcpg_lambda.get_xlim()
 
     # a point has its dimensions, or its tolerance
     cells = read_table(results, "cells")
     mine = cells[(cells["problem"] == "obstacle") & (cells["dual"] == "mcpg") & (cells["primal"] == "offline-pga")]
     size = f"({mine['N'].iloc[0]:.0f}, {mine['R'].iloc[0]:.0f}), δ = 0.5"
-    axes = next(axes for axes in drawn["obstacle-dimension"].axes if axes.get_title() == "mcpg")
+    axes = next(axes for axes in drawn["obstacle-work-precision"].axes if axes.get_title() == "mcpg")
     assert size in [text.get_text() for text in axes.texts]
 
 

@@ -213,9 +213,9 @@ def test_answers_that_are_all_undecided_are_shown(changed: Changed) -> None:
 def test_several_processes_draw_the_same_pictures_in_the_same_order(quick_run: Path) -> None:
     """Also those that read tables which are not sent to other processes."""
     name, data = next(iter(problem_tables(quick_run / FILE)))
-    tasks = [task for task in tasks_of(name, data) if task[0].endswith(("errors", "shares", "outputs", "-inf-sup"))]
+    tasks = [task for task in tasks_of(name, data) if task[0].endswith(("errors", "solvers", "-inf-sup"))]
     alone = render(tasks, image_of)
     with processes(2) as pool:
         together = render(tasks, image_of, pool)
-    assert [len(pages) for pages in alone] == [1] * 4
+    assert [len(pages) for pages in alone] == [1] * 3
     assert alone == together

@@ -22,9 +22,9 @@ from vibench import interrupts
 from vibench.errors import RequestError, unknown_name
 from vibench.files import TEMPORARY, read_regular, write_atomically
 from vibench.report.figures import convergence
-from vibench.report.figures.constants import inf_sup, shares
-from vibench.report.figures.convergence import diagnostics, enrichment, orthogonality, projection_errors
-from vibench.report.figures.costs import break_even, dimension, outputs, precision, solvers, total_cost, work_precision
+from vibench.report.figures.constants import inf_sup
+from vibench.report.figures.convergence import enrichment, projection_errors
+from vibench.report.figures.costs import solvers, total_cost, work_precision
 from vibench.report.figures.data import Extent, ProblemTables, file_names, problem_tables
 from vibench.report.figures.solutions import solutions
 from vibench.report.figures.style import Pages, caption_of, save, styled
@@ -34,9 +34,8 @@ DrawPages = Callable[[ProblemTables], Pages]
 
 # Figures of every problem, by the end of their file names.
 OF_PROBLEM: dict[str, DrawPages] = {
-    "solutions": solutions, "diagnostics": diagnostics, "errors": projection_errors, "orthogonality": orthogonality,
-    "dimension": dimension, "work-precision": work_precision, "shares": shares, "solvers": solvers,
-    "precision": precision, "total-cost": total_cost, "outputs": outputs, "break-even": break_even,
+    "solutions": solutions, "errors": projection_errors, "work-precision": work_precision, "solvers": solvers,
+    "total-cost": total_cost,
 }  # fmt: skip
 # Figures of every problem and dual strategy.
 OF_DUAL: dict[str, DrawPages] = {"enrichment": enrichment, "inf-sup": inf_sup}

@@ -17,23 +17,19 @@ from vibench.report.figures.data import (
     common_tolerances,
     dimensions,
     one_solver,
-    point_names,
     series,
     some,
     titled_parts,
 )
 from vibench.report.figures.style import (
     HIGH_FIDELITY_LOOK,
-    Layout,
     Look,
     Looks,
     Pages,
     Series,
-    Sheet,
     counted,
     plot,
     positive,
-    scatter,
     two_rows,
 )
 from vibench.stability.infsup import VANISHES
@@ -142,34 +138,3 @@ def _caption(data: ProblemTables, constants: pd.DataFrame, shown: pd.DataFrame, 
             left_out = [value for value in given if value not in set(kept)]
             text.append(f"{primal} is shown at δ = {some(kept)}, its loosest; left out: {some(left_out)}.")
     return " ".join(text)
-
-
-def shares(data: ProblemTables) -> Pages:
-    """Smallest shares of β over the span in that of the whole of V: over the validation against the training set."""
-    cells = data.cells[data.cells["share_training"].notna()].drop_duplicates([*PRIMAL, "dual", "pair"])
-    panels = [
-        (title, rows[rows["primal"].isin(names)])
-        for dual, rows in cells.groupby("dual", sort=False)
-        for title, names in titled_parts(str(dual), list(rows["primal"].unique()))
-    ]
-    for shown, part in data.pages(panels, 12):
-        title = f"{data.problem}: shares of the inf-sup constant"
-        sheet = Sheet.with_panels(len(shown), title, Layout(4.0, 3.2), "all")
-        looks = Looks(Series(str(name)) for _, rows in shown for name in rows["primal"].unique())
-        for panel, (dual, rows) in zip(sheet.panels, shown, strict=False):
-            panel.axline((1.0, 1.0), slope=1.0, color="0.6", linewidth=0.8, zorder=0)
-            for primal, mine in rows.groupby("primal", sort=False):
-                look = looks[Series(str(primal))]
-                scatter(panel, mine["share_training"], mine["share_validation"], look, str(primal))
-                panel.plot(mine["share_guaranteed"], mine["share_validation"], "|", color=look.colour)
-                for k, text in point_names(mine).items():
-                    sheet.label(panel, mine.at[k, "share_training"], mine.at[k, "share_validation"], text)
-                    sheet.label(panel, mine.at[k, "share_guaranteed"], mine.at[k, "share_validation"], "")
-            panel.set(title=dual, xlabel="smallest share, training set", ylabel="smallest share, validation set")
-        yield sheet.finish(
-            f"Smallest share of β over the span in that of the whole of V for {data.problem}: over the validation set "
-            "against over the training set, one point for each fixed enrichment with its (N, R) and tolerance δ; a "
-            "number alone is another δ. Below the diagonal, validation parameters are less stable than the training "
-            "set. The tick left of a point is √(1 − σ²), which bounds the share on the training set.",
-            part,
-        )

@@ -33,32 +33,7 @@ from vibench.report.figures.style import (
     look_of,
     plot,
     positive,
-    scatter,
 )
-
-
-def diagnostics(data: ProblemTables) -> Pages:
-    """Quantities that the problem reports at every parameter, such as the largest aspect ratio (paper, Figure 3)."""
-    stages = ("training", "validation")
-    reported = data.histories[data.histories["stage"].isin(stages)]
-    if reported.empty:
-        return
-    quantities = list(reported["quantity"].unique())
-    sheet = Sheet.with_panels(len(quantities), f"{data.problem}: diagnostics over the parameters")
-    looks = Looks(map(Series, stages))
-    for panel, quantity in zip(sheet.panels, quantities, strict=False):
-        first = 1
-        for stage in stages:
-            mine = reported[(reported["stage"] == stage) & (reported["quantity"] == quantity)]
-            values = mine.drop_duplicates("step").sort_values("step")["value"].to_numpy()
-            scatter(panel, first + np.arange(len(values)), values, looks[Series(stage)], f"{stage} parameters")
-            first += len(values)
-        panel.set(xlabel="parameter, training then validation", ylabel=str(quantity).replace("_", " "))
-        counted(panel)
-    named = ", ".join(str(quantity).replace("_", " ") for quantity in quantities)
-    yield sheet.finish(
-        f"What {data.problem} reports at every training parameter and every validation parameter: {named}."
-    )
 
 
 def projection_errors(data: ProblemTables) -> Pages:
@@ -80,21 +55,6 @@ def projection_errors(data: ProblemTables) -> Pages:
         f"Projection errors of {data.problem} over the training set: left, the relative tail of the POD against the "
         "number N of modes; right, the largest relative distance of a multiplier from the cone of the first R "
         "generators, for every dual strategy. Each curve is that of the tightest tolerance, which contains the others."
-    )
-
-
-def orthogonality(data: ProblemTables) -> Pages:
-    """Relative distance of every generator from the cone of the preceding ones (paper, Figures 6 and 12)."""
-    steps = data.histories[(data.histories["stage"] == "cone") & (data.histories["quantity"] == "e_orth")]
-    if steps.empty:
-        return
-    cones = _in_panels(steps)
-    sheet = Sheet.with_panels(len(cones), f"{data.problem}: angles between generators", share="all")
-    for panel, names in zip(sheet.panels, cones, strict=False):
-        _cones(panel, names, "number of preceding generators r", "e_orth(r)")
-    yield sheet.finish(
-        f"Distance e_orth(r) of generator r + 1 of {data.problem} from the cone of the r generators before it, for "
-        "every dual strategy: 1 for a generator orthogonal to that cone, near 0 for one that is nearly in it."
     )
 
 

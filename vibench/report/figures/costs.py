@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 import pandas as pd
@@ -15,7 +14,6 @@ from vibench.report.figures.data import (
     ProblemTables,
     best_solver,
     by_dimensions,
-    common_programs,
     correction_in_words,
     label,
     of_solvers,
@@ -27,69 +25,43 @@ from vibench.report.figures.data import (
     titled_parts,
 )
 from vibench.report.figures.style import HIGH_FIDELITY_LOOK, Layout, Looks, Pages, Series, Sheet, plot, scatter
-from vibench.results import ranking
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
 
 ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
 
 
-def dimension(data: ProblemTables) -> Pages:
-    """Errors against the dimension of the reduced problem, N + S + R; means over the queries that all cells solved."""
-    cells = best_solver(data.cells)
-    # Reduced assembly changes no dimension: it is shown only where a correction has no full assembly.
-    full = cells["assembly"] == "full"
-    cells = cells[full | ~full.groupby(cells["correction"]).transform("any")]
-    size = cells["N"] + cells["enrichment"].fillna(0) + cells["R"]
-    return _errors_against(data, cells, size, "dimension N + S + R", "errors against dimension")
-
-
 def work_precision(data: ProblemTables) -> Pages:
-    """Errors against the time of a query; no cell is both faster and more accurate than those on the line."""
+    """Errors against the time of a query, a point per cell; no cell is both faster and more accurate than the front.
+
+    Dual strategies, assemblies and corrections have a row of panels each.
+    """
     cells = best_solver(data.cells)
-    seconds = 1e3 * cells["online_s"]
-    return _errors_against(data, cells, seconds, "mean time of a query [ms]", "work and precision", front=True)
-
-
-def _errors_against(
-    data: ProblemTables, cells: pd.DataFrame, x: pd.Series, xlabel: str, title: str, *, front: bool = False
-) -> Pages:
-    """One point per cell with its (N, R) and δ; a row of panels for every dual strategy, assembly and correction."""
-    compared = on_common_queries(cells[x.notna()], data.queries)
+    compared = on_common_queries(cells, data.queries)
     cells = compared.cells[compared.cells[list(ERRORS)].notna().any(axis=1)]
-    over = compared.over or f" over all {compared.asked} queries"
+    over, seconds = compared.over or f" over all {compared.asked} queries", 1e3 * cells["online_s"]
     rows_of = "dual strategy" + " and way of a query" * (cells["way"].nunique() > 1)
-    beyond = "The thin line is the Pareto front: no model is both faster and more accurate." if front else ""
     looks = Looks(Series(str(primal)) for primal in cells["primal"].unique())
     for rows, part in data.pages(list(_ways(cells)), 4):
-        heading = f"{data.problem}, {cells['solver'].iloc[0]}: {title}{compared.over}"
+        heading = f"{data.problem}, {cells['solver'].iloc[0]}: work and precision{compared.over}"
         sheet = Sheet(len(rows), 2, heading, Layout(4.4, 3.3), "all", "col")
         for row, (way, mine, names) in enumerate(rows):
             for place, (column, ylabel) in enumerate(ERRORS.items()):
                 panel, drawn = sheet.panel(row, place), mine[mine[column].notna()]
-                _points(panel, drawn, x, drawn[column], names, looks)
-                _name_points(sheet, panel, drawn[drawn["primal"].isin(names)], x, drawn[column])
-                if front:
-                    best = drawn.index[_front(x[drawn.index].to_numpy(float), drawn[column].to_numpy(float))]
-                    panel.plot(x[best], drawn[column][best], c="0.6", lw=0.8, drawstyle="steps-post", zorder=0)
-                panel.set(xlabel=xlabel, ylabel=ylabel, title=way, xscale="log", yscale="log")
+                for name in names:
+                    own = drawn.index[drawn["primal"] == name]
+                    scatter(panel, seconds[own], drawn[column][own], looks[Series(str(name))], str(name))
+                for index, text in point_names(drawn[drawn["primal"].isin(names)]).items():
+                    sheet.label(panel, seconds[index], drawn[column][index], text)
+                best = drawn.index[_front(seconds[drawn.index].to_numpy(float), drawn[column].to_numpy(float))]
+                panel.plot(seconds[best], drawn[column][best], c="0.6", lw=0.8, drawstyle="steps-post", zorder=0)
+                panel.set(xlabel="mean time of a query [ms]", ylabel=ylabel, title=way, xscale="log", yscale="log")
         yield sheet.finish(
             f"Relative errors of u (left) and of λ (right) of the reduced models of {data.problem}, means{over}, "
-            f"against the {xlabel}; solver {cells['solver'].iloc[0]}. A row for every {rows_of}, a point for "
-            "every model, with its (N, R) and the tolerance δ of its primal strategy; a number alone is another δ. "
-            f"{beyond}",
+            f"against the mean time of a query; solver {cells['solver'].iloc[0]}. A row for every {rows_of}, a point "
+            "for every model, with its (N, R) and the tolerance δ of its primal strategy; a number alone is another δ. "
+            "The thin line is the Pareto front: no model is both faster and more accurate.",
             part,
         )
-
-
-def _points(panel: Axes, cells: pd.DataFrame, x: pd.Series, y: pd.Series, names: Iterable[Any], looks: Looks) -> None:
-    for name in names:
-        mine = cells.index[cells["primal"] == name]
-        scatter(panel, x[mine], y[mine], looks[Series(str(name))], str(name))
-
-
-def _name_points(sheet: Sheet, panel: Axes, cells: pd.DataFrame, x: pd.Series, y: pd.Series) -> None:
-    for index, text in point_names(cells).items():
-        sheet.label(panel, x[index], y[index], text)
 
 
 def _ways(cells: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
@@ -100,75 +72,6 @@ def _ways(cells: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
         title += f", {correction_in_words(correction)}" * (correction != CorrectionMode.NONE)
         for part, names in titled_parts(title, [str(name) for name in mine["primal"].unique()]):
             yield part, mine, names
-
-
-def outputs(data: ProblemTables) -> Pages:
-    """Errors of every quantity of interest, over its largest value of the training set, against the time of a query."""
-    of_outputs = data.outputs.loc[data.outputs["error_scaled_mean"].notna(), ["cell", "output", "error_scaled_mean"]]
-    models = best_solver(data.cells).merge(of_outputs, "inner", "cell")
-    panels = [
-        (f"{name}, {title}", rows, names)
-        for name, of_output in models.groupby("output", sort=False)
-        for title, rows, names in _ways(of_output)
-    ]
-    for shown, part in data.pages(panels, 12):
-        solver = models["solver"].iloc[0]
-        sheet = Sheet.with_panels(len(shown), f"{data.problem}, {solver}: quantities of interest")
-        looks = Looks(Series(name) for _, _, names in shown for name in names)
-        for panel, (title, mine, names) in zip(sheet.panels, shown, strict=False):
-            x, y = 1e3 * mine["online_s"], mine["error_scaled_mean"]
-            _points(panel, mine, x, y.where(y > 0.0), names, looks)
-            _name_points(sheet, panel, mine[mine["primal"].isin(names)], x, y)
-            panel.set(xlabel="mean time of a query [ms]", ylabel="mean error over the scale", title=title)
-            panel.set(xscale="log", yscale="log")
-        yield sheet.finish(
-            f"Mean errors of the quantities of interest of {data.problem} over their largest value on the training "
-            f"set, against the mean time of a query; solver {solver}. A panel for every quantity, dual strategy and "
-            "assembly, a point for every model, with its (N, R) and the tolerance δ of its primal strategy; a number "
-            "alone is another δ.",
-            part,
-        )
-
-
-def break_even(data: ProblemTables) -> Pages:
-    """Queries from which a reduced model is cheaper than the high-fidelity one, against its errors, also of outputs."""
-    cells, numbers = best_solver(data.cells), ["benefit_threshold", "threshold_low", "threshold_high", "meaning"]
-    against = data.thresholds[data.thresholds["cell_a"].isna()].set_index("cell_b")[numbers]
-    models = cells.merge(against, "inner", left_on="cell", right_index=True)
-    decided = models[models["meaning"] == Meaning.FROM]
-    if (decided["correction"] != CorrectionMode.NONE).any():
-        # Strategies are distinguished by their names: a corrected one needs another.
-        named = [label(row.primal, None, correction_in_words(row.correction)) for row in decided.itertuples()]
-        decided = decided.assign(primal=named)
-    errors = {
-        measure: ranking.errors_of(decided, data.outputs, measure).dropna()
-        for measure in ranking.measures(data.outputs)
-        if measure != "solution"
-    }
-    panels = [(measure, decided.loc[error.index], error) for measure, error in errors.items() if len(error)]
-    without = len(models) - len(decided)
-    left_out = f"Models without such a number, or with an undecided one, have no point: {without}." * bool(without)
-    for shown, part in data.pages(panels, 12):
-        solver = decided["solver"].iloc[0]
-        sheet = Sheet.with_panels(len(shown), f"{data.problem}, {solver}: break-even and accuracy")
-        looks = Looks(Series(str(name)) for _, mine, _ in shown for name in mine["primal"].unique())
-        for panel, (measure, mine, error) in zip(sheet.panels, shown, strict=False):
-            number = mine["benefit_threshold"]
-            _points(panel, mine, error.where(error > 0.0), number, mine["primal"].unique(), looks)
-            low, high = (mine[f"threshold_{end}"].replace(np.inf, np.nan) for end in ("low", "high"))
-            panel.vlines(error, low, high, color="0.6", lw=0.8, zorder=0)
-            best = mine.iloc[_front(error.to_numpy(float), number.to_numpy(float))]
-            _name_points(sheet, panel, best, error, number)
-            title = measure.removeprefix("output:").replace("lambda", "λ")
-            panel.set(xlabel="mean relative error", ylabel="break-even [queries]", title=title)
-            panel.set(xscale="log", yscale="log")
-        yield sheet.finish(
-            f"Number of queries from which a reduced model of {data.problem} is cheaper than the high-fidelity one, "
-            f"over its mean relative error of u, of λ and of every quantity of interest; solver {solver}. Lines are "
-            "95 % intervals. A point for every model; those on the Pareto front, which no model beats in both, have "
-            f"their (N, R) and the tolerance δ of their primal strategy. {left_out}",
-            part,
-        )
 
 
 def _front(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -260,38 +163,6 @@ def solvers(data: ProblemTables) -> Pages:
             if compared
             else f"The run has one solver, {names[0]}: there is no performance profile to draw."
         )
-    )
-
-
-def precision(data: ProblemTables) -> Pages:
-    """Median time of a program against the part of the error of u and of λ that the solver makes, over the accuracy."""
-    shared = common_programs(data.queries)
-    if shared["accuracy"].nunique() < 2:
-        return
-    count = len(shared) // shared.groupby(["solver", "accuracy"]).ngroups
-    groups = parts(sorted(map(str, shared["solver"].unique())))
-    title = f"{data.problem}: time and precision of the QP solvers, {count} programs"
-    sheet = Sheet(len(groups), 2, title, sharex="all", sharey="col")
-    looks = Looks(Series(name) for group in groups for name in group)
-    for row, group in enumerate(groups):
-        for solver in group:
-            mine = shared[shared["solver"] == solver]
-            medians = mine.groupby("accuracy")[["solve_s", "solver_error_u", "solver_error_lambda"]].median()
-            for column, name in enumerate(("u", "lambda")):
-                # A logarithmic axis has no zero.
-                error = np.maximum(medians[f"solver_error_{name}"], 1e-16)
-                panel, look = sheet.panel(row, column), looks[Series(solver)]
-                # Every point is an accuracy, and has a marker.
-                plot(panel, 1e3 * medians["solve_s"], error, look, solver, markevery=1)
-        for column, name in enumerate(("u", "λ")):
-            panel = sheet.panel(row, column)
-            panel.set(xlabel="median time of a program [ms]", ylabel=f"median error of {name} made by the solver")
-            panel.set(xscale="log", yscale="log")
-    accuracies = ", ".join(f"{value:g}" for value in sorted(shared["accuracy"].unique(), reverse=True))
-    yield sheet.finish(
-        f"The part of the relative error of u (left) and of λ (right) of {data.problem} that the QP solver makes, "
-        f"against the time of a program: medians over the {count} programs that every solver shown solved at each of "
-        f"its accuracies, of {accuracies}; a marker for each accuracy."
     )
 
 
