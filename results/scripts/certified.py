@@ -12,9 +12,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 from page import CERTIFIED, SECONDS, Page, made_by, origin, read, start
 
+from vibench.model.bound_terms import CorrectionMode
 from vibench.report.figures.style import Sheet, look_of, scatter, styled
 from vibench.results import ranking
-from vibench.study.cells import FEASIBLE, UNCORRECTED
 from vibench.study.parameter_sets import OWN
 from vibench_problems.paper.published import PROBLEMS
 
@@ -41,7 +41,9 @@ NORMS = {
 def effectivities(cells: pd.DataFrame, queries: pd.DataFrame, of: str) -> pd.DataFrame:
     """Effectivities over the ok queries of every certified model, "median" or "max", and the number of violations."""
     rows = []
-    for cell in cells[(cells["assembly"] == CERTIFIED) & (cells["correction"] == UNCORRECTED)].to_dict("records"):
+    for cell in cells[(cells["assembly"] == CERTIFIED) & (cells["correction"] == CorrectionMode.NONE)].to_dict(
+        "records"
+    ):
         mine = queries[(queries["cell"] == cell["cell"]) & (queries["status"] == "ok")]
         row = {name: cell[name] for name in [*MODEL, "certificate"]} | {"queries": len(mine)}
         for norm, (_, bounds) in NORMS.items():
@@ -52,7 +54,7 @@ def effectivities(cells: pd.DataFrame, queries: pd.DataFrame, of: str) -> pd.Dat
 
 def costs(cells: pd.DataFrame) -> pd.DataFrame:
     """Seconds of a query with and without its certificate, and of what is prepared offline."""
-    plain = cells[cells["correction"] == UNCORRECTED]
+    plain = cells[cells["correction"] == CorrectionMode.NONE]
     without, with_one = (plain[plain["assembly"] == assembly].set_index(MODEL) for assembly in ("reduced", CERTIFIED))
     compared = pd.DataFrame(
         {
@@ -73,7 +75,11 @@ def corrections(cells: pd.DataFrame, queries: pd.DataFrame) -> pd.DataFrame:
 
     Ratios are of errors of λ in W without correction and with it: medians over the queries.
     """
-    ways = {"": ("reduced", UNCORRECTED), " online": (CERTIFIED, FEASIBLE), " in full": ("reduced", FEASIBLE)}
+    ways = {
+        "": ("reduced", CorrectionMode.NONE),
+        " online": (CERTIFIED, CorrectionMode.FEASIBLE),
+        " in full": ("reduced", CorrectionMode.FEASIBLE),
+    }
     found = {name: cells[(cells["assembly"] == way[0]) & (cells["correction"] == way[1])] for name, way in ways.items()}
     table = found[""][MODEL].set_index(MODEL)
     for name, mine in found.items():
@@ -132,7 +138,7 @@ def equal_errors(cells: pd.DataFrame) -> pd.DataFrame:
 
 def figure(cells: pd.DataFrame, queries: pd.DataFrame) -> Figure:
     """Bounds against errors of all certified queries, a row of panels for every norm; equal on the grey line."""
-    certified = cells[(cells["assembly"] == CERTIFIED) & (cells["correction"] == UNCORRECTED)]
+    certified = cells[(cells["assembly"] == CERTIFIED) & (cells["correction"] == CorrectionMode.NONE)]
     problems = list(certified["problem"].unique())
     sheet = Sheet(len(NORMS), len(problems), "bounds against errors, all queries of certified models")
     for column, problem in enumerate(problems):

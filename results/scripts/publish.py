@@ -17,12 +17,12 @@ import pandas as pd
 from page import start
 
 from vibench.execution.recording import cell_columns
+from vibench.model.bound_terms import CorrectionMode
 from vibench.report.citation import Citation
 from vibench.report.site import publish
 from vibench.results.database import ResultsDatabase
 from vibench.results.schema import KEYS, STORED, SqlType
 from vibench.results.sqlite import FILE
-from vibench.study.cells import UNCORRECTED
 from vibench.study.matrix import expand, read_study
 
 RESULTS = Path(__file__).parents[1]
@@ -85,7 +85,7 @@ def rows(table: Path) -> list[dict[str, Any]]:
 
 def stored(table: str, row: dict[str, Any]) -> dict[str, Any]:
     """The columns of a row that the results file has; cells of before there were corrections have none."""
-    uncorrected = {name: UNCORRECTED for name in ("correction",) if name in STORED[table]}
+    uncorrected = {name: CorrectionMode.NONE for name in ("correction",) if name in STORED[table]}
     return uncorrected | {name: value for name, value in row.items() if name in STORED[table]}
 
 

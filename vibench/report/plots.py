@@ -46,7 +46,6 @@ class PlotPanel:
     y: str
     x_label: str
     y_label: str
-    logarithmic: bool = True  # both axes
     line: float | None = None  # abscissa of the high-fidelity model, which has no error
 
 
@@ -62,22 +61,11 @@ class Plot:
 def plots(name: str, data: ProblemTables, rows: Mapping[str, int]) -> Iterator[Plot]:
     """Plots of one problem, whose names begin with `name`; `rows` has the row of every cell in the table of cells."""
     compared = on_common_queries(best_solver(data.cells), data.queries)
-    cells = compared.cells
-    size = cells["N"] + cells["enrichment"].fillna(0) + cells["R"]
-    shown = cells.assign(dimension=size, online_ms=1e3 * cells["online_s"])
+    shown = compared.cells.assign(online_ms=1e3 * compared.cells["online_s"])
     solver = f", {shown['solver'].iloc[0]}" if len(shown) else ""
-    kinds = {
-        "work-precision": ("work and precision", "online_ms", "time of a query [ms]"),
-        "dimension": ("errors against dimension", "dimension", "dimension N + S + R"),
-        "offline": ("errors against offline seconds", "offline_s", "offline [s]"),
-    }
-    for kind, (title, column, x_label) in kinds.items():
-        panels = [PlotPanel(column, error, x_label, y_label) for error, y_label in ERRORS.items()]
-        yield from _plot(f"{name}-{kind}", f"{data.problem}{solver}: {title}{compared.over}", shown, panels, rows)
-    fixed = data.cells[data.cells["share_training"].notna()].drop_duplicates("model")
-    panels = [PlotPanel("share_training", "share_validation", "training parameters", "validation parameters", False)]
-    title = "smallest share of β over the span in that of the whole of V"
-    yield from _plot(f"{name}-shares", f"{data.problem}: {title}", fixed, panels, rows)
+    panels = [PlotPanel("online_ms", error, "time of a query [ms]", y_label) for error, y_label in ERRORS.items()]
+    title = f"{data.problem}{solver}: work and precision{compared.over}"
+    yield from _plot(f"{name}-work-precision", title, shown, panels, rows)
 
 
 def overview(
@@ -147,7 +135,6 @@ def _plot(
             {
                 "x_label": panel.x_label,
                 "y_label": panel.y_label,
-                "scale": "log" if panel.logarithmic else "linear",
                 # Four digits are more than a screen shows.
                 "line": None if panel.line is None else short(panel.line, 4),
                 **{end: [short(value, 4) for value in points[getattr(panel, end)]] for end in ("x", "y")},
@@ -170,9 +157,9 @@ def _series(way: Series, look: Look) -> dict[str, Any]:
 
 
 def _coordinates(cells: pd.DataFrame, panel: PlotPanel) -> pd.DataFrame:
-    """Both values of every cell; missing if one of them is, or is not positive on a logarithmic axis."""
+    """Both values of every cell; missing if one of them is, or is not positive."""
     values = cells[[panel.x, panel.y]].astype(float)
-    fine = np.isfinite(values).all(axis=1) & ((values > 0.0).all(axis=1) | (not panel.logarithmic))
+    fine = np.isfinite(values).all(axis=1) & (values > 0.0).all(axis=1)
     return values.where(fine)
 
 

@@ -310,7 +310,7 @@ function drawCosts(costs, place) {
 
 function drawPanel(plot, panel, place) {
   const made = Bokeh.Plotting.figure({
-    x_axis_type: panel.scale, y_axis_type: panel.scale, height: 340, sizing_mode: "stretch_width", min_border_right: 12,
+    x_axis_type: "log", y_axis_type: "log", height: 340, sizing_mode: "stretch_width", min_border_right: 12,
     tools: "pan,box_zoom,wheel_zoom,tap,reset,save", x_axis_label: panel.x_label, y_axis_label: panel.y_label,
     background_fill_color: null, border_fill_color: null,
   });
