@@ -269,11 +269,9 @@ def _certificate_arrays(
     exact: Mapping[str, ExactMember],
     unknowns: Indices | None,
 ) -> dict[str, Array]:
-    """The arrays of a certificate for which there is no `reason_for_none`.
-
-    With the positions of the contact `unknowns`, those that take ν to a corrected u at mesh size are among them.
-    Bounds grow by what the measured errors of the polynomials, of A and of all θ, may add.
-    """
+    """The arrays of a certificate for which there is no `reason_for_none`."""
+    # With the positions of the contact `unknowns`, those that take ν to a corrected u at mesh size are among them.
+    # Bounds grow by what the measured errors of the polynomials, of A and of all θ, may add.
     base, residual, corrections, terms = (
         certificate.base, certificate.residual, certificate.prepared, certificate.base.bound_terms
     )  # fmt: skip
@@ -325,11 +323,9 @@ def _error(polynomial: AffinePolynomial) -> float:
 
 
 def guarantee(certificate: OnlineCertificate, exact: Set[str]) -> Guarantee:
-    """Worth of the bounds: that of the certificate if all members are exact, constant or declared by expressions.
-
-    Where a polynomial takes the place of a function they are verified at most: its error was measured at some
-    parameters, which proves nothing about others, however small it is there.
-    """
+    """Worth of the bounds: that of the certificate if all members are exact, constant or declared by expressions."""
+    # Where a polynomial takes the place of a function they are verified at most: its error was measured at some
+    # parameters, which proves nothing about others, however small it is there.
     return certificate.base.guarantee if exact >= set(MEMBERS) else Guarantee.VERIFIED
 
 
@@ -340,10 +336,8 @@ def _linear(problem: Problem) -> list[Output]:
 def _output_arrays(
     model: Model, basis: Array, generators: Array, certificate: OnlineCertificate | None
 ) -> dict[str, Array]:
-    """Coefficients of x (O×N') and α (O×R), none without linear outputs.
-
-    With a certificate also of λ on all rows (O×m), of a in u = u_N − lift · a (O×j), and the `output_weights` (O×2).
-    """
+    """Coefficients of x (O×N') and α (O×R), none without linear outputs."""
+    # With a certificate also of λ on all rows (O×m), of a in u = u_N − lift · a (O×j), and the `output_weights` (O×2).
     problem, outputs = model.problem, _linear(model.problem)
     if not outputs:
         return {}

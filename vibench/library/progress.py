@@ -48,11 +48,10 @@ class _Running:
 
 
 class TimeLeft:
-    """Estimate of the seconds left from the mean wall seconds of the stages of each sort done so far.
+    """Estimate of the seconds left from the mean wall seconds of the stages of each sort done so far."""
 
-    A stage that reports its fractions counts before its end. Sorts without any finished stage take as long as their
-    `effort` says, at the pace of the other sorts of the same problem.
-    """
+    # A stage that reports its fractions counts before its end. Sorts without any finished stage take as long as their
+    # `effort` says, at the pace of the other sorts of the same problem.
 
     def __init__(self, pending: Sequence[Stage], jobs: int) -> None:
         self._jobs = jobs

@@ -73,11 +73,9 @@ def source(
     thetas: Mapping[str, AffinePolynomial] = MappingProxyType({}),
     exact: Mapping[str, ExactMember] = MappingProxyType({}),
 ) -> tuple[str, str]:
-    """The C source of a model whose basis does not depend on the parameter, and its header.
-
-    The names of its functions begin with `stem`. With the `thetas` of a certificate it has error bounds. Members that
-    are `exact` take the place of polynomials with their names.
-    """
+    """The C source of a model whose basis does not depend on the parameter, and its header."""
+    # The names of its functions begin with `stem`. With the `thetas` of a certificate it has error bounds. Members that
+    # are `exact` take the place of polynomials with their names.
     name = re.sub(r"\W", "_", f"model_{stem}" if not stem[:1].isalpha() else stem, flags=re.ASCII)
     box, cell, polynomials = about["parameters"], about["cell"], {**members, **thetas}
     own = {key: exact.get(key, polynomial) for key, polynomial in polynomials.items()}
@@ -156,10 +154,8 @@ def _array(name: str, array: Array | Indices) -> str:
 
 
 def _member(name: str, member: AffinePolynomial | ExactMember) -> str:
-    """Terms of one member, and a function that evaluates its θ.
-
-    A polynomial has arrays of degrees, and of coefficients that are not zero, product by product.
-    """
+    """Terms of one member, and a function that evaluates its θ."""
+    # A polynomial has arrays of degrees, and of coefficients that are not zero, product by product.
     head = (
         f"static void {name}_thetas(const double *mu, double polynomials[DIMENSION][DEGREE + 1], double *theta)\n{{\n"
     )

@@ -36,10 +36,8 @@ Shape = tuple[str, ...]
 
 
 def checked(**expected: Shape | type) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """A function whose arguments of these names are checked: arrays of finite numbers by shapes, others by classes.
-
-    An argument that is `None` by default may be so. Spaces have the dimension "n" as V and "m" as W.
-    """
+    """A function whose arguments of these names are checked: arrays of finite numbers by shapes, others by classes."""
+    # An argument that is `None` by default may be so. Spaces have the dimension "n" as V and "m" as W.
 
     def wrap(function: Callable[P, T]) -> Callable[P, T]:
         signature = inspect.signature(function)

@@ -43,14 +43,7 @@ class CompiledModel:
 
     @classmethod
     def of(cls, reduced: AnyReducedModel, accuracy: float) -> CompiledModel:
-        """Interpolate the members of a reduced model.
-
-        Raises
-        ------
-        UnsupportedError
-            If there is none: the basis depends on the parameter, polynomials of the members are not accurate enough or
-            too large.
-        """
+        """Interpolate the members of a reduced model."""
         try:
             _, polynomials = member_polynomials(reduced, TOLERANCE, EVALUATIONS, fixed=True, check=_refuse_large)
         except RequestError as error:
@@ -72,13 +65,7 @@ class CompiledModel:
         return c_source.source(self.members, {"lower": self.lower, "upper": self.upper}, about, "model")[0]
 
     def program(self) -> CompiledProgram:
-        """Compile and load the program.
-
-        Raises
-        ------
-        UnsupportedError
-            If there is no C compiler, or it fails.
-        """
+        """Compile and load the program."""
         sizes = (self.members[name].terms.shape[1] for name in "fg")
         return CompiledProgram.compiled(self.source, *sizes)
 
@@ -103,13 +90,7 @@ class CompiledProgram:
 
     @classmethod
     def compiled(cls, source: str, unknowns: int, constraints: int) -> CompiledProgram:
-        """Compile a source and load the program.
-
-        Raises
-        ------
-        UnsupportedError
-            If there is no C compiler, or it fails.
-        """
+        """Compile a source and load the program."""
         # A library that is loaded needs its file no longer.
         with TemporaryDirectory(prefix="vibench-") as folder:
             loaded = ctypes.CDLL(str(_compiled(source, Path(folder))))
@@ -128,13 +109,7 @@ class CompiledProgram:
 
 
 def compiler() -> list[str]:
-    """The command of the C compiler: that of the environment variable CC, or the first of cc, gcc and clang.
-
-    Raises
-    ------
-    UnsupportedError
-        If there is none.
-    """
+    """The command of the C compiler: that of the environment variable CC, or the first of cc, gcc and clang."""
     named, usual = shlex.split(os.environ.get("CC", "")), ("cc", "gcc", "clang")
     for command in [named] if named else [[name] for name in usual]:
         if shutil.which(command[0]):

@@ -20,10 +20,9 @@ from vibench.offline.assemblies import Assemblies, assemblies
 
 
 class Answer(NamedTuple):
-    """The pair u (n,), λ (m,), whether it is corrected, and a note why it is not although that is asked for.
+    """The pair u (n,), λ (m,), whether it is corrected, and a note why it is not although that is asked for."""
 
-    `bound` has its bounds at online cost, where the model has them; `share` is ω/ρ of the reduced solution.
-    """
+    # `bound` has its bounds at online cost, where the model has them; `share` is ω/ρ of the reduced solution.
 
     u: Array
     lam: Array

@@ -468,10 +468,7 @@ class Model:
 
 
 def parameter_in(box: ParameterBox, mu: Parameters) -> Array:
-    """A parameter as an array (d,); outside the box there is a warning of the caller of the caller.
-
-    Raises a `RequestError` if it is no parameter of the box.
-    """
+    """A parameter as an array (d,); outside the box there is a warning of the caller of the caller."""
     if isinstance(mu, Mapping):
         names = [normal_name(name) for name in box.names]
         given = {normal_name(str(name)): value for name, value in mu.items()}
@@ -495,13 +492,7 @@ def parameter_in(box: ParameterBox, mu: Parameters) -> Array:
 
 
 def check_built(built: object) -> Mapping[str, Any]:
-    """Return what a formulation has built, or refuse what is no mapping with texts as names.
-
-    Raises
-    ------
-    NumericalError
-        Naming what it is.
-    """
+    """Return what a formulation has built, or refuse what is no mapping with texts as names."""
     if not isinstance(built, Mapping) or not all(isinstance(name, str) for name in built):
         raise NumericalError(f"`build` returned a {type(built).__name__}, expected a mapping whose names are texts")
     return built

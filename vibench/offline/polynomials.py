@@ -46,17 +46,11 @@ def member_polynomials(
     rotated: Mapping[str, Array] = MappingProxyType({}),
     check: Callable[[VariationalInequality], None] | None = None,
 ) -> tuple[AnyReducedModel, dict[str, AffinePolynomial]]:
-    """The model whose members are evaluated, see `declared_model`, and polynomials of the members.
-
-    A is a packed upper triangle (row by row). With `fixed` a basis that depends on the parameter is refused. The
-    arrays of `beside` have polynomials, too. Those in `rotated` are the θ of A times a matrix, by name: one polynomial
-    serves them and A. `check` may refuse a model by its program at one parameter, before it is interpolated.
-
-    Raises
-    ------
-    RequestError
-        If polynomials do not reach the tolerance on a grid of so many evaluations, or the model has none.
-    """
+    """The model whose members are evaluated, see `declared_model`, and polynomials of the members."""
+    # A is a packed upper triangle (row by row). With `fixed` a basis that depends on the parameter is refused. The
+    # arrays of `beside` have polynomials, too. Those in `rotated` are the θ of A times a matrix, by name: one
+    # polynomial serves them and A. `check` may refuse a model by its program at one parameter, before it is
+    # interpolated.
     box = reduced.problem.parameters
     try:
         queried = declared_model(reduced)
@@ -91,15 +85,8 @@ def member_polynomials(
 
 
 def declared_model(queried: AnyReducedModel) -> AnyReducedModel:
-    """The model without high-fidelity assembly where its problem declares all members constant or affine sums.
-
-    Their terms are projected, whatever the assembly of the cell was; any other model is returned as it is.
-
-    Raises
-    ------
-    NumericalError
-        If a declared sum differs from the assembled member.
-    """
+    """The model without high-fidelity assembly where its problem declares all members constant or affine sums."""
+    # Their terms are projected, whatever the assembly of the cell was; any other model is returned as it is.
     if isinstance(queried, HyperReducedModel):
         return queried
     problem = queried.problem
@@ -138,13 +125,7 @@ def coefficients_of(queried: AnyReducedModel, mu: Array) -> Mapping[str, Array]:
 
 
 def members_of(queried: AnyReducedModel, mu: Array, theta: Mapping[str, Array]) -> VariationalInequality:
-    """A, f, B, g at a parameter with these coefficients, on a space that does not depend on it.
-
-    Raises
-    ------
-    RequestError
-        If the model has no such space.
-    """
+    """A, f, B, g at a parameter with these coefficients, on a space that does not depend on it."""
     if isinstance(queried, HyperReducedModel):
         return queried.members(mu, theta)
     if queried.kind is Kind.PER_PARAMETER:

@@ -8,11 +8,10 @@ from pkgutil import resolve_name
 
 
 class PluginKind(StrEnum):
-    """A kind of plugin; its text, such as "dual strategy", is its name in messages and records.
+    """A kind of plugin; its text, such as "dual strategy", is its name in messages and records."""
 
-    `plural` names the list of `vibench list`, `cli_name` is the prefix in `vibench check NAME:…`, "" where its plugins
-    are not checked, `module` is the module that `vibench new` writes.
-    """
+    # `plural` names the list of `vibench list`, `cli_name` is the prefix in `vibench check NAME:…`, "" where its
+    # plugins are not checked, `module` is the module that `vibench new` writes.
 
     plural: str
     entry_points: str

@@ -66,11 +66,9 @@ def inside(folder: Path, path: str) -> str:
 
 
 def named_path(path: Any) -> tuple[Any, Any]:
-    """The name of a file or a folder in results, and its absolute path; twice the value if it is no path.
-
-    The name is the path from the folder of the study, or from the current one. For other places it is the last part:
-    results neither depend on the place of a study nor reveal it.
-    """
+    """The name of a file or a folder in results, and its absolute path; twice the value if it is no path."""
+    # The name is the path from the folder of the study, or from the current one. For other places it is the last part:
+    # results neither depend on the place of a study nor reveal it.
     path = os.fspath(path) if isinstance(path, os.PathLike) else path
     if not isinstance(path, str) or not path:
         return path, path
@@ -98,10 +96,7 @@ def options_of(plugin: Any) -> Mapping[str, Option]:
 
 
 def checked_arguments(plugin: type, what: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of a class, called `what` in messages, converted to the types of its constructor's annotations.
-
-    Raises a `RequestError` if an option is unknown, missing, or not of its type.
-    """
+    """Options of a class, called `what` in messages, converted to the types of its constructor's annotations."""
     options, checked = options_of(plugin), {}
     # Unknown names first: a misspelt option would otherwise be reported as missing.
     for name in given:
@@ -141,10 +136,9 @@ def _in_words(schema: Mapping[str, Any]) -> str:
 
 
 class Key(NamedTuple):
-    """A key of a TOML file, in words.
+    """A key of a TOML file, in words."""
 
-    `table` is the name of the model of its table, "" for the file itself; `default` is JSON, "" where there is none.
-    """
+    # `table` is the name of the model of its table, "" for the file itself; `default` is JSON, "" where there is none.
 
     table: str
     name: str

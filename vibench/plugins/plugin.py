@@ -113,11 +113,11 @@ class Plugin:
 
 @dataclass(frozen=True)
 class GivenPlugin(RegisteredPlugin):
-    """A class or an object passed to a study in Python; known only to that process and to its workers.
+    """A class or an object passed to a study in Python; known only to that process and to its workers."""
 
-    `fingerprint` is "object " and the hash of its code and state. `pickled` is the class or the object by cloudpickle,
-    empty where only another process has it. `modules` are versions of the modules that it imports, by name.
-    """
+    # `fingerprint` is "object " and the hash of its code and state. `pickled` is the class or the object by
+    # cloudpickle, empty where only another process has it. `modules` are versions of the modules that it imports, by
+    # name.
 
     fingerprint: str = ""
     pickled: bytes = b""
@@ -244,13 +244,10 @@ def _received(kind: PluginKind, name: str, options: str, code: str, places: str,
 
 
 def fingerprint_of(value: Any) -> tuple[str, dict[str, str]]:
-    """Hash of a value and of its code, equal in all processes that make it in the same way.
-
-    Functions and classes of scripts and notebooks count with their bytecode and the global names that it uses, those of
-    modules with the `module_version`. Values of cached properties do not count.
-
-    Returns also the versions of the modules that it uses. Raises a `TypeError` if the value cannot be pickled.
-    """
+    """Hash of a value and of its code, equal in all processes that make it in the same way."""
+    # Functions and classes of scripts and notebooks count with their bytecode and the global names that it uses, those
+    # of modules with the `module_version`. Values of cached properties do not count.
+    # Returns also the versions of the modules that it uses. Raises a `TypeError` if the value cannot be pickled.
     seen: dict[int, tuple[int, Any]] = {}
     own = _hash_of(value, seen)
     modules = [one for _, one in seen.values() if isinstance(one, ModuleType)]
@@ -352,10 +349,8 @@ def is_importable(value: Any) -> bool:
 
 
 def module_version(module: ModuleType) -> str:
-    """Version of the package of a module if it is installed and has one, else the hash of its sources.
-
-    It is "" for modules of Python and of vibench, whose versions are recorded anyway.
-    """
+    """Version of the package of a module if it is installed and has one, else the hash of its sources."""
+    # It is "" for modules of Python and of vibench, whose versions are recorded anyway.
     source, top = getattr(module, "__file__", None), module.__name__.partition(".")[0]
     if source is None or top in ("vibench", *sys.stdlib_module_names):
         return ""

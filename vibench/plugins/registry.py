@@ -32,10 +32,9 @@ FACTORISATION = "factorisation"
 
 @dataclass(frozen=True)
 class RegisteredPlugin:
-    """The entry points of a name: several if packages register different objects, none if nobody does.
+    """The entry points of a name: several if packages register different objects, none if nobody does."""
 
-    Both are refused only when the plugin is loaded; QP solvers of qpsolvers have none.
-    """
+    # Both are refused only when the plugin is loaded; QP solvers of qpsolvers have none.
 
     kind: PluginKind
     name: str
@@ -64,10 +63,8 @@ class RegisteredPlugin:
 
     @cached_property
     def conflict(self) -> str:
-        """Reason why the name is ambiguous: several packages, or qpsolvers, provide it; "" if it is unique.
-
-        Nothing of that name is loaded: results of one plugin would be recorded under the name of another.
-        """
+        """Reason why the name is ambiguous: several packages, or qpsolvers, provide it; "" if it is unique."""
+        # Nothing of that name is loaded: results of one plugin would be recorded under the name of another.
         if len(self.entries) < 2 - self._in_qpsolvers:
             return ""
         values = [""] * self._in_qpsolvers + [f" ({entry.value})" for entry in self.entries]
@@ -108,10 +105,7 @@ class RegisteredPlugin:
         return [option for entry in self.entries for option in names_of_options(entry.module, entry.attr)]
 
     def load(self) -> Any:
-        """The object that its entry point refers to.
-
-        Raises a `RequestError` if the name is unknown or ambiguous, or the object is of another kind or fails to load.
-        """
+        """The object that its entry point refers to."""
         where = f"{self} ({self._entry.value})"
         try:
             plugin = self._entry.load()
@@ -128,10 +122,7 @@ class RegisteredPlugin:
 
     @cached_property
     def code(self) -> str:
-        """Version with a hash of its outermost package or module; all versions for an ambiguous name.
-
-        Raises a `RequestError` if no plugin has the name.
-        """
+        """Version with a hash of its outermost package or module; all versions for an ambiguous name."""
         if self.conflict:
             return self.origin
         if self.kind is PluginKind.SOLVER and not self.entries:
@@ -160,10 +151,7 @@ class RegisteredPlugin:
         return set() if self.conflict else {name for name, one in self.options.items() if one.annotation is Path}
 
     def check_options(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Options, converted to the types of its constructor's arguments; unchanged for an ambiguous name.
-
-        Raises a `RequestError` if an option is unknown, missing, or not of its type.
-        """
+        """Options, converted to the types of its constructor's arguments; unchanged for an ambiguous name."""
         from vibench.plugins.options import checked_arguments
 
         if self.conflict:
@@ -226,10 +214,8 @@ def registered(kind: PluginKind) -> dict[str, RegisteredPlugin]:
 
 @cache
 def default_formulation() -> str:
-    """Name of the formulation of studies that name none: the one whose class says `is_default = True`; "" without any.
-
-    The class is read, not imported: results are shown by this name. Raises a `RequestError` if there are several.
-    """
+    """Name of the formulation of studies that name none, whose class says `is_default = True`; "" without any."""
+    # The class is read, not imported: results are shown by this name. Raises a `RequestError` if there are several.
     names = [
         name
         for name, plugin in registered(PluginKind.FORMULATION).items()
@@ -249,10 +235,7 @@ def _is_default(module: str, name: str) -> bool:
 
 
 def find_named(text: str, kinds: Mapping[str, PluginKind], solvers: Sequence[str]) -> RegisteredPlugin:
-    """The plugin that NAME or KIND:NAME refers to, of kinds by their command line names and of installed QP solvers.
-
-    Raises a `RequestError` if there is no such plugin, or several.
-    """
+    """The plugin that NAME or KIND:NAME refers to, of kinds by their command line names and of installed QP solvers."""
     prefix, colon, rest = text.partition(":")
     name = rest if colon else text
     searched = {word: kind for word, kind in kinds.items() if not colon or word == prefix}

@@ -31,11 +31,10 @@ SUFFIX = ".artefact"
 @storable
 @dataclass(frozen=True)
 class History:
-    """One convergence history: a quantity ("error", "sigma", …) over the steps of an algorithm, one value per step.
+    """One convergence history: a quantity ("error", "sigma", …) over the steps of an algorithm, one value per step."""
 
-    `stage` is the column of the histories table. `first_step` is not 0 where several stages hold parts of one history
-    (`Stage.partial`).
-    """
+    # `stage` is the column of the histories table. `first_step` is not 0 where several stages hold parts of one history
+    # (`Stage.partial`).
 
     stage: str
     quantity: str
@@ -44,10 +43,7 @@ class History:
 
     @classmethod
     def of(cls, stage: str, quantity: object, values: Iterable[Any], first_step: int | None = None) -> History:
-        """The history of a quantity that a plugin may have named and evaluated; `first_step` is 0 by default.
-
-        Raises a `TypeError`, a `ValueError` or an `OverflowError` if a value is no number, or too large for one.
-        """
+        """The history of a quantity that a plugin may have named and evaluated; `first_step` is 0 by default."""
         # The name must be one printable line: it goes to tables and terminals.
         return cls(stage, one_line(str(quantity)), tuple(map(float, values)), first_step or 0)
 
@@ -84,10 +80,9 @@ def default_folder() -> Path:
 
 
 class Store:
-    """The artefacts in a folder, with a cache of those used last.
+    """The artefacts in a folder, with a cache of those used last."""
 
-    `cached_bytes` limits the files of cached artefacts, 256 MiB by default; a larger artefact is read at each use.
-    """
+    # `cached_bytes` limits the files of cached artefacts, 256 MiB by default; a larger artefact is read at each use.
 
     def __init__(self, folder: Path, cached_bytes: int | None = None) -> None:
         self.folder = folder
@@ -100,10 +95,7 @@ class Store:
         return self.folder / "lock"
 
     def get(self, key: str) -> Artefact | None:
-        """The artefact stored under a key; `None` if it is missing or damaged.
-
-        Raises a `StorageError` if the folder cannot be read.
-        """
+        """The artefact stored under a key; `None` if it is missing or damaged."""
         if (recent := self._recent.get(key)) is not None:
             return recent[0]
         try:
@@ -122,11 +114,7 @@ class Store:
         return artefact
 
     def put(self, key: str, value: Any, seconds: Seconds, histories: tuple[History, ...]) -> None:
-        """Store an artefact atomically: it is written to a temporary file, synced and renamed.
-
-        Raises a `NumericalError` if the value holds anything but arrays and data, and a `StorageError` if it cannot be
-        written.
-        """
+        """Store an artefact atomically: it is written to a temporary file, synced and renamed."""
         content = encoded(key, Artefact(value, seconds, histories, machine()))
         self._recent.pop(key, None)
         try:
@@ -137,10 +125,7 @@ class Store:
 
     @contextlib.contextmanager
     def used(self) -> Iterator[None]:
-        """Keep the store from being cleared inside the block.
-
-        Raises a `RequestError` if it is being cleared now, or cannot be written.
-        """
+        """Keep the store from being cleared inside the block."""
         with locked(self.lock, shared=True, busy=f"the artefacts in '{self.folder}' are being removed"):
             yield
 
@@ -154,10 +139,7 @@ class Store:
         return listed
 
     def clear(self, older_than: float | None = None) -> int:
-        """Remove artefacts (older than some seconds) and temporary files of killed runs; returns the bytes freed.
-
-        Raises a `RequestError` if a run uses the store.
-        """
+        """Remove artefacts (older than some seconds) and temporary files of killed runs; returns the bytes freed."""
         freed, newest = 0, time.time() - (older_than or 0.0)
         if not self.folder.is_dir():
             return freed
@@ -186,10 +168,7 @@ def _digest(key: str, content: bytes) -> bytes:
 
 
 def usable_store() -> Store:
-    """The store all runs share.
-
-    Raises a `RequestError` if its folder cannot be created, or others may write into it.
-    """
+    """The store all runs share."""
     store = Store(default_folder())
     try:
         store.folder.mkdir(0o700, parents=True, exist_ok=True)

@@ -46,21 +46,13 @@ class NestedPrograms(Stage):
 @storable
 @dataclass(frozen=True)
 class ReducedPrograms:
-    """Reduced programs at the validation parameters, for any QP solver.
-
-    Attributes
-    ----------
-    factor
-        Cholesky factor (lower) of A, where A is constant and the programs are solved in dual form.
-    errors
-        Largest relative difference of a member of each program from its Galerkin projection; zero for full assembly.
-    projected
-        The Galerkin projections solved to round-off, or `None` where that fails; empty for full assembly.
-    """
+    """Reduced programs at the validation parameters, for any QP solver."""
 
     programs: tuple[VariationalInequality, ...]
-    factor: Array | None
+    factor: Array | None  # Cholesky factor (lower) of A, where A is constant and the programs are solved in dual form
+    # Largest relative difference of a member of each program from its Galerkin projection; zero for full assembly.
     errors: tuple[float, ...]
+    # The Galerkin projections solved to round-off, or `None` where that fails; empty for full assembly.
     projected: tuple[ExactSolution | None, ...] = ()
 
 

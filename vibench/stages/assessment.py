@@ -126,12 +126,10 @@ def error_columns(
     exact: Sequence[ExactSolution | None],
     projected: Sequence[ExactSolution | None] = (),
 ) -> list[Row]:
-    """Errors of answers to solutions (x, α), one per parameter of `mus` (P×d), their error bounds and effectivities.
-
-    `exact` are the same programs solved to round-off: the difference is the error of the solver. `projected` are the
-    programs assembled in full, solved to round-off, where those of the queries are not: the difference from `exact` is
-    the error of reduced assembly. A `corrector` with a certificate adds bounds at online cost.
-    """
+    """Errors of answers to solutions (x, α), one per parameter of `mus` (P×d), their error bounds and effectivities."""
+    # `exact` are the same programs solved to round-off: the difference is the error of the solver. `projected` are the
+    # programs assembled in full, solved to round-off, where those of the queries are not: the difference from `exact`
+    # is the error of reduced assembly. A `corrector` with a certificate adds bounds at online cost.
     if not solutions:
         return []
     model = corrector.model

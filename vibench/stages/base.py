@@ -88,37 +88,24 @@ class Unstored:
 
 
 class Stage(ABC):
-    """One stage of a computation; subclasses are frozen dataclasses of what determines the result.
+    """One stage of a computation; subclasses are frozen dataclasses of what determines the result."""
 
-    The runner, the result writer and the progress display treat all stages alike: a stage declares its label, the axes
-    of the study it depends on and the rows that are recorded of it.
+    # The runner, the result writer and the progress display treat all stages alike: a stage declares its label, the
+    # axes of the study it depends on and the rows that are recorded of it.
 
-    Attributes
-    ----------
-    label
-        Name of the result in a word or two, for messages and for the names of artefacts.
-    stored
-        Whether the value is kept as an artefact, under `key`.
-    partial
-        Whether several stages hold parts of one result; progress is then shown part by part.
-    dispensable
-        Whether stages that need it run even if it failed, and find the reason in `FAILED_STAGES`; these are not
-        `stored`.
-    """
-
-    label: ClassVar[str]
-    stored: ClassVar[bool] = True
+    label: ClassVar[str]  # name of the result in a word or two, for messages and for the names of artefacts
+    stored: ClassVar[bool] = True  # whether the value is kept as an artefact, under `key`
+    # Whether several stages hold parts of one result; progress is then shown part by part.
     partial: ClassVar[bool] = False
+    # Whether stages that need it run even if it failed, and find the reason in `FAILED_STAGES`; these are not `stored`.
     dispensable: ClassVar[bool] = False
 
     @cached_property
     def key(self) -> str:
-        """Name of the artefact: the label, and a hash of everything that determines the value.
-
-        These are the fields of the stage, the keys of its inputs, the libraries, its own module with those of other
-        stages that it imports, and the layers of vibench below the stages that determine numbers. The code of a plugin
-        enters through `Plugin.code`.
-        """
+        """Name of the artefact: the label, and a hash of everything that determines the value."""
+        # These are the fields of the stage, the keys of its inputs, the libraries, its own module with those of other
+        # stages that it imports, and the layers of vibench below the stages that determine numbers. The code of a
+        # plugin enters through `Plugin.code`.
         own = {name: _described(value) for name, value in self._fields().items()}
         content = [type(self).__name__, self.code(), libraries(), own, [one.key for one in self.inputs()]]
         return f"{self.label.lower().replace(' ', '-')}-{digest(content)}"
@@ -263,10 +250,7 @@ class ItemwiseStage(Stage):
 
 
 def value_of(store: Store, stage: Stage) -> Any:
-    """The stored value of a stage that has been run.
-
-    Raises a `NumericalError` if its artefact is missing.
-    """
+    """The stored value of a stage that has been run. Raises a `NumericalError` if its artefact is missing."""
     artefact = store.get(stage.key)
     if artefact is None:
         raise NumericalError(f"the artefact {stage.key} is missing")

@@ -50,10 +50,9 @@ QueryRows = tuple[Row, Row | None]
 
 @dataclass(frozen=True)
 class CellRows:
-    """The rows of one cell: its own, one per query, the solutions of those that have one, and one per output.
+    """The rows of one cell: its own, one per query, the solutions of those that have one, and one per output."""
 
-    `parameters` are names and units of mu_1, mu_2, … of the queries.
-    """
+    # `parameters` are names and units of mu_1, mu_2, … of the queries.
 
     cell: Row
     queries: tuple[Row, ...]

@@ -65,20 +65,13 @@ def _functions(strategy: PrimalStrategy) -> dict[str, FunctionType]:
 @storable
 @dataclass(frozen=True)
 class AssessedGrowth:
-    """A nested enrichment and its inf-sup constants on the training set.
-
-    Attributes
-    ----------
-    steps, ratios
-        The smallest β_span, and the smallest ratio of β_span to that of V, after every vector (S+1,).
-    training
-        β_span at every training parameter (P,), by tolerance.
-    """
+    """A nested enrichment and its inf-sup constants on the training set."""
 
     grown: Grown
+    # `steps`, `ratios`: the smallest β_span, and the smallest ratio of β_span to that of V, after every vector (S+1,).
     steps: Array
     ratios: Array
-    training: Mapping[float, Array]
+    training: Mapping[float, Array]  # β_span at every training parameter (P,), by tolerance
 
 
 @dataclass(frozen=True)

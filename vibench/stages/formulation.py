@@ -50,10 +50,9 @@ for _kind in (
 
 @dataclass(frozen=True)
 class AffineDecomposition(Stage):
-    """Affine decomposition of A, f, B and g over the training set, for their evaluation at reduced cost.
+    """Affine decomposition of A, f, B and g over the training set, for their evaluation at reduced cost."""
 
-    The training matrices are not stored, they are assembled again.
-    """
+    # The training matrices are not stored, they are assembled again.
 
     label = "affine decomposition"
 
@@ -265,10 +264,9 @@ class CertificateBaseStage(Stage):
 
 @dataclass(frozen=True)
 class CertificateStage(Stage):
-    """Certificate of the queries of one reduced model; the value is its `OnlineCertificate` without the base.
+    """Certificate of the queries of one reduced model; the value is its `OnlineCertificate` without the base."""
 
-    The base, which is of mesh size, is stored once for all models.
-    """
+    # The base, which is of mesh size, is stored once for all models.
 
     label = "certificate"
 

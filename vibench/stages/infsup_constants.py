@@ -105,10 +105,9 @@ class ReferenceConstants:
 
 @dataclass(frozen=True)
 class InfSupConstants(Stage):
-    """Inf-sup constants of a primal space with a reduced cone: an `InfSup` per validation parameter.
+    """Inf-sup constants of a primal space with a reduced cone: an `InfSup` per validation parameter."""
 
-    The space is that of a reduced model, V_N alone, or, with `None`, the whole of V.
-    """
+    # The space is that of a reduced model, V_N alone, or, with `None`, the whole of V.
 
     label = "inf-sup constants"
 

@@ -31,11 +31,10 @@ def _solver_of(problem: Problem) -> HighFidelitySolver:
 
 
 class MarginalSolutions:
-    """Solutions of a problem next to its validation parameters; the first one in a process does the set-up.
+    """Solutions of a problem next to its validation parameters; the first one in a process does the set-up."""
 
-    Each starts from a contact set as in the sweep. A start from none takes several times as long but happens once,
-    however many solutions follow: it is part of the set-up.
-    """
+    # Each starts from a contact set as in the sweep. A start from none takes several times as long but happens once,
+    # however many solutions follow: it is part of the set-up.
 
     def __init__(self, problem: Problem, reference: TimedSnapshots, seed: int) -> None:
         self._problem, self._mus, self._u, self._seed = problem, reference.mu, reference.u, seed
@@ -44,10 +43,8 @@ class MarginalSolutions:
         self._allowed = 1e-6 * float(np.max(problem.V.norm(reference.u), initial=0.0))
 
     def solve(self, number: int, *seed: int) -> MarginalSolution:
-        """One solution with its assembly, at another parameter next to its own for every seed.
-
-        It has no seconds if it fails or differs from the solution of this parameter.
-        """
+        """One solution with its assembly, at another parameter next to its own for every seed."""
+        # It has no seconds if it fails or differs from the solution of this parameter.
         assembled = self.assemble(number, *seed)
         vi = assembled.vi
         try:
@@ -64,29 +61,20 @@ class MarginalSolutions:
 
 
 class MarginalSolution(NamedTuple):
-    """A high-fidelity solution that was timed.
+    """A high-fidelity solution that was timed."""
 
-    Attributes
-    ----------
-    number
-        Number of its validation parameter.
-    vi
-        The matrices next to that parameter; the next assembly may be written into the same arrays.
-    assembly, seconds
-        Seconds of the assembly and of the whole solution; `None` of a wrong one.
-    """
-
-    number: int
+    number: int  # number of its validation parameter
+    # The matrices next to that parameter; the next assembly may be written into the same arrays.
     vi: VariationalInequality
+    # `assembly`, `seconds`: seconds of the assembly and of the whole solution; `None` of a wrong one.
     assembly: Seconds
     seconds: Seconds | None
 
 
 class SolutionsBeside:
-    """High-fidelity solutions beside the queries of cells in rounds.
+    """High-fidelity solutions beside the queries of cells in rounds."""
 
-    `sweep` (P,) are CPU seconds of all solutions, as the sweep over the validation set measured them.
-    """
+    # `sweep` (P,) are CPU seconds of all solutions, as the sweep over the validation set measured them.
 
     def __init__(self, marginal: MarginalSolutions, sweep: Sequence[float]) -> None:
         self._marginal, self._sweep = marginal, np.asarray(sweep)
@@ -95,10 +83,8 @@ class SolutionsBeside:
     def alternated(
         self, order: Sequence[int], done: list[MarginalSolution], at: int, cell: int
     ) -> Iterator[tuple[int, MarginalSolution | None]]:
-        """The queries `order` of a cell in a round, each with the solution that was made before it, if there is one.
-
-        Solutions are added to `done`.
-        """
+        """The queries `order` of a cell in a round, each with the solution that was made before it, if there is one."""
+        # Solutions are added to `done`.
         # Solve before the first query, before that in the middle and after the last, unless fewer are enough.
         for place, k in enumerate(order):
             yield k, self._next(done, k, at, cell) if place in (0, len(order) // 2) else None

@@ -68,10 +68,7 @@ def _title(box: ParameterBox, mu: Array) -> str:
 
 
 def _checked(picture: Picture) -> Picture:
-    """A picture whose arrays hold real numbers and fit together, and whose names are texts.
-
-    Raises a `NumericalError` that names the member that does not.
-    """
+    """A picture whose arrays hold real numbers and fit together, and whose names are texts."""
     mistyped = [name for name in members(arrays=True) if getattr(picture, name).dtype.kind not in "fiu"]
     mistyped += [name for name in members(arrays=False) if not isinstance(getattr(picture, name), str)]
     if mistyped:

@@ -47,26 +47,15 @@ class Answered(NamedTuple):
 
 @dataclass(frozen=True)
 class ProgramQuery:
-    """An assembled program for the QP solver of the cell.
-
-    Attributes
-    ----------
-    factor
-        The Cholesky factor of A where it is known; the program is then solved in its multipliers.
-    accuracy
-        Relative accuracy prescribed to the solver.
-    start
-        Number and program of the query whose solution the solver starts from; `None` for a cold start.
-    units
-        Units (n,) of the unknowns where they are not those of the model.
-    """
+    """An assembled program for the QP solver of the cell."""
 
     program: VariationalInequality
-    factor: Array | None
+    factor: Array | None  # the Cholesky factor of A where it is known; the program is then solved in its multipliers
     solver: str
-    accuracy: float
+    accuracy: float  # relative accuracy prescribed to the solver
+    # Number and program of the query whose solution the solver starts from; `None` for a cold start.
     start: tuple[int, VariationalInequality] | None = None
-    units: Array | None = None
+    units: Array | None = None  # units (n,) of the unknowns where they are not those of the model
 
     @property
     def form(self) -> str:
@@ -119,11 +108,10 @@ class ProgramQuery:
 
 @dataclass(frozen=True)
 class ModelQuery:
-    """A query that the formulation itself answers at a parameter mu (d,).
+    """A query that the formulation itself answers at a parameter mu (d,)."""
 
-    `near` returns a parameter next to mu for every seed, `program` is its program, if it has any, and `start` number
-    and parameter of the query whose answer it starts from.
-    """
+    # `near` returns a parameter next to mu for every seed, `program` is its program, if it has any, and `start` number
+    # and parameter of the query whose answer it starts from.
 
     model: Model
     mu: Array
@@ -182,10 +170,9 @@ class ModelQuery:
 
 
 class Queries:
-    """The queries of a model at the validation parameters `mus` (P×d), for any QP solver.
+    """The queries of a model at the validation parameters `mus` (P×d), for any QP solver."""
 
-    `programs` are the programs at these, of a formulation that has any.
-    """
+    # `programs` are the programs at these, of a formulation that has any.
 
     def __init__(
         self,
@@ -246,10 +233,8 @@ def path_before(mus: Array, box: ParameterBox) -> list[int | None]:
 
 
 def run_query(query: ProgramQuery | ModelQuery, query_seconds: float, time_limit: TimeLimit) -> tuple[Row, Row | None]:
-    """The columns of a query, and those of its solution if there is one.
-
-    A solver that takes more than `query_seconds` has the status timeout.
-    """
+    """The columns of a query, and those of its solution if there is one."""
+    # A solver that takes more than `query_seconds` has the status timeout.
     row: Row = {"form": query.form}
     if query.start is not None:
         row["started_from"] = query.start[0]

@@ -38,11 +38,9 @@ class DamagedArtefactError(VibenchError):
 
 
 def storable(kind: ClassT) -> ClassT:
-    """Add a class to the closed list of those whose objects may be stored; may be used as a decorator.
-
-    A dataclass is stored by its fields, an enumeration by the name of the member, any other class by the value of
-    `__getstate__` without cached properties. A module that defines a stage lists the classes of its value.
-    """
+    """Add a class to the closed list of those whose objects may be stored; may be used as a decorator."""
+    # A dataclass is stored by its fields, an enumeration by the name of the member, any other class by the value of
+    # `__getstate__` without cached properties. A module that defines a stage lists the classes of its value.
     # Files name classes without their modules.
     if _classes.setdefault(kind.__name__, kind) is not kind:
         raise TypeError(f"two storable classes are called {kind.__name__}")
@@ -50,10 +48,7 @@ def storable(kind: ClassT) -> ClassT:
 
 
 def dumps(value: Any) -> bytes:
-    """A value as bytes: `None`, truth values, numbers, texts, tuples, lists, dictionaries, arrays, `storable` objects.
-
-    Raises a `NumericalError` that names the first part that is none of these.
-    """
+    """A value as bytes: `None`, booleans, numbers, texts, tuples, lists, dictionaries, arrays, `storable` objects."""
     writer = _Writer()
     text = json.dumps(writer.described(value), allow_nan=False, separators=(",", ":"))
     # One tensor holds the JSON text; the others are the arrays it refers to, by their numbers.
@@ -61,10 +56,7 @@ def dumps(value: Any) -> bytes:
 
 
 def loads(content: bytes) -> Any:
-    """The value that `dumps` wrote; arrays have the same entries, shape and order in memory, dense ones are read-only.
-
-    Raises a `DamagedArtefactError` if the content is anything else. It imports and runs nothing that the content names.
-    """
+    """The value that `dumps` wrote, dense arrays read-only; a `DamagedArtefactError` for any other content."""
     try:
         arrays = safetensors.numpy.load(content)
         text = arrays.pop("structure").tobytes().decode("ascii")

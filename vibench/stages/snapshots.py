@@ -39,29 +39,17 @@ storable(Fingerprint)
 @storable
 @dataclass(frozen=True)
 class TimedSnapshots(Snapshots):
-    """High-fidelity solutions at some parameters, and their seconds.
+    """High-fidelity solutions at some parameters, and their seconds."""
 
-    Attributes
-    ----------
-    seconds
-        Seconds per solution, assembly included and set-up excluded: the median of repeats at validation parameters.
-    setups
-        Seconds of the set-up of each chunk: those of the first solution beyond its repetition from a known start.
-    fallbacks
-        Fallbacks of the active set method per solution, "" where it needed none.
-    fingerprint
-        Fingerprint of the problem at the first training parameter, as the process of the chunk assembled it.
-    selecting
-        Seconds of the choice of the parameters by an adaptive training.
-    bounds
-        Relative error bounds of validation solutions, infinite where there is none; empty for training solutions.
-    """
-
+    # Seconds per solution, assembly included and set-up excluded: the median of repeats at validation parameters.
     seconds: tuple[Seconds, ...]
+    # Seconds of the set-up of each chunk: those of the first solution beyond its repetition from a known start.
     setups: tuple[Seconds, ...]
-    fallbacks: tuple[str, ...]
+    fallbacks: tuple[str, ...]  # fallbacks of the active set method per solution, "" where it needed none
+    # Fingerprint of the problem at the first training parameter, as the process of the chunk assembled it.
     fingerprint: Fingerprint
-    selecting: Seconds = NO_TIME
+    selecting: Seconds = NO_TIME  # seconds of the choice of the parameters by an adaptive training
+    # Relative error bounds of validation solutions, infinite where there is none; empty for training solutions.
     bounds: tuple[float, ...] = ()
 
 
@@ -227,10 +215,9 @@ class SnapshotStage(Stage):
 
 @dataclass(frozen=True)
 class AdaptiveTraining(Stage):
-    """Training parameters chosen one after the other by a sampling strategy, with their high-fidelity solutions.
+    """Training parameters chosen one after the other by a sampling strategy, with their high-fidelity solutions."""
 
-    The value is a `TimedSnapshots`; the seconds of the stage include those of the choice.
-    """
+    # The value is a `TimedSnapshots`; the seconds of the stage include those of the choice.
 
     label = "adaptive training"
 
@@ -290,10 +277,7 @@ def fingerprint_here(problem: Plugin) -> Fingerprint:
 
 
 def gather(store: Store, chunks: tuple[Stage, ...]) -> TimedSnapshots:
-    """The snapshots of all chunks.
-
-    Raises a `NumericalError` if the problem was assembled otherwise for a chunk than it is in this process.
-    """
+    """The snapshots of all chunks."""
     parts = [value_of(store, chunk) for chunk in chunks]
     (problem,) = {plugin for chunk in chunks for plugin in chunk.plugins if plugin.kind is PluginKind.PROBLEM}
     with faults_of(problem):

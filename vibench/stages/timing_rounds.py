@@ -43,23 +43,15 @@ ASSEMBLY_SECONDS = 0.02
 
 @dataclass(frozen=True)
 class TimedRound:
-    """One round of one cell.
+    """One round of one cell."""
 
-    Attributes
-    ----------
-    assemble, solve, certify
-        Seconds of assembly, solver and certificate by the number of the query. A full assembly is timed for some of
-        the queries, which count for all.
-    slowdown
-        Slowdown of the calibration before or after it, whichever is larger.
-    beside
-        Mean seconds of the high-fidelity solutions beside the queries, their assembly included.
-    """
-
+    # `assemble`, `solve`, `certify`: seconds of assembly, solver and certificate by the number of the query. A full
+    # assembly is timed for some of the queries, which count for all.
     assemble: Mapping[int, Seconds]
     solve: Mapping[int, Seconds]
-    slowdown: float
+    slowdown: float  # slowdown of the calibration before or after it, whichever is larger
     certify: Mapping[int, Seconds] = field(default_factory=dict)
+    # Mean seconds of the high-fidelity solutions beside the queries, their assembly included.
     beside: Seconds | None = None
 
     @property
@@ -84,28 +76,19 @@ class TimedCell:
 
 @dataclass(frozen=True)
 class TimingRounds(ItemwiseStage):
-    """One block of rounds of cells that are compared; an item is a round of one of them.
+    """One block of rounds of cells that are compared; an item is a round of one of them."""
 
-    A cell's queries alternate with high-fidelity solutions, so that a disturbance of the machine affects both alike.
-    The order of the cells changes from round to round. The value is a `TimedCell` per cell.
-
-    Attributes
-    ----------
-    queries
-        The queries of every cell that are ok.
-    rounds, first
-        Number of rounds, and number of the first one: those of earlier blocks come before.
-    session
-        Blocks of a later session are timed in processes that have timed none of an earlier one.
-    """
+    # A cell's queries alternate with high-fidelity solutions, so that a disturbance of the machine affects both alike.
+    # The order of the cells changes from round to round. The value is a `TimedCell` per cell.
 
     label = "timing"
 
     cells: tuple[CellQueries, ...]
-    queries: tuple[tuple[int, ...], ...]
+    queries: tuple[tuple[int, ...], ...]  # the queries of every cell that are ok
+    # `rounds`, `first`: number of rounds, and number of the first one: those of earlier blocks come before.
     rounds: int
     first: int
-    session: int = 0
+    session: int = 0  # blocks of a later session are timed in processes that have timed none of an earlier one
 
     @property
     def items(self) -> int:
@@ -206,10 +189,7 @@ class _Rounds(Items):
         cell: int,
         warm_up: int,
     ) -> tuple[dict[int, Seconds], dict[int, Seconds], dict[int, Seconds]]:
-        """Seconds of assembly, solution, and certificate with correction of queries, each with the solution before it.
-
-        `warm_up` is part of the seeds of what is timed.
-        """
+        """Seconds of assembly, solution and certificate of queries; `warm_up` is part of the seeds."""
         # Every repetition is perturbed, so that a caching solver or problem cannot be timed on a cache hit.
         stage, seed = self._stage.cells[cell], (at, cell, warm_up)
         assemble: dict[int, Seconds] = {}

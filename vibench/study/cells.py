@@ -45,13 +45,12 @@ class Axes:
 
 @dataclass(frozen=True)
 class Cell:
-    """A problem, strategies, tolerances, a QP solver, and how queries are assembled and corrected.
+    """A problem, strategies, tolerances, a QP solver, and how queries are assembled and corrected."""
 
-    `interpolation` is the tolerance of reduced assembly, `None` for full assembly; `bounds` need the former. What the
-    `formulation` does not use is `None`. `labels` of problem, dual and primal strategy are no part of the identity,
-    nor are those of the parameter sets; nor are `nested_tolerances`, all tolerances of a nested primal strategy in the
-    study, whose enrichments are stages of one.
-    """
+    # `interpolation` is the tolerance of reduced assembly, `None` for full assembly; `bounds` need the former. What the
+    # `formulation` does not use is `None`. `labels` of problem, dual and primal strategy are no part of the identity,
+    # nor are those of the parameter sets; nor are `nested_tolerances`, all tolerances of a nested primal strategy in
+    # the study, whose enrichments are stages of one.
 
     problem: Plugin
     dual: Plugin | None
@@ -110,10 +109,7 @@ class Cell:
 
     @classmethod
     def from_definition(cls, text: str, places: Mapping[str, str] = {}) -> Cell:
-        """The cell of a definition, with the code of its plugins as installed, and new `places` of files by name.
-
-        Raises a `RequestError` if a plugin is not installed, or a file cannot be read or is unknown.
-        """
+        """The cell of a definition, with the code of its plugins as installed, and new `places` of files by name."""
         content = json.loads(text)
         recorded = ((name, part) for name, part in content.items() if isinstance(part, dict) and "code" in part)
         plugins = {name: Plugin(**part) for name, part in recorded}

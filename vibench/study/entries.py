@@ -76,10 +76,7 @@ class Entry(BaseModel):
         return self._given is None
 
     def registered(self, kind: PluginKind) -> RegisteredPlugin:
-        """The registry entry of its name, or its class or object in the state of the first call.
-
-        Raises a `RequestError` if this is not of the kind, or cannot be sent to worker processes.
-        """
+        """The registry entry of its name, or its class or object in the state of the first call."""
         if self.is_registered:
             return find(kind, self.name)
         if not isinstance(self._given, GivenPlugin):
@@ -123,10 +120,7 @@ class FormulationEntry(Entry):
 
     @property
     def uses(self) -> tuple[str, ...]:
-        """The axes of a study that it has.
-
-        Raises a `RequestError` if it declares axes that there are not.
-        """
+        """The axes of a study that it has. Raises a `RequestError` if it declares axes that there are not."""
         return axes_of(self.kind, str(self.registered(PluginKind.FORMULATION)))
 
 

@@ -139,10 +139,7 @@ def _entries_in(axis: Any, name: str) -> list[Any]:
 
 
 def expand(study: Study) -> list[Cell]:
-    """All cells of a study without duplicates, in the order of its axes.
-
-    Raises a `RequestError` if the matrix is empty, or a strategy that takes a tolerance has none.
-    """
+    """All cells of a study without duplicates, in the order of its axes."""
     cells: dict[str, Cell] = {}
     problems = [
         (entry, plugin, study.training_sets(entry), study.validation_set(entry).sized(plugin))
@@ -231,12 +228,8 @@ def _solved(study: Study, entry: FormulationEntry) -> list[tuple[tuple[str, bool
 
 
 def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
-    """The study of a single cell, with the same key.
-
-    `settings` do not determine its numbers: `timing_rounds`, `timing_rounds_min`, `limits`.
-
-    Raises a `RequestError` if a plugin of the cell is not installed, or the name is not one of a study.
-    """
+    """The study of a single cell, with the same key."""
+    # `settings` do not determine its numbers: `timing_rounds`, `timing_rounds_min`, `limits`.
     tolerances: dict[str, Any] = dict([_stop("pod", "N", cell.pod), _stop("dual", "R", cell.cone)])
     if cell.primal_tol is not None:
         tolerances["primal"] = {cell.labels[2]: [cell.primal_tol]}

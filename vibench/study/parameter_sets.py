@@ -24,12 +24,11 @@ CHUNKS = 4
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """The training or the validation set of a problem: its own, or that of a sampling strategy.
+    """The training or the validation set of a problem: its own, or that of a sampling strategy."""
 
-    `count` is the number of parameters of a validation set, and `seed` that of a problem's own one, and of random
-    numbers in timings; both are 0 for training sets. `sampling` is `None` for the problem's own set. Sets that differ
-    only in their labels are the same set.
-    """
+    # `count` is the number of parameters of a validation set, and `seed` that of a problem's own one, and of random
+    # numbers in timings; both are 0 for training sets. `sampling` is `None` for the problem's own set. Sets that differ
+    # only in their labels are the same set.
 
     role: Literal["training", "validation"]
     count: int
@@ -90,10 +89,7 @@ def _problem(plugin: Plugin) -> Problem:
 
 @lru_cache(maxsize=64)
 def parameters_of(problem: Plugin, parameters: ParameterSet) -> Array:
-    """The parameters (P×d) of a set for a problem, which is built; cached, so that nobody may change them.
-
-    Raises a `RequestError` that names the problem and the strategy if there is no such set.
-    """
+    """The parameters (P×d) of a set for a problem, which is built; cached, so that nobody may change them."""
     built, sampling = _problem(problem), parameters.sampling
     try:
         return parameters.of(built)
@@ -103,11 +99,9 @@ def parameters_of(problem: Plugin, parameters: ParameterSet) -> Array:
 
 
 def check_sets(problem: Plugin, training: ParameterSet, validation: ParameterSet) -> None:
-    """Raise a `RequestError` if a problem has no such sets, or all validation parameters are training parameters.
-
-    Errors there would say nothing of other parameters, and two strategies with one seed draw the same points. Only the
-    problem itself may choose equal sets.
-    """
+    """Raise a `RequestError` if a problem has no such sets, or all validation parameters are training parameters."""
+    # Errors there would say nothing of other parameters, and two strategies with one seed draw the same points. Only
+    # the problem itself may choose equal sets.
     if validation.is_adaptive and validation.sampling is not None:
         raise RequestError(
             f"sampling strategy '{validation.sampling.name}' chooses training parameters by what solutions know; it "

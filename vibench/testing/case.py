@@ -36,11 +36,11 @@ Arrays = dict[str, Any]
 
 @dataclass(eq=False)
 class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
-    """A plugin under examination, the arguments it is called with, and the results.
+    """A plugin under examination, the arguments it is called with, and the results."""
 
-    Every call receives copies, so that a plugin that writes to its input fails the check "no mutation" alone. `seconds`
-    limits each call; `round_off` is the largest relative difference that arrays of another process may have.
-    """
+    # Every call receives copies, so that a plugin that writes to its input fails the check "no mutation" alone.
+    # `seconds` limits each call; `round_off` is the largest relative difference that arrays of another process may
+    # have.
 
     base: ClassVar[type]
     checks: ClassVar[tuple[Check[Any], ...]]
@@ -276,11 +276,9 @@ class Segment(NamedTuple):
 def find_jump(
     evaluate: Callable[[float], Arrays], scales: dict[str, float], late: Callable[[], bool] = lambda: False
 ) -> Segment | None:
-    """A segment of length 2⁻³⁰ at most on which an array jumps, `None` if no jump is found before it is `late`.
-
-    Jumps below 1e-3 of the largest entry are not found. `evaluate` returns the arrays at t ∈ [0, 1]; `scales` names
-    those that are examined, with their largest modulus.
-    """
+    """A segment of length 2⁻³⁰ at most on which an array jumps, `None` if no jump is found before it is `late`."""
+    # Jumps below 1e-3 of the largest entry are not found. `evaluate` returns the arrays at t ∈ [0, 1]; `scales` names
+    # those that are examined, with their largest modulus.
 
     def segment(left: float, right: float, first: Arrays, last: Arrays) -> Segment:
         middle = evaluate(0.5 * (left + right))

@@ -82,11 +82,10 @@ class ConformanceWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Check(Generic[CaseT_contra]):
-    """A name, a function from a case to its faults and notes, and the names of checks that must pass before.
+    """A name, a function from a case to its faults and notes, and the names of checks that must pass before."""
 
-    A function that reports its faults by a `ConformanceError` alone returns `None`; a `SkipTest` ends the check as
-    skipped, for its reason.
-    """
+    # A function that reports its faults by a `ConformanceError` alone returns `None`; a `SkipTest` ends the check as
+    # skipped, for its reason.
 
     name: str
     faults: Callable[[CaseT_contra], Iterable[str] | None]
@@ -264,10 +263,7 @@ def _title(plugin: Any) -> str:
 
 
 def call_in_other_process(function: Callable[..., Any], *arguments: Any, seconds: float) -> Any:
-    """Value of a function in another process, whose hashes have another seed than those here.
-
-    Raises a `NotImportableError` if it cannot be sent there, a `ConformanceError` if it fails or takes too long there.
-    """
+    """Value of a function in another process, whose hashes have another seed than those here."""
     # The seed orders sets of texts.
     seed = "1" if os.environ.get("PYTHONHASHSEED") != "1" else "2"
     value = call_isolated(function, *arguments, seconds=seconds, supervisor=_supervisor(PYTHONHASHSEED=seed))

@@ -188,10 +188,8 @@ class SolverCase:
             yield f"a later call overwrites {name} of an earlier solution: {what} before"
 
     def repetition(self) -> Iterator[str]:
-        """A program that was solved before is solved again: it takes as many function calls and as long as a new one.
-
-        Seconds alone depend on what else the machine does, calls alone on the number of iterations.
-        """
+        """A program that was solved before takes as many function calls and as long as a new one."""
+        # Seconds alone depend on what else the machine does, calls alone on the number of iterations.
         program = _scaled(self.programs["many constraints"].program)
         # The first nine are counted, the others timed: the profiler that counts calls slows them down.
         new = [replace(program, f=program.f * (1.0 + 1e-6 * (k + 1))) for k in range(18)]
