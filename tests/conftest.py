@@ -27,7 +27,6 @@ from vibench.library import runs
 from vibench.plugins import registry
 from vibench.plugins.kinds import PluginKind
 from vibench.results.sqlite import FILE
-from vibench.stages.artefacts import CACHE_VARIABLE
 
 # The examples of a test are the same ones every time and everywhere; `--hypothesis-profile=explore` draws new ones.
 settings.register_profile("same", deadline=None, derandomize=True, database=None)
@@ -102,7 +101,7 @@ def artefacts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Folder in which the runs of this test process keep their artefacts: nobody else's are reused."""
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(CACHE_VARIABLE, str(folder))
+        patch.setenv("VIBENCH_CACHE", str(folder))
         # Hundreds of processes are started; each would compile the sources again where bytecode is not kept.
         patch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
         patch.delenv("COLUMNS", raising=False)  # pytest-xdist sets it: tables would leave out what does not fit
@@ -142,7 +141,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory, artefacts: Path) -> Shared:
         with (parent / f"{name}.lock").open("w") as lock, pytest.MonkeyPatch.context() as patch:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not made.exists():
-                patch.setenv(CACHE_VARIABLE, str(cache))
+                patch.setenv("VIBENCH_CACHE", str(cache))
                 make(folder)
                 made.touch()
         if cache.exists():

@@ -26,7 +26,6 @@ from vibench.arrays import Array
 from vibench.execution.run import Options, run_study
 from vibench.library.progress import ProgressDisplay
 from vibench.results.sqlite import FILE
-from vibench.stages.artefacts import CACHE_VARIABLE
 
 GRIDS = {200: (5, 4), 2_000: (20, 10), 20_000: (50, 40)}
 """Tolerances of the POD and of the cone, by the number of cells; each pair has `ACCURACIES`."""
@@ -82,7 +81,7 @@ def cost(cells: int, folder: Path) -> tuple[float, float]:
     noted = folder / "cost.json"
     if not noted.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        environment = os.environ | {CACHE_VARIABLE: str(folder.with_name(f"{folder.name}-cache"))}
+        environment = os.environ | {"VIBENCH_CACHE": str(folder.with_name(f"{folder.name}-cache"))}
         with folder.with_suffix(".printed").open("w") as printed:
             command = [sys.executable, __file__, "--run", str(cells), str(folder)]
             subprocess.run(command, env=environment, stdout=printed, check=True)

@@ -18,8 +18,6 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from running import assert_same_numbers
 
-from vibench.stages.artefacts import CACHE_VARIABLE
-
 WAYS = {
     "one worker": ("--jobs", "1"),
     "two workers": ("--jobs", "2"),
@@ -33,7 +31,7 @@ def wall(folder: Path, study: str, arguments: Sequence[str]) -> float:
     noted = folder / "seconds"
     if not noted.exists():
         command = [str(Path(sysconfig.get_path("scripts")) / "vibench"), "run", study, "--out", str(folder / "run")]
-        environment = os.environ | {CACHE_VARIABLE: str(folder / "cache")}
+        environment = os.environ | {"VIBENCH_CACHE": str(folder / "cache")}
         folder.mkdir(parents=True, exist_ok=True)
         start = time.perf_counter()
         with (folder / "printed").open("w") as printed:

@@ -19,7 +19,7 @@ from vibench.results.database import ResultsDatabase
 from vibench.results.read import results_file
 from vibench.results.schema import STORED
 from vibench.results.sqlite import FILE, read_meta, read_rows, study_of
-from vibench.stages.artefacts import CACHE_VARIABLE, SUFFIX, Store
+from vibench.stages.artefacts import Store
 from vibench.stages.serialisation import dumps
 
 STUDY = {
@@ -40,7 +40,7 @@ def made(vibench: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) 
     folder = tmp_path_factory.mktemp("made")
     write_study(folder, STUDY)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(CACHE_VARIABLE, str(folder / "cache"))
+        patch.setenv("VIBENCH_CACHE", str(folder / "cache"))
         done = vibench(folder, "run", "study.toml", "--jobs", "1", "--out", "out")
     assert done.returncode == 0, done.stderr
     return folder
@@ -190,7 +190,7 @@ def test_a_resumed_run_computes_damaged_cells_again(made: Path, results: Path, v
         db.execute("UPDATE thresholds SET benefit_threshold = 1.0")  # made anew by every run
         db.commit()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(CACHE_VARIABLE, str(made / "cache"))
+        patch.setenv("VIBENCH_CACHE", str(made / "cache"))
         done = vibench(results.parent.parent, "run", "study.toml", "--jobs", "1", "--out", "run")
     assert done.returncode == 0, done.stderr
     assert f"computed again, as their rows were damaged: {first}, {second}" in done.stdout
@@ -268,10 +268,10 @@ def test_a_value_that_is_none_of_its_column_is_refused(command: str, results: Pa
 @pytest.mark.parametrize("damages", [flips(3, 90), truncations(4, 40)], ids=["flips", "truncations"])
 def test_damage_of_an_artefact_is_found(damages: Iterator[Damage], made: Path, tmp_path: Path) -> None:
     """Every kind of artefact; the digest covers all of it."""
-    paths = sorted((made / "cache" / "artefacts").glob(f"*{SUFFIX}"))
+    paths = sorted((made / "cache" / "artefacts").glob("*.artefact"))
     assert len({path.name.rpartition("-")[0] for path in paths}) >= 15
     for path, damage in zip(paths * 10, damages, strict=False):
-        content, key = path.read_bytes(), path.name.removesuffix(SUFFIX)
+        content, key = path.read_bytes(), path.name.removesuffix(".artefact")
         (tmp_path / path.name).write_bytes(damage(content))
         assert Store(tmp_path).get(key) is None
         (tmp_path / path.name).write_bytes(content)

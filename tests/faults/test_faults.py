@@ -19,7 +19,6 @@ from running import Vibench, assert_same_numbers, rows, without_seconds
 from samples import wire_study, write_study
 
 from vibench.results.sqlite import FILE
-from vibench.stages.artefacts import CACHE_VARIABLE
 
 WIRES = [{"name": "wire", "label": f"{nodes}", "options": {"nodes": nodes}} for nodes in (20, 40)]
 LONG = wire_study(
@@ -56,7 +55,7 @@ def undisturbed(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> C
 
 @pytest.fixture
 def place(length: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
     write_study(tmp_path, STUDIES[length])
     return tmp_path
 

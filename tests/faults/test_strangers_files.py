@@ -24,7 +24,7 @@ from vibench.results.read import read_table, results_file
 from vibench.results.show import export as write_export
 from vibench.results.sqlite import FILE
 from vibench.stages import artefacts
-from vibench.stages.artefacts import CACHE_VARIABLE, SUFFIX, Artefact, Store, usable_store
+from vibench.stages.artefacts import Artefact, Store, usable_store
 from vibench.timing import NO_TIME
 
 
@@ -59,7 +59,7 @@ def test_a_planted_artefact_runs_no_code(tmp_path: Path) -> None:
     """Under the name of another and with the digest of its own: it counts as damaged."""
     folder, proof = tmp_path / "store", tmp_path / "proof"
     Store(folder).put("pod-1", 1, NO_TIME, ())
-    path = folder / f"pod-1{SUFFIX}"
+    path = folder / "pod-1.artefact"
     for content in (pickle.dumps(Payload(proof)), pickle.dumps(Artefact(Payload(proof), NO_TIME, (), "here"))):
         for digest in (hashlib.sha256(b"pod-1\0" + content).digest(), bytes(32), path.read_bytes()[:32], b""):
             path.write_bytes(digest + content)
@@ -80,10 +80,10 @@ def test_a_folder_that_others_may_write_is_refused(
     named: bool, mode: int, refused: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A folder that the user names may be shared with a group on purpose, and never with everybody."""
-    monkeypatch.delenv(CACHE_VARIABLE, raising=False)
+    monkeypatch.delenv("VIBENCH_CACHE", raising=False)
     monkeypatch.setattr(artefacts.platformdirs, "user_cache_dir", lambda name: str(tmp_path))
     if named:
-        monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+        monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path))
     usable_store()
     (tmp_path / "artefacts").chmod(mode)
     if refused:

@@ -19,7 +19,6 @@ from sources import SOURCES, mentions
 from vibench.interfaces.problem import MEMBERS
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
-from vibench.stages.artefacts import CACHE_VARIABLE
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "vibench-rope"
 
@@ -56,7 +55,7 @@ def python(example: Path, artefacts: Path) -> Python:
 
     def run(*arguments: str, where: Path = example.parent) -> subprocess.CompletedProcess[str]:
         clean = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PIP_"))}
-        environment = clean | {CACHE_VARIABLE: str(artefacts.parent)}
+        environment = clean | {"VIBENCH_CACHE": str(artefacts.parent)}
         command = [str(interpreter), *arguments]
         done = subprocess.run(command, cwd=where, env=environment, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr

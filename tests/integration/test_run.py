@@ -17,7 +17,7 @@ from samples import wire_study, write_study
 import vibench.execution.run  # noqa: F401  lists the classes of all stages
 from vibench.results.schema import TABLES
 from vibench.results.sqlite import FILE
-from vibench.stages.artefacts import CACHE_VARIABLE, SUFFIX, Store, encoded
+from vibench.stages.artefacts import Store, encoded
 from vibench.study.parameter_sets import CHUNKS
 
 SOLVERS = ["piqp", "careful", "gives-up"]
@@ -198,7 +198,7 @@ def test_edits_beside_numbers_run_nothing(
     package, edited_core = Path(importlib.util.find_spec("vibench").submodule_search_locations[0]), tmp_path / "core"
     # First on the path the copy takes the place of what is installed; its bytecode would take seconds to make.
     shutil.copytree(package, edited_core / "vibench")
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
     study = write_study(tmp_path, wire_study())
 
     def vibench(*commands: tuple[str, ...]) -> str:
@@ -246,7 +246,7 @@ def test_the_number_of_jobs_changes_no_result(vibench: Vibench, tmp_path: Path) 
 def test_artefacts_are_shared_by_studies_and_seconds_only_on_their_machine(
     vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
     # high-fidelity solutions of both sets, and their constants at one; pictures; POD, cone, enrichment; assembly, exact
     # solutions; constraints twice; five inf-sup constants
     made = 3 * CHUNKS + 13
@@ -269,8 +269,8 @@ def test_artefacts_are_shared_by_studies_and_seconds_only_on_their_machine(
     again, anew = (rows(tmp_path / folder)[0]["offline_wall_s"] for folder in ("again", "anew"))
     assert again == rows(tmp_path / "runs" / "wire")[0]["offline_wall_s"] != anew  # measured only where made anew
     store = Store(tmp_path / "cache" / "artefacts")
-    for path in (tmp_path / "cache" / "artefacts").glob(f"*{SUFFIX}"):
-        key = path.name.removesuffix(SUFFIX)
+    for path in (tmp_path / "cache" / "artefacts").glob("*.artefact"):
+        key = path.name.removesuffix(".artefact")
         path.write_bytes(encoded(key, replace(store.get(key), machine="elsewhere")))
     assert stages("one.toml", "--out", "here") == made + 2
     assert rows(tmp_path / "here")[0]["machine"] == rows(tmp_path / "again")[0]["machine"]
@@ -279,10 +279,10 @@ def test_artefacts_are_shared_by_studies_and_seconds_only_on_their_machine(
 def test_clean_shows_and_frees_artefacts_asked(
     vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
     vibench(tmp_path, "run", write_study(tmp_path, wire_study()), "--jobs", "1")
     artefacts = tmp_path / "cache" / "artefacts"
-    count = len(list(artefacts.glob(f"*{SUFFIX}")))
+    count = len(list(artefacts.glob("*.artefact")))
     refused = vibench(tmp_path, "clean")
     assert refused.returncode == 2
     assert "--yes" in refused.stderr
@@ -290,7 +290,7 @@ def test_clean_shows_and_frees_artefacts_asked(
         done = vibench(tmp_path, "clean", *options)
         assert (done.returncode, done.stderr) == (0, "")
         assert re.search(rf"high fidelity solutions +{2 * CHUNKS} ", done.stdout)
-        assert len(list(artefacts.glob(f"*{SUFFIX}"))) == left
+        assert len(list(artefacts.glob("*.artefact"))) == left
     assert "MiB freed" in done.stdout
     assert (tmp_path / "runs" / "wire" / FILE).exists()
 

@@ -35,7 +35,7 @@ from vibench.plugins.registry import RegisteredPlugin, find, registered, unreada
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
-from vibench.stages.artefacts import CACHE_VARIABLE, Store, default_folder
+from vibench.stages.artefacts import Store, default_folder
 from vibench.study.matrix import read_study
 from vibench.text import new_console
 from vibench.timing import DISTURBED, Calibration, Stopwatch
@@ -209,7 +209,7 @@ def check_disk(out: Path) -> Iterator[Diagnosis]:
     yield _folder("artefacts", store.folder)
     sizes = [size for _, size, _ in store.contents()]
     yield Diagnosis("stored", f"{len(sizes)} artefacts, {sum(sizes) / 2**20:.1f} MiB; `vibench clean` deletes them")
-    source = f"${CACHE_VARIABLE}" if os.environ.get(CACHE_VARIABLE) else f"the default; ${CACHE_VARIABLE} changes it"
+    source = "$VIBENCH_CACHE" if os.environ.get("VIBENCH_CACHE") else "the default; $VIBENCH_CACHE changes it"
     yield Diagnosis("artefact folder", source)
 
 

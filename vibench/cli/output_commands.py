@@ -172,7 +172,7 @@ def _export_model(
 ) -> None:
     """Export a model, and say which errors its polynomials have, what it bounds and how long its queries take."""
     from vibench.library import reduced_model
-    from vibench.library.export import RUNTIME, export_model
+    from vibench.library.export import export_model
     from vibench.library.runs import open_run
     from vibench.model.chebyshev import MEASURED
     from vibench.offline.polynomials import TOLERANCE
@@ -204,5 +204,5 @@ def _export_model(
     query, solution = (f"{1e3 * median(column):.2g} ms" for column in zip(*seconds[1:], strict=True))
     echo(f"a query takes {query}; the high-fidelity solution {solution}")
     sources = [file.with_suffix(end) for end in (".c", ".h") if target.suffix == ".c"]
-    written = ", ".join(map(str, [file, file.with_name(RUNTIME), *sources]))
-    echo(f"{written}: `from {Path(RUNTIME).stem} import Model`, then `Model({str(file)!r}).solve(mu)`")
+    written = ", ".join(map(str, [file, file.with_name("reduced_model.py"), *sources]))
+    echo(f"{written}: `from reduced_model import Model`, then `Model({str(file)!r}).solve(mu)`")

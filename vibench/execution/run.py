@@ -27,7 +27,7 @@ from vibench.execution.timing_plan import OfflinePlan, TimingPlan
 from vibench.linalg.factorisations import DEFAULT, implementation
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
-from vibench.plugins.registry import FACTORISATION, find, registered
+from vibench.plugins.registry import find, registered
 from vibench.provenance import solver_distribution
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
@@ -325,7 +325,7 @@ def unavailable(cell: Cell) -> str:
     for plugin in (*plugins, *([] if cell.solver is None else [find(PluginKind.SOLVER, cell.solver)])):
         if plugin.conflict:
             return plugin.conflict
-    chosen = implementation(cell.problem.arguments.get(FACTORISATION, DEFAULT))
+    chosen = implementation(cell.problem.arguments.get("factorisation", DEFAULT))
     needs = [(str(plugin), plugin.missing) for plugin in plugins]
     needs += [] if chosen.is_installed else [(f"factorisation '{chosen.name}'", [chosen.distribution])]
     for name, missing in needs:

@@ -11,8 +11,17 @@ from vibench.results.paired_timing import PairedTiming
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Failed, Row, Stage
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
-from vibench.stages.timing_rounds import QUERY_SUBSETS, TimedCell, TimedRound, TimingRounds, block_rows
+from vibench.stages.timing_rounds import (
+    QUERY_SUBSETS,
+    OfflineRepeat,
+    TimedCell,
+    TimedRound,
+    TimingRounds,
+    block_rows,
+    offline_columns,
+    scatter,
+    sources,
+)
 from vibench.study.cells import Cell
 from vibench.timing import Seconds
 

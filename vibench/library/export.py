@@ -32,9 +32,6 @@ from vibench.provenance import distribution_version
 from vibench.qp.settings import SETTINGS
 from vibench.study.cells import Cell
 
-# The script that is written beside exported files.
-RUNTIME = "reduced_model.py"
-
 
 @dataclass(frozen=True)
 class ExportedModel:
@@ -106,7 +103,9 @@ def export_model(
         raise RequestError(f"evaluations is {evaluations}, expected a number of parameters")
     if file.parent.exists() and not file.parent.is_dir():
         raise RequestError(f"'{file.parent}' is no folder")
-    runtime = {file.with_name(RUNTIME): (files("vibench.library") / RUNTIME).read_bytes()}
+    # The script that is written beside exported files evaluates them without vibench.
+    script = "reduced_model.py"
+    runtime = {file.with_name(script): (files("vibench.library") / script).read_bytes()}
     sources = [file.with_suffix(".c"), file.with_suffix(".h")] if c else []
     _refuse_to_overwrite([file, *sources], runtime)
     found = exported(model, tolerance, evaluations, bases, c)

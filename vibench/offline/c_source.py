@@ -80,22 +80,18 @@ def source(
     box, cell, polynomials = about["parameters"], about["cell"], {**members, **thetas}
     own = {key: exact.get(key, polynomial) for key, polynomial in polynomials.items()}
     values = {
-        "name": name,
-        "macro": name.upper(),
+        "name": name, "macro": name.upper(),
         "origin": _comment(", ".join(str(cell.get(key, "")) for key in ("problem", "dual", "primal", "cell"))),
         "licence": _comment(f"{about['source']['distribution']}, {about['source']['licence']}"),
         "exporter": _comment(about["exported_by"]),
         "parameters": _comment(", ".join(f"{n} [{u}]" for n, u in zip(box["names"], box["units"], strict=True))),
-        "dimension": len(arrays["lower"]),
-        "unknowns": members["f"].terms.shape[1],
+        "dimension": len(arrays["lower"]), "unknowns": members["f"].terms.shape[1],
         "constraints": members["g"].terms.shape[1],
         "degree": max((max(one.degrees) for one in own.values() if isinstance(one, AffinePolynomial)), default=0),
-        "terms": max(len(member.terms) for member in own.values()),
-        "accuracy": repr(float(about["accuracy"])),
-        "lower": _numbers(arrays["lower"]),
-        "upper": _numbers(arrays["upper"]),
+        "terms": max(len(member.terms) for member in own.values()), "accuracy": repr(float(about["accuracy"])),
+        "lower": _numbers(arrays["lower"]), "upper": _numbers(arrays["upper"]),
         "members": "\n".join(_member(key, own[key]) for key in MEMBERS),
-    }
+    }  # fmt: skip
     # A function that nothing calls would be a warning of the compiler.
     some = any(isinstance(one, AffinePolynomial) for one in own.values())
     values["products"] = _filled("reduced_model_products.c", {}) if some else ""
@@ -136,16 +132,11 @@ def _of_certificate(
     numbers = loads * (loads + 1) // 2 + 8 * rows + 20 * loads + norms + kept
     sizes = {name: polynomial.terms.shape[1] for name, polynomial in thetas.items()}
     return sizes | {
-        "rows": rows,
-        "loads": loads,
-        "directions": directions,
-        "kept": kept,
-        "residual_terms": norms,
-        "spectral": int("certificate_anchors" in arrays),
-        "stack": round(8e-3 * numbers) + 1,
+        "rows": rows, "loads": loads, "directions": directions, "kept": kept, "residual_terms": norms,
+        "spectral": int("certificate_anchors" in arrays), "stack": round(8e-3 * numbers) + 1,
         "thetas": "\n".join(_member(key, polynomial) for key, polynomial in thetas.items()),
         "arrays": "\n".join(map(_array, own, own.values())),
-    }
+    }  # fmt: skip
 
 
 def _array(name: str, array: Array | Indices) -> str:

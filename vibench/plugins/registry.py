@@ -26,10 +26,6 @@ if TYPE_CHECKING:
     from vibench.qp.verification import QPSolver
 
 
-# Option of every problem, in addition to those of its constructor.
-FACTORISATION = "factorisation"
-
-
 @dataclass(frozen=True)
 class RegisteredPlugin:
     """The entry points of a name: several if packages register different objects, none if nobody does."""
@@ -161,13 +157,14 @@ class RegisteredPlugin:
 
     def _without_factorisation(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
         """Options without `factorisation`, which has to exist, and this option if it is not the default."""
-        if self.kind is not PluginKind.PROBLEM or FACTORISATION not in given or FACTORISATION in self.options:
+        # Every problem has this option, in addition to those of its constructor.
+        if self.kind is not PluginKind.PROBLEM or "factorisation" not in given or "factorisation" in self.options:
             return dict(given), {}
         from vibench.linalg.factorisations import DEFAULT, implementation
 
-        own, name = dict(given), implementation(given[FACTORISATION]).name
-        del own[FACTORISATION]
-        return own, {} if name == DEFAULT else {FACTORISATION: name}
+        own, name = dict(given), implementation(given["factorisation"]).name
+        del own["factorisation"]
+        return own, {} if name == DEFAULT else {"factorisation": name}
 
     def canonical_options(self, given: Mapping[str, Any]) -> str:
         """Checked options as canonical JSON, without those that equal their default."""
@@ -194,7 +191,7 @@ class RegisteredPlugin:
         # The constructor must not factorise X_V with the default first, which may take longest of all.
         with factorised_later():
             made = self.load()(**own)
-            made.factorised_by(chosen[FACTORISATION])
+            made.factorised_by(chosen["factorisation"])
         return made
 
 

@@ -21,12 +21,6 @@ from vibench.stages.serialisation import DamagedArtefactError, dumps, loads, sto
 from vibench.text import one_line
 from vibench.timing import Seconds
 
-CACHE_VARIABLE = "VIBENCH_CACHE"
-"""Environment variable that sets the cache folder, in which artefacts are kept."""
-
-SUFFIX = ".artefact"
-"""Suffix of artefact files: each holds a digest (SHA-256) of its name and of the content that follows."""
-
 
 @storable
 @dataclass(frozen=True)
@@ -76,7 +70,7 @@ class Artefact:
 
 def default_folder() -> Path:
     """Folder of the artefacts: `$VIBENCH_CACHE`, or the user's cache folder."""
-    return Path(os.environ.get(CACHE_VARIABLE) or platformdirs.user_cache_dir("vibench")).absolute() / "artefacts"
+    return Path(os.environ.get("VIBENCH_CACHE") or platformdirs.user_cache_dir("vibench")).absolute() / "artefacts"
 
 
 class Store:
@@ -132,7 +126,7 @@ class Store:
     def contents(self) -> list[tuple[str, int, float]]:
         """The stored artefacts: label of the stage, bytes, and age in seconds."""
         listed = []
-        for path in sorted(self.folder.glob(f"*{SUFFIX}")):
+        for path in sorted(self.folder.glob("*.artefact")):
             with contextlib.suppress(FileNotFoundError):
                 status = path.stat()
                 listed.append((path.name.rpartition("-")[0], status.st_size, time.time() - status.st_mtime))
@@ -144,7 +138,7 @@ class Store:
         if not self.folder.is_dir():
             return freed
         with locked(self.lock, busy=f"a run uses the artefacts in '{self.folder}'"):
-            for path in [*self.folder.glob(f"*{SUFFIX}"), *self.folder.glob(f"{TEMPORARY}*{PART}")]:
+            for path in [*self.folder.glob("*.artefact"), *self.folder.glob(f"{TEMPORARY}*{PART}")]:
                 with contextlib.suppress(FileNotFoundError):
                     status = path.lstat()
                     if path.suffix == PART or older_than is None or status.st_mtime <= newest:
@@ -153,7 +147,8 @@ class Store:
         return freed
 
     def _path(self, key: str) -> Path:
-        return self.folder / f"{key}{SUFFIX}"
+        # The file holds a digest (SHA-256) of its name and of the content that follows.
+        return self.folder / f"{key}.artefact"
 
 
 def encoded(key: str, artefact: Artefact) -> bytes:
@@ -173,14 +168,14 @@ def usable_store() -> Store:
     try:
         store.folder.mkdir(0o700, parents=True, exist_ok=True)
         # Whoever may write could plant false numbers. A folder that is named on purpose may be shared by a group.
-        if store.folder.stat().st_mode & (0o002 if os.environ.get(CACHE_VARIABLE) else 0o022):
+        if store.folder.stat().st_mode & (0o002 if os.environ.get("VIBENCH_CACHE") else 0o022):
             raise RequestError(
                 f"others may write into the folder for artefacts, '{store.folder}': run `chmod go-w` on it, "
-                f"or set {CACHE_VARIABLE} to another one"
+                f"or set VIBENCH_CACHE to another one"
             )
     except OSError as error:
         raise RequestError(
             f"the folder for artefacts, '{store.folder}', cannot be made: {error.strerror}; "
-            f"set {CACHE_VARIABLE} to another one"
+            f"set VIBENCH_CACHE to another one"
         ) from None
     return store

@@ -31,9 +31,8 @@ from vibench.stability.coercivity import Stability
 from vibench.stability.infsup import InfSup, stability_ratio
 from vibench.stages.artefacts import Artefact, Store
 from vibench.stages.assembly import AssemblyStage, ExactSolutions, ReducedPrograms
-from vibench.stages.assessment import error_columns, pair_columns
+from vibench.stages.assessment import error_columns, pair_columns, summarise
 from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, TimeLimit, build_problem, value_of
-from vibench.stages.cell_summary import summarise
 from vibench.stages.enrichment import EnrichmentStage, spaces_of
 from vibench.stages.formulation import CertificateStage, FormulationStage
 from vibench.stages.infsup_constants import InfSupConstants, ReferenceConstants
@@ -149,13 +148,10 @@ class CellQueries(ItemwiseStage):
         """The stages whose seconds add up to the offline time of the cell, by column."""
         built, certificate = self.built, self.certificate
         parts: Mapping[str, tuple[Stage | None, ...]] = {
-            "pod": (built.pod,),
-            "cone": (built.cone,),
-            "enrichment": (built.enrichment,),
-            "formulation": (built if built.builds else None,),
-            "assembly": (built.decomposition, built.reduction),
+            "pod": (built.pod,), "cone": (built.cone,), "enrichment": (built.enrichment,),
+            "formulation": (built if built.builds else None,), "assembly": (built.decomposition, built.reduction),
             "certificate": (None,) if certificate is None else (certificate.base, certificate),
-        }
+        }  # fmt: skip
         made = {name: tuple(stage for stage in stages if stage is not None) for name, stages in parts.items()}
         return {"snapshots": self.training} | made
 
@@ -265,14 +261,10 @@ class _Queries(Items):
         constants = [one for k in numbers if isinstance(one := self._stability[k], Stability)]
         if programs is not None:
             return error_columns(
-                self._corrector,
-                mus,
-                [vectors(solution) for solution in solutions.values()],
-                compared,
-                constants,
+                self._corrector, mus, [vectors(solution) for solution in solutions.values()], compared, constants,
                 [self._exact[k] for k in numbers],
                 [programs.projected[k] for k in numbers] if programs.projected else (),
-            )
+            )  # fmt: skip
         # u and λ of a formulation are reconstructed only here, where a broken answer costs one query.
         answers = [FormulationAnswer(*vectors(solution)) for solution in solutions.values()]
         pairs = [self._model.pair(mu, answer) for mu, answer in zip(mus, answers, strict=True)]
@@ -316,14 +308,10 @@ class _Queries(Items):
         # A formulation may count its vectors otherwise than the offline phase.
         added = added if online.enrichment is None else online.enrichment
         row: Row = {
-            "enrichment_kind": kind.value,
-            "N": online.dimension - (added or 0),
-            "R": online.generators,
-            "enrichment": added,
-            "multiplier": self._model.formulation.multiplier.value,
-            "correction_cost": "",
+            "enrichment_kind": kind.value, "N": online.dimension - (added or 0), "R": online.generators,
+            "enrichment": added, "multiplier": self._model.formulation.multiplier.value, "correction_cost": "",
             "certificate": (Guarantee.NONE if self._certificate is None else self._certificate.base.guarantee).value,
-        }
+        }  # fmt: skip
         if self._queries.programs is not None and self._stage.assembly is not None:
             row |= self._program_sizes(self._stage.assembly, self._queries.programs, rows, fallbacks)
         return row, fallbacks
@@ -379,13 +367,10 @@ class _Queries(Items):
         if unbounded := int(np.sum(np.isinf(self._reference.bounds))):
             fallbacks.append(f"{unbounded} of the validation solutions have no error bound: residuals verify them")
         return {
-            "model": self._stage.model,
-            "dim_V": self._problem.V.dim,
-            "dim_W": self._problem.W.dim,
-            "snapshots": len(self._training.mu),
-            "fallbacks": "; ".join(fallbacks),
+            "model": self._stage.model, "dim_V": self._problem.V.dim, "dim_W": self._problem.W.dim,
+            "snapshots": len(self._training.mu), "fallbacks": "; ".join(fallbacks),
             "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        }
+        }  # fmt: skip
 
     def _offline(self) -> Row:
         """Offline seconds as if the cell had been run alone, and the machines that measured them."""

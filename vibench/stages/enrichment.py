@@ -234,15 +234,9 @@ def _reduction(store: Store, pod: PODStage, cone: ConeStage, interpolation: floa
     """The offline phase up to V_N and the cone, which are stored."""
     reduced: ReducedCone = value_of(store, cone)
     reduction = Reduction(
-        build_problem(pod.problem),
-        cone.dual.create(),
-        None,
-        pod.stop,
-        cone.stop,
-        training=pod.training.strategy(),
-        assembly="full" if interpolation is None else "reduced",
-        interpolation=interpolation or Reduction.interpolation,
-    )
+        build_problem(pod.problem), cone.dual.create(), None, pod.stop, cone.stop, training=pod.training.strategy(),
+        assembly="full" if interpolation is None else "reduced", interpolation=interpolation or Reduction.interpolation,
+    )  # fmt: skip
     return reduction.given(pod=value_of(store, pod), cone=reduced.cone, multipliers=reduced.prepared)
 
 

@@ -217,18 +217,12 @@ class FormulationStage(Stage):
         if self.reduction is not None:
             steps["operators"] = value_of(store, self.reduction)
         return _StoredReduction(
-            build_problem(self.problem),
-            None if cone is None else cone.dual.create(),
-            None if enrichment is None else enrichment.primal.create(),
-            None if pod is None else pod.stop,
-            None if cone is None else cone.stop,
-            None if enrichment is None else enrichment.tolerance,
-            training=self.training.strategy(),
-            assembly="full" if self.interpolation is None else "reduced",
-            interpolation=self.interpolation or Reduction.interpolation,
-            accuracy=accuracy,
-            read=read,
-        ).given(**steps)
+            build_problem(self.problem), None if cone is None else cone.dual.create(),
+            None if enrichment is None else enrichment.primal.create(), None if pod is None else pod.stop,
+            None if cone is None else cone.stop, None if enrichment is None else enrichment.tolerance,
+            training=self.training.strategy(), assembly="full" if self.interpolation is None else "reduced",
+            interpolation=self.interpolation or Reduction.interpolation, accuracy=accuracy, read=read,
+        ).given(**steps)  # fmt: skip
 
     def model(self, store: Store, solver: str | None = None, accuracy: float | None = None) -> Model:
         """The model for a solver and an accuracy, once the stages of `model_inputs` have been run."""

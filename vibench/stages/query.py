@@ -69,12 +69,9 @@ class ProgramQuery:
         """The same query in other units of the unknowns, which depend on the seed (see docs/measurement.md)."""
         d = random_units(len(self.program.f), self.accuracy, *seed)
         return replace(
-            self,
-            program=in_units(self.program, d),
-            factor=None if self.factor is None else self.factor * d[:, None],
-            start=None if self.start is None else (self.start[0], in_units(self.start[1], d)),
-            units=d,
-        )
+            self, program=in_units(self.program, d), factor=None if self.factor is None else self.factor * d[:, None],
+            start=None if self.start is None else (self.start[0], in_units(self.start[1], d)), units=d,
+        )  # fmt: skip
 
     def prepare(self, time_limit: TimeLimit) -> Callable[[], tuple[QPSolution, Seconds]]:
         """Solve the query to start from, untimed, and return the timed solution of this one."""

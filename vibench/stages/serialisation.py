@@ -20,12 +20,9 @@ from vibench.errors import NumericalError, VibenchError
 from vibench.text import one_line
 
 SPARSE = {
-    "csr": ("data", "indices", "indptr"),
-    "csc": ("data", "indices", "indptr"),
-    "bsr": ("data", "indices", "indptr"),
-    "coo": ("row", "col", "data"),
-    "dia": ("data", "offsets"),
-}
+    "csr": ("data", "indices", "indptr"), "csc": ("data", "indices", "indptr"), "bsr": ("data", "indices", "indptr"),
+    "coo": ("row", "col", "data"), "dia": ("data", "offsets"),
+}  # fmt: skip
 """The arrays of a sparse matrix, by its format; matrices of other formats are stored as `coo`."""
 
 _classes: dict[str, type] = {}
@@ -141,16 +138,12 @@ class _Reader:
         self._arrays, self._views = arrays, dict[str, np.ndarray[Any, Any]]()
         self._kinds: dict[str, Callable[[Any], Any]] = {
             "float": lambda text: {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}[text],
-            "tuple": lambda parts: tuple(map(self.value, parts)),
-            "list": lambda parts: list(map(self.value, parts)),
-            "dict": lambda parts: {self.value(key): self.value(part) for key, part in parts},
-            "array": self._read_only,
-            "columnwise": lambda number: self._read_only(number).T,
-            "scalar": lambda number: self._arrays[number][()],
-            "sparse": lambda parts: self._sparse(*parts),
-            "member": lambda parts: _class(parts[0], Enum)[parts[1]],
+            "tuple": lambda parts: tuple(map(self.value, parts)), "list": lambda parts: list(map(self.value, parts)),
+            "dict": lambda parts: {self.value(key): self.value(part) for key, part in parts}, "array": self._read_only,
+            "columnwise": lambda number: self._read_only(number).T, "scalar": lambda number: self._arrays[number][()],
+            "sparse": lambda parts: self._sparse(*parts), "member": lambda parts: _class(parts[0], Enum)[parts[1]],
             "object": lambda parts: self._object(*parts),
-        }
+        }  # fmt: skip
 
     def value(self, described: Any) -> Any:
         """The value of a description."""

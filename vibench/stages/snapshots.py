@@ -288,13 +288,9 @@ def gather(store: Store, chunks: tuple[Stage, ...]) -> TimedSnapshots:
                 "unseeded random numbers, the order of sets, and what is kept between calls"
             )
     return TimedSnapshots(
-        np.concatenate([part.mu for part in parts]),
-        np.hstack([part.u for part in parts]),
-        np.hstack([part.lam for part in parts]),
-        tuple(seconds for part in parts for seconds in part.seconds),
+        np.concatenate([part.mu for part in parts]), np.hstack([part.u for part in parts]),
+        np.hstack([part.lam for part in parts]), tuple(seconds for part in parts for seconds in part.seconds),
         tuple(seconds for part in parts for seconds in part.setups),
-        tuple(note for part in parts for note in part.fallbacks),
-        here,
-        sum((part.selecting for part in parts), NO_TIME),
-        tuple(bound for part in parts for bound in part.bounds),
-    )
+        tuple(note for part in parts for note in part.fallbacks), here,
+        sum((part.selecting for part in parts), NO_TIME), tuple(bound for part in parts for bound in part.bounds),
+    )  # fmt: skip

@@ -100,12 +100,9 @@ class Cell:
         if self.correction == CorrectionMode.NONE:
             del content["correction"]
         return content | {
-            "seed": validation["seed"],
-            "validation": validation["count"],
-            "training": training["sampling"],
-            "validation_sampling": validation["sampling"],
-            "set_labels": (training["label"], validation["label"]),
-        }
+            "seed": validation["seed"], "validation": validation["count"], "training": training["sampling"],
+            "validation_sampling": validation["sampling"], "set_labels": (training["label"], validation["label"]),
+        }  # fmt: skip
 
     @classmethod
     def from_definition(cls, text: str, places: Mapping[str, str] = {}) -> Cell:

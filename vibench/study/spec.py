@@ -26,7 +26,7 @@ from vibench.interfaces.strategies import Stop
 from vibench.linalg.factorisations import DEFAULT
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
-from vibench.plugins.registry import FACTORISATION, default_formulation, find, registered
+from vibench.plugins.registry import default_formulation, find, registered
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.study.entries import (
@@ -224,7 +224,7 @@ class Study(_Model):
             raise RequestError(fault_line(error, cls, named)) from None
         if study.factorisation != DEFAULT:
             # A factorisation in the options of a problem wins.
-            given = {FACTORISATION: study.factorisation}
+            given = {"factorisation": study.factorisation}
             study.problem[:] = (one.model_copy(update={"options": given | one.options}) for one in study.problem)
         # After the types: messages about names need valid entries.
         _check_names(study)

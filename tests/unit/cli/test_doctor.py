@@ -18,7 +18,7 @@ from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.qp.verification import Residuals
-from vibench.stages.artefacts import CACHE_VARIABLE, Store, default_folder
+from vibench.stages.artefacts import Store, default_folder
 from vibench.timing import NO_TIME, Seconds, Stopwatch
 
 FINE = Trial(Status.OK, "", residuals=Residuals(0.0, 2e-9, 0.0))
@@ -156,11 +156,11 @@ class TestDisk:
         assert found == Diagnosis("runs", f"{tmp_path / 'new'}: 0.2 GiB free", Health.NOTE)
 
     def test_artefacts_are_counted_in_their_folder(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+        monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
         Store(default_folder()).put("pod-1", "x" * 2**20, NO_TIME, ())
         found = by_subject(list(doctor.check_disk(tmp_path)))
         assert found["stored"].text.startswith("1 artefacts, 1.0 MiB")
-        assert CACHE_VARIABLE in found["artefact folder"].text
+        assert "VIBENCH_CACHE" in found["artefact folder"].text
         assert str(tmp_path / "cache" / "artefacts") in found["artefacts"].text
 
 

@@ -13,7 +13,7 @@ from vibench.results.break_even import SCATTER
 from vibench.stages.assembly import ExactSolutions
 from vibench.stages.base import Stage
 from vibench.stages.cell_queries import CellQueries, cell_queries
-from vibench.stages.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
+from vibench.stages.timing_rounds import OfflineRepeat, offline_columns, scatter, sources
 from vibench.study.matrix import expand, read_study
 from vibench.timing import Seconds
 

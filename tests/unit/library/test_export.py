@@ -24,7 +24,7 @@ from samples import with_ways
 
 import vibench
 from vibench.library import export, reduced_model
-from vibench.library.export import RUNTIME, export_model
+from vibench.library.export import export_model
 from vibench.library.export import exported as exported_model
 from vibench.library.reduced_model import Model as Exported
 from vibench.model.affine import affine_decomposition
@@ -33,7 +33,7 @@ from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.offline import polynomials
 from vibench.qp.exact import exact_solution
 
-FILES = {"model.npz", RUNTIME}
+FILES = {"model.npz", "reduced_model.py"}
 
 
 @pytest.fixture(scope="module")
@@ -435,10 +435,10 @@ def test_models_without_an_export_are_refused(
         export_model(model_of(run, "obstacle", "online-supremizers", "full"), tmp_path / "model.npz")
     with pytest.raises(vibench.RequestError, match="C sources are for fixed bases"):
         export_model(per_parameter(model), tmp_path / "model.npz", c=True)
-    (tmp_path / RUNTIME).write_text("precious")
+    (tmp_path / "reduced_model.py").write_text("precious")
     with pytest.raises(vibench.RequestError, match="is not the runtime of this version"):
         export_model(model, tmp_path / "model.npz")
-    assert [file.name for file in tmp_path.iterdir()] == [RUNTIME]
+    assert [file.name for file in tmp_path.iterdir()] == ["reduced_model.py"]
     monkeypatch.setattr(type(model.reduced), "members", lambda self, mu, samples: {}["mu is not in the list"])
     with pytest.raises(vibench.RequestError, match="cannot be evaluated in the whole parameter box: KeyError"):
         export_model(model, tmp_path / "deep" / "model.npz")

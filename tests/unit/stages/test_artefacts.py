@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from vibench.errors import NumericalError, RequestError, StorageError
 from vibench.stages import artefacts as module
-from vibench.stages.artefacts import SUFFIX, Artefact, History, Store, encoded
+from vibench.stages.artefacts import Artefact, History, Store, encoded
 from vibench.timing import Seconds
 
 TIME = Seconds(1.5, 2.5)
@@ -51,7 +51,7 @@ def test_what_is_put_is_got_by_another_process(tmp_path: Path, monkeypatch: pyte
     assert found is not None
     np.testing.assert_array_equal(found.value, [0.0, 1.0, 2.0])
     assert (found.seconds, found.histories, found.machine) == (TIME, (HISTORY,), "there")
-    assert files(folder) == [f"key{SUFFIX}"]
+    assert files(folder) == ["key.artefact"]
 
 
 def test_what_cannot_be_written_leaves_the_earlier_artefact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,7 +71,7 @@ def test_what_cannot_be_written_leaves_the_earlier_artefact(tmp_path: Path, monk
     found = Store(tmp_path).get("key")
     assert found is not None
     assert found.value == 1
-    assert files(tmp_path) == [f"key{SUFFIX}"]
+    assert files(tmp_path) == ["key.artefact"]
 
 
 def test_an_artefact_is_not_seen_before_it_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -114,7 +114,7 @@ def flip_a_bit(path: Path) -> None:
 )
 def test_a_damaged_artefact_counts_as_missing(damage: Callable[[Path], object], tmp_path: Path) -> None:
     Store(tmp_path).put("key", list(range(100)), TIME, ())
-    damage(tmp_path / f"key{SUFFIX}")
+    damage(tmp_path / "key.artefact")
     assert Store(tmp_path).get("key") is None
 
 
@@ -141,7 +141,7 @@ def test_what_is_stored_is_counted_and_cleared(tmp_path: Path) -> None:
     store.put("conestage-1", list(range(1000)), TIME, ())
     (tmp_path / "vibench-left by a killed run.part").write_bytes(b"12345")
     counted = {sort: size for sort, size, _ in store.contents()}
-    assert counted == {path.name.split("-")[0]: path.stat().st_size for path in tmp_path.glob(f"*{SUFFIX}")}
+    assert counted == {path.name.split("-")[0]: path.stat().st_size for path in tmp_path.glob("*.artefact")}
     assert store.clear(older_than=3600.0) == 5
     assert store.clear() == sum(counted.values())
     assert store.contents() == []

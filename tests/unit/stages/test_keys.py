@@ -18,10 +18,9 @@ from vibench.stages import timing_rounds
 from vibench.stages.artefacts import Artefact, Store
 from vibench.stages.base import ItemwiseStage, Result, Stage, build_problem
 from vibench.stages.cell_queries import cell_queries
-from vibench.stages.offline_repeats import OfflineRepeat
 from vibench.stages.pictures import PictureStage
 from vibench.stages.snapshots import fingerprint_here
-from vibench.stages.timing_rounds import TimingRounds
+from vibench.stages.timing_rounds import OfflineRepeat, TimingRounds
 from vibench.study.matrix import expand
 from vibench.study.spec import Study
 

@@ -22,9 +22,9 @@ from vibench.qp.status import Status
 from vibench.reduction.nested import Milestone
 from vibench.stability.coercivity import Stability
 from vibench.stages import snapshots
+from vibench.stages.assessment import summarise
 from vibench.stages.base import FAILED_STAGES, Failed, value_of
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.cell_summary import summarise
 from vibench.stages.enrichment import NestedEnrichment, SingleEnrichment
 from vibench.stages.infsup_constants import ReferenceConstants
 from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage
