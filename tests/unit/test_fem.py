@@ -40,13 +40,15 @@ def test_the_h1_norm_of_polynomials() -> None:
     assert np.array_equal(fem.h1_gram(scalar, free).toarray(), fem.h1_gram(scalar).toarray()[np.ix_(free, free)])
 
 
-def test_masses_of_a_domain_a_patch_and_a_part_of_the_boundary() -> None:
+def test_masses_and_loads_of_a_domain_a_patch_and_a_part_of_the_boundary() -> None:
     whole = Basis(MESH, ElementTriP1())
     patch = whole.with_elements(MESH.elements_satisfying(lambda x: x[0] < 1.0))
     top = FacetBasis(MESH, ElementTriP1(), facets="top")
     for basis, measure in ((whole, 2.0), (patch, 1.0), (top, 2.0)):
         assert fem.lumped_mass(basis).sum() == pytest.approx(measure)
         assert np.allclose(fem.mass(basis).sum(axis=1), fem.lumped_mass(basis))
+    basis = Basis(MESH, ElementTriP1())
+    assert np.allclose(fem.lumped_mass(basis), unit_load.assemble(basis))
 
 
 @pytest.mark.parametrize("sense", ["<=", ">="])
@@ -75,17 +77,23 @@ def test_a_field_is_constrained_vertex_by_vertex_or_in_the_mean(sense: fem.Sense
         assert square[interior] == pytest.approx(sign * h**2 * ((2.0 / 3.0) ** 2 + h**2 / 6.0))
 
 
-def test_a_constraint_on_a_part_of_the_boundary() -> None:
+def test_constraints_without_vertices_of_their_own_carry_no_multiplier() -> None:
     top = FacetBasis(MESH, ElementTriP1(), facets="top")
     inner = np.flatnonzero((MESH.p[0] > 0.1) & (MESH.p[0] < 1.9))
     found = fem.unilateral(top, "<=", free=inner)
     assert np.all(found.points[1] == 1.0)
     assert np.allclose(found.W.matrix.diagonal(), 1.0 / 3.0)
-
-
-def test_quadratic_functions_carry_no_multipliers() -> None:
+    basis = Basis(MESH, ElementVector(ElementTriP1()))
+    top = MESH.boundaries["top"]
+    fixed_vertically = basis.nodal_dofs[1, MESH.p[0] < 0.5]
+    free = np.setdiff1d(np.arange(basis.N), fixed_vertically)
+    found = fem.normal_constraint(basis, top, free=free)
+    assert np.all(found.points[0] > 0.5)
+    assert len(found.nodes) == 5
     with pytest.raises(NumericalError, match="linear or bilinear elements"):
         fem.unilateral(Basis(MESH, ElementTriP2()), "<=")
+    with pytest.raises(NumericalError, match="ElementVector"):
+        fem.normal_constraint(Basis(MESH, ElementTriP1()), MESH.boundaries["top"])
 
 
 @pytest.mark.parametrize("lumped", [True, False])
@@ -102,21 +110,6 @@ def test_normal_displacements_of_a_rigid_motion(lumped: bool) -> None:
     along = fem.normal_constraint(basis, facets, direction=np.array([0.0, 1.0]), lumped=lumped)
     assert (along.B @ motion).sum() == pytest.approx(0.5 * 3.0)
     assert np.allclose(along.bound(np.ones(len(along.nodes))).sum(), 3.0)
-
-
-def test_vertices_without_a_free_component_carry_no_multiplier() -> None:
-    basis = Basis(MESH, ElementVector(ElementTriP1()))
-    top = MESH.boundaries["top"]
-    fixed_vertically = basis.nodal_dofs[1, MESH.p[0] < 0.5]
-    free = np.setdiff1d(np.arange(basis.N), fixed_vertically)
-    found = fem.normal_constraint(basis, top, free=free)
-    assert np.all(found.points[0] > 0.5)
-    assert len(found.nodes) == 5
-
-
-def test_normal_displacements_need_a_vector_basis() -> None:
-    with pytest.raises(NumericalError, match="ElementVector"):
-        fem.normal_constraint(Basis(MESH, ElementTriP1()), MESH.boundaries["top"])
 
 
 class Patch(AffineProblem):
@@ -167,11 +160,8 @@ def test_dirichlet_data_that_depend_on_the_parameter_are_lifted(mu: list[float],
     assert abs(vi.B - by_hand.B).max() == 0.0
 
 
-def test_a_lifted_problem_passes_the_conformance_checks() -> None:
+def test_lifted_problems_pass_the_checks_and_keep_their_constants() -> None:
     check(partial(Patch, depth=0.2))
-
-
-def test_constants_stay_constant_when_they_are_lifted() -> None:
     problem = Patch()
     stiffness, B, g = problem.full
     problem.declare(
@@ -212,8 +202,3 @@ def test_contact_of_a_block_is_that_of_scikit_fem_alone() -> None:
     alone = solve(*condense(stiffness, x=prescribed, D=D))
     assert np.allclose(solution.u, alone[free], atol=1e-13)
     assert np.allclose(fem.eliminate(full, free).B.toarray(), Cube().assemble(np.array([0.1])).B.toarray())
-
-
-def test_the_load_of_a_lumped_mass_is_that_of_scikit_fem() -> None:
-    basis = Basis(MESH, ElementTriP1())
-    assert np.allclose(fem.lumped_mass(basis), unit_load.assemble(basis))

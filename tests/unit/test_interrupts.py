@@ -32,20 +32,14 @@ def test_a_command_can_catch_what_ends_the_process_outside(handler: object) -> N
     assert now() is handler
 
 
-def test_an_interrupted_command_raises_what_the_command_line_reports() -> None:
+def test_commands_catch_raise_or_ignore_interrupts() -> None:
+    """As in a script that runs a command in the background."""
     with interrupted_at_once(), pytest.raises(Interrupted):
         interruptible(lambda: os.kill(os.getpid(), signal.SIGINT))()
-
-
-def test_a_command_may_ignore_interrupts_for_good() -> None:
     with interrupted_at_once():
         interruptible(lambda: signal.signal(signal.SIGINT, signal.SIG_IGN))()  # type: ignore[arg-type, return-value]
         assert now() is signal.SIG_IGN
     assert now() is signal.SIG_IGN
-
-
-def test_interrupts_that_are_ignored_remain_so() -> None:
-    """As in a script that runs a command in the background."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with interrupted_at_once():
         interruptible(lambda: os.kill(os.getpid(), signal.SIGINT))()

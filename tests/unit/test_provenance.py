@@ -15,32 +15,32 @@ from vibench import provenance
 from vibench.provenance import core_code, cores, distribution_version, machine, solver_version, source_hash, versions
 
 
-@pytest.mark.parametrize(
-    ("groups", "file", "limit"),
-    [
+def test_memory_is_what_control_groups_allow(tmp_path: Path) -> None:
+    for groups, file, limit in (
         ("0::/\n", "memory.max", "123456789\n"),
         ("0::/user/one.scope\n", "user/memory.max", "123456789\n"),
         ("3:cpu,memory:/docker/ab\n1:cpu:/x\n0::/\n", "memory/docker/ab/memory.limit_in_bytes", "123456789\n"),
         ("3:memory:/docker/ab\n", "memory/memory.limit_in_bytes", "123456789\n"),
-    ],
-)
-def test_memory_is_what_control_groups_allow(groups: str, file: str, limit: str, tmp_path: Path) -> None:
-    (tmp_path / "groups").write_text(groups)
-    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
-    machine = provenance.memory(tmp_path / "groups", tmp_path)
-    assert machine == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    for text, expected in ((limit, 123456789), ("max\n", machine), (f"{2**63 - 4096}\n", machine)):
-        (tmp_path / file).write_text(text)
-        assert provenance.memory(tmp_path / "groups", tmp_path) == expected
+    ):
+        (tmp_path / "groups").write_text(groups)
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        machine = provenance.memory(tmp_path / "groups", tmp_path)
+        assert machine == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        for text, expected in ((limit, 123456789), ("max\n", machine), (f"{2**63 - 4096}\n", machine)):
+            (tmp_path / file).write_text(text)
+            assert provenance.memory(tmp_path / "groups", tmp_path) == expected
 
 
-def test_the_machine_is_named_with_cores_memory_and_system() -> None:
+def test_the_processor_has_its_model_and_caches_and_the_machine_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     text = machine()
     assert f"{cores()} cores" in text
     assert "GiB" in text
     assert platform.system() in text
     assert platform.machine() in text
     assert "\n" not in text
+    monkeypatch.setattr(provenance.Path, "is_file", lambda _: False)
+    text = machine.__wrapped__()
+    assert text.split(",")[0].strip() in (platform.processor(), platform.machine())
 
 
 def test_the_processor_has_its_model_and_the_sizes_of_its_caches_of_data(tmp_path: Path) -> None:
@@ -131,12 +131,6 @@ def test_the_code_of_the_core_is_its_version_and_a_hash_of_its_sources(edited: C
     assert before.partition(" ")[0] == importlib.metadata.version("vibench")
     edited("linalg/inner_product.py")
     assert core_code() != before
-
-
-def test_the_processor_is_named_without_cpuinfo(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(provenance.Path, "is_file", lambda _: False)
-    text = machine.__wrapped__()
-    assert text.split(",")[0].strip() in (platform.processor(), platform.machine())
 
 
 def test_versions_name_the_commit_of_a_checkout_and_whether_it_was_changed(tmp_path: Path) -> None:

@@ -65,24 +65,12 @@ def loaded(code: str) -> set[str]:
     return set(done.stdout.split())
 
 
-def test_importing_vibench_loads_nothing_heavy() -> None:
+def test_each_part_of_vibench_loads_nothing_that_it_does_not_need() -> None:
+    """Every run starts some, and every death of one another: pandas would take a quarter of their start."""
     assert loaded("import vibench") & HEAVY == set()
-
-
-def test_naming_a_status_loads_no_solver() -> None:
     assert loaded("from vibench import Status; Status.OK") & HEAVY == set()
-
-
-def test_naming_the_qp_solvers_loads_no_numpy() -> None:
     assert loaded("from vibench.qp.settings import SETTINGS") & (HEAVY | {"numpy"}) == set()
-
-
-def test_reading_results_loads_no_stage_and_no_solver() -> None:
     code = "import vibench.results.read\nassert not any(name.startswith('vibench.stages') for name in sys.modules)"
     assert loaded(code) & {"qpsolvers", "matplotlib", "skfem"} == set()
-
-
-def test_a_worker_process_loads_no_tables_and_no_figures() -> None:
-    """Every run starts some, and every death of one another: pandas would take a quarter of their start."""
     code = "import vibench.execution.worker, vibench.stages.cell_queries, vibench.stages.pictures"
     assert loaded(code) & {"matplotlib", "pandas", "rich", "typer"} == set()

@@ -43,9 +43,8 @@ def reproduction() -> Iterator[ModuleType]:
     sys.path.remove(scripts)
 
 
-@pytest.mark.parametrize(
-    ("paper", "ours", "within", "expected"),
-    [
+def test_numbers_agree_within_a_relative_difference_or_an_order() -> None:
+    for paper, ours, within, expected in (
         (50, 43, 0.15, True),
         (19, 14, 0.15, False),
         ((3, 46), (3, 44), 0.15, True),
@@ -55,15 +54,19 @@ def reproduction() -> Iterator[ModuleType]:
         ((1, 2), (1,), 1.0, False),
         (-1.25, -1.25, 0.0, True),
         (1.0, math.nan, 1.0, False),
-    ],
-)
-def test_numbers_agree_within_a_relative_difference(paper: float, ours: float, within: float, expected: bool) -> None:
-    assert claims.close(paper, ours, within) is expected
+    ):
+        assert claims.close(paper, ours, within) is expected
+    assert claims.same_order(8.0, [9.1, 12.6])
+    assert not claims.same_order(8.0, [9.1, 26.0])
+    assert not claims.same_order(1e-7, [2e-14])
+    smaller = {0: 1.0, 1: 0.5, 2: 0.4, 3: 0.3, 5: 9.0}
+    larger = {0: 1.0, 1: 0.5 * (1.0 - 1e-12), 2: 0.3, 3: 0.2, 4: 0.1}
+    assert claims.exceptions(smaller, larger) == [2, 3]
+    assert claims.ranges([9, 10, 11, 19, 22, 27, 28]) == "9–11, 19, 22, 27–28"
 
 
-@pytest.mark.parametrize(
-    ("meaning", "low", "high", "expected"),
-    [
+def test_break_evens_agree_in_their_intervals_and_are_written_with_them(reproduction: ModuleType) -> None:
+    for meaning, low, high, expected in (
         ("from", 90.0, 110.0, "agrees"),
         ("from", 40.0, 110.0, "agrees"),
         ("from", 30.0, 110.0, "cannot be compared"),
@@ -75,92 +78,47 @@ def test_numbers_agree_within_a_relative_difference(paper: float, ours: float, w
         ("until", 90.0, 110.0, "differs"),
         ("at once", None, None, "differs"),
         ("undecided", 90.0, None, "cannot be compared"),
-    ],
-)
-def test_a_break_even_agrees_in_the_interval(
-    meaning: str, low: float | None, high: float | None, expected: str
-) -> None:
-    assert claims.break_even_verdict(102.0, meaning, low, high).value == expected
-
-
-def test_a_break_even_is_written_with_its_interval() -> None:
-    assert claims.break_even_text(28.3, "from", 18.8, 63.1) == "from 28 (19–63)"
-    assert claims.break_even_text(math.nan, "never", math.nan, math.nan) == "never"
-    assert claims.break_even_text(None, "undecided", 179.3, None) == "undecided (≥ 179)"
-
-
-@pytest.mark.parametrize(
-    ("meanings", "expected"),
-    [
+    ):
+        assert claims.break_even_verdict(102.0, meaning, low, high).value == expected
+    for meanings, expected in (
         (["from", "from", "from"], "agrees"),
         (["from", "undecided", "from"], "cannot be compared"),
         (["undecided", "never"], "differs"),
         (["until"], "differs"),
-    ],
-)
-def test_queries_are_cheaper_only_where_every_break_even_says_so(meanings: list[str], expected: str) -> None:
-    assert claims.cheaper_from(meanings).value == expected
+    ):
+        assert claims.cheaper_from(meanings).value == expected
+    assert claims.break_even_text(28.3, "from", 18.8, 63.1) == "from 28 (19–63)"
+    assert claims.break_even_text(math.nan, "never", math.nan, math.nan) == "never"
+    assert claims.break_even_text(None, "undecided", 179.3, None) == "undecided (≥ 179)"
+    table = reproduction.markdown(("claim",), [["n* of a|b\nis -1e-06, 2e+07 in 1e-7, 3–4"]])
+    assert table.splitlines()[-1] == r"| n\* of a\|b is −1e-6, 2e7 in 1e-7, 3–4 |"
 
 
-def test_an_order_of_magnitude_is_a_factor_of_the_root_of_ten() -> None:
-    assert claims.same_order(8.0, [9.1, 12.6])
-    assert not claims.same_order(8.0, [9.1, 26.0])
-    assert not claims.same_order(1e-7, [2e-14])
-
-
-def test_exceptions_of_an_inequality_are_the_steps_of_both_beyond_round_off() -> None:
-    smaller = {0: 1.0, 1: 0.5, 2: 0.4, 3: 0.3, 5: 9.0}
-    larger = {0: 1.0, 1: 0.5 * (1.0 - 1e-12), 2: 0.3, 3: 0.2, 4: 0.1}
-    assert claims.exceptions(smaller, larger) == [2, 3]
-    assert claims.ranges([9, 10, 11, 19, 22, 27, 28]) == "9–11, 19, 22, 27–28"
-
-
-def test_the_cause_is_given_where_the_numbers_do_not_agree() -> None:
+def test_causes_are_given_where_numbers_disagree_and_inputs_are_no_outcome() -> None:
+    """Inputs, prescribed sizes and arithmetic on printed numbers do not count as agreement, but still may differ."""
     agreed = claims.number("Table 1", "N", 50, 47, within=0.15, why="Counted.", cause="Another mesh.")
     differing = claims.number("Table 1", "N", 50, 30, within=0.15, why="Counted.", cause="Another mesh.")
     missing = claims.number("Table 1", "ratio", 2.0, math.nan, within=0.15)
     assert (agreed.verdict.value, agreed.why) == ("agrees", "Counted.")
     assert (differing.verdict.value, differing.why) == ("differs", "Counted. Another mesh.")
     assert missing.verdict.value == "cannot be compared"
-
-
-def test_what_was_put_in_is_no_outcome() -> None:
-    """Inputs, prescribed sizes and arithmetic on printed numbers do not count as agreement, but still may differ."""
     copied, other = (claims.number("§5.1", "load", -1, ours, given=True) for ours in (-1, -2))
     assert (copied.verdict.value, other.verdict.value) == ("by construction", "differs")
     assert claims.holds("§5.2", "d ≥ γ₀ / 2", "0.09", True, why="Inputs.", given=True).why == "Inputs."
     assert claims.judged(None, given=True) is Agreement.OPEN
 
 
-@pytest.mark.parametrize(
-    ("anew", "kept", "expected"),
-    [(25.1, 19.5, "agrees"), (152.0, 25.8, "cannot be compared"), (200.0, 100.0, "differs")],
-)
-def test_a_ratio_that_the_paper_leaves_open_is_not_confirmed(anew: float, kept: float, expected: str) -> None:
-    seconds = {"snapshots": 20.0, "POD": 0.1, "mCPG": 10.0, "PGA": anew, "PGA, residuals kept": kept}
-    pair = HERTZ.pairs[2] if expected != "agrees" else OBSTACLE.pairs[0]  # 1.68 and 2.06
-    claim = paper_tables.transcribed(seconds, pair, "Table")
-    assert claim.verdict.value == expected
-    assert all(claims.text(1.0 + value / 30.1) in claim.ours for value in (anew, kept))
-
-
-def test_sizes_that_a_study_prescribes_and_inputs_of_the_paper_are_no_outcome_on_the_page(page: str) -> None:
-    verdicts = {row["claim"]: row["verdict"] for row in ROW.finditer(page)}
-    prescribed = [f"Table 2, {pair.name}: {size}" for pair in HERTZ.pairs for size in "NR"]
-    copied = ["Hertz, §5.2: E [Pa], ν", "Obstacle, §5.1: load [1/m]", "Obstacle, §5.1: nodes"]
-    printed = [f"Table {number}: benefit thresholds from the printed seconds" for number in (1, 2)]
-    assert {verdicts[claim] for claim in (*prescribed, *copied, *printed)} == {Agreement.GIVEN.value}
-
-
-def test_the_fit_of_the_page_is_that_of_the_variants_tried(page: str, reproduction: ModuleType) -> None:
-    fit = reproduction.variants()
-    assert reproduction.FIT.format(**fit) in page
-    assert (fit["count"], fit["low"], fit["high"]) == (9, 10, 72)
-
-
-def test_cells_of_the_page_are_one_line_without_markup(reproduction: ModuleType) -> None:
-    table = reproduction.markdown(("claim",), [["n* of a|b\nis -1e-06, 2e+07 in 1e-7, 3–4"]])
-    assert table.splitlines()[-1] == r"| n\* of a\|b is −1e-6, 2e7 in 1e-7, 3–4 |"
+def test_a_ratio_that_the_paper_leaves_open_is_not_confirmed() -> None:
+    for anew, kept, expected in (
+        (25.1, 19.5, "agrees"),
+        (152.0, 25.8, "cannot be compared"),
+        (200.0, 100.0, "differs"),
+    ):
+        seconds = {"snapshots": 20.0, "POD": 0.1, "mCPG": 10.0, "PGA": anew, "PGA, residuals kept": kept}
+        pair = HERTZ.pairs[2] if expected != "agrees" else OBSTACLE.pairs[0]  # 1.68 and 2.06
+        claim = paper_tables.transcribed(seconds, pair, "Table")
+        assert claim.verdict.value == expected
+        assert all(claims.text(1.0 + value / 30.1) in claim.ours for value in (anew, kept))
 
 
 @pytest.fixture(scope="module")
@@ -174,21 +132,23 @@ def test_the_page_has_every_row_of_both_tables(page: str, table: str, column: st
     assert [line for line in LINES if named.count(f"{table}, {column}: {line}") != 1] == []
 
 
-def test_the_page_has_every_figure(page: str) -> None:
+def test_the_page_has_every_row_and_figure_counts_them_and_gives_reasons(page: str, reproduction: ModuleType) -> None:
     found = {int(number) for row in ROW.finditer(page) for number in re.findall(r"Fig\. (\d+)", row["claim"])}
     assert found == set(range(1, 16))
-
-
-def test_the_counts_of_the_page_are_those_of_its_rows(page: str) -> None:
     found = [row["verdict"] for row in ROW.finditer(page[page.index("## Problem data") :])]
     counts = [found.count(verdict.value) for verdict in Agreement]
     assert f"| all | {' | '.join(map(str, counts))} |" in page
     assert sum(counts) > 150
-
-
-def test_what_differs_or_cannot_be_compared_has_a_reason(page: str) -> None:
     rows = [line for line in page.splitlines() if re.search(r"\| (differs|cannot be compared) \| ", line)]
     assert [row for row in rows if row.endswith(" |  |")] == []
+    verdicts = {row["claim"]: row["verdict"] for row in ROW.finditer(page)}
+    prescribed = [f"Table 2, {pair.name}: {size}" for pair in HERTZ.pairs for size in "NR"]
+    copied = ["Hertz, §5.2: E [Pa], ν", "Obstacle, §5.1: load [1/m]", "Obstacle, §5.1: nodes"]
+    printed = [f"Table {number}: benefit thresholds from the printed seconds" for number in (1, 2)]
+    assert {verdicts[claim] for claim in (*prescribed, *copied, *printed)} == {Agreement.GIVEN.value}
+    fit = reproduction.variants()
+    assert reproduction.FIT.format(**fit) in page
+    assert (fit["count"], fit["low"], fit["high"]) == (9, 10, 72)
 
 
 TWINS = ROOT / "results" / "paper-figures" / "paper-figures.md"
@@ -216,15 +176,12 @@ def judged_under_figures() -> list[tuple[str, str, str]]:
     return result
 
 
-def test_both_pages_of_the_paper_agree_on_every_claim_that_they_share(page: str) -> None:
+def test_both_pages_of_the_paper_have_the_same_claims_on_figures(page: str) -> None:
+    """The other way round: of a figure that is drawn again, the claims of the page stand below it."""
     under_figures = judged_under_figures()
     assert len(under_figures) > 100
     rows = {(unescaped(r["claim"]).partition(": ")[2], unescaped(r["ours"]), r["verdict"]) for r in ROW.finditer(page)}
     assert [claim for claim in under_figures if claim not in rows] == []
-
-
-def test_the_page_repeats_every_verdict_on_a_figure(page: str) -> None:
-    """The other way round: of a figure that is drawn again, the claims of the page stand below it."""
     statements = {statement for statement, _, _ in judged_under_figures()}
     of_figures = [unescaped(row["claim"]) for row in ROW.finditer(page) if DRAWN.search(row["claim"])]
     missing = {claim for claim in of_figures if claim.partition(": ")[2] not in statements}

@@ -40,11 +40,8 @@ def linked(page: Path) -> set[Path]:
     return {(page.parent / target).resolve() for target in targets if "://" not in target}
 
 
-def test_the_folder_is_light() -> None:
+def test_the_folder_is_light_and_scripts_lie_apart() -> None:
     assert sum(path.stat().st_size for path in FILES) <= LARGEST
-
-
-def test_scripts_lie_apart_from_what_they_wrote() -> None:
     assert {path for path in FILES if path.suffix == ".py"} == {path for path in FILES if SCRIPTS in path.parents}
 
 
@@ -64,14 +61,11 @@ def scripts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(SCRIPTS))
 
 
-def test_the_command_of_a_script_has_the_arguments_that_it_takes() -> None:
+def test_pages_and_scripts_name_the_commands_that_make_them() -> None:
     for path in sorted({*SCRIPTS.glob("*.py")} - {SCRIPTS / "page.py", SCRIPTS / "committed.py"}):
         script = importlib.import_module(path.stem)
         (command,) = re.findall(rf"python results/scripts/{path.name}((?: [^>\s]+)*)", script.__doc__ or "")
         assert len(command.split()) == len(inspect.signature(script.main).parameters), path
-
-
-def test_the_page_of_a_study_names_the_command_that_makes_the_tables_of_all_queries() -> None:
     for name in NAMES:
         text = (RESULTS / name / "README.md").read_text(encoding="utf-8")
         assert f"`vibench run {name}` leaves the tables of all queries and histories under `runs/{name}/tables`" in text

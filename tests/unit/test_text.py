@@ -46,7 +46,7 @@ def test_json_has_the_same_content_afterwards(content: object) -> None:
     assert json.loads(printable(json.dumps(content, ensure_ascii=False))) == content
 
 
-def test_a_long_text_is_cut_and_says_how_long_it_was() -> None:
+def test_long_texts_and_messages_of_exceptions_are_cut_to_one_line() -> None:
     for clean in (brief, one_line):
         for unit in ("x", "x ", "\x1b", "µ", "\n"):
             text = unit * 50_000
@@ -54,19 +54,16 @@ def test_a_long_text_is_cut_and_says_how_long_it_was() -> None:
             assert shown.endswith(f"… ({len(text)} characters)")
             assert len(shown) <= LONGEST
             assert clean(shown) == shown
-
-
-class UnreadableError(Exception):
-    def __str__(self) -> str:
-        raise ValueError("not to be read")
-
-
-def test_the_message_of_an_exception_is_one_short_line() -> None:
     assert in_a_line(UnreadableError()) == "UnreadableError: its message cannot be read"
     line = in_a_line(RuntimeError("the wire\nsnapped \x1b[2J\ud800" + 50_000_000 * "x"))
     assert line.startswith(r"RuntimeError: the wire snapped \u001b[2J\ud800xxx")
     assert line.endswith("… (50000036 characters)")
     assert len(line) <= LONGEST
+
+
+class UnreadableError(Exception):
+    def __str__(self) -> str:
+        raise ValueError("not to be read")
 
 
 @given(st.floats(1e-15, 1.0), st.floats(1.0 + 1e-12, 100.0))
@@ -82,13 +79,10 @@ def test_a_residual_just_above_the_accuracy_is_told_from_it() -> None:
 
 
 @pytest.mark.parametrize("opening", ["[", '{"a": '])
-def test_json_nested_beyond_the_stack_is_no_json(opening: str) -> None:
+def test_json_nested_beyond_the_stack_is_refused_in_a_line(opening: str, tmp_path: Path) -> None:
     assert parsed_json(b'{"a": [1.5]}') == {"a": [1.5]}
     with pytest.raises(ValueError, match="nested too deeply"):
         parsed_json(opening * 100_000)
-
-
-def test_files_with_such_json_are_refused_in_a_line(tmp_path: Path) -> None:
     deep = tmp_path / "deep.json"
     deep.write_text("[" * 100_000)
     with pytest.raises(RequestError, match="cannot be read as a file of pytest-benchmark"):

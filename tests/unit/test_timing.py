@@ -45,56 +45,54 @@ def test_seconds_add_up_and_differences_are_never_negative() -> None:
     assert Seconds(3.0, 1.0).beyond(Seconds(1.0, 2.0)) == Seconds(2.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("count", "first"), [(1, 0), (5, 0), (6, 0), (9, 1), (30, 9), (100, 39), (2000, 955), (20_000, 9860)]
-)
-def test_the_interval_of_a_median_has_the_tabulated_order_statistics(count: int, first: int) -> None:
+def test_the_interval_of_a_median_has_the_tabulated_order_statistics() -> None:
     """As in Conover, Practical Nonparametric Statistics: the largest ones left out with a probability up to 0.025."""
-    values = [float(k) for k in range(count)]
-    assert median_interval(values[::-1]) == (first, count - 1 - first)
-    if count > 5:
-        inside, wider = (1.0 - 2.0 * binom.cdf(k, count, 0.5) for k in (first, first + 1))
-        assert inside >= 0.95 > wider
+    for count, first in ((1, 0), (5, 0), (6, 0), (9, 1), (30, 9), (100, 39), (2000, 955), (20_000, 9860)):
+        values = [float(k) for k in range(count)]
+        assert median_interval(values[::-1]) == (first, count - 1 - first)
+        if count > 5:
+            inside, wider = (1.0 - 2.0 * binom.cdf(k, count, 0.5) for k in (first, first + 1))
+            assert inside >= 0.95 > wider
 
 
-def test_work_is_timed_once(clocks: Callable[..., None]) -> None:
+def test_repeats_are_timed_until_they_have_taken_enough(clocks: Callable[..., None]) -> None:
+    with pytest.raises(ZeroDivisionError):
+        median_seconds(lambda: 1 // 0)
     clocks((0.25, 0.75))
     work = Work()
     assert timed(work) == (1, Seconds(0.25, 0.75))
     assert work.count == 1
-
-
-def test_repeats_end_when_they_have_taken_enough(clocks: Callable[..., None]) -> None:
+    clocks((0.125, 1.25))
+    work = Work()
+    assert median_seconds(work) == (1, Seconds(0.125, 1.25))
+    assert work.count == 1
     clocks((0.9, 0.9), (0.5, 0.5), (0.25, 0.25), (0.25, 0.25))
     work = Work()
     assert median_seconds(work) == (1, Seconds(0.25, 0.25))
     assert work.count == 1 + 3
-
-
-def test_the_median_of_the_repeats_counts_and_the_warm_up_does_not(clocks: Callable[..., None]) -> None:
     sixteenths = ((1, 1), (8, 12), (2, 4), (4, 8), (6, 2), (1, 10))
     clocks(*((cpu / 256, wall / 256) for cpu, wall in sixteenths))
     work = Work()
     assert median_seconds(work) == (1, Seconds(4 / 256, 8 / 256))
     assert work.count == 1 + REPEATS
+    clocks(*[(0.1, 0.1)] * (1 + REPEATS))
+    done: list[int] = []
+    result, seconds = median_seconds(lambda number: done.append(number) or -number, itertools.count(7))
+    assert result == -7
+    assert done == list(range(7, 7 + 1 + REPEATS))
+    assert seconds.cpu == pytest.approx(0.1)
 
 
-def test_slow_work_is_done_once(clocks: Callable[..., None]) -> None:
-    clocks((0.125, 1.25))
-    work = Work()
-    assert median_seconds(work) == (1, Seconds(0.125, 1.25))
-    assert work.count == 1
-
-
-def test_what_work_raises_comes_through() -> None:
-    with pytest.raises(ZeroDivisionError):
-        median_seconds(lambda: 1 // 0)
-
-
-def test_sleep_is_no_cpu_seconds() -> None:
+def test_clocks_are_those_of_this_module_and_sleep_is_no_cpu_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
     _, spent = timed(lambda: time.sleep(0.2))
     assert spent.wall >= 0.2
     assert spent.cpu < 0.5 * spent.wall
+    with monkeypatch.context() as patch:
+        for clock in ("thread_time", "process_time", "perf_counter", "monotonic", "time"):
+            patch.setattr(time, clock, lambda: 0.0)
+        _, spent = timed(lambda: sum(range(1000)))
+    assert spent.cpu > 0.0
+    assert spent.wall > 0.0
 
 
 def in_a_thread() -> None:
@@ -118,15 +116,6 @@ def test_work_in_a_thread_or_in_a_child_process_is_counted(work: Callable[[], No
     assert timed(work)[1].cpu >= 0.05
 
 
-def test_clocks_that_a_plugin_replaces_are_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patch:
-        for clock in ("thread_time", "process_time", "perf_counter", "monotonic", "time"):
-            patch.setattr(time, clock, lambda: 0.0)
-        _, spent = timed(lambda: sum(range(1000)))
-    assert spent.cpu > 0.0
-    assert spent.wall > 0.0
-
-
 def test_processes_started_with_it_have_one_thread() -> None:
     code = "import numpy, threadpoolctl; print({x['num_threads'] for x in threadpoolctl.threadpool_info()})"
     environment = os.environ | ONE_THREAD
@@ -134,24 +123,12 @@ def test_processes_started_with_it_have_one_thread() -> None:
     assert done.stdout.strip() == "{1}"
 
 
-def test_every_repeat_may_have_work_of_its_own_and_the_first_result_counts(clocks: Callable[..., None]) -> None:
-    clocks(*[(0.1, 0.1)] * (1 + REPEATS))
-    done: list[int] = []
-    result, seconds = median_seconds(lambda number: done.append(number) or -number, itertools.count(7))
-    assert result == -7
-    assert done == list(range(7, 7 + 1 + REPEATS))
-    assert seconds.cpu == pytest.approx(0.1)
-
-
-def test_the_calibration_tells_how_much_slower_than_on_a_calm_machine(clocks: Callable[..., None]) -> None:
+def test_the_calibration_tells_how_much_slower_and_is_not_marked_by_a_quick_run(clocks: Callable[..., None]) -> None:
+    """Against the best of all, every round but the luckiest would count as disturbed."""
     spent = (2.0, 1.0, 2.0, 4.0, 0.7, 0.5, 1.0, 2.0)
     clocks(*[(cpu, 9.0) for cpu in spent])
     calibration = Calibration()
     assert [calibration.slowdown() for _ in range(3)] == pytest.approx([2.0, 1.0, 2.0])
-
-
-def test_one_quick_run_of_the_calibration_marks_no_others(clocks: Callable[..., None]) -> None:
-    """Against the best of all, every round but the luckiest would count as disturbed."""
     clocks(*[(cpu, cpu) for cpu in [0.5] * 2 + [1.0] * 38 + [1.5] * 2])
     calibration = Calibration()
     slowdowns = [calibration.slowdown() for _ in range(20)]

@@ -126,12 +126,19 @@ def test_the_installed_command_completes_for_bash(command: str, tmp_path: Path) 
         assert words != ["run", "paper-"] or all(word.startswith("paper-") for word in done.stdout.split())
 
 
-def test_the_overview_reads_the_options_that_the_registry_knows() -> None:
+def test_overviews_have_options_and_whole_sentences_in_80_columns(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without importing any plugin."""
     for kind in ("problems", "primal", "dual", "sampling"):
         for plugin in registered(next(one for one in PluginKind if one.plural == kind)).values():
             assert plugin.names_of_options == list(plugin.options)
             assert plugin.summary == (plugin.load().__doc__ or "").split("\n")[0]
+    assert find(PluginKind.STUDY, "benefit").summary.endswith("of Niakh et al. (2022)")
+    assert first_sentence("A. of B et al. (2022), i.e. this. More. And") == "A. of B et al. (2022), i.e. this"
+    assert first_sentence("All of it.") == "All of it"
+    monkeypatch.setenv("COLUMNS", "80")
+    assert max(map(len, main("list")[1].splitlines())) <= 80
+    lines = {line.split()[0]: line for line in main("--help")[1].splitlines() if line.startswith("  ")}
+    assert [name for name in COMMANDS if lines[name].endswith("...")] == []
 
 
 def test_help_ends_with_examples_that_are_commands(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,17 +154,3 @@ def test_help_ends_with_examples_that_are_commands(main: Main, monkeypatch: pyte
             program, command, *arguments = shlex.split(example)
             assert (program, command) == ("vibench", name)
             GROUP.get_command(None, name).make_context(name, arguments)
-
-
-def test_the_overview_of_studies_has_whole_sentences() -> None:
-    """A point of an abbreviation ends none."""
-    assert find(PluginKind.STUDY, "benefit").summary.endswith("of Niakh et al. (2022)")
-    assert first_sentence("A. of B et al. (2022), i.e. this. More. And") == "A. of B et al. (2022), i.e. this"
-    assert first_sentence("All of it.") == "All of it"
-
-
-def test_the_overview_fits_80_columns_and_cuts_no_command_short(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    assert max(map(len, main("list")[1].splitlines())) <= 80
-    lines = {line.split()[0]: line for line in main("--help")[1].splitlines() if line.startswith("  ")}
-    assert [name for name in COMMANDS if lines[name].endswith("...")] == []

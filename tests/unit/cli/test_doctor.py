@@ -144,24 +144,22 @@ class TestDisk:
         assert out.splitlines()[-1] == "broken: runs"
         assert "taken/below: cannot be used: Not a directory" in out
 
-    def test_a_folder_that_takes_no_locks_is_broken(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        monkeypatch.setattr(doctor, "locked", Mock(side_effect=RequestError("cannot be locked: No locks available")))
-        found = by_subject(list(doctor.check_disk(tmp_path)))["runs"]
-        assert found.health is Health.BROKEN
-        assert "No locks available" in found.text
-
-    def test_little_room_is_a_note(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=2**28))
-        found = by_subject(list(doctor.check_disk(tmp_path / "new")))["runs"]
-        assert found == Diagnosis("runs", f"{tmp_path / 'new'}: 0.2 GiB free", Health.NOTE)
-
-    def test_artefacts_are_counted_in_their_folder(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def test_disks_without_room_or_locks_are_noticed_and_artefacts_counted(
+        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
         monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
         Store(default_folder()).put("pod-1", "x" * 2**20, NO_TIME, ())
         found = by_subject(list(doctor.check_disk(tmp_path)))
         assert found["stored"].text.startswith("1 artefacts, 1.0 MiB")
         assert "VIBENCH_CACHE" in found["artefact folder"].text
         assert str(tmp_path / "cache" / "artefacts") in found["artefacts"].text
+        monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=2**28))
+        found = by_subject(list(doctor.check_disk(tmp_path / "new")))["runs"]
+        assert found == Diagnosis("runs", f"{tmp_path / 'new'}: 0.2 GiB free", Health.NOTE)
+        monkeypatch.setattr(doctor, "locked", Mock(side_effect=RequestError("cannot be locked: No locks available")))
+        found = by_subject(list(doctor.check_disk(tmp_path)))["runs"]
+        assert found.health is Health.BROKEN
+        assert "No locks available" in found.text
 
 
 class TestTimings:

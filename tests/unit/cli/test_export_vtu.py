@@ -30,16 +30,13 @@ def test_a_solution_of_a_run_is_exported(quick_run: Path, main: Main) -> None:
         assert np.allclose(written.point_data[f"{quantity}, reduced"], values, rtol=1e-9, atol=1e-12, equal_nan=True)
 
 
-def test_a_parameter_outside_the_box_is_one_line(quick_run: Path, vibench: Vibench, tmp_path: Path) -> None:
+def test_impossible_exports_are_refused(quick_run: Path, vibench: Vibench, tmp_path: Path, main: Main) -> None:
     cell = first_cell(quick_run)
     upper = open_run(quick_run).model(cell).parameters.upper
     done = vibench(tmp_path, "export", str(quick_run), cell, "out.vtu", "--mu", str(1.001 * upper[0]))
     assert done.returncode == 0, done.stderr
     said = "vibench: radius: outside the parameter domain, where the model was not trained"
     assert set(done.stderr.splitlines()) == {said}
-
-
-def test_an_export_of_nothing_known_is_refused(quick_run: Path, main: Main) -> None:
     for arguments, said in (
         ("{cell} fields.vtu --mu -1e9,-.5", "mu is [-1000000000.0, -0.5], expected finite numbers (radius)"),
         ("{cell} fields.vtu --mu -x,0.1", "--mu is '-x,0.1', expected numbers separated by commas"),

@@ -111,15 +111,12 @@ def test_long_texts_share_the_room_that_is_left_and_nothing_is_cut() -> None:
     assert sum(line.count("charlie") for line in lines) == 27
 
 
-def test_values_that_all_rows_share_stand_in_the_title_unless_asked_for() -> None:
+def test_values_that_rows_share_stand_in_the_title() -> None:
     frame = pd.DataFrame({"solver": ["piqp", "piqp"], "N": [8, 8], "k": [1, 2], "none": [None, None]})
     assert printed(frame, 80)[:2] == ["table, solver piqp", "N  k"]
     assert printed(frame, 80, axes=["N"])[0] == "table, solver piqp, N 8"
     assert printed(frame, 80, every=True)[1].split() == ["solver", "N", "k", "none"]
     assert printed(pd.DataFrame({"a": []}), 80) == ["table: no rows"]
-
-
-def test_the_axes_of_a_single_row_stand_in_the_title_and_its_other_values_do_not() -> None:
     frame = pd.DataFrame({"cell": ["be21"], "solver": ["piqp"], "δ": [None], "N": [8], "ok": ["4/4"]})
     title, headings, _, row = printed(frame, 80, axes=["solver", "δ"])
     assert (title, headings.split(), row.split()) == ("table, solver piqp", ["cell", "N", "ok"], ["be21", "8", "4/4"])

@@ -132,7 +132,7 @@ def test_a_dry_run_lists_the_matrix_and_does_nothing_else(main: Main, tmp_path: 
     assert list(Path.cwd().iterdir()) == []
 
 
-def test_list_shows_every_plugin_and_its_options(main: Main) -> None:
+def test_lists_show_their_plugins_and_options(main: Main) -> None:
     code, out, err = main("list")
     assert (code, err) == (0, "")
     assert [name for kind in PluginKind for name in registered(kind) if name not in out] == []
@@ -145,6 +145,19 @@ def test_list_shows_every_plugin_and_its_options(main: Main) -> None:
     assert "mu_1: radius from 0.7 to 1.3 m" in text
     assert "mu_1: scale from 0.8 to 1.2 mu_2: centre_x from -0.05 to 0.05 m" in text
     assert "unknowns" not in text
+    lists = [kind.plural for kind in PluginKind]
+    for what, kind in zip(lists, PluginKind, strict=True):
+        code, out, _ = main("list", what)
+        assert code == 0
+        assert out.startswith(what)
+        assert all(name in out for name in registered(kind))
+        assert [title for title in lists if re.search(rf"^{title}(,|$)", out, re.MULTILINE)] == [what]
+        if what == "studies":
+            assert f"{len(expand(read_study('quick')))} cells" in out
+        if what == "solvers":
+            shown = {line.split()[0]: line for line in out.splitlines() if line.split()}
+            assert set(SETTINGS) <= set(shown)
+            assert not any("not installed" in shown[name] for name in ("piqp", "proxqp", "osqp"))
 
 
 def test_ctrl_c_while_drawing_says_what_is_there(main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -194,7 +207,7 @@ def test_an_error_that_nobody_foresaw_is_not_hidden(main: Main, monkeypatch: pyt
         main("run")
 
 
-def test_help_on_a_command_is_its_own(main: Main) -> None:
+def test_help_is_there_for_every_command_and_word(main: Main) -> None:
     _, out, err = main()
     assert [name for name in ("run", "list", "show") if f"\n  {name} " not in out + err] == []
     assert main("help", "show") == main("show", "--help")
@@ -204,22 +217,6 @@ def test_help_on_a_command_is_its_own(main: Main) -> None:
     assert main("--version")[1].startswith(f"vibench {importlib.metadata.version('vibench')}")
     known = "no command, key, column, status, plugin or term is called 'shwo'; did you mean 'show'?"
     refused(main("help", "shwo"), known)
-
-
-def test_help_on_a_key_of_study_files_is_what_it_means_wherever_it_stands(main: Main) -> None:
-    code, out, _ = main("help", "training")
-    assert code == 0
-    meanings = [model.model_fields["training"].description for model in (Study, ProblemEntry)]
-    of_file, of_entry, columns, of_study = out.splitlines()
-    assert of_file.startswith('training, in a study file (list of table, default ["own"]): ')
-    assert of_entry.startswith("training, in problem of a study file (")
-    assert [line.partition("): ")[2] for line in (of_file, of_entry)] == meanings
-    in_all = [table for table, described in STORED.items() if "training" in described]
-    assert of_study.startswith("training, a study of vibench")
-    assert columns == (f"training, in {', '.join(in_all)}: {STORED['cells']['training'].meaning}")
-
-
-def test_help_knows_every_word_that_people_see(main: Main) -> None:
     said = {
         "supremizer": "Supremizer: T(µ)η, the displacement", "as fast": "Break-even: ", "feasible": "Correction: ",
         "certified": "Certificate: certified, v", "κ": "ρ, ω, κ: residual", "mcpg": "mcpg, a dual strategy of vibench",
@@ -233,7 +230,27 @@ def test_help_knows_every_word_that_people_see(main: Main) -> None:
         assert main("help", word)[0] == 0, word
 
 
-def test_a_command_of_before_says_what_to_write_now() -> None:
+def test_help_on_keys_and_columns_is_their_meaning(main: Main) -> None:
+    code, out, _ = main("help", "training")
+    assert code == 0
+    meanings = [model.model_fields["training"].description for model in (Study, ProblemEntry)]
+    of_file, of_entry, columns, of_study = out.splitlines()
+    assert of_file.startswith('training, in a study file (list of table, default ["own"]): ')
+    assert of_entry.startswith("training, in problem of a study file (")
+    assert [line.partition("): ")[2] for line in (of_file, of_entry)] == meanings
+    in_all = [table for table, described in STORED.items() if "training" in described]
+    assert of_study.startswith("training, a study of vibench")
+    assert columns == (f"training, in {', '.join(in_all)}: {STORED['cells']['training'].meaning}")
+    for name in ("online_s", "online [ms]"):
+        assert f"online_s [s], in cells: {STORED['cells']['online_s'].meaning}" in main("help", name)[1].splitlines()
+    names = {"total_s": "total_s", "total [s]": "total_s", "total": "total_s", "until": "cheapest_until"}
+    for name, column in names.items() | {("certified error", "certified_error"), ("sure", "probability")}:
+        added = added_columns()[column]
+        unit = f" [{added.unit}]" * bool(added.unit)
+        assert f"{column}{unit}, in best: {added.meaning}" in main("help", name)[1].splitlines()
+
+
+def test_former_commands_say_what_to_write_now_and_still_work(main: Main, quick_run: Path) -> None:
     for old, new in (
         ("diff a b --limit 2", "compare a b --limit 2 --table changes --strict"),
         ("import my-model", "pack my-model"),
@@ -245,9 +262,6 @@ def test_a_command_of_before_says_what_to_write_now() -> None:
         ("export-vtu quick 3f9a 1 --at m=x", "export quick 3f9a 3f9a.vtu --mu 1 --at m=x"),
     ):
         assert (renamed(old.split()), renamed(new.split())) == (new.split(), None)
-
-
-def test_a_command_of_before_still_works(main: Main, quick_run: Path) -> None:
     run = str(quick_run)
     assert main("diff", run, run)[:2] == main("compare", run, run, "--table", "changes", "--strict")[:2]
     line = main("diff", run, run)[2]
@@ -281,22 +295,6 @@ def test_options_replace_axes(main: Main, monkeypatch: pytest.MonkeyPatch) -> No
         assert {look(cell) for cell in listed[-1]} == values
 
 
-def test_every_list_shows_only_its_own(main: Main) -> None:
-    lists = [kind.plural for kind in PluginKind]
-    for what, kind in zip(lists, PluginKind, strict=True):
-        code, out, _ = main("list", what)
-        assert code == 0
-        assert out.startswith(what)
-        assert all(name in out for name in registered(kind))
-        assert [title for title in lists if re.search(rf"^{title}(,|$)", out, re.MULTILINE)] == [what]
-        if what == "studies":
-            assert f"{len(expand(read_study('quick')))} cells" in out
-        if what == "solvers":
-            shown = {line.split()[0]: line for line in out.splitlines() if line.split()}
-            assert set(SETTINGS) <= set(shown)
-            assert not any("not installed" in shown[name] for name in ("piqp", "proxqp", "osqp"))
-
-
 def test_show_prints_every_table_in_every_form(main: Main, quick_run: Path) -> None:
     for table in ("summary", "benefits", *TABLES):
         code, out, err = main("show", str(quick_run), "--table", table, "--format", "csv")
@@ -321,13 +319,3 @@ def test_show_prints_every_table_in_every_form(main: Main, quick_run: Path) -> N
     assert len(main("show", "quick", "--format", "csv")[1].splitlines()) == 1 + len(
         read_table(quick_run / FILE, "cells")
     )
-
-
-def test_help_on_a_column_is_its_meaning_in_its_table(main: Main) -> None:
-    for name in ("online_s", "online [ms]"):
-        assert f"online_s [s], in cells: {STORED['cells']['online_s'].meaning}" in main("help", name)[1].splitlines()
-    names = {"total_s": "total_s", "total [s]": "total_s", "total": "total_s", "until": "cheapest_until"}
-    for name, column in names.items() | {("certified error", "certified_error"), ("sure", "probability")}:
-        added = added_columns()[column]
-        unit = f" [{added.unit}]" * bool(added.unit)
-        assert f"{column}{unit}, in best: {added.meaning}" in main("help", name)[1].splitlines()

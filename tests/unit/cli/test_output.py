@@ -35,7 +35,7 @@ def test_a_table_is_printable(text: str) -> None:
     assert all(line.isprintable() for line in printed(lambda: print_frame(frame, text)))
 
 
-def test_markup_is_text() -> None:
+def test_markup_is_text_and_lines_of_cells_stay_apart() -> None:
     for text in (
         "[/b]",
         "[red]membrane[/red]",
@@ -53,8 +53,5 @@ def test_markup_is_text() -> None:
         out = io.StringIO()  # a terminal of any kind
         print_line(Console(file=out, force_terminal=True, width=20), text)
         assert out.getvalue() == f"{text}\n"
-
-
-def test_cells_of_several_lines_keep_them() -> None:
     lines = printed(lambda: print_frame(pd.DataFrame({"options": ["one: int\ntwo: \x1b[2J", "b"]}), "plugins"))
     assert [line.strip() for line in lines if ":" in line] == ["one: int", r"two: \u001b[2J"]

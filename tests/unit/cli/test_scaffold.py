@@ -85,7 +85,7 @@ def test_new_plugins_pass_their_checks_and_give_rows_as_they_are(vibench: Vibenc
     assert row["enrichment"] > 0
 
 
-def test_a_new_package_registers_its_plugin_under_its_name(written: dict[str, Path]) -> None:
+def test_new_packages_register_their_plugin_and_keep_to_ruff(written: dict[str, Path]) -> None:
     for kind, folder in written.items():
         project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
         assert (folder.name, project["name"]) == (f"vibench-{NAMES[kind]}",) * 2
@@ -97,9 +97,6 @@ def test_a_new_package_registers_its_plugin_under_its_name(written: dict[str, Pa
         source = scaffold.module_file(folder, CHECKED[kind], name)
         assert source == folder / "src" / f"{module.replace('.', '/')}.py"
         assert f"{'def' if kind == 'solver' else 'class'} {cls}(" in source.read_text()
-
-
-def test_new_packages_keep_to_the_rules_of_ruff(written: dict[str, Path]) -> None:
     rules = ["--isolated", "--no-cache", "--line-length", "110", "--select", "E,F,W,I,UP,B"]
     for folder in written.values():
         command = [sys.executable, "-m", "ruff", "check", *rules, "."]

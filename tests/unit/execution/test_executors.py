@@ -161,15 +161,13 @@ def test_a_client_that_closes_while_it_is_asked_holds_up_nobody(client: str, job
         assert len(asked) == 3
 
 
-def test_another_vibench_is_refused(cluster: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(executors, "code_here", lambda: "mine")
-    with pytest.raises(RequestError, match=r"the dask worker tcp://.* has other code: .* instead of mine"):
-        Dask(cluster.scheduler_address, 1, tmp_path)
-
-
-def test_workers_without_artefacts_refused(
+def test_other_code_and_workers_without_artefacts_are_refused(
     cluster: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(executors, "code_here", lambda: "mine")
+        with pytest.raises(RequestError, match=r"the dask worker tcp://.* has other code: .* instead of mine"):
+            Dask(cluster.scheduler_address, 1, tmp_path)
     monkeypatch.setattr(executors, "_describe", elsewhere)
     with pytest.raises(RequestError, match="does not see the artefacts"):
         Dask(cluster.scheduler_address, 1, tmp_path)
@@ -198,13 +196,29 @@ def test_a_cluster_that_is_shut_down_stops_the_run_with_a_line_and_it_goes_on_wi
     assert "2 cells, 2 ok" in done.stdout
 
 
-def test_a_scheduler_that_does_not_answer_is_named(vibench: Vibench, tmp_path: Path) -> None:
-    path = write_study(tmp_path, wire_study())
-    done = vibench(tmp_path, "run", path, "--executor", "dask", "--scheduler", "tcp://127.0.0.1:9")
+def test_wrong_requests_for_dask_are_refused_in_a_line(vibench: Vibench, tmp_path: Path) -> None:
+    path, there = write_study(tmp_path, wire_study()), "tcp://127.0.0.1:9"
+    for options, expected in (
+        (("--executor", "dask", "--scheduler", there), f"no dask scheduler answers at '{there}'"),
+        (
+            ("--executor", "dask", "--scheduler", "tls://a:9"),
+            "the scheduler 'tls://a:9' asks for credentials: set distributed.comm.tls of dask",
+        ),
+        (("--scheduler", there), f"--scheduler {there} is for --executor dask"),
+    ):
+        done = vibench(tmp_path, "run", path, *options)
+        assert done.returncode == 2
+        *warnings, line = done.stderr.splitlines()
+        assert line.startswith(f"vibench: {expected}")
+        unsafe = f"vibench: {there}: the connection is not authenticated"
+        assert [warning.startswith(unsafe) for warning in warnings] == [True] * ("answers" in expected)
+        assert "answers" in expected or line == f"vibench: {expected}"
+    (tmp_path / "hidden").mkdir()
+    (tmp_path / "hidden" / "distributed.py").write_text("raise ImportError('not here')\n")
+    path = write_study(tmp_path, wire_study(problem=["obstacle"]))
+    done = vibench(tmp_path, "run", path, "--executor", "dask", plugins=tmp_path / "hidden")
     assert done.returncode == 2
-    warning, line = done.stderr.splitlines()
-    assert warning.startswith("vibench: tcp://127.0.0.1:9: the connection is not authenticated")
-    assert line.startswith("vibench: no dask scheduler answers at 'tcp://127.0.0.1:9'")
+    assert "install vibench with its extra 'cluster'" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -233,15 +247,6 @@ def test_a_port_that_is_no_scheduler_is_refused_in_a_line(said: bytes, words: st
         assert "\n" not in str(error.value)
         for one in taken:
             one.close()
-
-
-def test_an_authenticated_scheduler_needs_credentials(vibench: Vibench, tmp_path: Path) -> None:
-    done = vibench(
-        tmp_path, "run", write_study(tmp_path, wire_study()), "--executor", "dask", "--scheduler", "tls://a:9"
-    )
-    assert (done.returncode, done.stderr) == (
-        2, "vibench: the scheduler 'tls://a:9' asks for credentials: set distributed.comm.tls of dask\n",
-    )  # fmt: skip
 
 
 def test_a_cluster_of_this_machine_answers_nobody_else(tmp_path: Path) -> None:
@@ -279,22 +284,6 @@ def refusal(context: ssl.SSLContext, plain: socket.socket) -> bool:
             return answer(connection) == b""
     except (ssl.SSLError, ConnectionError):
         return True
-
-
-def test_a_scheduler_without_dask_is_refused(vibench: Vibench, tmp_path: Path) -> None:
-    done = vibench(tmp_path, "run", write_study(tmp_path, wire_study()), "--scheduler", "tcp://127.0.0.1:9")
-    assert (done.returncode, done.stderr) == (
-        2, "vibench: --scheduler tcp://127.0.0.1:9 is for --executor dask\n",
-    )  # fmt: skip
-
-
-def test_without_dask_the_extra_is_named(vibench: Vibench, tmp_path: Path) -> None:
-    (tmp_path / "hidden").mkdir()
-    (tmp_path / "hidden" / "distributed.py").write_text("raise ImportError('not here')\n")
-    path = write_study(tmp_path, wire_study(problem=["obstacle"]))
-    done = vibench(tmp_path, "run", path, "--executor", "dask", plugins=tmp_path / "hidden")
-    assert done.returncode == 2
-    assert "install vibench with its extra 'cluster'" in done.stderr
 
 
 def test_dask_changes_no_number(vibench: Vibench, tmp_path: Path) -> None:

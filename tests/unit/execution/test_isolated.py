@@ -26,7 +26,7 @@ def _fakes(plugins_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[No
     registry.registered.cache_clear()
 
 
-def test_the_program_has_constraints_that_hold_and_constraints_that_do_not_matter() -> None:
+def test_the_program_has_constraints_of_both_sorts_and_is_solved() -> None:
     program = wire()
     free = np.linalg.solve(program.A, program.f)
     assert np.any(program.B @ free > program.g)
@@ -34,9 +34,6 @@ def test_the_program_has_constraints_that_hold_and_constraints_that_do_not_matte
     assert answer.x is not None
     active = np.abs(program.B @ answer.x - program.g) < 1e-6 * program.g
     assert 0 < active.sum() < 12
-
-
-def test_the_solvers_of_the_dependencies_solve_the_program() -> None:
     found = attempts(SOLVERS_OF_TESTS)
     assert tuple(found) == SOLVERS_OF_TESTS
     for trial in found.values():

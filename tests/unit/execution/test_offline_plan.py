@@ -36,7 +36,7 @@ def plan_of(
     return plan, plan.repeats([(CELL, GOAL)])
 
 
-def test_short_stages_are_repeated_the_cheapest_first_within_the_budget() -> None:
+def test_short_stages_are_repeated_within_the_budget_and_offline_alone() -> None:
     costs = dict(zip((stage.key for stage in STAGES), (0.5, 0.1, 2.0, 0.2, 0.3, 9.0, 0.1), strict=False))
     plan, repeats = plan_of(costs)
     paid = [costs[one.stage.key] for one in repeats]
@@ -45,9 +45,6 @@ def test_short_stages_are_repeated_the_cheapest_first_within_the_budget() -> Non
     firsts = [costs[one.stage.key] for one in repeats if one.number == 1]
     assert firsts == sorted(cost for cost in costs.values() if cost <= 3.0)
     assert plan.repeats([(CELL, GOAL)]) == []  # once is enough
-
-
-def test_what_is_not_offline_pays_for_no_repeats() -> None:
     costs = {stage.key: 1.0 for stage in STAGES}
     _, repeats = plan_of(costs)
     plan = OfflinePlan(None, SimpleNamespace(), 0)  # type: ignore[arg-type]
@@ -56,9 +53,6 @@ def test_what_is_not_offline_pays_for_no_repeats() -> None:
         plan.note(stage, spent(1.0), 1.0)
     assert plan.repeats([(CELL, GOAL)]) == repeats
     assert 0 < len(repeats) < 2 * len(STAGES)
-
-
-def test_repeats_that_are_asked_for_are_all_run() -> None:
     costs = dict.fromkeys((stage.key for stage in STAGES), 100.0)
     _, repeats = plan_of(costs, requested=3)
     assert sorted(one.number for one in repeats) == sorted([1, 2, 3] * len(STAGES))
@@ -79,25 +73,22 @@ def test_the_seconds_of_a_nested_enrichment_are_those_of_its_growth(tmp_path_fac
     assert OfflineRepeat(source, 2).seconds(store, name) is None
 
 
-def test_the_scatter_of_stages_is_pooled() -> None:
+def test_medians_count_and_scatter_is_pooled() -> None:
     rng = np.random.default_rng(0)
     runs = [[spent(base * float(np.exp(0.3 * rng.standard_normal()))) for _ in range(3)] for base in [0.1, 1.0] * 300]
     assert scatter(runs) == pytest.approx(0.3, rel=0.05)
     assert scatter([[spent(1.0)]]) == SCATTER
     assert scatter([*runs, [spent(1e-5), spent(1e-3)]]) == scatter(runs)  # too short to say anything
+    found = columns({"high-fidelity solutions": [1.0, 2.0, 9.0], "cone": [3.0, 5.0]})
+    assert (found["offline_snapshots_s"], found["offline_cone_s"]) == (4 * 2.0 + 0.5, 4.0)
+    assert found["offline_s"] == 12.5
+    assert found["offline_repeats"] == 5
 
 
 def columns(runs_of: Mapping[str, list[float]], deviation: float = 0.1) -> dict[str, Any]:
     stages: dict[str, Stage] = {one.key: one for some in GOAL.offline_stages.values() for one in some}
     runs = {key: [spent(cpu) for cpu in runs_of.get(stage.label, [0.0])] for key, stage in stages.items()}
     return offline_columns(GOAL, 0.5, runs, deviation)
-
-
-def test_the_median_of_all_runs_of_a_stage_counts() -> None:
-    found = columns({"high-fidelity solutions": [1.0, 2.0, 9.0], "cone": [3.0, 5.0]})
-    assert (found["offline_snapshots_s"], found["offline_cone_s"]) == (4 * 2.0 + 0.5, 4.0)
-    assert found["offline_s"] == 12.5
-    assert found["offline_repeats"] == 5
 
 
 def test_an_interval_narrows_with_the_repeats_of_what_takes_long() -> None:

@@ -24,29 +24,29 @@ def refusal(folder: Path) -> str:
     return str(caught.value)
 
 
-def test_a_folder_has_one_run_at_a_time(tmp_path: Path) -> None:
+def test_what_is_no_folder_of_one_run_is_refused(tmp_path: Path) -> None:
     """The second one is told who the first is; a folder that was claimed before is no foreign one."""
     with claimed(tmp_path / "run"):
         assert f"another run writes into '{tmp_path / 'run'}' (process {os.getpid()} on" in refusal(tmp_path / "run")
     with claimed(tmp_path / "run"):
         pass
-
-
-def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     assert "is a file" in refusal(tmp_path / "file")
     assert "cannot be written" in refusal(tmp_path / "file" / "below")
-
-
-def test_a_folder_with_other_things_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").touch()
-    line = refusal(tmp_path)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").touch()
+    line = refusal(tmp_path / "full")
     assert "not empty" in line
     assert FILE in line
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    assert [path.name for path in (tmp_path / "full").iterdir()] == ["notes.txt"]
 
 
-def test_only_what_a_run_writes_is_cleared(tmp_path: Path) -> None:
+def test_folders_are_cleared_of_what_their_own_run_writes(tmp_path: Path) -> None:
+    ResultsDatabase(tmp_path, STUDY).close()
+    (tmp_path / LOG).touch()
+    with pytest.raises(RequestError, match="holds results of the study 'sample'"):
+        clear(tmp_path, "another", pytest.fail)
+    assert (tmp_path / LOG).exists()
     ResultsDatabase(tmp_path, STUDY).close()
     (tmp_path / "tables").mkdir()
     made, kept = (LOG, REPORT, "tables/cells.csv"), ("notes.txt", "tables/notes.txt", FILE)
@@ -54,17 +54,6 @@ def test_only_what_a_run_writes_is_cleared(tmp_path: Path) -> None:
         (tmp_path / name).touch()
     clear(tmp_path, "sample", pytest.fail)
     assert [name for name in (*made, *kept) if (tmp_path / name).exists()] == list(kept)
-
-
-def test_the_folder_of_another_study_is_not_cleared(tmp_path: Path) -> None:
-    ResultsDatabase(tmp_path, STUDY).close()
-    (tmp_path / LOG).touch()
-    with pytest.raises(RequestError, match="holds results of the study 'sample'"):
-        clear(tmp_path, "another", pytest.fail)
-    assert (tmp_path / LOG).exists()
-
-
-def test_a_damaged_results_file_is_kept_under_another_name(tmp_path: Path) -> None:
     (tmp_path / FILE).write_bytes(b"hello")
     notes: list[str] = []
     clear(tmp_path, "sample", notes.append)
@@ -98,24 +87,16 @@ def database(tmp_path: Path) -> Iterator[ResultsDatabase]:
     found.close()
 
 
-@pytest.mark.parametrize(
-    ("changed", "again"),
-    [
+def test_cells_ended_by_a_limit_of_their_row_are_run_again_where_it_is_larger(database: ResultsDatabase) -> None:
+    for changed, again in (
         ({}, set()),
         ({"query_seconds": 1.0, "cell_seconds": 1.0, "memory_gib": 1.0}, set()),
         ({"query_seconds": 21.0}, {"slow", "both"}),
         ({"cell_seconds": 601.0}, {"slow", "both"}),
         ({"memory_gib": 9.0, "query_seconds": 1.0}, {"large"}),
         ({"memory_gib": 9.0, "cell_seconds": 601.0}, {"slow", "both", "large"}),
-    ],
-)
-def test_cells_that_ended_by_a_limit_are_run_again_where_it_is_larger(
-    database: ResultsDatabase, changed: dict[str, float], again: set[str]
-) -> None:
-    assert ended_by_smaller_limits(database, BEFORE.model_copy(update=changed)) == again
-
-
-def test_limits_are_those_of_the_rows_and_not_of_the_last_study(database: ResultsDatabase) -> None:
+    ):
+        assert ended_by_smaller_limits(database, BEFORE.model_copy(update=changed)) == again
     larger = BEFORE.model_copy(update={"cell_seconds": 700.0})
     keep_limits(database, "after", larger)
     database.write_cell({"cell": "slow", "study_hash": "after", "status": "timeout"}, [])

@@ -50,7 +50,7 @@ def stages(cell: Cell, study: Study) -> list[Stage]:
     return list(stages_of(cell_queries(cell, 20.0)))
 
 
-def test_a_cell_is_named_by_the_key_columns(cell: Cell) -> None:
+def test_cells_and_sizes_are_named_by_columns(cell: Cell) -> None:
     columns = cell_columns(cell)
     assert tuple(columns) == tuple(KEYS)
     assert columns == {
@@ -60,9 +60,6 @@ def test_a_cell_is_named_by_the_key_columns(cell: Cell) -> None:
         "dual_tol": 1e-1, "dual_size": None, "primal_tol": 0.5, "solver": "piqp",
         "accuracy": cell.accuracy, "assembly": "full", "bounds": 0, "correction": "none",
     }  # fmt: skip
-
-
-def test_prescribed_sizes_have_columns_of_their_own(cell: Cell) -> None:
     columns = cell_columns(replace(cell, pod=Stop(size=5), cone=Stop(size=4)))
     assert [columns[name] for name in ("pod_tol", "pod_size", "dual_tol", "dual_size")] == [None, 5, None, 4]
 
@@ -73,22 +70,21 @@ POD = TRAINED | {"pod_tol", "pod_size"}
 CONE = TRAINED | {"dual", "dual_options", "dual_tol", "dual_size"}
 
 
-@pytest.mark.parametrize(
-    ("sort", "names"),
-    [
+def test_histories_of_every_stage_are_named_by_their_dependences(cell: Cell, stages: list[Stage]) -> None:
+    for sort, names in (
         (SnapshotStage, TRAINED),
         (PODStage, POD),
         (ConeStage, CONE),
         (NestedEnrichment, POD | CONE | {"primal", "primal_options", "primal_tol"}),
         (EnergyConstants, set()),
-    ],
-)
-def test_a_history_is_named_by_its_dependences(sort: type, names: set[str], cell: Cell, stages: list[Stage]) -> None:
-    columns = axis_columns(first(stages, sort).axes, labels_of([cell]))
-    assert set(columns) == names
-    assert set(columns) <= set(STORED["histories"])
-    of_cell = cell_columns(cell)
-    assert columns == {name: of_cell[name] for name in names}
+    ):
+        columns = axis_columns(first(stages, sort).axes, labels_of([cell]))
+        assert set(columns) == names
+        assert set(columns) <= set(STORED["histories"])
+        of_cell = cell_columns(cell)
+        assert columns == {name: of_cell[name] for name in names}
+    other = replace(cell, labels=("x", "y", "z"), solver="osqp")
+    assert axis_columns(first(stages, PODStage).axes, labels_of([cell, other]))["problem"] == "membrane"
 
 
 def test_every_stage_of_every_cell_has_names(study: Study) -> None:
@@ -97,8 +93,3 @@ def test_every_stage_of_every_cell_has_names(study: Study) -> None:
     for cell in cells:
         for stage in stages_of(cell_queries(cell, 20.0)):
             assert set(axis_columns(stage.axes, labels)) <= set(STORED["histories"])
-
-
-def test_the_first_of_two_labels_names_the_history(cell: Cell, stages: list[Stage]) -> None:
-    other = replace(cell, labels=("x", "y", "z"), solver="osqp")
-    assert axis_columns(first(stages, PODStage).axes, labels_of([cell, other]))["problem"] == "membrane"

@@ -73,6 +73,21 @@ def record(plan: TimingPlan, stage: TimingRounds | None, unsteady: float = 0.0) 
     return stages
 
 
+def first_row(writer: ResultWriter) -> dict[str, Any]:
+    row = writer.database.cell(GROUP[0].key)
+    assert row is not None
+    return row
+
+
+def begun(writer: ResultWriter, rounds: int = 12) -> tuple[TimingPlan, TimingRounds]:
+    """A plan, and the first stage of the group, whose cells all have their rows."""
+    for cell in GROUP:
+        write(writer, cell)
+    plan = plan_of(writer, rounds)
+    (stage,) = plan.start([])
+    return plan, stage
+
+
 def test_a_group_is_timed_when_its_last_cell_has_its_row(writer: ResultWriter) -> None:
     plan = plan_of(writer)
     assert plan.start(CELLS) == []
@@ -101,22 +116,10 @@ def test_cells_without_an_ok_query_are_not_timed_and_hold_nobody_up(writer: Resu
     assert plan_of(writer).start([])[0].cells == stage.cells
 
 
-def test_a_group_of_failures_is_not_timed_at_all(writer: ResultWriter) -> None:
-    plan = plan_of(writer)
-    plan.start(GROUP)
-    for cell in GROUP:
-        write(writer, cell, 0, 1, 2, 3, status="failed")
-        assert plan.ended(cell) is None
-
-
 def test_seconds_are_written_once_and_asked_again_for_another_number_of_rounds(writer: ResultWriter) -> None:
-    for cell in GROUP:
-        write(writer, cell)
-    plan = plan_of(writer)
-    (stage,) = plan.start([])
+    plan, stage = begun(writer)
     record(plan, stage)
-    row = writer.database.cell(GROUP[0].key)
-    assert row is not None
+    row = first_row(writer)
     assert (row["online_s"], row["hf_s"]) == pytest.approx((3.0, 30.0))
     assert (row["timing_rounds"], row["timed_rounds"], row["timing_reason"]) == (12, 6, "")
     assert row["machine"] == "this one"
@@ -139,10 +142,7 @@ def test_rounds_come_in_passes_and_at_least_two_blocks_where_they_decide(rounds:
 
 def test_rounds_end_for_the_cells_whose_comparisons_are_decided(writer: ResultWriter) -> None:
     """Thirty seconds against three are decided in two blocks, enrichments that differ by less than they scatter not."""
-    for cell in GROUP:
-        write(writer, cell)
-    plan = plan_of(writer)
-    (stage,) = plan.start([])
+    plan, stage = begun(writer)
     stages = record(plan, stage, unsteady=0.1)
     assert [(one.first, one.rounds) for one in stages] == [(3 * k, 3) for k in range(len(stages))]
     assert [one.session for one in stages] == list(range(len(stages)))
@@ -157,10 +157,7 @@ def test_rounds_end_for_the_cells_whose_comparisons_are_decided(writer: ResultWr
 
 def test_rounds_end_where_a_decision_would_take_far_too_many(writer: ResultWriter) -> None:
     """Two equal enrichments are never told apart."""
-    for cell in GROUP:
-        write(writer, cell)
-    plan = plan_of(writer, rounds=60)
-    (stage,) = plan.start([])
+    plan, stage = begun(writer, rounds=60)
     assert len(record(plan, stage)) == 2
 
 
@@ -174,23 +171,16 @@ def test_as_many_rounds_as_are_asked_for_at_least(writer: ResultWriter) -> None:
 
 def test_a_group_that_was_not_timed_to_the_end_is_timed_again(writer: ResultWriter) -> None:
     """As after an interruption between two blocks; what was measured can be shown until then."""
-    for cell in GROUP:
-        write(writer, cell)
-    plan = plan_of(writer)
-    (stage,) = plan.start([])
+    plan, stage = begun(writer)
     plan.record(stage, timed(stage))
-    row = writer.database.cell(GROUP[0].key)
-    assert row is not None
+    row = first_row(writer)
     assert (row["online_s"], row["timing_rounds"], row["timed_rounds"]) == (pytest.approx(3.0), None, 3)
     (again,) = plan_of(writer).start([])
     assert len(again.cells) == len(GROUP)
 
 
 def test_a_cell_that_is_done_again_is_timed_together_with_the_others(writer: ResultWriter) -> None:
-    for cell in GROUP:
-        write(writer, cell)
-    plan = plan_of(writer)
-    (stage,) = plan.start([])
+    plan, stage = begun(writer)
     record(plan, stage)
     plan = plan_of(writer)
     assert plan.start(GROUP[:1]) == []
@@ -201,32 +191,29 @@ def test_a_cell_that_is_done_again_is_timed_together_with_the_others(writer: Res
 
 
 def test_a_failed_timing_leaves_a_reason_and_is_not_tried_for_ever(writer: ResultWriter) -> None:
-    for cell in GROUP:
-        write(writer, cell)
-    plan = plan_of(writer)
-    (stage,) = plan.start([])
+    plan, stage = begun(writer)
     assert plan.record(stage, Failed(Status.CRASHED, "the worker died")) is None
-    row = writer.database.cell(GROUP[0].key)
-    assert row is not None
+    row = first_row(writer)
     assert (row["online_s"], row["timing_reason"]) == (None, "all rounds: the worker died")
     assert plan_of(writer).start([]) == []
 
 
 def test_the_machine_that_timed_a_cell_is_named(writer: ResultWriter) -> None:
     """Break-even compares seconds of one machine alone."""
-    for cell in GROUP:
-        write(writer, cell)
-    plan = plan_of(writer)
-    (stage,) = plan.start([])
+    plan, stage = begun(writer)
     plan.record(stage, tuple(TimedCell(one.rounds, "another") for one in timed(stage)))
-    row = writer.database.cell(GROUP[0].key)
-    assert row is not None
+    row = first_row(writer)
     assert row["machine"] == "another; this one"
 
 
-def test_what_is_not_timing_is_none_of_its_business(writer: ResultWriter) -> None:
+def test_groups_of_failures_and_what_is_not_timing_are_not_timed(writer: ResultWriter) -> None:
     plan_of(writer).record(cell_queries(GROUP[0], 20.0), Failed(Status.ERROR, "anything"))
     assert list(writer.database.rows("cells")) == []
+    plan = plan_of(writer)
+    plan.start(GROUP)
+    for cell in GROUP:
+        write(writer, cell, 0, 1, 2, 3, status="failed")
+        assert plan.ended(cell) is None
 
 
 def test_a_group_costs_the_same_however_many_there_are() -> None:

@@ -45,7 +45,7 @@ def test_every_solution_is_that_of_the_right_active_set(seed: int) -> None:
     assert found.residuals.worst <= 1e-10
 
 
-def test_kkt_conditions_hold_with_exact_zeros() -> None:
+def test_kkt_conditions_hold_with_exact_zeros_and_asymmetry_is_refused() -> None:
     problem = Varying()
     for mu in problem.training_set():
         vi = problem.assemble(mu)
@@ -56,6 +56,14 @@ def test_kkt_conditions_hold_with_exact_zeros() -> None:
         assert gap.max() <= 1e-10
         assert np.all((found.lam == 0.0) | (np.abs(gap) <= 1e-10))
         assert 0 < np.count_nonzero(found.lam) < 8
+    problem, mu = Varying(), np.array([0.5])
+    solver, vi = active_set.HighFidelitySolver(problem), problem.assemble(mu)
+    solver.solve_assembled(mu, vi)
+    solver.check_coercive(mu, vi)
+    crooked = vi.A.tolil()
+    crooked[0, 1] *= 1.001
+    with pytest.raises(NumericalError, match=r"A at mu = \[0.5\] is not symmetric"):
+        solver.check_coercive(mu, replace(vi, A=sp.csc_array(crooked)))
 
 
 def test_a_cycling_active_set_is_helped_and_the_help_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,14 +108,3 @@ def test_a_contact_set_that_moves_node_by_node_is_followed_to_its_end() -> None:
     assert found.iterations > 100
     assert found.fallback == ""
     assert np.all(found.u >= obstacle - 1e-12)
-
-
-def test_a_stiffness_that_is_not_symmetric_is_refused_and_where() -> None:
-    problem, mu = Varying(), np.array([0.5])
-    solver, vi = active_set.HighFidelitySolver(problem), problem.assemble(mu)
-    solver.solve_assembled(mu, vi)
-    solver.check_coercive(mu, vi)
-    crooked = vi.A.tolil()
-    crooked[0, 1] *= 1.001
-    with pytest.raises(NumericalError, match=r"A at mu = \[0.5\] is not symmetric"):
-        solver.check_coercive(mu, replace(vi, A=sp.csc_array(crooked)))

@@ -17,7 +17,7 @@ def places(problem: Obstacle) -> Array:
     return problem.mesh.p[:, problem.disc_nodes]
 
 
-def test_a_coarser_mesh_saves_iterations_and_changes_no_solution() -> None:
+def test_coarser_meshes_save_iterations_and_change_no_solution(monkeypatch: pytest.MonkeyPatch) -> None:
     coarse, fine = Obstacle(700), Obstacle(2800)
     cold = HighFidelitySolver(fine).solve(MU)
     nested = NestedStart(coarse, places(coarse), places(fine))
@@ -32,6 +32,16 @@ def test_a_coarser_mesh_saves_iterations_and_changes_no_solution() -> None:
     assert found.fallback == ""
     assert np.array_equal(found.lam > 0.0, cold.lam > 0.0)
     assert np.allclose(found.u, cold.u, rtol=0.0, atol=1e-12)
+    cold = HighFidelitySolver(Obstacle(1500)).solve(MU)
+    monkeypatch.setattr(obstacle, "NESTED", 1000)
+    problem = Obstacle(1500)
+    solver = HighFidelitySolver(problem)
+    first = solver.solve(MU)
+    assert first.iterations < cold.iterations
+    assert np.allclose(first.u, cold.u, rtol=0.0, atol=1e-12)
+    nearest = first.lam > 0.0
+    assert problem.start(MU, nearest) is nearest
+    assert solver.solve(MU).iterations == 1  # from its own contact set
 
 
 def test_a_start_depends_on_the_parameter_alone_and_can_be_copied_after_use() -> None:
@@ -43,19 +53,6 @@ def test_a_start_depends_on_the_parameter_alone_and_can_be_copied_after_use() ->
     other.solve(fine.parameters.lower)
     assert other.solve(MU).iterations == solver.solve(MU).iterations == first
     assert np.array_equal(pickle.loads(pickle.dumps(nested)).nearest, nested.nearest)
-
-
-def test_the_obstacle_starts_from_a_coarser_mesh_where_its_own_is_fine(monkeypatch: pytest.MonkeyPatch) -> None:
-    cold = HighFidelitySolver(Obstacle(1500)).solve(MU)
-    monkeypatch.setattr(obstacle, "NESTED", 1000)
-    problem = Obstacle(1500)
-    solver = HighFidelitySolver(problem)
-    first = solver.solve(MU)
-    assert first.iterations < cold.iterations
-    assert np.allclose(first.u, cold.u, rtol=0.0, atol=1e-12)
-    nearest = first.lam > 0.0
-    assert problem.start(MU, nearest) is nearest
-    assert solver.solve(MU).iterations == 1  # from its own contact set
 
 
 @pytest.mark.parametrize("start", [np.zeros(3, bool), np.zeros(100)], ids=["too short", "not of booleans"])

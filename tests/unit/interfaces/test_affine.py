@@ -53,8 +53,10 @@ class Strings(AffineProblem):
         return self.parameters.grid(4, 3)
 
 
-def test_a_declared_problem_passes_the_conformance_checks() -> None:
+def test_affine_declarations_pass_the_checks_or_are_named() -> None:
     check(Strings)
+    with pytest.raises(ConformanceError, match="affine sums: f of `affine` differs from that of `assemble`"):
+        check(Wrong)
 
 
 class Wrong(Strings):
@@ -65,12 +67,7 @@ class Wrong(Strings):
         self.affine = {**self.affine, "f": self.affine["f"].mapped(lambda term: 0.5 * term)}
 
 
-def test_the_conformance_checks_name_a_sum_that_is_not_the_member() -> None:
-    with pytest.raises(ConformanceError, match="affine sums: f of `affine` differs from that of `assemble`"):
-        check(Wrong)
-
-
-def test_members_are_the_sums_that_were_declared() -> None:
+def test_declared_sums_are_members_and_terms_of_the_decomposition() -> None:
     problem, mu = Strings(), np.array([1.3, 0.2])
     vi = problem.assemble(mu)
     terms = [term.toarray() for term in problem.affine["A"].terms]
@@ -82,6 +79,25 @@ def test_members_are_the_sums_that_were_declared() -> None:
     assert problem.contact_dofs.tolist() == [2, 3, 4, 5, 6]
     assert np.array_equal(problem.constraint(mu)[0].toarray(), vi.B.toarray())
     assert np.allclose(problem.affine["A"].coefficients(mu), [1.3, 1.69, 0.5])
+    problem = Strings()
+    members = affine_decomposition(problem, problem.training_set(), 1e-6)
+    assert {name: (m.way, len(m.terms), m.error) for name, m in members.items()} == {
+        "A": (Evaluation.AFFINE, 3, 0.0),
+        "f": (Evaluation.AFFINE, 1, 0.0),
+        "B": (Evaluation.CONSTANT, 1, 0.0),
+        "g": (Evaluation.AFFINE, 1, 0.0),
+    }
+    problem.affine = {
+        **problem.affine,
+        "f": AffineSum.of([("tension", problem.affine["f"].terms[0])], ["tension", "d"]),
+    }
+    with pytest.raises(
+        NumericalError, match=r"the affine sum declared for f differs from the assembled f by 3\.1e-01 at mu"
+    ):
+        affine_decomposition(problem, problem.training_set(), 1e-6)
+    problem.affine = {"A": AffineSum.of([(1.0, sp.csr_array(sp.eye_array(3)))], ())}
+    with pytest.raises(NumericalError, match=r"the affine sum of A has shape \(3, 3\), A itself \(24, 24\)"):
+        affine_decomposition(problem, problem.training_set(), 1e-6)
 
 
 def test_constraints_on_most_unknowns_declare_no_contact() -> None:
@@ -96,32 +112,6 @@ def test_constraints_on_most_unknowns_declare_no_contact() -> None:
     assert problem.contact(np.ones(2)) is None
     solution = HighFidelitySolver(problem).solve(np.array([1.0, 0.2]))
     assert solution.u.max() == pytest.approx(0.2)
-
-
-def test_the_decomposition_has_the_declared_terms() -> None:
-    problem = Strings()
-    members = affine_decomposition(problem, problem.training_set(), 1e-6)
-    assert {name: (m.way, len(m.terms), m.error) for name, m in members.items()} == {
-        "A": (Evaluation.AFFINE, 3, 0.0),
-        "f": (Evaluation.AFFINE, 1, 0.0),
-        "B": (Evaluation.CONSTANT, 1, 0.0),
-        "g": (Evaluation.AFFINE, 1, 0.0),
-    }
-
-
-def test_a_sum_that_is_not_the_member_is_refused() -> None:
-    problem = Strings()
-    problem.affine = {
-        **problem.affine,
-        "f": AffineSum.of([("tension", problem.affine["f"].terms[0])], ["tension", "d"]),
-    }
-    with pytest.raises(
-        NumericalError, match=r"the affine sum declared for f differs from the assembled f by 3\.1e-01 at mu"
-    ):
-        affine_decomposition(problem, problem.training_set(), 1e-6)
-    problem.affine = {"A": AffineSum.of([(1.0, sp.csr_array(sp.eye_array(3)))], ())}
-    with pytest.raises(NumericalError, match=r"the affine sum of A has shape \(3, 3\), A itself \(24, 24\)"):
-        affine_decomposition(problem, problem.training_set(), 1e-6)
 
 
 @given(data=st.data())
@@ -139,31 +129,22 @@ def test_a_sum_of_sparse_matrices_is_that_of_dense_ones(data: st.DataObject) -> 
     assert np.allclose(total.entries(rows, columns)(np.array([2.0])), np.ravel(expected), rtol=1e-14, atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("declared", "error", "message"),
-    [
+def test_wrong_declarations_and_coefficients_are_refused() -> None:
+    for declared, error, message in (
         ({"f": np.ones(23)}, NumericalError, r"f has shape \(23,\); the spaces V and W require \(24,\)"),
         ({"f": [("tensoin", np.ones(24))]}, RequestError, "no parameter is called 'tensoin'; did you mean 'tension'"),
         ({"f": [(1.0, np.ones(24)), (1.0, np.ones(23))]}, NumericalError, r"shapes \[\(24,\), \(23,\)\]"),
         ({"f": []}, NumericalError, r"shapes \[\]; expected one shape"),
-    ],
-)
-def test_a_wrong_declaration_is_refused(declared: dict[str, Any], error: type[Exception], message: str) -> None:
-    problem = Strings()
-    members: dict[str, Any] = dict(problem._members) | declared
-    with pytest.raises(error, match=message):
-        problem.declare(**members)
-
-
-def test_coefficients_are_finite_and_one_for_each_term() -> None:
+    ):
+        problem = Strings()
+        members: dict[str, Any] = dict(problem._members) | declared
+        with pytest.raises(error, match=message):
+            problem.declare(**members)
     total = AffineSum((np.ones(2), np.ones(2)), lambda mu: mu)
     with pytest.raises(NumericalError, match="2 terms need as many finite coefficients, found at mu"):
         total.coefficients(np.ones(3))
     with pytest.raises(NumericalError, match="finite"):
         total.coefficients(np.array([1.0, np.nan]))
-
-
-def test_expressions_travel_to_other_processes() -> None:
     total = AffineSum.of([("x**2", np.ones(2)), (3.0, np.arange(2.0))], ("x",))
     again = pickle.loads(pickle.dumps(total))
     assert np.array_equal(again.at(np.array([2.0])), [4.0, 7.0])

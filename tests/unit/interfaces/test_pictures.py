@@ -60,14 +60,11 @@ def test_cells_in_the_order_of_vtk_pass_whatever_their_integers(dtype: type) -> 
     assert list(replace(SOLID, cells=cells).faults()) == []
 
 
-def test_a_hexahedron_of_higher_order_is_looked_at_by_its_corners() -> None:
+def test_right_meshes_of_any_order_and_of_pictures_pass() -> None:
     points = np.vstack([CUBE, np.zeros((12, 3))])
     right = MeshFields(points, {"hexahedron20": np.arange(20)[None]}, {}, {})
     assert list(right.faults()) == []
     assert "inside out" in next(replace(right, points=points * [1.0, 1.0, -1.0]).faults())
-
-
-def test_the_mesh_of_a_picture_passes() -> None:
     x = np.array([1.0, 0.0, 0.5])
     line = Picture(x[None], np.zeros((3, 0), dtype=int), x, "u [m]", x[None, :2], x[:2], "λ [N/m]")
     plane = replace(line, points=np.stack([x, x**2]), triangles=np.array([[0], [1], [2]]))

@@ -5,13 +5,10 @@ from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
 
 
-def test_a_stop_is_a_tolerance_or_a_size() -> None:
+def test_stops_are_a_tolerance_or_a_size_and_reached_as_they_say() -> None:
     for wrong in ({}, {"tolerance": 0.1, "size": 3}):
         with pytest.raises(RequestError, match="either a tolerance or a size"):
             Stop(**wrong)
-
-
-def test_tolerances_and_sizes_are_reached_as_they_say() -> None:
     errors = np.array([1.0, 0.1, 0.01])
     assert Stop(tolerance=0.1).first_reached(errors) == 1
     assert Stop(tolerance=1e-3).first_reached(errors) is None

@@ -56,7 +56,9 @@ PARTLY = given(st.integers(0, 10_000), st.integers(0, 9), st.booleans(), st.inte
 
 
 @PARTLY
-def test_a_partial_factor_gives_the_matrix(seed: int, count: int, bodies: bool, columns: int) -> None:
+def test_partial_factors_give_the_matrix_its_schur_complement_and_all_unknowns(
+    seed: int, count: int, bodies: bool, columns: int
+) -> None:
     X, last, factor = partly_eliminated(seed, count, bodies)
     F = factor.apply_factor(np.eye(9))
     assert np.allclose(F.T @ F, X)
@@ -65,11 +67,12 @@ def test_a_partial_factor_gives_the_matrix(seed: int, count: int, bodies: bool, 
     y = np.random.default_rng(seed).standard_normal((9, columns) if columns else 9)
     assert np.allclose(factor.solve_factor(y), np.linalg.solve(F, y))
     assert np.allclose(factor.solve_factor_transposed(y), np.linalg.solve(F.T, y))
-
-
-@PARTLY
-def test_all_unknowns_follow_from_the_last(seed: int, count: int, bodies: bool, columns: int) -> None:
-    X, last, factor = partly_eliminated(seed, count, bodies)
+    rest = np.setdiff1d(np.arange(9), last)
+    taken = X[np.ix_(last, rest)] @ np.linalg.solve(X[np.ix_(rest, rest)], X[np.ix_(rest, last)])
+    S, F = X[np.ix_(last, last)] - taken, factor.trailing_factor
+    assert np.allclose(factor.schur_blocks().toarray(), S)
+    assert np.allclose(F.T @ F, S)
+    assert np.array_equal(F, np.triu(F))
     rng, rest = np.random.default_rng(seed), np.setdiff1d(np.arange(9), last)
     given_there = rng.standard_normal((count, columns) if columns else count)
     u = factor.extend(given_there)
@@ -81,17 +84,6 @@ def test_all_unknowns_follow_from_the_last(seed: int, count: int, bodies: bool, 
     solved, load = factor.eliminate(r)
     assert np.allclose(X[np.ix_(rest, rest)] @ solved[np.argsort(factor.order[: 9 - count])], r[rest])
     assert np.allclose(load, r[last] - X[np.ix_(last, rest)] @ np.linalg.solve(X[np.ix_(rest, rest)], r[rest]))
-
-
-@PARTLY
-def test_the_tail_is_a_factor_of_the_schur_complement(seed: int, count: int, bodies: bool, columns: int) -> None:
-    X, last, factor = partly_eliminated(seed, count, bodies)
-    rest = np.setdiff1d(np.arange(9), last)
-    taken = X[np.ix_(last, rest)] @ np.linalg.solve(X[np.ix_(rest, rest)], X[np.ix_(rest, last)])
-    S, F = X[np.ix_(last, last)] - taken, factor.trailing_factor
-    assert np.allclose(factor.schur_blocks().toarray(), S)
-    assert np.allclose(F.T @ F, S)
-    assert np.array_equal(F, np.triu(F))
 
 
 @pytest.mark.parametrize("first", [0, 3], ids=["neighbouring rows", "rows with gaps"])

@@ -79,7 +79,7 @@ def test_a_factor_with_some_unknowns_last_makes_inner_products_euclidean(chosen:
 
 
 @EVERY
-def test_tiny_matrices_and_empty_contact(chosen: Implementation) -> None:
+def test_tiny_matrices_and_what_is_not_definite_by_name(chosen: Implementation) -> None:
     A = sp.csc_array(np.diag([2.0, 3.0, 4.0, 5.0]) - 0.5 * np.eye(4, k=1) - 0.5 * np.eye(4, k=-1))
     for count in (0, 1, 4):
         partly = chosen.eliminate(A, np.arange(4), count, "A")
@@ -87,10 +87,6 @@ def test_tiny_matrices_and_empty_contact(chosen: Implementation) -> None:
         assert partly.extend(np.ones(count)).shape == (4,)
     assert chosen.factorise(sp.csc_array([[4.0]]), "A").solve(np.array([2.0])) == pytest.approx(0.5)
     assert chosen.factorise(sp.csc_array((0, 0)), "A").solve(np.zeros((0, 2))).shape == (0, 2)
-
-
-@EVERY
-def test_what_is_not_definite_is_refused_by_name(chosen: Implementation) -> None:
     for matrix in (
         -np.eye(3), np.diag([1.0, 0.0, 1.0]), np.array([[1.0, 2.0], [2.0, 1.0]]), np.array([[1.0, 1.0], [1.0, 1.0]]),
         np.diag([1.0, np.nan]), np.diag([1.0, np.inf]), np.array([[1.0, np.nan], [np.nan, 1.0]]),

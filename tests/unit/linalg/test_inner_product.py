@@ -55,7 +55,7 @@ def test_empty_bases_are_fine_and_inner_products_travel_between_processes() -> N
     assert np.array_equal(pickle.loads(pickle.dumps(X)).whiten(u), X.whiten(u))
 
 
-def test_what_is_no_inner_product_is_refused() -> None:
+def test_what_is_no_inner_product_is_refused_at_once_or_later() -> None:
     for matrix, message in (
         (np.array([[1.0, 2.0], [2.0, 1.0]]), "not positive definite"),
         (np.array([[1.0, 0.5], [0.0, 1.0]]), "not symmetric"),
@@ -66,9 +66,6 @@ def test_what_is_no_inner_product_is_refused() -> None:
     ):
         with pytest.raises(NumericalError, match=message):
             InnerProduct(sp.csc_array(matrix))
-
-
-def test_what_is_factorised_later_is_refused_later() -> None:
     indefinite, made = sp.csc_array([[1.0, 2.0], [2.0, 1.0]]), []
     with pytest.raises(NumericalError, match="X is not positive definite"), factorised_later():
         made.append(InnerProduct(indefinite, "X"))
@@ -98,15 +95,12 @@ def test_range_has_the_rank_of_its_vectors(seed: int, rank: int) -> None:
     assert np.allclose(q @ (q.T @ y), y, atol=1e-12 * np.abs(y).max())
 
 
-def test_range_drops_duplicates_and_zero_vectors_but_keeps_small_ones() -> None:
+def test_ranges_drop_duplicates_and_are_orthogonal_to_a_given_space() -> None:
     e = np.eye(6)
     y = np.column_stack([e[0], e[0], np.zeros(6), 1e-9 * e[1], e[0] + 1e-15 * e[2]])
     q = orthonormal_range(y)
     assert q.shape[1] == 2
     assert np.allclose(np.abs(q.T @ e[:, :2]), np.eye(2), atol=1e-9)
-
-
-def test_range_against_a_space_is_orthogonal_to_it_even_for_nearly_contained_vectors() -> None:
     rng = np.random.default_rng(1)
     fixed, _ = np.linalg.qr(rng.standard_normal((20, 5)))
     nearly = fixed @ rng.standard_normal((5, 3)) + 1e-8 * rng.standard_normal((20, 3))

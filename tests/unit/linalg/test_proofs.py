@@ -73,7 +73,7 @@ def test_the_error_of_a_factorisation_is_bounded(seed: int, n: int) -> None:
         assert float(total) <= bound[back[i]]
 
 
-def test_patterns_may_be_neither_symmetric_nor_hold_the_diagonal() -> None:
+def test_patterns_and_indices_may_be_unsorted_and_unsymmetric() -> None:
     """Sums are symmetrised and shifted by other means then, with the same counts."""
     rng = np.random.default_rng(4)
     for n in (6, 40):
@@ -88,6 +88,12 @@ def test_patterns_may_be_neither_symmetric_nor_hold_the_diagonal() -> None:
         definite = [sp.csr_array(2.0 * np.tril(full, -1)), sp.csr_array(np.diag(np.abs(full).sum(axis=0) + 1.0))]
         assert proved_positive(definite, np.ones(n)) == n
         assert proved_positive([*definite, sp.csc_array(np.diag([np.nan] + [1.0] * (n - 1)))], np.ones(n)) == 0
+    matrix = sp.csr_array(sp.csr_array(membrane(6)[:, ::-1])[:, ::-1])
+    before = matrix.copy()
+    assert band_of_one([matrix])
+    assert not band_of_one([matrix, -1.0001 * matrix])
+    assert np.array_equal(matrix.indices, before.indices)
+    assert np.array_equal(matrix.data, before.data)
 
 
 def membrane(side: int) -> sp.csr_array:
@@ -149,15 +155,6 @@ def test_random_bands_are_proved_exactly_where_definite(seed: int, n: int, shift
         assert proved is bool(scaled > 0.0)
     elif scaled < 0.0:
         assert not proved
-
-
-def test_parts_with_unsorted_indices_are_left_as_they_are() -> None:
-    matrix = sp.csr_array(sp.csr_array(membrane(6)[:, ::-1])[:, ::-1])
-    before = matrix.copy()
-    assert band_of_one([matrix])
-    assert not band_of_one([matrix, -1.0001 * matrix])
-    assert np.array_equal(matrix.indices, before.indices)
-    assert np.array_equal(matrix.data, before.data)
 
 
 def test_wide_bands_are_left_to_a_sparse_factorisation_in_the_given_order(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,7 +44,7 @@ def test_equilibrium_with_given_retained_unknowns(seed: int, count: int) -> None
     assert np.allclose((dense @ corrected - f)[others], 0.0, atol=1e-10)
 
 
-def test_columns_of_retained_unknowns_and_no_others() -> None:
+def test_retained_unknowns_alone_have_columns() -> None:
     A, retained = sparse_spd(12, np.random.default_rng(3)), np.array([2, 3, 7, 11])
     pattern, B = EliminationPattern.of(A, retained), np.zeros((3, 12))
     B[[0, 0, 2], [7, 2, 11]] = 1.0, 2.0, 3.0
@@ -56,6 +56,10 @@ def test_columns_of_retained_unknowns_and_no_others() -> None:
     B[1, 4] = 1.0
     with pytest.raises(NumericalError, match="touches unknowns that are to be eliminated"):
         pattern.on_retained(sp.csr_array(B))
+    problem = Declaring(n=60)
+    problem.first = 14
+    with pytest.raises(NumericalError, match="B touches 1 unknowns outside the declared contact_dofs, the first is 13"):
+        HighFidelitySolver(problem).solve(problem.training_set()[0])
 
 
 @given(st.integers(0, 10_000), st.integers(0, 12))
@@ -101,10 +105,3 @@ def test_successive_solves_give_the_solutions_of_single_ones(problem: Varying) -
         iterations.append((found.iterations, alone.iterations))
     warm, cold = np.sum(iterations[1:], axis=0)
     assert warm < cold
-
-
-def test_a_constraint_outside_the_declared_contact_is_refused() -> None:
-    problem = Declaring(n=60)
-    problem.first = 14
-    with pytest.raises(NumericalError, match="B touches 1 unknowns outside the declared contact_dofs, the first is 13"):
-        HighFidelitySolver(problem).solve(problem.training_set()[0])

@@ -66,7 +66,7 @@ def test_constants_are_those_of_the_default_whoever_factorises(name: str) -> Non
         assert found.value == pytest.approx(expected.value, rel=1e-6)
 
 
-def test_factors_too_large_to_be_kept_are_those_of_the_last_parameter_alone() -> None:
+def test_factors_and_parameters_are_kept_as_they_fit() -> None:
     """Otherwise α, β_A and the bounds at one parameter would each factorise A."""
     kept, one, two = Assemblies(Varying(), factor_limit=1), np.array([0.2]), np.array([0.5])
     first = kept.energy_at(one)
@@ -74,9 +74,6 @@ def test_factors_too_large_to_be_kept_are_those_of_the_last_parameter_alone() ->
     assert kept.energy_at(one).contact_form(kept.at(one)) is first.contact_form(kept.at(one))
     assert (kept.energy_at(two).A != first.A).nnz
     assert kept.energy_at(one) is not first
-
-
-def test_as_many_parameters_are_together_as_their_factors_and_their_matrices_fit() -> None:
     mu = np.array([0.2])
     factors, matrices = Assemblies(Varying()).energy_at(mu).nbytes, assemblies._bytes(Assemblies(Varying()).at(mu))
     assert Assemblies(Varying(), limit=5 * matrices).together(mu) == 5

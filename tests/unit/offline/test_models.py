@@ -49,19 +49,21 @@ def test_a_model_answers_as_the_run_did(small_run: vibench.Run, model: vibench.M
         assert bounds.lam >= model.problem.W.norm(solution.lam - exact.lam)
 
 
-def test_parameters_by_name_and_reconstruction(model: vibench.Model, mus: np.ndarray) -> None:
+def test_single_answers_have_seconds_reconstructions_and_other_solvers(model: vibench.Model, mus: np.ndarray) -> None:
     solution = model.solve(dict(zip(model.parameters.names, mus[0].tolist(), strict=True)))
     assert np.array_equal(solution.mu, mus[0])
     u, lam = model.reconstruct(mus[0], solution.x, solution.alpha)
     assert np.allclose(u, solution.u, rtol=0.0, atol=1e-14 * np.abs(u).max())
     assert np.array_equal(lam, solution.lam)
-
-
-def test_seconds_are_numbers(model: vibench.Model, mus: np.ndarray) -> None:
     solution = model.solve(mus[0])
     assert isinstance(solution.assembly, float)
     assert isinstance(solution.solution, float)
     assert solution.solution >= 0.0
+    loose = model.solve(mus[0], solver="proxqp", accuracy=1e-4)
+    assert loose.status == "ok"
+    assert loose.residuals is not None
+    assert loose.residuals.worst <= 1e-4
+    assert np.allclose(loose.u, model.solve(mus[0]).u, rtol=0.0, atol=1e-2 * np.abs(loose.u).max())
 
 
 def test_many_parameters_give_a_table(model: vibench.Model, mus: np.ndarray, certified: vibench.Run) -> None:
@@ -117,37 +119,20 @@ def test_models_and_solutions_are_shown_by_what_they_are(model: vibench.Model, m
     assert "<td>&lt;b&gt;</td>" in html("title", {"name": "<b>"})
 
 
-def test_another_solver_and_accuracy(model: vibench.Model, mus: np.ndarray) -> None:
-    loose = model.solve(mus[0], solver="proxqp", accuracy=1e-4)
-    assert loose.status == "ok"
-    assert loose.residuals is not None
-    assert loose.residuals.worst <= 1e-4
-    assert np.allclose(loose.u, model.solve(mus[0]).u, rtol=0.0, atol=1e-2 * np.abs(loose.u).max())
-
-
-def test_a_parameter_outside_the_domain_is_warned_of(model: vibench.Model) -> None:
+def test_parameters_outside_their_domain_are_warned_of_and_what_is_none_refused(model: vibench.Model) -> None:
     box = model.parameters
     with pytest.warns(UserWarning, match="^height, curvature: outside the parameter domain"):
         model.solve(box.upper + 0.1 * (box.upper - box.lower))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         model.solve(box.upper)
-
-
-@pytest.mark.parametrize(
-    ("mu", "line"),
-    [
+    for mu, line in (
         ([1.0, 2.0, 3.0, 4.0], "expected finite numbers"),
         ([float("nan")] * 2, "expected finite numbers"),
         ({"height": 1.0}, "mu has the components \\['height'\\], expected"),
-    ],
-)
-def test_what_is_no_parameter(model: vibench.Model, mu: object, line: str) -> None:
-    with pytest.raises(vibench.RequestError, match=line):
-        model.solve(mu)  # type: ignore[arg-type]
-
-
-def test_names_of_components_are_compared_in_their_unicode_form() -> None:
+    ):
+        with pytest.raises(vibench.RequestError, match=line):
+            model.solve(mu)  # type: ignore[arg-type]
     micro, letter = "\u00b5", "\u03bc"
     box = vibench.ParameterBox((micro, "e"), np.array([1.0, 1.0]), np.array([2.0, 2.0]), ("1", "1"))
     assert box.logarithmic([letter, micro]) == [0]
@@ -156,15 +141,14 @@ def test_names_of_components_are_compared_in_their_unicode_form() -> None:
         parameter_in(box, {letter: 1.5, micro: 1.5, "e": 2.0})
 
 
-def test_solvers_that_are_not_there(model: vibench.Model, mus: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_solvers_and_answers_are_named(
+    model: vibench.Model, mus: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(vibench.RequestError, match="no QP solver is called 'piqpp'; did you mean 'piqp'"):
         model.solve(mus[0], solver="piqpp")
     monkeypatch.setattr("vibench.offline.models.installed_solvers", lambda _: ["piqp"])
     with pytest.raises(vibench.RequestError, match="the QP solver 'proxqp' is not installed"):
         model.solve(mus[0], solver="proxqp")
-
-
-def test_no_answer_is_no_solution(model: vibench.Model, mus: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     nothing = vibench.QPSolution(None, None, "gave up")
     monkeypatch.setattr("vibench.offline.models.solve_qp", lambda *_: nothing)
     solution = model.solve(mus[0])
@@ -188,7 +172,7 @@ def certified(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
     return vibench.run(study, tmp_path_factory.mktemp("certified") / "run", progress=False, jobs=1)
 
 
-def test_a_certified_model_bounds_its_errors_and_says_whether_they_keep_a_tolerance(certified: vibench.Run) -> None:
+def test_certificates_bound_errors_and_tolerances_need_them(certified: vibench.Run) -> None:
     row = with_ways(certified.cells).set_index("assembly").loc["certified"]
     assert (row["certificate"], row["bound_online_violations"]) == ("certified", 0)
     assert row["offline_certificate_s"] > 0.0
@@ -207,16 +191,18 @@ def test_a_certified_model_bounds_its_errors_and_says_whether_they_keep_a_tolera
         assert model.solve(mu, tolerance=0.99 * relative).verdict == "not certified"
         rough = model.solve(mu, accuracy=1e-14, tolerance=1.01 * relative)  # more than the solver reaches, or less
         assert rough.verdict == ("certified" if rough.status == "ok" else "not certified")
-
-
-def test_the_bound_of_the_multiplier_is_in_rows_and_says_what_it_rests_on(certified: vibench.Run) -> None:
-    row = with_ways(certified.cells).set_index("assembly").loc["certified"]
     rows = certified.queries[certified.queries["cell"] == row["cell"]]
     assert set(rows["beta_energy_online_note"]) == {BoundNote.ON_BODIES}
     assert (rows["beta_energy_online"] <= rows["beta_energy"] * (1.0 + 1e-2)).all()  # both are moved outwards
     assert (rows["bound_online_lambda"] >= rows["error_lambda_absolute"]).all()
     assert row["effectivity_online_lambda_median"] == pytest.approx(rows["effectivity_online_lambda"].median())
     assert 1.0 <= row["effectivity_online_lambda_median"] < 20.0
+    model = certified.model(with_ways(certified.cells).set_index("assembly").loc["reduced", "cell"])
+    assert model.solve([1.0]).bound is None
+    with pytest.raises(vibench.RequestError, match="no error bounds"):
+        model.solve([1.0], tolerance=1e-2)
+    with pytest.raises(vibench.RequestError, match="expected a positive finite number"):
+        model.solve([1.0], tolerance=0.0)
 
 
 def test_corrected_solutions_satisfy_the_constraints_and_have_bounds_of_their_own(certified: vibench.Run) -> None:
@@ -241,12 +227,3 @@ def test_corrected_solutions_satisfy_the_constraints_and_have_bounds_of_their_ow
     at_mesh_size = uncertified.solve(mu, corrected=True)  # without a certificate: the same, A is constant
     assert (at_mesh_size.bound, at_mesh_size.answer.is_corrected) == (None, True)
     assert model.problem.W.norm(at_mesh_size.lam - corrected.lam) <= 1e-6 * model.problem.W.norm(exact.lam)
-
-
-def test_a_tolerance_needs_a_certificate(certified: vibench.Run) -> None:
-    model = certified.model(with_ways(certified.cells).set_index("assembly").loc["reduced", "cell"])
-    assert model.solve([1.0]).bound is None
-    with pytest.raises(vibench.RequestError, match="no error bounds"):
-        model.solve([1.0], tolerance=1e-2)
-    with pytest.raises(vibench.RequestError, match="expected a positive finite number"):
-        model.solve([1.0], tolerance=0.0)

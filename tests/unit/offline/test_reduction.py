@@ -64,7 +64,9 @@ def test_a_reduction_answers_as_the_run_of_the_same_study(
             assert one.bound.u_energy == pytest.approx(other.bound.u_energy, rel=5e-2)
 
 
-def test_steps_are_computed_once_and_only_when_asked_for(reduce: partial[vibench.Reduction]) -> None:
+def test_steps_are_computed_once_when_asked_for_and_follow_given_ones(
+    reduce: partial[vibench.Reduction], snapshots: vibench.Snapshots
+) -> None:
     calls: list[str] = []
 
     class Counting(vibench.DualStrategy):
@@ -79,6 +81,14 @@ def test_steps_are_computed_once_and_only_when_asked_for(reduce: partial[vibench
     assert reduction.model is reduction.model
     assert calls == ["cone"]
     assert reduction.enrichment.kind is vibench.Kind.NONE
+    first = reduce().given(snapshots=snapshots)
+    assert first.snapshots is snapshots
+    whole = first.cone.size
+    cone = vibench.greedy_cone(snapshots.lam, first.problem.W, vibench.Stop(size=1))
+    second = first.given(cone=cone)
+    assert second.snapshots is snapshots
+    assert second.model.reduced.generators.shape[1] == 1
+    assert first.model.reduced.generators.shape[1] == whole > 1
 
 
 class Few(vibench.Sampling):
@@ -98,17 +108,6 @@ class Centre(vibench.AdaptiveSampling):
         first, *others = self.parameters(box)
         trainer.solve(first)
         trainer.solve(max(others, key=trainer.bound))
-
-
-def test_steps_after_given_ones_follow_them(reduce: partial[vibench.Reduction], snapshots: vibench.Snapshots) -> None:
-    first = reduce().given(snapshots=snapshots)
-    assert first.snapshots is snapshots
-    whole = first.cone.size
-    cone = vibench.greedy_cone(snapshots.lam, first.problem.W, vibench.Stop(size=1))
-    second = first.given(cone=cone)
-    assert second.snapshots is snapshots
-    assert second.model.reduced.generators.shape[1] == 1
-    assert first.model.reduced.generators.shape[1] == whole > 1
 
 
 def test_training_sets_of_sampling_strategies(reduce: partial[vibench.Reduction]) -> None:

@@ -190,7 +190,8 @@ def test_what_cannot_be_run_is_refused_in_a_line(names: dict[str, Any]) -> None:
         assert "\n" not in line
 
 
-def test_the_problem_is_the_one_at_the_time_of_the_study(names: dict[str, Any]) -> None:
+def test_a_problem_is_that_of_the_study_s_time_and_its_class_keeps_its_global_names(names: dict[str, Any]) -> None:
+    """Cloudpickle would give it copies of them where it is loaded in the process that defines it."""
     mine = names["Mine"]()
     asked = study(problem=[mine])
     mine.depth = 7.0
@@ -200,6 +201,10 @@ def test_the_problem_is_the_one_at_the_time_of_the_study(names: dict[str, Any]) 
     (other,) = expand(study(problem=[mine]))
     assert (other.key, other.problem.name) == (cell.key, "Mine")
     assert other.code != cell.code
+    before = names["Mine"].__init__
+    (cell,) = expand(study(problem=[names["Mine"]()]))
+    assert type(cell.problem.create()) is names["Mine"]
+    assert names["Mine"].__init__ is before
 
 
 def test_labels_and_options_tell_objects_and_classes_apart(names: dict[str, Any]) -> None:
@@ -213,15 +218,9 @@ def test_labels_and_options_tell_objects_and_classes_apart(names: dict[str, Any]
     assert [cell.problem.create().V.dim for cell in cells] == [12, 9, 6, 8]
 
 
-def test_a_notebook_s_class_keeps_its_global_names(names: dict[str, Any]) -> None:
-    """Cloudpickle would give it copies of them where it is loaded in the process that defines it."""
-    before = names["Mine"].__init__
-    (cell,) = expand(study(problem=[names["Mine"]()]))
-    assert type(cell.problem.create()) is names["Mine"]
-    assert names["Mine"].__init__ is before
-
-
-def test_the_definition_of_a_cell_holds_no_object(names: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_definition_of_a_cell_holds_no_object_and_a_pickled_plugin_brings_it(
+    names: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It is found again by what made it, and refused in a line where that is not: another process, edited code."""
     (cell,) = expand(study(problem=[names["Mine"](9)]))
     content = json.loads(cell.definition)
@@ -231,15 +230,10 @@ def test_the_definition_of_a_cell_holds_no_object(names: dict[str, Any], monkeyp
     assert (again.key, again.code) == (cell.key, cell.code)
     (remade,) = expand(study_of_cell(again, "given"))
     assert (remade.key, remade.problem.create().V.dim) == (cell.key, 9)
+    sent = pickle.dumps(cell.problem)
     monkeypatch.setattr(module, "_given", {})
     with pytest.raises(RequestError, match=r"problem 'Mine' is a class or an object that .* another process"):
         Cell.from_definition(cell.definition)
-
-
-def test_a_pickled_plugin_brings_what_was_given(names: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    (cell,) = expand(study(problem=[names["Mine"](9)]))
-    sent = pickle.dumps(cell.problem)
-    monkeypatch.setattr(module, "_given", {})
     received = pickle.loads(sent)
     assert received == cell.problem
     assert pickle.loads(pickle.dumps(received)) == received  # a worker of dask sends it on

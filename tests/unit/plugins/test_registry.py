@@ -115,30 +115,29 @@ BASES: Mapping[PluginKind, type] = {
 
 
 @pytest.mark.parametrize("kind", BASES)
-def test_the_built_in_plugins_are_found_through_their_entry_points(kind: str) -> None:
+def test_built_in_plugins_are_found_with_a_summary_and_options_with_defaults(kind: str) -> None:
     entries = importlib.metadata.distribution("vibench").entry_points.select(group=kind.entry_points)
     assert entries
     for entry in entries:
         assert entry.name in registered(kind)
         assert issubclass(find(kind, entry.name).load(), BASES[kind])
         assert find(kind, entry.name).origin == f"vibench {importlib.metadata.version('vibench')}"
-
-
-def test_registered_studies_are_files_that_load() -> None:
-    assert "quick" in registered(PluginKind.STUDY)
-    for name in (name for name, study in registered(PluginKind.STUDY).items() if not study.package):
-        assert Path(find(PluginKind.STUDY, name).load()).is_file()
-        assert read_study(name).name == name
-
-
-@pytest.mark.parametrize("kind", BASES)
-def test_every_built_in_plugin_has_a_summary_and_options_with_defaults(kind: str) -> None:
     for name in registered(kind):
         assert (find(kind, name).load().__doc__ or "").strip()
         assert all(option.expected for option in find(kind, name).options.values())
         required = [option.name for option in find(kind, name).options.values() if option.required]
         assert required == (["path"] if name == "pack" else [])
         assert find(kind, name).check_options(dict.fromkeys(required, "text")) == dict.fromkeys(required, Path("text"))
+
+
+def test_registered_studies_are_files_that_load_or_refused(register: Register, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "quick" in registered(PluginKind.STUDY)
+    for name in (name for name, study in registered(PluginKind.STUDY).items() if not study.package):
+        assert Path(find(PluginKind.STUDY, name).load()).is_file()
+        assert read_study(name).name == name
+    monkeypatch.setitem(sys.modules, "lost_study", types.SimpleNamespace(path=Path("/nowhere/lost.toml")))
+    register(("vibench.studies", "lost", "lost_study:path"))
+    assert "/nowhere/lost.toml" in refusal(read_study, "lost")
 
 
 def test_names_are_sorted_groups_separate_and_unknown_names_refused_with_the_nearest(register: Register) -> None:
@@ -152,7 +151,8 @@ def test_names_are_sorted_groups_separate_and_unknown_names_refused_with_the_nea
     assert find(PluginKind.DUAL, "plain").origin == "unknown"  # it is in no distribution
 
 
-def test_a_name_that_two_packages_use_is_refused_and_no_other(register: Register) -> None:
+def test_a_name_of_two_packages_or_of_a_solver_of_qpsolvers_is_refused(register: Register) -> None:
+    """Installed or not: results of another machine may be named after the real one."""
     register(
         *((GROUP, "plain", f"{HERE}:{one}") for one in ("Plain", "Choosy")),
         *((GROUP, "heir", f"{HERE}:Heir") for _ in range(2)),  # one entry point that is found twice is no conflict
@@ -168,10 +168,6 @@ def test_a_name_that_two_packages_use_is_refused_and_no_other(register: Register
     plugin = Entry(name="plain", options={"mode": "slow"}).plugin(PluginKind.DUAL)
     assert plugin.options == '{"mode": "slow"}'
     assert "two packages" in refusal(plugin.create)
-
-
-def test_a_plugin_cannot_take_the_name_of_a_solver_of_qpsolvers(register: Register) -> None:
-    """Installed or not: results of another machine may be named after the real one."""
     register(*(("vibench.qp_solvers", name, f"{HERE}:no_strategy") for name in ("piqp", "ecos", "mine")))
     for name in ("piqp", "ecos"):
         line = refusal(registry.qp_solver, name)
@@ -232,12 +228,6 @@ def test_a_study_may_name_a_registered_solver_and_is_not_stopped_by_another(regi
     assert registry.qp_solver("piqp") == {}
 
 
-def test_a_registered_study_without_file_is_refused(register: Register, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "lost_study", types.SimpleNamespace(path=Path("/nowhere/lost.toml")))
-    register(("vibench.studies", "lost", "lost_study:path"))
-    assert "/nowhere/lost.toml" in refusal(read_study, "lost")
-
-
 ACCEPTED = [
     {"weight": 0.5},
     {"weight": 0.5, "count": 9},
@@ -251,7 +241,7 @@ ACCEPTED = [
 
 
 @pytest.mark.usefixtures("_own")
-def test_options_that_fit_reach_the_constructor() -> None:
+def test_options_that_fit_reach_the_constructor_and_others_are_refused_with_what_is_expected() -> None:
     """TOML knows neither tuples nor enumerations; a float may be written as an integer."""
     for options in ACCEPTED:
         made = find(PluginKind.DUAL, "choosy").create(options)
@@ -259,6 +249,17 @@ def test_options_that_fit_reach_the_constructor() -> None:
     made = Plugin(PluginKind.DUAL, "choosy", '{"weight": 0.5, "point": [1.0, 2.0], "colour": "blue"}', "").create()
     assert (made.given["point"], made.given["colour"]) == ((1.0, 2.0), Colour.BLUE)
     assert isinstance(find(PluginKind.DUAL, "record").check_options({"width": 2})["width"], float)
+    for options, words in REFUSED:
+        line = refusal(find(PluginKind.DUAL, "choosy").check_options, options)
+        assert [word for word in ("'choosy'", *words) if word not in line] == [], line
+    options = find(PluginKind.DUAL, "choosy").options
+    listed = {name: (option.expected, str(option).partition(" = ")[2]) for name, option in options.items()}
+    assert listed["weight"] == ("float > 0 and < 1", "")
+    assert listed["count"] == ("int ≥ 1 and ≤ 9", "3")
+    assert listed["mode"] == ("'slow', 'fast'", "'slow'")
+    assert listed["grid"] == ("'coarse', 'fine' or int ≥ 2", "'coarse'")
+    assert listed["exact"] == ("bool", "False")
+    assert listed["anything"][0] == "any value"
 
 
 REFUSED = [
@@ -284,13 +285,6 @@ REFUSED = [
 
 
 @pytest.mark.usefixtures("_own")
-def test_options_that_do_not_fit_are_refused_with_what_is_expected() -> None:
-    for options, words in REFUSED:
-        line = refusal(find(PluginKind.DUAL, "choosy").check_options, options)
-        assert [word for word in ("'choosy'", *words) if word not in line] == [], line
-
-
-@pytest.mark.usefixtures("_own")
 def test_constructors_may_be_missing_inherited_generated_or_open() -> None:
     assert find(PluginKind.DUAL, "plain").options == {}
     assert isinstance(find(PluginKind.DUAL, "plain").create({}), Plain)
@@ -300,18 +294,6 @@ def test_constructors_may_be_missing_inherited_generated_or_open() -> None:
     assert find(PluginKind.DUAL, "record").create({"width": 2.0}) == Record(2.0)
     assert "float > 0" in refusal(find(PluginKind.DUAL, "record").check_options, {"width": -1.0})
     assert find(PluginKind.DUAL, "open").create({"width": 2.0}).given == {"width": 2.0}
-
-
-@pytest.mark.usefixtures("_own")
-def test_options_are_listed_in_words() -> None:
-    options = find(PluginKind.DUAL, "choosy").options
-    listed = {name: (option.expected, str(option).partition(" = ")[2]) for name, option in options.items()}
-    assert listed["weight"] == ("float > 0 and < 1", "")
-    assert listed["count"] == ("int ≥ 1 and ≤ 9", "3")
-    assert listed["mode"] == ("'slow', 'fast'", "'slow'")
-    assert listed["grid"] == ("'coarse', 'fine' or int ≥ 2", "'coarse'")
-    assert listed["exact"] == ("bool", "False")
-    assert listed["anything"][0] == "any value"
 
 
 def test_code_follows_sources(register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -49,16 +49,13 @@ def test_it_is_the_best_of_all_active_sets(seed: int, n: int, m: int) -> None:
     assert 0.5 * found.x @ vi.A @ found.x - vi.f @ found.x == pytest.approx(min(energies), rel=1e-8, abs=1e-10)
 
 
-def test_it_is_nearer_than_any_solver() -> None:
+def test_solutions_are_nearer_than_any_solver_s_and_may_have_many_multipliers() -> None:
     """A scale of stiffness like that of a reduced contact problem, 1e11, and loads of 1e6."""
     vi = program(3, 12, 9)
     stiff = VariationalInequality(1e11 * vi.A, 1e11 * vi.f, vi.B, vi.g)
     found, answer = exact_solution(stiff), solve_qp(stiff, "piqp", 1e-7)
     assert kkt_residuals(stiff, found.x, found.alpha).worst <= 1e-12
     assert np.linalg.norm(answer.x - found.x) < 1e-3 * np.linalg.norm(found.x)
-
-
-def test_multipliers_of_equal_constraints_are_not_unique() -> None:
     vi = program(0, 4, 3)
     vi = VariationalInequality(vi.A, vi.f + 10.0 * vi.B[0], vi.B, vi.g)  # which presses on the first
     once = exact_solution(vi)
@@ -67,9 +64,6 @@ def test_multipliers_of_equal_constraints_are_not_unique() -> None:
     assert (once.unique, twice.unique) == (True, False)
     assert np.allclose(twice.x, once.x, atol=1e-12)
     assert np.isclose(twice.alpha[0] + twice.alpha[3], once.alpha[0])
-
-
-def test_what_has_no_solution_gets_none_and_no_unknowns_are_a_solution() -> None:
     indefinite = VariationalInequality(np.diag([1.0, -1.0]), np.ones(2), np.eye(2), np.ones(2))
     infeasible = VariationalInequality(np.eye(1), np.ones(1), np.array([[1.0], [-1.0]]), np.array([-1.0, -1.0]))
     assert exact_solution(indefinite) is exact_solution(infeasible) is None
@@ -77,7 +71,7 @@ def test_what_has_no_solution_gets_none_and_no_unknowns_are_a_solution() -> None
     assert exact_solution(empty).alpha.tolist() == [0.0, 0.0]
 
 
-def test_of_parallel_rows_the_tightest_is_kept_and_opposite_ones_without_room_are_an_equality() -> None:
+def test_of_parallel_rows_the_tightest_is_kept_and_rows_that_differ_are_all() -> None:
     lines = "1 2 0; -2 -4 0; 0 0 1; 0 0 -3; 1 0 0; 5 0 0; 0 1e-9 0; 0 0 0; 0.1 0.2 0; 0 0 7; -1 1 1"
     B = sp.csr_array([[float(entry) for entry in line.split()] for line in lines.split(";")])
     g = np.array([1.0, -2.0, 5.0, 1.0, 2.0, 3.0, np.inf, 1.0, 0.1, 35.0, 0.0])
@@ -93,6 +87,12 @@ def test_of_parallel_rows_the_tightest_is_kept_and_opposite_ones_without_room_ar
     assert other.opposite[0] in {0, 8}
     room = rows_that_matter(B, g + 1e-3 * np.isin(np.arange(11), [0, 8]), 1e-12 * np.abs(g))
     assert not room.equal.any()
+    B = np.random.default_rng(0).standard_normal((4, 6))
+    B[1] = B[0] * (1.0 + 1e-9 * np.arange(6))
+    B[2] = -B[0] * (1.0 - 1e-9 * np.arange(6))
+    rows = rows_that_matter(sp.csr_array(B), np.zeros(4), np.ones(4))
+    assert rows.kept.tolist() == [0, 1, 2, 3]
+    assert not rows.equal.any()
 
 
 @given(st.integers(0, 10_000))
@@ -111,12 +111,3 @@ def test_multipliers_of_the_rows_that_matter_are_the_same_forces_on_all_rows(see
     lam = rows.multipliers(forces, 15)
     assert np.all(lam >= 0.0)
     np.testing.assert_allclose(vi.B.T @ lam, rows.program(vi).B.T @ forces, rtol=0.0, atol=1e-12)
-
-
-def test_rows_that_differ_are_kept() -> None:
-    B = np.random.default_rng(0).standard_normal((4, 6))
-    B[1] = B[0] * (1.0 + 1e-9 * np.arange(6))
-    B[2] = -B[0] * (1.0 - 1e-9 * np.arange(6))
-    rows = rows_that_matter(sp.csr_array(B), np.zeros(4), np.ones(4))
-    assert rows.kept.tolist() == [0, 1, 2, 3]
-    assert not rows.equal.any()

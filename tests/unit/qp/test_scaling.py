@@ -97,16 +97,13 @@ def test_far_constraints_have_no_part_in_the_units(seed: int, far: float) -> Non
     assert verification.kkt_residuals(loaded, np.full(1, 0.5), np.zeros(1)).dual == 1.0
 
 
-def test_sparse_members_have_the_units_of_dense_ones() -> None:
+def test_sparse_and_zero_data_have_units_too() -> None:
     vi = indentation(5, 2, 3)
     sparse = VariationalInequality(sp.csc_array(vi.A), vi.f, sp.csr_array(vi.B), vi.g)
     one, other = units_of(vi), units_of(sparse)
     assert (one.length, one.force) == (pytest.approx(other.length), pytest.approx(other.force))
     assert np.allclose(other.scaled(sparse).B.toarray(), one.scaled(vi).B)
     assert np.allclose(other.scaled(sparse).A.toarray(), one.scaled(vi).A)
-
-
-def test_data_that_are_zero_have_units_too() -> None:
     nothing = VariationalInequality(np.zeros((2, 2)), np.zeros(2), np.zeros((1, 2)), np.zeros(1))
     unconstrained = VariationalInequality(np.eye(2), np.zeros(2), np.zeros((0, 2)), np.zeros(0))
     for vi in (nothing, unconstrained):

@@ -29,7 +29,7 @@ def program(seed: int, n: int = 6, m: int = 4, sizes: tuple[int, int] = (-4, 4))
     return VariationalInequality(spd(n, rng), 1e-3 * rng.standard_normal(n) * 50.0, B, g)
 
 
-def test_programs_without_unknowns_or_constraints() -> None:
+def test_programs_sparse_or_without_unknowns_or_constraints_are_solved() -> None:
     for bound, status in ((1.0, "ok"), (-1.0, "infeasible")):
         vi = VariationalInequality(np.zeros((0, 0)), np.zeros(0), np.zeros((1, 0)), np.array([bound]))
         assert verification.verify(vi, solve_qp(vi, "osqp", 1e-8), 1e-8)[0] == status
@@ -37,11 +37,16 @@ def test_programs_without_unknowns_or_constraints() -> None:
     answer = solve_qp(vi, "piqp", 1e-8)
     assert verification.verify(vi, answer, 1e-8)[0] is Status.OK
     assert np.allclose(answer.x, np.arange(3.0), atol=1e-7)
+    vi = program(3)
+    sparse = VariationalInequality(sp.csc_array(vi.A), vi.f, sp.csr_array(vi.B), vi.g)
+    answer = solve_qp(sparse, "piqp", 1e-9)
+    assert np.allclose(answer.x, exact(vi)[0], atol=1e-7)
+    assert verification.kkt_residuals(sparse, answer.x, answer.alpha).worst <= 1e-9
 
 
 @pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])
 @pytest.mark.parametrize("accuracy", [1e-5, 1e-7])
-def test_required_solvers_reach_the_accuracy_they_are_asked_for(solver: str, accuracy: float) -> None:
+def test_required_solvers_reach_the_accuracy_of_primal_and_dual_programs(solver: str, accuracy: float) -> None:
     for seed in range(30):
         vi = program(seed)
         if abs(vi.f @ exact(vi)[0]) < 0.05 * np.abs(vi.f).max():
@@ -53,14 +58,12 @@ def test_required_solvers_reach_the_accuracy_they_are_asked_for(solver: str, acc
         assert answer.iterations is not None
         x, _ = exact(vi)
         assert np.allclose(answer.x, x, atol=200.0 * accuracy * (1.0 + np.abs(x).max()))
-
-
-def test_sparse_programs_go_through_the_same_door() -> None:
-    vi = program(3)
-    sparse = VariationalInequality(sp.csc_array(vi.A), vi.f, sp.csr_array(vi.B), vi.g)
-    answer = solve_qp(sparse, "piqp", 1e-9)
-    assert np.allclose(answer.x, exact(vi)[0], atol=1e-7)
-    assert verification.kkt_residuals(sparse, answer.x, answer.alpha).worst <= 1e-9
+    for seed in range(30):
+        vi = program(seed)
+        primal, dual = (solve_qp(vi, solver, 1e-9, factor=L) for L in (None, np.linalg.cholesky(vi.A)))
+        assert verification.verify(vi, primal, 1e-8)[0] is Status.OK
+        assert verification.verify(vi, dual, 1e-8)[:2] == (Status.OK, ""), seed
+        assert np.allclose(dual.x, exact(vi)[0], atol=1e-6 * max(1.0, np.abs(primal.x).max()))
 
 
 @given(seeds, st.integers(1, 7), st.integers(0, 5))
@@ -78,17 +81,7 @@ def test_with_a_factor_of_a_the_dual_is_solved_and_gives_the_same_solution(seed:
     assert verification.kkt_residuals(vi, dual.x, dual.alpha).dual <= 1e-12  # x is made from α, whatever the solver did
 
 
-@pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])
-def test_the_dual_of_a_program_with_rows_of_very_different_sizes_is_solved_to_the_accuracy(solver: str) -> None:
-    for seed in range(30):
-        vi = program(seed)
-        primal, dual = (solve_qp(vi, solver, 1e-9, factor=L) for L in (None, np.linalg.cholesky(vi.A)))
-        assert verification.verify(vi, primal, 1e-8)[0] is Status.OK
-        assert verification.verify(vi, dual, 1e-8)[:2] == (Status.OK, ""), seed
-        assert np.allclose(dual.x, exact(vi)[0], atol=1e-6 * max(1.0, np.abs(primal.x).max()))
-
-
-def test_negative_multipliers_are_set_to_zero_and_reported() -> None:
+def test_negative_multipliers_missing_answers_and_nan_are_reported() -> None:
     vi = VariationalInequality(np.diag([2.0, 3.0]), np.array([2.0, 3.0]), np.eye(2), np.array([0.5, 2.0]))
     wrong = {"wrong": lambda *_: QPSolution(np.array([1.0, -0.1]), np.zeros(2), "solved", 4)}
     answer = solve_qp(vi, "wrong", 1e-7, wrong, np.diag(np.sqrt([2.0, 3.0])))  # of the dual program
@@ -102,9 +95,6 @@ def test_negative_multipliers_are_set_to_zero_and_reported() -> None:
     assert answer.alpha.tolist() == [0.5, 0.0]
     assert np.isclose(answer.negative, 0.1)
     assert "multipliers down to -1e-01" in verification.verify(vi, answer, 1e-7)[1]
-
-
-def test_a_solver_that_gives_up_on_the_dual_or_answers_no_number_is_seen() -> None:
     vi = program(3)
     answer = solve_qp(vi, "no", 1e-7, {"no": lambda *_: QPSolution(None, None, "gave up")}, np.linalg.cholesky(vi.A))
     assert (answer.x, answer.alpha, answer.solver_status) == (None, None, "gave up")
@@ -232,13 +222,18 @@ def test_bounds_give_what_rows_give(solver: str, monkeypatch: pytest.MonkeyPatch
         assert np.allclose(one.alpha, other.alpha, rtol=0.0, atol=1e-8)
 
 
-def test_a_tighter_accuracy_never_asks_for_less() -> None:
+def test_reports_are_found_and_a_tighter_accuracy_never_asks_for_less() -> None:
     for settings in SETTINGS.values():
         loose, tight = settings.at(1e-4), settings.at(1e-8)
         assert loose.keys() == tight.keys()
         for key, value in tight.items():
             if isinstance(value, float) and not isinstance(loose[key], bool):
                 assert value <= loose[key]
+    info = SimpleNamespace(status="fine", iter=np.array([7, 0]))
+    solution = SimpleNamespace(extras={"info": info, "iterations": np.array([7, 0])}, found=True)
+    assert SETTINGS["osqp"].report(solution) == ("fine", 7)
+    assert SETTINGS["quadprog"].report(solution) == ("found", 7)
+    assert SETTINGS["highs"].report(SimpleNamespace(extras={}, found=False)) == ("not found", None)
 
 
 @pytest.mark.parametrize("solver", sorted(set(SETTINGS) & set(installed_solvers())))
@@ -248,11 +243,3 @@ def test_settings_are_words_the_installed_solver_understands(solver: str) -> Non
     assert np.allclose(answer.x, 0.5, atol=1e-4)
     assert np.allclose(answer.alpha, 0.5, atol=1e-4)
     assert answer.solver_status
-
-
-def test_reports_are_found_wherever_a_solver_leaves_them() -> None:
-    info = SimpleNamespace(status="fine", iter=np.array([7, 0]))
-    solution = SimpleNamespace(extras={"info": info, "iterations": np.array([7, 0])}, found=True)
-    assert SETTINGS["osqp"].report(solution) == ("fine", 7)
-    assert SETTINGS["quadprog"].report(solution) == ("found", 7)
-    assert SETTINGS["highs"].report(SimpleNamespace(extras={}, found=False)) == ("not found", None)

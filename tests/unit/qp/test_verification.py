@@ -38,7 +38,7 @@ def same(one: Residuals, other: Residuals) -> None:
         assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-6, abs=1e-12), name
 
 
-def test_as_defined_by_hand() -> None:
+def test_residuals_are_those_defined_and_hide_neither_nan_nor_indefinite_matrices() -> None:
     vi = VariationalInequality(A=np.diag([4.0, 1.0]), f=np.array([4.0, 1.0]), B=np.array([[2.0, 0.0]]), g=np.ones(1))
     x, alpha = np.array([0.75, 1.0]), np.array([0.25])
     energy = np.sqrt(4.0 * 0.75**2 + 1.0 + 0.5**2 / 4.0)  # ‖x‖²_A and (2 · 0.25)² / 4
@@ -47,6 +47,11 @@ def test_as_defined_by_hand() -> None:
     assert found.dual == pytest.approx(abs(4.0 - 3.0 - 0.5) / 2.0 / energy)
     assert found.gap == pytest.approx(0.25 * 0.5 / energy**2)
     assert found.worst == max(found.primal, found.dual, found.gap)
+    empty = VariationalInequality(np.zeros((0, 0)), np.zeros(0), np.zeros((1, 0)), np.ones(1))
+    assert kkt_residuals(empty, np.zeros(0), np.zeros(1)).worst == 0.0
+    assert not kkt_residuals(program(0), np.full(6, np.nan), np.zeros(4)).worst <= 1.0
+    with pytest.raises(NumericalError, match="A is not positive definite"):
+        kkt_residuals(replace(program(0), A=-np.eye(6)), np.ones(6), np.zeros(4))
 
 
 @given(seeds, st.integers(-9, 9), st.integers(-9, 9), st.booleans())
@@ -81,7 +86,7 @@ def test_they_bound_the_error_and_vanish_with_it(seed: int) -> None:
     assert found.worst >= 1e-3 * (e @ vi.A @ e) / energy**2
 
 
-def test_a_membrane_in_small_units_without_contact_is_no_solution() -> None:
+def test_small_units_far_gaps_and_missing_loads_hide_no_error() -> None:
     """An absolute floor of the primal residual called the unconstrained solution ok."""
     vi = program(3)
     small = VariationalInequality(vi.A, 1e-9 * vi.f, vi.B, 1e-9 * vi.g)
@@ -90,31 +95,16 @@ def test_a_membrane_in_small_units_without_contact_is_no_solution() -> None:
     status, reason, _ = verify(small, QPSolution(x, np.zeros(4), "solved"), 1e-6)
     assert status is Status.INACCURATE
     assert reason.startswith("primal residual")
-
-
-def test_far_gaps_are_no_scale() -> None:
-    """Without load, an error of 10 % of the penetration beside a gap that is far away."""
     for far in (2e5, 2e7, 1e20):
         vi = VariationalInequality(np.eye(2), np.zeros(2), np.eye(2), np.array([-1.0, far]))
         for depth, status in ((1.0, Status.OK), (0.9, Status.INACCURATE), (1.1, Status.INACCURATE)):
             answer = QPSolution(np.array([-depth, 0.0]), np.array([depth, 0.0]), "")
             assert verify(vi, answer, 1e-8)[0] is status
-
-
-def test_what_nothing_drives_stays_where_it_is() -> None:
     vi = VariationalInequality(np.diag([4.0, 1.0]), np.zeros(2), np.eye(2), np.array([0.0, 1e20]))
     found = solve_qp(vi, "piqp", 1e-8)
     assert (found.x.tolist(), found.alpha.tolist()) == ([0.0, 0.0], [0.0, 0.0])
     assert kkt_residuals(vi, found.x, found.alpha).worst == 0.0
     assert kkt_residuals(vi, np.array([1e-9, 0.0]), np.zeros(2)).dual == pytest.approx(1.0)  # no other scale is there
-
-
-def test_no_data_have_no_residual_and_what_is_no_number_or_not_definite_is_not_hidden() -> None:
-    empty = VariationalInequality(np.zeros((0, 0)), np.zeros(0), np.zeros((1, 0)), np.ones(1))
-    assert kkt_residuals(empty, np.zeros(0), np.zeros(1)).worst == 0.0
-    assert not kkt_residuals(program(0), np.full(6, np.nan), np.zeros(4)).worst <= 1.0
-    with pytest.raises(NumericalError, match="A is not positive definite"):
-        kkt_residuals(replace(program(0), A=-np.eye(6)), np.ones(6), np.zeros(4))
 
 
 def test_contradictions_are_certified_beside_a_far_row() -> None:

@@ -46,16 +46,13 @@ def test_copies_and_near_copies_add_nothing(seed: int, count: int, copies: int, 
         assert np.isclose(abs(X.gram(found, single)[0, 0]), X.norm(single)[0], rtol=1e-6)
 
 
-def test_the_smallest_size_that_meets_the_tolerance_is_taken() -> None:
+def test_the_smallest_size_of_a_tolerance_is_taken_and_none_above_the_rank() -> None:
     X = space(8)
     q = X.orthonormalise(np.random.default_rng(0).standard_normal((8, 4)))
     for tolerance, size in ((0.5, 1), (1e-3, 2), (1e-5, 3), (1e-7, 4)):
         assert pod(q * np.array([1.0, 1e-2, 1e-4, 1e-6]), X, Stop(tolerance=tolerance)).basis.shape[1] == size
     errors = pod(q[:, :3] * np.array([1.0, 1e-5, 1e-10]), X, Stop(size=3)).errors
     assert np.isclose(errors[2], 1e-10, rtol=1e-4)  # eigenvalues of the Gram matrix would floor at 1e-8
-
-
-def test_more_modes_than_the_rank_are_refused() -> None:
     X = space(6)
     snapshots = np.outer(np.arange(1.0, 7.0), [1.0, 2.0, 3.0])
     assert pod(snapshots, X, Stop(tolerance=1e-9)).basis.shape[1] == 1

@@ -111,7 +111,9 @@ def test_a_known_inverse_proves_it_from_the_compliance_alone(angle: float) -> No
     assert contact.of_inverse(B, B @ np.asarray(B @ (1.01 * accurate)).T, W).value <= exact
 
 
-def test_what_a_complement_may_be_too_soft_by_is_taken_from_the_constant() -> None:
+def test_estimates_too_large_or_complements_too_soft_cost_sharpness_or_the_proof(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Ŝ of a matrix P with A ≼ P / (1 − δ/σ), here exactly so: without δ/σ more than β_A would be proved."""
     vi, W, exact = varying(40)
     for lost in (1e-2, 0.4):
@@ -122,9 +124,6 @@ def test_what_a_complement_may_be_too_soft_by_is_taken_from_the_constant() -> No
         assert 0.0 < found.value <= exact
         assert condensed(softer, np.unique(vi.B.indices))[0].energy_inf_sup(B, stiffness.liftings(B), W).value > exact
     assert condensed(vi.A, np.unique(vi.B.indices), 0.6)[0].energy_inf_sup(B, stiffness.liftings(B), W).value == 0.0
-
-
-def test_an_estimate_that_is_too_large_costs_sharpness_or_the_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     vi, W, _ = varying()
     contact, stiffness = condensed(sp.csc_array(vi.A), np.unique(vi.B.indices))
     B = sp.csr_array(sp.csc_array(vi.B)[:, stiffness.retained])
@@ -140,15 +139,12 @@ def test_an_estimate_that_is_too_large_costs_sharpness_or_the_proof(monkeypatch:
         assert found == Constant(pytest.approx(expected), True)
 
 
-def test_the_fraction_of_the_diagonal_is_below_and_near_the_largest() -> None:
+def test_fractions_of_diagonals_are_near_the_largest_and_wrong_entries_unproved() -> None:
     for n in (3, 40):
         X = space(n, 7)
         unit = 1.0 / np.sqrt(X.matrix.diagonal())
         largest = float(np.linalg.eigvalsh(X.matrix.toarray() * np.outer(unit, unit))[0])
         assert largest / 1.6 < share_of_diagonal(X) <= largest
-
-
-def test_a_matrix_with_a_wrong_entry_is_not_proved_positive() -> None:
     assert contact_infsup._proved_positive(np.eye(4) + 0.25, 1e-3)
     assert not contact_infsup._proved_positive(np.eye(4) + 0.25, 1.0)  # more is left out than the smallest eigenvalue
     for wrong, place in product([np.nan, np.inf, 0.0, -1.0], [(0, 0), (3, 3), (2, 1)]):

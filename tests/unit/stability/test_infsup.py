@@ -100,16 +100,13 @@ def test_the_order_of_the_constants(mu: float) -> None:
     assert np.isclose(full.scaled(-2.0).span, 2.0 * full.span)
 
 
-def test_the_high_fidelity_constant_against_the_dense_eigenproblem() -> None:
+def test_the_full_constant_against_the_dense_eigenproblem_and_for_nearly_parallel_generators() -> None:
     problem = Varying()
     B = problem.assemble(np.array([0.7])).B
     S = (B @ np.linalg.solve(problem.V.matrix.toarray(), B.T.toarray())).astype(float)
     smallest = scipy.linalg.eigh(S, problem.W.matrix.toarray(), eigvals_only=True)[0]
     found = inf_sup_full(problem.V, B, nodal_cone(problem.W))
     assert np.isclose(found.span, np.sqrt(smallest), rtol=1e-8)
-
-
-def test_nearly_parallel_generators_do_not_push_the_constant_below_the_high_fidelity_one() -> None:
     V, W = InnerProduct(sp.eye_array(6)), InnerProduct(sp.eye_array(4))
     B = sp.csr_array(np.eye(4, 6) * np.array([[1.0], [0.5], [0.1], [0.01]]))
     base = np.array([1.0, 1.0, 1.0, 0.0])
@@ -200,7 +197,7 @@ def test_hard_cases_are_known_to_one_percent() -> None:
             assert upper - lower <= 0.01 * upper + 1e-7
 
 
-def test_ten_generators_of_which_the_minimum_needs_many() -> None:
+def test_intervals_where_many_generators_count_or_the_program_is_not_exact() -> None:
     C, G = random_pair(5, 7, 10, 0.4)
     M = C.T @ C
     lower, upper, sharp = cone_interval(C, G, 0.0)
@@ -209,9 +206,6 @@ def test_ten_generators_of_which_the_minimum_needs_many() -> None:
     assert lower <= exact <= upper * (1.0 + 1e-9)
     assert upper - lower <= 0.01 * upper
     assert sharp == "SDP/U2"
-
-
-def test_where_the_semidefinite_program_is_not_exact_the_interval_stays_wide_and_certified() -> None:
     M, G = HORN + 1.5 * np.eye(5), np.eye(5)  # the smallest quotient is 1.5, at two neighbours of the pentagon
     assert minimum_by_faces(M, G) == pytest.approx(np.sqrt(1.5))
     lower, upper, sharp = cone_interval(np.linalg.cholesky(M).T, G, 0.5)
@@ -230,7 +224,7 @@ def test_certificates_hold_whatever_the_iterations_reached(seed: int, count: int
     assert exact <= upper * (1.0 + 1e-9) + 1e-12
 
 
-def test_zeros_of_the_gram_matrix_that_were_rounded_limit_nothing() -> None:
+def test_intervals_of_special_cases_and_rounded_zeros() -> None:
     """Neighbours touch, others do not; the products of the images are all positive."""
     G = np.eye(4) + 0.3 * np.diag(np.ones(3), 1) + 0.3 * np.diag(np.ones(3), -1)
     M = np.ones((4, 4)) + np.diag([1.0, 2.0, 3.0, 4.0])
@@ -238,9 +232,6 @@ def test_zeros_of_the_gram_matrix_that_were_rounded_limit_nothing() -> None:
         assert entrywise_bound(M, np.where(G == 0.0, noise, G)) == 2.0
     M[0, 3] = M[3, 0] = -0.1
     assert entrywise_bound(M, G) == pytest.approx(2.0 - 4 * 0.1)
-
-
-def test_intervals_of_special_cases() -> None:
     G = np.array([[1.0, 0.2], [0.2, 1.0]])
     # a point where the minimum sits on a generator
     assert cone_interval(np.array([[1.0, 0.9], [0.0, 1.5]]), G, 0.1) == (1.0, 1.0, "L½/U0")

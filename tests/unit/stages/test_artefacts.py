@@ -135,7 +135,7 @@ def test_artefacts_are_kept_up_to_so_many_bytes_and_those_used_long_ago_go_first
     assert store.get("large") is not large
 
 
-def test_what_is_stored_is_counted_and_cleared(tmp_path: Path) -> None:
+def test_stored_artefacts_are_counted_and_cleared_unless_in_use(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.put("podstage-1", 1, TIME, ())
     store.put("conestage-1", list(range(1000)), TIME, ())
@@ -146,9 +146,6 @@ def test_what_is_stored_is_counted_and_cleared(tmp_path: Path) -> None:
     assert store.clear() == sum(counted.values())
     assert store.contents() == []
     assert Store(tmp_path / "nowhere").clear() == 0
-
-
-def test_what_runs_use_is_not_cleared(tmp_path: Path) -> None:
     one, two = Store(tmp_path), Store(tmp_path)
     one.put("key", 1, TIME, ())
     with one.used(), two.used(), pytest.raises(RequestError, match="a run uses the artefacts in"):

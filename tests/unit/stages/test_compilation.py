@@ -47,7 +47,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
     return vibench.run(STUDY, tmp_path_factory.mktemp("compiled") / "run", progress=False, jobs=1)
 
 
-def test_a_compiled_cell_has_the_rows_of_the_reduced_one(run: vibench.Run) -> None:
+def test_compiled_cells_have_the_rows_of_reduced_ones_and_are_no_solver(run: vibench.Run) -> None:
     cells = run.cells.set_index(["formulation", "solver"]).sort_index()
     assert list(cells.index) == [("compiled", "–"), ("mixed", "osqp"), ("mixed", "piqp")]
     mine, other = cells.loc[("compiled", "–")], cells.loc[("mixed", "piqp")]
@@ -63,6 +63,12 @@ def test_a_compiled_cell_has_the_rows_of_the_reduced_one(run: vibench.Run) -> No
     assert (rows[["primal_residual", "dual_residual", "gap"]] <= 1e-9).all(axis=None)
     for name in ("error_u", "error_lambda", "bound_u_energy"):
         assert np.allclose(rows[name], expected[name], rtol=1e-3, atol=1e-7)  # PIQP solves to 1e-7
+    queries = run.table("queries")
+    kept = set(of_solvers(queries)["cell"])
+    assert kept == set(run.cells[run.cells["formulation"] == "mixed"]["cell"]) < set(queries["cell"])
+    compared = run.table("disagreements")
+    assert len(compared) > 0
+    assert (compared["solver_a"] != compared["solver_b"]).all()
 
 
 def test_a_crash_costs_its_query_alone(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,7 +82,7 @@ def test_a_crash_costs_its_query_alone(run: vibench.Run, tmp_path: Path, monkeyp
     assert set(queries.drop(heights.index[-1])["status"]) == {"ok"}
 
 
-def test_without_a_compiler_a_line_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compilers_are_looked_for_by_name_or_missed_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", "no-such-compiler -O2")
     other = [{"name": "radial-obstacle", "options": {"resolution": 140}}]  # whose formulation nobody has built
     study = small_study("without", other, formulation=["mixed", "compiled"], assembly=["reduced"], validation=1)
@@ -85,6 +91,13 @@ def test_without_a_compiler_a_line_says_why(tmp_path: Path, monkeypatch: pytest.
     reason = "in formulation: the environment variable CC names the C compiler 'no-such-compiler', which is not found"
     assert cells.loc["compiled", "reason"] == reason
     assert cells.loc["mixed", "status"] == "ok"
+    monkeypatch.setenv("CC", f"{shutil.which('cc')} -g")
+    assert compiler() == [shutil.which("cc"), "-g"]
+    monkeypatch.delenv("CC")
+    assert compiler() == ["cc"]
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UnsupportedError, match="none of cc, gcc, clang is on the PATH; install one, or name it in"):
+        compiler()
 
 
 def polynomial(value: np.ndarray, slope: float = 0.0) -> AffinePolynomial:
@@ -103,7 +116,7 @@ def small_model(**members: np.ndarray) -> CompiledModel:
     return CompiledModel(polynomials, np.zeros(2), np.ones(2), ("s", "t"), ("1", "m"), 1e-9)
 
 
-def test_a_program_answers_and_says_what_it_cannot() -> None:
+def test_programs_answer_say_what_they_cannot_and_are_repeated_near_by() -> None:
     program, strided = small_model().program(), np.array([[0.3, 9.0], [0.5, 9.0], [1.0, 9.0], [7.0, 9.0]])[:, 0]
     for mu, limit in ((strided[:2], 0.25), (strided[1:3], 0.3), (strided[[3, 1]], 0.25)):  # the last one is outside
         found = program(mu)
@@ -117,35 +130,32 @@ def test_a_program_answers_and_says_what_it_cannot() -> None:
     assert (found.x, found.alpha, found.solver_status) == (None, None, "the constraints contradict each other")
     found = small_model(A=np.array([1.0, 2.0, 1.0])).program()(middle)
     assert (found.x, found.solver_status) == (None, "not solved")
+    vi = VariationalInequality(np.eye(2), np.array([1.0, 0.0]), LIMITS, np.array([0.25, 1.0]))
+    program = small_model().program()
+    answers = SimpleNamespace(program=lambda mu: SimpleNamespace(program=(mu, vi)), solve=lambda mu, _: program(mu))
+    model = SimpleNamespace(online=answers, settings=lambda _: (None, None))
+    query = ModelQuery(model, np.full(2, 0.5), lambda *seed: np.array([0.5, 0.5 + 1e-10 * seed[0]]), vi)  # type: ignore[arg-type]
+    other = query.repeated(3, 1)
+    assert other.mu[1] == other.program[0][1] == 0.5 + 3e-10  # type: ignore[index]
+    for one, limit in ((query, 0.25), (other, 0.25 * (1.0 + 1.2e-10))):
+        answer, seconds = one.prepare(nullcontext)()
+        assert answer.x is not None
+        assert answer.x[0] == pytest.approx(limit, rel=1e-14)
+        assert seconds.cpu > 0.0
 
 
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
+def test_a_failing_compiler_is_quoted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for text, reason in (
         ("echo 'model.c:1:1: error: no space' >&2; exit 3", r"compiler' failed \(3\): model.c:1:1: error: no space$"),
         ("exit 1", r"failed \(1\): it says nothing$"),
         ("exit 0", r"failed \(0\): it says nothing$"),  # and makes no file
-    ],
-)
-def test_a_failing_compiler_is_quoted(text: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CC", script(tmp_path, text))
-    with pytest.raises(UnsupportedError, match=reason):
-        small_model().program()
+    ):
+        monkeypatch.setenv("CC", script(tmp_path, text))
+        with pytest.raises(UnsupportedError, match=reason):
+            small_model().program()
 
 
-def test_compilers_are_looked_for_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CC", f"{shutil.which('cc')} -g")
-    assert compiler() == [shutil.which("cc"), "-g"]
-    monkeypatch.delenv("CC")
-    assert compiler() == ["cc"]
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(UnsupportedError, match="none of cc, gcc, clang is on the PATH; install one, or name it in"):
-        compiler()
-
-
-def test_no_program_of_a_model_that_is_too_large_or_not_smooth(
-    run: vibench.Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_models_too_large_or_not_smooth_have_no_program(run: vibench.Run, monkeypatch: pytest.MonkeyPatch) -> None:
     reduced = run.model(str(run.cells["cell"].iloc[0])).reduced
 
     def interpolated(*_: object, **__: object) -> None:
@@ -164,27 +174,3 @@ def test_no_program_of_a_model_that_is_too_large_or_not_smooth(
     monkeypatch.setattr(compiled, "member_polynomials", inaccurate)
     with pytest.raises(UnsupportedError, match="the model cannot be exported to C: B is not smooth"):
         CompiledModel.of(reduced, 1e-9)
-
-
-def test_repetitions_are_posed_at_parameters_near_by() -> None:
-    vi = VariationalInequality(np.eye(2), np.array([1.0, 0.0]), LIMITS, np.array([0.25, 1.0]))
-    program = small_model().program()
-    answers = SimpleNamespace(program=lambda mu: SimpleNamespace(program=(mu, vi)), solve=lambda mu, _: program(mu))
-    model = SimpleNamespace(online=answers, settings=lambda _: (None, None))
-    query = ModelQuery(model, np.full(2, 0.5), lambda *seed: np.array([0.5, 0.5 + 1e-10 * seed[0]]), vi)  # type: ignore[arg-type]
-    other = query.repeated(3, 1)
-    assert other.mu[1] == other.program[0][1] == 0.5 + 3e-10  # type: ignore[index]
-    for one, limit in ((query, 0.25), (other, 0.25 * (1.0 + 1.2e-10))):
-        answer, seconds = one.prepare(nullcontext)()
-        assert answer.x is not None
-        assert answer.x[0] == pytest.approx(limit, rel=1e-14)
-        assert seconds.cpu > 0.0
-
-
-def test_no_solver_is_compared_by_answers_of_a_program(run: vibench.Run) -> None:
-    queries = run.table("queries")
-    kept = set(of_solvers(queries)["cell"])
-    assert kept == set(run.cells[run.cells["formulation"] == "mixed"]["cell"]) < set(queries["cell"])
-    compared = run.table("disagreements")
-    assert len(compared) > 0
-    assert (compared["solver_a"] != compared["solver_b"]).all()

@@ -74,7 +74,9 @@ def test_keys_say_what_determines_a_stage_and_nothing_else() -> None:
     assert len(keys) == 2 + CHUNKS
 
 
-def test_chunks_make_up_the_whole_sweep_in_order(store: SampleStore) -> None:
+def test_chunks_make_up_the_whole_sweep_in_order_with_its_diagnostics(
+    store: SampleStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     found = gather(store, solution_stages(PROBLEM, OWN_TRAINING))
     problem = PROBLEM.create()
     assert np.array_equal(found.mu, problem.training_set())
@@ -83,17 +85,10 @@ def test_chunks_make_up_the_whole_sweep_in_order(store: SampleStore) -> None:
     assert all(s.cpu > 0.0 for s in found.seconds)
     validation = gather(store, solution_stages(PROBLEM, VALIDATION))
     assert np.array_equal(validation.mu, problem.validation_set(9, 3))
-
-
-def test_few_parameters_leave_empty_chunks(tmp_path: Path) -> None:
-    store = SampleStore(tmp_path)
-    chunks = solution_stages(PROBLEM, ParameterSet("validation", 3, 1))
-    for chunk in chunks:
-        carry_out(chunk, store)
-    assert gather(store, chunks).mu.shape == (3, 3)
-
-
-def test_diagnostics_are_kept_beside_the_solutions(store: SampleStore) -> None:
+    own_store, chunks = SampleStore(tmp_path), solution_stages(PROBLEM, ParameterSet("validation", 3, 1))
+    for chunk in chunks:  # few parameters leave some of them empty
+        carry_out(chunk, own_store)
+    assert gather(own_store, chunks).mu.shape == (3, 3)
     steps = {}
     for chunk in solution_stages(PROBLEM, OWN_TRAINING):
         for history in store.get(chunk.key).histories:
@@ -101,9 +96,12 @@ def test_diagnostics_are_kept_beside_the_solutions(store: SampleStore) -> None:
             steps |= {history.first_step + k: v for k, v in enumerate(history.values)}
     assert sorted(steps) == list(range(125))
     assert min(steps.values()) >= 1.0
+    monkeypatch.setattr(problem, "diagnostics", lambda mu: {})
+    monkeypatch.setattr(snapshots, "build_problem", lambda plugin: problem)
+    assert SnapshotStage(PROBLEM, ParameterSet("validation", 2, 0), 0).run(None).histories == ()
 
 
-def test_histories_of_the_offline_stages(store: SampleStore) -> None:
+def test_histories_and_models_are_those_of_the_offline_stages(store: SampleStore) -> None:
     stage = cell("offline-pga", 0.5).built.enrichment
     pod = {h.quantity: h.values for h in store.get(stage.pod.key).histories}
     cone = {h.quantity: h.values for h in store.get(stage.cone.key).histories}
@@ -116,6 +114,13 @@ def test_histories_of_the_offline_stages(store: SampleStore) -> None:
     assert len(own) == len(full) == 125
     assert np.all(own >= np.sqrt(1.0 - 0.5**2) * full * (1.0 - 1e-9))
     assert np.isclose(min(own), added["beta_span_min"][-1])
+    enrichment = cell("online-supremizers", None).built.enrichment
+    model, basis = enrichment.reduction(store).projection, value_of(store, enrichment.pod).basis
+    prepared = value_of(store, enrichment.cone).prepared
+    assert model.kind is Kind.PER_PARAMETER
+    query = model.assemble(np.array([1.05, 0.01, -0.03]))
+    assert query.basis.shape[1] == basis.shape[1] + prepared.rank
+    assert query.program.B.shape == (prepared.chi.shape[1], query.basis.shape[1])
 
 
 @pytest.mark.parametrize("interpolation", [None, 1e-6])
@@ -146,49 +151,40 @@ def test_a_cell_of_a_nested_strategy_is_the_cell_built_alone(store: SampleStore,
             assert np.allclose(one.B, other.B, rtol=1e-10, atol=1e-13)
 
 
-def test_the_model_behind_a_cell_is_ready_for_queries(store: SampleStore) -> None:
-    enrichment = cell("online-supremizers", None).built.enrichment
-    model, basis = enrichment.reduction(store).projection, value_of(store, enrichment.pod).basis
-    prepared = value_of(store, enrichment.cone).prepared
-    assert model.kind is Kind.PER_PARAMETER
-    query = model.assemble(np.array([1.05, 0.01, -0.03]))
-    assert query.basis.shape[1] == basis.shape[1] + prepared.rank
-    assert query.program.B.shape == (prepared.chi.shape[1], query.basis.shape[1])
-
-
-@pytest.mark.parametrize(
-    ("primal", "tolerance", "kind"),
-    [("decorrelated", None, "none"), ("online-supremizers", None, "per-parameter"), ("offline-pga", 0.5, "fixed")],
-)
-def test_rows_of_a_cell(store: SampleStore, primal: str, tolerance: float | None, kind: str) -> None:
-    rows = value_of(store, cell(primal, tolerance))
-    assert rows.cell["enrichment_kind"] == kind
-    assert rows.cell["status"] == "ok"
-    assert rows.cell["queries"] == rows.cell["queries_ok"] == len(rows.queries) == 9
-    parts = ("snapshots", "pod", "cone", "enrichment", "assembly")
-    assert rows.cell["offline_s"] == pytest.approx(sum(rows.cell[f"offline_{part}_s"] for part in parts))
-    snapshots = sum((store.get(chunk.key).seconds for chunk in solution_stages(PROBLEM, OWN_TRAINING)), NO_TIME)
-    training, validation = (
-        gather(store, solution_stages(PROBLEM, OWN_TRAINING)),
-        gather(store, solution_stages(PROBLEM, VALIDATION)),
-    )
-    assert snapshots.cpu == pytest.approx(sum(seconds.cpu for seconds in training.seconds))
-    setup = median(seconds.cpu for seconds in (*training.setups, *validation.setups))
-    assert rows.cell["offline_snapshots_s"] == pytest.approx(snapshots.cpu + setup)
-    assert rows.cell["hf_setup_s"] == pytest.approx(setup)
-    assert rows.cell["hf_s"] == pytest.approx(mean(seconds.cpu for seconds in validation.seconds))
-    assert [row["hf_s"] for row in rows.queries] == [seconds.cpu for seconds in validation.seconds]
-    enrichment = store.get(cell(primal, tolerance).built.enrichment.key)
-    assert rows.cell["offline_enrichment_s"] == enrichment.seconds.cpu
-    chi = value_of(store, cell(primal, tolerance).built.enrichment.cone).cone.generators
-    gram = chi.T @ (PROBLEM.create().W.matrix @ chi)
-    assert rows.cell["gram_condition"] == pytest.approx(np.linalg.cond(gram), rel=1e-6)
-    expected = {"none": 0, "per-parameter": rows.cell["rank"]}
-    if kind in expected:
-        assert rows.cell["enrichment"] == expected[kind]
-    for row in rows.queries:
-        assert row["error_u"] < 0.05
-        assert max(row["primal_residual"], row["dual_residual"], row["gap"]) <= 1e-8
+def test_rows_of_a_cell(store: SampleStore) -> None:
+    for primal, tolerance, kind in (
+        ("decorrelated", None, "none"),
+        ("online-supremizers", None, "per-parameter"),
+        ("offline-pga", 0.5, "fixed"),
+    ):
+        rows = value_of(store, cell(primal, tolerance))
+        assert rows.cell["enrichment_kind"] == kind
+        assert rows.cell["status"] == "ok"
+        assert rows.cell["queries"] == rows.cell["queries_ok"] == len(rows.queries) == 9
+        parts = ("snapshots", "pod", "cone", "enrichment", "assembly")
+        assert rows.cell["offline_s"] == pytest.approx(sum(rows.cell[f"offline_{part}_s"] for part in parts))
+        snapshots = sum((store.get(chunk.key).seconds for chunk in solution_stages(PROBLEM, OWN_TRAINING)), NO_TIME)
+        training, validation = (
+            gather(store, solution_stages(PROBLEM, OWN_TRAINING)),
+            gather(store, solution_stages(PROBLEM, VALIDATION)),
+        )
+        assert snapshots.cpu == pytest.approx(sum(seconds.cpu for seconds in training.seconds))
+        setup = median(seconds.cpu for seconds in (*training.setups, *validation.setups))
+        assert rows.cell["offline_snapshots_s"] == pytest.approx(snapshots.cpu + setup)
+        assert rows.cell["hf_setup_s"] == pytest.approx(setup)
+        assert rows.cell["hf_s"] == pytest.approx(mean(seconds.cpu for seconds in validation.seconds))
+        assert [row["hf_s"] for row in rows.queries] == [seconds.cpu for seconds in validation.seconds]
+        enrichment = store.get(cell(primal, tolerance).built.enrichment.key)
+        assert rows.cell["offline_enrichment_s"] == enrichment.seconds.cpu
+        chi = value_of(store, cell(primal, tolerance).built.enrichment.cone).cone.generators
+        gram = chi.T @ (PROBLEM.create().W.matrix @ chi)
+        assert rows.cell["gram_condition"] == pytest.approx(np.linalg.cond(gram), rel=1e-6)
+        expected = {"none": 0, "per-parameter": rows.cell["rank"]}
+        if kind in expected:
+            assert rows.cell["enrichment"] == expected[kind]
+        for row in rows.queries:
+            assert row["error_u"] < 0.05
+            assert max(row["primal_residual"], row["dual_residual"], row["gap"]) <= 1e-8
 
 
 def test_a_row_says_how_much_of_its_error_the_solver_makes(store: SampleStore) -> None:
@@ -242,14 +238,6 @@ def test_the_set_up_and_a_start_without_contact_set_are_no_part_of_the_seconds_o
     np.testing.assert_array_equal(found.value.u, alone.value.u)  # whatever was solved before
 
 
-def test_a_slow_query_is_a_timeout(store: SampleStore) -> None:
-    impatient = replace(cell("decorrelated", None), query_seconds=1e-9)
-    rows = impatient.run(store).value
-    assert rows.cell["status"] == "timeout"
-    assert rows.cell["queries_ok"] == 0
-    assert "the limit is 1e-09 s" in rows.queries[0]["reason"]
-
-
 def test_the_reference_constants_are_those_of_every_parameter(store: SampleStore) -> None:
     constants = ReferenceConstants(ConstraintMatrices(PROBLEM, VALIDATION)).gather(store)
     mus = PROBLEM.create().validation_set(9, 3)
@@ -289,17 +277,28 @@ def test_every_query_has_proved_bounds_of_the_errors_in_the_same_norms(store: Sa
         assert rows.cell[f"effectivity_{name}_median"] == median
 
 
-def test_a_missing_artefact_is_named(tmp_path: Path) -> None:
+def test_slow_queries_missing_artefacts_and_failed_constants_are_named(tmp_path: Path, store: SampleStore) -> None:
     stage = PODStage(PROBLEM, Stop(size=2))
     with pytest.raises(NumericalError, match=stage.key):
         value_of(SampleStore(tmp_path), stage)
-
-
-def test_a_problem_without_diagnostics_has_no_such_history(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = PROBLEM.create()
-    monkeypatch.setattr(problem, "diagnostics", lambda mu: {})
-    monkeypatch.setattr(snapshots, "build_problem", lambda plugin: problem)
-    assert SnapshotStage(PROBLEM, ParameterSet("validation", 2, 0), 0).run(None).histories == ()
+    impatient = replace(cell("decorrelated", None), query_seconds=1e-9)
+    rows = impatient.run(store).value
+    assert rows.cell["status"] == "timeout"
+    assert rows.cell["queries_ok"] == 0
+    assert "the limit is 1e-09 s" in rows.queries[0]["reason"]
+    stage = cell("offline-pga", 0.5)
+    first, *_ = stage.reference.energy
+    token = FAILED_STAGES.set({first.key: Failed(Status.TIMEOUT, "too long")})
+    try:
+        rows = stage.run(store).value.queries
+    finally:
+        FAILED_STAGES.reset(token)
+    lost = chunk_of(np.arange(9.0)[:, None], 0)[1].size
+    assert [row["status"] for row in rows] == ["timeout"] * lost + ["ok"] * (9 - lost)
+    assert {row["reason"] for row in rows[:lost]} == {"in high-fidelity constants: too long"}
+    before = value_of(store, stage).queries
+    assert all(row["bound_u"] == other["bound_u"] for row, other in zip(rows[lost:], before[lost:], strict=True))
+    assert not any("coercivity" in row for row in rows[:lost])
 
 
 def query(status: str, error: float | None = 1.0, **columns) -> dict:
@@ -343,19 +342,3 @@ def test_what_is_zero_is_counted_apart_and_enters_no_mean(drawn: list[tuple[bool
         assert found[f"error_{name}_max"] == (max(errors) if errors else None)
         mean = found[f"error_{name}_mean"]
         assert mean == pytest.approx(sum(errors) / len(errors)) if errors else mean is None
-
-
-def test_a_chunk_of_constants_that_failed_costs_the_queries_at_its_own_parameters(store: SampleStore) -> None:
-    stage = cell("offline-pga", 0.5)
-    first, *_ = stage.reference.energy
-    token = FAILED_STAGES.set({first.key: Failed(Status.TIMEOUT, "too long")})
-    try:
-        rows = stage.run(store).value.queries
-    finally:
-        FAILED_STAGES.reset(token)
-    lost = chunk_of(np.arange(9.0)[:, None], 0)[1].size
-    assert [row["status"] for row in rows] == ["timeout"] * lost + ["ok"] * (9 - lost)
-    assert {row["reason"] for row in rows[:lost]} == {"in high-fidelity constants: too long"}
-    before = value_of(store, stage).queries
-    assert all(row["bound_u"] == other["bound_u"] for row, other in zip(rows[lost:], before[lost:], strict=True))
-    assert not any("coercivity" in row for row in rows[:lost])

@@ -59,24 +59,18 @@ def test_a_value_is_read_as_it_was_written(value: Any) -> None:
     assert_same(value, loads(dumps(value)))
 
 
-def test_parts_of_arrays_are_stored_and_not_what_they_are_parts_of() -> None:
+def test_arrays_are_stored_once_without_what_they_are_parts_of_and_read_only() -> None:
+    """What a process keeps for several stages no plugin may write into; SciPy sorts indices in place."""
     whole = np.arange(60_000.0).reshape(300, 200)
     content = dumps([whole[:2, ::3], whole[3]])
     assert len(content) < 5_000
     assert_same([np.ascontiguousarray(whole[:2, ::3]), whole[3]], loads(content))
-
-
-def test_dense_arrays_are_read_only_and_those_of_sparse_matrices_are_not() -> None:
-    """What a process keeps for several stages no plugin may write into; SciPy sorts indices in place."""
     dense, columns, matrix = loads(dumps((np.eye(3), np.asfortranarray(np.ones((2, 3))), sp.eye_array(3).tocsr())))
     for array in (dense, columns):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1.0
     matrix.data[:] = 2.0
     matrix.sort_indices()
-
-
-def test_an_array_that_occurs_twice_is_stored_and_made_once() -> None:
     one = np.arange(1000.0)
     first, second = loads(dumps((one, one)))
     assert first is second
@@ -95,15 +89,12 @@ def test_sparse_matrices_of_every_format(kind: str, box: int) -> None:
             assert_same(np.asarray(getattr(matrix, name)), getattr(found, name), writeable=True)
 
 
-def test_long_and_unsorted_indices_stay_as_they_are() -> None:
+def test_factors_coordinates_and_unsorted_indices_stay_as_they_are() -> None:
     matrix = sp.csr_array((np.ones(3), np.array([2, 0, 1]), np.array([0, 2, 3])), shape=(2, 3))
     matrix.indices, matrix.indptr = matrix.indices.astype(np.int64), matrix.indptr.astype(np.int64)
     found = loads(dumps(matrix))
     assert_same(matrix.indices, found.indices, writeable=True)
     assert_same(matrix.indptr, found.indptr, writeable=True)
-
-
-def test_factors_and_coordinates_are_those_of_the_same_matrices() -> None:
     X = InnerProduct(sp.csc_array(np.diag([2.0, 3.0, 4.0, 5.0]) - np.eye(4, k=1) - np.eye(4, k=-1)))
     space = ContactCoordinates(X, np.ones((4, 1)) / X.norm(np.ones(4)), np.array([2, 3]))
     coordinates = np.arange(3.0)[:, None]
@@ -145,9 +136,8 @@ class Stranger:
     size: int
 
 
-@pytest.mark.parametrize(
-    ("value", "named"),
-    [
+def test_anything_else_is_named_when_it_is_written() -> None:
+    for value, named in (
         (lambda: 0, "builtins.function"),
         ({"at": [Stranger(1)]}, "Stranger"),
         (b"bytes", "builtins.bytes"),
@@ -158,11 +148,9 @@ class Stranger:
         (np.array([1j]), "complex128"),
         (np.ma.masked_array([1.0]), "MaskedArray"),
         (type("Sample", (), {})(), "Sample"),
-    ],
-)
-def test_anything_else_is_named_when_it_is_written(value: Any, named: str) -> None:
-    with pytest.raises(NumericalError, match=f"{named}.* cannot be stored"):
-        dumps(value)
+    ):
+        with pytest.raises(NumericalError, match=f"{named}.* cannot be stored"):
+            dumps(value)
 
 
 def crafted(structure: str | bytes, **arrays: Any) -> bytes:

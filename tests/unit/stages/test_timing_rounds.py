@@ -95,13 +95,15 @@ def test_every_round_has_every_cell_once_before_the_next_one_begins(rounds: int,
     assert sorted(places) == [(number, k) for number in range(rounds) for k in range(count)]
 
 
-def test_the_order_of_the_cells_changes_from_round_to_round() -> None:
+def test_order_and_limit_of_a_stage_are_those_of_all_its_cells(tmp_path: Path) -> None:
     """Whoever comes after a large model finds its own arrays out of the cache: not always the same one."""
     stage = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 12, first=0)
     first = [stage.place(number * 6)[1] for number in range(12)]
     assert len(set(first)) > 3
     later = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 4, first=8)
     assert [later.place(number * 6)[1] for number in range(4)] == first[8:]
+    assert TimingRounds(CELLS, (EVERY,) * 4, 12, first=0).weight == 4
+    assert CELLS[0].weight == 1
 
 
 def test_a_machine_that_slows_down_halfway_meets_all_alike() -> None:
@@ -123,7 +125,9 @@ def _in(stage: TimingRounds) -> timing_rounds._Rounds:
     return rounds
 
 
-def test_every_ok_query_is_timed_and_no_other(store: SampleStore) -> None:
+def test_every_ok_query_alone_is_timed_and_a_long_round_ends_early(
+    store: SampleStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
     fine = (EVERY, (0, 2, 5), EVERY, (3,))
     timed = TimingRounds(CELLS, fine, 8, first=0).run(store).value
     for one, numbers in zip(timed, fine, strict=True):
@@ -136,6 +140,10 @@ def test_every_ok_query_is_timed_and_no_other(store: SampleStore) -> None:
         rows = seconds_of_queries(list(one.rounds.values()))
         assert set(rows) == set(numbers)
         assert all(row["total_s"] == row["assemble_s"] + row["solve_s"] for row in rows.values())
+    prepare = ProgramQuery.prepare
+    monkeypatch.setattr(ProgramQuery, "prepare", lambda *of: lambda: (prepare(*of)()[0], Seconds(0.1, 6.0)))
+    timed = TimingRounds(CELLS[:1], (EVERY,), 4, first=0).run(store).value[0]
+    assert [len(each.solve) for each in timed.rounds.values()] == [1] * 4
 
 
 @pytest.mark.parametrize(("enough", "in_full"), [(0.0, 1), (np.inf, VALIDATION)])
@@ -246,14 +254,7 @@ def test_full_matrices_are_those_of_solutions_assembled_once(
     assert len(reduced) == 3 * (1 + 4 * VALIDATION)  # none after the last query
 
 
-def test_a_round_that_takes_long_ends_early(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    prepare = ProgramQuery.prepare
-    monkeypatch.setattr(ProgramQuery, "prepare", lambda *of: lambda: (prepare(*of)()[0], Seconds(0.1, 6.0)))
-    timed = TimingRounds(CELLS[:1], (EVERY,), 4, first=0).run(store).value[0]
-    assert [len(each.solve) for each in timed.rounds.values()] == [1] * 4
-
-
-def test_a_lost_round_is_told_and_the_others_keep_their_numbers() -> None:
+def test_lost_rounds_are_told_and_rows_have_the_pace_of_their_block() -> None:
     stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 3, first=6)
     items: list[TimedRound | Failed] = [steady(2.0) for _ in range(stage.items)]
     gone = next(item for item in range(stage.items) if stage.place(item) == (1, 0))
@@ -262,9 +263,6 @@ def test_a_lost_round_is_told_and_the_others_keep_their_numbers() -> None:
     assert [list(one.rounds) for one in timed] == [[6, 8], [6, 7, 8]]
     assert [one.failures for one in timed] == [(items[gone],), ()]
     assert [[row["round"] for row in rows] for rows in block_rows(stage, timed)] == [[6, 8], [6, 7, 8]]
-
-
-def test_rows_have_what_a_high_fidelity_solution_of_their_block_took_at_the_pace_of_their_round() -> None:
     stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 3, first=0)
     paced = {k: replace(steady(pace), beside=Seconds(4.0 * pace, 4.0 * pace)) for k, pace in enumerate((1.0, 2.0, 1.0))}
     other = {k: replace(steady(3.0 * pace), beside=Seconds(9.0 * pace, 9.0)) for k, pace in enumerate((1.0, 2.0, 1.0))}
@@ -279,7 +277,7 @@ def test_rows_have_what_a_high_fidelity_solution_of_their_block_took_at_the_pace
     assert row["hf_s"] is None
 
 
-def test_a_certificate_is_a_part_of_its_query() -> None:
+def test_certificates_are_a_part_of_queries_and_columns_are_means_medians_and_quartiles() -> None:
     rounds = [replace(steady(1.0), certify=dict.fromkeys((0, 1), Seconds(spent, 2.0))) for spent in (0.25, 0.5, 4.0)]
     rows = as_rows(*rounds)
     assert [(row["certify_s"], row["total_s"], row["total_wall_s"]) for row in rows] == [
@@ -288,9 +286,6 @@ def test_a_certificate_is_a_part_of_its_query() -> None:
     assert seconds_of_cell(rows)["online_certify_s"] == 0.5
     assert seconds_of_cell(rows)["online_s"] == pytest.approx(2.5)
     assert seconds_of_queries(rounds)[1]["certify_s"] == 0.5
-
-
-def test_columns_are_means_over_blocks_and_medians_and_quartiles_over_rounds() -> None:
     rounds = [
         TimedRound({k: Seconds(0.5, 1.0)}, {k: Seconds(spent, spent), k + 4: Seconds(spent, spent)}, slow)
         for k, (spent, slow) in enumerate([(1.0, 1.0), (3.0, 1.2), (2.0, 1.4), (8.0, 3.0)])
@@ -318,11 +313,6 @@ def test_a_slow_machine_marks_the_row_and_waiting_for_a_core_does_not(wall: floa
     """CPU seconds stop while a process waits; what others do to the caches, the calibration shows."""
     once = TimedRound({0: Seconds(1.0, wall)}, {0: Seconds(1.0, wall)}, slow)
     assert seconds_of_cell(as_rows(*[once] * 3))["disturbed"] == disturbed
-
-
-def test_the_limit_of_the_stage_is_that_of_all_its_cells(tmp_path: Path) -> None:
-    assert TimingRounds(CELLS, (EVERY,) * 4, 12, first=0).weight == 4
-    assert CELLS[0].weight == 1
 
 
 class Remembers:

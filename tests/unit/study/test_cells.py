@@ -29,35 +29,14 @@ def cells_of(tmp_path: Path) -> Expand:
     return lambda content: expand(read_study(write_study(tmp_path, content)))
 
 
-def test_the_matrix_is_the_product_of_the_axes(cells_of: Expand) -> None:
+def test_the_matrix_is_the_product_of_the_axes_in_their_order_without_repeats(
+    cells_of: Expand,
+) -> None:
     cells = cells_of(STUDY)
     plain = [cell for cell in cells if cell.primal.name == "decorrelated"]
     assert len(plain) == 2 * 2 * 2  # pod × dual × solvers
     assert len(cells) - len(plain) == 2 * 2 * 2 * 3  # and × primal tolerances
     assert len({cell.key for cell in cells}) == len(cells)
-
-
-def test_accuracies_are_an_axis(cells_of: Expand) -> None:
-    cells = cells_of(changed(STUDY, "accuracy", to=[1e-4, 1e-7, 1e-10]))
-    alone = cells_of(changed(STUDY, "accuracy", to=1e-4))
-    assert len(cells) == 3 * len(alone)
-    assert {cell.accuracy for cell in cells} == {1e-4, 1e-7, 1e-10}
-    assert {cell.key for cell in alone} < {cell.key for cell in cells}
-    assert len({str(cell) for cell in cells}) == len(cells)
-
-
-def test_corrections_are_an_axis_and_cells_without_one_are_those_of_studies_without_it(cells_of: Expand) -> None:
-    cells = cells_of(STUDY | {"correction": ["none", "feasible", "auto"]})
-    alone = cells_of(STUDY)
-    assert len(cells) == 3 * len(alone)
-    assert [cell for cell in cells if cell.correction == "none"] == alone
-    assert [cell.key for cell in cells if cell.correction == "none"] == [cell.key for cell in alone]
-    assert all(("correction" in cell.definition) == (cell.correction != "none") for cell in cells)
-    assert all(Cell.from_definition(cell.definition) == cell for cell in cells)
-    assert len({str(cell) for cell in cells}) == len(cells)
-
-
-def test_a_strategy_without_tolerance_is_not_repeated(cells_of: Expand) -> None:
     few, many = (
         cells_of(changed(STUDY, "tolerances", 0, "primal", to={"offline-pga": values}))
         for values in ([0.5], [0.5, 0.4, 0.3, 0.2])
@@ -67,13 +46,27 @@ def test_a_strategy_without_tolerance_is_not_repeated(cells_of: Expand) -> None:
         assert len(plain) == 8
         assert {cell.primal_tol for cell in plain} == {None}
     assert len(many) - len(few) == 3 * 8
-
-
-def test_every_combination_is_there_in_the_order_of_the_axes(cells_of: Expand) -> None:
     cells = cells_of(changed(STUDY, "primal", to=["decorrelated"]))
     assert [(cell.pod.tolerance, cell.dual.name, cell.solver) for cell in cells] == [
         (pod, dual, solver) for pod in (1e-2, 1e-3) for dual in ("cpg", "mcpg") for solver in ("piqp", "osqp")
     ]
+
+
+def test_accuracies_and_corrections_are_axes(cells_of: Expand) -> None:
+    cells = cells_of(changed(STUDY, "accuracy", to=[1e-4, 1e-7, 1e-10]))
+    alone = cells_of(changed(STUDY, "accuracy", to=1e-4))
+    assert len(cells) == 3 * len(alone)
+    assert {cell.accuracy for cell in cells} == {1e-4, 1e-7, 1e-10}
+    assert {cell.key for cell in alone} < {cell.key for cell in cells}
+    assert len({str(cell) for cell in cells}) == len(cells)
+    cells = cells_of(STUDY | {"correction": ["none", "feasible", "auto"]})
+    alone = cells_of(STUDY)
+    assert len(cells) == 3 * len(alone)
+    assert [cell for cell in cells if cell.correction == "none"] == alone
+    assert [cell.key for cell in cells if cell.correction == "none"] == [cell.key for cell in alone]
+    assert all(("correction" in cell.definition) == (cell.correction != "none") for cell in cells)
+    assert all(Cell.from_definition(cell.definition) == cell for cell in cells)
+    assert len({str(cell) for cell in cells}) == len(cells)
 
 
 def test_duplicates_merge(cells_of: Expand) -> None:
@@ -90,24 +83,18 @@ def test_duplicates_merge(cells_of: Expand) -> None:
         assert [cell.key for cell in cells_of(changed(STUDY, axis, to=entries))] == keys, axis
 
 
-def test_tables_that_overlap_add_up_once(cells_of: Expand) -> None:
+def test_tables_add_up_once_and_sizes_take_the_place_of_tolerances_by_strategy_and_label(cells_of: Expand) -> None:
     first = STUDY["tolerances"][0]
     second = {"pod": [1e-3, 1e-4], "dual": [1e-1, 1e-2], "primal": {"offline-pga": [0.5]}}
     both = {cell.key for cell in cells_of(changed(STUDY, "tolerances", to=[first, second]))}
     alone = [{cell.key for cell in cells_of(changed(STUDY, "tolerances", to=[table]))} for table in (first, second)]
     assert both == alone[0] | alone[1]
     assert alone[0] & alone[1]
-
-
-def test_prescribed_sizes_take_the_place_of_tolerances(cells_of: Expand) -> None:
     table = {"N": [5, 6, 7], "R": [3], "primal": {"offline-pga": [0.5]}}
     cells = cells_of(changed(STUDY, "tolerances", to=[table]))
     assert len(cells) == 3 * 2 * 2 * 2
     assert {cell.pod for cell in cells} == {Stop(size=5), Stop(size=6), Stop(size=7)}
     assert {cell.cone for cell in cells} == {Stop(size=3)}
-
-
-def test_dual_tolerances_and_sizes_may_differ_by_strategy_and_label(cells_of: Expand) -> None:
     for key, values in (("dual", [0.1, 0.2, 0.3]), ("R", [1, 2, 3])):
         table = {"pod": [1e-3], key: {"cpg": values[:1], "mcpg": values[1:]}, "primal": {"offline-pga": [0.5]}}
         found = {(cell.dual.name, cell.cone) for cell in cells_of(changed(STUDY, "tolerances", to=[table]))}
@@ -129,9 +116,8 @@ def test_every_strategy_that_takes_a_tolerance_must_be_given_one(cells_of: Expan
             cells_of(changed(STUDY, "tolerances", 0, key, to=values))
 
 
-@pytest.mark.parametrize(
-    ("before", "now"),
-    [
+def test_former_words_are_translated_and_named(cells_of: Expand) -> None:
+    for before, now in (
         ({"assembly": ["full", "certified"]}, {"assembly": ["full", "reduced"], "bounds": [True]}),
         ({"assembly": ["reduced", "certified"]}, {"assembly": ["reduced"], "bounds": [False, True]}),
         ({"assembly": ["compiled"]}, {"assembly": ["reduced"], "formulation": ["compiled"]}),
@@ -139,15 +125,13 @@ def test_every_strategy_that_takes_a_tolerance_must_be_given_one(cells_of: Expan
             {"assembly": ["full", "compiled", "certified"]},
             {"assembly": ["full", "reduced"], "bounds": [True], "formulation": ["mixed", "compiled"]},
         ),
-    ],
-)
-def test_former_words_are_translated_and_named(before: dict[str, Any], now: dict[str, Any], cells_of: Expand) -> None:
-    with pytest.warns(UserWarning, match=r"^assembly = .* is of before; write now: .*") as noted:
-        translated = cells_of(STUDY | before)
-    assert len(noted) == 1
-    assert [cell.key for cell in translated] == [cell.key for cell in cells_of(STUDY | now)]
-    assert {cell.bounds for cell in translated if cell.assembly == "full"} <= {False}
-    assert {cell.validation.seed for cell in translated} == {STUDY["seed"]}
+    ):
+        with pytest.warns(UserWarning, match=r"^assembly = .* is of before; write now: .*") as noted:
+            translated = cells_of(STUDY | before)
+        assert len(noted) == 1
+        assert [cell.key for cell in translated] == [cell.key for cell in cells_of(STUDY | now)]
+        assert {cell.bounds for cell in translated if cell.assembly == "full"} <= {False}
+        assert {cell.validation.seed for cell in translated} == {STUDY["seed"]}
 
 
 SAMPLE = Cell(
@@ -192,23 +176,21 @@ OTHER: Mapping[str, Mapping[str, Any]] = {
 }
 
 
-def test_the_cases_cover_every_member_of_a_cell() -> None:
+def test_keys_depend_on_all_members_that_determine_numbers_and_not_on_labels_or_code() -> None:
     covered = {name for change in OTHER.values() for name in change}
     assert covered | {"labels", "nested_tolerances", "formulation_label"} == {field.name for field in fields(Cell)}
-
-
-def test_all_changes_of_what_determines_the_numbers_give_other_keys() -> None:
     assert len({SAMPLE.key, *(replace(SAMPLE, **change).key for change in OTHER.values())}) == 1 + len(OTHER)
-
-
-def test_the_key_does_not_depend_on_labels_or_code() -> None:
     named = {name: replace(getattr(SAMPLE, name), label="x") for name in ("training", "validation")}
     assert replace(SAMPLE, labels=("x", "y", "z"), **named).key == SAMPLE.key
     newer = {axis: replace(getattr(SAMPLE, axis), code="package 2") for axis in ("problem", "dual", "primal")}
     assert replace(SAMPLE, **newer).key == SAMPLE.key
+    assert str(SAMPLE) == "P · D · Q 0.5 · 0.001, R=4 · piqp 1e-07"
+    assert str(replace(SAMPLE, primal_tol=None)) == "P · D · Q · 0.001, R=4 · piqp 1e-07"
 
 
-def test_the_code_changes_with_every_plugin_the_core_and_the_solver(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_code_changes_with_plugins_core_and_solver(
+    monkeypatch: pytest.MonkeyPatch, register: Register, tmp_path: Path
+) -> None:
     whole = replace(SAMPLE, formulation=FORMULATION)
     for role in ("training", "validation"):
         whole = replace(whole, **{role: replace(getattr(whole, role), sampling=SAMPLING)})
@@ -225,9 +207,6 @@ def test_the_code_changes_with_every_plugin_the_core_and_the_solver(monkeypatch:
             codes.append(whole.code)
     registry.registered.cache_clear()
     assert len(set(codes)) == len(codes)
-
-
-def test_code_changes_with_a_solver(register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "own_solver.py").write_text("def solve(program, accuracy): ...\n")
     register(("vibench.qp_solvers", "mine", "own_solver:solve"))
@@ -239,18 +218,10 @@ def test_code_changes_with_a_solver(register: Register, tmp_path: Path, monkeypa
     assert SAMPLE.code == before[1]
 
 
-def test_entries_of_the_same_title_are_told_apart_by_their_options(cells_of: Expand) -> None:
+def test_entries_of_one_title_are_told_apart_by_options(cells_of: Expand) -> None:
     cells = cells_of(changed(STUDY, "problem", to=["obstacle", {"name": "obstacle", "options": {"length": 2.0}}]))
     assert {cell.problem.options for cell in cells} == {"{}", '{"length": 2.0}'}
     assert {cell.labels[0] for cell in cells} == {"obstacle"}
-
-
-def test_a_cell_says_what_it_is() -> None:
-    assert str(SAMPLE) == "P · D · Q 0.5 · 0.001, R=4 · piqp 1e-07"
-    assert str(replace(SAMPLE, primal_tol=None)) == "P · D · Q · 0.001, R=4 · piqp 1e-07"
-
-
-def test_a_plugin_of_an_entry_is_created_with_its_options(cells_of: Expand) -> None:
     problem = cells_of(changed(STUDY, "problem", 0, "options", to={"resolution": 200, "load": -2.0}))[0].problem
     made = problem.create()
     assert made.load == -2.0

@@ -76,7 +76,7 @@ def test_a_study_chooses_for_its_problems_and_a_problem_for_itself() -> None:
         create("problem", "obstacle", {"factorisation": "superlo"})
 
 
-def test_available_is_the_name_of_what_is_there() -> None:
+def test_available_and_missing_implementations_are_named() -> None:
     def plugin() -> Plugin:
         return Plugin.of(find(PluginKind.PROBLEM, "hertz"), {"factorisation": "available"})
 
@@ -84,9 +84,6 @@ def test_available_is_the_name_of_what_is_there() -> None:
         assert "factorisation" not in plugin().arguments  # SuperLU, the default
     with mock.patch.object(factorisations, "distribution_version", return_value="1.0"):
         assert plugin().arguments["factorisation"] == "pardiso"
-
-
-def test_what_is_not_installed_is_unavailable_with_the_command_that_installs_it() -> None:
     (cell,) = expand(Study.model_validate(STUDY | {"factorisation": "pardiso"}))
     with mock.patch.object(factorisations, "distribution_version", return_value=""):
         assert "`pip install pypardiso`" in unavailable(cell)

@@ -29,14 +29,11 @@ def plugin(name: str, options: str) -> Plugin:
     return Plugin("sampling strategy", name, options, "").as_installed()
 
 
-def test_a_study_that_names_no_set_has_those_of_its_problems(tmp_path: Path) -> None:
+def test_studies_have_the_sets_of_their_problems_or_an_axis_with_labels(tmp_path: Path) -> None:
     plain = cells_of(STUDY, tmp_path)
     assert {(cell.training, cell.validation) for cell in plain} == {(OWN_TRAINING, ParameterSet("validation", 3, 7))}
     named = cells_of(changed(STUDY, "training", to="own"), tmp_path)
     assert [cell.key for cell in named] == [cell.key for cell in plain]
-
-
-def test_training_sets_are_an_axis_with_a_label_each(tmp_path: Path) -> None:
     sets = ["own", SOBOL, {**SOBOL, "seed": 2, "label": "other"}]
     cells = cells_of(changed(STUDY, "training", to=sets), tmp_path)
     assert len(cells) == 3 * len(cells_of(STUDY, tmp_path))
@@ -47,7 +44,7 @@ def test_training_sets_are_an_axis_with_a_label_each(tmp_path: Path) -> None:
     assert {str(cell).split(" · ")[0] for cell in cells} == {"obstacle", "obstacle (sobol)", "obstacle (other)"}
 
 
-def test_a_problem_may_have_sets_of_its_own(tmp_path: Path) -> None:
+def test_problems_and_restored_cells_have_sets_of_their_own(tmp_path: Path) -> None:
     problems = [{**STUDY["problem"][0], "training": SOBOL, "validation": 5}, {"name": "radial-obstacle"}]
     validation = {"name": "random", "options": {"size": 7, "seed": 4}}
     content = changed(changed(STUDY, "problem", to=problems), "validation", to=validation)
@@ -55,9 +52,6 @@ def test_a_problem_may_have_sets_of_its_own(tmp_path: Path) -> None:
         (c.problem.name, c.training.label, c.validation.count, c.validation.label) for c in cells_of(content, tmp_path)
     }
     assert found == {("obstacle", "sobol", 5, "own"), ("radial-obstacle", "own", 7, "random")}
-
-
-def test_a_cell_is_restored_with_its_sets(tmp_path: Path) -> None:
     content = changed(changed(STUDY, "training", to=SOBOL), "validation", to={"name": "random", "size": 7, "seed": 4})
     cell = cells_of(content, tmp_path)[0]
     assert Cell.from_definition(cell.definition) == cell
@@ -66,7 +60,9 @@ def test_a_cell_is_restored_with_its_sets(tmp_path: Path) -> None:
     assert (alone.training.label, alone.validation.label) == ("sobol", "random")
 
 
-def test_a_file_is_beside_the_study_and_part_of_the_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_are_beside_the_study_part_of_the_code_and_regular(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir("/")
     (tmp_path / "sets").mkdir()
     file = tmp_path / "sets" / "points.csv"
@@ -81,14 +77,14 @@ def test_a_file_is_beside_the_study_and_part_of_the_code(tmp_path: Path, monkeyp
     np.save(tmp_path / "points.npy", np.array([[0.9, 0.0, 0.0]]))
     content = changed(STUDY, "training", to={"name": "file", "options": {"path": "points.npy"}})
     assert len(cells_of(content, tmp_path)) == len(cells_of(STUDY, tmp_path))
-
-
-def test_a_pipe_and_a_device_hold_no_points(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.csv")
     for path in ("pipe.csv", "/dev/zero"):  # reading them would not end
         content = changed(STUDY, "training", to={"name": "file", "path": path})
         with pytest.raises(RequestError, match="cannot be read: it is no regular file"):
             cells_of(content, tmp_path)
+    (tmp_path / "points.csv").write_text("\u00b5\n0.5\n", encoding="utf-8")
+    box = ParameterBox(("\u03bc",), np.zeros(1), np.ones(1), ("1",))
+    assert plugin("file", json.dumps({"path": f"{tmp_path}/points.csv"})).create().parameters(box).tolist() == [[0.5]]
 
 
 @pytest.mark.parametrize("shape", [(-1, 3), (2**40, 3), (2**62, 2**62), (0, 3)])
@@ -99,12 +95,6 @@ def test_an_array_of_points_is_no_larger_than_its_file(shape: tuple[int, ...], t
     content = changed(STUDY, "training", to={"name": "file", "path": "points.npy"})
     with pytest.raises(RequestError, match=r"points.npy' cannot be read|shape \(0, 3\)"):
         cells_of(content, tmp_path)
-
-
-def test_the_columns_of_a_file_are_compared_as_names_in_expressions_are(tmp_path: Path) -> None:
-    (tmp_path / "points.csv").write_text("\u00b5\n0.5\n", encoding="utf-8")
-    box = ParameterBox(("\u03bc",), np.zeros(1), np.ones(1), ("1",))
-    assert plugin("file", json.dumps({"path": f"{tmp_path}/points.csv"})).create().parameters(box).tolist() == [[0.5]]
 
 
 BAD: dict[str, tuple[tuple[str, Any], list[str]]] = {

@@ -30,7 +30,7 @@ def refusal(request: str, overrides: Mapping[str, Any] | None = None) -> str:
     return line
 
 
-def test_a_correct_study_is_read_as_written(tmp_path: Path) -> None:
+def test_correct_studies_are_read_as_written_by_path_or_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     study = read_study(write_study(tmp_path))
     assert (study.name, study.seed, study.validation, study.accuracy) == ("sample", 7, 3, [1e-7])
     assert study.solver_names() == ["piqp", "osqp"]
@@ -38,6 +38,14 @@ def test_a_correct_study_is_read_as_written(tmp_path: Path) -> None:
     assert study.problem[0].options == {"resolution": "coarse"}
     assert study.tolerances[0].primal == {"offline-pga": [0.5, 0.3, 0.1]}
     assert study.limits.query_seconds == 20.0
+    study = read_study(write_study(tmp_path, changed(STUDY, "solvers", to="available")))
+    assert {"piqp", "proxqp", "osqp"} <= set(study.solver_names())
+    path = write_study(tmp_path)
+    assert find_study(path) == Path(path)
+    assert find_study("quick").name == "quick.toml"
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "quick").mkdir()  # what `vibench run --out quick` leaves
+    assert read_study("quick").name == "quick"
 
 
 def test_the_writer_of_the_tests_writes_toml() -> None:
@@ -154,7 +162,7 @@ def test_a_key_in_the_wrong_place_is_not_suggested_again(tmp_path: Path) -> None
         assert f"did you mean '{key}'" not in line
 
 
-def test_what_is_no_file_of_a_study_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_file_of_a_study_or_invalid_toml_is_refused(tmp_path: Path) -> None:
     missing = str(tmp_path / "nowhere.toml")
     assert f"'{missing}' does not exist" in refusal(missing)
     for name in ("folder", "folder.toml"):
@@ -166,6 +174,14 @@ def test_what_is_no_file_of_a_study_is_refused(tmp_path: Path) -> None:
         path = tmp_path / "study.toml"
         path.write_bytes(content)
         assert refusal(str(path)).startswith(f"{path}: ")
+    path = tmp_path / "study.toml"
+    for text in INVALID.values():
+        path.write_text(text)
+        line = refusal(str(path))
+        assert line.startswith(f"{path}: ")
+        assert "TOML" in line
+    path.write_text('name = "a"\nseed = = 3\n')
+    assert "line 2" in refusal(str(path))
 
 
 INVALID = {
@@ -179,35 +195,7 @@ INVALID = {
 }
 
 
-def test_invalid_toml_is_refused_with_the_file(tmp_path: Path) -> None:
-    path = tmp_path / "study.toml"
-    for text in INVALID.values():
-        path.write_text(text)
-        line = refusal(str(path))
-        assert line.startswith(f"{path}: ")
-        assert "TOML" in line
-    path.write_text('name = "a"\nseed = = 3\n')
-    assert "line 2" in refusal(str(path))
-
-
-def test_available_stands_for_every_installed_solver(tmp_path: Path) -> None:
-    study = read_study(write_study(tmp_path, changed(STUDY, "solvers", to="available")))
-    assert {"piqp", "proxqp", "osqp"} <= set(study.solver_names())
-
-
-def test_find_study_knows_paths_and_names(tmp_path: Path) -> None:
-    path = write_study(tmp_path)
-    assert find_study(path) == Path(path)
-    assert find_study("quick").name == "quick.toml"
-
-
-def test_a_folder_does_not_hide_a_registered_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "quick").mkdir()  # what `vibench run --out quick` leaves
-    assert read_study("quick").name == "quick"
-
-
-def test_overrides_replace_whole_axes(tmp_path: Path) -> None:
+def test_overrides_replace_whole_axes_and_keep_entries_with_their_name_or_label(tmp_path: Path) -> None:
     given = {"dual": ["mcpg"], "primal": ["online-supremizers"], "solvers": ["proxqp"], "problem": ["obstacle"]}
     given["correction"] = ["auto"]
     study = read_study(write_study(tmp_path), given)
@@ -215,9 +203,6 @@ def test_overrides_replace_whole_axes(tmp_path: Path) -> None:
     assert [entry.name for entry in study.primal] == ["online-supremizers"]
     assert study.solver_names() == ["proxqp"]
     assert study.correction == ["auto"]
-
-
-def test_overrides_keep_entries_with_their_name_or_label(tmp_path: Path) -> None:
     study = read_study(write_study(tmp_path), {"problem": ["obstacle"]})
     assert study.problem[0].options == {"resolution": "coarse"}
     entries = [{"name": "obstacle", "label": size, "options": {"resolution": size}} for size in ("coarse", "medium")]
@@ -225,9 +210,14 @@ def test_overrides_keep_entries_with_their_name_or_label(tmp_path: Path) -> None
     assert [entry.title for entry in read_study(path, {"problem": ["obstacle"]}).problem] == ["coarse", "medium"]
     (medium,) = read_study(path, {"problem": ["medium"]}).problem
     assert (medium.title, medium.options) == ("medium", {"resolution": "medium"})
+    path = write_study(tmp_path)
+    plain, replaced = read_study(path), read_study(path, {"pod": [0.5], "dual": []})
+    assert replaced.tolerances[0].pod == [0.5]
+    assert replaced.model_dump(exclude={"tolerances"}) == plain.model_dump(exclude={"tolerances"})
+    assert replaced.tolerances[0].dual == plain.tolerances[0].dual
 
 
-def test_overrides_replace_tolerances_in_every_table(tmp_path: Path) -> None:
+def test_overrides_replace_tolerances_in_every_table_and_with_their_strategy(tmp_path: Path) -> None:
     second = {"N": [4], "R": {"cpg": [2], "mcpg": [3]}, "primal": {"offline-pga": [0.9]}}
     path = write_study(tmp_path, changed(STUDY, "tolerances", 1, to=second))
     study = read_study(path, {"pod": [0.5], "dual_tol": [0.25, 0.125], "primal_tol": [0.75]})
@@ -236,17 +226,6 @@ def test_overrides_replace_tolerances_in_every_table(tmp_path: Path) -> None:
         assert (table.pod, table.N) == ([0.5], None)
         assert (table.dual, table.R) == ([0.25, 0.125], None)
         assert table.primal == {"offline-pga": [0.75]}
-
-
-def test_overrides_leave_the_other_axes_alone(tmp_path: Path) -> None:
-    path = write_study(tmp_path)
-    plain, replaced = read_study(path), read_study(path, {"pod": [0.5], "dual": []})
-    assert replaced.tolerances[0].pod == [0.5]
-    assert replaced.model_dump(exclude={"tolerances"}) == plain.model_dump(exclude={"tolerances"})
-    assert replaced.tolerances[0].dual == plain.tolerances[0].dual
-
-
-def test_a_strategy_and_its_tolerance_can_both_be_given_by_overrides(tmp_path: Path) -> None:
     for table in ({}, {"primal": {}}):
         content = changed(STUDY, "tolerances", to=[{"pod": [1e-3], "dual": [1e-1]} | table])
         path = write_study(tmp_path, changed(content, "primal", to=["decorrelated"]))

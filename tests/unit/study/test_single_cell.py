@@ -36,15 +36,12 @@ def test_a_study_of_one_cell_has_its_parameter_sets() -> None:
         assert (again.key, str(again), again.validation.count) == (cell.key, str(cell), 9)
 
 
-def test_a_definition_without_parameter_sets_is_one_with_those_of_the_problem() -> None:
+def test_a_row_is_made_again_from_its_results_file_or_an_older_definition(quick_run: Path, main: Main) -> None:
     cell = expand(read_study("quick"))[0]
     older = json.loads(cell.definition)
     for name in ("training", "validation_sampling", "set_labels"):
         del older[name]
     assert Cell.from_definition(json.dumps(older)) == cell
-
-
-def test_a_row_is_made_again_from_its_results_file(quick_run: Path, main: Main) -> None:
     row = read_table(quick_run / FILE, "cells").iloc[3]
     study = recorded_study(str(quick_run / FILE), row["cell"][:6])
     assert [cell.key for cell in expand(study)] == [row["cell"]]
@@ -55,7 +52,12 @@ def test_a_row_is_made_again_from_its_results_file(quick_run: Path, main: Main) 
     assert main("run", "quick", "--cell", row["cell"], "--dry-run") == (code, out, err)
 
 
-def test_what_is_no_cell_is_refused(quick_run: Path, changed: Changed, main: Main) -> None:
+def test_a_cell_is_found_by_its_beginning_or_refused(quick_run: Path, changed: Changed, main: Main) -> None:
+    cells = expand(read_study("quick"))
+    assert only_cell(cells, cells[5].key, "quick") is cells[5]
+    with pytest.raises(RequestError, match=f"{len(cells)} cells of quick begin with ''"):
+        only_cell(cells, "", "quick")
+    assert isinstance(cells[5], Cell)
     results = str(quick_run / FILE)
     refused(main("run", results, "--cell", "xyz"), "0 cells", "begin with 'xyz'", "expected one")
     refused(main("run", "quick", "--cell", "xyz"), "0 cells of 'quick' begin with 'xyz'")
@@ -64,11 +66,3 @@ def test_what_is_no_cell_is_refused(quick_run: Path, changed: Changed, main: Mai
         broken = changed(f"UPDATE cells SET definition = '{definition}'")
         key = read_table(broken, "cells")["cell"].iloc[0]
         refused(main("run", str(broken), "--cell", key), key, "cannot be read")
-
-
-def test_a_cell_is_found_by_a_beginning_that_no_other_has() -> None:
-    cells = expand(read_study("quick"))
-    assert only_cell(cells, cells[5].key, "quick") is cells[5]
-    with pytest.raises(RequestError, match=f"{len(cells)} cells of quick begin with ''"):
-        only_cell(cells, "", "quick")
-    assert isinstance(cells[5], Cell)
