@@ -32,8 +32,8 @@ def test_few_sums_know_the_residual_of_many_conditions() -> None:
     few = rng.standard_normal((15, 200)) + 1.0
     groups: list[Array] = [rng.standard_normal((20, 15)) @ few for _ in range(100)]
     for conditions in groups:
-        made.add(conditions)
-    made.add(np.zeros((20, 200)))  # conditions of nothing are met by any columns
+        made.add(conditions, 1.0)
+    made.add(np.zeros((20, 200)), 1.0)  # conditions of nothing are met by any columns
     columns, weights = made.columns(1e-2)
     assert len(columns) <= 15
     assert weights.min() > 0.0
