@@ -85,9 +85,9 @@ def sample_snapshots() -> tuple[Array, InnerProduct]:
     return _snapshots().lam.copy(), MovingSupport().W
 
 
-def sample_offline(modes: int = 4, generators: int = 6) -> Offline:
-    """A reduced model of the sample problem to enrich: N POD modes and a greedy cone of R generators."""
-    reduction = Reduction(MovingSupport(), _Greedy(), None, Stop(size=modes), Stop(size=generators))
+def sample_offline() -> Offline:
+    """A reduced model of the sample problem to enrich: 4 POD modes and a greedy cone of 6 generators."""
+    reduction = Reduction(MovingSupport(), _Greedy(), None, Stop(size=4), Stop(size=6))
     return reduction.given(snapshots=_snapshots()).offline
 
 
