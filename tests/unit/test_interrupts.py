@@ -21,7 +21,8 @@ def now() -> object:
     return signal.getsignal(signal.SIGINT)
 
 
-def test_a_command_can_catch_what_ends_the_process_outside(handler: object) -> None:
+def test_commands_catch_raise_or_ignore_what_ends_the_process_outside(handler: object) -> None:
+    """As in a script that runs a command in the background."""
     seen = []
     with interrupted_at_once():
         outside = now()
@@ -30,10 +31,6 @@ def test_a_command_can_catch_what_ends_the_process_outside(handler: object) -> N
     assert outside is not handler
     assert seen == [handler]
     assert now() is handler
-
-
-def test_commands_catch_raise_or_ignore_interrupts() -> None:
-    """As in a script that runs a command in the background."""
     with interrupted_at_once(), pytest.raises(Interrupted):
         interruptible(lambda: os.kill(os.getpid(), signal.SIGINT))()
     with interrupted_at_once():

@@ -26,12 +26,9 @@ NAMES = re.compile(r"^[ ]*from (vibench(?:\.[a-z]+)?) import (\([^)]*\)|[^\n]+)"
 PUBLIC = {"vibench": vibench, **{f"vibench.{group}": getattr(vibench, group) for group in vibench.GROUPS}}
 
 
-def test_there_are_sources_of_every_sort() -> None:
+def test_sources_of_every_sort_import_nothing_but_the_public_surface() -> None:
     assert {path.suffix for path in AUTHORS} == {".py", ".template", ".md"}
     assert len(AUTHORS) > 30
-
-
-def test_plugins_templates_and_pages_import_nothing_but_the_public_surface() -> None:
     for path in AUTHORS:
         text = path.read_text(encoding="utf-8")
         assert set(IMPORTED.findall(text)) <= {*PUBLIC, "vibench.testing"}, path
@@ -40,15 +37,12 @@ def test_plugins_templates_and_pages_import_nothing_but_the_public_surface() -> 
             assert module == "vibench.testing" or imported <= set(PUBLIC[module].__all__), path
 
 
-def test_every_public_name_is_documented_and_in_one_place() -> None:
+def test_every_public_name_is_documented_in_one_place_which_is_named() -> None:
     places = [(module, name) for module, found in PUBLIC.items() for name in found.__all__]
     for module, name in places:
         found = getattr(PUBLIC[module], name)
         assert found.__doc__ or not (inspect.isclass(found) or inspect.isfunction(found)), name
     assert len(places) == len({name for _, name in places})
-
-
-def test_a_name_of_a_submodule_is_refused_with_its_place() -> None:
     for group in vibench.GROUPS:
         for name in getattr(vibench, group).__all__:
             text = f"^'{name}' is in vibench.{group}: from vibench.{group} import {name}$"

@@ -40,12 +40,9 @@ def linked(page: Path) -> set[Path]:
     return {(page.parent / target).resolve() for target in targets if "://" not in target}
 
 
-def test_the_folder_is_light_and_scripts_lie_apart() -> None:
+def test_the_folder_is_light_every_file_is_on_a_page_and_every_link_resolves() -> None:
     assert sum(path.stat().st_size for path in FILES) <= LARGEST
     assert {path for path in FILES if path.suffix == ".py"} == {path for path in FILES if SCRIPTS in path.parents}
-
-
-def test_every_file_is_on_a_page_every_link_resolves_and_the_overview_has_all_pages() -> None:
     pages = {*PAGES, ROOT / "README.md", *(ROOT / "docs").rglob("*.md")}
     shown = set().union(*map(linked, pages))
     assert [path for path in FILES if path.suffix not in {".md", ".py"} and path not in shown] == []
@@ -71,15 +68,23 @@ def test_pages_and_scripts_name_the_commands_that_make_them() -> None:
         assert f"`vibench run {name}` leaves the tables of all queries and histories under `runs/{name}/tables`" in text
 
 
-def test_the_first_page_and_what_to_use_are_made_from_the_tables() -> None:
+def test_the_first_page_and_the_documentation_are_made_from_the_tables(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The gain over the next high-fidelity solution, not over a mean that pays its set-up again and again."""
     committed, first_page, what_to_use = map(importlib.import_module, ("committed", "first_page", "what_to_use"))
     results, page = committed.Results(RESULTS), (ROOT / "README.md").read_text(encoding="utf-8")
     assert first_page.PLACE.search(page)
     assert first_page.filled(page, results) == page
     assert what_to_use.what_to_use(results) == (ROOT / "docs" / "what-to-use.md").read_text(encoding="utf-8")
-
-
-def test_sentences_of_the_documentation_are_rendered_from_the_tables(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    (models,) = (part for part in text.split("\n\n") if part.startswith("| "))
+    head, _, *rows = [[word.strip() for word in line.strip("|").split("|")] for line in models.splitlines()]
+    assert "a high-fidelity solution that starts from the nearest contact set" in text
+    for problem in ("obstacle", "hertz"):
+        mine = [row for row in rows if row[0] == problem]
+        assert len({row[1] for row in mine}) == 2  # the pair that enrichment serves best is not shown alone
+        assert "decorrelated" in {row[2] for row in mine}
+    gains = [k for k, name in enumerate(head) if name.startswith("gain")]
+    assert all(row[k] == "–" or re.fullmatch(r"\S+ \(\S+–\S+\)", row[k]) for row in rows for k in gains)
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
     sentences = importlib.import_module("sentences")
     page = (ROOT / "docs" / "field.md").read_text(encoding="utf-8")
@@ -108,7 +113,12 @@ def test_a_page_made_anew_is_as_light(quick_run: Path, tmp_path: Path) -> None:
     assert "## Break-even of fixed enrichments" in text
 
 
-def test_the_results_are_published_by_one_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_and_their_hashes_are_published_by_one_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All cells of a study have one hash of it, and pandas reads a column of such as numbers."""
+    cells = pd.read_csv(RESULTS / "benefit" / "cells.csv").head(2).assign(study_hash="9369049480579e14")
+    cells.to_csv(tmp_path / "cells.csv", index=False)
+    rows = importlib.import_module("publish").rows(tmp_path / "cells.csv")
+    assert [row["study_hash"] for row in rows] == ["9369049480579e14"] * 2
     script = importlib.import_module("publish")
     monkeypatch.setattr(html, "page", lambda *_, **__: "<!doctype html>")
     script.main(str(tmp_path / "site"))
@@ -133,14 +143,6 @@ def test_the_results_are_published_by_one_command(tmp_path: Path, monkeypatch: p
     assert len(published_runs) == len(list(RESULTS.glob("*/cells.csv"))) + len(others)
     machines = {machine for file in published_runs for machine in read_table(file, "cells")["machine"].dropna()}
     assert machines >= {machine for file in others for machine in pd.read_csv(file)["machine"].dropna()}
-
-
-def test_a_hash_that_looks_like_a_number_is_a_text(tmp_path: Path) -> None:
-    """All cells of a study have one hash of it, and pandas reads a column of such as numbers."""
-    cells = pd.read_csv(RESULTS / "benefit" / "cells.csv").head(2).assign(study_hash="9369049480579e14")
-    cells.to_csv(tmp_path / "cells.csv", index=False)
-    rows = importlib.import_module("publish").rows(tmp_path / "cells.csv")
-    assert [row["study_hash"] for row in rows] == ["9369049480579e14"] * 2
 
 
 def test_numbers_at_logarithmic_axes_are_text() -> None:
@@ -187,20 +189,6 @@ def test_other_machines_are_compared_row_by_row(tmp_path: Path) -> None:
     assert verdicts[6:] == ["–", "2.00 (2.00–2.00)"]
 
 
-def test_the_readme_says_what_a_query_is_compared_with() -> None:
-    """The gain over the next high-fidelity solution, not over a mean that pays its set-up again and again."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    (models,) = (part for part in text.split("\n\n") if part.startswith("| "))
-    head, _, *rows = [[word.strip() for word in line.strip("|").split("|")] for line in models.splitlines()]
-    assert "a high-fidelity solution that starts from the nearest contact set" in text
-    for problem in ("obstacle", "hertz"):
-        mine = [row for row in rows if row[0] == problem]
-        assert len({row[1] for row in mine}) == 2  # the pair that enrichment serves best is not shown alone
-        assert "decorrelated" in {row[2] for row in mine}
-    gains = [k for k, name in enumerate(head) if name.startswith("gain")]
-    assert all(row[k] == "–" or re.fullmatch(r"\S+ \(\S+–\S+\)", row[k]) for row in rows for k in gains)
-
-
 def test_a_smaller_picture_keeps_its_caption_and_is_described_in_a_sentence(tmp_path: Path) -> None:
     page = importlib.import_module("page")
     figure = Sheet(1, 1).finish("Errors at δ = 0.5 of [all] models. More of it.")
@@ -221,7 +209,7 @@ def test_a_smaller_picture_keeps_its_caption_and_is_described_in_a_sentence(tmp_
     assert shown == "4 panels show error over seconds; gain over seconds."
 
 
-def test_vibench_is_cited_alike_everywhere() -> None:
+def test_citations_and_the_lock_file_agree_with_the_project() -> None:
     """Title, author, version and year in README, on the page of the benchmark and in CITATION.cff."""
     entry = re.compile(r"^@software\{vibench,\n.*?^\}$", re.MULTILINE | re.DOTALL)
     first, second = (
@@ -237,11 +225,7 @@ def test_vibench_is_cited_alike_everywhere() -> None:
     assert f"  year: {fields['year']}\n" in text
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert fields["version"] == project["version"]
-
-
-def test_the_lock_file_has_every_distribution_that_is_needed() -> None:
     locked = set(re.findall(r"^([\w.-]+)==\S+ \\\n +--hash=sha256:[0-9a-f]{64}$", LOCK.read_text(), re.MULTILINE))
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = [line for name in ("solvers", "nmf", "hdf5", "mesh") for line in project["optional-dependencies"][name]]
     needed = {re.split(r"[^\w.-]", line)[0].lower() for line in [*project["dependencies"], *extras, "hatchling"]}
     assert needed - locked == set()

@@ -44,7 +44,8 @@ def completed(line: str) -> list[str]:
     return [item.value for item in (option or arguments[0]).shell_complete(context, last)]
 
 
-def test_values_are_completed_with_what_there_is() -> None:
+def test_values_are_completed_with_what_there_is_once(register: Register) -> None:
+    """The command then refuses it and names both packages; a prompt is no place for that."""
     for line, *words in (
         ("run quick --problem ob", "obstacle"),
         ("run quick --dual ", *registered(PluginKind.DUAL)),
@@ -67,6 +68,8 @@ def test_values_are_completed_with_what_there_is() -> None:
         assert completed(f"vibench {line}") == words, line
     assert set(completion.lists("")) == {kind.plural for kind in PluginKind}
     assert set(completion.table_names("")) == set(completion.SHOWN) == set(VIEWS) > set(TABLES)
+    register(*(("vibench.problems", "mine", f"{module}:Problem") for module in ("one", "other")))
+    assert completed("vibench run quick --problem ") == ["mine"]
 
 
 class TestFiles:
@@ -74,7 +77,7 @@ class TestFiles:
     def _here(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.chdir(tmp_path)
 
-    def test_studies_are_those_registered_and_the_files_here(self) -> None:
+    def test_studies_runs_and_cells_are_those_there(self) -> None:
         Path("papers").mkdir()
         for name in ("paper-mine.toml", "paper-notes.txt", "papers/radial.toml"):
             Path(name).touch()
@@ -82,8 +85,6 @@ class TestFiles:
         assert completion.studies("papers/") == ["papers/radial.toml"]
         assert completion.studies(f"{Path.cwd()}/papers/r") == [f"{Path.cwd()}/papers/radial.toml"]
         assert completion.studies("nowhere/") == []
-
-    def test_runs_are_the_folders_with_results(self) -> None:
         for name in ("mine", "more", "other", "m\x1b[2J", "m\nrm"):  # a prompt would obey the last two
             Path("runs", name).mkdir(parents=True)
             if name != "more":
@@ -102,12 +103,6 @@ class TestFiles:
         Path("runs/broken").mkdir()
         Path("runs/broken", FILE).write_text("no database")
         assert completed("vibench replay broken ") == []
-
-
-def test_a_name_that_two_packages_register_is_completed_once(register: Register) -> None:
-    """The command then refuses it and names both packages; a prompt is no place for that."""
-    register(*(("vibench.problems", "mine", f"{module}:Problem") for module in ("one", "other")))
-    assert completed("vibench run quick --problem ") == ["mine"]
 
 
 def test_the_installed_command_completes_for_bash(command: str, tmp_path: Path) -> None:

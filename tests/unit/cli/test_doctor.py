@@ -137,16 +137,14 @@ def test_the_error_of_a_plugin_is_no_markup(main: Main, register: Register, monk
 
 
 class TestDisk:
-    def test_a_place_that_cannot_be_written_is_broken(self, main: Main, trials: dict[str, Trial]) -> None:
+    def test_places_without_room_locks_or_permission_are_noticed(
+        self, main: Main, trials: dict[str, Trial], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
         Path("taken").touch()
         code, out, _ = main("doctor", "--out", "taken/below")
         assert code == 1
         assert out.splitlines()[-1] == "broken: runs"
         assert "taken/below: cannot be used: Not a directory" in out
-
-    def test_disks_without_room_or_locks_are_noticed_and_artefacts_counted(
-        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-    ) -> None:
         monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
         Store(default_folder()).put("pod-1", "x" * 2**20, NO_TIME, ())
         found = by_subject(list(doctor.check_disk(tmp_path)))

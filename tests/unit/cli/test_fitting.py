@@ -64,11 +64,19 @@ def test_what_has_no_room_is_left_out_whole_and_named(rows: list[tuple[float, fl
     assert set(body) <= whole
 
 
-def test_the_columns_that_matter_least_go_first() -> None:
+def test_columns_that_matter_least_go_first_and_long_texts_share_the_room() -> None:
+    """Rich takes room from columns that need it, and cuts what is beyond the width."""
     frame = pd.DataFrame({name: [1.23456, 2.34567] for name in ("alpha", "bravo", "charlie")})
     lines = printed(frame.assign(bravo=[1, 2], charlie=[3, 4]), 13, ["charlie", "alpha", "bravo"])
     assert lines[1].split() == ["alpha", "charlie"]
     assert "bravo" in " ".join(lines[5:])
+    words = " ".join(["alpha", "bravo", "charlie"] * 9)
+    frame = pd.DataFrame(
+        {"name": ["a" * 33, "b"], "value": [words, "2"], "unit": ["1", "s"], "meaning": [words, f"{words} delta"]}
+    )
+    lines = printed(frame, 80)
+    assert max(map(cell_len, lines)) <= 80
+    assert sum(line.count("charlie") for line in lines) == 27
 
 
 ALIKE = pd.DataFrame(
@@ -98,17 +106,6 @@ def test_what_tells_rows_apart_is_not_left_out_nor_what_the_table_is_about(width
     assert not any(axis in text.split("not shown")[-1] for axis in ("problem", "primal", "correction"))
     headings = printed(ALIKE, 120, [*AXES, "cell", "error"], axes=AXES)[1].split()
     assert headings == ["cell", *AXES, "error", "online", "[ms]", "N"]  # one column for every axis where there is room
-
-
-def test_long_texts_share_the_room_that_is_left_and_nothing_is_cut() -> None:
-    """Rich takes room from columns that need it, and cuts what is beyond the width."""
-    words = " ".join(["alpha", "bravo", "charlie"] * 9)
-    frame = pd.DataFrame(
-        {"name": ["a" * 33, "b"], "value": [words, "2"], "unit": ["1", "s"], "meaning": [words, f"{words} delta"]}
-    )
-    lines = printed(frame, 80)
-    assert max(map(cell_len, lines)) <= 80
-    assert sum(line.count("charlie") for line in lines) == 27
 
 
 def test_values_that_rows_share_stand_in_the_title() -> None:
@@ -141,7 +138,7 @@ def test_a_width_that_is_none_is_no_width(monkeypatch: pytest.MonkeyPatch) -> No
 class TestShow:
     """Rows and columns that are asked for."""
 
-    def test_columns_and_rows_are_those_asked_for(self, main: Main, quick_run: Path) -> None:
+    def test_columns_and_rows_are_those_asked_for_and_numbers_are_numbers(self, main: Main, quick_run: Path) -> None:
         run, cells = str(quick_run), read_table(results_file(str(quick_run)), "cells")
         _, out, _ = main("show", run, "--columns", "solver,online [ms],online_s", "--format", "csv")
         assert out.splitlines()[0] == "solver,online_s"  # by name or heading
@@ -155,8 +152,6 @@ class TestShow:
         _, out, _ = main("show", run, "--columns", "cell,solver", "--limit", "3")
         for line in out.splitlines()[3:]:  # keys that replay takes
             assert cells["cell"].str.startswith(line.split()[0]).sum() == 1
-
-    def test_json_has_numbers_as_numbers(self, main: Main, quick_run: Path) -> None:
         for table in SHOWN:
             _, out, _ = main("show", str(quick_run), "--table", table, "--format", "json", "--limit", "20")
             found = pd.read_json(io.StringIO(out))

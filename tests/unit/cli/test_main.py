@@ -70,7 +70,7 @@ def test_a_wrong_request_is_refused_in_one_line(main: Main, quick_run: Path, tmp
 
 
 class TestOutputFolder:
-    def test_a_place_that_cannot_be_written_is_refused(self, main: Main) -> None:
+    def test_taken_places_and_other_folders_are_refused_and_kept(self, main: Main) -> None:
         Path("taken").touch()
         refused(main("run", "--out", "taken"), "'taken'", "is a file")
         refused(main("run", "--out", "taken/below"), "taken/below", "cannot be written")
@@ -80,8 +80,6 @@ class TestOutputFolder:
         Path("runs").mkdir()
         Path("runs/quick").touch()  # the folder of the study
         refused(main("run"), "runs/quick", "is a file")
-
-    def test_a_folder_with_other_things_is_refused_and_kept(self, main: Main) -> None:
         for content in (None, "hello", "SQLite format 3\0 and then nothing"):
             folder = Path(f"full{len(content or '')}")
             folder.mkdir()
@@ -160,12 +158,17 @@ def test_lists_show_their_plugins_and_options(main: Main) -> None:
             assert not any("not installed" in shown[name] for name in ("piqp", "proxqp", "osqp"))
 
 
-def test_ctrl_c_while_drawing_says_what_is_there(main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupts_are_told_and_unforeseen_errors_not_hidden(
+    main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("vibench.report.figures.draw_all", Mock(side_effect=KeyboardInterrupt))
     code, out, _ = main("figures", str(quick_run), "--out", "pictures")
     assert code == 130
     assert "interrupted while drawing: results and tables are complete" in out
     assert f"`vibench figures {quick_run}`" in out
+    monkeypatch.setattr("vibench.study.matrix.read_study", Mock(side_effect=ZeroDivisionError))
+    with pytest.raises(ZeroDivisionError):
+        main("run")
 
 
 def test_a_run_ends_with_the_summary_and_says_where_things_are(main: Main, quick_run: Path) -> None:
@@ -199,12 +202,6 @@ def test_a_run_of_an_odd_name_is_shown(name: str, main: Main, quick_run: Path) -
         assert (code, err) == (0, "")
         assert out.startswith(f"{printable(name)}: summary")
         assert all(line.isprintable() for line in out.splitlines())
-
-
-def test_an_error_that_nobody_foresaw_is_not_hidden(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vibench.study.matrix.read_study", Mock(side_effect=ZeroDivisionError))
-    with pytest.raises(ZeroDivisionError):
-        main("run")
 
 
 def test_help_is_there_for_every_command_and_word(main: Main) -> None:

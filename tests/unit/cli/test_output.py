@@ -22,15 +22,11 @@ def printed(action: Callable[[], object]) -> list[str]:
     return out.getvalue().split("\n")
 
 
-@given(ANYTHING, ANYTHING)
-def test_every_line_is_one_printable_line(one: str, other: str) -> None:
+@given(ANYTHING, ANYTHING, ANYTHING)
+def test_every_line_and_every_table_is_printable(one: str, other: str, text: str) -> None:
     for lines, count in ((printed(lambda: echo(one, other)), 3), (printed(lambda: print_line(new_console(), one)), 2)):
         assert len(lines) == count
         assert all(line.isprintable() for line in lines)
-
-
-@given(ANYTHING)
-def test_a_table_is_printable(text: str) -> None:
     frame = pd.DataFrame({"name": [text, "b"], "same": text, text: [1.0, None]})
     assert all(line.isprintable() for line in printed(lambda: print_frame(frame, text)))
 

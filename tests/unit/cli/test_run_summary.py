@@ -24,7 +24,7 @@ def row(cell: str, reason: str, status: str = "inaccurate", **more: Any) -> dict
     return cell_row(**own | {"pod_size": None, "cell": cell, "reason": reason, "status": status} | more)
 
 
-def test_a_line_for_every_reason_names_a_cell_by_all_its_axes() -> None:
+def test_every_reason_has_a_line_with_all_axes_and_a_missed_accuracy_a_remedy() -> None:
     """Reasons that differ in their numbers alone are one; there are never more lines than reasons that matter."""
     rows = [row(f"c{k}", f"{k} of 16 queries, first mu=({k}.5, -1e-0{k}): gap residual {k}.1e-07") for k in range(1, 9)]
     line, other = failures([row("c0", "broke"), *rows], "runs/a")
@@ -39,10 +39,6 @@ def test_a_line_for_every_reason_names_a_cell_by_all_its_axes() -> None:
     lines = list(failures([row(f"c{k}", "a" * k, "error") for k in range(1000)], "runs/a"))
     assert len(lines) == REASONS + 1
     assert lines[-1] == f"{1000 - REASONS} cells not ok for {1000 - REASONS} other reasons"
-
-
-def test_a_missed_accuracy_has_a_remedy() -> None:
-    """Solvers that are ok on the same model at the same accuracy; where there are none, the command that finds one."""
     missed = row("c1", "dual residual 3.5e-09", model="m")
     others = [
         row("c2", "", "ok", model="m", solver="quadprog"), row("c3", "", "ok", model="m", solver="proxqp"),

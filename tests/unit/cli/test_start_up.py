@@ -15,16 +15,13 @@ def imported(command: str, *arguments: str, **environment: str) -> tuple[set[str
     return {line.rsplit("|", 1)[1].strip().split(".")[0] for line in lines}, done.stdout
 
 
-def test_help_imports_no_heavy_library(command: str) -> None:
+def test_help_and_lists_import_no_library_they_do_not_need(command: str) -> None:
     """All commands are defined before any prints its help: one stands for the others."""
     for name in ("", "export"):
         packages, printed = imported(command, *name.split(), "--help")
         assert printed.startswith(f"Usage: vibench {name}".rstrip())
         assert "vibench" in packages
         assert packages & HEAVY == set()
-
-
-def test_lists_import_no_tables_and_plugins_only_for_their_options(command: str) -> None:
     packages, printed = imported(command, "list")
     assert "obstacle" in printed
     assert packages & {"scipy", "pandas", "skfem", "qpsolvers", "matplotlib"} == set()

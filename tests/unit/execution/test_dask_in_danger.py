@@ -92,19 +92,9 @@ def ended(process: subprocess.Popen[str]) -> list[str]:
     return [line for line in err.splitlines() if "the connection is not authenticated" not in line]
 
 
-def test_a_worker_that_dies_changes_no_row(command: str, plugins_folder: Path, waiting: str, tmp_path: Path) -> None:
-    with scheduled(tmp_path / "cluster", plugins_folder) as (address, _, workers):
-        first, _ = workers(2)
-        until(lambda: arrived(address) == 2)
-        with started([command, *on(address, waiting)], tmp_path, plugins_folder) as process:
-            read_until(process, "[2/4] ok")
-            stop(first)
-            (tmp_path / "go on").touch()
-            assert ended(process) == []
-    assert_same_numbers(tmp_path / "local", tmp_path / "dask")
-
-
-def test_a_late_worker_does_what_is_left(command: str, plugins_folder: Path, waiting: str, tmp_path: Path) -> None:
+def test_a_late_worker_does_what_one_that_dies_leaves(
+    command: str, plugins_folder: Path, waiting: str, tmp_path: Path
+) -> None:
     with scheduled(tmp_path / "cluster", plugins_folder) as (address, _, workers):
         (first,) = workers(1)
         until(lambda: arrived(address) == 1)

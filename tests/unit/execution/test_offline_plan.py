@@ -73,7 +73,7 @@ def test_the_seconds_of_a_nested_enrichment_are_those_of_its_growth(tmp_path_fac
     assert OfflineRepeat(source, 2).seconds(store, name) is None
 
 
-def test_medians_count_and_scatter_is_pooled() -> None:
+def test_medians_count_scatter_is_pooled_and_repeats_narrow_intervals() -> None:
     rng = np.random.default_rng(0)
     runs = [[spent(base * float(np.exp(0.3 * rng.standard_normal()))) for _ in range(3)] for base in [0.1, 1.0] * 300]
     assert scatter(runs) == pytest.approx(0.3, rel=0.05)
@@ -84,14 +84,6 @@ def test_medians_count_and_scatter_is_pooled() -> None:
     assert found["offline_s"] == 12.5
     assert found["offline_repeats"] == 5
 
-
-def columns(runs_of: Mapping[str, list[float]], deviation: float = 0.1) -> dict[str, Any]:
-    stages: dict[str, Stage] = {one.key: one for some in GOAL.offline_stages.values() for one in some}
-    runs = {key: [spent(cpu) for cpu in runs_of.get(stage.label, [0.0])] for key, stage in stages.items()}
-    return offline_columns(GOAL, 0.5, runs, deviation)
-
-
-def test_an_interval_narrows_with_the_repeats_of_what_takes_long() -> None:
     def width(**runs: list[float]) -> float:
         found = columns({name.replace("_", " "): values for name, values in runs.items()})
         return float(np.log(found["offline_high_s"] / found["offline_low_s"]))
@@ -100,6 +92,12 @@ def test_an_interval_narrows_with_the_repeats_of_what_takes_long() -> None:
     assert once == pytest.approx(2.0 * 1.96 * 0.1)
     assert width(cone=[1.0] * 4) == pytest.approx(once / 2.0)
     assert width(cone=[1.0], POD=[1e-6] * 4) == pytest.approx(once, rel=1e-3)
+
+
+def columns(runs_of: Mapping[str, list[float]], deviation: float = 0.1) -> dict[str, Any]:
+    stages: dict[str, Stage] = {one.key: one for some in GOAL.offline_stages.values() for one in some}
+    runs = {key: [spent(cpu) for cpu in runs_of.get(stage.label, [0.0])] for key, stage in stages.items()}
+    return offline_columns(GOAL, 0.5, runs, deviation)
 
 
 def test_seconds_of_cells_whose_artefacts_are_gone_stay_as_they_are() -> None:

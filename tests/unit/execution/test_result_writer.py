@@ -70,7 +70,9 @@ POD = TRAINED | {"pod_tol", "pod_size"}
 CONE = TRAINED | {"dual", "dual_options", "dual_tol", "dual_size"}
 
 
-def test_histories_of_every_stage_are_named_by_their_dependences(cell: Cell, stages: list[Stage]) -> None:
+def test_histories_of_every_stage_have_names_by_their_dependences(
+    cell: Cell, stages: list[Stage], study: Study
+) -> None:
     for sort, names in (
         (SnapshotStage, TRAINED),
         (PODStage, POD),
@@ -85,11 +87,7 @@ def test_histories_of_every_stage_are_named_by_their_dependences(cell: Cell, sta
         assert columns == {name: of_cell[name] for name in names}
     other = replace(cell, labels=("x", "y", "z"), solver="osqp")
     assert axis_columns(first(stages, PODStage).axes, labels_of([cell, other]))["problem"] == "membrane"
-
-
-def test_every_stage_of_every_cell_has_names(study: Study) -> None:
-    cells = expand(study)
-    labels = labels_of(cells)
-    for cell in cells:
-        for stage in stages_of(cell_queries(cell, 20.0)):
+    labels = labels_of(expand(study))
+    for one in expand(study):
+        for stage in stages_of(cell_queries(one, 20.0)):
             assert set(axis_columns(stage.axes, labels)) <= set(STORED["histories"])

@@ -49,7 +49,7 @@ def test_a_model_answers_as_the_run_did(small_run: vibench.Run, model: vibench.M
         assert bounds.lam >= model.problem.W.norm(solution.lam - exact.lam)
 
 
-def test_single_answers_have_seconds_reconstructions_and_other_solvers(model: vibench.Model, mus: np.ndarray) -> None:
+def test_single_answers_have_seconds_reconstructions_and_tables_in_html(model: vibench.Model, mus: np.ndarray) -> None:
     solution = model.solve(dict(zip(model.parameters.names, mus[0].tolist(), strict=True)))
     assert np.array_equal(solution.mu, mus[0])
     u, lam = model.reconstruct(mus[0], solution.x, solution.alpha)
@@ -64,6 +64,14 @@ def test_single_answers_have_seconds_reconstructions_and_other_solvers(model: vi
     assert loose.residuals is not None
     assert loose.residuals.worst <= 1e-4
     assert np.allclose(loose.u, model.solve(mus[0]).u, rtol=0.0, atol=1e-2 * np.abs(loose.u).max())
+    assert repr(model).startswith("Model(problem='radial-obstacle', R=")
+    assert " at 0x" not in repr(model)
+    shown = model._repr_html_()
+    assert "<th>solver</th><td>piqp</td>" in shown
+    solution = model.solve(mus[0])._repr_html_()
+    assert "<th>status</th><td>ok</td>" in solution
+    assert "<th>reason</th>" not in solution
+    assert "<td>&lt;b&gt;</td>" in html("title", {"name": "<b>"})
 
 
 def test_many_parameters_give_a_table(model: vibench.Model, mus: np.ndarray, certified: vibench.Run) -> None:
@@ -106,17 +114,6 @@ def test_a_table_of_many_assembles_what_single_queries_do(
         for name in MEMBERS:
             one, other = getattr(alone, name), getattr(reduced.program, name)
             assert np.allclose(one, other, rtol=0.0, atol=1e-13 * np.abs(one).max()), name
-
-
-def test_models_and_solutions_are_shown_by_what_they_are(model: vibench.Model, mus: np.ndarray) -> None:
-    assert repr(model).startswith("Model(problem='radial-obstacle', R=")
-    assert " at 0x" not in repr(model)
-    shown = model._repr_html_()
-    assert "<th>solver</th><td>piqp</td>" in shown
-    solution = model.solve(mus[0])._repr_html_()
-    assert "<th>status</th><td>ok</td>" in solution
-    assert "<th>reason</th>" not in solution
-    assert "<td>&lt;b&gt;</td>" in html("title", {"name": "<b>"})
 
 
 def test_parameters_outside_their_domain_are_warned_of_and_what_is_none_refused(model: vibench.Model) -> None:

@@ -87,7 +87,7 @@ EDITS = {
 }
 
 
-def test_exactly_the_edits_that_may_change_a_number_change_the_fingerprint() -> None:
+def test_fingerprints_change_with_exactly_the_edits_that_may_change_a_number() -> None:
     for what, (before, after) in EDITS.items():
         assert before in SOURCE
         assert hashed(SOURCE.replace(before, after)) != hashed(), what
@@ -97,9 +97,6 @@ def test_exactly_the_edits_that_may_change_a_number_change_the_fingerprint() -> 
         "a name that it does not use": ("    class Shape", "    OTHER = LENGTH\n\n    class Shape"),
     }.items():
         assert hashed(SOURCE.replace(before, after)) == hashed(), what
-
-
-def test_a_class_and_its_objects_differ_and_what_they_compute_on_demand_does_not_count() -> None:
     names = notebook()
     used = names["Shape"]()
     assert used.area == 10.0
@@ -181,13 +178,18 @@ REFUSED: Mapping[str, tuple[str, ...]] = {
 }  # fmt: skip
 
 
-def test_what_cannot_be_run_is_refused_in_a_line(names: dict[str, Any]) -> None:
+def test_what_cannot_be_run_or_imported_is_refused(names: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     for axes, words in REFUSED.items():
         with pytest.raises(RequestError) as caught:
             study(**eval(axes, names | {"Wire": Wire}))
         line = str(caught.value)
         assert [word for word in words if word not in line] == [], line
         assert "\n" not in line
+    lost = give(PluginKind.PROBLEM, "wire", Wire)
+    monkeypatch.setitem(sys.modules, "fake_plugins", None)
+    monkeypatch.delitem(lost.__dict__, "given")
+    with pytest.raises(RequestError, match="problem 'wire' cannot be received by a worker process: ModuleNotFound"):
+        lost.create({})
 
 
 def test_a_problem_is_that_of_the_study_s_time_and_its_class_keeps_its_global_names(names: dict[str, Any]) -> None:
@@ -238,11 +240,3 @@ def test_the_definition_of_a_cell_holds_no_object_and_a_pickled_plugin_brings_it
     assert received == cell.problem
     assert pickle.loads(pickle.dumps(received)) == received  # a worker of dask sends it on
     assert received.registered.package == "__main__"
-
-
-def test_what_a_worker_cannot_import_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    lost = give(PluginKind.PROBLEM, "wire", Wire)
-    monkeypatch.setitem(sys.modules, "fake_plugins", None)
-    monkeypatch.delitem(lost.__dict__, "given")
-    with pytest.raises(RequestError, match="problem 'wire' cannot be received by a worker process: ModuleNotFound"):
-        lost.create({})

@@ -130,7 +130,7 @@ def test_built_in_plugins_are_found_with_a_summary_and_options_with_defaults(kin
         assert find(kind, name).check_options(dict.fromkeys(required, "text")) == dict.fromkeys(required, Path("text"))
 
 
-def test_registered_studies_are_files_that_load_or_refused(register: Register, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_registered_studies_and_solvers_are_used(register: Register, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "quick" in registered(PluginKind.STUDY)
     for name in (name for name, study in registered(PluginKind.STUDY).items() if not study.package):
         assert Path(find(PluginKind.STUDY, name).load()).is_file()
@@ -138,17 +138,12 @@ def test_registered_studies_are_files_that_load_or_refused(register: Register, m
     monkeypatch.setitem(sys.modules, "lost_study", types.SimpleNamespace(path=Path("/nowhere/lost.toml")))
     register(("vibench.studies", "lost", "lost_study:path"))
     assert "/nowhere/lost.toml" in refusal(read_study, "lost")
-
-
-def test_names_are_sorted_groups_separate_and_unknown_names_refused_with_the_nearest(register: Register) -> None:
-    register(*((GROUP, name, f"{HERE}:Plain") for name in ("plain", "other")))
-    assert list(registered(PluginKind.DUAL)) == ["other", "plain"]
-    assert registered(PluginKind.PROBLEM) == {}
-    assert "known: none" in refusal(find(PluginKind.PROBLEM, "plain").load)
-    line = refusal(find(PluginKind.DUAL, "plian").load)
-    assert "no dual strategy is called 'plian'; did you mean 'plain'? (known: other, plain)" in line
-    assert "did you mean" not in refusal(find(PluginKind.DUAL, "xyzzy").load)
-    assert find(PluginKind.DUAL, "plain").origin == "unknown"  # it is in no distribution
+    solvers = (("mine", f"{HERE}:no_strategy"), ("broken", "no_such_module:solve"))
+    register(*built_in(), *(("vibench.qp_solvers", name, value) for name, value in solvers))
+    assert read_study("quick").solver_names()
+    assert read_study("quick", {"solvers": ["mine"]}).solver_names() == ["mine"]
+    assert registry.qp_solver("mine") == {"mine": no_strategy}
+    assert registry.qp_solver("piqp") == {}
 
 
 def test_a_name_of_two_packages_or_of_a_solver_of_qpsolvers_is_refused(register: Register) -> None:
@@ -177,13 +172,21 @@ def test_a_name_of_two_packages_or_of_a_solver_of_qpsolvers_is_refused(register:
     assert find(PluginKind.SOLVER, "osqp").conflict == ""
 
 
-def test_a_distribution_in_two_folders_is_one(
+def test_names_are_sorted_and_each_distribution_is_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, register: Register
 ) -> None:
     for folder in ("one", "other"):
         monkeypatch.syspath_prepend(str(install(tmp_path / folder, fake_plugins, FAKES)))
     assert find(PluginKind.SOLVER, "careful").conflict == ""
     assert find(PluginKind.SOLVER, "careful").origin == "fake-plugins 1.0"
+    register(*((GROUP, name, f"{HERE}:Plain") for name in ("plain", "other")))
+    assert list(registered(PluginKind.DUAL)) == ["other", "plain"]
+    assert registered(PluginKind.PROBLEM) == {}
+    assert "known: none" in refusal(find(PluginKind.PROBLEM, "plain").load)
+    line = refusal(find(PluginKind.DUAL, "plian").load)
+    assert "no dual strategy is called 'plian'; did you mean 'plain'? (known: other, plain)" in line
+    assert "did you mean" not in refusal(find(PluginKind.DUAL, "xyzzy").load)
+    assert find(PluginKind.DUAL, "plain").origin == "unknown"  # it is in no distribution
 
 
 UNLOADABLE = [
@@ -217,15 +220,6 @@ def built_in() -> list[tuple[str, str, str]]:
         for entry in importlib.metadata.distribution("vibench").entry_points
         if entry.group.startswith("vibench.")
     ]
-
-
-def test_a_study_may_name_a_registered_solver_and_is_not_stopped_by_another(register: Register) -> None:
-    solvers = (("mine", f"{HERE}:no_strategy"), ("broken", "no_such_module:solve"))
-    register(*built_in(), *(("vibench.qp_solvers", name, value) for name, value in solvers))
-    assert read_study("quick").solver_names()
-    assert read_study("quick", {"solvers": ["mine"]}).solver_names() == ["mine"]
-    assert registry.qp_solver("mine") == {"mine": no_strategy}
-    assert registry.qp_solver("piqp") == {}
 
 
 ACCEPTED = [

@@ -32,14 +32,11 @@ def test_proved_constants_enclose_the_spectrum_closely() -> None:
             coercivity_and_continuity(sp.csc_array(indefinite), X)
 
 
-def test_a_more_accurate_estimate_comes_before_a_larger_margin() -> None:
+def test_wrong_estimates_cost_accuracy_sharpness_or_the_proof_in_this_order(monkeypatch: pytest.MonkeyPatch) -> None:
     low = moved(lambda accuracy: 2.0 * (1.0 + 5.0 * accuracy), -1.0, lambda a: a <= 2.0)
     high = moved(lambda accuracy: 2.0 / (1.0 + 5.0 * accuracy), 1.0, lambda c: c >= 2.0)
     assert low == Constant(pytest.approx(2.0 * (1.0 + 5e-5) / (1.0 + MARGINS[0]), rel=1e-12), True)
     assert high == Constant(pytest.approx(2.0 / (1.0 + 5e-5) * (1.0 + MARGINS[0]), rel=1e-12), True)
-
-
-def test_an_eigenvalue_that_lanczos_missed_costs_sharpness_or_the_proof(monkeypatch: pytest.MonkeyPatch) -> None:
     A, V = spd(40, np.random.default_rng(1)), space(40, 5)
     values = scipy.linalg.eigh(A, V.matrix.toarray(), eigvals_only=True)
     for missed, margin in ((1.005, 1e-2), (1.05, 1e-1), (1.4, 0.5), (2.0, None)):

@@ -41,7 +41,8 @@ def kahan(n: int, c: float) -> np.ndarray:
     return np.asarray(matrix / np.linalg.norm(matrix, axis=0))
 
 
-def test_the_rank_is_that_of_the_singular_values() -> None:
+def test_the_rank_is_that_of_singular_values_and_conditions_do_not_saturate() -> None:
+    """cond G = (1 + cos φ) / (1 − cos φ) of two unit vectors at the angle φ: 4 / φ² for small angles."""
     chi = kahan(90, 0.3)
     assert abs(scipy.linalg.qr(chi, pivoting=True)[1][-1, -1]) > RANK_RTOL  # which hides the deficiency
     cone = cone_basis(chi, InnerProduct(sp.eye_array(90)))
@@ -65,10 +66,6 @@ def test_the_rank_is_that_of_the_singular_values() -> None:
     cone = cone_basis(np.zeros((6, 0)), W)
     assert (cone.rank, cone.gram_condition, cone.rank_gap, cone.span.shape) == (0, None, np.inf, (6, 0))
     assert (beta_span(np.ones((2, 3))), beta_span(np.eye(3)), beta_span(np.zeros((4, 0)))) == (0.0, 1.0, np.inf)
-
-
-def test_the_condition_of_nearly_parallel_generators_does_not_saturate() -> None:
-    """cond G = (1 + cos φ) / (1 − cos φ) of two unit vectors at the angle φ: 4 / φ² for small angles."""
     for distance in (1e-4, 1e-8, 1e-11, 1e-13):
         chi = np.array([[1.0, np.cos(distance)], [0.0, np.sin(distance)]])
         cone = cone_basis(chi, InnerProduct(sp.eye_array(2)))

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -66,15 +67,18 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
 
 @pytest.fixture
 def wire_store(register: Register, tmp_path: Path) -> SampleStore:
-    """A store with a cell of a problem that declares nothing, asked for in reduced assembly."""
+    """A store with cells in reduced and full assembly of two problems: neither declares anything, one is uneven."""
     register(
-        ("vibench.problems", "wire", "fake_plugins:Wire"),
+        *(
+            ("vibench.problems", name, f"fake_plugins:{cls}")
+            for name, cls in (("wire", "Wire"), ("uneven", "UnevenWire"))
+        ),
         ("vibench.dual_strategies", "mcpg", "vibench_strategies.mcpg:ModifiedCPG"),
         ("vibench.primal_strategies", "decorrelated", "vibench_strategies.decorrelated:Decorrelated"),
     )
     store = SampleStore(tmp_path)
-    carry_out(wire(TOLERANCE), store)
-    carry_out(wire(None), store)
+    for problem, interpolation in product((WIRE, UNEVEN), (TOLERANCE, None)):
+        carry_out(wire(interpolation, problem), store)
     return store
 
 
@@ -107,16 +111,8 @@ def test_rows_of_an_interpolated_problem(store: SampleStore) -> None:
     assert rows.cell["fallbacks"] == ""
 
 
-def test_what_interpolation_misses_is_measured_noted_and_not_compared(register: Register, tmp_path: Path) -> None:
-    register(
-        ("vibench.problems", "uneven", "fake_plugins:UnevenWire"),
-        ("vibench.dual_strategies", "mcpg", "vibench_strategies.mcpg:ModifiedCPG"),
-        ("vibench.primal_strategies", "decorrelated", "vibench_strategies.decorrelated:Decorrelated"),
-    )
-    store, reduced, full = SampleStore(tmp_path), wire(TOLERANCE, UNEVEN), wire(None, UNEVEN)
-    for stage in (reduced, full):
-        carry_out(stage, store)
-    one, other = value_of(store, reduced), value_of(store, full)
+def test_what_interpolation_misses_is_measured_noted_and_not_compared(wire_store: SampleStore) -> None:
+    one, other = (value_of(wire_store, wire(interpolation, UNEVEN)) for interpolation in (TOLERANCE, None))
     assert one.cell["interpolation_error"] < 1e-12  # the training set sees nothing of it
     assert one.cell["assembly_error_max"] > 0.01
     assert one.cell["fallbacks"].startswith("reduced assembly differs from the Galerkin projection by up to")
@@ -182,18 +178,7 @@ def test_assembly_in_full_has_no_offline_part_and_no_error(store: SampleStore, n
     assert rows.cell["assembly_share_mean"] is None
 
 
-@pytest.mark.parametrize("name", ["obstacle", "hertz", "radial"])
-def test_reduced_assembly_costs_its_separation_and_its_projection(store: SampleStore, name: str) -> None:
-    reduction = CELLS[name].built.reduction
-    spent = [store.get(stage.key).seconds.cpu for stage in (reduction.decomposition, reduction)]
-    assert min(spent) > 0.0
-    row = value_of(store, CELLS[name]).cell
-    assert row["offline_assembly_s"] == pytest.approx(sum(spent))
-    parts = ("snapshots", "pod", "cone", "enrichment", "assembly")
-    assert row["offline_s"] == pytest.approx(sum(row[f"offline_{part}_s"] for part in parts))
-
-
-def test_the_separation_of_a_problem_serves_every_reduced_model() -> None:
+def test_separations_serve_every_reduced_model_and_count_in_its_costs(store: SampleStore) -> None:
     one, other = (CELLS[name].built.reduction for name in ("obstacle", "obstacle, fixed"))
     assert one.key != other.key
     assert one.decomposition.key == other.decomposition.key
@@ -202,6 +187,14 @@ def test_the_separation_of_a_problem_serves_every_reduced_model() -> None:
     assert one.decomposition.inputs() == ()
     assert one.decomposition in CELLS["obstacle"].inputs()
     assert CELLS["obstacle"].assembly.key != CELLS["obstacle, full"].assembly.key
+    for name in ("obstacle", "hertz", "radial"):
+        reduction = CELLS[name].built.reduction
+        spent = [store.get(stage.key).seconds.cpu for stage in (reduction.decomposition, reduction)]
+        assert min(spent) > 0.0
+        row = value_of(store, CELLS[name]).cell
+        assert row["offline_assembly_s"] == pytest.approx(sum(spent))
+        parts = ("snapshots", "pod", "cone", "enrichment", "assembly")
+        assert row["offline_s"] == pytest.approx(sum(row[f"offline_{part}_s"] for part in parts))
 
 
 def test_a_problem_that_declares_nothing_is_assembled_in_full_and_the_reason_is_told(wire_store: SampleStore) -> None:

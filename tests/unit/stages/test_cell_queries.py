@@ -54,12 +54,22 @@ def test_a_path_visits_every_parameter_once_and_goes_on_to_the_nearest(seed: int
         assert np.linalg.norm(scaled[there] - scaled[here]) == pytest.approx(apart.min())
 
 
-def test_an_ordered_set_is_its_own_path() -> None:
+def test_rows_say_which_query_of_the_path_they_started_from(tmp_path: Path) -> None:
     problem = PROBLEM.create()
     walk = Plugin("sampling strategy", "random-walk", '{"size": 5, "seed": 1}', "test")
     assert query_before(ParameterSet("validation", 5, 1, walk), problem) == [None, 0, 1, 2, 3]
     own = ParameterSet("validation", 5, 1)
     assert query_before(own, problem) == path_before(own.of(problem), problem.parameters) != [None, 0, 1, 2, 3]
+    stage, store, started = cell(PROBLEM, "osqp", 1e-6), SampleStore(tmp_path), {}
+    for warm, solver in ((False, "osqp"), (True, "osqp"), (True, "piqp")):
+        asked = replace(stage, warm_start=warm, solver=solver)
+        carry_out(asked, store)
+        rows = value_of(store, asked).queries
+        assert {row["status"] for row in rows} == {"ok"}
+        started[warm, solver] = [row.get("started_from") for row in rows]
+    assert started[False, "osqp"] == started[True, "piqp"] == [None] * 4
+    assert started[True, "osqp"] == path_before(problem.validation_set(4, 1), problem.parameters)
+    assert started[True, "osqp"].count(None) == 1
 
 
 @pytest.mark.parametrize(("solver", "dual"), [*product(["piqp", "proxqp", "osqp"], [False, True])])
@@ -116,17 +126,3 @@ def test_a_cell_too_large_is_assessed_in_parts(
     if (certificate := stage.certificate) is not None:  # the data of mesh size are there once for all models
         assert certificate.certificate(store).base is value_of(store, certificate.base)
         assert "base" not in value_of(store, certificate)
-
-
-def test_rows_say_which_query_they_started_from(tmp_path: Path) -> None:
-    stage, store, started = cell(PROBLEM, "osqp", 1e-6), SampleStore(tmp_path), {}
-    for warm, solver in ((False, "osqp"), (True, "osqp"), (True, "piqp")):
-        asked = replace(stage, warm_start=warm, solver=solver)
-        carry_out(asked, store)
-        rows = value_of(store, asked).queries
-        assert {row["status"] for row in rows} == {"ok"}
-        started[warm, solver] = [row.get("started_from") for row in rows]
-    problem = PROBLEM.create()
-    assert started[False, "osqp"] == started[True, "piqp"] == [None] * 4
-    assert started[True, "osqp"] == path_before(problem.validation_set(4, 1), problem.parameters)
-    assert started[True, "osqp"].count(None) == 1

@@ -198,7 +198,7 @@ def test_solutions_come_before_amid_and_after_queries_until_enough(taken: float,
     assert len(set(marginal.asked)) == len(marginal.asked)  # each is next to another parameter
 
 
-def test_a_long_solution_serves_all_cells_of_a_round_and_no_other_round() -> None:
+def test_long_solutions_serve_all_cells_of_a_round_and_stand_for_a_part() -> None:
     marginal = Given(2.0)
     beside, done = SolutionsBeside(marginal, [1.0] * 9), [list[MarginalSolution]() for _ in range(3)]
     for solutions, (at, cell) in zip(done, [(0, 0), (0, 1), (1, 1)], strict=True):
@@ -207,9 +207,6 @@ def test_a_long_solution_serves_all_cells_of_a_round_and_no_other_round() -> Non
     assert [number for number, *_ in marginal.asked] == [0, 2]
     assert [[one.number for one in solutions] for solutions in done] == [[0], [0], [2]]
     assert done[0][0].vi.A is not done[1][0].vi.A  # kept in arrays of its own
-
-
-def test_some_solutions_stand_for_all_of_a_part_by_the_sweep() -> None:
     marginal = Given(0.01, None, 0.03)
     beside, done = SolutionsBeside(marginal, [1.0, 2.0, 3.0, 6.0]), list[MarginalSolution]()
     list(beside.alternated([1, 2, 3], done, 0, 0))
@@ -333,14 +330,19 @@ class Remembers:
         return self.known[key]
 
 
-def test_a_solver_with_memory_meets_no_program_again(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two cells of one problem and solver are in the rounds, whose programs are the same."""
-    solver = Remembers()
+def test_a_solver_with_memory_meets_no_program_again_and_none_is_assembled_twice(
+    store: SampleStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two cells of one problem and solver are in the rounds, whose programs are the same; a problem may cache, too."""
+    solver, visited, plain = Remembers(), list[tuple[float, ...]](), HyperReducedModel.assemble
     monkeypatch.setattr(registry, "qp_solver", lambda name: {name: solver})
+    monkeypatch.setattr(HyperReducedModel, "assemble", lambda one, mu: (visited.append(tuple(mu)), plain(one, mu))[1])
     timed = TimingRounds(OF_THREE, (EVERY[:3],) * 4, 12, first=0).run(store).value
     assert [len(one.rounds) for one in timed] == [12] * 4
     assert solver.solved == 4 * (12 + 1)  # a query in every round, and the warm-up
     assert solver.remembered == 0
+    assert len(visited) == len(set(visited)) == 2 * (12 + 1)
+    assert len({tuple(np.round(mu, 6)) for mu in visited}) == 3
 
 
 @pytest.mark.parametrize("which", [0, 2])
@@ -354,17 +356,6 @@ def test_answers_to_similar_programs_are_not_timed(
     with pytest.raises(NumericalError, match=r"residual .* above 3e-07.*does the solver remember answers"):
         TimingRounds(OF_THREE[which : which + 1], (EVERY[:3],), 12, first=0).run(store)
     assert solver.remembered == 1
-
-
-def test_reduced_programs_are_assembled_nowhere_twice(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A problem may keep what it computed for a parameter."""
-    monkeypatch.setattr(registry, "qp_solver", lambda name: {name: Remembers()})
-    visited: list[tuple[float, ...]] = []
-    plain = HyperReducedModel.assemble
-    monkeypatch.setattr(HyperReducedModel, "assemble", lambda one, mu: (visited.append(tuple(mu)), plain(one, mu))[1])
-    TimingRounds(OF_THREE, (EVERY[:3],) * 4, 12, first=0).run(store)
-    assert len(visited) == len(set(visited)) == 2 * (12 + 1)
-    assert len({tuple(np.round(mu, 6)) for mu in visited}) == 3
 
 
 @pytest.mark.parametrize("reduced", [False, True], ids=["primal", "dual"])

@@ -138,7 +138,7 @@ WRONG: Mapping[str, tuple[tuple[str | int, ...], Any, tuple[str, ...]]] = {
 }
 
 
-def test_what_is_wrong_is_said_in_one_line(tmp_path: Path) -> None:
+def test_what_is_wrong_is_said_in_one_line_without_the_key_itself(tmp_path: Path) -> None:
     cases = [(changed(STUDY, *where, to=value), words) for where, value, words in WRONG.values()]
     for size, tolerance in (("N", "pod"), ("R", "dual")):
         for value, word in (([0], "greater than"), ([1.5], "integer"), ([], "at least 1")):
@@ -152,9 +152,6 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path) -> None:
         message = line.removeprefix(path)
         assert [word for word in words if word.lower() not in message.lower()] == [], line
         assert [word for word in JARGON if word in message] == [], line
-
-
-def test_a_key_in_the_wrong_place_is_not_suggested_again(tmp_path: Path) -> None:
     places = (((), "pod"), ((), "resolution"), (("limits",), "seed"), (TABLE, "name"))
     for where, key in places:
         line = refusal(write_study(tmp_path, changed(changed(STUDY, "limits", to={}), *where, key, to=1)))

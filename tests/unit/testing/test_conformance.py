@@ -96,7 +96,7 @@ def test_every_check_has_a_line(plugin: str, code: int, title: str, lines: list[
     assert out.splitlines()[-1].endswith(counts)
 
 
-def test_the_plugins_that_are_broken_elsewhere_are_correct() -> None:
+def test_plugins_broken_elsewhere_are_correct_on_data_of_one_s_own_too() -> None:
     strategies = broken_strategies.Greedy, broken_strategies.LastErrorAlone, broken_strategies.Supremizing
     for plugin in (broken_problems.Declared, testing.MovingSupport, Varying, *strategies):
         testing.check(plugin)
@@ -108,9 +108,6 @@ def test_the_plugins_that_are_broken_elsewhere_are_correct() -> None:
     title, *lines = str(caught.value).splitlines()
     assert title == "Worse fails 2 of 26 checks"
     assert [line.split(":")[0] for line in lines] == ["training set", "pickling"]
-
-
-def test_snapshots_and_a_model_of_one_s_own_are_used() -> None:
     snapshots, W = testing.sample_snapshots()
     misses = testing.examine(broken_strategies.Misses, snapshots=snapshots[:, :2], W=W, tolerances=[1e-9], sizes=[1])
     assert failures(misses) == {}  # two generators are all there is
@@ -212,16 +209,7 @@ def test_a_plugin_that_is_not_there_is_refused_in_one_line(main: Main) -> None:
         refused(main("check", *filter(None, arguments.split(" "))), *words)
 
 
-def test_a_name_of_two_plugins_is_refused_until_the_kind_is_given(main: Main, register) -> None:
-    register(
-        ("vibench.problems", "twin", "broken_problems:Declared"),
-        ("vibench.dual_strategies", "twin", "broken_strategies:Greedy"),
-    )
-    refused(main("check", "twin"), "several plugins are called 'twin'", "problem:twin or dual:twin")
-    assert main("check", "dual:twin")[1].startswith("dual strategy 'twin'")
-
-
-def test_options_reach_the_plugin(main: Main, tmp_path: Path) -> None:
+def test_options_reach_the_plugin_of_the_kind_that_is_given(main: Main, tmp_path: Path, register) -> None:
     _, out, _ = main("check", "fake_plugins:Wire", "--option", "nodes=20", "--option", "depth=0.1")
     assert "n = 20, m = 20" in out
     code, out, _ = main("check", "fake_plugins:BadCone", "--option", "how=negative")
@@ -236,3 +224,9 @@ def test_options_reach_the_plugin(main: Main, tmp_path: Path) -> None:
     code, out, _ = main("check", "lying_around:Mine")
     assert code == 0
     assert out.startswith("dual strategy 'lying_around:Mine'")
+    register(
+        ("vibench.problems", "twin", "broken_problems:Declared"),
+        ("vibench.dual_strategies", "twin", "broken_strategies:Greedy"),
+    )
+    refused(main("check", "twin"), "several plugins are called 'twin'", "problem:twin or dual:twin")
+    assert main("check", "dual:twin")[1].startswith("dual strategy 'twin'")

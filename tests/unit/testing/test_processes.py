@@ -110,7 +110,7 @@ def fails() -> None:
     raise ArithmeticError("the wire snapped")
 
 
-def test_another_process_has_other_hashes() -> None:
+def test_other_processes_have_other_hashes_and_get_what_can_be_sent() -> None:
     there = call_in_other_process(process, seconds=PATIENCE)
     assert there[0] != os.getpid()
     assert there[1] != hash("a text")
@@ -118,8 +118,6 @@ def test_another_process_has_other_hashes() -> None:
     with pytest.raises(ConformanceError, match="in another process it fails: ArithmeticError: the wire snapped"):
         call_in_other_process(fails, seconds=PATIENCE)
 
-
-def test_what_cannot_be_sent_to_another_process_is_not_compared() -> None:
     class Local(Wire):
         pass
 

@@ -148,7 +148,7 @@ def test_what_is_right_passes_and_a_seed_that_changes_nothing_is_doubtful() -> N
     assert "seeds 0 to 3 give the same points" in doubt.message
 
 
-def test_the_command_chooses_a_size_and_a_seed_and_says_so(main: Main) -> None:
+def test_the_command_says_its_size_and_seed_and_names_what_hangs(main: Main) -> None:
     code, out, err = main("check", "sampling:latin-hypercube")
     assert (code, err) == (0, ""), out
     assert out.startswith(
@@ -158,6 +158,10 @@ def test_the_command_chooses_a_size_and_a_seed_and_says_so(main: Main) -> None:
     code, out, _ = main("check", "sampling:list", "--option", "points=[[0.5, 1, 5.2], [1, 2, 5.3]]")
     assert code == 0
     assert "1 parameter: refused, point 0 has 3 values" in out
+    Path("hanging_points.py").write_text(HANGING)
+    code, out, _ = main("check", "hanging_points:Hangs", "--seconds", "3")
+    assert code == 1
+    assert "failed   parameters: stopped: the checks take longer than 3 s" in out
 
 
 HANGING = """
@@ -169,10 +173,3 @@ class Hangs(Sampling):
     def parameters(self, box):
         time.sleep(60.0)
 """
-
-
-def test_the_command_names_what_hangs(main: Main) -> None:
-    Path("hanging_points.py").write_text(HANGING)
-    code, out, _ = main("check", "hanging_points:Hangs", "--seconds", "3")
-    assert code == 1
-    assert "failed   parameters: stopped: the checks take longer than 3 s" in out
