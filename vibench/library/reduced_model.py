@@ -143,8 +143,11 @@ class Model:
             of = self._matrices or _matrices(A, B)
             if {"A", "B"} <= self._constant.keys() and "plain" not in self.data:
                 self._matrices = of
-            (x, forces), found = self._solved(of, f, g / of.norms)
-            alpha, status = forces / of.norms, "ok"
+            # In v = x − A⁻¹f the size of the program is what contact does, however large the load is.
+            free = of.inverse.T @ (of.inverse @ f)
+            free += of.inverse.T @ (of.inverse @ (f - A @ free))
+            (v, forces), found = self._solved(of, g / of.norms - of.B @ free)
+            x, alpha, status = free + v, forces / of.norms, "ok"
             if not all(residual <= self.about["accuracy"] for residual in found):  # NaN is not
                 status = "inaccurate"
             elif self._is_outside(np.asarray(mu, dtype=float)):
@@ -158,28 +161,27 @@ class Model:
         """Values of the outputs by name."""
         return dict(zip(self._outputs, values.tolist(), strict=True))
 
-    def _solved(self, of: _Matrices, f: Array, g: Array) -> tuple[tuple[Array, Array], Residuals]:
-        """The solver's x and α for rows of B of norm 1, or those of its active set, whichever are better; residuals."""
-        A, B = of.A, of.B
-        length, force = _units(A, f, g)  # in which the solver's tolerances are relative ones
-        settings = self.about["settings"][self.solver]
-        y, z = SOLVERS[self.solver](A * (length / force), f / force, B, g / length, settings)
+    def _solved(self, of: _Matrices, g: Array) -> tuple[tuple[Array, Array], Residuals]:
+        """The solver's v and α without load for rows of B of norm 1, or those of its active set; residuals."""
+        A, B, f = of.A, of.B, np.zeros(len(of.A))
+        if (g >= 0.0).all():  # no constraint acts
+            return (f, np.zeros(len(g))), (0.0, 0.0, 0.0)
+        length = float(-g.min())  # units in which the solver's tolerances are relative ones
+        force = 1e-3 * length * float(A.trace()) / len(A)
+        y, z = SOLVERS[self.solver](A * (length / force), f, B, g / length, self.about["settings"][self.solver])
         if not np.isfinite(y.sum() + z.sum()):
             y, z = (np.nan_to_num(vector, nan=0.0, posinf=0.0, neginf=0.0) for vector in (y, z))
         # forces below 1e-3 are often those of rows that touch without any: those that are missing come back
-        best = _polished(of, f, g, (z > g / length - B @ y) & (z > 1e-3 * z.max(initial=0.0)))
-        found = residuals(A, f, B, g, *best, of.inverse)
+        best = _polished(of, g, (z > g / length - B @ y) & (z > 1e-3 * z.max(initial=0.0)))
+        found, given = residuals(of, f, g, *best), (length * y, force * np.maximum(z, 0.0))
         # residuals of some 1e-13 are round-off; NaN is not
-        if not all(residual <= 1e-13 for residual in found):
-            given = length * y, force * np.maximum(z, 0.0)
-            of_given = residuals(A, f, B, g, *given, of.inverse)
-            if _worst(of_given) <= _worst(found):
-                return given, of_given
-        return best, found
+        if all(residual <= 1e-13 for residual in found):
+            return best, found
+        return min((given, residuals(of, f, g, *given)), (best, found), key=lambda pair: _worst(pair[1]))
 
 
 class _Matrices(NamedTuple):
-    """A, B with rows of norm 1, these norms, |B|, the inverse L⁻¹ of the factor of A, and L⁻¹Bᵀ."""
+    """A, B with rows of norm 1, these norms, |B|, the inverse L⁻¹ of A's factor, L⁻¹Bᵀ, and norms of its columns."""
 
     A: Array
     B: Array
@@ -187,33 +189,39 @@ class _Matrices(NamedTuple):
     sizes: Array
     inverse: Array
     whitened: Array
+    lengths: Array
 
 
 def _matrices(A: Array, B: Array) -> _Matrices:
     norms = np.sqrt((B * B).sum(axis=1))
     norms[norms == 0.0] = 1.0
     B, inverse = B / norms[:, None], np.linalg.inv(np.linalg.cholesky(A))
-    return _Matrices(A, B, norms, abs(B), inverse, inverse @ B.T)
+    whitened = inverse @ B.T
+    return _Matrices(A, B, norms, abs(B), inverse, whitened, np.sqrt((whitened**2).sum(axis=0)))
 
 
-def residuals(A: Array, f: Array, B: Array, g: Array, x: Array, alpha: Array, inverse: Any = None) -> Residuals:
-    """With s = B x − g, S² = xᵀA x + ‖Bᵀα‖² and norms in A⁻¹: max (s_i)₊/‖B_i‖S, ‖f − A x − Bᵀα‖/S, |αᵀs|/S².
+def residuals(of: _Matrices, f: Array, g: Array, x: Array, alpha: Array) -> Residuals:
+    """With s = B x − g and norms in A⁻¹: max (s_i)₊/‖B_i‖F, ‖f − A x − Bᵀα‖/F, |αᵀs|/F².
 
-    `inverse` is that of the Cholesky factor of A, if it is known.
+    F is the larger of ‖Bᵀα‖ and max (B_i u₀ − g_i)₊/‖B_i‖, u₀ = A⁻¹f; without contact S, S² = xᵀA x + ‖Bᵀα‖².
     """
-    s, force, Ax = B @ x - g, alpha @ B, A @ x
+    A, B = of.A, of.B
+    free = of.inverse.T @ (of.inverse @ f)
+    way, least = (_step(of, at, B @ at - g, g) for at in (x, free))
+    Ax, force, s = A @ x, alpha @ B, B @ x - g
+    rest, pull = np.sqrt(((of.inverse @ np.array([f - Ax - force, force]).T) ** 2).sum(axis=0)).tolist()
+    F = max(pull, least) if least else float(np.hypot(np.sqrt(max(float(x @ Ax), 0.0)), pull))
+    return _ratio(way, F), _ratio(rest, F), _ratio(abs(float(alpha @ s)), F**2)
+
+
+def _step(of: _Matrices, x: Array, s: Array, g: Array) -> float:
+    """The largest s_i/‖B_i‖ of rows that are violated at x by more than round-off; infinite for a row of zeros."""
     rows = (s > 0.0).nonzero()[0]
     if len(rows):
-        sizes = abs(B[rows]) @ abs(x) + abs(g[rows])
-        rows = rows[s[rows] > 1.01 * np.finfo(float).eps * ((B[rows] != 0.0).sum(axis=1) + 2.0) * sizes]
-    inverse = np.linalg.inv(np.linalg.cholesky(A)) if inverse is None else inverse
-    whitened = inverse @ np.array([f - Ax - force, force, *B[rows]]).T
-    norms, way = np.sqrt((whitened**2).sum(axis=0)), 0.0
-    if len(rows):
-        with np.errstate(divide="ignore"):  # a row of zeros
-            way = float((s[rows] / norms[2:]).max())
-    rest, S, gap = float(norms[0]), float(np.hypot(np.sqrt(max(float(x @ Ax), 0.0)), norms[1])), abs(float(alpha @ s))
-    return _ratio(way, S), _ratio(rest, S), _ratio(gap, S**2)
+        sizes = of.sizes[rows] @ abs(x) + abs(g[rows])
+        rows = rows[s[rows] > 1.01 * np.finfo(float).eps * ((of.B[rows] != 0.0).sum(axis=1) + 2.0) * sizes]
+    with np.errstate(divide="ignore"):
+        return float((s[rows] / of.lengths[rows]).max(initial=0.0))
 
 
 def _ratio(size: float, scale: float) -> float:
@@ -224,31 +232,24 @@ def _worst(found: Residuals) -> float:
     return float(np.nan_to_num(np.max(found), nan=np.inf))
 
 
-def _units(A: Array, f: Array, g: Array) -> tuple[float, float]:
-    """Units of length and force for the solver: of the load, or without load of what violated constraints prescribe."""
-    k, load, square, curvature = float(A.trace()) / len(f), float(abs(f).max()), float(f @ f), float(f @ A @ f)
-    moved, depth = load * (square / (curvature or np.inf)), float((-g).max(initial=0.0))
-    return (max(moved, depth), load) if moved > 1e-10 * depth else (depth or 1.0, 1e-3 * k * (depth or 1.0))
-
-
-def _polished(of: _Matrices, f: Array, g: Array, active: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """The solution up to round-off: equations on an active set, which changes until all signs are right."""
-    (A, B, _, sizes, inverse, whitened), load = of, of.inverse @ f
+def _polished(of: _Matrices, g: Array, active: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """The solution without load up to round-off: equations on an active set, which changes until signs are right."""
+    A, B, _, sizes, inverse, whitened, _ = of
     k = np.sqrt(A.trace() / len(A))
     for step in range(20 + 4 * len(g)):
         chosen = active.nonzero()[0]
-        rows, W, x, alpha = B[chosen], whitened[:, chosen], np.zeros(len(f)), np.zeros(len(g))
-        rest, missed, root = load, g[chosen], _root(W.T @ W)
+        rows, W, x, alpha = B[chosen], whitened[:, chosen], np.zeros(len(A)), np.zeros(len(g))
+        rest, missed, root = np.zeros(len(A)), g[chosen], _root(W.T @ W)
         if root is not None:
             for _ in range(2):  # the second time with the residuals, up to round-off
                 forces = (root @ (W.T @ rest - missed)) @ root
                 alpha[chosen] += forces
                 x += (rest - W @ forces) @ inverse
-                rest, missed = inverse @ (f - A @ x - alpha[chosen] @ rows), g[chosen] - rows @ x
+                rest, missed = -inverse @ (A @ x + alpha[chosen] @ rows), g[chosen] - rows @ x
         else:
             system = np.block([[A / k, k * rows.T], [k * rows, np.zeros((len(chosen), len(chosen)))]])
-            solved = np.linalg.lstsq(system, np.append(f / k, k * g[chosen]), rcond=None)[0]
-            x, alpha[chosen] = solved[: len(f)], k**2 * solved[len(f) :]
+            solved = np.linalg.lstsq(system, np.append(np.zeros(len(A)), k * g[chosen]), rcond=None)[0]
+            x, alpha[chosen] = solved[: len(A)], k**2 * solved[len(A) :]
         excess = B @ x - g
         violated = excess > 1e-12 * (sizes @ abs(x) + abs(g))
         pulling = alpha < -1e-12 * abs(alpha).max(initial=0.0)

@@ -12,7 +12,7 @@ of the constraints, and its Cholesky factor.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,8 +23,9 @@ from cachetools import LRUCache
 from vibench.arrays import Array, Indices, Mask, SparseMatrix, times_dense
 from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality, is_absent
-from vibench.qp.exact import Directions
+from vibench.qp.exact import Directions, Rows, rows_that_matter
 from vibench.qp.scaling import near_rows
+from vibench.qp.verification import round_off_of_terms
 
 
 @dataclass(frozen=True)
@@ -131,6 +132,50 @@ class ContactForm:
         if not self.is_dense:
             return self.force_representer(multiplier).norm
         return float(np.sqrt(max(float(multiplier @ (self.compliance @ multiplier)), 0.0)))
+
+    @cached_property
+    def _matter(self) -> Rows:
+        room = round_off_of_terms(self.entries, np.abs(self.vi.g))
+        return rows_that_matter(self.B, self.vi.g, room, directions=self.directions)
+
+    def contact_energy(self, multiplier: Array) -> float:
+        """F of a multiplier η (m,): the norm of its force in A⁻¹, but for what equalities hold (MATH.md §12)."""
+        if not len(self._matter.equalities):
+            return self.force_norm(multiplier)
+        held = replace(self.vi, f=np.asarray(self.vi.B.T @ multiplier), g=np.zeros_like(multiplier))
+        u = self._stiffness.holding(held, self._matter.equalities)
+        return float(np.sqrt(max(float(u @ (self.vi.A @ u)), 0.0)))
+
+    @cached_property
+    def least_contact(self) -> float:
+        """F_low, a lower bound of F from the solution without constraints; 0 where none is violated there."""
+        if len(self._matter.equalities):
+            free = self.values(self._stiffness.holding(self.vi, self._matter.equalities))
+        else:
+            free = representers(self._stiffness, self.vi.f[:, None])[0].values
+        excess = self.B @ free - self.vi.g
+        doubtful = round_off_of_terms(self.entries, self.sizes @ np.abs(free) + np.abs(self.vi.g))
+        reached = np.flatnonzero((excess > doubtful) & ~self._matter.implied)
+        return self.largest_step(reached, excess[reached])
+
+    def largest_step(self, rows: Indices, excess: Array) -> float:
+        """The largest s_i / ‖B_i‖_{A⁻¹} over violated rows (k,), whose s are given.
+
+        ‖B_i‖⁻¹ is bounded from above without A⁻¹, so that the rows with the largest bounds are enough.
+        """
+        if self.is_dense:
+            return float(np.max(excess / np.sqrt(self.squares[rows]), initial=0.0))
+        bounds = excess * np.sqrt(self.stiffnesses[rows])
+        largest, order = 0.0, np.argsort(-bounds, kind="stable")
+        # eight solutions at once: usually the first block has the largest step
+        for start in range(0, len(order), 8):
+            block = order[start : start + 8]
+            if bounds[block[0]] <= largest:
+                break
+            loads = sp.csr_array(self.B)[rows[block]].toarray().T
+            squares = np.einsum("ik,ik->k", loads, self._stiffness.compliance(loads))
+            largest = max(largest, float(np.max(excess[block] / np.sqrt(squares))))
+        return largest
 
     def _displaced(self, multiplier: Array) -> Array:
         """Displacements D η (c,) of a multiplier η (m,)."""

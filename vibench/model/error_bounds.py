@@ -140,7 +140,7 @@ def _bounds(
 
 
 def reference_bound(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam: Array) -> float:
-    """Δ_A / S of a high-fidelity solution u (n,) and λ ≥ 0 (m,), S² = ‖u‖²_A + ‖Bᵀλ‖²_{A⁻¹}; infinite without a w.
+    """Δ_A / F of a high-fidelity solution u (n,) and λ ≥ 0 (m,), or over S without contact; infinite without a w.
 
     Residuals say less: what is κ in Δ_A is only the square of an error. `vi` and `energy` are of the same parameter.
 
@@ -154,7 +154,9 @@ def reference_bound(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam
         return inf
     (riesz,) = riesz_representatives([energy], [residual(vi, u, lam)])
     bound, contact = bound_terms(correction, u, lam, riesz).primal, correction.contact
-    size = hypot(energy.norm(u), contact.force_norm(lam))
+    size = contact.contact_energy(lam)
+    if not bound <= REFERENCE * size and not contact.least_contact:
+        size = hypot(energy.norm(u), contact.force_norm(lam))
     round_off = np.nan_to_num(_round_off(contact, contact.values(u), correction.values), posinf=0.0)
     # 2κ is at most twice λᵀ times the first margin and the round-off itself, where w was found at once
     open_by_round_off = np.sqrt(4.0 * float(lam @ first_margin(round_off)))

@@ -1,9 +1,9 @@
 """Errors and residuals of pairs u_N and λ_N: against high-fidelity solutions, and of the high-fidelity problem itself.
 
 The natural residuals are those of `vibench.qp.verification` for the high-fidelity program, whatever model found the
-pair, in matrices of contact size. With S² = ‖u‖²_A + ‖Bᵀλ‖²_{A⁻¹} and s = B u − g,
+pair, in matrices of contact size: with their unit F, the energy that contact adds, and s = B u − g,
 
-    primal max_i (s_i)₊ / ‖B_i‖_{A⁻¹} / S,    dual ‖f − A u − Bᵀλ‖_{A⁻¹} / S,    gap |λᵀs| / S².
+    primal max_i (s_i)₊ / ‖B_i‖_{A⁻¹} / F,    dual ‖f − A u − Bᵀλ‖_{A⁻¹} / F,    gap |λᵀs| / F².
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
-import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices, Mask, SparseMatrix
+from vibench.arrays import Array, Mask, SparseMatrix
 from vibench.highfidelity.active_set import solve_unverified
 from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.outputs import Output
@@ -298,36 +297,16 @@ def high_fidelity_residuals(
         residual, _ = accurate_residuals(vi, u, lam)
         rho = representers(energy.stiffness, residual[:, None])[0].norm
     excess = np.asarray(on.in_extended_precision @ values.astype(np.longdouble) - vi.g, dtype=float)
-    size = float(np.hypot(energy.norm(u) if u_energy is None else u_energy, on.force_norm(lam)))
+    # u_N may miss contact altogether: F_low is that of the unconstrained solution.
+    least = on.least_contact
+    unit = max(on.contact_energy(lam), least)
+    if not least:
+        unit = float(np.hypot(energy.norm(u) if u_energy is None else u_energy, on.force_norm(lam)))
     violated = np.flatnonzero(excess > round_off_of_terms(on.entries, on.sizes @ np.abs(values) + np.abs(vi.g)))
     # s may be infinite where λ is zero.
     pressed = lam > 0.0
     gap = abs(float(lam[pressed] @ excess[pressed]))
-    return Residuals(
-        primal=ratio(_largest_step(on, energy, violated, excess[violated]), size),
-        dual=ratio(rho, size),
-        gap=ratio(gap, size * size),
-    )
-
-
-def _largest_step(on: ContactForm, energy: EnergyNorm, rows: Indices, excess: Array) -> float:
-    """The largest s_i / ‖B_i‖_{A⁻¹} over violated rows (k,), whose s are given.
-
-    ‖B_i‖⁻¹ is bounded from above without A⁻¹, so that the rows with the largest bounds are enough.
-    """
-    if on.is_dense:
-        return float(np.max(excess / np.sqrt(on.squares[rows]), initial=0.0))
-    bounds = excess * np.sqrt(on.stiffnesses[rows])
-    largest, order = 0.0, np.argsort(-bounds, kind="stable")
-    # eight solutions at once: usually the first block has the largest step
-    for start in range(0, len(order), 8):
-        block = order[start : start + 8]
-        if bounds[block[0]] <= largest:
-            break
-        loads = sp.csr_array(on.B)[rows[block]].toarray().T
-        squares = np.einsum("ik,ik->k", loads, energy.stiffness.compliance(loads))
-        largest = max(largest, float(np.max(excess[block] / np.sqrt(squares))))
-    return largest
+    return Residuals.relative(on.largest_step(violated, excess[violated]), rho, gap, unit)
 
 
 def residual_multiplier(vi: VariationalInequality, energy: EnergyNorm, u: Array) -> Array:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.linalg.lapack import dtrtrs
+from scipy.linalg.lapack import dposv, dtrtrs
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError, message_of
@@ -88,6 +88,7 @@ def solve_qp(
 
     The data are scaled first (`Units`), every constraint row to unit norm and x and the objective by what drives them
     (`drive`), so that the absolute tolerances of the solvers correspond to the relative residuals of the benchmark.
+    A dense program is shifted by A⁻¹f before: its size is what contact does then, not the load (MATH.md §12).
     Constraints at a distance of more than 1e4 units are left out at first, and restored if the solution violates one of
     them. The solution is scaled back.
 
@@ -112,7 +113,15 @@ def solve_qp(
         If the solver does not return a `QPSolution` of the right shapes, with a text as its status.
     """
     if not program.f.any() and (program.g >= 0.0).all():
-        return QPSolution(np.zeros_like(program.f), np.zeros_like(program.g), "nothing to solve: 0 is the solution")
+        return QPSolution(np.zeros_like(program.f), np.zeros_like(program.g), "nothing to solve: no constraint acts")
+    if factor is None and isinstance(program.A, np.ndarray) and program.f.any():
+        L, free, failed = dposv(program.A, program.f)
+        # An A of which a pivot leaves next to nothing is left to the solver: A⁻¹f would be round-off.
+        if not failed and (np.square(L.diagonal()) > 1e-10 * program.A.diagonal()).all():
+            shifted = replace(program, f=np.zeros_like(free), g=program.g - program.B @ free)
+            begun = start if start is None or start.x is None else replace(start, x=start.x - free)
+            answer = solve_qp(shifted, solver, accuracy, extra, start=begun)
+            return answer if answer.x is None else replace(answer, x=answer.x + free)
     rows = row_norms(program.B)
     driven = drive(program, rows)
     kept = near(program, rows, driven)
@@ -195,6 +204,10 @@ def _solve_dual(
     whitened = _solve_factor(factor, right.T)
     constraints, load = whitened[:, :count], whitened[:, count]
     A, f = constraints.T @ constraints, constraints.T @ load - program.g / rows
+    if not (f > 0.0).any():
+        # The unconstrained solution satisfies all constraints.
+        x = _solve_factor(factor, load, transposed=True)
+        return QPSolution(x, np.zeros(count), "nothing to solve: no constraint acts")
     dual = VariationalInequality(A, f, B=-np.eye(count), g=np.zeros(count))
     if start is not None and start.alpha is not None and start.x is not None:
         # The multipliers of the constraints −α ≤ 0 are the slacks g − Bx.

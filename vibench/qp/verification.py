@@ -1,22 +1,24 @@
 """KKT verification: residuals recomputed from the solution, and a status from them alone, not from the solver.
 
-A residual means something only in the norms of the program. With r = f − A x − Bᵀα, s = B x − g and the energy
-S² = ‖x‖²_A + ‖Bᵀα‖²_{A⁻¹} of the solution, the *natural* residuals
+A residual means something only in the norms of the program, relative to what contact does. With u₀ = A⁻¹f the natural
+size of a program is F = ‖u − u₀‖_A = ‖Bᵀα‖_{A⁻¹}: a loaded body beside the one in contact adds nothing to it. With
+r = f − A x − Bᵀα and s = B x − g the *natural* residuals
 
-    dual ‖r‖_{A⁻¹} / S,    primal max_i (s_i)₊ / ‖B_i‖_{A⁻¹} / S,    gap |αᵀs| / S²,    ‖B_i‖²_{A⁻¹} = B_i A⁻¹ B_iᵀ,
+    dual ‖r‖_{A⁻¹} / F,    primal max_i (s_i)₊ / ‖B_i‖_{A⁻¹} / F,    gap |αᵀs| / F²,    ‖B_i‖²_{A⁻¹} = B_i A⁻¹ B_iᵀ,
 
-are the same in all units of x and f, in any basis of x, and for any scaling of rows of B with g. They are the terms of
-the error bound of `vibench.model.error_bounds`: (s_i)₊ / ‖B_i‖_{A⁻¹} is the energy norm of the smallest correction that
-row i needs alone. Whether a row is violated is decided row by row, against the round-off of its own s_i: a far row, as
-one with g_i = ∞, says nothing of the others.
+are the same in all units of x and f, in any basis of x, and for any scaling of rows of B with g (MATH.md §12). Their
+unit is the F of the answer; where that does not suffice, the larger of it and of F_low = max_i (B_i u₀ − g_i)₊ /
+‖B_i‖_{A⁻¹} ≤ F. Without contact, F_low = 0, it is S, S² = ‖x‖²_A + ‖Bᵀα‖²_{A⁻¹}. Pairs of opposite rows are equalities
+and belong to u₀, or a loaded tie would hide the contact. Whether a row is violated is decided row by row, against the
+round-off of its own s_i: a far row, as one with g_i = ∞, says nothing of the others.
 
 Two solutions of one program whose residuals meet an accuracy have a bounded distance. For solutions k = 1, 2 with
 α_k ≥ 0, residuals r_k = f − Ax_k − Bᵀα_k and excesses s_k = Bx_k − g, the difference d = x₁ − x₂ satisfies
 
     ‖d‖²_A = dᵀ(r₂ − r₁) − (α₁ − α₂)ᵀ(s₁ − s₂) ≤ ‖d‖_A (‖r₁‖ + ‖r₂‖) + |α₁ᵀs₁| + |α₂ᵀs₂| + α₁ᵀ(s₂)₊ + α₂ᵀ(s₁)₊
 
-in the norm of A⁻¹. Where every natural residual is at most ε, ‖r_k‖ ≤ ε S_k, |α_kᵀs_k| ≤ ε S_k² and
-(s_k)_i ≤ ε S_k ‖B_i‖; with p_k = Σ_i ‖B_i‖ (α_k)_i the last terms are at most ε S_k p_l ≤ ε (S_k² + p_l²)/2. This
+in the norm of A⁻¹. Where every natural residual is at most ε in the units U_k, ‖r_k‖ ≤ ε U_k, |α_kᵀs_k| ≤ ε U_k² and
+(s_k)_i ≤ ε U_k ‖B_i‖; with p_k = Σ_i ‖B_i‖ (α_k)_i the last terms are at most ε U_k p_l ≤ ε (U_k² + p_l²)/2. This
 gives ‖d‖²_A ≤ (l₁ + l₂)‖d‖_A + c₁ + c₂, each term from data of one solution alone, and the smallest eigenvalue of A
 the distance ‖d‖. In a V-orthonormal basis ‖d‖ is the distance of the two displacements in V. Solvers that are `ok` on
 the same reduced problem and farther apart reveal a bug.
@@ -24,8 +26,7 @@ the same reduced problem and farther apart reveal a bug.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -38,12 +39,10 @@ from vibench.errors import NumericalError
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky
+from vibench.qp.exact import Rows, rows_that_matter
 from vibench.qp.scaling import row_norms
 from vibench.qp.status import Status
 from vibench.text import above
-
-# From functionals, the columns of an array (n×k), to their norms (k,) in A⁻¹.
-DualNorms = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ class QPSolver(Protocol):
 
 @dataclass(frozen=True)
 class Residuals:
-    """Natural KKT residuals, recomputed from the solution; see above.
+    """Natural KKT residuals, recomputed from the solution, and the energy that they are relative to; see above.
 
     The solution 0 of a program without load, whose constraints are satisfied there, has the residuals 0.
     """
@@ -78,6 +77,12 @@ class Residuals:
     primal: float
     dual: float
     gap: float
+    unit: float
+
+    @classmethod
+    def relative(cls, step: float, residual: float, gap: float, unit: float) -> Residuals:
+        """The residuals from max (s_i)₊/‖B_i‖, ‖r‖, |αᵀs| and their unit."""
+        return cls(_over(step, unit), _over(residual, unit), _over(gap, unit * unit), unit)
 
     @property
     def worst(self) -> float:
@@ -85,7 +90,22 @@ class Residuals:
         return float(np.max([self.primal, self.dual, self.gap]))
 
 
-def kkt_residuals(program: VariationalInequality, x: Array, alpha: Array, norms: DualNorms | None = None) -> Residuals:
+class Inverse(Protocol):
+    """A factorisation of a symmetric positive definite A (n×n)."""
+
+    def solve(self, right: Array) -> Array:
+        """A⁻¹ r for right-hand sides (n×k)."""
+
+    def dual_norms(self, functionals: Array) -> Array:
+        """Norms (k,) in A⁻¹ of functionals (n×k)."""
+
+    def holding(self, program: VariationalInequality, rows: Indices) -> Array:
+        """The minimiser (n,) of ½ uᵀA u − fᵀu with these rows of B u ≤ g as equalities."""
+
+
+def kkt_residuals(
+    program: VariationalInequality, x: Array, alpha: Array, inverse: Inverse | None = None, accuracy: float = 0.0
+) -> Residuals:
     """Natural residuals of x (n,), α (m,) ≥ 0.
 
     Parameters
@@ -94,8 +114,10 @@ def kkt_residuals(program: VariationalInequality, x: Array, alpha: Array, norms:
         A, f, B, g, dense or sparse; g may be infinite in rows that constrain nothing.
     x, alpha
         The solution.
-    norms
-        Norms in A⁻¹ where A is factorised already.
+    inverse
+        The factorisation of A where there is one already.
+    accuracy
+        Residuals up to this are good enough: F of the answer is their unit then, and no other one is computed.
 
     Raises
     ------
@@ -103,24 +125,75 @@ def kkt_residuals(program: VariationalInequality, x: Array, alpha: Array, norms:
         If A is not positive definite.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # a diverging solver returns infinite residuals
-        return _residuals(program, x, alpha, norms or dual_norms(program.A))
+        return _residuals(program, x, alpha, inverse or inverse_of(program.A), accuracy)
 
 
-def _residuals(program: VariationalInequality, x: Array, alpha: Array, norms: DualNorms) -> Residuals:
+def _residuals(program: VariationalInequality, x: Array, alpha: Array, inverse: Inverse, accuracy: float) -> Residuals:
     B, g = program.B, program.g
     residual, excess = accurate_residuals(program, x, alpha)
     violated = np.flatnonzero(excess > round_off(B, x, g))
-    rows = B[violated].T if isinstance(B, np.ndarray) else sp.csr_array(B)[violated].toarray().T
-    lengths = norms(np.column_stack([rows, B.T @ alpha, residual]))  # one solve for all costs the least
-    reach, energy = lengths[:-2], _energy(program, x, float(lengths[-2]))
-    steps = np.divide(excess[violated], reach, out=np.full(len(violated), np.inf), where=reach > 0.0)
+    force = np.asarray(B.T @ alpha)
+    # One solve for all costs the least.
+    lengths = inverse.dual_norms(np.column_stack([_dense_rows(B, violated).T, force, residual]))
+    step, left, contact = _largest_step(excess[violated], lengths[:-2]), float(lengths[-1]), float(lengths[-2])
+    rows = rows_that_matter(sp.csr_array(B), g, round_off(B, x, g))
+    if len(rows.equalities):
+        held = inverse.holding(replace(program, f=force, g=np.zeros_like(g)), rows.equalities)
+        contact = _energy(program.A, held)
+    found = Residuals.relative(step, left, _gap(alpha, excess), contact)
+    if found.worst <= accuracy or not np.isfinite([step, left, contact]).all():
+        return found
+    free, moved = _refined_solution(program.A, inverse, program.f), _refined_solution(program.A, inverse, -force)
+    least = _least_contact(program, inverse, free, rows)
+    unit = max(contact, least) if least else float(np.hypot(_energy(program.A, x), lengths[-2]))
+    found = Residuals.relative(step, left, _gap(alpha, excess), unit)
+    # What rounding leaves of x says nothing of α, which is then judged with v = −A⁻¹Bᵀα, the x of no round-off being
+    # u₀ + v: the factor allows for sums of as many terms as a reduced program has.
+    if not left <= 64.0 * EPS * float(np.sqrt(np.abs(x) @ (abs(program.A) @ np.abs(x)))):
+        return found
+    excess = np.asarray(_extended(B) @ (sum(free) + sum(moved)) - g, dtype=float)
+    violated = np.flatnonzero(excess > 0.0)
+    rest = np.asarray(-force - _extended(program.A) @ sum(moved), dtype=float)
+    lengths = inverse.dual_norms(np.column_stack([_dense_rows(B, violated).T, rest]))
+    step = _largest_step(excess[violated], lengths[:-1])
+    return min(found, Residuals.relative(step, float(lengths[-1]), _gap(alpha, excess), unit), key=lambda r: r.worst)
+
+
+def _largest_step(excess: Array, lengths: Array) -> float:
+    """The largest (s_i)₊ / ‖B_i‖ of violated rows (k,), from their lengths; infinite for a violated row of zeros."""
+    steps = np.divide(excess, lengths, out=np.full(len(excess), np.inf), where=lengths > 0.0)
+    return float(np.max(steps, initial=0.0))
+
+
+def _gap(alpha: Array, excess: Array) -> float:
     pressed = alpha > 0.0  # elsewhere s may be infinite
-    gap = abs(float(alpha[pressed] @ excess[pressed]))
-    return Residuals(
-        primal=_over(float(np.max(steps, initial=0.0)), energy),
-        dual=_over(float(lengths[-1]), energy),
-        gap=_over(gap, energy * energy),
-    )
+    return abs(float(alpha[pressed] @ excess[pressed]))
+
+
+def _dense_rows(B: SparseMatrix | Array, rows: Indices) -> Array:
+    return B[rows] if isinstance(B, np.ndarray) else np.asarray(sp.csr_array(B)[rows].toarray())
+
+
+def _refined_solution(A: SparseMatrix | Array, inverse: Inverse, load: Array) -> tuple[Any, Any]:
+    """The solution A⁻¹f and its first correction (n,), whose sum in extended precision is exact to second order."""
+    first = inverse.solve(load[:, None])[:, 0]
+    rest = np.asarray(load - _extended(A) @ _extended(first), dtype=float)
+    return _extended(first), _extended(inverse.solve(rest[:, None])[:, 0])
+
+
+def _least_contact(program: VariationalInequality, inverse: Inverse, free: tuple[Any, Any], rows: Rows) -> float:
+    """F_low, a lower bound of F from u₀ alone; 0 where no row is violated there beyond the round-off of u₀."""
+    B, g = program.B, program.g
+    at = sum(free) if not len(rows.equalities) else inverse.holding(program, rows.equalities)
+    excess = np.asarray(_extended(B) @ at - g, dtype=float)
+    doubtful = round_off(B, np.asarray(at, dtype=float), g) + np.abs(np.asarray(B @ free[1].astype(float)))
+    reached = np.flatnonzero((excess > doubtful) & ~rows.implied)
+    # Every row gives a lower bound, and those that are farthest out the largest ones: a solution for each of thousands
+    # would cost more than the verification.
+    depths = excess[reached] / row_norms(B)[reached]
+    reached = reached[np.argsort(-depths, kind="stable")[:32]]
+    lengths = inverse.dual_norms(_dense_rows(B, reached).T) if len(reached) else np.zeros(0)
+    return float(np.max(excess[reached] / lengths, initial=0.0, where=lengths > 0.0))
 
 
 def accurate_residuals(program: VariationalInequality, x: Array, alpha: Array) -> tuple[Array, Array]:
@@ -139,28 +212,58 @@ def _extended(array: Any) -> Any:
     return type(array)((array.data.astype(np.longdouble), array.indices, array.indptr), shape=array.shape)
 
 
-def _energy(program: VariationalInequality, x: Array, force: float) -> float:
-    """The energy S of a solution x (n,) from the norm ‖Bᵀα‖ of its forces in A⁻¹."""
-    return float(np.hypot(np.sqrt(max(float(x @ (program.A @ x)), 0.0)), force))
+def _energy(A: SparseMatrix | Array, x: Array) -> float:
+    """The norm ‖x‖_A of x (n,)."""
+    return float(np.sqrt(max(float(x @ (A @ x)), 0.0)))
 
 
-def dual_norms(A: SparseMatrix | Array) -> DualNorms:
-    """The `DualNorms` of a symmetric positive definite A (n×n), which is factorised here.
-
-    Raises a `NumericalError` if it is not positive definite.
-    """
+def inverse_of(A: SparseMatrix | Array) -> Inverse:
+    """Factorise a symmetric positive definite A (n×n); raises a `NumericalError` if it is not positive definite."""
     if not isinstance(A, np.ndarray):
-        factor = SparseCholesky(A, "A")
-        return lambda columns: norms_by_solutions(columns, factor.solve(columns))
+        return _SparseInverse(SparseCholesky(A, "A"))
     try:
-        L = np.linalg.cholesky(A)
+        return _DenseInverse(np.asarray(np.linalg.cholesky(A), float))
     except np.linalg.LinAlgError:
         raise NumericalError("A is not positive definite") from None
-    if not len(L):  # LAPACK solves no system without unknowns
-        return lambda columns: np.zeros(columns.shape[1])
-    return lambda columns: np.linalg.norm(
-        scipy.linalg.solve_triangular(L, columns, lower=True, check_finite=False), axis=0
-    )
+
+
+@dataclass(frozen=True)
+class _SparseInverse:
+    factor: SparseCholesky
+
+    def solve(self, right: Array) -> Array:
+        return self.factor.solve(right)
+
+    def dual_norms(self, functionals: Array) -> Array:
+        return norms_by_solutions(functionals, self.solve(functionals))
+
+    def holding(self, program: VariationalInequality, rows: Indices) -> Array:
+        return held_by_forces(self, program, rows)
+
+
+@dataclass(frozen=True)
+class _DenseInverse:
+    L: Array
+
+    def solve(self, right: Array) -> Array:
+        return np.asarray(scipy.linalg.cho_solve((self.L, True), right, check_finite=False)) if len(self.L) else right
+
+    def dual_norms(self, functionals: Array) -> Array:
+        if not len(self.L):  # LAPACK solves no system without unknowns
+            return np.zeros(functionals.shape[1])
+        whitened = scipy.linalg.solve_triangular(self.L, functionals, lower=True, check_finite=False)
+        return np.asarray(np.linalg.norm(whitened, axis=0))
+
+    def holding(self, program: VariationalInequality, rows: Indices) -> Array:
+        return held_by_forces(self, program, rows)
+
+
+def held_by_forces(inverse: Inverse, program: VariationalInequality, rows: Indices) -> Array:
+    """`Inverse.holding` by the forces of the rows, which may be dependent."""
+    T, free = _dense_rows(program.B, rows), inverse.solve(program.f[:, None])[:, 0]
+    shifts = inverse.solve(T.T)
+    forces = np.linalg.lstsq(T @ shifts, T @ free - program.g[rows], rcond=None)[0]
+    return np.asarray(free - shifts @ forces)
 
 
 def norms_by_solutions(functionals: Array, solutions: Array) -> Array:
@@ -191,10 +294,12 @@ def verify(program: VariationalInequality, answer: QPSolution, accuracy: float) 
         if infeasibility_certificate(program) is not None:
             return Status.INFEASIBLE, "no point satisfies the constraints (certified)", None
         return Status.FAILED, f"the solver returned nothing: {answer.solver_status}", None
-    # Check this before any residual: max(0, nan) is 0 and would hide it.
-    if not (np.all(np.isfinite(answer.x)) and np.all(np.isfinite(answer.alpha))):
-        return Status.NONFINITE, f"the solution is not finite: {answer.solver_status}", None
-    residuals = kkt_residuals(program, answer.x, answer.alpha)
+    # Check this before any residual: max(0, nan) is 0 and would hide it, as negative multipliers may hide a violation.
+    finite = np.all(np.isfinite(answer.x)) and np.all(np.isfinite(answer.alpha))
+    if not finite or np.min(answer.alpha, initial=0.0) < 0.0:
+        status, what = (Status.FAILED, "has negative multipliers") if finite else (Status.NONFINITE, "is not finite")
+        return status, f"the solution {what}: {answer.solver_status}", None
+    residuals = kkt_residuals(program, answer.x, answer.alpha, accuracy=accuracy)
     if residuals.worst <= accuracy:
         return Status.OK, "", residuals
     if residuals.primal > accuracy and infeasibility_certificate(program) is not None:
@@ -250,16 +355,14 @@ class Slack:
     constant: float
 
 
-def slack(program: VariationalInequality, x: Array, alpha: Array, accuracy: float) -> Slack:
-    """Slack of a solution x (n,), α (m,) of a dense program whose three natural residuals are at most `accuracy`."""
+def slack(program: VariationalInequality, alpha: Array, residuals: Residuals, accuracy: float) -> Slack:
+    """Slack of a solution with multipliers α (m,) of a dense program, if its `residuals` are at most `accuracy`."""
     smallest = float(np.min(np.linalg.eigvalsh(program.A), initial=np.inf))
     if not smallest > 0.0:
         return Slack(float("inf"), float("inf"))
-    norms = dual_norms(program.A)
-    energy = _energy(program, x, float(norms((program.B.T @ alpha)[:, None])[0]))
-    pressed = float(norms(program.B.T) @ alpha)
-    constant = accuracy * (1.5 * energy**2 + 0.5 * pressed**2)
-    return Slack(accuracy * energy / np.sqrt(smallest), constant / smallest)
+    pressed = float(inverse_of(program.A).dual_norms(program.B.T) @ alpha)
+    constant = accuracy * (1.5 * residuals.unit**2 + 0.5 * pressed**2)
+    return Slack(accuracy * residuals.unit / np.sqrt(smallest), constant / smallest)
 
 
 def allowed(first: Slack, second: Slack) -> float:

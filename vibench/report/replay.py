@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from importlib.resources import files
 from itertools import chain
 from pathlib import Path
@@ -77,7 +76,7 @@ def _line(trial: Trial, recorded_x: Array | None) -> dict[str, Any]:
     line: dict[str, Any] = {"claims": solution.solver_status, "status": trial.status.value}
     line |= {"iterations": solution.iterations, "seconds": trial.seconds.cpu}
     if trial.residuals is not None:
-        line |= asdict(trial.residuals)
+        line |= {name: getattr(trial.residuals, name) for name in ("primal", "dual", "gap")}
     if recorded_x is not None and solution.x is not None:
         line["distance"] = float(np.linalg.norm(solution.x - recorded_x))
     return line

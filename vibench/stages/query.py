@@ -98,7 +98,7 @@ class ProgramQuery:
         row: Row = {"solver_status": answer.solver_status, "iterations": answer.iterations}
         solution = None
         if residuals is not None and answer.x is not None and answer.alpha is not None:
-            left_open = slack(self.program, answer.x, answer.alpha, self.accuracy)
+            left_open = slack(self.program, answer.alpha, residuals, self.accuracy)
             solution = solution_row(answer.x, answer.alpha, left_open)
         return QueryStatus(status, reason, residuals=residuals), row, solution
 
@@ -163,7 +163,7 @@ class ModelQuery:
             return status, row, None if status.pair is None or x is None else solution_row(x, alpha, None)
         if status.residuals is None or x is None or alpha is None:
             return status, row, None
-        return status, row, solution_row(x, alpha, slack(self.program, x, alpha, self.model.accuracy))
+        return status, row, solution_row(x, alpha, slack(self.program, alpha, status.residuals, self.model.accuracy))
 
 
 class Queries:

@@ -207,7 +207,7 @@ def test_residuals_are_those_of_vibench(run: vibench.Run, tmp_path: Path) -> Non
         x, alpha = random.standard_normal(len(f)), random.random(len(g))
         program = vibench.VariationalInequality(A, load, B, g)
         expected = vibench.qp.kkt_residuals(program, x, alpha)
-        found = reduced_model.residuals(A, load, B / rows[:, None], g / rows, x, rows * alpha)
+        found = reduced_model.residuals(reduced_model._matrices(A, B), load, g / rows, x, rows * alpha)
         assert found == pytest.approx((expected.primal, expected.dual, expected.gap), rel=1e-12)
 
 
@@ -302,8 +302,8 @@ def test_polishing_ends_where_changes_of_all_rows_at_once_cycle() -> None:
         B /= np.linalg.norm(B, axis=1)[:, None]
         g[8:] = B[8:] @ np.linalg.lstsq(B[:8], g[:8], rcond=None)[0]
         A, f = np.eye(12), 3.0 * rng.random(12)
-        x, alpha = reduced_model._polished(reduced_model._matrices(A, B), f, g, np.ones(11, bool))
-        assert max(reduced_model.residuals(A, f, B, g, x, alpha)) <= 1e-12
+        of, g = reduced_model._matrices(A, B), g - B @ f  # of x − A⁻¹f
+        assert max(reduced_model.residuals(of, 0.0 * f, g, *reduced_model._polished(of, g, np.ones(11, bool)))) <= 1e-12
 
 
 def test_wrong_solvers_are_not_believed(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -316,7 +316,7 @@ def test_wrong_solvers_are_not_believed(run: vibench.Run, tmp_path: Path, monkey
             assert exported.solve([0.17, 0.1]).status == "inaccurate"
     no_numbers = lambda A, f, B, g, _: (np.full(len(f), np.nan), np.full(len(g), np.inf))  # noqa: E731
     monkeypatch.setitem(reduced_model.SOLVERS, "piqp", no_numbers)
-    monkeypatch.setattr(reduced_model, "_polished", lambda _, f, g, *__: (np.zeros(len(f)), np.zeros(len(g))))
+    monkeypatch.setattr(reduced_model, "_polished", lambda of, g, _: (np.zeros(len(of.A)), np.zeros(len(g))))
     assert exported.solve([0.17, 0.1]).status == "inaccurate"
 
 

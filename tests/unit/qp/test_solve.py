@@ -30,6 +30,12 @@ def program(seed: int, n: int = 6, m: int = 4, sizes: tuple[int, int] = (-4, 4))
     return VariationalInequality(spd(n, rng), 1e-3 * rng.standard_normal(n) * 50.0, B, g)
 
 
+def pressed(seed: int) -> VariationalInequality:
+    """The program with a load that presses it against constraints."""
+    vi = program(seed)
+    return replace(vi, f=100.0 * vi.f)
+
+
 def test_programs_sparse_or_without_unknowns_or_constraints_are_solved() -> None:
     for bound, status in ((1.0, "ok"), (-1.0, "infeasible")):
         vi = VariationalInequality(np.zeros((0, 0)), np.zeros(0), np.zeros((1, 0)), np.array([bound]))
@@ -55,7 +61,7 @@ def test_required_solvers_reach_the_accuracy_of_primal_and_dual_programs(solver:
         status, reason, found = verification.verify(vi, answer, accuracy)
         assert status is Status.OK, (seed, reason)
         assert found.worst <= accuracy
-        assert answer.iterations is not None
+        assert (answer.iterations is None) is not answer.alpha.any()  # without contact there is nothing to solve
         x, _ = exact(vi)
         assert np.allclose(answer.x, x, atol=200.0 * accuracy * (1.0 + np.abs(x).max()))
     for seed in range(30):
@@ -72,7 +78,8 @@ def test_with_a_factor_of_a_the_dual_is_solved_and_gives_the_same_solution(seed:
     asked, factor = list[int](), np.linalg.cholesky(vi.A)
     watched = {"watched": lambda scaled, accuracy: asked.append(len(scaled.f)) or solve_qp(scaled, "piqp", accuracy)}
     primal, dual = (solve_qp(vi, "watched", 1e-10, watched, L) for L in (None, factor))
-    assert asked == [n] + ([m] if m else [])  # the dual has as many unknowns as there are constraints
+    # The dual has as many unknowns as there are constraints; where none acts there is nothing to solve.
+    assert asked == ([n, m] if primal.alpha.any() else [])
     assert np.allclose(dual.x, primal.x, atol=1e-6 * max(1e-3, np.abs(primal.x).max()))
     assert np.all(dual.alpha >= 0.0)
     assert np.allclose(vi.B.T @ dual.alpha, vi.B.T @ primal.alpha, atol=1e-5 * max(1e-3, np.abs(vi.f).max()))
@@ -92,10 +99,11 @@ def test_negative_multipliers_missing_answers_and_nan_are_reported() -> None:
     vi = VariationalInequality(np.eye(2), np.ones(2), np.eye(2), np.array([0.5, 0.5]))
     wrong = {"wrong": lambda *_: QPSolution(np.array([0.5, 0.5]), np.array([0.5, -0.1]), "solved")}
     answer = solve_qp(vi, "wrong", 1e-7, wrong)
-    assert answer.alpha.tolist() == [0.5, 0.0]
-    assert np.isclose(answer.negative, 0.1)
-    assert "multipliers down to -1e-01" in verification.verify(vi, answer, 1e-7)[1]
-    vi = program(3)
+    # The program of x − A⁻¹f without load, whose unit of force is a thousandth of what the constraints prescribe.
+    assert np.allclose(answer.alpha, [0.5 * 0.5e-3, 0.0])
+    assert np.isclose(answer.negative, 0.1 * 0.5e-3)
+    assert "multipliers down to -5e-05" in verification.verify(vi, answer, 1e-7)[1]
+    vi = pressed(3)
     answer = solve_qp(vi, "no", 1e-7, {"no": lambda *_: QPSolution(None, None, "gave up")}, np.linalg.cholesky(vi.A))
     assert (answer.x, answer.alpha, answer.solver_status) == (None, None, "gave up")
     assert verification.verify(vi, answer, 1e-7)[0] is Status.FAILED
@@ -127,17 +135,18 @@ def test_residuals_and_certificates_of_our_own_decide_the_status() -> None:
 
 
 def test_a_registered_solver_sees_scaled_data_and_its_answer_is_scaled_back() -> None:
-    vi, seen = program(5), list[VariationalInequality]()
+    vi, seen = pressed(3), list[VariationalInequality]()
     brute = {"brute": lambda scaled, _: seen.append(scaled) or QPSolution(*exact(scaled), "found")}
     answer = solve_qp(vi, "brute", 1e-9, brute)
     assert np.allclose(np.linalg.norm(seen[0].B, axis=1), 1.0)
-    assert np.isclose(np.abs(seen[0].f).max(), 1.0)
+    assert not seen[0].f.any()  # in x − A⁻¹f the load is gone
+    assert np.isclose(seen[0].g.min(), -1.0)
     assert verification.kkt_residuals(vi, answer.x, answer.alpha).worst < 1e-9
 
 
 def answered(status: Any, iterations: Any) -> QPSolution:
     """What a solver answers that says this of itself."""
-    vi = program(4)
+    vi = pressed(4)
     return solve_qp(vi, "odd", 1e-7, {"odd": lambda scaled, _: QPSolution(*exact(scaled), status, iterations)})
 
 

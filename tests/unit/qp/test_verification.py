@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
@@ -41,7 +42,7 @@ def same(one: Residuals, other: Residuals) -> None:
 def test_residuals_are_those_defined_and_hide_neither_nan_nor_indefinite_matrices() -> None:
     vi = VariationalInequality(A=np.diag([4.0, 1.0]), f=np.array([4.0, 1.0]), B=np.array([[2.0, 0.0]]), g=np.ones(1))
     x, alpha = np.array([0.75, 1.0]), np.array([0.25])
-    energy = np.sqrt(4.0 * 0.75**2 + 1.0 + 0.5**2 / 4.0)  # ‖x‖²_A and (2 · 0.25)² / 4
+    energy = 1.0  # B u₀ − g = 1, and B A⁻¹ Bᵀ = 1: more than ‖Bᵀα‖ = 0.25
     found = kkt_residuals(vi, x, alpha)
     assert found.primal == pytest.approx(0.5 / 1.0 / energy)  # B A⁻¹ Bᵀ = 1
     assert found.dual == pytest.approx(abs(4.0 - 3.0 - 0.5) / 2.0 / energy)
@@ -115,3 +116,76 @@ def test_contradictions_are_certified_beside_a_far_row() -> None:
         assert np.allclose(B.T @ alpha, 0.0, atol=1e-9)
         assert alpha[:2] @ vi.g[:2] < 0.0
         assert infeasibility_certificate(replace(vi, g=np.array([-1.0, 1.5, far]))) is None
+
+
+def with_a_loaded_body(seed: int, fraction: float) -> tuple[VariationalInequality, np.ndarray, float]:
+    """A body in contact beside a loaded one without constraints, in a common basis; λ, and the F of contact.
+
+    F is the given fraction of the energy of the loaded body.
+    """
+    rng = np.random.default_rng(seed)
+    one, other = program(seed), spd(6, rng)
+    _, lam = exact(one)
+    F = float(np.linalg.norm(np.linalg.solve(np.linalg.cholesky(one.A), one.B.T @ lam)))
+    load = rng.standard_normal(6)
+    load *= F / fraction / np.sqrt(load @ np.linalg.solve(other, load))
+    Q = np.linalg.qr(rng.standard_normal((12, 12)))[0]
+    A = Q @ scipy.linalg.block_diag(one.A, other) @ Q.T
+    vi = VariationalInequality(A, Q @ np.concatenate([one.f, load]), np.hstack([one.B, np.zeros((4, 6))]) @ Q.T, one.g)
+    return vi, lam, F
+
+
+def natural_error(vi: VariationalInequality, alpha: np.ndarray, lam: np.ndarray) -> float:
+    """‖Bᵀ(λ − α)‖ in A⁻¹."""
+    return float(np.linalg.norm(np.linalg.solve(np.linalg.cholesky(vi.A), vi.B.T @ (alpha - lam))))
+
+
+@given(seeds, st.sampled_from([1e-2, 1e-4, 1e-10]))
+def test_a_loaded_body_beside_the_one_in_contact_hides_no_error(seed: int, fraction: float) -> None:
+    """Relative to the energy of both bodies, twice λ and no contact at all were ok."""
+    vi, lam, F = with_a_loaded_body(seed, fraction)
+    if not F > 0.0:
+        return
+    free = np.linalg.solve(vi.A, vi.f)
+    for wrong in (0.0, 0.5, 0.9, 1.1, 2.0):
+        x = free - np.linalg.solve(vi.A, vi.B.T @ (wrong * lam))
+        assert verify(vi, QPSolution(x, wrong * lam, ""), 1e-3)[0] is Status.INACCURATE, wrong
+    # In a common basis the data themselves leave the round-off of the whole over that of the contact open.
+    accuracy = max(1e-12, 1e-14 / fraction)
+    assert kkt_residuals(vi, free - np.linalg.solve(vi.A, vi.B.T @ lam), lam, accuracy=accuracy).worst <= accuracy
+    alone = np.linalg.norm(np.linalg.solve(np.linalg.cholesky(vi.A), vi.B.T @ lam))
+    assert kkt_residuals(vi, x, lam).unit == pytest.approx(alone, rel=1e-5)
+
+
+@pytest.mark.parametrize("solver", ["piqp", "daqp", "clarabel", "cvxopt", "osqp"])
+@pytest.mark.parametrize("accuracy", [1e-6, 1e-9])
+@pytest.mark.parametrize("count", [7, pytest.param(600, marks=pytest.mark.long)])
+def test_what_is_ok_is_accurate_relative_to_the_contact(solver: str, accuracy: float, count: int) -> None:
+    """With E = √(ε² + 2ε(1 + π)) the natural error of λ is at most F·E/(1 − E), F from all to 1e-6 of the energy."""
+    ok = 0
+    for seed in range(count):
+        vi, lam, F = with_a_loaded_body(seed, 10.0 ** (-6 * (seed % 7) / 6))
+        for factor in (None, np.linalg.cholesky(vi.A)):
+            found = solve_qp(vi, solver, accuracy, factor=factor)
+            if verify(vi, found, accuracy)[0] is Status.OK:
+                lengths = np.sqrt(np.einsum("ij,ji->i", vi.B, np.linalg.solve(vi.A, vi.B.T)))
+                pi = float(lam @ lengths) / F if F else 0.0
+                E, ok = np.sqrt(accuracy**2 + 2.0 * accuracy * (1.0 + pi)), ok + 1
+                assert natural_error(vi, found.alpha, lam) <= F * E / (1.0 - E), seed
+    assert ok >= 0.95 * 2 * count
+
+
+def test_a_loaded_tie_hides_no_contact() -> None:
+    """Opposite rows hold x₁ = 1e6; F is that of the contact of x₂ alone, 0.25/√1."""
+    B = np.array([[1.0, 0.0], [-2.0, 0.0], [0.0, 1.0]])
+    vi = VariationalInequality(np.eye(2), np.array([0.0, 1.0]), B, np.array([1e6, -2e6, 0.75]))
+    right, wrong = (QPSolution(np.array([1e6, x]), np.array([0.0, 5e5, 1.0 - x]), "") for x in (0.75, 1.0))
+    assert verify(vi, right, 1e-8)[0] is Status.OK
+    assert verify(vi, wrong, 1e-3)[0] is Status.INACCURATE
+    assert kkt_residuals(vi, right.x, right.alpha).unit == pytest.approx(0.25)
+
+
+def test_negative_multipliers_are_no_solution() -> None:
+    vi, (x, alpha) = program(3), exact(program(3))
+    status, reason, _ = verify(vi, QPSolution(x, alpha - 1e-12, "solved"), 1e-6)
+    assert (status, reason) == (Status.FAILED, "the solution has negative multipliers: solved")

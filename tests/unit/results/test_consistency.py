@@ -36,18 +36,20 @@ def test_no_two_points_with_small_residuals_are_farther_apart_than_allowed(seed:
     """The accuracy is the largest residual of the two: what the theorem needs, and no more."""
     vi, rng = program(seed), np.random.default_rng(seed)
     first, second = random_answer(vi, rng, size), random_answer(vi, rng, size)
-    accuracy = max(verification.kkt_residuals(vi, *answer).worst for answer in (first, second))
-    limit = allowed(slack(vi, *first, accuracy), slack(vi, *second, accuracy))
+    residuals = [verification.kkt_residuals(vi, *answer) for answer in (first, second)]
+    accuracy = max(one.worst for one in residuals)
+    limit = allowed(slack(vi, first[1], residuals[0], accuracy), slack(vi, second[1], residuals[1], accuracy))
     assert np.linalg.norm(first[0] - second[0]) <= limit * (1.0 + 1e-9) + 1e-12
 
 
 def test_what_is_allowed_shrinks_with_the_accuracy() -> None:
     vi = program(1)
     x, alpha = random_answer(vi, np.random.default_rng(0), 0.0)
-    limits = [allowed(*[slack(vi, x, alpha, accuracy)] * 2) for accuracy in (1e-4, 1e-6, 1e-8)]
+    residuals = verification.kkt_residuals(vi, x, alpha)
+    limits = [allowed(*[slack(vi, alpha, residuals, accuracy)] * 2) for accuracy in (1e-4, 1e-6, 1e-8)]
     assert limits[0] > 5.0 * limits[1] > 25.0 * limits[2] > 0.0
     flat = VariationalInequality(np.zeros((6, 6)), vi.f, vi.B, vi.g)
-    assert slack(flat, x, alpha, 1e-6) == Slack(np.inf, np.inf)
+    assert slack(flat, alpha, residuals, 1e-6) == Slack(np.inf, np.inf)
 
 
 def answer(solver: str, query: int, *x: float) -> Recorded:

@@ -76,7 +76,7 @@ def test_rows_say_which_query_of_the_path_they_started_from(tmp_path: Path) -> N
 def test_a_start_changes_the_way_and_not_the_answer(solver: str, dual: bool) -> None:
     rng = np.random.default_rng(3)
     A = np.diag(1.0 + rng.random(5))
-    program = VariationalInequality(A, rng.standard_normal(5), rng.standard_normal((3, 5)), 0.1 * rng.random(3))
+    program = VariationalInequality(A, rng.standard_normal(5), rng.standard_normal((3, 5)), -0.1 * rng.random(3))
     factor = np.linalg.cholesky(A) if dual else None
     cold = solve_qp(program, solver, 1e-8, factor=factor)
     warm = solve_qp(program, solver, 1e-8, factor=factor, start=cold)
