@@ -112,6 +112,7 @@ class _Settings(NamedTuple):
     accuracy: float
     tolerance: float | None
     mode: CorrectionMode
+    of: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,6 +291,7 @@ class Model:
         accuracy: float | None = None,
         tolerance: float | None = None,
         corrected: bool | None = None,
+        of: str = "solution",
     ) -> Solution:
         """Answer a query at a parameter, verify the answer, and bound its errors where the model has bounds.
 
@@ -303,6 +305,9 @@ class Model:
             QP solver and the relative accuracy that it has to reach; those of the model by default.
         tolerance
             Largest relative error of u in the energy norm; `verdict` of the solution says if the bound is within it.
+        of
+            "solution", or "contact": the bounds of u and of λ are relative to ‖u − A⁻¹f‖_A, what contact does to the
+            solution, then, which a load beside the contact does not enlarge.
         corrected
             Whether `u` and `lam` of the solution are corrected: they satisfy the constraints, and are usually more
             accurate where the violation dominates the bound (`omega` > `rho`). A certificate does that at online cost;
@@ -317,7 +322,7 @@ class Model:
         NumericalError
             If the answer is of another type or size.
         """
-        settings = self._settings(solver, accuracy, tolerance, corrected)
+        settings = self._settings(solver, accuracy, tolerance, corrected, of)
         at = parameter_in(self.parameters, mu)
         # Assembly and solution are timed apart only where the QP solver of the cell solves.
         if not self.solves_programs:
@@ -326,13 +331,15 @@ class Model:
         return self._solution(at, assembled, assembly.cpu, settings)
 
     def _settings(
-        self, solver: str | None, accuracy: float | None, tolerance: float | None, corrected: bool | None
+        self, solver: str | None, accuracy: float | None, tolerance: float | None, corrected: bool | None, of: str
     ) -> _Settings:
         """The checked arguments of `solve`, with the defaults of the model."""
         if tolerance is not None and not 0.0 < tolerance < inf:
             raise RequestError(f"the tolerance is {tolerance:g}, expected a positive finite number")
         if tolerance is not None and self.certificate is None:
             raise RequestError("the model has no error bounds: a tolerance needs one with bounds = true")
+        if of not in {"solution", "contact"}:
+            raise RequestError(f"of is {of!r:.40}, expected 'solution' or 'contact'")
         # Corrections are made of programs: refuse a formulation without them before anything is solved.
         if corrected:
             self.reduced  # noqa: B018
@@ -344,7 +351,7 @@ class Model:
             if name in SETTINGS:
                 raise RequestError(f"the QP solver '{name}' is not installed")
             raise unknown_name(PluginKind.SOLVER, name, {*SETTINGS, *own})
-        return _Settings(name, self.accuracy if accuracy is None else accuracy, tolerance, mode)
+        return _Settings(name, self.accuracy if accuracy is None else accuracy, tolerance, mode, of)
 
     def _answered(self, at: Array, settings: _Settings) -> Solution:
         """The answer of the formulation itself."""
@@ -384,7 +391,12 @@ class Model:
             bound = OnlineBound.none(f"the program has no solution: {reason}")
             if residuals is not None and x is not None and alpha is not None:
                 bound, correction = self.certificate.certify(self.problem, at, assembled, x, alpha, settings.mode)
-                bound = bound if correction is None else correction.bound
+                last = bound if correction is None else correction.bound
+                if settings.of == "contact":
+                    of_contact = self.certificate.least_contact(self.problem, at, assembled, alpha, bound)
+                    worst = max(last.u_energy, last.lambda_natural)
+                    last = replace(last, relative=worst / of_contact if of_contact > 0.0 else inf)
+                bound = last
 
         def pair() -> tuple[Array, Array] | None:
             if x is None or alpha is None:
@@ -412,6 +424,7 @@ class Model:
         accuracy: float | None = None,
         tolerance: float | None = None,
         corrected: bool | None = None,
+        of: str = "solution",
     ) -> pd.DataFrame:
         """A table of `solve` at parameters (P×d), a row for each: what a sample or an optimisation needs.
 
@@ -430,7 +443,7 @@ class Model:
         given = np.asarray(mus, dtype=float)
         if given.ndim != 2:
             raise RequestError(f"the parameters have the shape {given.shape}, expected (P, {self.parameters.dim})")
-        settings = self._settings(solver, accuracy, tolerance, corrected)
+        settings = self._settings(solver, accuracy, tolerance, corrected, of)
         points = [parameter_in(self.parameters, mu) for mu in given]
         if not self.solves_programs:
             return pd.DataFrame([self._answered(at, settings).columns() for at in points])

@@ -259,7 +259,7 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "corrected": integer("1 if the corrected pair is returned, 0 if the reduced one; empty without corrections."),
         "correction_share": real("1", "ω/ρ of the reduced solution, above which auto corrects at 1; empty if unknown."),
         "correction_note": text("Why the solution is not corrected although a correction was requested."),
-        "reference_bound": real("1", "Bound of the energy error of the high-fidelity solution, relative to ‖u‖_A and "
+        "reference_bound": real("1", "Bound of the energy error of the high-fidelity solution, relative to "
             "‖Bᵀλ‖_A⁻¹; at most 1e-6, or what round-off of B u − g leaves open; empty where no correction is found."),
         "hf_s": real("s", "High-fidelity solution, with assembly but without set-up: median of the repetitions."),
         "zero_u": integer("1 if the high-fidelity ‖u‖ is at most 1e-8 of the largest in the training set, else 0."),
@@ -329,9 +329,9 @@ STORED: Mapping[str, Mapping[str, Column]] = {
             constraint="NOT NULL"),
         "reason": text("Why the status is not ok."),
         "solver_status": text("Status reported by the solver."),
-        "primal_residual": real("1", "Natural primal residual: a correction of one row over the solution, in energy."),
-        "dual_residual": real("1", "Natural dual residual: its norm in A⁻¹ over the energy norm of the solution."),
-        "gap": real("1", "Natural gap: |αᵀs| over the energy of the solution."),
+        "primal_residual": real("1", "Natural primal residual: a correction of one row over what contact does, in energy."),
+        "dual_residual": real("1", "Natural dual residual: its norm in A⁻¹ over the energy norm of what contact does."),
+        "gap": real("1", "Natural gap: |αᵀs| over the energy of what contact does."),
         "hf_primal_residual": real("1", "Natural primal residual of u_N in the high-fidelity problem."),
         "hf_dual_residual": real("1", "Natural dual residual of u_N and λ_N in the high-fidelity problem."),
         "hf_gap": real("1", "Natural gap of u_N and λ_N in the high-fidelity problem."),

@@ -188,6 +188,13 @@ def test_certificates_bound_errors_and_tolerances_need_them(certified: vibench.R
         assert model.solve(mu, tolerance=0.99 * relative).verdict == "not certified"
         rough = model.solve(mu, accuracy=1e-14, tolerance=1.01 * relative)  # more than the solver reaches, or less
         assert rough.verdict == ("certified" if rough.status == "ok" else "not certified")
+        # relative to ‖u − A⁻¹f‖_A, of which the certificate knows a lower bound
+        vi, norm = model.problem.assemble(mu), assemblies(model.problem).energy_at(mu)
+        contact, bound = norm.dual_norm(vi.B.T @ model.high_fidelity(mu).lam), solution.bound
+        of_contact = model.solve(mu, tolerance=10.0, of="contact").bound.relative
+        assert 1.0 <= of_contact * contact / max(bound.u_energy, bound.lambda_natural) < 3.0
+        assert model.solve(mu, tolerance=1.01 * of_contact, of="contact").verdict == "certified"
+        assert model.solve(mu, tolerance=0.99 * of_contact, of="contact").verdict == "not certified"
     rows = certified.queries[certified.queries["cell"] == row["cell"]]
     assert set(rows["beta_energy_online_note"]) == {BoundNote.ON_BODIES}
     assert (rows["beta_energy_online"] <= rows["beta_energy"] * (1.0 + 1e-2)).all()  # both are moved outwards
@@ -200,6 +207,8 @@ def test_certificates_bound_errors_and_tolerances_need_them(certified: vibench.R
         model.solve([1.0], tolerance=1e-2)
     with pytest.raises(vibench.RequestError, match="expected a positive finite number"):
         model.solve([1.0], tolerance=0.0)
+    with pytest.raises(vibench.RequestError, match="of is 'body', expected 'solution' or 'contact'"):
+        model.solve([1.0], of="body")
 
 
 def test_corrected_solutions_satisfy_the_constraints_and_have_bounds_of_their_own(certified: vibench.Run) -> None:

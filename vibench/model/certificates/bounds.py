@@ -70,7 +70,7 @@ class OnlineBound:
     u_energy, lambda_natural
         Bounds of ‖u − u_N‖ in the norm of A(µ) and of ‖Bᵀ(λ − λ_N)‖ in that of A(µ)⁻¹.
     relative
-        Bound of ‖u − u_N‖ / ‖u‖ in the norm of A(µ).
+        Bound of ‖u − u_N‖ / ‖u‖ in the norm of A(µ), or of the larger error of u and λ over what contact does.
     rho, omega, kappa
         Upper bounds of the terms ρ/√α, ω√γ and κ.
     coercivity
@@ -201,6 +201,23 @@ class OnlineCertificate:
         if bound.guarantee is Guarantee.NONE or not mode.applies(bound.omega, bound.rho):
             return bound, None
         return bound, self._corrected_pair(query, bound)
+
+    def least_contact(
+        self, problem: Problem, mu: Array, reduced: ReducedProblem, alpha: Array, bound: OnlineBound
+    ) -> float:
+        """A lower bound of ‖u − A⁻¹f‖_A = ‖Bᵀλ‖_{A⁻¹} at mu (d,), from the α (R,) that has this bound; may be negative.
+
+        ‖Bᵀλ_N‖ is at least λ_NᵀBz / ‖z‖_A for every z, such as that of the reduced program.
+        """
+        program, lam = reduced.program, self.generators @ alpha
+        z = scipy.linalg.solve(program.A, program.B.T @ alpha, assume_a="pos")
+        query = _Query(self.base, problem, mu, reduced, z, lam)
+        if bound.guarantee is Guarantee.NONE or not (size := float(z @ (program.A @ z))) > 0.0:
+            return 0.0
+        # The interpolated stiffness may be softer than A by its error: ‖z‖²_A ≤ zᵀA_N z (1 + ε/(α − ε)).
+        energy = size * query.lower / (query.lower - self.base.stiffness_error)
+        force = float(lam @ (query.contact.B @ (self.contact_basis @ query.y)))
+        return force / sqrt(energy) - bound.lambda_natural
 
     def _bound(self, query: _Query, alpha: Array) -> OnlineBound:
         base, lam, lower, upper = self.base, query.lam, query.lower, query.upper
