@@ -10,6 +10,7 @@ from numerics import Varying, exact, spd
 from vibench.errors import NumericalError
 from vibench.highfidelity import active_set
 from vibench.interfaces.problem import VariationalInequality
+from vibench.qp.verification import kkt_residuals
 
 
 def string(n: int, gap: float, load: float) -> VariationalInequality:
@@ -108,3 +109,32 @@ def test_a_contact_set_that_moves_node_by_node_is_followed_to_its_end() -> None:
     assert found.iterations > 100
     assert found.fallback == ""
     assert np.all(found.u >= obstacle - 1e-12)
+
+
+def test_a_stiffness_that_is_not_symmetric_is_refused_and_where() -> None:
+    problem, mu = Varying(), np.array([0.5])
+    solver, vi = active_set.HighFidelitySolver(problem), problem.assemble(mu)
+    solver.solve_assembled(mu, vi)
+    solver.check_coercive(mu, vi)
+    crooked = vi.A.tolil()
+    crooked[0, 1] *= 1.001
+    with pytest.raises(NumericalError, match=r"A at mu = \[0.5\] is not symmetric"):
+        solver.check_coercive(mu, replace(vi, A=sp.csc_array(crooked)))
+
+
+@pytest.mark.parametrize("fraction", [1.0, 1e-4, 1e-8])
+def test_a_string_in_contact_is_as_accurate_beside_a_loaded_one(fraction: float) -> None:
+    """Its residuals are relative to what contact does, in x − A⁻¹f where round-off of the whole would hide them."""
+    n, h = 100, 1.0 / 101
+    A = sp.csr_array(sp.diags_array([-np.ones(n - 1), 2.0 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1]) / h)
+    f, B, g = -h * np.ones(n), -sp.eye_array(n, format="csr"), 0.03 * np.ones(n)
+    alone = active_set.solve_high_fidelity(VariationalInequality(A, f, B, g))
+    both = VariationalInequality(
+        sp.csr_array(sp.block_diag([A, A])), np.append(f, f / fraction), sp.csr_array(sp.hstack([B, 0.0 * B])), g
+    )
+    beside = active_set.solve_high_fidelity(both)
+    assert beside.residuals.worst <= 1e-10
+    assert beside.residuals.unit == pytest.approx(alone.residuals.unit, rel=1e-9)
+    assert np.allclose(beside.lam, alone.lam, rtol=1e-9)
+    hidden = kkt_residuals(both, beside.u, 2.0 * beside.lam)
+    assert hidden.worst > 0.1
