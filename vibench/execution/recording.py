@@ -158,6 +158,19 @@ class ResultWriter:
             self.database.replace(table, [keys | row for row in rows], **keys)
 
 
+def refute(database: ResultsDatabase) -> None:
+    """Give cells with bounds the status of a cell of their problem whose bound was refuted: they rest on the same."""
+    bounded = [row for row in database.rows("cells") if row["bounds"]]
+    refuted = {
+        (row["problem"], row["problem_options"]): row for row in reversed(bounded) if row["status"] == Status.REFUTED
+    }
+    for row in bounded:
+        first = refuted.get((row["problem"], row["problem_options"]))
+        if first is not None and row["status"] == Status.OK:
+            reason = f"as the bounds of cell {first['cell']}: {first['reason']}"
+            database.write_columns(row["cell"], {"status": Status.REFUTED.value, "reason": reason})
+
+
 def cell_columns(cell: Cell) -> dict[str, Any]:
     without: dict[str, Any] = {}
     for name, plugin in (("dual", cell.dual), ("primal", cell.primal)):

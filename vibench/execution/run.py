@@ -21,6 +21,7 @@ from vibench.execution.recording import (
     ended_by_smaller_limits,
     keep_limits,
     labels_of,
+    refute,
 )
 from vibench.execution.supervisor import Job
 from vibench.execution.timing_plan import OfflinePlan, TimingPlan
@@ -153,6 +154,7 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
             keep_limits(database, writer.study_hash, study.limits)
             run = _Run(study, folder, store, writer, observer, options)
             interrupted = run.execute(cells, todo)
+            refute(database)
             everything = list(database.rows("cells"))
             # Both tables compare cells of the whole file, those of earlier runs included.
             database.replace("thresholds", break_even_rows(everything, database.rows("timings")))

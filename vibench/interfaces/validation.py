@@ -14,6 +14,7 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
+from vibench.interfaces.declarations import contradictions
 from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality, is_absent
 from vibench.interfaces.strategies import Cone, Enrichment, Sampling, check_sample
 from vibench.linalg.inner_product import InnerProduct
@@ -187,16 +188,20 @@ class ReferenceAssembly:
     """Assembly at one parameter, as the problem returned it; assemblies at other parameters are compared with it."""
 
     def __init__(self, problem: Problem, vi: VariationalInequality) -> None:
-        self._problem, self._vi = problem, vi
+        self._problem, self._vi, self._compared = problem, vi, 0
         self.fingerprint = fingerprint(problem, vi)
 
-    def refuse_false_constants(self, mu: Array, vi: VariationalInequality) -> None:
-        """Raise a `NumericalError` if a member declared `constant` is another one in the assembly at mu (d,)."""
+    def refuse_false_declarations(self, mu: Array, vi: VariationalInequality) -> None:
+        """Raise a `NumericalError` if a declaration, such as `constant`, `affine` or `contact`, differs from `vi`."""
         # The same object needs no product; `refuse_rewritten_constants` tells if its entries were replaced.
         names = [name for name in self._problem.constant if getattr(vi, name) is not getattr(self._vi, name)]
         for deviation in _fingerprint({name: getattr(vi, name) for name in names}).deviations(self.fingerprint):
             where = f"at mu = {mu.tolist()} from that at the first training parameter"
             raise NumericalError(f"a member declared `constant` depends on mu: {deviation} {where}")
+        # Integration over all elements takes as long as an assembly: a few parameters of a chunk have to do.
+        self._compared += 1
+        for difference in contradictions(self._problem, mu, vi, elements=self._compared <= 4):
+            raise NumericalError(f"refuted at mu = {mu.tolist()}: {difference}")
 
     def refuse_rewritten_constants(self) -> None:
         """Raise a `NumericalError` if later assemblies have written other entries into a member declared `constant`."""

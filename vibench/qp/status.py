@@ -12,6 +12,7 @@ class Status(StrEnum):
     INACCURATE = "inaccurate"
     NONFINITE = "nonfinite"
     INFEASIBLE = "infeasible"
+    REFUTED = "refuted"
     FAILED = "failed"
     TIMEOUT = "timeout"
     CRASHED = "crashed"

@@ -113,6 +113,25 @@ def online_columns(bound: OnlineBound, error: Row) -> Row:
     return row | {"coercivity_online": bound.coercivity, "bound_online_violated": int(violated)}
 
 
+def refutation(row: Row) -> Row:
+    """Status and reason of an ok query whose error is above its bound plus the accuracy of the reference; or nothing.
+
+    Such a query shows that something is false on which the bound rests, a declaration of the problem or a proof.
+    """
+    for name in ("u_energy", "lambda_natural"):
+        absolute, bound = row.get(f"error_{name}_absolute"), row.get(f"bound_online_{name}")
+        force = row.get("error_lambda_natural")
+        if row["status"] != Status.OK or absolute is None or bound is None:
+            continue
+        contact = row["error_lambda_natural_absolute"] / force if force else absolute
+        # The reference itself is known to its own bound, relative to what contact does.
+        if not absolute <= bound + (1e-10 + (row.get("reference_bound") or 0.0)) * contact:
+            what = f"the error of {'u' if name == 'u_energy' else 'λ'} is {absolute / bound:.2g} times its bound"
+            certificate = "the certificate rests on a declaration that is false here; `vibench check` names it"
+            return {"status": Status.REFUTED.value, "reason": f"{what}: {certificate}"}
+    return {}
+
+
 def is_violated(error: Array | float, bound: Array | float, size: Array | float) -> Any:
     """Whether errors exceed their bounds by more than round-off of solutions of a `size`; true for NaN."""
     return np.logical_not(error <= bound + 1e-10 * size)

@@ -31,7 +31,7 @@ from vibench.stability.coercivity import Stability
 from vibench.stability.infsup import InfSup, stability_ratio
 from vibench.stages.artefacts import Artefact, Store
 from vibench.stages.assembly import AssemblyStage, ExactSolutions, ReducedPrograms
-from vibench.stages.assessment import error_columns, pair_columns, summarise
+from vibench.stages.assessment import error_columns, pair_columns, refutation, summarise
 from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, TimeLimit, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage, spaces_of
 from vibench.stages.formulation import CertificateStage, FormulationStage
@@ -222,6 +222,7 @@ class _Queries(Items):
         solutions = {k: solution for k, (_, solution) in enumerate(items) if solution is not None}
         assessed = dict(zip(solutions, self._assess_in_parts(solutions), strict=True))
         rows = [row | assessed.get(k, {}) for k, (row, _) in enumerate(items)]
+        rows = [row | refutation(row) for row in rows]
         sizes, fallbacks = self._sizes(rows)
         own = summarise(rows) | self._common(fallbacks) | sizes | self._offline()
         outputs = summarise_outputs(

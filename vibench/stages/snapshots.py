@@ -125,7 +125,7 @@ class SnapshotStage(Stage):
             except NumericalError:
                 refuse_shifted()
                 InnerProduct(vi.A, f"A at mu = {mu.tolist()}")
-                reference.refuse_false_constants(mu, vi)
+                reference.refuse_false_declarations(mu, vi)
                 raise
 
         def solve(mu: Array) -> tuple[VariationalInequality, ActiveSetSolution]:
@@ -147,7 +147,7 @@ class SnapshotStage(Stage):
                 solution = solver.verify(mu, vi, unverified)
             if k == 0 or "A" not in problem.constant:
                 solver.check_coercive(mu, vi)
-            reference.refuse_false_constants(mu, vi)
+            reference.refuse_false_declarations(mu, vi)
             solver.remember(mu, solution)
             solutions.append(solution)
             u[:, k], lam[:, k] = solution.u, solution.lam
@@ -156,12 +156,26 @@ class SnapshotStage(Stage):
         if solutions:
             beginning, seconds[0] = seconds[0], self._once_started(problem, solver, solve, solutions, mus)
             kept.done(solver, beginning.beyond(seconds[0]))
+        for mu in self._probes(problem):
+            reference.refuse_false_declarations(mu, checked_assembly(problem, mu))
         reference.refuse_rewritten_constants()
         refuse_shifted()
         setups = () if kept.seconds is None else (kept.seconds,)
         measured = tuple(seconds), setups, tuple(fallbacks), reference.fingerprint
         swept = TimedSnapshots(mus, u, lam, *measured, bounds=tuple(self._bounds(problem, mus, u, lam)))
         return Result(swept, sum(seconds, NO_TIME), self._diagnostics(problem, mus, first))
+
+    def _probes(self, problem: Problem) -> Array:
+        """Random parameters at which declarations are compared with assembly where the validation set is short.
+
+        A default validation set is random in the box: with k parameters a declaration is false in at most 3/k of it,
+        at 95 %. A set of the problem's own may avoid parts of the box, which are not entered then.
+        """
+        of_default = self.parameters.sampling is None and type(problem).validation_set is Problem.validation_set
+        if self.parameters.role == "training" or self.chunk or not of_default:
+            return np.zeros((0, problem.parameters.dim))
+        missing = max(0, 16 - len(self.parameters.of(problem)))
+        return problem.parameters.sample(missing, self.parameters.seed + 1)
 
     def _bounds(self, problem: Problem, mus: Array, u: Array, lam: Array) -> Iterator[float]:
         """Error bounds that verify reference solutions; none for training solutions."""

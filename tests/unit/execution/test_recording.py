@@ -5,13 +5,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from samples import cell_row
 
 from vibench.errors import RequestError
-from vibench.execution.recording import LOG, REPORT, claimed, clear, ended_by_smaller_limits, keep_limits
+from vibench.execution.recording import LOG, REPORT, claimed, clear, ended_by_smaller_limits, keep_limits, refute
 from vibench.execution.supervisor import OUT_OF_MEMORY
 from vibench.results.database import ResultsDatabase
 from vibench.results.sqlite import FILE
+from vibench.stages.assessment import refutation
 from vibench.study.spec import Limits
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4}
@@ -102,3 +105,28 @@ def test_cells_ended_by_a_limit_of_their_row_are_run_again_where_it_is_larger(da
     database.write_cell({"cell": "slow", "study_hash": "after", "status": "timeout"}, [])
     assert ended_by_smaller_limits(database, larger) == {"both"}
     assert ended_by_smaller_limits(database, BEFORE) == set()
+
+
+def test_a_refuted_bound_refutes_all_bounds_of_its_problem_and_no_other(database: ResultsDatabase) -> None:
+    refuted = {"status": "refuted", "reason": "the error of λ is 2 times its bound", "bounds": 1}
+    for key, changes in {"a": {"bounds": 1}, "b": refuted, "c": {"bounds": 0}, "d": {"bounds": 1, "problem": "other"},
+                         "e": {"bounds": 1, "status": "failed", "reason": "no"}}.items():  # fmt: skip
+        database.write_cell(cell_row() | {"cell": key} | changes, [])
+    refute(database)
+    cells = {row["cell"]: (row["status"], row["reason"]) for row in database.rows("cells")}
+    assert cells["a"] == ("refuted", "as the bounds of cell b: the error of λ is 2 times its bound")
+    assert [cells[key][0] for key in "bcde"] == ["refuted", "ok", "ok", "failed"]
+
+
+def test_an_error_above_its_bound_and_the_accuracy_of_the_reference_refutes_it() -> None:
+    row = {
+        "status": "ok", "reference_bound": 1e-7, "error_u_energy_absolute": 1.0, "bound_online_u_energy": 2.0,
+        "error_lambda_natural_absolute": 1.0, "error_lambda_natural": 0.1, "bound_online_lambda_natural": 1.0,
+    }  # fmt: skip
+    assert refutation(row) == {}
+    assert refutation(row | {"bound_online_lambda_natural": 1.0 - 0.9e-6}) == {}  # F = 10, known to 1e-6
+    found = refutation(row | {"bound_online_lambda_natural": 0.5})
+    assert (found["status"], found["reason"][:37]) == ("refuted", "the error of λ is 2 times its bound: ")
+    assert refutation(row | {"bound_online_u_energy": np.nan})["status"] == "refuted"
+    assert refutation(row | {"status": "failed", "bound_online_lambda_natural": 0.5}) == {}
+    assert refutation({"status": "ok"}) == {}

@@ -371,7 +371,7 @@ class GreedyTrainer(Trainer):
         # verification and checks are not timed
         solution = self._solver.verify(mu, vi, unverified)
         self._solver.check_coercive(mu, vi)
-        self._reference.refuse_false_constants(mu, vi)
+        self._reference.refuse_false_declarations(mu, vi)
         self._solver.remember(mu, solution)
         if not self.solved:
             # the first solution has no start: what it takes beyond its repetition, which has one, is the set-up
