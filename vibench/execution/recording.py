@@ -14,6 +14,7 @@ from vibench import provenance
 from vibench.errors import RequestError
 from vibench.execution.supervisor import OUT_OF_MEMORY
 from vibench.files import locked
+from vibench.model.certificates.base import Guarantee
 from vibench.plugins.plugin import Plugin
 from vibench.qp.status import Status
 from vibench.results.database import ResultsDatabase
@@ -166,7 +167,12 @@ def refute(database: ResultsDatabase) -> None:
     }
     for row in bounded:
         first = refuted.get((row["problem"], row["problem_options"]))
-        if first is not None and row["status"] == Status.OK:
+        if first is None:
+            continue
+        # No table calls a refuted bound certified.
+        for table in ("cells", "queries"):
+            database.write_columns(row["cell"], {"certificate": Guarantee.REFUTED.value}, table)
+        if row["status"] == Status.OK:
             reason = f"as the bounds of cell {first['cell']}: {first['reason']}"
             database.write_columns(row["cell"], {"status": Status.REFUTED.value, "reason": reason})
 

@@ -271,12 +271,12 @@ class ResultsDatabase:
                 self._digests.count(table, "cell = ?", (cell,))
             self._replace("timings", {"cell": cell}, rounds)
 
-    def write_columns(self, cell: str, columns: Mapping[str, Any]) -> None:
-        """Write some columns of a cell that has its row."""
+    def write_columns(self, cell: str, columns: Mapping[str, Any], table: str = "cells") -> None:
+        """Write some columns of a cell that has its row, or of all its rows of another table."""
         with self._writing():
-            self._digests.count("cells", "cell = ?", (cell,), remove=True)
-            self._update("cells", columns, cell=cell)
-            self._digests.count("cells", "cell = ?", (cell,))
+            self._digests.count(table, "cell = ?", (cell,), remove=True)
+            self._update(table, columns, cell=cell)
+            self._digests.count(table, "cell = ?", (cell,))
 
     def _update(self, table: str, columns: Mapping[str, Any], **keys: Any) -> None:
         changes = ", ".join(f'"{name}" = ?' for name in columns)

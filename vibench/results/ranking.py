@@ -497,7 +497,7 @@ def _ties(best: Candidate, other: Candidate, paired: PairedTiming, queries: floa
 
 def certified_errors(queries: pd.DataFrame) -> pd.Series:
     """Bounds of the mean relative errors of cells with certificates, by cell: the larger one of u and λ, in energy."""
-    fine = queries[queries["status"] == "ok"]
+    fine = queries[(queries["status"] == "ok") & (queries["certificate"] != "refuted")]
     return relative_bounds(fine).groupby(fine["cell"]).mean().max(axis=1, skipna=False)
 
 

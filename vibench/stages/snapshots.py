@@ -16,7 +16,7 @@ from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolver
 from vibench.interfaces.formulations import Snapshots
 from vibench.interfaces.problem import Problem, VariationalInequality
-from vibench.interfaces.validation import Fingerprint, checked_assembly, reference_assembly
+from vibench.interfaces.validation import Fingerprint, ReferenceAssembly, checked_assembly, reference_assembly
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.certificates.greedy import GreedyTrainer
 from vibench.model.error_bounds import reference_bound
@@ -156,8 +156,7 @@ class SnapshotStage(Stage):
         if solutions:
             beginning, seconds[0] = seconds[0], self._once_started(problem, solver, solve, solutions, mus)
             kept.done(solver, beginning.beyond(seconds[0]))
-        for mu in self._probes(problem):
-            reference.refuse_false_declarations(mu, checked_assembly(problem, mu))
+        self._probe(problem, reference)
         reference.refuse_rewritten_constants()
         refuse_shifted()
         setups = () if kept.seconds is None else (kept.seconds,)
@@ -165,17 +164,17 @@ class SnapshotStage(Stage):
         swept = TimedSnapshots(mus, u, lam, *measured, bounds=tuple(self._bounds(problem, mus, u, lam)))
         return Result(swept, sum(seconds, NO_TIME), self._diagnostics(problem, mus, first))
 
-    def _probes(self, problem: Problem) -> Array:
-        """Random parameters at which declarations are compared with assembly where the validation set is short.
+    def _probe(self, problem: Problem, reference: ReferenceAssembly) -> None:
+        """Compare declarations with assembly at random parameters where the validation set is short.
 
         A default validation set is random in the box: with k parameters a declaration is false in at most 3/k of it,
         at 95 %. A set of the problem's own may avoid parts of the box, which are not entered then.
         """
         of_default = self.parameters.sampling is None and type(problem).validation_set is Problem.validation_set
-        if self.parameters.role == "training" or self.chunk or not of_default:
-            return np.zeros((0, problem.parameters.dim))
-        missing = max(0, 16 - len(self.parameters.of(problem)))
-        return problem.parameters.sample(missing, self.parameters.seed + 1)
+        if self.parameters.role == "validation" and of_default and not self.chunk:
+            missing = max(0, 16 - len(self.parameters.of(problem)))
+            for mu in problem.parameters.sample(missing, self.parameters.seed + 1):
+                reference.refuse_false_declarations(mu, checked_assembly(problem, mu))
 
     def _bounds(self, problem: Problem, mus: Array, u: Array, lam: Array) -> Iterator[float]:
         """Error bounds that verify reference solutions; none for training solutions."""

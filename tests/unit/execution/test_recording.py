@@ -116,6 +116,7 @@ def test_a_refuted_bound_refutes_all_bounds_of_its_problem_and_no_other(database
     cells = {row["cell"]: (row["status"], row["reason"]) for row in database.rows("cells")}
     assert cells["a"] == ("refuted", "as the bounds of cell b: the error of λ is 2 times its bound")
     assert [cells[key][0] for key in "bcde"] == ["refuted", "ok", "ok", "failed"]
+    assert {row["cell"] for row in database.rows("cells") if row["certificate"] == "refuted"} == {"a", "b", "e"}
 
 
 def test_an_error_above_its_bound_and_the_accuracy_of_the_reference_refutes_it() -> None:

@@ -49,6 +49,7 @@ class Guarantee(StrEnum):
 
     CERTIFIED = "certified"
     VERIFIED = "verified"
+    REFUTED = "refuted"
     NONE = "none"
 
 

@@ -88,6 +88,9 @@ def _panels(data: ProblemTables, shown: pd.DataFrame) -> list[_Panel]:
     """A panel for each pair, and several where there are more strategies than a panel takes."""
     panels, by_pair = [], dict(iter(shown.groupby("pair", sort=False)))
     for pair, sizes in data.queries[["pair", "N", "R"]].groupby("pair", sort=False):
+        # Without contact, as without generators, a pair has no constants.
+        if pair not in by_pair:
+            continue
         rows = by_pair[pair]
         fixed = rows[rows["enrichment_kind"] == Kind.FIXED]
         sorting = fixed if len(fixed) else rows
