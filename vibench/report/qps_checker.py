@@ -2,12 +2,15 @@
 
 Programs are min ½ xᵀPx + qᵀx subject to Gx ≤ h, in programs/NAME.npz; solutions x and multipliers z ≥ 0 of
 Px + q + Gᵀz = 0 are x_CELL and z_CELL in solutions/NAME.npz, a cell being a solver at an accuracy; rows.csv names the
-cells and holds the claimed status and residuals. With r = Px + q + Gᵀz, s = Gx − h, norms ‖·‖ in P⁻¹ and
-S² = xᵀPx + ‖Gᵀz‖², the residuals, which depend on no units and on no scaling of rows, are
+cells and holds the claimed status and residuals. With r = Px + q + Gᵀz, s = Gx − h, norms ‖·‖ in P⁻¹ and F = ‖Gᵀz‖,
+the residuals, which depend on no units and on no scaling of rows, are
 
-    primal  max (s_i)₊ / ‖G_i‖ / S, over the rows whose s_i is not round-off
-    dual    ‖r‖ / S
-    gap     |zᵀs| / S²
+    primal  max (s_i)₊ / ‖G_i‖ / F, over the rows whose s_i is not round-off
+    dual    ‖r‖ / F
+    gap     |zᵀs| / F²
+
+Where one is above the accuracy F is the larger of this and of max (s_i)₊ / ‖G_i‖ at x = −P⁻¹q; if that is zero, there
+is no contact, and S takes its place, S² = xᵀPx + ‖Gᵀz‖².
 
 Usage: python check.py [FOLDER]. Exit code 1 if a row claims "ok" and is not, or a claimed residual is not reproduced.
 """
@@ -21,18 +24,34 @@ from pathlib import Path
 import numpy as np
 
 
-def residuals(P: np.ndarray, q: np.ndarray, G: np.ndarray, h: np.ndarray, x: np.ndarray, z: np.ndarray) -> list[float]:
+def residuals(
+    P: np.ndarray, q: np.ndarray, G: np.ndarray, h: np.ndarray, x: np.ndarray, z: np.ndarray, accuracy: float = 0.0
+) -> list[float]:
     """Primal and dual residual and gap, as defined above."""
+    L = np.linalg.cholesky(P)
     P, q, G, h, x, z = (array.astype(np.longdouble) for array in (P, q, G, h, x, z))
-    r, s, force = P @ x + q + G.T @ z, G @ x - h, G.T @ z
-    terms = np.count_nonzero(G, axis=1) + 2.0
-    violated = s > 1.01 * float(np.finfo(float).eps) * terms * (abs(G) @ abs(x) + abs(h))
-    columns = np.column_stack([r, force, G[violated].T]).astype(float)
-    norms = np.linalg.norm(np.linalg.solve(np.linalg.cholesky(P.astype(float)), columns), axis=0)
-    S = float(np.hypot(np.sqrt(max(float(x @ P @ x), 0.0)), norms[1]))
-    primal, gap = float(np.max(s[violated] / norms[2:], initial=0.0)), abs(float(z[z > 0.0] @ s[z > 0.0]))
-    sizes = (primal, S), (float(norms[0]), S), (gap, S**2)
-    return [0.0 if size == 0.0 else size / scale if scale else float("inf") for size, scale in sizes]
+    r, force = P @ x + q + G.T @ z, G.T @ z
+    free = -np.linalg.solve(L.T, np.linalg.solve(L, q.astype(float))).astype(np.longdouble)
+    free -= np.linalg.solve(L.T, np.linalg.solve(L, (P @ free + q).astype(float)))
+
+    def norms(functionals: np.ndarray) -> np.ndarray:
+        return np.asarray(np.linalg.norm(np.linalg.solve(L, functionals.astype(float)), axis=0))
+
+    def step(point: np.ndarray) -> float:
+        s, terms = G @ point - h, np.count_nonzero(G, axis=1) + 2.0
+        rows = s > 1.01 * float(np.finfo(float).eps) * terms * (abs(G) @ abs(point) + abs(h))
+        return float(np.max(s[rows] / norms(G[rows].T), initial=0.0))
+
+    rest, F = norms(np.column_stack([r, force])).tolist()
+    s, least = G @ x - h, step(free)
+    S = float(np.hypot(np.sqrt(max(float(x @ P @ x), 0.0)), F))
+    found: list[float] = []
+    for unit in (F, max(F, least) if least else S):
+        sizes = (step(x), unit), (rest, unit), (abs(float(z[z > 0.0] @ s[z > 0.0])), unit**2)
+        found = [0.0 if size == 0.0 else size / scale if scale else float("inf") for size, scale in sizes]
+        if max(found) <= accuracy:
+            break
+    return found
 
 
 def main(folder: Path) -> int:
@@ -45,7 +64,8 @@ def main(folder: Path) -> int:
             solution = np.load(folder / "solutions" / f"{row['program']}.npz", allow_pickle=False)
             x, z = solution[f"x_{row['cell']}"], solution[f"z_{row['cell']}"]
             finite = bool(np.all(np.isfinite(x)) and np.all(np.isfinite(z)))
-            recomputed = residuals(program["P"], program["q"], program["G"], program["h"], x, z)
+            arrays = (program["P"], program["q"], program["G"], program["h"])
+            recomputed = residuals(*arrays, x, z, float(row["accuracy"]))
             # Two computations of a residual may differ by round-off.
             margin = 1e-12
             claimed = [float(row[name] or "nan") for name in ("primal_residual", "dual_residual", "gap")]

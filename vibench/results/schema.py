@@ -293,7 +293,7 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "bound_omega": real("A", "ω, the norm of the correction w of the constraint violation."),
         "bound_kappa": real("A²", "κ = λ_Nᵀ(B w − s), the complementarity of w and λ_N."),
         "bound_note": text("Why there are no bounds, or none of λ in W, or which constant is estimated; else empty."),
-        "certificate": text("Bounds at online cost: certified, verified (interpolation errors were measured), refuted or none."),
+        "certificate": text("Bounds at online cost: certified, verified (interpolation is measured), refuted or none."),
         "bound_online_u_energy": real("A", "Bound of error_u_energy_absolute at online cost."),
         "bound_online_lambda_natural": real("A", "Bound of error_lambda_natural_absolute at online cost."),
         "bound_online_lambda": real("W", "Bound of error_lambda_absolute at online cost; empty where "

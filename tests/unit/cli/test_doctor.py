@@ -21,7 +21,7 @@ from vibench.qp.verification import Residuals
 from vibench.stages.artefacts import Store, default_folder
 from vibench.timing import NO_TIME, Seconds, Stopwatch
 
-FINE = Trial(Status.OK, "", residuals=Residuals(0.0, 2e-9, 0.0))
+FINE = Trial(Status.OK, "", residuals=Residuals(0.0, 2e-9, 0.0, 1.0))
 
 
 @pytest.fixture
