@@ -215,7 +215,12 @@ def main(run: str, run_compiled: str, target: str) -> None:
         robustness(cells),
     )
     page.section("Bounds", "Errors above their bounds, of those compared.", violated(queries))
-    page.section("Uncertainty that formulations state", uncertainty(queries))
+    page.section(
+        "Uncertainty that formulations state",
+        "The bound of u is of the sum with λ, so that it is large beside the error of u where the error of λ is "
+        "larger: `regression` has no enrichment.",
+        uncertainty(queries),
+    )
     page.add(
         f"All columns of the cells: {page.link('cells', cells.drop(columns=['definition', 'versions']))}; of the "
         f"break-evens with `mixed`: {page.link('thresholds', compared)}."

@@ -244,7 +244,12 @@ def main(run: str, target: str) -> None:
     )
     page.draw("pressed", pressed())
     page.section("Models", models(cells))
-    page.section("Bounds", effectivities(cells))
+    page.section(
+        "Bounds",
+        "Effectivities. The bound of u at high-fidelity cost is of the sum with λ: where the error of λ is the larger "
+        "one, as without enrichment (`decorrelated`), the effectivity of u is large.",
+        effectivities(cells),
+    )
     page.section("Seconds", seconds(cells))
     page.section(
         "Break-even",
