@@ -304,14 +304,13 @@ def formulations() -> Sequence[str]:
     levels, *_ = page_tables("formulations")
     (compiled,) = [table for table in page_tables("formulations") if "query / compiled" in table]
     best = levels.groupby("problem").last()
-    assert dict(best["formulation"]) == {
-        "hertz": "regression (radial)", "obstacle": "regression (radial)", "bearing": "local (contact sets)",
-        "american-put": "local (contact sets)",
-    }  # fmt: skip
-    least = best["smallest error"].map("{:.2g}".format)
+    places = {"hertz": "Hertz contact", "obstacle": "the obstacle", "bearing": "the bearing", "american-put": "the put"}
+    least = (places[problem] + best["smallest error"].map(" ({:.2g})".format)[problem] for problem in places)
+    winners = pd.Series(list(least), best["formulation"][list(places)]).groupby(level=0).agg(" and ".join)
     return (
-        f"smallest errors on Hertz contact ({least['hertz']}) and on the obstacle ({least['obstacle']}); on the "
-        f"bearing ({least['bearing']}) and on the put ({least['american-put']}) `local` with contact sets has them",
+        ", and of ".join(
+            f"`{name.replace(' (', '` (')}{'' if '(' in name else '`'} on {at}" for name, at in winners.items()
+        ),
         f"queries of `mixed` are {span(pd.to_numeric(compiled['query / compiled']).dropna())} times as fast",
         f"{of.str.split().str[0].nunique()} formulations, {len(table)} cells".replace("7 ", "seven "),
         f"has the fastest queries on all four problems, with errors of λ of {span(fastest['error_lambda_mean'])}",
@@ -349,12 +348,17 @@ def break_evens() -> Sequence[str]:
         numbers = table["benefit_threshold"][chosen & (meaning == name)]
         return " to ".join(dict.fromkeys(f"{end:.0f}" for end in (numbers.min(), numbers.max()))) + " queries"
 
+    def tally(chosen: pd.Series) -> str:
+        words = {"from": "from some query on", "until": "until some query"}
+        return ", ".join(
+            f"{words.get(name, name)} in {count}" for name, count in meaning[chosen].value_counts().items()
+        )
+
     processes, contact = of == "regression", of == "local (contact sets)"
     sparse, hyper, undecided = of == "sparse-dictionary", kind == "hyper-reduced", meaning == "undecided"
-    assert {some(of == name, "never") for name in ("penalty", "proximal")} == {16}
     assert not some(processes, "at once")
     local = (kind == "local") & (table["dual"] == "mcpg")
-    assert set(table["dual"][sparse & (meaning == "never")]) == {"mcpg"}
+    cones = set(table["dual"][sparse & (meaning == "never")])
     offline = undecided & table["rounds_missing"].isna()
     others = table[undecided & ~offline]
     timed = pd.read_csv(ROOT / "results" / "formulations" / "cells.csv").set_index("cell").loc[others["cell_b"]]
@@ -368,12 +372,13 @@ def break_evens() -> Sequence[str]:
         f"{number(contact, 'from').removesuffix(' queries')} in {some(contact, 'from')}; "
         f"with `mcpg` never in {some(local, 'never')} of {local.sum()}",
         f"from at most {table['benefit_threshold'][sparse].max():.0f} queries on in {some(sparse, 'from')}, never in "
-        f"{some(sparse, 'never')}",
+        f"{some(sparse, 'never')}{', all with `mcpg`' * (cones == {'mcpg'})}",
         f"in {some(hyper, 'until')} of {hyper.sum()}, and is cheaper there until {number(hyper, 'until')} only",
         f"{undecided.sum()} of the {len(table)} pairs are undecided, {(undecided & hyper).sum()} of them of `hyper",
         f"In {offline.sum()} of the {undecided.sum()} the offline seconds are too close, which no further rounds would "
         f"change; the others would need {span(missing)} rounds more (`rounds_missing`) after {span(done)}, of which "
         f"{most} are permitted,",
+        *(tally(of == name) for name in ("penalty", "proximal")),
     )
 
 

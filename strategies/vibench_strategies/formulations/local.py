@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -130,8 +131,14 @@ def _largest(place: Array, weights: Array) -> int:
 
 def _features(place: Array) -> Array:
     """1, a place (d,) and the products of its coordinates, of which polynomials are sums."""
-    i, j = np.triu_indices(len(place))
+    i, j = _pairs(len(place))
     return np.concatenate([[1.0], place, place[i] * place[j]])
+
+
+@cache
+def _pairs(d: int) -> tuple[Indices, Indices]:
+    """Cached: numbers of the coordinates of all products of two."""
+    return np.triu_indices(d)
 
 
 def _clusters(points: Array, count: int, seed: int) -> tuple[Array, Indices]:

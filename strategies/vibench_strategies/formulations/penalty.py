@@ -1,19 +1,18 @@
-"""A penalty on what violates the reduced constraints, with continuation."""
+"""A penalty on what violates the reduced constraints, by Newton's method."""
 
 from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
 import numpy as np
-import scipy.linalg
 from annotated_types import Ge, Gt, Lt
 
 from vibench import Array, Multiplier
 from vibench_strategies.formulations.reduced_programs import ProgramFormulation
-from vibench_strategies.formulations.whitened import Whitened
+from vibench_strategies.formulations.whitened import Whitened, positive_solution
 
 NEWTON_STEPS = 100
-"""Of one penalty; a convex piecewise quadratic function needs finitely many, in practice one to five."""
+"""Of one penalty; a convex piecewise quadratic function needs finitely many."""
 
 
 class Penalty(ProgramFormulation):
@@ -28,9 +27,9 @@ class Penalty(ProgramFormulation):
     Parameters
     ----------
     epsilon
-        ε, from 1 to it by continuation.
+        ε, at which Newton's method starts.
     reduction
-        Factor by which the continuation reduces ε in each step.
+        Factor by which ε is reduced in each step from 1 on, where Newton's method runs in circles at ε itself.
     """
 
     uses: ClassVar[tuple[str, ...]] = ("pod", "dual", "primal", "assembly")
@@ -44,7 +43,7 @@ class Penalty(ProgramFormulation):
         self.epsilon, self.reduction = epsilon, reduction
 
     def algorithm(self, program: Whitened, accuracy: float) -> tuple[Array, Array, int, str]:  # noqa: ARG002
-        """Newton's method for one penalty after the other."""
+        """Newton's method, for one penalty after the other where it fails at the last one."""
         z, nu, steps, converged = penalised(program, self.epsilon, self.reduction)
         return z, nu, steps, "" if converged else f"Newton's method has not converged in {NEWTON_STEPS} steps"
 
@@ -52,32 +51,51 @@ class Penalty(ProgramFormulation):
 def penalised(program: Whitened, epsilon: float, reduction: float) -> tuple[Array, Array, int, bool]:
     """Minimise ½‖z − y‖² + ‖(Y z − g)₊‖² / (2ε); returns z, ν = (Y z − g)₊ / ε, Newton steps, whether they converged.
 
-    ε falls from 1 by the factor `reduction`, each minimum being the start of the next one. Every step solves the
-    quadratic piece of the present active set, the Newton step of a semismooth function, in its multipliers:
-    (Y_S Y_Sᵀ + ε I) ν_S = Y_S y − g_S, whose condition is that of the constraints and not of the penalty. An exact line
-    search makes it converge from everywhere.
+    Newton's method starts at ε itself, with full steps. Where these run in circles, ε falls from 1 by the factor
+    `reduction`, each minimum being the start of the next one, with an exact line search, which converges always.
     """
-    Y, y, g, steps = program.Y, program.y, program.g, 0
-    z, current = y, 1.0
+    z, nu, steps, settled = _newton(program, program.y, epsilon, full=True)
+    if settled:
+        return z, nu, steps, True
+    z, current = program.y, 1.0
     while True:
-        current, settled = max(epsilon, current), False
-        for _ in range(NEWTON_STEPS):
-            steps += 1
-            active = Y @ z > g
-            S = Y[active]
-            matrix = S @ S.T
-            matrix[np.diag_indices_from(matrix)] += current
-            nu = scipy.linalg.solve(matrix, S @ y - g[active], assume_a="pos") if len(S) else np.zeros(0)
-            following = y - S.T @ nu
-            if settled := np.array_equal(Y @ following > g, active):
-                z = following
-                break
-            z = z + _step(program, z, following - z, current) * (following - z)
+        current = max(epsilon, current)
+        z, nu, count, settled = _newton(program, z, current, full=False)
+        steps += count
         if current == epsilon or not settled:
-            multipliers = np.zeros(len(g))
-            multipliers[active] = np.maximum(nu, 0.0)
-            return z, multipliers, steps, bool(settled)
+            return z, nu, steps, settled
         current *= reduction
+
+
+def _newton(program: Whitened, z: Array, epsilon: float, *, full: bool) -> tuple[Array, Array, int, bool]:
+    """Newton's method from z for one ε, with full steps or a line search; z, ν, steps, and whether it has converged.
+
+    Every step solves the quadratic piece of the present active set, the Newton step of a semismooth function, in its
+    multipliers: (Y_S Y_Sᵀ + ε I) ν_S = Y_S y − g_S, whose condition is that of the constraints and not of the penalty.
+    """
+    Y, y, g, multipliers = program.Y, program.y, program.g, np.zeros(len(program.g))
+    active, settled, seen, count = Y @ z > g, False, set[bytes](), 0
+    while count < NEWTON_STEPS:
+        count += 1
+        S = Y[active]
+        matrix = S @ S.T
+        matrix.flat[:: len(S) + 1] += epsilon
+        nu = positive_solution(matrix, S @ y - g[active])
+        following = y - S.T @ nu
+        before, active = active, Y @ following > g
+        if settled := bool((active == before).all()):
+            z = following
+            break
+        if full:
+            # a full step depends on the active set alone: the second time it begins a circle
+            if (known := active.tobytes()) in seen:
+                break
+            z, seen = following, seen | {known}
+        else:
+            z = z + _step(program, z, following - z, epsilon) * (following - z)
+            active = Y @ z > g
+    multipliers[before] = np.maximum(nu, 0.0)
+    return z, multipliers, count, settled
 
 
 def _step(program: Whitened, z: Array, d: Array, epsilon: float) -> float:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-import scipy.linalg
 from annotated_types import Gt, Le
 
 from vibench import Array
 from vibench_strategies.formulations.reduced_programs import ProgramFormulation
-from vibench_strategies.formulations.whitened import Whitened
+from vibench_strategies.formulations.whitened import Whitened, positive_solution
 
 PROXIMAL_STEPS = 200
 NEWTON_STEPS = 15
@@ -104,27 +103,29 @@ def latent_proximal(program: Whitened, tolerance: float, step: float, growth: fl
 def _newton(
     C: Array, b: Array, psi: Array, nu: Array, a: float, tolerance: float, most: int
 ) -> tuple[Array | None, int]:
-    """Minimise Σ exp(ψ_i − a ν_i)/a + ½νᵀCν − bᵀν, from ν (k,) or 0.
+    """Minimise Σ exp(ψ_i − a ν_i)/a + ½νᵀCν − bᵀν, from what is positive of ν (k,).
 
     Returns the minimiser, or `None` where `most` steps are not enough, and the number of steps.
     """
-
-    def value(at: Array) -> float:
-        with np.errstate(over="ignore"):
-            return float(np.exp(psi - a * at).sum() / a + at @ (0.5 * (C @ at) - b))
-
-    nu = min(nu, np.maximum(nu, 0.0), np.zeros_like(nu), key=value)
-    present = value(nu)
+    nu = np.maximum(nu, 0.0)
+    pressed, slack = C @ nu, np.exp(psi - a * nu)
+    matrix, present = np.empty_like(C), float(slack.sum() / a + nu @ (0.5 * pressed - b))
+    diagonal = np.einsum("ii->i", matrix)
     for count in range(1, most + 1):
-        slack = np.exp(psi - a * nu)
-        gradient = C @ nu - b - slack
-        factor = scipy.linalg.cho_factor(C + np.diag(a * slack + RIDGE), lower=True, check_finite=False)
-        direction = -scipy.linalg.cho_solve(factor, gradient, check_finite=False)
-        slope, rise = float(gradient @ direction), a * float(np.max(-direction))
+        gradient = pressed - b - slack
+        matrix[:] = C
+        diagonal += a * slack + RIDGE
+        direction = -positive_solution(matrix, gradient)
+        slope, rise, along = float(gradient @ direction), -a * float(direction.min()), C @ direction
         t = RISE / max(RISE, rise)
-        while (found := value(nu + t * direction)) > present + 1e-4 * t * slope + ROUND_OFF * abs(present):
+        while True:
+            following, at = pressed + t * along, nu + t * direction
+            slack = np.exp(psi - a * at)
+            value = float(slack.sum() / a + at @ (0.5 * following - b))
+            if value <= present + 1e-4 * t * slope + ROUND_OFF * abs(present):
+                break
             t *= 0.5
-        nu, present = nu + t * direction, found
-        if rise <= RISE and -slope <= tolerance**2 * float(nu @ (C @ nu)):
+        nu, pressed, present = at, following, value
+        if rise <= RISE and -slope <= tolerance**2 * float(nu @ pressed):
             return nu, count
     return None, most

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import numpy as np
 import scipy.linalg
 from annotated_types import Gt, Le
-from scipy.interpolate import RBFInterpolator
 from scipy.optimize import nnls
 
 from vibench import Array, Formulation, FormulationAnswer, FormulationModel, QuerySettings, UnsupportedError
@@ -68,7 +67,8 @@ class Regression(Formulation):
             raise UnsupportedError(f"the training parameters are in a hyperplane, no linear function of {box.dim} fits")
         values = {"u": problem.V.gram(offline.pod.basis, snapshots.u), "lam": problem.W.gram(span, snapshots.lam)}
         rest = problem.V.norm(snapshots.u - offline.pod.basis @ values["u"])
-        fitted = {n: {"values": v} if self.kind == "radial" else self._processes(places, v) for n, v in values.items()}
+        fit = _radial if self.kind == "radial" else self._processes
+        fitted = {name: fit(places, of) for name, of in values.items()}
         rays = problem.W.gram(span, cone.generators)
         return {"places": places, "left_out": float(np.mean(rest**2)), "rays": rays, **fitted}
 
@@ -99,71 +99,65 @@ class Regression(Formulation):
 
     def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:
         """The fitted functions, and the bases of their coefficients."""
-        made = RadialFunctions if self.kind == "radial" else Processes
-        return RegressionModel(offline, built, made(built["places"], built["u"]), made(built["places"], built["lam"]))
+        return RegressionModel(offline, built, (Radial if self.kind == "radial" else Processes)(built))
 
 
-class RadialFunctions:
-    """Sums of cubic radial basis functions and a linear function, of values (k×P) at places (P×d) in the unit cube."""
+def _radial(places: Array, values: Array) -> dict[str, Array]:
+    """Weights (P+1+d×k) of cubic functions around the places (P×d), of 1 and of the coordinates, for values (k×P)."""
+    linear = np.column_stack([np.ones(len(places)), places])
+    cubes = np.linalg.norm(places[:, None] - places, axis=2) ** 3 + NOISE * np.eye(len(places))
+    matrix = np.block([[cubes, linear], [linear.T, np.zeros((linear.shape[1], linear.shape[1]))]])
+    return {"weights": np.linalg.solve(matrix, np.pad(values.T, ((0, linear.shape[1]), (0, 0))))}
 
-    def __init__(self, places: Array, of: Mapping[str, Array]) -> None:
-        values = of["values"].T
-        self._fitted = (
-            RBFInterpolator(places, values, kernel="cubic", degree=1, smoothing=NOISE) if values.size else None
-        )
 
-    def at(self, place: Array) -> Array:
-        """Their values (k,) at a place (d,)."""
-        return np.zeros(0) if self._fitted is None else np.asarray(self._fitted(place[None])[0])
+class Radial:
+    """Sums of radial basis functions and a linear function, from what `Regression` stores of them."""
 
-    def with_variance(self, place: Array) -> tuple[Array, None]:
-        """Their values; they state no variance."""
-        return self.at(place), None
+    def __init__(self, built: Mapping[str, Any]) -> None:
+        self._places, self._count = built["places"], built["u"]["weights"].shape[1]
+        self._weights = np.hstack([built["u"]["weights"], built["lam"]["weights"]])
+
+    def at(self, place: Array) -> tuple[Array, Array, None]:
+        """Coefficients of u and of λ at a place (d,), without a variance."""
+        away = self._places - place
+        squares = np.einsum("ij,ij->i", away, away)
+        values = np.concatenate([squares * np.sqrt(squares), [1.0], place]) @ self._weights
+        return values[: self._count], values[self._count :], None
 
 
 class Processes:
     """Gaussian processes, from what `Regression` stores of them."""
 
-    def __init__(self, places: Array, of: Mapping[str, Array]) -> None:
-        self._places, self._of = places, of
+    def __init__(self, built: Mapping[str, Any]) -> None:
+        u, lam = built["u"], built["lam"]
+        self._places, self._count, self._u = built["places"], len(u["means"]), u
+        self._means = np.append(u["means"], lam["means"])
+        self._scales = 5.0 * np.vstack([u["lengths"], lam["lengths"]]) ** -2.0
+        self._weights = np.vstack([(of["spreads"] * of["variances"])[:, None] * of["weights"] for of in (u, lam)])
+        self._factors = u["variances"][:, None, None] * u["inverses"]
 
-    def at(self, place: Array) -> Array:
-        """Their means (k,) at a place (d,)."""
-        return self._means(self._covariances(place))
-
-    def with_variance(self, place: Array) -> tuple[Array, float]:
-        """Their means, and the sum of their variances."""
-        of, covariances = self._of, self._covariances(place)
-        explained = np.einsum("kpq,kq->kp", of["inverses"], covariances)
-        left = np.maximum(of["variances"] - np.sum(explained**2, axis=1), 0.0)
-        return self._means(covariances), float(left @ of["spreads"] ** 2)
-
-    def _means(self, covariances: Array) -> Array:
-        of = self._of
-        return np.asarray(of["means"] + of["spreads"] * np.sum(of["weights"] * covariances, axis=1))
-
-    def _covariances(self, place: Array) -> Array:
-        """Covariances (k×P) of the values at a place (d,) with those at the training parameters."""
-        of = self._of
-        r = np.sqrt(5.0 * (of["lengths"] ** -2.0) @ ((self._places - place) ** 2).T)
-        return np.asarray(of["variances"][:, None] * (1.0 + r + r**2 / 3.0) * np.exp(-r))
-
-
-Fitted = Processes | RadialFunctions
+    def at(self, place: Array) -> tuple[Array, Array, float]:
+        """Means of the coefficients of u and of λ at a place (d,), and the sum of the variances of those of u."""
+        count, squares = self._count, self._scales @ ((self._places - place) ** 2).T
+        r = np.sqrt(squares)
+        correlations = (1.0 + r + squares / 3.0) * np.exp(-r)
+        values = self._means + np.einsum("kp,kp->k", self._weights, correlations)
+        explained = (self._factors @ correlations[:count, :, None])[:, :, 0]
+        left = np.maximum(self._u["variances"] - np.einsum("kp,kp->k", explained, explained), 0.0)
+        return values[:count], values[count:], float(left @ self._u["spreads"] ** 2)
 
 
 class RegressionModel(FixedSpacesModel):
     """Evaluates fitted coefficients at a parameter."""
 
-    def __init__(self, offline: OfflinePhase, built: Mapping[str, Any], u: Fitted, lam: Fitted) -> None:
+    def __init__(self, offline: OfflinePhase, built: Mapping[str, Any], functions: Radial | Processes) -> None:
         super().__init__(offline.pod.basis, offline.cone.generators)
-        self._box, self._u, self._lam = offline.problem.parameters, u, lam
+        self._box, self.functions = offline.problem.parameters, functions
         self._left_out, self._rays = built["left_out"], built["rays"]
 
     def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:  # noqa: ARG002
         """The coefficients, those of λ projected on the cone, and the uncertainty of u."""
-        place = self._box.to_unit(mu)
-        (x, variance), lam = self._u.with_variance(place), self._lam.at(place)
+        x, lam, variance = self.functions.at(self._box.to_unit(mu))
         alpha = nnls(self._rays, lam)[0] if self._rays.size else np.zeros(self._rays.shape[1])
         stated = None if variance is None else np.sqrt(variance + self._left_out)
         return FormulationAnswer(x, alpha, uncertainty=stated)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
+import scipy.linalg
 from annotated_types import Ge, Gt, Lt
+from scipy.linalg.lapack import dtrtrs
 
 from vibench import Array, NumericalError
 from vibench_strategies.formulations.reduced_programs import ProgramFormulation
@@ -59,41 +61,68 @@ def greedy_active_set(program: Whitened, tolerance: float, entries: int | None) 
     NumericalError
         If no z satisfies all constraints.
     """
-    Y, g, z, nu, steps = program.Y, program.g, program.y.copy(), np.zeros(len(program.g)), 0
-    chosen = list[int]()
+    Y, y, g, z, nu, steps = program.Y, program.y, program.g, program.y.copy(), np.zeros(len(program.g)), 0
+    chosen = Chosen(Y)
     limit = 10 * len(g) + 10
     while True:
         excess = Y @ z - g
-        worst = int(np.argmax(excess))
-        violation = max(float(excess[worst]), 0.0) / (program.energy(z, nu) or 1.0)
-        if violation <= tolerance or (entries is not None and len(chosen) >= entries):
-            return program.y - Y.T @ nu, nu, steps, violation
+        worst = int(excess.argmax())
+        # as `Whitened.energy`: for the chosen constraints Yᵀν is y − z
+        energy = float(np.sqrt(z @ z + (y - z) @ (y - z)))
+        violation = max(float(excess[worst]), 0.0) / (energy or 1.0)
+        if violation <= tolerance or (entries is not None and len(chosen.rows) >= entries):
+            return y - Y.T @ nu, nu, steps, violation
+        lacking = excess[worst]
         while True:
             steps += 1
             if steps > limit:
                 raise NumericalError(f"the greedy choice has not ended after {limit} steps: its constraints cycle")
-            on_chosen, rest = _parts(Y[chosen], Y[worst])
+            on_chosen, rest = chosen.parts(Y[worst])
             square = float(rest @ rest)
-            falling = [k for k, share in enumerate(on_chosen) if share > DEPENDENT]
-            ratios = [nu[chosen[k]] / on_chosen[k] for k in falling]
-            full = (Y[worst] @ z - g[worst]) / square if square > DEPENDENT**2 else np.inf
-            partial = min(ratios, default=np.inf)
-            length = min(full, partial)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratios = np.where(on_chosen > DEPENDENT, nu[chosen.rows] / on_chosen, np.inf)
+            full = lacking / square if square > DEPENDENT**2 else np.inf
+            length = min(full, ratios.min(initial=np.inf))
             if not np.isfinite(length):
                 raise NumericalError("the reduced program is infeasible: no coefficients satisfy all constraints")
             z -= length * rest
-            nu[chosen] -= length * on_chosen
+            nu[chosen.rows] -= length * on_chosen
             nu[worst] += length
-            if full <= partial:
-                chosen.append(worst)
+            if length == full:
+                chosen.add(worst, on_chosen, rest)
                 break
-            leaving = chosen.pop(falling[int(np.argmin(ratios))])
-            nu[leaving] = 0.0
+            lacking -= length * square
+            nu[chosen.drop(int(ratios.argmin()))] = 0.0
 
 
-def _parts(rows: Array, row: Array) -> tuple[Array, Array]:
-    """Coefficients of a row in the span of `rows` (j×N), which are independent, and what is left of it."""
-    if not len(rows):
-        return np.zeros(0), row.copy()
-    coefficients = np.asarray(np.linalg.lstsq(rows.T, row, rcond=None)[0], float)
-    return coefficients, row - rows.T @ coefficients
+class Chosen:
+    """Chosen rows of Y (k×N), which are independent, with the factors Y_Sᵀ = Q T, updated at every choice."""
+
+    def __init__(self, Y: Array) -> None:
+        self.rows = list[int]()
+        self._Q, self._T = np.zeros((Y.shape[1], 0)), np.zeros((0, 0))
+
+    def parts(self, row: Array) -> tuple[Array, Array]:
+        """Coefficients (j,) of a row in the span of those chosen, and what is left of it (N,)."""
+        if not self.rows:
+            return np.zeros(0), row
+        on = self._Q.T @ row
+        rest = row - self._Q @ on
+        # a second time: of a nearly dependent row round-off is left, too
+        again = self._Q.T @ rest
+        return dtrtrs(self._T, on + again)[0], rest - self._Q @ again
+
+    def add(self, row: int, coefficients: Array, rest: Array) -> None:
+        """Choose a row with these parts."""
+        length, size = np.sqrt(rest @ rest), len(self.rows)
+        T = np.zeros((size + 1, size + 1))
+        T[:size, :size], T[:size, size], T[size, size] = self._T, self._T @ coefficients, length
+        self._Q, self._T = np.column_stack([self._Q, rest / length]), T
+        self.rows.append(row)
+
+    def drop(self, place: int) -> int:
+        """Drop the row at a place, and return its number."""
+        Q, T = scipy.linalg.qr_delete(self._Q, self._T, place, which="col", check_finite=False)
+        # a square Q is taken for a full factorisation, which keeps all columns
+        self._Q, self._T = Q[:, : T.shape[1]], T[: T.shape[1]]
+        return self.rows.pop(place)

@@ -5,12 +5,26 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
+from scipy.linalg.lapack import dposv, dpotrf, dtrtrs
 
 from vibench import Array, Mask, NumericalError, VariationalInequality, is_absent
 
-FEASIBLE = 1e-12
-"""Violations below this share of the solution are round-off; the scale is that of `Whitened.energy`."""
+
+def positive_solution(matrix: Array, right: Array) -> Array:
+    """The solution (k,) of a system with a positive definite matrix (k×k), which is overwritten.
+
+    Raises
+    ------
+    NumericalError
+        If it is not positive definite.
+    """
+    if not len(right):
+        return right
+    # `scipy.linalg.solve` takes longer to check its arguments than LAPACK to solve systems of these sizes
+    _, solution, info = dposv(matrix.T, right, lower=False, overwrite_a=True)
+    if info:
+        raise NumericalError(f"a matrix of {len(right)} constraints is not positive definite")
+    return np.asarray(solution)
 
 
 @dataclass(frozen=True)
@@ -49,18 +63,19 @@ class Whitened:
         NumericalError
             If A is not positive definite, or a zero row of B makes the program infeasible.
         """
-        try:
-            lower = scipy.linalg.cholesky(program.A, lower=True) if factor is None else factor
-        except np.linalg.LinAlgError:
-            raise NumericalError("the stiffness of the reduced program is not positive definite") from None
-        columns = np.column_stack([program.B.T, program.f])
-        whitened = scipy.linalg.solve_triangular(lower, columns, lower=True, check_finite=False)
+        # LAPACK itself: for small programs SciPy takes longer to check arguments than to factorise
+        lower, info = dpotrf(program.A, lower=True) if factor is None else (factor, 0)
+        if info:
+            raise NumericalError("the stiffness of the reduced program is not positive definite")
+        whitened, _ = dtrtrs(lower, np.vstack([program.B, program.f]).T, lower=True, overwrite_b=True)
         rows, free, bounds = whitened[:, :-1].T, whitened[:, -1], program.g
         lengths = np.sqrt(np.einsum("ij,ij->i", rows, rows))
         if ((lengths == 0.0) & (bounds < 0.0)).any():
             raise NumericalError("the reduced program is infeasible: a row of B is zero where g is negative")
         kept = (lengths > 0.0) & ~is_absent(bounds)
-        rows, lengths, bounds = rows[kept] / lengths[kept, None], lengths[kept], bounds[kept] / lengths[kept]
+        if not kept.all():
+            rows, lengths, bounds = rows[kept], lengths[kept], bounds[kept]
+        rows, bounds = rows / lengths[:, None], bounds / lengths
         unit = float(np.max(rows @ free - bounds, initial=0.0)) or 1.0
         return cls(rows, free / unit, bounds / unit, kept, lower, lengths, unit)
 
@@ -78,4 +93,4 @@ class Whitened:
         """The solution x (N,), α (R,) of the program itself from z (N,), ν (k,)."""
         alpha = np.zeros(len(self.kept))
         alpha[self.kept] = self.unit * nu / self.lengths
-        return scipy.linalg.solve_triangular(self.lower, self.unit * z, lower=True, trans="T"), alpha
+        return dtrtrs(self.lower, self.unit * z, lower=True, trans=True)[0], alpha

@@ -146,7 +146,7 @@ def test_processes_are_those_of_scikit_learn_and_multipliers_are_projected_on_th
     assert found.uncertainty == pytest.approx(np.sqrt(variance), rel=1e-3)
     # λ is the nearest of the cone in W to what the processes predict: the conditions of the projection
     span, chi, alpha = STRING.multipliers.span, STRING.cone.generators, found.alpha
-    predicted = span @ fitted.online._lam.at(place)
+    predicted = span @ fitted.online.functions.at(place)[1]
     slope = W.gram(chi, (found.lam - predicted)[:, None])[:, 0]
     assert slope.min() >= -1e-8 * W.norm(predicted)
     assert np.abs(slope[alpha > 0.0]).max() <= 1e-8 * W.norm(predicted)

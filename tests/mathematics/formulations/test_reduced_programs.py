@@ -9,8 +9,8 @@ from numerics import exact, fitted_rate, spd
 from vibench import Array, NumericalError, VariationalInequality
 from vibench_strategies.formulations.penalty import penalised
 from vibench_strategies.formulations.proximal import latent_proximal
-from vibench_strategies.formulations.sparse_dictionary import greedy_active_set
-from vibench_strategies.formulations.whitened import Whitened
+from vibench_strategies.formulations.sparse_dictionary import Chosen, greedy_active_set
+from vibench_strategies.formulations.whitened import Whitened, positive_solution
 
 Solved = tuple[Array, Array]
 
@@ -104,6 +104,14 @@ def test_a_zero_row_below_zero_is_infeasible() -> None:
                 Whitened.of(zero)
 
 
+def test_matrices_that_are_not_positive_definite_are_named() -> None:
+    indefinite, vi = np.array([[1.0, 2.0], [2.0, 1.0]]), program(0, n=2)
+    with pytest.raises(NumericalError, match="a matrix of 2 constraints is not positive definite"):
+        positive_solution(indefinite, np.ones(2))
+    with pytest.raises(NumericalError, match="the stiffness of the reduced program is not positive definite"):
+        Whitened.of(VariationalInequality(np.array([[1.0, 2.0], [2.0, 1.0]]), vi.f, vi.B, vi.g))
+
+
 def test_the_penalty_converges_linearly_in_epsilon_and_from_outside() -> None:
     vi = program(4)
     whitened = Whitened.of(vi)
@@ -124,6 +132,40 @@ def test_the_penalty_converges_linearly_in_epsilon_and_from_outside() -> None:
         lam.append(np.linalg.norm(alpha - known[1]))
     assert fitted_rate(epsilons, u) == pytest.approx(1.0, abs=0.02)
     assert fitted_rate(epsilons, lam) == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_penalty_starts_at_its_epsilon_and_continues_only_where_full_steps_run_in_circles() -> None:
+    for seed, n, m, circles in ((4, 6, 9, False), (9, 3, 6, True), (19, 6, 9, True)):
+        whitened = Whitened.of(program(seed, n, m))
+        z, nu, steps, converged = penalised(whitened, 1e-6, 0.1)
+        assert converged
+        assert (steps > 6) == circles
+        assert (penalised(whitened, 1e-6, 0.5)[2] > steps) == circles
+        # the minimiser of a strictly convex function has this gradient, however it was found
+        excess = np.maximum(whitened.Y @ z - whitened.g, 0.0)
+        assert np.allclose(z - whitened.y + whitened.Y.T @ excess / 1e-6, 0.0, atol=1e-9)
+        assert np.allclose(nu, excess / 1e-6, atol=1e-8)
+
+
+def test_parts_of_rows_are_exact_after_choices_and_drops_of_nearly_dependent_ones() -> None:
+    rng = np.random.default_rng(0)
+    Y = rng.standard_normal((9, 6))
+    Y[4] = Y[1] + 1e-7 * Y[2]
+    Y[5] = Y[3] - Y[0]
+    chosen = Chosen(Y)
+    for row in (0, 1, 2, 3, 6):
+        coefficients, rest = chosen.parts(Y[row])
+        chosen.add(row, coefficients, rest)
+    assert np.linalg.norm(chosen.parts(Y[5])[1]) < 1e-14
+    assert chosen.drop(2) == 2  # the direction in which Y[4] differs from Y[1]
+    for row in (4, 7):
+        coefficients, rest = chosen.parts(Y[row])
+        assert np.abs(Y[chosen.rows] @ rest).max() < 1e-13 * np.linalg.norm(rest)
+        assert np.allclose(Y[chosen.rows].T @ coefficients + rest, Y[row], atol=1e-13)
+        chosen.add(row, coefficients, rest)
+    assert len(chosen.rows) == 6
+    assert chosen.drop(5) == 7
+    assert chosen.rows == [0, 1, 3, 6, 4]
 
 
 @pytest.mark.parametrize("reduction", [1e-6, 0.5])

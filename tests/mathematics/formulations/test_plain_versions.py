@@ -1,0 +1,69 @@
+"""Formulations beside plain versions of them that are written from their papers, on a small Hertz contact."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("sklearn")  # of both versions of `regression`
+
+import plain_formulations as plain
+
+from vibench import FormulationAnswer, Reduction, Stop, create
+from vibench.offline.models import CellSolver
+
+ACCURACY = 1e-9
+SOLVE = CellSolver("piqp", ACCURACY)
+
+
+@pytest.fixture(scope="module")
+def discs() -> Reduction:
+    problem = create("problem", "hertz", {"resolution": 300})
+    pair = create("dual strategy", "mcpg"), create("primal strategy", "offline-pga")
+    return Reduction(problem, *pair, Stop(1e-3), Stop(1e-2), 0.5, assembly="reduced", accuracy=ACCURACY)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "plainly", "tolerance"),
+    [
+        ("penalty", {}, plain.penalty, 1e-6),
+        ("proximal", {}, lambda discs: plain.proximal(discs, ACCURACY), 1e-3),
+        ("sparse-dictionary", {}, lambda discs: plain.sparse_dictionary(discs, ACCURACY), 1e-6),
+        ("regression", {}, plain.gaussian_regression, 1e-3),
+        ("regression", {"kind": "radial"}, plain.radial_regression, 1e-6),
+    ],
+    ids=["penalty", "proximal", "sparse-dictionary", "gaussian", "radial"],
+)
+def test_answers_are_those_of_the_plain_version(
+    discs: Reduction, name: str, options: dict[str, str], plainly: object, tolerance: float
+) -> None:
+    model, query = discs.with_formulation(create("formulation", name, options)).model, plainly(discs)
+    for mu in discs.problem.validation_set(4, 0):
+        found = model.solve(mu)
+        u, lam = model.online.reconstruct(mu, FormulationAnswer(*query(mu)[:2]))
+        assert found.status == "ok"
+        assert discs.problem.V.norm(found.u - u) <= tolerance * discs.problem.V.norm(u)
+        assert discs.problem.W.norm(found.lam - lam) <= 10.0 * tolerance * discs.problem.W.norm(lam)
+        if found.uncertainty is not None:
+            assert found.uncertainty == pytest.approx(query(mu)[2], rel=0.1)
+
+
+def test_a_plain_hyper_reduced_query_has_the_same_answer_on_the_same_domain(discs: Reduction) -> None:
+    model = discs.with_formulation(create("formulation", "hyper-reduced", {"integrate": "all"})).model
+    tested, (rows, weights) = np.zeros_like(discs.cone.generators), model.built["rows"]
+    tested[rows] = weights[:, None] * discs.cone.generators[rows]
+    query = plain.hyper_reduced(discs, SOLVE, model.built["vectors"], model.built["elements"], tested)
+    for mu in discs.problem.validation_set(4, 0):
+        found, (x, alpha) = model.solve(mu), query(mu)
+        assert np.allclose(found.x, x, atol=1e-6 * np.abs(x).max())
+        assert np.allclose(found.alpha, alpha, atol=1e-5 * alpha.max())
+
+
+def test_local_spaces_are_about_as_accurate_as_plain_ones(discs: Reduction) -> None:
+    model, query, errors = discs.with_formulation(create("formulation", "local")).model, plain.local(discs, SOLVE), []
+    V = discs.problem.V
+    for mu in discs.problem.validation_set(8, 0):
+        exact, (x, _, reconstruct, _) = model.high_fidelity(mu).u, query(mu)
+        errors.append([V.norm(model.solve(mu).u - exact), V.norm(reconstruct(x[:, None])[:, 0] - exact)])
+    ours, plain_errors = np.mean(errors, axis=0)
+    assert ours <= 1.5 * plain_errors
