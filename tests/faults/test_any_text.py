@@ -23,7 +23,7 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.plugins import registry
 from vibench.qp.verification import QPSolution
 from vibench.report import html
-from vibench.report.figures import dimension, problem_tables
+from vibench.report.figures import problem_tables, work_precision
 from vibench.report.figures.style import styled, write_figure
 from vibench.results import formats, pictures
 from vibench.results.database import ResultsDatabase
@@ -103,7 +103,7 @@ def drawn(path: Path) -> str:
     stream = io.BytesIO()
     (data,) = [data for _, data in problem_tables(path)]
     with styled():
-        (figure,) = dimension(data)
+        (figure,) = work_precision(data)
         write_figure(figure, stream, "svg")
     return stream.getvalue().decode("utf-8")
 

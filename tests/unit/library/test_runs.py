@@ -89,7 +89,7 @@ def test_figures_and_findings(run: vibench.Run) -> None:
         ("inf-sup", {}, "the figure is of one dual strategy: name one of cpg, mcpg"),
         ("inf-sup", {"dual": "gpc"}, "no dual strategy is called 'gpc'"),
         ("errors", {"problem": "hertz"}, "no problem is called 'hertz'"),
-        ("precision", {}, "no data for the figure 'precision' of radial-obstacle"),
+        ("dimension", {}, "no figure is called 'dimension'"),
     ):
         with pytest.raises(vibench.RequestError, match=line):
             run.figure(kind, **options)

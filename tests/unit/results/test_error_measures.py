@@ -9,16 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from running import Main, refused
-from sample_run import write_sample_run
 from samples import cell_row
 
 import vibench
 from vibench.errors import RequestError
 from vibench.interfaces.strategies import Kind
-from vibench.report.figures import caption_of
-from vibench.report.figures.costs import break_even
-from vibench.report.figures.costs import outputs as figure_of_outputs
-from vibench.report.figures.data import problem_tables
 from vibench.results.break_even import break_even_rows
 from vibench.results.database import FILE, ResultsDatabase
 from vibench.results.ranking import errors_of, fastest, measures, with_errors, within
@@ -167,60 +162,3 @@ def test_a_pair_without_an_error_has_none() -> None:
     found = with_errors(thresholds, cells, pd.Series([np.nan, 0.5]))
     np.testing.assert_array_equal(found[["error_a", "error_b"]], [[0.0, 0.5], [np.nan, 0.5]])
     assert list(within(found, 0.5).index) == [0]
-
-
-@pytest.mark.parametrize("count", [1, 2, 4, 5])
-def test_figures_of_any_number_of_outputs_are_drawn(count: int, tmp_path: Path) -> None:
-    """Their panels need not fill a row."""
-    data = next(data for _, data in problem_tables(write_sample_run(tmp_path / "run")))
-    outputs = pd.concat([data.outputs.assign(output=f"force {k}") for k in range(count)], ignore_index=True)
-    thresholds = data.thresholds.assign(benefit_threshold=9.0, threshold_low=8.0, threshold_high=10.0, meaning="from")
-    known = type(data)(**{**vars(data), "outputs": outputs, "thresholds": thresholds})
-    names = [f"force {k}" for k in range(count)]
-    for draw, expected in (
-        (break_even, ["u", "λ", *names]),
-        (figure_of_outputs, [f"{n}, {d}" for n in names for d in DUALS]),
-    ):
-        (figure,) = draw(known)
-        assert [axes.get_title() for axes in figure.axes if axes.get_title()] == expected
-
-
-DUALS = ("narrow", "wide")
-
-
-def test_the_figure_has_a_panel_for_every_measure_and_says_what_has_no_point(tmp_path: Path) -> None:
-    data = next(data for _, data in problem_tables(write_sample_run(tmp_path / "run")))
-    thresholds = data.thresholds.copy()
-    mine = thresholds["cell_a"].isna()
-    numbers = {"benefit_threshold": 50.0, "threshold_low": 40.0, "threshold_high": 60.0, "meaning": "from"}
-    thresholds.loc[mine, list(numbers)] = list(numbers.values())
-    thresholds.loc[thresholds.index[mine][0], "meaning"] = "never"
-    known = type(data)(**{**vars(data), "thresholds": thresholds})
-    (figure,) = break_even(known)
-    drawn = [axes for axes in figure.axes if axes.get_title()]
-    assert [axes.get_title() for axes in drawn] == ["u", "λ", "force"]
-    count = int(mine.sum()) - 1
-    for axes in drawn:
-        lines = [line.get_data() for line in axes.lines if line.get_marker() != "None"]
-        points = np.concatenate([np.column_stack(line) for line in lines])
-        assert len(points) == count
-        assert set(points[:, 1]) == {50.0}
-    assert "Models without such a number, or with an undecided one, have no point: 1." in caption_of(figure)
-    assert not list(break_even(type(data)(**{**vars(data), "thresholds": thresholds.assign(meaning="undecided")})))
-
-
-def test_the_figure_names_the_models_that_no_other_beats_in_both(tmp_path: Path) -> None:
-    data = next(data for _, data in problem_tables(write_sample_run(tmp_path / "run")))
-    rng, mine = np.random.default_rng(3), data.thresholds["cell_a"].isna()
-    queries = pd.Series(rng.permutation(int(mine.sum())) * 10.0 + 10.0, index=data.thresholds.index[mine])
-    thresholds = data.thresholds.assign(meaning="from", benefit_threshold=queries, threshold_low=9.0, threshold_high=70)
-    (figure,) = break_even(type(data)(**{**vars(data), "thresholds": thresholds}))
-    cells = data.cells.set_index("cell").join(thresholds[mine].set_index("cell_b")["benefit_threshold"], how="inner")
-    shown = {axes.get_title(): [text.get_text() for text in axes.texts] for axes in figure.axes if axes.get_title()}
-    for title, column in {"u": "error_u_mean", "λ": "error_lambda_mean"}.items():
-        both = cells[[column, "benefit_threshold"]].to_numpy(float)
-        beaten = [any((other <= one).all() and (other < one).any() for other in both) for one in both]
-        front = cells[~np.array(beaten)]
-        assert len(shown[title]) == len(front) < len(cells)
-        pairs = [f"({N:.0f}, {R:.0f})" for N, R in zip(front["N"], front["R"], strict=True)]
-        assert sorted(pairs) == sorted(text.split(", δ")[0] for text in shown[title])

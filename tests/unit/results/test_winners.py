@@ -172,8 +172,10 @@ def test_certified_errors_are_means_of_relative_bounds() -> None:
         {"cell": "a", **both, "bound_online_u_energy": 5.0, "bound_online_lambda_natural": 1.0},
         {"cell": "a", **both, "bound_online_u_energy": 7.0, "bound_online_lambda_natural": 1.0},
         {"cell": "b", **both, "bound_online_u_energy": None, "bound_online_lambda_natural": None},
+        {"cell": "c", **both, "bound_online_u_energy": 5.0, "bound_online_lambda_natural": 1.0},
     ]
-    found = certified_errors(pd.DataFrame(rows))
+    found = certified_errors(pd.DataFrame(rows).assign(certificate=["certified", "certified", "none", "refuted"]))
+    assert "c" not in found
     assert found["a"] == pytest.approx(0.6)  # of ‖u‖ = 10, beside 0.5 of ‖λ‖ = 2
     assert np.isnan(found["b"])
 
