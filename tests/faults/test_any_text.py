@@ -57,7 +57,7 @@ def answered(text: str, count: Any) -> dict[str, Any]:
     return row
 
 
-PROGRAM = VariationalInequality(np.eye(1), np.ones(1), np.eye(1), np.full(1, 2.0))
+PROGRAM = VariationalInequality(np.eye(1), np.ones(1), np.eye(1), np.full(1, 0.5))
 
 
 def recorded(folder: Path, text: str, count: Any) -> Path:
