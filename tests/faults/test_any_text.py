@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from numerics import exact
 from odd_plugins import LABEL, ODD
 from outputs import clean, elements
 from samples import cell_row, query_rows
@@ -49,7 +50,7 @@ def answered(text: str, count: Any) -> dict[str, Any]:
     """The row of a query whose solver is right, and says this of itself."""
 
     def solver(program: VariationalInequality, accuracy: float) -> QPSolution:
-        return QPSolution(np.ones(1), np.zeros(1), text, count)
+        return QPSolution(*exact(program), text, count)
 
     with mock.patch.object(registry, "qp_solver", lambda name: {name: solver}):
         row, _ = run_query(ProgramQuery(PROGRAM, None, "odd", 1e-7), 60.0, contextlib.nullcontext)

@@ -143,7 +143,7 @@ class Reduction:
         Steps that were given before are kept, steps that were computed are computed again: they may depend on the new.
         """
         other, kept = replace(self), self.__dict__.get("_given", {}) | steps
-        # Cached properties read the dictionary of the instance, so that these steps are never computed.
+        # Cached properties look at the attributes of the instance first, so that these steps are never computed.
         other.__dict__.update(kept, _given=kept)
         return other
 

@@ -128,7 +128,10 @@ def _whole_run(read: Mapping[str, pd.DataFrame]) -> Iterator[tuple[Weight, str]]
     if len(many := cells[cells["R"] > cells["dim_W"]]):
         most = many.loc[many["R"].idxmax()]
         sizes = f"{most['R']:.0f} generators for {most['dim_W']:.0f} multipliers"
-        yield Weight.WHOLE_RUN, f"{most['dual']} has {sizes}: the orthant is smaller and exact there."
+        yield (
+            Weight.WHOLE_RUN,
+            f"{most['dual']} has {sizes}: one for each is a smaller cone, and exact.",
+        )
     few = cells[cells["queries_ok"] < 0.5 * cells["queries"]]
     if len(few):
         having = f"{_number(len(few), 'cell')} {'has' if len(few) == 1 else 'have'}"

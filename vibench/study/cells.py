@@ -120,7 +120,9 @@ class Cell:
             content["formulation_label"] = name
         if content["assembly"] in ("certified", "compiled"):  # these were assemblies
             content["bounds"], content["assembly"] = content["assembly"] == "certified", "reduced"
-        content |= {name: _installed(plugin.moved(places)) for name, plugin in plugins.items()}
+        # The problem first: its error is the one to mend.
+        for name in sorted(plugins, key=lambda name: name != "problem"):
+            content[name] = _installed(plugins[name].moved(places))
         for axis in ("pod", "cone"):
             content[axis] = None if content[axis] is None else Stop(**content[axis])
         for name in ("labels", "nested_tolerances"):
