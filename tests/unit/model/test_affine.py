@@ -87,36 +87,26 @@ def test_what_is_declared_constant_is_assembled_once_and_believed() -> None:
         assert members[name].way is Evaluation.CONSTANT
         assert np.array_equal(dense(members[name].terms[0]), dense(getattr(first, name)))
         assert len(members[name].rows) == 0
-
-
-def test_where_only_the_constraint_varies_nothing_else_is_assembled() -> None:
+    # where only the constraint varies nothing else is assembled
     problem = declaring(Touching, constant=frozenset({"A", "f"}))()
-    training = problem.training_set()
     members = affine_decomposition(problem, training, 1e-8)
     assert problem.assembled == [training[0, 0]]
     assert problem.contacts == training.ravel().tolist()
-    assert {name: member.way for name, member in members.items()} == {
-        "A": Evaluation.CONSTANT,
-        "f": Evaluation.CONSTANT,
-        "B": Evaluation.CONTACT,
-        "g": Evaluation.CONTACT,
-    }
+    ways = [Evaluation.CONSTANT, Evaluation.CONSTANT, Evaluation.CONTACT, Evaluation.CONTACT]
+    assert [(name, member.way) for name, member in members.items()] == [*zip("AfBg", ways, strict=True)]
 
 
 def test_members_that_do_not_vary_are_found_whatever_is_declared() -> None:
-    for base in (Varying, declaring(Varying, entrywise=frozenset({"f"}))):
-        member = affine_decomposition(base(), base().training_set(), 1e-8)["f"]
-        assert member.way is Evaluation.CONSTANT
-        assert np.array_equal(member.terms[0], Varying().assemble(NEW).f)
-        assert member.error == 0.0
-
-
-def test_a_member_that_varies_little_is_not_constant() -> None:
     class Trembling(Varying):
         def assemble(self, mu: np.ndarray) -> VariationalInequality:
             vi = super().assemble(mu)
             return VariationalInequality(vi.A, vi.f * (1.0 + 1e-11 * mu[0]), vi.B, vi.g)
 
+    for base in (Varying, declaring(Varying, entrywise=frozenset({"f"}))):
+        member = affine_decomposition(base(), base().training_set(), 1e-8)["f"]
+        assert member.way is Evaluation.CONSTANT
+        assert np.array_equal(member.terms[0], Varying().assemble(NEW).f)
+        assert member.error == 0.0
     assert affine_decomposition(Trembling(), Trembling().training_set(), 1e-8)["f"].way is Evaluation.FULL
 
 
@@ -130,29 +120,22 @@ def test_by_a_factor_is_one_term() -> None:
 
 
 @given(st.integers(0, 10_000), st.integers(2, 4))
-def test_a_symmetric_matrix_with_few_terms_is_rebuilt_in_full(seed: int, powers: int) -> None:
+def test_sums_of_few_terms_are_rebuilt_in_full(seed: int, powers: int) -> None:
+    """A symmetric matrix, and an asymmetric constraint whose pattern changes."""
     problem = Summed(seed, powers)
-    member = affine_decomposition(problem, problem.training_set(), 1e-11)["A"]
-    assert member.way is Evaluation.INTERPOLATED
-    assert len(member.terms) == powers
-    assert np.all(member.rows <= member.columns)
-    for term in member.terms:
+    training = problem.training_set()
+    assert len({problem.assemble(mu).B.nnz for mu in training}) == 2
+    members = affine_decomposition(problem, training, 1e-12)
+    for name, count in (("A", powers), ("B", 2)):
+        assert members[name].way is Evaluation.INTERPOLATED
+        assert len(members[name].terms) == count
+    assert np.all(members["A"].rows <= members["A"].columns)
+    for term in members["A"].terms:
         assert np.array_equal(dense(term), dense(term).T)
-    for mu in (NEW, np.array([0.93])):
-        A = problem.assemble(mu).A.toarray()
-        assert np.allclose(rebuilt(member, A), A, atol=1e-9 * np.abs(A).max())
-
-
-def test_an_asymmetric_constraint_whose_pattern_changes_is_rebuilt_in_full() -> None:
-    problem = Summed()
-    stored = {problem.assemble(mu).B.nnz for mu in problem.training_set()}
-    assert len(stored) == 2
-    member = affine_decomposition(problem, problem.training_set(), 1e-12)["B"]
-    assert member.way is Evaluation.INTERPOLATED
-    assert len(member.terms) == 2
     for mu in (NEW, np.array([0.5]), np.array([0.93])):
-        B = problem.assemble(mu).B
-        assert np.allclose(rebuilt(member, B), B.toarray(), atol=1e-13)
+        vi = problem.assemble(mu)
+        assert np.allclose(rebuilt(members["A"], vi.A), vi.A.toarray(), atol=1e-9 * np.abs(vi.A).max())
+        assert np.allclose(rebuilt(members["B"], vi.B), vi.B.toarray(), atol=1e-13)
 
 
 def test_patterns_of_equal_size_in_different_places_are_told_apart() -> None:
@@ -193,32 +176,30 @@ def test_a_constraint_with_contact_is_left_to_it_unless_it_is_constant_or_interp
     assert members["B"].reason == ""
     assert members["A"].way is Evaluation.FULL  # contact says nothing of A
     assert members["f"].way is Evaluation.CONSTANT
-    entrywise = declaring(Touching, entrywise=frozenset({"g"}))()
-    members = affine_decomposition(entrywise, entrywise.training_set(), 1e-2)
-    assert (members["B"].way, members["g"].way) == (Evaluation.CONTACT, Evaluation.INTERPOLATED)
-    believed = declaring(Touching, constant=frozenset({"A", "f", "g"}))()
-    members = affine_decomposition(believed, believed.training_set(), 1e-2)
-    assert (members["B"].way, members["g"].way) == (Evaluation.CONTACT, Evaluation.CONSTANT)
+    for declared, way in (
+        ({"entrywise": frozenset({"g"})}, Evaluation.INTERPOLATED),
+        ({"constant": frozenset({"A", "f", "g"})}, Evaluation.CONSTANT),
+    ):
+        problem = declaring(Touching, **declared)()
+        members = affine_decomposition(problem, problem.training_set(), 1e-2)
+        assert (members["B"].way, members["g"].way) == (Evaluation.CONTACT, way)
 
 
-@pytest.mark.parametrize("name", ["A", "B", "g"])
-def test_what_cannot_be_evaluated_apart_is_assembled_in_full_and_the_reason_names_it(name: str) -> None:
-    member = affine_decomposition(Varying(), Varying().training_set(), 1e-8)[name]
-    assert member.way is Evaluation.FULL
-    assert member.reason == f"{name} depends on mu and the problem does not evaluate it entry by entry"
-    assert member.terms == ()
-
-
-def test_contact_that_does_not_say_which_unknowns_it_touches_is_not_used() -> None:
+def test_what_cannot_be_evaluated_apart_is_assembled_in_full_and_the_reason_names_it() -> None:
     class Vague(Touching):
+        """Does not say which unknowns it touches."""
+
         contact_dofs = None
 
-    member = affine_decomposition(Vague(), Vague().training_set(), 1e-8)["B"]
-    assert member.way is Evaluation.FULL
-    assert member.reason.startswith("B depends on mu")
+    for problem, name in ((Varying(), "A"), (Varying(), "B"), (Varying(), "g"), (Vague(), "B")):
+        member = affine_decomposition(problem, problem.training_set(), 1e-8)[name]
+        assert member.way is Evaluation.FULL
+        assert member.reason == f"{name} depends on mu and the problem does not evaluate it entry by entry"
+        assert member.terms == ()
 
 
 def test_members_that_interpolation_does_not_compress_are_not_interpolated() -> None:
+    """It may take three quarters of the training parameters."""
     problem = declaring(Counting, entrywise=frozenset({"B"}))()
     member = affine_decomposition(problem, problem.training_set(), 1e-10)["B"]
     assert member.way is Evaluation.FULL
@@ -226,13 +207,9 @@ def test_members_that_interpolation_does_not_compress_are_not_interpolated() -> 
     touching = declaring(Touching, entrywise=frozenset({"B"}))()
     assert affine_decomposition(touching, touching.training_set(), 1e-10)["B"].way is Evaluation.CONTACT
     assert affine_decomposition(problem, problem.training_set(), 0.3)["B"].way is Evaluation.INTERPOLATED
-
-
-@pytest.mark.parametrize(("powers", "compressed"), [(3, True), (4, False)])
-def test_interpolation_may_take_three_quarters_of_the_training_parameters(powers: int, compressed: bool) -> None:
-    problem = Summed(powers=powers, count=4)
-    member = affine_decomposition(problem, problem.training_set(), 1e-11)["A"]
-    assert member.way is (Evaluation.INTERPOLATED if compressed else Evaluation.FULL)
+    for powers, way in ((3, Evaluation.INTERPOLATED), (4, Evaluation.FULL)):
+        summed = Summed(powers=powers, count=4)
+        assert affine_decomposition(summed, summed.training_set(), 1e-11)["A"].way is way
 
 
 @pytest.mark.parametrize("kind", [sp.csr_array, sp.csr_matrix, sp.coo_matrix])
@@ -266,11 +243,6 @@ def test_a_function_of_several_members_is_evaluated_once() -> None:
     found = coefficients(problem, {}, ("B", "g", "f"))(np.array([3.0]))
     assert {name: theta.tolist() for name, theta in found.items()} == {"B": [4.0], "g": [4.0], "f": [6.0]}
     assert asked == [3.0]
-
-
-def test_members_come_in_their_order() -> None:
-    problem = declaring(Touching, constant=frozenset({"g"}))()
-    assert tuple(affine_decomposition(problem, problem.training_set(), 1e-8)) == MEMBERS
 
 
 def test_an_assembly_that_is_not_finite_is_refused() -> None:

@@ -25,15 +25,6 @@ from vibench.results.sqlite import FILE, read_meta, read_rows
 from vibench.text import LONGEST
 
 
-def seen(folder: Path, table: str) -> list[tuple[Any, ...]]:
-    """The rows of a table as another process sees them."""
-    db = sqlite3.connect(folder / FILE)
-    try:
-        return db.execute(f"SELECT * FROM {table}").fetchall()
-    finally:
-        db.close()
-
-
 def refusal(action: Callable[[], object]) -> str:
     with pytest.raises(RequestError) as caught:
         action()
@@ -42,40 +33,28 @@ def refusal(action: Callable[[], object]) -> str:
     return line
 
 
-def test_a_new_folder_gets_every_table(journal: ResultsDatabase, tmp_path: Path) -> None:
-    for table in TABLES:
-        assert list(journal.rows(table)) == []
-    assert read_meta(tmp_path / "run" / FILE)["schema"] == str(VERSION)
-
-
-def test_a_cell_and_its_queries_come_back_as_written(journal: ResultsDatabase, tmp_path: Path) -> None:
-    cell, queries = cell_row(), query_rows(count=3)
-    journal.write_cell(cell, queries)
-    assert list(journal.rows("cells")) == [cell]
-    assert list(journal.rows("queries")) == queries
-    assert len(seen(tmp_path / "run", "queries")) == 3
-
-
-def test_missing_columns_are_null(journal: ResultsDatabase) -> None:
-    journal.write_cell({"cell": "c1", "status": "error"}, [])
-    (row,) = journal.rows("cells")
-    assert row == dict.fromkeys(STORED["cells"]) | {"cell": "c1", "status": "error"}
-
-
-def test_columns_are_added_for_every_parameter(journal: ResultsDatabase) -> None:
-    journal.write_cell(cell_row("c1"), [row | {"mu_3": 3.0} for row in query_rows("c1", 1)])
-    journal.write_cell(cell_row("c2"), query_rows("c2", 1, mu_1=9.0))
-    first, second = journal.rows("queries")
-    assert (first["mu_1"], first["mu_2"], first["mu_3"]) == (0.0, 2.0, 3.0)
-    assert (second["mu_1"], second["mu_2"], second["mu_3"]) == (9.0, 2.0, None)
-
-
-def test_columns_of_parameters_are_found_again(journal: ResultsDatabase, tmp_path: Path) -> None:
-    journal.write_cell(cell_row("c1"), query_rows("c1"))
-    again = ResultsDatabase(tmp_path / "run", RECORDED)
-    again.write_cell(cell_row("c2"), query_rows("c2"))
-    assert len(list(again.rows("queries"))) == 4
-    again.close()
+def test_cells_and_their_queries_come_back_as_written_after_a_crash_and_in_the_next_run(
+    journal: ResultsDatabase, tmp_path: Path
+) -> None:
+    """What a copy of the folder holds while the journal is open is what a crash would leave."""
+    run, rows = tmp_path / "run", (cell_row("c1"), query_rows("c1", 3))
+    assert [row for table in TABLES for row in journal.rows(table)] == []
+    assert read_meta(run / FILE)["schema"] == str(VERSION)
+    journal.write_cell(*rows)
+    shutil.copytree(run, tmp_path / "copy")
+    with contextlib.closing(ResultsDatabase(tmp_path / "copy", RECORDED)) as crashed:
+        for found in (journal, crashed):
+            assert (list(found.rows("cells")), list(found.rows("queries"))) == ([rows[0]], rows[1])
+    journal.write_cell({"cell": "c2", "status": "timeout", "code": "old"}, [])
+    journal.close()
+    with contextlib.closing(ResultsDatabase(run, RECORDED)) as again:
+        missing = dict.fromkeys(STORED["cells"]) | {"cell": "c2", "status": "timeout", "code": "old"}
+        assert list(again.rows("cells")) == [rows[0], missing]
+        assert again.finished() == {"c1": ("ok", "text"), "c2": ("timeout", "old")}
+        again.write_cell(cell_row("c3"), [row | {"mu_3": 3.0} for row in query_rows("c3", 1, mu_1=9.0)])
+        again.write_cell(cell_row("c4"), query_rows("c4", 1))
+        parameters = [(row["mu_1"], row["mu_2"], row["mu_3"]) for row in again.rows("queries")]
+    assert parameters[2:] == [(0.2, 4.0, None), (9.0, 2.0, 3.0), (0.0, 2.0, None)]
 
 
 @pytest.mark.parametrize(
@@ -109,26 +88,19 @@ def test_a_row_that_cannot_be_stored_costs_its_cell_and_no_other(
     assert journal.finished() == {"c1": ("error", "text"), "c2": ("ok", "text")}  # a later run resumes behind both
 
 
-def test_a_column_of_the_cell_itself_that_cannot_be_stored_is_named(journal: ResultsDatabase) -> None:
-    assert "'rank_gap'" in journal.write_cell(cell_row(rank_gap=1j), query_rows())["reason"]
-    assert list(journal.rows("queries")) == []
-
-
-def test_solutions_that_cannot_be_stored_are_named(journal: ResultsDatabase) -> None:
-    stored = journal.write_cell(cell_row(), query_rows(), [{"cell": "c1", "query": 0, "x": "not bytes"}])
-    assert "'x' of the table 'solutions'" in stored["reason"]
-
-
-def test_a_rewrite_that_cannot_be_stored_leaves_nothing_of_the_earlier_rows(journal: ResultsDatabase) -> None:
+def test_what_cannot_be_stored_is_named_and_leaves_nothing_of_earlier_rows(journal: ResultsDatabase) -> None:
+    for cell, queries, solutions, words in (
+        (cell_row(rank_gap=1j), query_rows(), [], "'rank_gap'"),
+        (cell_row(), query_rows(), [{"cell": "c1", "query": 0, "x": "not bytes"}], "'x' of the table 'solutions'"),
+        (cell_row(), [*query_rows(count=1), *query_rows(status=None)], [], "'status'"),
+    ):
+        journal.write_cell(cell_row(), query_rows())
+        before = list(journal.rows("cells")), list(journal.rows("queries"))
+        assert words in journal.write_cell(cell, queries, solutions)["reason"]
+        assert [row["status"] for row in journal.rows("cells")] == ["error"]
+        assert list(journal.rows("queries")) == []
+    # a disk that fails is no fault of the values
     journal.write_cell(cell_row(), query_rows())
-    journal.write_cell(cell_row(), [*query_rows(count=1), *query_rows(status=None)])
-    assert [row["status"] for row in journal.rows("cells")] == ["error"]
-    assert list(journal.rows("queries")) == []
-
-
-def test_a_disk_that_fails_is_no_fault_of_the_values(journal: ResultsDatabase) -> None:
-    journal.write_cell(cell_row(), query_rows())
-    before = list(journal.rows("cells")), list(journal.rows("queries"))
     journal._db.execute("PRAGMA query_only=ON")
     with pytest.raises(StorageError, match="cannot be written"):
         journal.write_cell(cell_row(status="error"), query_rows(count=1))
@@ -184,47 +156,18 @@ def test_a_rewritten_cell_has_only_its_new_queries(journal: ResultsDatabase) -> 
     assert [row["gap"] for row in journal.rows("queries") if row["cell"] == "c1"] == [0.25]
 
 
-def test_finished_tells_status_and_code(journal: ResultsDatabase) -> None:
-    journal.write_cell(cell_row("c1", status="ok", code="new"), [])
-    journal.write_cell(cell_row("c2", status="timeout", code="old"), [])
-    assert journal.finished() == {"c1": ("ok", "new"), "c2": ("timeout", "old")}
-
-
-def test_what_was_written_is_there_for_the_next_run(journal: ResultsDatabase, tmp_path: Path) -> None:
-    journal.write_cell(cell_row(), query_rows())
-    journal.close()
-    again = ResultsDatabase(tmp_path / "run", RECORDED)
-    assert len(again.finished()) == 1
-    assert len(list(again.rows("queries"))) == 2
-    again.close()
-
-
-def test_a_run_that_dies_loses_no_written_cell(journal: ResultsDatabase, tmp_path: Path) -> None:
-    """What a copy of the folder holds while the journal is open is what a crash would leave."""
-    journal.write_cell(cell_row(), query_rows())
-    shutil.copytree(tmp_path / "run", tmp_path / "copy")
-    again = ResultsDatabase(tmp_path / "copy", RECORDED)
-    assert len(list(again.rows("cells"))) == 1
-    assert len(list(again.rows("queries"))) == 2
-    again.close()
-
-
-HISTORY = {"artefact": "pod-1", "stage": "pod", "quantity": "error", "step": 0, "value": 1.0}
-
-
-def test_histories_replace_those_of_the_same_name(journal: ResultsDatabase) -> None:
-    journal.write_histories([[HISTORY, HISTORY | {"step": 1, "value": 0.5}]])
-    journal.write_histories([[HISTORY | {"artefact": "pod-2", "pod_tol": 0.75}]])
-    journal.write_histories([[HISTORY | {"value": 0.25}]])
-    found = sorted((row["artefact"], row["step"], row["value"]) for row in journal.rows("histories"))
-    assert found == [("pod-1", 0, 0.25), ("pod-2", 0, 1.0)]
-
-
-def test_a_failing_write_of_histories_leaves_the_earlier_ones(journal: ResultsDatabase) -> None:
-    journal.write_histories([[HISTORY]])
+def test_histories_replace_those_of_the_same_name_and_a_failing_write_leaves_them(journal: ResultsDatabase) -> None:
+    history = {"artefact": "pod-1", "stage": "pod", "quantity": "error", "step": 0, "value": 1.0}
+    journal.write_histories([[history, history | {"step": 1, "value": 0.5}]])
+    journal.write_histories([[history | {"artefact": "pod-2", "pod_tol": 0.75}]])
+    # SQLite would take NumPy's integers for bytes
+    journal.write_histories([[history | {"value": np.int64(2)}]])
+    journal.write_cell(cell_row(N=np.int64(12)), query_rows(count=1, iterations=np.int32(7)))
+    assert (next(journal.rows("cells"))["N"], next(journal.rows("queries"))["iterations"]) == (12, 7)
     with pytest.raises(sqlite3.Error):
-        journal.write_histories([[HISTORY | {"step": 1}, HISTORY | {"surprise": 1}]])
-    assert [row["step"] for row in journal.rows("histories")] == [0]
+        journal.write_histories([[history | {"step": 1}, history | {"surprise": 1}]])
+    found = sorted((row["artefact"], row["step"], row["value"]) for row in journal.rows("histories"))
+    assert found == [("pod-1", 0, 2), ("pod-2", 0, 1.0)]
 
 
 def test_thresholds_replace_all_earlier_ones(journal: ResultsDatabase) -> None:
@@ -234,43 +177,44 @@ def test_thresholds_replace_all_earlier_ones(journal: ResultsDatabase) -> None:
     assert [row["benefit_threshold"] for row in journal.rows("thresholds")] == [4.0]
 
 
-def test_numbers_of_numpy_are_stored_as_numbers(journal: ResultsDatabase) -> None:
-    """SQLite would take NumPy's integers for bytes."""
-    journal.write_cell(cell_row(N=np.int64(12)), query_rows(count=1, iterations=np.int32(7)))
-    journal.write_histories([[HISTORY | {"value": np.int64(2)}]])
-    assert next(journal.rows("cells"))["N"] == 12
-    assert next(journal.rows("queries"))["iterations"] == 7
-    assert next(journal.rows("histories"))["value"] == 2
-
-
-@pytest.mark.parametrize(("key", "value"), [("name", "other"), ("seed", 2), ("validation", 5), ("accuracy", 1e-8)])
-def test_results_of_another_study_are_refused(key: str, value: Any, journal: ResultsDatabase, tmp_path: Path) -> None:
-    line = refusal(lambda: ResultsDatabase(tmp_path / "run", RECORDED | {key: value}))
-    assert str(tmp_path / "run") in line
-    assert "another study" in line
-    assert f"{key} {RECORDED[key]!r} instead of {value!r}" in line
-
-
-def test_results_of_another_schema_are_refused(
+def test_results_of_another_study_or_schema_are_refused_and_left_as_they_were(
     journal: ResultsDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "VERSION", VERSION + 1)
-    line = refusal(lambda: ResultsDatabase(tmp_path / "run", RECORDED))
-    assert f"schema {VERSION}" in line
-    assert str(VERSION + 1) in line
-
-
-def test_a_refused_folder_is_left_as_it_was(journal: ResultsDatabase, tmp_path: Path) -> None:
+    run = tmp_path / "run"
     journal.write_cell(cell_row(), query_rows())
     journal.close()
-    before = (tmp_path / "run" / FILE).read_bytes()
-    refusal(lambda: ResultsDatabase(tmp_path / "run", RECORDED | {"seed": 2}))
-    assert (tmp_path / "run" / FILE).read_bytes() == before
+    before = (run / FILE).read_bytes()
+    for key, value in (("name", "other"), ("seed", 2), ("validation", 5), ("accuracy", 1e-8)):
+        line = refusal(lambda key=key, value=value: ResultsDatabase(run, RECORDED | {key: value}))
+        assert f"{run}" in line
+        assert "another study" in line
+        assert f"{key} {RECORDED[key]!r} instead of {value!r}" in line
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "VERSION", VERSION + 1)
+        line = refusal(lambda: ResultsDatabase(run, RECORDED))
+    assert f"schema {VERSION}" in line
+    assert str(VERSION + 1) in line
+    assert (run / FILE).read_bytes() == before
+    with contextlib.closing(sqlite3.connect(run / FILE)) as db:
+        db.execute("UPDATE meta SET value = 'nonsense' WHERE key = 'study'")
+        db.commit()
+    assert FILE in refusal(lambda: ResultsDatabase(run, RECORDED))
 
 
-def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
+def test_folders_and_files_that_cannot_be_made_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
     assert "cannot be written" in refusal(lambda: ResultsDatabase(tmp_path / "file" / "below", RECORDED))
+    assert "output folder" in refusal(lambda: ResultsDatabase(tmp_path / ("a" * 300), RECORDED))
+    if Path("/proc").is_dir():  # where nobody can write
+        assert "cannot be written" in refusal(lambda: ResultsDatabase(Path("/proc/vibench"), RECORDED))
+
+    def locked(*_: object, **__: object) -> None:
+        raise sqlite3.OperationalError("database is locked")
+
+    monkeypatch.setattr(module.sqlite3, "connect", locked)
+    line = refusal(lambda: ResultsDatabase(tmp_path / "run", RECORDED))
+    assert "cannot be written" in line
+    assert "locked" in line
 
 
 def test_a_name_of_a_column_that_is_no_text_is_damage(tmp_path: Path) -> None:
@@ -281,61 +225,20 @@ def test_a_name_of_a_column_that_is_no_text_is_damage(tmp_path: Path) -> None:
     assert "the columns of the table 'cells' are not those" in refusal(lambda: ResultsDatabase(tmp_path, RECORDED))
 
 
-def test_an_empty_folder_will_do(tmp_path: Path) -> None:
-    made = ResultsDatabase(tmp_path, RECORDED)
-    made.write_cell(cell_row(), [])
-    assert len(list(made.rows("cells"))) == 1
-    made.close()
-
-
-@pytest.mark.parametrize("content", [b"hello", b"SQLite format 3\x00 and then nothing"], ids=["text", "cut off"])
-def test_a_file_that_is_no_database_is_refused(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / FILE).write_bytes(content)
-    line = refusal(lambda: ResultsDatabase(tmp_path, RECORDED))
-    assert FILE in line
-    assert "not a results file" in line
-    assert (tmp_path / FILE).read_bytes() == content
-
-
-def test_a_database_of_something_else_is_refused(tmp_path: Path) -> None:
-    db = sqlite3.connect(tmp_path / FILE)
-    db.execute("CREATE TABLE notes (text TEXT)")
-    db.close()
-    assert "not a results file" in refusal(lambda: ResultsDatabase(tmp_path, RECORDED))
-
-
-def test_a_results_file_with_a_broken_study_is_refused(journal: ResultsDatabase, tmp_path: Path) -> None:
-    db = sqlite3.connect(tmp_path / "run" / FILE)
-    db.execute("UPDATE meta SET value = 'nonsense' WHERE key = 'study'")
-    db.commit()
-    db.close()
-    assert FILE in refusal(lambda: ResultsDatabase(tmp_path / "run", RECORDED))
-
-
-def test_a_file_left_empty_by_a_killed_run_is_taken_over(tmp_path: Path) -> None:
+def test_a_file_that_is_no_results_file_is_refused_unless_a_killed_run_left_it_empty(tmp_path: Path) -> None:
     (tmp_path / FILE).touch()
-    made = ResultsDatabase(tmp_path, RECORDED)
-    assert made.finished() == {}
-    made.close()
-
-
-def test_a_name_no_folder_can_have_is_refused(tmp_path: Path) -> None:
-    assert "output folder" in refusal(lambda: ResultsDatabase(tmp_path / ("a" * 300), RECORDED))
-
-
-@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs a folder nobody can write to")
-def test_a_folder_that_cannot_be_made_is_refused() -> None:
-    assert "cannot be written" in refusal(lambda: ResultsDatabase(Path("/proc/vibench"), RECORDED))
-
-
-def test_a_database_that_cannot_be_opened_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def locked(*_: object, **__: object) -> None:
-        raise sqlite3.OperationalError("database is locked")
-
-    monkeypatch.setattr(module.sqlite3, "connect", locked)
-    line = refusal(lambda: ResultsDatabase(tmp_path / "run", RECORDED))
-    assert "cannot be written" in line
-    assert "locked" in line
+    with contextlib.closing(ResultsDatabase(tmp_path, RECORDED)) as made:
+        assert made.finished() == {}
+    (tmp_path / FILE).unlink()
+    with contextlib.closing(sqlite3.connect(tmp_path / FILE)) as db:
+        db.execute("CREATE TABLE notes (text TEXT)")
+    for content in (None, b"hello", b"SQLite format 3\x00 and then nothing"):
+        if content:
+            (tmp_path / FILE).write_bytes(content)
+        before, line = (tmp_path / FILE).read_bytes(), refusal(lambda: ResultsDatabase(tmp_path, RECORDED))
+        assert FILE in line
+        assert "not a results file" in line
+        assert content is None or (tmp_path / FILE).read_bytes() == before
 
 
 def test_histories_of_other_code_give_way_and_parts_of_a_sweep_stay(tmp_path: Path) -> None:

@@ -135,10 +135,7 @@ def timed(cells: pd.DataFrame, noise: float = 0.0) -> PairedTiming:
 
 def model(name: str, offline: float, online: float, error: float = 1e-3) -> dict[str, Any]:
     phases = {f"offline_{phase}_s": 0.0 for phase in ("snapshots", "pod", "cone", "enrichment", "assembly")}
-    seconds = {
-        "offline_s": offline,
-        "offline_low_s": offline,
-        "offline_high_s": offline,
+    seconds = dict.fromkeys(("offline_s", "offline_low_s", "offline_high_s"), offline) | {
         "hf_setup_s": 0.0,
         "hf_s": 1.0,
     }
@@ -197,17 +194,14 @@ def test_the_certified_error_is_that_of_the_model_whichever_of_its_cells_is_the_
     assert pd.isna(row["certified_error"])
 
 
-@pytest.mark.parametrize(
-    ("asked", "message"),
-    [
+def test_what_cannot_be_asked_is_refused(quick_run: Path) -> None:
+    for asked, message in (
         ({"queries": -1}, "the number of queries is -1, expected a positive number"),
         ({"queries": 10, "error": 0.0}, "the largest error is 0, expected a positive number"),
         ({"error": 0.1}, "--within is for tables of break-even points, and for the table best with --queries"),
-    ],
-)
-def test_what_cannot_be_asked_is_refused(quick_run: Path, asked: dict[str, float], message: str) -> None:
-    with pytest.raises(RequestError, match=message):
-        vibench.open_run(quick_run).best(**asked)  # type: ignore[arg-type]
+    ):
+        with pytest.raises(RequestError, match=message):
+            vibench.open_run(quick_run).best(**asked)  # type: ignore[arg-type]
 
 
 def test_best_is_json_for_programs(quick_run: Path, vibench: Any) -> None:
@@ -216,28 +210,19 @@ def test_best_is_json_for_programs(quick_run: Path, vibench: Any) -> None:
 
 
 def test_every_error_that_is_reached_has_its_fastest_cell() -> None:
-    found = fastest(
-        cells_of(row_of("a", 0.05, 0.1), row_of("b", 0.06, 0.2), row_of("c", 0.004, 0.3), row_of("d", 0.003, 0.25))
-    )
+    """An exact cell that is the fastest stands alone, problems are apart, and an error of zero is one."""
+    first = row_of("a", 0.05, 0.1)
+    found = fastest(cells_of(first, row_of("b", 0.06, 0.2), row_of("c", 0.004, 0.3), row_of("d", 0.003, 0.25)))
     assert list(zip(found["cell"], found["error_below"], strict=True)) == [("a", 0.1), ("d", 0.01)]
-
-
-def test_an_exact_cell_that_is_the_fastest_stands_alone() -> None:
     assert list(fastest(cells_of(row_of("a", 0.05, 0.2), row_of("b", 1e-5, 0.1)))["cell"]) == ["b"]
-
-
-def test_cells_that_no_leaderboard_names_take_no_part() -> None:
+    found = fastest(cells_of(first, row_of("b", 0.0, 0.2, problem="zero", error_u_mean=0.0)))
+    assert list(found["cell"]) == ["a", "b"]
+    assert "error ≤" in formats.under_headings(found, ["problem", "error_below"], fastest_columns())
+    # cells that no leaderboard names take no part
     others = (
         row_of("b", 1e-5, 0.1, status="inaccurate"), row_of("c", 1e-5, None), row_of("d", None, 0.1, error_u_mean=None),
-        row_of("f", 1e-5, 0.1, solver_share_mean=0.5),
-        row_of("g", 0.11, 0.01),
+        row_of("f", 1e-5, 0.1, solver_share_mean=0.5), row_of("g", 0.11, 0.01),
     )  # fmt: skip
     assert list(fastest(cells_of(row_of("a", 0.05, 0.2), *others))["cell"]) == ["a"]
     assert fastest(cells_of(*others)).empty
     assert fastest(cells_of()).empty
-
-
-def test_problems_are_apart_and_an_error_of_zero_is_one() -> None:
-    found = fastest(cells_of(row_of("a", 0.05, 0.1), row_of("b", 0.0, 0.2, problem="zero", error_u_mean=0.0)))
-    assert list(found["cell"]) == ["a", "b"]
-    assert "error ≤" in formats.under_headings(found, ["problem", "error_below"], fastest_columns())
