@@ -232,24 +232,47 @@ def scalar(lam: float, u: float) -> tuple[VariationalInequality, np.ndarray, np.
 
 
 KNOWN = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, True), Constant(9.0, True), Constant(0.5, True))
-OPPOSITE = VariationalInequality(
-    sp.csc_array([[4.0]]), np.array([4.0]), sp.csr_array([[2.0], [-2.0]]), np.array([1.0, -1.0])
-)
+
+
+def test_opposite_rows_are_an_equality_that_corrections_hold_without_a_margin(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two opposite constraints ask for x = ½ exactly; what equalities may miss is in every term."""
+    vi, known = scalar(0.0, 0.0)[0], replace(KNOWN, energy_inf_sup=Constant(0.0, True))
+    vi = replace(vi, B=sp.csr_array([[2.0], [-2.0]]), g=np.array([1.0, -1.0]))
+    u, lam = np.array([0.6]), np.array([0.8, 0.0])
+    found = bounds_or_note(vi, u, lam, known)
+    assert numbers(found) == pytest.approx(numbers(ErrorBounds(0.2, 0.4, 0.2, np.inf, 0.0, 0.0, 0.2, 0.0)), abs=1e-7)
+    assert found.note == BoundNote.NOT_UNIQUE
+    empty = replace(vi, g=np.array([1.0, -1.001]))
+    assert bounds_or_note(empty, u, lam, known) == ErrorBounds.none(BoundNote.NO_CORRECTION)
+    assert reference_bound(empty, energy(vi), np.array([0.5]), np.array([1.0, 0.0])) == np.inf
+    # as in arithmetic of two digits: rows of norm 1 in A⁻¹ have a round-off of 0.01, hence η = 0.02
+    monkeypatch.setattr(module, "_round_off", lambda on, u, w: np.full(2, 0.01))
+    found = bounds_or_note(vi, u, lam, known)
+    square = 0.22**2 + 2.0 * 0.02 * 0.8  # r = 0, ω = 0.2 and κ = 0 without η
+    expected = ErrorBounds(np.sqrt(square), 2.0 * np.sqrt(square), np.sqrt(square), np.inf, 0.0, 0.0, 0.22, 0.016)
+    assert numbers(found) == pytest.approx(numbers(expected), abs=1e-7)
+    residual = bounds_or_note(vi, u, np.array([0.7, 0.0]), known)  # r = 0.2: ‖r + A w‖ = 0.3
+    assert residual.lambda_natural == pytest.approx(np.sqrt(0.32**2 + 2.0 * 0.02 * 0.7), abs=1e-7)
 
 
 def test_each_term_enters_where_the_derivation_says() -> None:
+    """What is not proved is said, and rows that are absent bound nothing."""
     vi, u, lam = scalar(lam=0.8, u=0.6)  # r = 4 − 2.4 − 1.6 = 0, s = 0.2, w = 0.1 and κ = 0
-    (found,) = error_bounds([vi], [energy(vi)], [KNOWN], u[:, None], lam[:, None])
-    expected = ErrorBounds(
-        u_energy=0.2, u=0.4, lambda_natural=0.2, lam=0.4, rho=0.0, rho_range=0.0, omega=0.2, kappa=0.0
-    )
-    assert numbers(found) == pytest.approx(numbers(expected), abs=1e-7)
+    found = bounds_or_note(vi, u, lam, KNOWN)
+    assert numbers(found) == pytest.approx(numbers(ErrorBounds(0.2, 0.4, 0.2, 0.4, 0.0, 0.0, 0.2, 0.0)), abs=1e-7)
+    absent = VariationalInequality(vi.A, vi.f, sp.csr_array([[2.0], [3.0]]), np.array([1.0, np.inf]))
+    assert bounds_or_note(absent, u, np.append(lam, 0.0), KNOWN) == found
+    assert bounds_or_note(absent, u, np.append(lam, 0.1), KNOWN) == ErrorBounds.none(BoundNote.ON_ABSENT_ROW)
+    known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, False), Constant(9.0, False), Constant(0.0, True))
+    estimated = bounds_or_note(vi, u, lam, known)
+    assert estimated.note == f"{BoundNote.ESTIMATED}; {BoundNote.NOT_UNIQUE}"
+    assert estimated.lam == np.inf
+    assert bounds_or_note(vi, u, -lam, known) == ErrorBounds.none(BoundNote.NOT_IN_CONE)
     vi, u, lam = scalar(lam=0.2, u=0.3)  # r = 4 − 1.2 − 0.4 = 2.4, s = −0.4, w = −0.1 is best: κ = 0.2·(−0.2 + 0.4)
-    (found,) = error_bounds([vi], [energy(vi)], [KNOWN], u[:, None], lam[:, None])
     square = 1.2**2 + 0.2**2 + 2.0 * 0.04
     natural = np.sqrt(square - 2.0 * 2.4 * 0.1)
     expected = ErrorBounds(np.sqrt(square), 2.0 * np.sqrt(square), natural, 2.0 * natural, 1.2, 1.2, 0.2, 0.04)
-    assert numbers(found) == pytest.approx(numbers(expected), abs=1e-7)
+    assert numbers(bounds_or_note(vi, u, lam, KNOWN)) == pytest.approx(numbers(expected), abs=1e-7)
 
 
 def test_of_the_residual_only_what_constraints_see_bounds_the_multiplier() -> None:
@@ -286,39 +309,6 @@ def test_as_many_constraints_as_unknowns_see_all_of_a_residual_there() -> None:
         assert on.force_representer(multiplier).norm == pytest.approx(on.force_norm(multiplier), rel=1e-10)
 
 
-def test_what_is_not_proved_is_said() -> None:
-    vi, u, lam = scalar(lam=0.8, u=0.6)
-    known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, False), Constant(9.0, False), Constant(0.0, True))
-    found = bounds_or_note(vi, u, lam, known)
-    assert found.note == f"{BoundNote.ESTIMATED}; {BoundNote.NOT_UNIQUE}"
-    assert found.lam == np.inf
-    assert bounds_or_note(vi, u, -lam, known) == ErrorBounds.none(BoundNote.NOT_IN_CONE)
-
-
-def test_opposite_rows_are_an_equality_that_corrections_hold_without_a_margin() -> None:
-    """Two opposite constraints ask for x = ½ exactly."""
-    vi, known = OPPOSITE, replace(KNOWN, energy_inf_sup=Constant(0.0, True))
-    found = bounds_or_note(vi, np.array([0.6]), np.array([0.8, 0.0]), known)
-    assert numbers(found) == pytest.approx(numbers(ErrorBounds(0.2, 0.4, 0.2, np.inf, 0.0, 0.0, 0.2, 0.0)), abs=1e-7)
-    assert found.note == BoundNote.NOT_UNIQUE
-    empty = VariationalInequality(vi.A, vi.f, vi.B, np.array([1.0, -1.001]))
-    assert bounds_or_note(empty, np.array([0.6]), np.array([0.8, 0.0]), known) == ErrorBounds.none(
-        BoundNote.NO_CORRECTION
-    )
-
-
-def test_what_equalities_may_miss_is_in_every_term(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As in arithmetic of two digits: rows of norm 1 in A⁻¹ have a round-off of 0.01, hence η = 0.02."""
-    vi, known = OPPOSITE, replace(KNOWN, energy_inf_sup=Constant(0.0, True))
-    monkeypatch.setattr(module, "_round_off", lambda on, u, w: np.full(2, 0.01))
-    found = bounds_or_note(vi, np.array([0.6]), np.array([0.8, 0.0]), known)
-    square = 0.22**2 + 2.0 * 0.02 * 0.8  # r = 0, ω = 0.2 and κ = 0 without η
-    expected = ErrorBounds(np.sqrt(square), 2.0 * np.sqrt(square), np.sqrt(square), np.inf, 0.0, 0.0, 0.22, 0.016)
-    assert numbers(found) == pytest.approx(numbers(expected), abs=1e-7)
-    residual = bounds_or_note(vi, np.array([0.6]), np.array([0.7, 0.0]), known)  # r = 0.2: ‖r + A w‖ = 0.3
-    assert residual.lambda_natural == pytest.approx(np.sqrt(0.32**2 + 2.0 * 0.02 * 0.7), abs=1e-7)
-
-
 def test_a_reference_is_verified_by_its_bound_where_residuals_do_not_tell() -> None:
     """A multiplier of a row without contact is a gap, which bounds the square of an error."""
     vi, u, lam = scalar(lam=1.0, u=0.5)
@@ -329,8 +319,6 @@ def test_a_reference_is_verified_by_its_bound_where_residuals_do_not_tell() -> N
     assert kkt_residuals(apart, u, lam).worst <= ACCURACY
     with pytest.raises(NumericalError, match=r"the error bound of the high-fidelity solution is 7\.1e-06 of it"):
         reference_bound(apart, energy(vi), u, lam)
-    empty = VariationalInequality(vi.A, vi.f, sp.csr_array([[2.0], [-2.0]]), np.array([1.0, -1.001]))
-    assert reference_bound(empty, energy(vi), np.array([0.5]), np.array([1.0, 0.0])) == np.inf
 
 
 def test_what_round_off_leaves_open_refuses_no_reference() -> None:
@@ -340,13 +328,6 @@ def test_what_round_off_leaves_open_refuses_no_reference() -> None:
     u, lam = np.array([far, far - 0.5]), np.array([1.0])
     vi = VariationalInequality(A, A @ u + B.T @ lam, B, np.array([0.5]))
     assert REFERENCE < reference_bound(vi, energy(vi), u, lam) < 1e-3
-
-
-def test_rows_that_are_absent_bound_nothing() -> None:
-    vi, u, lam = scalar(lam=0.8, u=0.6)
-    absent = VariationalInequality(vi.A, vi.f, sp.csr_array([[2.0], [3.0]]), np.array([1.0, np.inf]))
-    assert bounds_or_note(absent, u, np.append(lam, 0.0), KNOWN) == bounds_or_note(vi, u, lam, KNOWN)
-    assert bounds_or_note(absent, u, np.append(lam, 0.1), KNOWN) == ErrorBounds.none(BoundNote.ON_ABSENT_ROW)
 
 
 def test_an_active_set_method_that_fails_or_finds_dependent_constraints_is_replaced(

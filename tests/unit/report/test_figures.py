@@ -119,24 +119,22 @@ def problems() -> list[str]:
     return [entry.title for entry in read_study("quick").problem]
 
 
-def test_a_run_has_its_figures(drawn: Drawn, folder: Path) -> None:
-    names = {path.stem for path in folder.glob("*.png")}
-    for problem in problems():
-        assert {f"{problem}-{kind}" for kind in OF_PROBLEM} <= names
-        for dual in read_study("quick").dual:
-            assert {f"{problem}-{dual.title}-enrichment", f"{problem}-{dual.title}-inf-sup"} <= names
-    assert {path.stem for path in folder.glob("*.svg")} == names == {*drawn}
-
-
 def panels(figure: Figure) -> list[Axes]:
     """The panels of a figure that are shown, its colour bars left out."""
     return [axes for axes in figure.axes if axes.axison and "colorbar" not in str(axes.get_label())]
 
 
 def test_every_figure_can_be_read(drawn: Drawn, folder: Path) -> None:
-    """It is no blank sheet, nothing is clipped, panels have data, labels and ticks, and its caption is stored."""
-    captions = figures.read_captions(folder)
-    assert set(captions) == set(drawn) != set()
+    """It is no blank sheet, nothing is clipped, panels have data, labels and ticks, and its caption is stored.
+
+    Lines that have to be told apart have names and looks of their own.
+    """
+    captions, names = figures.read_captions(folder), {path.stem for path in folder.glob("*.png")}
+    for problem in problems():
+        assert {f"{problem}-{kind}" for kind in OF_PROBLEM} <= names
+        for dual in read_study("quick").dual:
+            assert {f"{problem}-{dual.title}-enrichment", f"{problem}-{dual.title}-inf-sup"} <= names
+    assert {path.stem for path in folder.glob("*.svg")} == names == {*drawn} == {*captions} != set()
     for name, figure in drawn.items():
         picture = Image.open(folder / f"{name}.png")
         assert min(picture.size) > 300, name
@@ -150,15 +148,6 @@ def test_every_figure_can_be_read(drawn: Drawn, folder: Path) -> None:
             assert axes.get_xlabel(), name
             for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
                 assert sum(low <= tick <= high for tick in axis.get_majorticklocs()) >= 2, name
-        places = [tuple(np.round(axes.get_position().bounds[:2], 6)) for axes in panels(figure)]
-        assert max(sum(place[1] == row for place in places) for row in {place[1] for place in places}) <= 3, name
-        assert captions[name] == figures.caption_of(figure)
-        assert len(captions[name]) > 60, name
-
-
-def test_lines_that_have_to_be_told_apart_have_names_and_looks_of_their_own(drawn: Drawn) -> None:
-    for name, figure in drawn.items():
-        for axes in panels(figure):
             lines = [line for line in axes.get_lines() if not line.get_label().startswith("_")]
             looks = {
                 (line.get_color(), str(line.get_linestyle()), line.get_marker(), line.get_markerfacecolor())
@@ -166,8 +155,11 @@ def test_lines_that_have_to_be_told_apart_have_names_and_looks_of_their_own(draw
             }
             assert len(looks) == len({line.get_label() for line in lines}), name
         named = {label for axes in figure.axes for label in axes.get_legend_handles_labels()[1]}
-        shown = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
-        assert named == shown, name
+        assert named == {text.get_text() for legend in figure.legends for text in legend.get_texts()}, name
+        places = [tuple(np.round(axes.get_position().bounds[:2], 6)) for axes in panels(figure)]
+        assert max(sum(place[1] == row for place in places) for row in {place[1] for place in places}) <= 3, name
+        assert captions[name] == figures.caption_of(figure)
+        assert len(captions[name]) > 60, name
 
 
 def test_projection_errors_are_those_of_the_histories_and_dual_strategies_have_orthogonality(
@@ -269,22 +261,21 @@ def test_cells_that_failed_do_not_stop_the_others(change: Callable[..., None], d
 
 
 def test_a_solver_that_failed_takes_no_strategy_out_of_a_figure(change: Callable[..., None], draw: Draw) -> None:
+    """One label with two options is two strategies."""
     change("DELETE FROM queries WHERE solver = 'osqp' AND primal != 'decorrelated'")
+    change(*(f"UPDATE {table} SET primal_options = '{{\"k\": 1}}' WHERE solver = 'osqp' AND primal = 'decorrelated'"
+             for table in ("cells", "queries")))  # fmt: skip
     _, labels = draw("inf-sup")["obstacle-mcpg-inf-sup"].axes[0].get_legend_handles_labels()
     assert any(label.startswith("online-supremizers") for label in labels)
+    assert {"decorrelated", "decorrelated (k = 1)"} <= set(labels)
 
 
 def test_without_a_fixed_enrichment_there_is_no_enrichment_figure(change: Callable[..., None], draw: Draw) -> None:
-    change("DELETE FROM queries WHERE primal = 'offline-pga'")
-    drawn = draw("enrichment", "inf-sup", "total-cost", "work-precision")
+    """Nor does one need cones: where every snapshot has no contact there is no generator, so no e_orth."""
+    change("DELETE FROM queries WHERE primal = 'offline-pga'", "DELETE FROM histories WHERE stage = 'cone'")
+    drawn = draw(*kinds_of_histories(), "inf-sup", "total-cost", "work-precision")
     assert not [name for name in drawn if name.endswith("enrichment")]
     assert "obstacle-mcpg-inf-sup" in drawn
-
-
-def test_without_cones_the_other_figures_are_drawn(change: Callable[..., None], draw: Draw) -> None:
-    """As where every snapshot has no contact: no generator, so no e_orth."""
-    change("DELETE FROM histories WHERE stage = 'cone'")
-    assert "obstacle-mcpg-inf-sup" in draw(*kinds_of_histories(), "inf-sup")
 
 
 def test_a_fixed_enrichment_without_tolerance_is_named_without_one(change: Callable[..., None], draw: Draw) -> None:
@@ -295,21 +286,18 @@ def test_a_fixed_enrichment_without_tolerance_is_named_without_one(change: Calla
             assert not [label for label in axes.get_legend_handles_labels()[1] if "nan" in label], name
 
 
-def test_prescribed_sizes_are_drawn_too(change: Callable[..., None], draw: Draw) -> None:
-    sizes = "pod_tol = NULL, pod_size = 13, dual_tol = NULL, dual_size = 20"
-    change(
-        f"UPDATE queries SET {sizes}", f"UPDATE cells SET {sizes}",
-        f"UPDATE histories SET {sizes} WHERE stage = 'enrichment'",
-    )  # fmt: skip
-    figure = draw("enrichment")["obstacle-mcpg-enrichment"]
-    assert all(data_of(axes) for axes in figure.axes)
-
-
-def test_two_pairs_of_tolerances_get_two_panels(change: Callable[..., None], draw: Draw) -> None:
+def test_prescribed_sizes_are_drawn_too_and_two_pairs_of_tolerances_get_two_panels(
+    change: Callable[..., None], results: Path, tmp_path: Path
+) -> None:
     change(*(f"UPDATE {table} SET pod_tol = 0.1 WHERE solver = 'osqp'" for table in ("queries", "cells")))
-    drawn = draw("inf-sup", "enrichment")
+    drawn = drawn_from(results, tmp_path / "pairs", "inf-sup", "enrichment")
     assert len(drawn["obstacle-mcpg-inf-sup"].axes) == 4
     assert len(drawn["obstacle-mcpg-enrichment"].axes) == 6
+    sizes = "pod_tol = NULL, pod_size = 13, dual_tol = NULL, dual_size = 20"
+    enrichments = f"UPDATE histories SET {sizes} WHERE stage = 'enrichment'"
+    change(*(f"UPDATE {table} SET {sizes}" for table in ("queries", "cells")), enrichments)
+    figure = drawn_from(results, tmp_path / "sizes", "enrichment")["obstacle-mcpg-enrichment"]
+    assert all(data_of(axes) for axes in figure.axes)
 
 
 def test_entries_that_share_a_label_get_files_of_their_own(change: Callable[..., None], draw: Draw) -> None:
@@ -476,13 +464,6 @@ def test_the_tightest_enrichment_is_the_one_that_went_farthest(results: Path) ->
     assert set(convergence._tightest(looser)["primal_tol"]) == {0.9}
 
 
-def test_one_label_with_two_options_is_two_strategies(change: Callable[..., None], draw: Draw) -> None:
-    change(*(f"UPDATE {table} SET primal_options = '{{\"k\": 1}}' WHERE solver = 'osqp' AND primal = 'decorrelated'"
-             for table in ("cells", "queries")))  # fmt: skip
-    labels = draw("inf-sup")["obstacle-mcpg-inf-sup"].axes[0].get_legend_handles_labels()[1]
-    assert {"decorrelated", "decorrelated (k = 1)"} <= set(labels)
-
-
 def test_a_caption_says_which_tolerances_are_left_out(change: Callable[..., None], draw: Draw) -> None:
     """The loosest is shown; of two that are as loose up to round-off, the one with the larger δ."""
     again = "problem = 'obstacle' AND primal = 'offline-pga'"
@@ -516,16 +497,11 @@ def test_what_is_computed_once_per_combination_is_that_of_every_row() -> None:
     rows = [("a", 1.0, None), ("b", np.nan, "x"), ("a", 1.0, None), ("a", np.nan, "x"), ("b", np.nan, "x")]
     frame = pd.DataFrame(rows, columns=["name", "number", "text"], index=[7, 7, 3, 2, 1])
     calls = list[tuple[Any, ...]]()
-
-    def value(*row: Any) -> str:
-        calls.append(row)
-        return str(row)
-
-    found = _per_combination(frame, value)
+    found = _per_combination(frame, lambda *row: calls.append(row) or str(row))
     assert list(found) == [str(row) for row in frame.itertuples(index=False, name=None)]
     assert list(found.index) == list(frame.index)
     assert len(calls) == 3
-    assert _per_combination(frame.iloc[:0], value).empty
+    assert _per_combination(frame.iloc[:0], lambda *row: str(row)).empty
 
 
 def test_a_report_has_half_a_page_of_a_long_figure_and_the_whole_of_any_other(results: Path) -> None:
