@@ -68,7 +68,7 @@ def proximal(offline: Reduction, accuracy: float, growth: float = 2.0) -> Query:
                 psi = psi + change * min(1.0, 3.0 / max(change.max(), 3.0))
             nu = np.maximum(before - psi, 0.0) / step
             x = free - lifted @ nu
-            if nu @ np.abs(B @ x - g) <= accuracy * (x @ A @ x + nu @ G @ nu):
+            if nu @ np.abs(B @ x - g) <= accuracy * (nu @ G @ nu):
                 break
             step *= growth
         return free - lifted @ nu, nu

@@ -49,15 +49,15 @@ class Penalty(ProgramFormulation):
 
 
 def penalised(program: Whitened, epsilon: float, reduction: float) -> tuple[Array, Array, int, bool]:
-    """Minimise ½‖z − y‖² + ‖(Y z − g)₊‖² / (2ε); returns z, ν = (Y z − g)₊ / ε, Newton steps, whether they converged.
+    """Minimise ½‖z‖² + ‖(Y z − g)₊‖² / (2ε); returns z, ν = (Y z − g)₊ / ε, Newton steps, whether they converged.
 
     Newton's method starts at ε itself, with full steps. Where these run in circles, ε falls from 1 by the factor
     `reduction`, each minimum being the start of the next one, with an exact line search, which converges always.
     """
-    z, nu, steps, settled = _newton(program, program.y, epsilon, full=True)
+    z, nu, steps, settled = _newton(program, np.zeros_like(program.y), epsilon, full=True)
     if settled:
         return z, nu, steps, True
-    z, current = program.y, 1.0
+    z, current = np.zeros_like(program.y), 1.0
     while True:
         current = max(epsilon, current)
         z, nu, count, settled = _newton(program, z, current, full=False)
@@ -71,17 +71,17 @@ def _newton(program: Whitened, z: Array, epsilon: float, *, full: bool) -> tuple
     """Newton's method from z for one ε, with full steps or a line search; z, ν, steps, and whether it has converged.
 
     Every step solves the quadratic piece of the present active set, the Newton step of a semismooth function, in its
-    multipliers: (Y_S Y_Sᵀ + ε I) ν_S = Y_S y − g_S, whose condition is that of the constraints and not of the penalty.
+    multipliers: (Y_S Y_Sᵀ + ε I) ν_S = −g_S, whose condition is that of the constraints and not of the penalty.
     """
-    Y, y, g, multipliers = program.Y, program.y, program.g, np.zeros(len(program.g))
+    Y, g, multipliers = program.Y, program.g, np.zeros(len(program.g))
     active, settled, seen, count = Y @ z > g, False, set[bytes](), 0
     while count < NEWTON_STEPS:
         count += 1
         S = Y[active]
         matrix = S @ S.T
         matrix.flat[:: len(S) + 1] += epsilon
-        nu = positive_solution(matrix, S @ y - g[active])
-        following = y - S.T @ nu
+        nu = positive_solution(matrix, -g[active])
+        following = -(S.T @ nu)
         before, active = active, Y @ following > g
         if settled := bool((active == before).all()):
             z = following
@@ -101,7 +101,7 @@ def _newton(program: Whitened, z: Array, epsilon: float, *, full: bool) -> tuple
 def _step(program: Whitened, z: Array, d: Array, epsilon: float) -> float:
     """Minimiser t ∈ (0, 1] along z + t d, where the derivative of the penalised function, piecewise linear, is zero."""
     excess, slope = program.Y @ z - program.g, program.Y @ d
-    curvature, start = d @ d, (z - program.y) @ d
+    curvature, start = d @ d, z @ d
 
     def derivative(t: Array) -> Array:
         violations = np.maximum(excess[:, None] + slope[:, None] * t, 0.0)

@@ -68,19 +68,19 @@ class Proximal(ProgramFormulation):
 def latent_proximal(program: Whitened, tolerance: float, step: float, growth: float) -> tuple[Array, Array, int, float]:
     """Entropic proximal points of a program; returns z, ν ≥ 0, Newton steps, and the natural residual reached.
 
-    With slacks g − Y z = exp(ψ) the k-th one solves z + Yᵀν = y for ν = (ψ_{k−1} − ψ)/a_k: in ν alone
+    With slacks g − Y z = exp(ψ) the k-th one solves z + Yᵀν = 0 for ν = (ψ_{k−1} − ψ)/a_k: in ν alone
 
-        exp(ψ_{k−1} − a_k ν) = g − Y (y − Yᵀν),
+        exp(ψ_{k−1} − a_k ν) = g + Y Yᵀν,
 
     the stationarity of a convex function, by Newton's method with backtracking. a_k grows geometrically. Up to the
     accuracy of the steps every z is strictly feasible. ν may be negative where a constraint is not active, until
     it converges to zero there; it is cut off, which the residual contains.
     """
-    Y, b, steps = program.Y, program.Y @ program.y - program.g, 0
+    Y, b, steps = program.Y, -program.g, 0
     C = Y @ Y.T
     # Slacks of one unit: that of the program, by which the worst constraint is violated at first.
     psi, nu, a, residual = np.log(np.maximum(1.0, -b)), np.zeros(len(b)), step, 1.0
-    lowest, z, positive = np.log(CENTRE * tolerance), program.y, nu
+    lowest, z, positive = np.log(CENTRE * tolerance), np.zeros_like(program.y), nu
     for _ in range(PROXIMAL_STEPS):
         most = NEWTON_STEPS * (1 if a > step else PATIENCE)
         found, count = _newton(C, b, psi, nu, a, INEXACT * max(tolerance, min(residual, 1.0)), most)
@@ -90,10 +90,10 @@ def latent_proximal(program: Whitened, tolerance: float, step: float, growth: fl
             continue
         nu, psi, positive = found, psi - a * found, np.maximum(found, 0.0)
         a *= growth if count <= EASY else 1.0
-        z = program.y - Y.T @ nu
-        energy, gap = program.energy(z, positive), float(positive @ np.exp(psi))
-        off = float(np.linalg.norm(Y.T @ (positive - nu))), float(np.max(Y @ z - program.g, initial=0.0))
-        residual = max(max(off) / energy, gap / energy**2)
+        z, pressed = -(Y.T @ nu), Y.T @ positive
+        size, gap = program.size(pressed), float(positive @ np.exp(psi))
+        off = float(np.linalg.norm(pressed + z)), float(np.max(Y @ z - program.g, initial=0.0))
+        residual = max(max(off) / size, gap / size**2)
         if residual <= tolerance:
             break
         psi = np.maximum(psi, lowest)

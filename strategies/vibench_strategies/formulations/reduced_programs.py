@@ -84,7 +84,7 @@ class ProgramModel(PhasesModel):
         reduced = self.assembled(mu)
         program = Whitened.of(reduced.program, reduced.factor)
         if program.is_free:
-            x, alpha = program.back(program.y, np.zeros(len(program.g)))
+            x, alpha = program.back(np.zeros_like(program.y), np.zeros(len(program.g)))
             return FormulationAnswer(x, alpha, iterations=0)
         z, nu, steps, reason = self._formulation.algorithm(program, settings.accuracy)
         x, alpha = program.back(z, nu)

@@ -53,7 +53,7 @@ def greedy_active_set(program: Whitened, tolerance: float, entries: int | None) 
 
     Each step takes the constraint that the present solution violates most, and moves to the solution with it; a
     multiplier that would become negative on the way leaves (Goldfarb and Idnani 1983). All iterates are optimal for
-    the chosen constraints. What is left of violation, relative to the energy of the solution, certifies them for all
+    the chosen constraints. What is left of violation, relative to what contact does, certifies them for all
     others: at most `tolerance`, unless the number of `entries` ends the choice first.
 
     Raises
@@ -61,17 +61,15 @@ def greedy_active_set(program: Whitened, tolerance: float, entries: int | None) 
     NumericalError
         If no z satisfies all constraints.
     """
-    Y, y, g, z, nu, steps = program.Y, program.y, program.g, program.y.copy(), np.zeros(len(program.g)), 0
+    Y, g, z, nu, steps = program.Y, program.g, np.zeros_like(program.y), np.zeros(len(program.g)), 0
     chosen = Chosen(Y)
     limit = 10 * len(g) + 10
     while True:
         excess = Y @ z - g
         worst = int(excess.argmax())
-        # as `Whitened.energy`: for the chosen constraints Yᵀν is y − z
-        energy = float(np.sqrt(z @ z + (y - z) @ (y - z)))
-        violation = max(float(excess[worst]), 0.0) / (energy or 1.0)
+        violation = max(float(excess[worst]), 0.0) / program.size(z)
         if violation <= tolerance or (entries is not None and len(chosen.rows) >= entries):
-            return y - Y.T @ nu, nu, steps, violation
+            return -(Y.T @ nu), nu, steps, violation
         lacking = excess[worst]
         while True:
             steps += 1

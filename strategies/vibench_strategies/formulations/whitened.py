@@ -29,17 +29,19 @@ def positive_solution(matrix: Array, right: Array) -> Array:
 
 @dataclass(frozen=True)
 class Whitened:
-    """The program min ½‖z − y‖² subject to Y z ≤ g, whose rows Y_i have unit length.
+    """The program min ½‖z‖² subject to Y z ≤ g, whose rows Y_i have unit length.
 
-    With A = L Lᵀ and l_i² = B_i A⁻¹ B_iᵀ it is the program min ½xᵀA x − fᵀx subject to B x ≤ g for z = Lᵀx / σ and
-    multipliers ν_i = l_i α_i / σ, where σ is the largest energy norm of the correction that a constraint needs alone at
-    the unconstrained solution. Neither units of x and f, nor a basis of x, nor the scaling of a row with its multiplier
-    has a part in it. z + Yᵀν = y.
+    With A = L Lᵀ, l_i² = B_i A⁻¹ B_iᵀ and the unconstrained solution u₀ it is the program min ½xᵀA x − fᵀx subject to
+    B x ≤ g for z = Lᵀ(x − u₀) / σ and multipliers ν_i = l_i α_i / σ, where σ is the largest energy norm of the
+    correction that a constraint needs alone at u₀. Neither units of x and f, nor a basis of x, nor the scaling of a row
+    with its multiplier, nor a load beside the contact has a part in it. z + Yᵀν = 0.
 
     Attributes
     ----------
-    Y, y, g
-        Rows (k×N), unconstrained solution (N,) and bounds (k,); k of R constraints that are neither absent nor zero.
+    Y, g
+        Rows (k×N) and bounds (k,); k of R constraints that are neither absent nor zero.
+    y
+        Lᵀu₀ / σ (N,).
     kept
         Which constraints these are (R,).
     lower, lengths, unit
@@ -47,8 +49,8 @@ class Whitened:
     """
 
     Y: Array
-    y: Array
     g: Array
+    y: Array
     kept: Mask
     lower: Array
     lengths: Array
@@ -76,21 +78,22 @@ class Whitened:
         if not kept.all():
             rows, lengths, bounds = rows[kept], lengths[kept], bounds[kept]
         rows, bounds = rows / lengths[:, None], bounds / lengths
-        unit = float(np.max(rows @ free - bounds, initial=0.0)) or 1.0
-        return cls(rows, free / unit, bounds / unit, kept, lower, lengths, unit)
+        bounds = bounds - rows @ free
+        unit = max(0.0, -float(np.min(bounds, initial=0.0))) or 1.0
+        return cls(rows, bounds / unit, free / unit, kept, lower, lengths, unit)
 
     @property
     def is_free(self) -> bool:
-        """Whether the unconstrained solution is feasible, so that z = y and ν = 0."""
-        return bool((self.g >= self.Y @ self.y).all())
+        """Whether the unconstrained solution is feasible, so that z = 0 and ν = 0."""
+        return bool((self.g >= 0.0).all())
 
-    def energy(self, z: Array, nu: Array) -> float:
-        """S = √(‖z‖² + ‖Yᵀν‖²), relative to which residuals are natural (docs/mathematics.md)."""
-        pressed = self.Y.T @ nu
-        return float(np.sqrt(z @ z + pressed @ pressed))
+    @staticmethod
+    def size(pressed: Array) -> float:
+        """F for Yᵀν (N,), relative to which residuals are natural (docs/mathematics.md); at least the unit."""
+        return max(1.0, float(np.sqrt(pressed @ pressed)))
 
     def back(self, z: Array, nu: Array) -> tuple[Array, Array]:
         """The solution x (N,), α (R,) of the program itself from z (N,), ν (k,)."""
         alpha = np.zeros(len(self.kept))
         alpha[self.kept] = self.unit * nu / self.lengths
-        return dtrtrs(self.lower, self.unit * z, lower=True, trans=True)[0], alpha
+        return dtrtrs(self.lower, self.unit * (self.y + z), lower=True, trans=True)[0], alpha
