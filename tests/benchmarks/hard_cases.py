@@ -1,12 +1,13 @@
 """Hard cases: solutions against ones of 100 digits, and certified models against high-fidelity solutions.
 
-Usage: python tests/benchmarks/hard_cases.py [COUNT [QUERIES [PACK...]]]
+Usage: python tests/benchmarks/hard_cases.py [COUNT [QUERIES [everywhere | PACK...]]]
 
 The first table has beams of 40 to 640 elements, trusses of 40 to 320 bays, and double obstacles with dependent rows and
 equalities: how many of QUERIES (20 by default) are ok, and the largest errors of three of them. The second one has
 certified models of the smaller ones at COUNT (1000 by default) random parameters: bounds of u in the energy norm and
 in V, of λ in the natural norm and in W, at online cost and at that of the mesh, of the pair and of the corrected one.
-With model packs, as that of examples/freefem/signorini.edp, it has these and nothing else.
+With model packs, as that of examples/freefem/signorini.edp, it has these and nothing else; with `everywhere` problems
+whose constraint touches all or most unknowns.
 """
 
 import sys
@@ -28,6 +29,7 @@ from vibench.stages.assessment import is_violated
 sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 from decimals import difference, exact_decimal
 from hard_problems import Beam, DoubleObstacle, Truss
+from other_problems import Covered, ThermalBlock, Torsion
 
 LARGE: list[AffineProblem] = [
     *(Beam(elements) for elements in (40, 80, 160, 320, 640)),
@@ -128,7 +130,12 @@ def main(count: int = 1000, queries: int = 20, *packs: str) -> None:
         for problem in LARGE:
             print(solved(problem, queries), flush=True)
     print("\nproblem, bound: without, violated, effectivity min, median, max")
-    for problem in [create("problem", "pack", {"path": path}) for path in packs] or SMALL:
+    if packs == ("everywhere",):
+        built_in = [create("problem", name, {"resolution": "coarse"}) for name in ("bearing", "american-put")]
+        problems = [ThermalBlock(), *built_in, Torsion(), Covered()]
+    else:
+        problems = [create("problem", "pack", {"path": path}) for path in packs] or SMALL
+    for problem in problems:
         print(*certified(problem, count), sep="\n", flush=True)
 
 

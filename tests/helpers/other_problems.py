@@ -1,4 +1,4 @@
-"""Problems of another nature than the built-in ones: plastic torsion, a perpetual put, a block on a rigid obstacle."""
+"""Problems of another nature than the built-in ones: plastic torsion, a thermal block, membranes, a put, a block."""
 
 from typing import Annotated
 
@@ -37,6 +37,59 @@ class Torsion(AffineProblem):
 
     def training_set(self) -> Array:
         return self.parameters.grid(15)
+
+
+class ThermalBlock(AffineProblem):
+    """A membrane below an obstacle, of square patches with their own stiffness: a parameter and a term of A for each.
+
+    P1 on a square mesh whose lines are those of the patches, lumped multipliers at its nodes.
+    """
+
+    def __init__(self, patches: Annotated[int, Ge(1), Le(4)] = 3, cells: Annotated[int, Ge(2), Le(64)] = 18) -> None:
+        names = tuple(f"k{i}{j}" for i in range(patches) for j in range(patches))
+        self.parameters = ParameterBox(names, np.full(len(names), 0.1), np.ones(len(names)), ("1",) * len(names))
+        ticks = np.linspace(0.0, 1.0, cells + 1)
+        mesh = MeshTri.init_tensor(ticks, ticks)
+        whole = Basis(mesh, ElementTriP1())
+        free = whole.complement_dofs(whole.get_dofs())
+        number = (np.floor(patches * mesh.p[:, mesh.t].mean(axis=1)).T @ [patches, 1]).astype(int)
+        parts = [Basis(mesh, ElementTriP1(), elements=np.flatnonzero(number == k)) for k in range(len(names))]
+        contact = fem.unilateral(whole, "<=", free=free)
+        self.V, self.W = InnerProduct(fem.h1_gram(whole, free)), contact.W
+        self.declare(
+            A=[(name, laplace.assemble(part)) for name, part in zip(names, parts, strict=True)],
+            f=fem.lumped_mass(whole), B=contact.B, g=contact.bound(0.07), free=free,
+        )  # fmt: skip
+
+    def training_set(self) -> Array:
+        return self.parameters.sample(60, 3)
+
+
+class Covered(AffineProblem):
+    """A membrane that an inflated cushion presses on an obstacle nearly everywhere; its tension and the load vary.
+
+    Where the load is large all nodes but those next to the edge are in contact.
+    """
+
+    parameters = ParameterBox(
+        ("tension", "load", "slope"), np.array([0.5, 20.0, -1.0]), np.array([2.0, 80.0, 1.0]), ("1",) * 3
+    )
+
+    def __init__(self, cells: Annotated[int, Ge(2), Le(64)] = 16) -> None:
+        ticks = np.linspace(0.0, 1.0, cells + 1)
+        basis = Basis(MeshTri.init_tensor(ticks, ticks), ElementTriP1())
+        free = basis.complement_dofs(basis.get_dofs())
+        contact = fem.unilateral(basis, "<=", free=free)
+        self.V, self.W = InnerProduct(fem.h1_gram(basis, free)), contact.W
+        weights, x = fem.lumped_mass(basis), basis.mesh.p[0]
+        self.declare(
+            A=[("tension", laplace.assemble(basis)), (1.0, fem.mass(basis))],
+            f=[("load", weights), ("load * slope / 2", weights * (x - 0.5))],
+            B=contact.B, g=contact.bound(0.02 + 0.02 * contact.points[0]), free=free,
+        )  # fmt: skip
+
+    def training_set(self) -> Array:
+        return self.parameters.grid(4, 4, 3)
 
 
 class Put(Problem):

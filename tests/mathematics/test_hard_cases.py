@@ -1,4 +1,4 @@
-"""Stiff problems, dependent rows and equalities: short versions of `tests/benchmarks/hard_cases.py`."""
+"""Stiff problems, dependent rows, contact nearly everywhere: short versions of `tests/benchmarks/hard_cases.py`."""
 
 from unittest import mock
 
@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from decimals import difference, exact_decimal
 from hard_problems import Beam, DoubleObstacle, Truss
+from other_problems import Covered, ThermalBlock, Torsion
 
 from vibench import AffineProblem, Array, Problem, Reduction, Stop, create
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky
 from vibench.linalg.definite import BlockDiagonal
+from vibench.model.certificates.base import Guarantee
 from vibench.model.error_bounds import bound_errors_at, corrected_pair
 from vibench.offline.assemblies import assemblies
 from vibench.stability.coercivity import Constant
@@ -62,7 +64,16 @@ def test_what_condensation_loses_is_won_back() -> None:
             assert found.fallback == "solved without condensation"
 
 
-@pytest.mark.parametrize("problem", [Beam(40), Truss(40), DoubleObstacle(50)], ids=lambda each: type(each).__name__)
+EVERYWHERE = [
+    *(create("problem", name, {"resolution": 80}) for name in ("bearing", "american-put")),
+    *(ThermalBlock(cells=9), Torsion(10), Covered(8)),
+]
+"""Problems whose constraint touches most unknowns; the stiffness of the block has nine parameters."""
+
+
+@pytest.mark.parametrize(
+    "problem", [Beam(40), Truss(40), DoubleObstacle(50), *EVERYWHERE], ids=lambda each: type(each).__name__
+)
 def test_certified_models_of_hard_problems_have_bounds_that_hold(problem: AffineProblem) -> None:
     """At online cost and at that of the mesh, of the pair and of the corrected one."""
     reduction = Reduction(
@@ -91,6 +102,7 @@ def test_certified_models_of_hard_problems_have_bounds_that_hold(problem: Affine
             ((pair.u, pair.lam), bound_errors_at(vi, energy, *unknown, pair.u, pair.lam)),
         ):
             assert bound is not None
+            assert getattr(bound, "guarantee", Guarantee.CERTIFIED) is Guarantee.CERTIFIED
             assert energy.norm(exact.u - u) <= bound.u_energy + 1e-9 * size
             assert energy.dual_norm(vi.B.T @ (exact.lam - lam)) <= bound.lambda_natural + 1e-9 * size
             assert bound.u_energy <= 10.0 * size

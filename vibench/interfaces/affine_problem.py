@@ -92,12 +92,11 @@ class AffineProblem(Problem):
         # Declared by classes of other problems; here by what was declared.
         self.constant = frozenset(constants)  # type: ignore[misc]
         self.affine = {name: sums[name] for name in MEMBERS if name not in self.constant}
-        # Condensation onto the unknowns of the constraint gains nothing where these are more than half of all.
+        # Error bounds need the contact unknowns however many they are; solvers decide whether to condense on them.
         touched = np.unique(np.concatenate([term.indices for term in sums["B"].terms])).astype(np.intp)
-        self._contact_dofs = touched if 0 < len(touched) <= 0.5 * n else None
-        if self._contact_dofs is not None:
-            on_contact = sums["B"].mapped(lambda term: sp.csr_array(term[:, touched]))
-            self._contact_columns = _constant_or_sum(on_contact)
+        self._contact_dofs = touched if len(touched) else None
+        on_contact = sums["B"].mapped(lambda term: sp.csr_array(term[:, touched]))
+        self._contact_columns = _constant_or_sum(on_contact)
 
     def _sum(self, member: Declaration) -> AffineSum:
         if isinstance(member, AffineSum):
@@ -110,7 +109,7 @@ class AffineProblem(Problem):
 
     @property
     def contact_dofs(self) -> Indices | None:
-        """Unknowns that B touches at some parameter; `None` where these are most of the unknowns."""
+        """Unknowns that B touches at some parameter; `None` where there are none."""
         return self._contact_dofs
 
     def contact(self, mu: Array) -> Contact | None:

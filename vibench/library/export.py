@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import PackageNotFoundError, metadata
 from importlib.resources import files
+from math import hypot, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -141,8 +142,8 @@ def exported(
         why = "only C programs have them; export to a name that ends in .c"
     certificate = None if why else model.certificate
     beside = None if certificate is None else partial(_certificate_thetas, certificate)
-    rotation = None if certificate is None else certificate.base.rotation
     # The matrix from the θ of A as a query evaluates them to those of the certificate; none of a constant A.
+    rotation = None if certificate is None else _stiffness_coefficients(certificate)
     rotated = {} if rotation is None else {"theta_A": rotation}
     try:
         queried, polynomials = member_polynomials(
@@ -259,7 +260,17 @@ def _reason_for_none(certificate: OnlineCertificate | None) -> str:
 def _certificate_thetas(certificate: OnlineCertificate, samples: Mapping[str, Array]) -> dict[str, Array]:
     """Coefficients θ (Q,) of A, f, B and g in the terms of the certificate, from those that a query evaluates."""
     found = certificate.base.coefficients(samples) | {"g": samples.get("g", np.ones(1))}
+    if (matrix := _stiffness_coefficients(certificate)) is not None:
+        found["A"] = matrix @ samples["A"]
     return {f"theta_{name}": value for name, value in found.items()}
+
+
+def _stiffness_coefficients(certificate: OnlineCertificate) -> Array | None:
+    """The matrix that makes θ of rotated terms of A, then those of `TermRanges`, from the θ of a query, if A varies."""
+    rotation, spectral = certificate.base.rotation, certificate.base.spectral
+    if rotation is None or spectral is None or spectral.ranges is None:
+        return rotation
+    return np.vstack([rotation, np.eye(rotation.shape[1])])
 
 
 def _certificate_arrays(
@@ -297,8 +308,8 @@ def _certificate_arrays(
     of_f, of_lam = sizes[: polynomials["theta_f"].terms.shape[1]], sizes[-certificate.generators.shape[1] :]
     stiffness = 0.0
     if base.spectral is not None:  # terms whose norms are not needed otherwise are taken to have the largest one
-        norms = base.spectral.norms
-        stiffness = error["theta_A"] * float(np.linalg.norm(np.where(norms > 0.0, norms, norms.max())))
+        norms, (leading, every) = base.spectral.norms, base.spectral.turn.shape
+        stiffness = error["theta_A"] * hypot(float(np.linalg.norm(norms)), sqrt(every - leading) * float(norms.max()))
     found |= {
         "load_error": np.array(base.load_error + error["theta_f"] * np.linalg.norm(of_f)),
         "stiffness_error": np.array(base.stiffness_error + stiffness),
@@ -307,11 +318,16 @@ def _certificate_arrays(
         "bound_errors": error["theta_g"] * np.linalg.norm(terms, axis=1),
     }  # fmt: skip
     if (spectral := base.spectral) is not None:
+        grid = spectral.grid
         found |= {
             "anchors": np.column_stack([spectral.alpha, spectral.gamma, spectral.theta.T]),
-            "lower": spectral.lower, "upper": spectral.upper, "count": np.array(spectral.count),
-            "term_norms": spectral.norms, "spectral_error": np.array(spectral.error + stiffness),
+            "axes": grid.axes, "lower": grid.lower, "upper": grid.upper, "counts": grid.counts, "places": grid.places,
+            "turn": spectral.turn, "term_norms": spectral.norms, "spectral_error": np.array(spectral.error + stiffness),
         }  # fmt: skip
+        if (ranges := spectral.ranges) is not None:
+            widest = np.maximum(-ranges.lower, ranges.upper) / np.abs(ranges.reference)
+            found["ranges"] = np.column_stack([ranges.reference, ranges.lower, ranges.upper])
+            found["range_errors"] = np.array([ranges.round_off, error["theta_A"] * np.linalg.norm(widest)])
     return {f"certificate_{name}": array for name, array in found.items()}
 
 

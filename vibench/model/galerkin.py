@@ -190,7 +190,10 @@ class ReducedModel:
     def _contact(self) -> ContactCoordinates | None:
         """Coordinates of contact size in which supremizers are orthonormalised; `None` where vectors (n,) are."""
         V, dofs = self.problem.V, self.problem.contact_dofs
-        return None if self.enrichment.eta is None or dofs is None else ContactCoordinates(V, self.fixed_basis, dofs)
+        # A dense factor of most unknowns would cost more than vectors of all.
+        if self.enrichment.eta is None or dofs is None or 2 * len(dofs) > V.dim:
+            return None
+        return ContactCoordinates(V, self.fixed_basis, dofs)
 
     @cached_property
     def _whitened_basis(self) -> Array:

@@ -137,12 +137,12 @@ def operator_norm(M: SparseMatrix, X: InnerProduct) -> Constant:
     """Upper bound of max |vᵀMv| / ‖v‖² over v for a symmetric M (n×n), with ‖v‖ the norm of X."""
     if not abs(M).sum():
         return Constant(0.0, True)
-    chosen = implementation(X.factorisation)
+    return moved(_largest(M, X), 1.0, lambda c: all(proved_above(part, -c, X) for part in (-M, M)))
 
-    def above(c: float) -> bool:
-        return all(is_proved_definite([c * X.matrix, sign * M], chosen) for sign in (-1.0, 1.0))
 
-    return moved(_largest(M, X), 1.0, above)
+def proved_above(M: SparseMatrix, bound: float, X: InnerProduct) -> bool:
+    """Prove M ≽ b X for a symmetric M (n×n) and b < 0."""
+    return is_proved_definite([-bound * X.matrix, M], implementation(X.factorisation))
 
 
 def largest_quotient(M: SparseMatrix, X: InnerProduct) -> float:

@@ -20,7 +20,7 @@ from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.certificates.contact_correction import ContactCompliance
 from vibench.model.certificates.prepared_correction import PreparedCorrections
 from vibench.model.certificates.residual import ResidualBasis
-from vibench.model.certificates.spectral import SpectralBounds
+from vibench.model.certificates.spectral import AnchorGrid, SpectralBounds, TermRanges
 from vibench.model.chebyshev import AffinePolynomial
 from vibench.model.hyperreduced import ProjectedMember, ReducedOperators
 from vibench.offline.compiled import CompiledModel
@@ -44,6 +44,7 @@ for _kind in (
     # Formulations may build steps of other offline phases, and compiled programs.
     POD, Cone, Kind, Enrichment, CompiledModel, AffinePolynomial,
     CertificateBase, ContactCompliance, OnlineInfSup, PreparedCorrections, ResidualBasis, SpectralBounds,
+    AnchorGrid, TermRanges,
 ):  # fmt: skip
     storable(_kind)
 

@@ -100,18 +100,21 @@ def test_declared_sums_are_members_and_terms_of_the_decomposition() -> None:
         affine_decomposition(problem, problem.training_set(), 1e-6)
 
 
-def test_constraints_on_most_unknowns_declare_no_contact() -> None:
+def test_constraints_may_touch_all_unknowns_or_none() -> None:
     class Everywhere(Strings):
         def __init__(self) -> None:
             super().__init__()
             self.W = InnerProduct(sp.csr_array(sp.eye_array(24)))
             self.declare(A=self.V.matrix, f=np.ones(24), B=sp.csr_array(sp.eye_array(24)), g=[("depth", np.ones(24))])
 
-    problem = Everywhere()
-    assert problem.contact_dofs is None
-    assert problem.contact(np.ones(2)) is None
-    solution = HighFidelitySolver(problem).solve(np.array([1.0, 0.2]))
+    problem, mu = Everywhere(), np.array([1.0, 0.2])
+    assert np.array_equal(problem.contact_dofs, np.arange(24))
+    assert np.array_equal(problem.contact(mu).g, np.full(24, 0.2))
+    solution = HighFidelitySolver(problem).solve(mu)
     assert solution.u.max() == pytest.approx(0.2)
+    problem.declare(A=problem.V.matrix, f=np.ones(24), B=sp.csr_array((24, 24)), g=np.ones(24))
+    assert problem.contact_dofs is None
+    assert problem.contact(mu) is None
 
 
 @given(data=st.data())

@@ -13,6 +13,7 @@ from vibench.highfidelity import active_set
 from vibench.interfaces.problem import MEMBERS, Problem
 from vibench.interfaces.strategies import Enrichment, Kind
 from vibench.interfaces.validation import checked_assembly
+from vibench.model import galerkin
 from vibench.model.galerkin import ReducedModel, project, projected_members
 from vibench.qp.solve import solve_qp
 from vibench.reduction.supremizers import supremizers
@@ -163,3 +164,19 @@ def test_bases_at_many_parameters_are_those_of_each(resolution: int, monkeypatch
             np.testing.assert_allclose(Z, reduced.primal_basis(vi), atol=1e-11 * np.abs(Z).max())
             np.testing.assert_allclose(u, Z @ x, atol=1e-11 * np.abs(u).max())
         assert len({id(Z) for Z in found}) == (len(vis) if bulge else 1)
+
+
+def test_of_contact_nearly_everywhere_no_dense_factor_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Supremizers are orthonormalised as vectors then; in coordinates of contact they span the same space."""
+    problem, cones = Torsion(8), []
+    solutions = [active_set.solve_high_fidelity(problem.assemble(np.array([twist]))) for twist in (5.0, 7.0)]
+    assert len(problem.contact_dofs) == problem.V.dim
+    eta, vi = problem.W.orthonormalise(np.column_stack([s.lam for s in solutions])), problem.assemble(np.array([6.0]))
+    found = model(problem, solutions, Enrichment(Kind.PER_PARAMETER, eta=eta))
+    dense = galerkin.ContactCoordinates(problem.V, found.fixed_basis, problem.contact_dofs)
+    monkeypatch.setattr(galerkin, "ContactCoordinates", lambda *_: cones.append(1))
+    plain = found.primal_basis(vi)
+    assert not cones
+    monkeypatch.setattr(ReducedModel, "_contact", dense)
+    cosines = np.linalg.svd(problem.V.gram(plain, found.primal_basis(vi)), compute_uv=False)
+    assert cosines == pytest.approx(np.ones(4))

@@ -21,7 +21,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
-from math import inf, sqrt
+from math import inf, isqrt, sqrt
 
 import numpy as np
 import scipy.linalg
@@ -39,7 +39,14 @@ from vibench.linalg.schur_complement import EliminationPattern, StaticCondensati
 from vibench.model.affine import AffineMember, Evaluation, coefficients, evaluated_members
 from vibench.model.bound_terms import BoundNote
 from vibench.model.certificates.prepared_correction import constant_unknowns
-from vibench.model.certificates.spectral import SpectralBounds, combined, leading_terms, rotated, spectral_bounds
+from vibench.model.certificates.spectral import (
+    SpectralBounds,
+    TermRanges,
+    combined,
+    leading_terms,
+    rotated,
+    spectral_bounds,
+)
 from vibench.model.galerkin import contact_at
 from vibench.stability.coercivity import MARGINS, energy_inf_sup, largest_quotient
 
@@ -172,15 +179,22 @@ class CertificateBase:
             theta["A"] = self.rotation @ theta["A"]
         return theta
 
-    def spectrum(self, mu: Array, theta: Array) -> tuple[float, float]:
-        """The bounds α(µ) and γ(µ) at mu (d,) with the rotated θ of A (Q,)."""
-        return (1.0, 1.0) if self.spectral is None else self.spectral.evaluate(mu, theta)
+    def spectrum(self, mu: Array, theta: Array, samples: Mapping[str, Array]) -> tuple[float, float]:
+        """The bounds α(µ) and γ(µ) at mu (d,) with the rotated θ of A (Q,), and the coefficients that led to these."""
+        return (1.0, 1.0) if self.spectral is None else self.spectral.evaluate(mu, theta, samples.get("A"))
 
 
 def unsupported(problem: Problem, members: Mapping[str, AffineMember]) -> str:
     """Reason why reduced models of a problem cannot be certified at online cost; "" if they can."""
     if not problem.has_contact:
         return "the problem does not assemble its constraint on its contact unknowns (`contact_dofs` and `contact`)"
+    count = len(contact_unknowns(problem))
+    # 4 GiB: the inverse is one such array, its factor another
+    if 8 * count**2 > 2**32:
+        return (
+            f"the constraint touches {count} unknowns, and certificates need their compliance, a dense matrix of "
+            f"{8e-9 * count**2:.0f} GB; the limit is 4.3 GB, {isqrt(2**29)} unknowns"
+        )
     if reason := "; ".join(members[name].reason for name in ("A", "f") if members[name].way is Evaluation.FULL):
         return reason
     if problem.parameters.listed is not None and not all(is_exact(problem, name, members[name]) for name in "Af"):
@@ -218,7 +232,8 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
     A, f, dofs = members["A"], members["f"], contact_unknowns(problem)
     constant = is_exact(problem, "A", A) and A.way is Evaluation.CONSTANT
     box = problem.parameters
-    at_centre = A.terms[0] if constant else checked_assembly(problem, 0.5 * (box.lower + box.upper)).A
+    centre = 0.5 * (box.lower + box.upper)
+    at_centre = A.terms[0] if constant else checked_assembly(problem, centre).A
     X = InnerProduct(at_centre, "A", problem.factorisation)
     terms, rotation, spectral, leading = list(A.terms), None, None, len(A.terms)
     evaluate = coefficients(problem, *evaluated_members({"A": A, "f": f}))
@@ -228,8 +243,9 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
         leading = len(terms) if is_exact(problem, "A", A) else leading_terms(T @ samples)
     load, stiffness, left_out = _interpolation_errors(problem, X, members, evaluate, rotation, terms, leading)
     if not constant:
+        ranges = TermRanges.of(A.terms, evaluate(centre)["A"], X) if A.way is Evaluation.AFFINE else None
         spectral = spectral_bounds(
-            problem, X, terms[:leading], lambda mu: T @ evaluate(mu).get("A", np.ones(1)), left_out
+            problem, X, terms[:leading], lambda mu: T @ evaluate(mu).get("A", np.ones(1)), left_out, ranges
         )
     pattern = EliminationPattern.of(X.matrix, dofs, X.factorisation)
     condensed = StaticCondensation(X.matrix, pattern, X.factorisation)

@@ -125,7 +125,7 @@ class _Query:
         self.problem, self.mu, self.x, self.lam, self.y = problem, mu, x, lam, evaluated.in_space(x)
         self.A, self.samples, self._contact = reduced.program.A, evaluated.samples, evaluated.contact
         self.theta = base.coefficients(self.samples)
-        self.lower, self.upper = base.spectrum(mu, self.theta["A"])
+        self.lower, self.upper = base.spectrum(mu, self.theta["A"], self.samples)
 
     @property
     def contact(self) -> Contact:

@@ -3,7 +3,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -513,6 +513,15 @@ def test_problems_that_cannot_be_certified_say_why() -> None:
     assert "contact unknowns" in unsupported(problem, members)
     with pytest.raises(UnsupportedError, match="contact unknowns"):
         certificate_base(problem, members, problem.training_set())
+
+
+def test_a_compliance_that_fits_no_memory_is_refused() -> None:
+    """A domain obstacle of 30,000 unknowns needs a dense matrix of 7 GB."""
+    wide = cast(Any, SimpleNamespace(has_contact=True, contact_dofs=np.arange(30_000)))
+    assert unsupported(wide, {}) == (
+        "the constraint touches 30000 unknowns, and certificates need their compliance, a dense matrix of 7 GB; the "
+        "limit is 4.3 GB, 23170 unknowns"
+    )
 
 
 def test_what_is_stored_is_of_contact_and_reduced_size() -> None:

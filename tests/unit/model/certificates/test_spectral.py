@@ -8,12 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import space, spd
 
-from vibench import InnerProduct, create
+from vibench import InnerProduct
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import Problem, VariationalInequality
-from vibench.model.certificates import spectral
-from vibench.model.certificates.spectral import anchors, leading_terms, rotated, spectral_bounds
-from vibench.stability.coercivity import Constant, operator_norm
+from vibench.model.certificates.spectral import AnchorGrid, TermRanges, leading_terms, rotated, spectral_bounds
+from vibench.stability.coercivity import operator_norm
 
 N, Q = 6, 3
 rng = np.random.default_rng(7)
@@ -84,12 +83,69 @@ def test_rotated_terms_have_the_same_sum() -> None:
     np.testing.assert_allclose(inner, np.eye(Q), atol=1e-12)
 
 
-@pytest.mark.parametrize(("dim", "count"), [(1, 9), (2, 9), (3, 4), (4, 3), (6, 2), (9, 1)])
-def test_anchors_are_as_many_as_may_be(dim: int, count: int) -> None:
-    box = ParameterBox(tuple("abcdefghi"[:dim]), np.zeros(dim), np.ones(dim), ("1",) * dim)
-    points, found = anchors(box)
-    assert found == count
-    assert len(points) == count**dim <= 81
+def box(dim: int) -> ParameterBox:
+    return ParameterBox(tuple("abcdefghi"[:dim]), np.full(dim, 0.5), np.full(dim, 2.0), ("1",) * dim)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 4, 6, 9])
+def test_anchors_cover_the_parameters_of_a_alone(dim: int) -> None:
+    """Of nine parameters some move A, along a curve; there are at most 81 anchors, and one where these are too few."""
+    grid = AnchorGrid.of(box(9), lambda mu: np.append(mu[9 - dim :] ** 4, 1.0), np.ones(dim + 1))
+    points = grid.points(box(9))
+    assert len(points) == np.prod(grid.counts) <= 81
+    assert np.array_equal(grid.axes, np.arange(9 - dim, 9) if dim < 9 else [])
+    assert np.all(points[:, : 9 - dim] == 1.25)
+    for point in points[:: max(1, len(points) // 9)]:
+        where, weights = grid.weights(point)
+        assert sum(weights) == pytest.approx(1.0)
+        assert points[np.array(where)[np.array(weights) > 1e-6]] == pytest.approx(point[None])
+
+
+def test_a_straight_path_has_four_anchors_and_a_curve_the_others() -> None:
+    """1/b² moves A along a line however fast, so that interpolation between its anchors leaves nothing."""
+    of = lambda mu: np.outer([1.0, mu[0], mu[0] ** 3], [1.0, mu[1] ** -2]).ravel()  # noqa: E731
+    grid = AnchorGrid.of(box(2), of, np.ones(6))
+    points = grid.points(box(2))
+    assert grid.counts[1] == 4 < grid.counts[0]
+    for mu in np.column_stack([np.repeat(points[::4, 0], 3), np.tile([0.6, 1.1, 1.9], len(points) // 4)]):
+        where, weights = grid.weights(mu)
+        assert weights @ np.array([of(point) for point in points[where]]) == pytest.approx(of(mu), rel=5e-3)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 4), st.integers(0, 3))
+@settings(max_examples=25, deadline=None)
+def test_ranges_of_terms_bound_any_sum(seed: int, definite: int, others: int) -> None:
+    """Semidefinite terms of low rank, and indefinite ones, with coefficients of any sign."""
+    rng = np.random.default_rng(seed)
+    factors = [rng.standard_normal((N, int(rank))) for rank in rng.integers(1, N + 1, definite)]
+    random = rng.standard_normal((others, N, N))
+    terms = [*(F @ F.T for F in factors), *(M + M.T for M in random), spd(N, rng, 10.0)]
+    reference = rng.uniform(0.5, 2.0, len(terms)) * rng.choice([-1.0, 1.0], len(terms))
+    reference[-1] = 1.0 + sum(
+        abs(theta) * np.linalg.norm(term, 2) for theta, term in zip(reference, terms, strict=True)
+    )
+    X = InnerProduct(sp.csc_array(sum(theta * term for theta, term in zip(reference, terms, strict=True))))
+    ranges = TermRanges.of([sp.csr_array(term) for term in terms], reference, X)
+    assert ranges is not None
+    for _ in range(20):
+        theta = reference * rng.uniform(-0.2, 3.0, len(terms))
+        low, high = ranges.evaluate(theta)
+        matrix = sum(t * term for t, term in zip(theta, terms, strict=True))
+        values = scipy.linalg.eigvalsh(matrix, X.matrix.toarray())
+        assert low <= values[0]
+        assert values[-1] <= high
+
+
+def test_of_patches_alpha_is_the_smallest_quotient_of_coefficients() -> None:
+    """The bound min θ_q(µ)/θ_q(µ̄) of semidefinite terms: it is attained where each acts alone."""
+    patches = [sp.csr_array(np.diag([float(k == q) for k in range(9)])) for q in range(9)]
+    ranges = TermRanges.of(patches, np.full(9, 0.5), InnerProduct(sp.csc_array(0.5 * np.eye(9))))
+    assert ranges is not None
+    theta = np.random.default_rng(0).uniform(0.1, 1.0, 9)
+    low, high = ranges.evaluate(theta)
+    assert theta.min() / 0.5 * (1.0 - 1e-6) <= low <= theta.min() / 0.5 <= theta.max() / 0.5 <= high
+    assert high <= theta.max() / 0.5 * (1.0 + 2e-3)
+    assert TermRanges.of(patches, np.array([0.0] * 9), X) is None
 
 
 def test_the_norm_of_an_operator_is_not_below_its_largest_eigenvalue_in_modulus() -> None:
@@ -102,28 +158,13 @@ def test_the_norm_of_an_operator_is_not_below_its_largest_eigenvalue_in_modulus(
     assert operator_norm(sp.csc_array((N, N)), X).value == 0.0
 
 
-def test_anchors_at_which_a_is_the_same_share_their_constants(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A of `hertz3d` depends on one of four parameters."""
-    problem, calls = create("problem", "hertz3d", {"resolution": 1000}), []
-
-    def counted(A: sp.csr_array, X: InnerProduct) -> tuple[Constant, Constant]:
-        calls.append(A)
-        return Constant(0.5, True), Constant(2.0, True)
-
-    monkeypatch.setattr(spectral, "coercivity_and_continuity", counted)
-    A = problem.affine["A"]
-    bounds = spectral.spectral_bounds(problem, problem.V, list(A.terms), A.coefficients, 0.0)
-    assert len(bounds.alpha) == bounds.count**4
-    assert len(calls) == bounds.count
-
-
 def test_terms_that_are_left_out_are_bounded_by_what_they_are() -> None:
     """The last of three terms, with its largest norm in the place of an error that was measured."""
     points = Curved.parameters.sample(50, 2)
     last = [abs((T @ theta(mu))[2]) * operator_norm(ROTATED[2], X).value for mu in points]
     found = spectral_bounds(Curved(), X, ROTATED[:2], lambda mu: T @ theta(mu), 1.5 * max(last))
-    assert found.norms[2] == 0.0
-    assert np.array_equal(found.norms[:2], BOUNDS.norms[:2])
+    assert found.turn.shape == (2, 3)
+    assert not found.turn[:, 2].any()
     for mu in points:
         low, high = found.evaluate(mu, T @ theta(mu))
         smallest, largest = extremes(mu)
