@@ -184,17 +184,13 @@ def test_enlarged_generators_are_better_conditioned_and_leave_less_of_the_snapsh
     assert cone.fallbacks == ()
 
 
-def test_a_sweep_that_is_not_enough_is_recorded() -> None:
+def test_sweeps_that_are_not_enough_and_steps_only_feasible_are_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     theta, X = bumps(25)
     assert EnlargedCPG(sweeps=1).reduce(theta, X, Stop(size=8)).fallbacks == ("generators still changed in sweep 1",)
-
-
-def test_a_step_that_is_only_feasible_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     whole: Callable[..., tuple[Array, str]] = enlarged_cpg.subtract_cone_component
     monkeypatch.setattr(enlarged_cpg, "subtract_cone_component", lambda *data: (whole(*data)[0], "not optimal"))
     theta, X = bumps(5)
-    notes = EnlargedCPG().reduce(theta, X, Stop(size=3)).fallbacks
-    assert notes[0] == "sweep 1, generator 1: not optimal"
+    assert EnlargedCPG().reduce(theta, X, Stop(size=3)).fallbacks[0] == "sweep 1, generator 1: not optimal"
 
 
 def test_a_generator_that_the_others_contain_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -227,19 +223,13 @@ def test_nmf_does_not_depend_on_how_long_basis_functions_are() -> None:
     assert np.allclose(one.errors, other.errors, rtol=1e-6)
 
 
-def test_a_factorisation_that_was_stopped_is_recorded() -> None:
+def test_a_factorisation_that_was_stopped_is_recorded_and_one_that_misses_its_tolerance_refused() -> None:
     theta, X = bumps()
-    assert NonnegativeFactors(iterations=1).reduce(theta, X, Stop(size=4)).fallbacks == (
-        "the factorisation was stopped after 1 iterations",
-    )
+    stopped = NonnegativeFactors(iterations=1).reduce(theta, X, Stop(size=4)).fallbacks
+    assert stopped == ("the factorisation was stopped after 1 iterations",)
     assert NonnegativeFactors(iterations=100_000).reduce(theta, X, Stop(size=2)).fallbacks == ()
-
-
-def test_a_tolerance_that_no_factorisation_reaches_ends_with_a_reason() -> None:
-    theta, X = bumps()
-    with pytest.raises(
-        NumericalError, match=r"no factorisation reaches tolerance 1e-14: the best of up to 12 generators"
-    ):
+    reason = r"no factorisation reaches tolerance 1e-14: the best of up to 12 generators"
+    with pytest.raises(NumericalError, match=reason):
         NonnegativeFactors(iterations=2).reduce(theta, X, Stop(tolerance=1e-14))
 
 
