@@ -258,7 +258,7 @@ def test_a_value_that_is_none_of_its_column_is_refused(command: str, results: Pa
     for (table, column, value), expected in WRONG.items():
         results.write_bytes(content)
         execute(results.parent, f"UPDATE {table} SET {column} = {value} WHERE rowid = 1")
-        more = {"show": ["--table", table], "compare": [folder], "report": ["--no-figures"], "figures": ["--jobs", "1"]}
+        more = {"show": ["--table", table], "compare": [folder], "report": ["--no-figures"], "figures": []}
         code, _, errors = main(command, folder, *more[command])
         assert code == 2
         assert f"in the column '{column}' of '{table}', expected {expected}" in errors

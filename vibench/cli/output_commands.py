@@ -33,13 +33,12 @@ def write_report(
     figures: Annotated[bool, Option("--figures/--no-figures", help="Add pictures, which take most time.")] = True,
 ) -> None:
     """Write the report of a run as one HTML page."""
-    from vibench import provenance
     from vibench.execution.recording import REPORT
     from vibench.report import html
     from vibench.results.read import results_file
 
     path = results_file(run)
-    written = html.write(path, out or path.parent / REPORT, provenance.cores(), figures=figures)
+    written = html.write(path, out or path.parent / REPORT, figures=figures)
     echo(f"report: {written}")
 
 
@@ -47,7 +46,6 @@ def draw_figures(
     names: RunsArgument,
     out: Annotated[Path | None, Option(metavar="DIR", help="Folder; RUN/figures by default.")] = None,
     formats: Annotated[list[FigureFormat] | None, Option("--format", help="Default: png and svg (repeatable).")] = None,
-    jobs: Annotated[int | None, Option("--jobs", "-j", min=0, help="Processes; one per core by default.")] = None,
 ) -> None:
     """Draw the figures of runs, with captions."""
     from vibench.results.read import results_file
@@ -58,20 +56,18 @@ def draw_figures(
     if out is not None and len(paths) > 1:
         raise RequestError("--out is for the figures of one run; those of several go into their folders")
     for path in paths:
-        draw_run(path, out or path.parent / "figures", jobs, forms)
+        draw_run(path, out or path.parent / "figures", forms)
 
 
-def draw_run(path: Path, folder: Path, jobs: int | None, formats: tuple[str, ...] = ("png", "svg")) -> None:
+def draw_run(path: Path, folder: Path, formats: tuple[str, ...] = ("png", "svg")) -> None:
     """Draw all figures of a results file; Ctrl-C leaves the results and the figures that are drawn."""
-    from vibench import provenance
     from vibench.library.progress import DrawingDisplay
     from vibench.report import figures
 
-    cores = provenance.cores()
     # The run is complete at this point: Ctrl-C costs pictures alone, and says how to get them.
     try:
         with DrawingDisplay() as display:
-            drawn = figures.draw_all(path, folder, formats, min(jobs or cores, cores), display.show)
+            drawn = figures.draw_all(path, folder, formats, display.show)
     except KeyboardInterrupt:
         missing = f"some figures are missing; `vibench figures {run_argument(path.parent)}` draws them"
         echo(f"interrupted while drawing: results and tables are complete, {missing}")

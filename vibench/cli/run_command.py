@@ -80,11 +80,11 @@ def run_study_command(
     options = Options(jobs, fresh, retry, executor, scheduler, repeats)
     with ProgressDisplay() as progress:
         outcome = run_study(loaded, folder, progress, options)
-    _conclude(loaded.name, outcome, folder, draw=options.workers if draw else None, fresh=fresh, strict=strict)
+    _conclude(loaded.name, outcome, folder, draw=draw, fresh=fresh, strict=strict)
 
 
-def _conclude(name: str, outcome: RunResult, folder: Path, *, draw: int | None, fresh: bool, strict: bool) -> None:
-    """Write the tables, print the summary and draw the figures of a run on `draw` processes; exit by its statuses."""
+def _conclude(name: str, outcome: RunResult, folder: Path, *, draw: bool, fresh: bool, strict: bool) -> None:
+    """Write the tables, print the summary and draw the figures of a run; exit by its statuses."""
     from vibench.results import show
     from vibench.results.read import results_file
 
@@ -103,7 +103,7 @@ def _conclude(name: str, outcome: RunResult, folder: Path, *, draw: int | None, 
     whole = not nothing_ran and print_summary(name, path, outcome.rows)
     echo(f"results: {path}, tables: {folder / 'tables'}")
     # Figures of an earlier run would show other numbers.
-    if (fresh or draw is not None) and (folder / "figures").is_dir():
+    if (fresh or draw) and (folder / "figures").is_dir():
         from vibench.report import figures
 
         figures.remove(folder / "figures")
@@ -111,10 +111,10 @@ def _conclude(name: str, outcome: RunResult, folder: Path, *, draw: int | None, 
         reasons = list(dict.fromkeys(str(row["reason"]) for row in outcome.rows))
         more = [f"{len(reasons) - REASONS} other reasons"] if len(reasons) > REASONS else []
         raise VibenchError(f"no cell could run here: {'; '.join([*reasons[:REASONS], *more])}")
-    if draw is not None:
-        output_commands.draw_run(path, folder / "figures", draw)
+    if draw:
+        output_commands.draw_run(path, folder / "figures")
     table = "this table again" if whole else f"all {len(statuses)} cells"
-    next_steps(folder, table, all_ok=set(statuses) == {Status.OK}, figures=draw is not None)
+    next_steps(folder, table, all_ok=set(statuses) == {Status.OK}, figures=draw)
     if strict and any(status not in (Status.OK, Status.UNAVAILABLE) for status in statuses):
         raise typer.Exit(1)
 

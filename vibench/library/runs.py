@@ -179,7 +179,7 @@ class Run:
 
         target = self.path.parent / "figures" if folder is None else Path(folder)
         with writing(target):
-            return draw_all(self.path, target, tuple(formats), 1)
+            return draw_all(self.path, target, tuple(formats))
 
     @requested
     def report(self, path: Path | str | None = None, *, figures: bool = True) -> Path:
@@ -190,7 +190,7 @@ class Run:
         from vibench.report import html  # noqa: PLC0415  loads matplotlib
 
         target = self.path.parent / REPORT if path is None else Path(path)
-        return html.write(self.path, target, jobs=1, figures=figures)
+        return html.write(self.path, target, figures=figures)
 
     @requested
     def model(self, cell: str) -> Model:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from itertools import groupby
@@ -20,7 +19,7 @@ from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.qp.status import Status
 from vibench.report import findings, plots
-from vibench.report.figures import FigureTask, figures_of, processes, render
+from vibench.report.figures import FigureTask, figures_of, render
 from vibench.report.figures.data import Extent, ProblemTables, label_of, problem_tables, whole
 from vibench.report.plots import image_of, script_safe, short
 from vibench.results import formats, pictures, ranking, show
@@ -152,11 +151,8 @@ def _column(name: str, values: pd.Series) -> dict[str, Any]:
     return {"name": heading, "levels": levels, "codes": [number[text] for text in texts]}
 
 
-def write(path: Path, target: Path, jobs: int, *, figures: bool = True) -> Path:
+def write(path: Path, target: Path, *, figures: bool = True) -> Path:
     """Write the page of a results file as `target`; an interrupted call leaves no incomplete file under its name.
-
-    `jobs` processes draw its pictures, which take most of the time, this one included. The others import the main
-    module: a script that calls this with more than one needs the guard ``if __name__ == "__main__"``.
 
     Raises a `RequestError` if `target` is the results file, or cannot be written.
     """
@@ -164,16 +160,14 @@ def write(path: Path, target: Path, jobs: int, *, figures: bool = True) -> Path:
     if os.path.realpath(target) == os.path.realpath(path):
         raise RequestError(f"'{target}' is the results file itself; choose another file for the report")
     try:
-        with processes(jobs if figures else 1) as pool:
-            text = page(path, pool, figures=figures)
-        write_atomically(target, text.encode("utf-8"))
+        write_atomically(target, page(path, figures=figures).encode("utf-8"))
     except OSError as error:
         raise RequestError(f"'{target}' cannot be written: {error.strerror}") from None
     return target
 
 
-def page(path: Path, pool: ProcessPoolExecutor | None = None, *, figures: bool = True) -> str:
-    """The page of a results file; processes of a pool draw its pictures, too."""
+def page(path: Path, *, figures: bool = True) -> str:
+    """The page of a results file."""
     study, read = study_of(path, read_meta(path)), {name: read_table(path, name) for name in TABLES}
     cells, data_of = in_order(read["cells"]), dict(problem_tables(path, read))
     # Histories may have millions of rows, and `data_of` has them.
@@ -190,8 +184,7 @@ def page(path: Path, pool: ProcessPoolExecutor | None = None, *, figures: bool =
     certified = ranking.certified_errors(read["queries"])
     first_plots = [p for name, data in data_of.items() for p in plots.overview(name, data, rows, paired, certified)]
     tasks = [task for name, data in data_of.items() for task in tasks_of(name, data)] if figures else []
-    rendered = render(tasks, image_of, pool)
-    images = [image for pages in rendered for image in pages]
+    images = render(tasks, image_of)
     templates = files("vibench.report") / "templates"
     style, script = ((templates / f"report.{end}").read_text(encoding="utf-8").strip() for end in ("css", "js"))
     template = environment("templates", trim_blocks=True, lstrip_blocks=True).get_template("report.html.j2")

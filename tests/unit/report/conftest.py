@@ -38,7 +38,7 @@ def reported(quick_run: Path) -> Path:
             with pytest.MonkeyPatch.context() as patch:
                 tasks_of = html.tasks_of
                 patch.setattr(html, "tasks_of", lambda name, data: tasks_of(name, data) if name == "obstacle" else [])
-                html.write(folder / FILE, folder / "report.html", jobs=1)
+                html.write(folder / FILE, folder / "report.html")
     return folder
 
 

@@ -63,7 +63,7 @@ def drawn_from(results: Path, folder: Path, *kinds: str, rendered: bool = False)
         for group in ("OF_PROBLEM", "OF_DUAL"):
             chosen = {kind: draw for kind, draw in getattr(figures, group).items() if not kinds or kind in kinds}
             patch.setattr(figures, group, chosen)
-        files = draw_all(results, folder, ("png", "svg"), 1)
+        files = draw_all(results, folder, ("png", "svg"))
     assert [path.stem for path in files] == [name for name in kept for _ in ("png", "svg")]
     captions = ["captions.json"] * bool(files)
     assert sorted([path.name for path in files] + captions) == sorted(path.name for path in folder.glob("*"))
@@ -232,20 +232,9 @@ def test_a_logarithmic_panel_with_nothing_to_show_stays_empty(change: Callable[.
         assert 0.0 < low < high
 
 
-def test_figures_read_histories_if_and_only_if_they_are_listed(quick_run: Path) -> None:
-    """Those that are not listed are drawn by other processes, which have none."""
-    every, reading = (*OF_PROBLEM.values(), *OF_DUAL.values()), set()
-    for _, draw, data in figures.drawings(quick_run / FILE):
-        try:
-            list(draw(replace(data, histories=None)))
-        except TypeError:  # None has no rows
-            reading.add(draw)
-    assert reading == {draw for draw in every if draw.__module__ == convergence.__name__}
-
-
 def test_without_queries_nothing_is_drawn(change: Callable[..., None], results: Path, tmp_path: Path) -> None:
     change("DELETE FROM queries")
-    assert draw_all(results, tmp_path / "figures", ("png", "svg"), 1) == []
+    assert draw_all(results, tmp_path / "figures", ("png", "svg")) == []
 
 
 def test_cells_that_failed_do_not_stop_the_others(change: Callable[..., None], draw: Draw) -> None:
@@ -433,22 +422,15 @@ def test_the_same_results_give_the_same_files(results: Path, tmp_path: Path) -> 
             assert first.read_bytes() == second.read_bytes(), first.name
 
 
-def test_several_processes_draw_the_same_files(
+def test_progress_names_every_figure_and_shows_the_end(
     change: Callable[..., None], results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also those of figures that read tables which are not sent to other processes."""
     change("DELETE FROM queries WHERE problem = 'hertz' OR dual = 'cpg'")
-    kinds = ("errors", "work-precision", "solvers", "total-cost")
-    monkeypatch.setattr(figures, "OF_PROBLEM", {kind: OF_PROBLEM[kind] for kind in kinds})
+    monkeypatch.setattr(figures, "OF_PROBLEM", {"solvers": OF_PROBLEM["solvers"]})
     shown: list[tuple[str, int, int]] = []
-    one, two = (
-        draw_all(results, tmp_path / f"{jobs}", ("svg",), jobs, lambda *now: shown.append(now)) for jobs in (1, 2)
-    )
-    assert [now for now in shown if now[1] == now[2]] == 2 * [("", len(one), len(one))]  # the end is shown, too
-    assert len(one) == len(kinds) + len(figures.OF_DUAL)
-    assert [file.name for file in one] == [file.name for file in two]
-    for first, second in zip(one, two, strict=True):
-        assert first.read_bytes() == second.read_bytes(), first.name
+    draw_all(results, tmp_path, ("svg",), lambda *now: shown.append(now))
+    names = ["obstacle-solvers", *(f"obstacle-mcpg-{kind}" for kind in OF_DUAL), ""]
+    assert shown == [(name, k, len(names) - 1) for k, name in enumerate(names)]
 
 
 def test_the_tightest_enrichment_is_the_one_that_went_farthest(results: Path) -> None:
@@ -482,8 +464,7 @@ def test_a_long_figure_is_drawn_in_parts(results: Path) -> None:
     data = dict(of_file(results))["obstacle"].restrict_to_dual("mcpg")
     pairs = pd.concat([data.queries.assign(pair=f"pair {k}") for k in range(8)])
     task = ("name", figures.inf_sup, replace(data, queries=pairs, extent=Extent.PAGES))
-    (rendered,) = figures.render([task], lambda name, figure: (name, figure))
-    drawn = dict(rendered)
+    drawn = dict(figures.render([task], lambda name, figure: (name, figure)))
     assert list(drawn) == ["name", "name-2"]
     assert [len([axes for axes in figure.axes if axes.get_title()]) for figure in drawn.values()] == [6, 2]
     assert [figure.caption[-12:] for figure in drawn.values()] == ["Part 1 of 2.", "Part 2 of 2."]

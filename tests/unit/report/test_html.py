@@ -13,11 +13,8 @@ from outputs import Links, clean, elements
 from running import Changed, Main
 
 from vibench.report import html
-from vibench.report.figures import processes, render
 from vibench.report.figures.data import problem_tables
 from vibench.report.findings import Finding, Weight, findings
-from vibench.report.html import tasks_of
-from vibench.report.plots import image_of
 from vibench.results.ranking import leaderboard
 from vibench.results.read import in_order, read_table
 from vibench.results.schema import STORED, TABLES
@@ -208,14 +205,3 @@ def test_answers_that_are_all_undecided_are_shown(changed: Changed) -> None:
     path = changed("UPDATE thresholds SET meaning = 'undecided', benefit_threshold = NULL, threshold_low = 7")
     table = data(html.page(path, figures=False), "table-data")["model"]
     assert "break-even" not in table["hidden"]
-
-
-def test_several_processes_draw_the_same_pictures_in_the_same_order(quick_run: Path) -> None:
-    """Also those that read tables which are not sent to other processes."""
-    name, data = next(iter(problem_tables(quick_run / FILE)))
-    tasks = [task for task in tasks_of(name, data) if task[0].endswith(("errors", "solvers", "-inf-sup"))]
-    alone = render(tasks, image_of)
-    with processes(2) as pool:
-        together = render(tasks, image_of, pool)
-    assert [len(pages) for pages in alone] == [1] * 3
-    assert alone == together

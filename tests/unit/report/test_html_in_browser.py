@@ -327,7 +327,7 @@ def test_on_paper_pictures_take_the_place_of_plots(browser: Chrome, made: Path) 
 
 def test_a_page_of_many_cells_shows_some_rows_at_a_time(browser: Chrome, quick_run: Path, tmp_path: Path) -> None:
     path = write_many(quick_run, tmp_path / "many", 120, queries=1)
-    page = html.write(path, tmp_path / "many.html", jobs=1, figures=False)
+    page = html.write(path, tmp_path / "many.html", figures=False)
     look(browser, page)
     count = '[data-table="summary"] .count'
     first = shown_rows(browser)

@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import pickle
 import re
-import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import replace
-from functools import cache, partial
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import TypeVar
 
-import pandas as pd
 from matplotlib.figure import Figure
 
-from vibench import interrupts
 from vibench.errors import RequestError, unknown_name
-from vibench.files import TEMPORARY, read_regular, write_atomically
-from vibench.report.figures import convergence
+from vibench.files import read_regular, write_atomically
 from vibench.report.figures.constants import inf_sup
 from vibench.report.figures.convergence import enrichment, projection_errors
 from vibench.report.figures.costs import solvers, total_cost, work_precision
@@ -111,19 +103,17 @@ def read_captions(folder: Path) -> dict[str, str]:
 
 
 def draw_all(
-    path: Path, folder: Path, formats: tuple[str, ...], jobs: int,
+    path: Path, folder: Path, formats: tuple[str, ...],
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> list[Path]:  # fmt: skip
     """Draw every figure that a results file has data for, in every format; returns the files written to the folder.
 
     Beside them is `captions.json`, with the caption of every figure by the name of its files.
 
-    Formats are "png", "svg" and "pdf"; `jobs` processes draw, this one included. `progress` is called before a figure
-    is drawn here, with its name, the number of those done, and that of all there may be.
+    Formats are "png", "svg" and "pdf". `progress` is called before a figure is drawn, with its name, the number of
+    those done, and that of all there may be.
     """
-    with processes(jobs) as pool:
-        figures = render(list(drawings(path)), partial(_save, folder, formats), pool, progress)
-    pages = [page for figure in figures for page in figure]
+    pages = render(list(drawings(path)), partial(_save, folder, formats), progress)
     if pages:
         captions = read_captions(folder) | {name: caption for name, caption, _ in pages}
         text = json.dumps(captions, ensure_ascii=False, indent=1) + "\n"
@@ -137,64 +127,18 @@ def _save(folder: Path, formats: tuple[str, ...], name: str, figure: Figure) -> 
     return name, caption_of(figure), save(figure, folder, name, formats)
 
 
-@contextlib.contextmanager
-def processes(jobs: int) -> Iterator[ProcessPoolExecutor | None]:
-    """Context with `jobs` processes that draw, this one included; the others load Matplotlib in the meantime."""
-    if jobs < 2:
-        yield None
-        return
-    pool = ProcessPoolExecutor(jobs - 1, get_context("spawn"))
-    try:
-        # Ctrl-C is for this process to handle.
-        with interrupts.held():
-            for _ in range(jobs - 1):
-                pool.submit(_tasks_in, None)
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
 def render(
-    tasks: Sequence[FigureTask], finish: Callable[[str, Figure], Made], pool: ProcessPoolExecutor | None = None,
+    tasks: Sequence[FigureTask], finish: Callable[[str, Figure], Made],
     progress: Callable[[str, int, int], None] = lambda *_: None,
-) -> list[list[Made]]:  # fmt: skip
-    """Draw figures here and in the processes of a pool; returns the results of `finish(name, page)` by figure."""
-    rendered: dict[int, list[Made]] = {}
-    with contextlib.ExitStack() as stack:
-        awaited = {} if pool is None else stack.enter_context(_submitted(tasks, finish, pool))
-        # The others draw from the last figure on, this process what only it can and then what they have not begun.
-        for k in sorted(range(len(tasks)), key=lambda k: k in awaited):
-            if k not in awaited or awaited[k].cancel():
-                awaited.pop(k, None)
-                progress(tasks[k][0], len(rendered) + sum(one.done() for one in awaited.values()), len(tasks))
-                rendered[k] = _render(tasks[k], finish)
-        for k, one in awaited.items():
-            progress(tasks[k][0], len(rendered), len(tasks))
-            rendered[k] = one.result()
-    progress("", len(rendered), len(tasks))
-    return [rendered[k] for k in range(len(tasks))]
-
-
-@contextlib.contextmanager
-def _submitted(
-    tasks: Sequence[FigureTask], finish: Callable[[str, Figure], Made], pool: ProcessPoolExecutor
-) -> Iterator[dict[int, Future[list[Made]]]]:
-    """Context with the figures that other processes may draw, by place."""
-    # Only figures of `convergence` read histories, which are never sent: a large study has millions of rows, and their
-    # few lines are drawn in less time.
-    places = [k for k, (_, draw, _) in enumerate(tasks) if draw.__module__ != convergence.__name__]
-    # None, since other figures that read histories would not notice empty ones.
-    none = cast("pd.DataFrame", None)
-    sent = [(name, draw, replace(data, histories=none)) for name, draw, data in (tasks[k] for k in places)]
-    with contextlib.ExitStack() as stack:
-        try:
-            file = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=TEMPORARY))) / "tasks"
-            # Written once for all of them: the tables that they share are large.
-            file.write_bytes(pickle.dumps(sent))
-        except OSError:
-            # Without room for it this process draws them all.
-            places.clear()
-        yield {places[k]: pool.submit(_render_sent, file, k, finish) for k in reversed(range(len(places)))}
+) -> list[Made]:  # fmt: skip
+    """Draw figures; returns the results of `finish(name, page)` of all their pages."""
+    rendered: list[Made] = []
+    for k, task in enumerate(tasks):
+        progress(task[0], k, len(tasks))
+        with styled():
+            rendered += [finish(name, page) for name, page in pages_of(task)]
+    progress("", len(tasks), len(tasks))
+    return rendered
 
 
 def pages_of(task: FigureTask) -> Iterator[tuple[str, Figure]]:
@@ -202,18 +146,3 @@ def pages_of(task: FigureTask) -> Iterator[tuple[str, Figure]]:
     name, draw, data = task
     for k, page in enumerate(draw(data), 1):
         yield name + f"-{k}" * (k > 1), page
-
-
-def _render(task: FigureTask, finish: Callable[[str, Figure], Made]) -> list[Made]:
-    with styled():
-        return [finish(name, page) for name, page in pages_of(task)]
-
-
-def _render_sent(file: Path, number: int, finish: Callable[[str, Figure], Made]) -> list[Made]:
-    return _render(_tasks_in(file)[number], finish)
-
-
-@cache
-def _tasks_in(file: Path | None) -> Sequence[FigureTask]:
-    """The figures that another process has written to a file; none without one."""
-    return () if file is None else pickle.loads(file.read_bytes())
