@@ -20,6 +20,7 @@ from .errors import UnsupportedError as UnsupportedError
 from .errors import VibenchError as VibenchError
 from .highfidelity.active_set import HighFidelitySolution as HighFidelitySolution
 from .highfidelity.active_set import HighFidelitySolver as HighFidelitySolver
+from .interfaces.absent_rows import is_absent as is_absent
 from .interfaces.affine import AffineSum as AffineSum
 from .interfaces.affine_problem import AffineProblem as AffineProblem
 from .interfaces.formulations import Formulation as Formulation
@@ -41,7 +42,6 @@ from .interfaces.problem import NestedStart as NestedStart
 from .interfaces.problem import Problem as Problem
 from .interfaces.problem import Sampler as Sampler
 from .interfaces.problem import VariationalInequality as VariationalInequality
-from .interfaces.problem import is_absent as is_absent
 from .interfaces.strategies import AdaptiveSampling as AdaptiveSampling
 from .interfaces.strategies import Cone as Cone
 from .interfaces.strategies import DualStrategy as DualStrategy

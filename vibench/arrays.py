@@ -6,7 +6,10 @@ from hashlib import sha256
 from typing import Any, TypeAlias
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
+
+from vibench.errors import NumericalError
 
 Array: TypeAlias = NDArray[np.float64]
 """A dense array of floats; the docstring of its user gives the shape."""
@@ -19,6 +22,43 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 SparseMatrix: TypeAlias = Any
 """A SciPy sparse array or matrix (SciPy ships no types)."""
+
+
+def real_matrix(value: Any, name: str) -> SparseMatrix:
+    """A matrix of any format and any type of real numbers as a sparse array of float64, in rows or columns.
+
+    Raises a `NumericalError` that calls it by `name` if it is something else.
+    """
+    if isinstance(value, sp.csr_array | sp.csc_array) and value.dtype == np.float64:
+        return value
+    if not (sp.issparse(value) or isinstance(value, np.ndarray)):
+        raise NumericalError(f"{name} is a {type(value).__name__}, expected a sparse matrix")
+    _check_real(value, name)
+    if value.ndim != 2:
+        raise NumericalError(f"{name} has shape {value.shape}, expected a matrix")
+    # Other formats lack what sparse arrays in rows can do, such as the choice of rows.
+    made = sp.csc_array if sp.issparse(value) and value.format == "csc" else sp.csr_array
+    return made(value, dtype=np.float64)
+
+
+def real_vector(value: Any, name: str) -> Array:
+    """A vector of any type of real numbers as an array of float64; raises as `real_matrix`."""
+    if type(value) is np.ndarray and value.dtype == np.float64:
+        return value
+    if not isinstance(value, np.ndarray):
+        raise NumericalError(f"{name} is a {type(value).__name__}, expected a vector, an array of NumPy")
+    _check_real(value, name)
+    return np.asarray(value, np.float64)
+
+
+def _check_real(value: Any, name: str) -> None:
+    if value.dtype.kind == "c":
+        raise NumericalError(f"{name} is complex; vibench is for real problems")
+    if value.dtype.kind not in "fiub":
+        raise NumericalError(f"{name} has entries of the type {value.dtype}, expected real numbers")
+    # A conversion would make numbers of the masked entries again.
+    if isinstance(value, np.ma.MaskedArray):
+        raise NumericalError(f"{name} is a masked array, expected numbers alone")
 
 
 def digest(matrix: SparseMatrix) -> bytes:

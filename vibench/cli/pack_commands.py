@@ -61,9 +61,11 @@ def pack(
         _reduce_cones(folder, dual or [], dual_tol, out)
     else:
         from vibench.packs.checks import read_model_pack
+        from vibench.packs.reader import naming
 
         checked = read_model_pack(folder)
-        echo(*_contents(checked), *_uses(checked, folder))
+        with naming(folder):
+            echo(*_contents(checked), *_uses(checked, folder))
 
 
 def _reduce_cones(folder: Path, dual: list[str], dual_tol: float, out: Path) -> None:
@@ -114,6 +116,14 @@ def _contents(pack: ModelPack) -> Iterator[str]:
     yield from (f"  {name}: {member}" for name, member in pack.members.items())
     count = "drawn at random in the box" if pack.validation is None else f"{len(pack.validation)} listed"
     yield f"  training parameters: {len(pack.training)}, validation parameters: {count}"
+    if pack.members:
+        from vibench.packs.checks import solve_at_training, zero_rows_of
+
+        mu, solution = solve_at_training(pack)
+        found = f"{int((solution.lam > 0.0).sum())} of {pack.W.dim} multipliers are positive"
+        yield f"  solved at mu = {mu.tolist()}: {found}, KKT residuals up to {solution.residuals.worst:.0e}"
+        if len(zero := zero_rows_of(pack)):
+            yield f"  {len(zero)} rows of B are zero at every listed parameter, the first is {zero[0]}"
     if pack.outputs:
         yield f"  outputs: {', '.join(f'{output.name} [{output.unit}]' for output in pack.outputs)}"
     if pack.reference is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,10 +13,10 @@ from vibench.arrays import Array, Mask, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness, condensed_stiffness
 from vibench.interfaces.problem import NestedStart, Problem, VariationalInequality
-from vibench.interfaces.validation import checked_assembly
+from vibench.interfaces.validation import at_parameter, checked_assembly, in_float64, settled
 from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.linalg.inner_product import check_symmetric
+from vibench.linalg.inner_product import check_positive_definite, check_symmetric
 from vibench.linalg.schur_complement import FEW_PER_UNKNOWN, EliminationPattern
 from vibench.qp import verification
 from vibench.qp.exact import least_distance_solution, rows_that_matter
@@ -67,6 +69,8 @@ class HighFidelitySolver:
         self._constrained = problem.contact_dofs if problem.contact_dofs is not None else np.zeros(0, dtype=np.intp)
         self._pattern: EliminationPattern | None = None
         self._stiffness: CondensedStiffness | None = None
+        # The constant stiffness that was found symmetric positive definite.
+        self._coercive: CondensedStiffness | None = None
         self._width = np.maximum(problem.parameters.upper - problem.parameters.lower, np.finfo(float).tiny)
         self._coarse: HighFidelitySolver | None = None
         self._solved: list[Array] = []
@@ -84,19 +88,30 @@ class HighFidelitySolver:
         return solution
 
     def solve_assembled(self, mu: Array, vi: VariationalInequality) -> ActiveSetSolution:
-        """Solve the variational inequality `vi` assembled at mu (d,); unless remembered, no other starts from it."""
-        return solve_unverified(vi, self.condensed(vi), self._start(mu))
+        """Solve the variational inequality `vi` assembled at mu (d,); unless remembered, no other starts from it.
+
+        Raises a `NumericalError` that names mu, and what A lacks if that is the cause.
+        """
+        with at_parameter(mu), _explained(vi, f"A at mu = {mu.tolist()}"):
+            return solve_unverified(vi, self.condensed(vi), self._start(mu))
 
     def verify(self, mu: Array, vi: VariationalInequality, unverified: ActiveSetSolution) -> HighFidelitySolution:
         """The solution of `vi`, which has to be the variational inequality solved last, at mu (d,), verified.
 
-        Raises a `NumericalError` if its residuals are above `ACCURACY`, or the problem refuses it.
+        Raises a `NumericalError` that names mu if A is not symmetric positive definite, which a constant one is asked
+        once, the residuals are above `ACCURACY`, or the problem refuses the solution.
         """
-        solution = verified(vi, self._stiffness or self.condensed(vi), unverified)
-        reason = self._problem.refuse(mu, solution.u, solution.lam)
-        if reason:
-            raise NumericalError(f"at mu = {mu.tolist()}: {reason}")
-        return solution
+        name = f"A at mu = {mu.tolist()}"
+        with at_parameter(mu), _explained(vi, name):
+            stiffness = self._stiffness or self.condensed(vi)
+            if self._coercive is not stiffness:
+                check_symmetric(vi.A, name)
+                stiffness.check_definite(name)
+                self._coercive = stiffness if "A" in self._problem.constant else None
+            solution = verified(vi, stiffness, unverified)
+            if reason := self._problem.refuse(mu, solution.u, solution.lam):
+                raise NumericalError(reason)
+            return solution
 
     def remember(self, mu: Array, solution: ActiveSetSolution) -> None:
         """Let later solutions start from the contact set of this one, at mu (d,)."""
@@ -107,17 +122,6 @@ class HighFidelitySolver:
         """Forget all solutions, so that no later one starts from them; factorisations stay."""
         self._solved.clear()
         self._active.clear()
-
-    def check_coercive(self, mu: Array, vi: VariationalInequality) -> None:
-        """Refuse a stiffness that is not symmetric positive definite.
-
-        The factorisation is reused: `vi` has to be the variational inequality solved last, at mu (d,).
-
-        Raises a `NumericalError` naming mu and the missing property.
-        """
-        name = f"A at mu = {mu.tolist()}"
-        check_symmetric(vi.A, name)
-        (self._stiffness or self.condensed(vi)).check_definite(name)
 
     def _start(self, mu: Array) -> Mask | None:
         """The initial active set, which the problem derives from the contact set of the nearest parameter."""
@@ -185,10 +189,25 @@ def solve_high_fidelity(
     Raises
     ------
     NumericalError
-        If neither the active set method nor its fallback reaches `ACCURACY`.
+        If A is not symmetric positive definite, or neither the active set method nor its fallback reaches `ACCURACY`.
     """
-    stiffness = stiffness or CondensedStiffness(vi.A)
-    return verified(vi, stiffness, solve_unverified(vi, stiffness, start))
+    vi = settled(in_float64(vi))
+    check_symmetric(vi.A, "A")
+    with _explained(vi, "A"):
+        stiffness = stiffness or CondensedStiffness(vi.A)
+        unverified = solve_unverified(vi, stiffness, start)
+        stiffness.check_definite("A")
+        return verified(vi, stiffness, unverified)
+
+
+@contextmanager
+def _explained(vi: VariationalInequality, name: str) -> Iterator[None]:
+    """Say what A, called by `name`, lacks where it is the cause of a failure in the block."""
+    try:
+        yield
+    except (NumericalError, RuntimeError, np.linalg.LinAlgError):
+        check_positive_definite(vi.A, name)
+        raise
 
 
 def solve_unverified(

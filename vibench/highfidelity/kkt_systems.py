@@ -25,6 +25,7 @@ from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky, symmetric_lu
 from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal, Factor
 from vibench.linalg.factorisations import DEFAULT, implementation
+from vibench.linalg.inner_product import check_regular
 from vibench.linalg.schur_complement import EliminationPattern, PrincipalSubmatrix, StaticCondensation
 from vibench.qp.scaling import row_norms
 from vibench.qp.verification import held_by_forces, norms_by_solutions
@@ -121,12 +122,8 @@ class CondensedStiffness:
 
         The elimination has factorised one block; A is definite exactly where the Schur complement is, too.
         """
-        if self._saddle is not None and self._saddle.is_definite:
-            return
-        if self.dense:
-            self._blocks  # noqa: B018  their Cholesky factorisation fails otherwise
-        else:
-            SparseCholesky(self._condensed.schur, name)  # its message has this name
+        if self._saddle is None or not self._saddle.is_definite:
+            check_regular(self._A, self.solve, name)
 
     def solve(self, right: Array) -> Array:
         """The solution A⁻¹ r for right-hand sides (n, k)."""
@@ -260,10 +257,6 @@ class ZoneStiffness(CondensedStiffness):
 
     def _condense(self) -> None:
         pass  # nothing is eliminated before it is asked for
-
-    def check_definite(self, name: str) -> None:
-        if "_solver" not in vars(self):
-            self._solver = implementation(self._factorisation).factorise(self._A, name)
 
     def solve(self, right: Array) -> Array:
         return self._solver.solve(right)
@@ -511,7 +504,7 @@ def _definite_pivots(factor: SuperLU, last: int) -> Array | None:
     pivots = np.asarray(factor.U.diagonal())
     size = len(pivots) - last
     # Rows have length 1 and A the diagonal 1: smaller pivots may consist of round-off alone.
-    regular = np.all(pivots[:size] > 0.0) and np.all(pivots[size:] < -1e-12)
+    regular = np.all(pivots[:size] > 16.0 * EPS * size) and np.all(pivots[size:] < -1e-12)
     natural = np.array_equal(factor.perm_r, np.arange(len(pivots)))
     return pivots if regular and natural else None
 

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.arrays import Array, Indices, SparseMatrix, real_vector
 from vibench.errors import NumericalError, RequestError, unknown_name
+from vibench.interfaces.absent_rows import ABSENT, is_absent
 from vibench.text import normal_name
 
 CONSTANTS: Mapping[str, float] = {"pi": math.pi, "e": math.e}
@@ -54,6 +55,12 @@ class Expression:
 
     text: str
     names: tuple[str, ...]
+
+    @property
+    def constant(self) -> float | None:
+        """Its value if that depends on no parameter, else `None`."""
+        used = {node.id for node in ast.walk(_tree(self.text)) if isinstance(node, ast.Name)}
+        return None if used.intersection(self.names) else self(np.zeros(len(self.names)))
 
     @classmethod
     def parse(cls, text: str, names: Sequence[str]) -> Expression:
@@ -187,6 +194,12 @@ class Thetas:
         """Whether all are numbers."""
         return not any(callable(theta) for theta in self.functions)
 
+    def number(self, q: int) -> float | None:
+        """The coefficient of a term if it is a number, or says that it is a constant one; else `None`."""
+        theta = self.functions[q]
+        constant: float | None = getattr(theta, "constant", None) if callable(theta) else theta
+        return constant
+
     def __call__(self, mu: Array) -> Array:
         """Evaluate all at mu (d,)."""
         return np.array([theta(mu) if callable(theta) else theta for theta in self.functions], float)
@@ -199,7 +212,8 @@ class AffineSum:
     Attributes
     ----------
     terms
-        Vectors of one length, or sparse matrices of one shape; at least one.
+        Vectors of one length, or sparse matrices of one shape; at least one. An infinite entry of a vector, of a row
+        that constrains nothing, belongs to a term whose coefficient is a positive number.
     thetas
         Function from mu (d,) to θ (Q,). A problem can be copied to another process only if this function can: a lambda
         cannot.
@@ -207,7 +221,7 @@ class AffineSum:
     Raises
     ------
     NumericalError
-        If there is no term, or the terms differ in their shapes.
+        If there is no term, the terms differ in their shapes, or an infinite entry has another coefficient.
     """
 
     terms: tuple[Any, ...]
@@ -217,6 +231,9 @@ class AffineSum:
         shapes = list(dict.fromkeys(np.shape(term) for term in self.terms))
         if len(shapes) != 1 or len({sp.issparse(term) for term in self.terms}) != 1:
             raise NumericalError(f"the terms of an affine sum have the shapes {shapes}; expected one shape for all")
+        if len(shapes[0]) == 1 and not sp.issparse(self.terms[0]):
+            terms = tuple(real_vector(term, "a term of an affine sum") for term in self.terms)
+            object.__setattr__(self, "terms", _with_absent_rows(terms, self.thetas))
 
     @classmethod
     def of(cls, pairs: Sequence[tuple[Theta, Any]], names: Sequence[str]) -> AffineSum:
@@ -282,6 +299,27 @@ class AffineSum:
     def mapped(self, change: Callable[[Any], Any]) -> AffineSum:
         """The sum with a linear map applied to every term."""
         return AffineSum(tuple(change(term) for term in self.terms), self.thetas)
+
+
+def _with_absent_rows(terms: tuple[Array, ...], thetas: Callable[[Array], Any]) -> tuple[Array, ...]:
+    """The terms of a sum that is `ABSENT` in all rows where one of them is infinite, whatever the others are."""
+    infinite = [is_absent(term) for term in terms]
+    rows = np.any(infinite, axis=0)
+    if not rows.any():
+        return terms
+    made, left = [np.where(rows, 0.0, term) for term in terms], rows.copy()
+    for q in (q for q, mask in enumerate(infinite) if mask.any()):
+        theta = thetas.number(q) if isinstance(thetas, Thetas) else None
+        # A coefficient that changes its sign would make a bound of −∞ of one of +∞.
+        if theta is None or not theta > 0.0:
+            row = int(np.argmax(infinite[q]))
+            raise NumericalError(
+                f"row {row} of term {q} is infinite, and its coefficient is no positive constant: give the infinite "
+                "entries a term of their own, with the coefficient 1"
+            )
+        made[q][infinite[q] & left] = ABSENT / theta
+        left &= ~infinite[q]
+    return tuple(made)
 
 
 def entries_of(array: Any, rows: Indices, columns: Indices) -> Array:

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices
+from vibench.arrays import Array, Indices, real_matrix, real_vector
 from vibench.errors import NumericalError
 from vibench.interfaces.affine import AffineSum, Theta, Thetas
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
@@ -64,13 +64,18 @@ class AffineProblem(Problem):
         RequestError
             If an expression is not arithmetic in the names of the parameters.
         NumericalError
-            If a member has a wrong shape.
+            If a member has a wrong shape, or an infinite entry of g a coefficient that is no positive constant.
         """
         n, m = self.V.dim, self.W.dim
         given = {"A": A, "f": f, "B": B, "g": g}
         if dirichlet_lift is not None:
             given["dirichlet_lift"] = dirichlet_lift
-        sums = {name: self._sum(member) for name, member in given.items()}
+        sums: dict[str, AffineSum] = {}
+        for name, member in given.items():
+            try:
+                sums[name] = self._sum(member)
+            except NumericalError as error:
+                raise NumericalError(f"{name}: {error}") from None
         # With `free` the members are declared for all unknowns, before Dirichlet conditions.
         N = n if free is None else int(np.shape(sums["A"].terms[0])[0])
         if free is not None and (len(free) != n or np.max(free, initial=-1) >= N):
@@ -79,7 +84,7 @@ class AffineProblem(Problem):
         for name, each in sums.items():
             if (shape := np.shape(each.terms[0])) != shapes[name]:
                 raise NumericalError(f"{name} has shape {shape}; the spaces V and W require {shapes[name]}")
-            sums[name] = each.mapped(sp.csr_array if name in ("A", "B") else partial(np.asarray, dtype=float))
+            sums[name] = each.mapped(partial(real_matrix if name in ("A", "B") else real_vector, name=name))
         if dirichlet_lift is not None:
             sums["f"] = _minus(sums["f"], sums["A"], sums["dirichlet_lift"])
             sums["g"] = _minus(sums["g"], sums["B"], sums["dirichlet_lift"])

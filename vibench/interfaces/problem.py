@@ -13,27 +13,13 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.spatial import KDTree
 
-from vibench.arrays import Array, Indices, Mask, SparseMatrix
+from vibench.arrays import Array, Indices, Mask, SparseMatrix, real_matrix, real_vector
+from vibench.interfaces.absent_rows import settled_bounds, without_infinities
 from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.outputs import MeshFields, Output, Picture
 from vibench.interfaces.parameters import ParameterBox
 from vibench.linalg.factorisations import DEFAULT
 from vibench.linalg.inner_product import InnerProduct
-
-# The bound g of a row that constrains nothing: finite, so that no sum with it, and no product with zero, is NaN.
-ABSENT = 1e100
-
-
-def is_absent(g: Array) -> Mask:
-    """Mask of the rows (m,) that constrain nothing: g is infinite, even with something finite added to it."""
-    return np.asarray(g >= 0.5 * ABSENT)
-
-
-def without_infinities(g: Any) -> Any:
-    """A bound g (m,) with `ABSENT` in place of +inf."""
-    if not isinstance(g, np.ndarray) or g.dtype.kind != "f" or not (infinite := g == np.inf).any():
-        return g
-    return np.where(infinite, ABSENT, g)
 
 
 @dataclass(frozen=True)
@@ -50,7 +36,7 @@ class VariationalInequality:
         Constraint, sparse (m×n), sign such that A u + Bᵀλ = f with λ ≥ 0.
     g
         Bound (m,), including the contribution of the Dirichlet lift; +inf, read as `ABSENT`, where a row constrains
-        nothing, and its multiplier is zero.
+        nothing, and its multiplier is zero. A zero row of B with g ≥ 0 constrains nothing, either.
     dirichlet_lift
         Lifting of inhomogeneous Dirichlet data, added to u in pictures only; `None` for homogeneous data.
     """
@@ -78,7 +64,9 @@ class Contact:
     g: Array
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "g", without_infinities(self.g))
+        B = real_matrix(self.B, "B on the contact unknowns")
+        object.__setattr__(self, "B", B)
+        object.__setattr__(self, "g", settled_bounds(B, without_infinities(real_vector(self.g, "g"))))
 
 
 @dataclass(frozen=True)
@@ -245,7 +233,8 @@ class Problem(ABC):
         contact = self.contact(mu)
         if contact is None or self.contact_dofs is None:
             vi = self.assemble(mu)
-            return vi.B, vi.g
+            B = real_matrix(vi.B, "B")
+            return B, settled_bounds(B, real_vector(vi.g, "g"))
         # Columns of contact unknowns become those of all unknowns; the entries are shared.
         B = sp.csr_array(contact.B)
         entries = (B.data, self.contact_dofs[B.indices], B.indptr)

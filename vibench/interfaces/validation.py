@@ -6,16 +6,18 @@ A fingerprint of an assembled problem is equal for equal numbers, and small enou
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array
-from vibench.errors import NumericalError
+from vibench.arrays import Array, real_matrix, real_vector
+from vibench.errors import NumericalError, VibenchError, in_a_line
+from vibench.interfaces.absent_rows import ABSENT, is_absent, settled_bounds
 from vibench.interfaces.declarations import contradictions
-from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality, is_absent
+from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment, Sampling, check_sample
 from vibench.linalg.inner_product import InnerProduct
 
@@ -106,22 +108,52 @@ def _finite_parameters(problem: Problem, name: str, mus: Array, count: int | Non
     return mus
 
 
+@contextmanager
+def at_parameter(mu: Array) -> Iterator[None]:
+    """Name mu (d,) in every error of the block; what a plugin raises becomes a `NumericalError`."""
+    where = f"mu = {mu.tolist()}"
+    try:
+        yield
+    except NumericalError as error:
+        if where in str(error):
+            raise
+        raise NumericalError(f"at {where}: {error}") from error
+    except (VibenchError, MemoryError):
+        raise
+    except Exception as error:
+        raise NumericalError(f"at {where}: {in_a_line(error)}") from error
+
+
+def in_float64(vi: VariationalInequality) -> VariationalInequality:
+    """The same with sparse matrices and vectors of float64; raises a `NumericalError` for what has no such form."""
+    A, B, f, g = real_matrix(vi.A, "A"), real_matrix(vi.B, "B"), real_vector(vi.f, "f"), real_vector(vi.g, "g")
+    if A is vi.A and B is vi.B and f is vi.f and g is vi.g:
+        return vi
+    return VariationalInequality(A, f, B, g, vi.dirichlet_lift)
+
+
+def settled(vi: VariationalInequality) -> VariationalInequality:
+    """The same with `settled_bounds`, for which it raises a `NumericalError`."""
+    g = settled_bounds(vi.B, vi.g)
+    return vi if g is vi.g else replace(vi, g=g)
+
+
 def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
-    """`problem.assemble(mu)`, refused if shapes are wrong, values not real and finite, or out of range.
+    """`problem.assemble(mu)` in sparse matrices and vectors of float64.
 
     Raises
     ------
     NumericalError
-        Naming the member, the fault and the expected value.
+        If it fails, shapes are wrong, values not real and finite, or out of range, naming mu, the member, the fault and
+        the expected value.
     """
-    vi = problem.assemble(mu)
+    with at_parameter(mu):
+        vi = in_float64(problem.assemble(mu))
     n, m = problem.V.dim, problem.W.dim
     for name, value, shape in (("A", vi.A, (n, n)), ("f", vi.f, (n,)), ("B", vi.B, (m, n)), ("g", vi.g, (m,))):
         if value.shape != shape:
             where = f"shape {value.shape} at mu = {mu.tolist()}"
             raise NumericalError(f"{name} has {where}; the spaces V and W require {shape}")
-        if np.iscomplexobj(value):
-            raise NumericalError(f"{name} is complex at mu = {mu.tolist()}; vibench is for real problems")
         entries = value if isinstance(value, np.ndarray) else value.data
         peak = max(np.max(entries, initial=0.0), -np.min(entries, initial=0.0))
         if not np.isfinite(peak):
@@ -129,14 +161,16 @@ def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
             raise NumericalError(f"{name} has entries that are not finite at mu = {mu.tolist()}{infinite}")
         # Not even cubes of entries beyond 1e100, or of inverses of smaller ones, are numbers. Rows of g may be far.
         largest = 1e100
-        too_large = peak > largest and name != "g"
+        # An infinite entry of an affine sum is nearly as large.
+        too_large = peak >= 0.5 * ABSENT and name != "g"
         too_small = 0.0 < peak < 1.0 / largest and name in ("A", "B")
         if too_large or too_small:
             raise NumericalError(
                 f"{name} has entries of up to {peak:.0e} at mu = {mu.tolist()}; products of such numbers over- or "
                 f"underflow: choose units in which they are between {1.0 / largest:.0e} and {largest:.0e}"
             )
-    return vi
+    with at_parameter(mu):
+        return settled(vi)
 
 
 @dataclass(frozen=True)

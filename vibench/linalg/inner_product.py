@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cached_property
@@ -13,6 +13,7 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, SparseMatrix
 from vibench.errors import NumericalError, RequestError
+from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.definite import Factor
 from vibench.linalg.factorisations import DEFAULT, implementation
@@ -67,7 +68,7 @@ class InnerProduct:
         is_matrix = (sp.issparse(matrix) or isinstance(matrix, np.ndarray)) and matrix.ndim == 2
         if not is_matrix or matrix.dtype.kind not in "fiub":
             raise RequestError(f"{name} is {brief(repr(matrix), 80)}, expected a matrix of real numbers")
-        self.matrix = sp.csc_array(matrix)
+        self.matrix = sp.csc_array(matrix, dtype=float)
         self._name, self.factorisation = name, factorisation
         check_symmetric(self.matrix, name)
         if (postponed := _postponed.get()) is not None:
@@ -195,6 +196,56 @@ def check_symmetric(matrix: SparseMatrix, name: str) -> None:
         raise NumericalError(f"{name} has entries that are not finite")
     if asymmetry(matrix):
         raise NumericalError(f"{name} is not symmetric")
+
+
+def check_positive_definite(matrix: SparseMatrix, name: str) -> None:
+    """Raise a `NumericalError` that says why a matrix is not symmetric and positive definite beyond round-off, if so."""
+    check_symmetric(matrix, name)
+    try:
+        solve = SparseCholesky(matrix, name).solve
+    except NumericalError:
+        raise NumericalError(f"{name} is not positive definite: {why_indefinite(matrix)}") from None
+    check_regular(matrix, solve, name)
+
+
+def check_regular(matrix: SparseMatrix, solve: Callable[[Array], Array], name: str) -> None:
+    """Raise a `NumericalError` if a positive definite matrix (n×n), with which `solve` solves, is singular.
+
+    A pivot that vanishes in exact arithmetic may be positive by round-off. Two steps of inverse iteration show a
+    direction without energy, in units of the diagonal.
+    """
+    n, units = matrix.shape[0], np.sqrt(np.abs(matrix.diagonal()))[:, None]
+    direction, growth = np.random.default_rng(0).standard_normal((n, 1)), 0.0
+    for _ in range(2):
+        direction = direction / (np.linalg.norm(direction) or 1.0)
+        direction = units * solve(units * direction)
+        growth = float(np.linalg.norm(direction))
+    # The round-off of a factorisation grows with the number of terms at most as slowly.
+    if not growth * EPS * max(16.0, np.sqrt(n)) < 1.0:
+        raise NumericalError(f"{name} is not positive definite: {why_indefinite(matrix)}")
+
+
+def why_indefinite(matrix: SparseMatrix) -> str:
+    """What a symmetric matrix (n×n) is that is not positive definite."""
+    diagonal = matrix.diagonal()
+    if np.all(diagonal < 0.0):
+        return "it is −A that is positive definite, the sign of A is the opposite one"
+    units = sp.diags_array(np.where(diagonal > 0.0, diagonal, np.max(np.abs(diagonal), initial=0.0) or 1.0))
+    try:
+        # Far above round-off, and far below what an indefinite matrix lacks.
+        solve = SparseCholesky(sp.csc_array(matrix + 1e-10 * units)).solve
+    except NumericalError:
+        return "it has a negative eigenvalue, and a coercive problem has none"
+    direction = np.random.default_rng(0).standard_normal(matrix.shape[0])
+    for _ in range(3):
+        direction = solve(units @ direction)
+        direction /= np.max(np.abs(direction))
+    constant = np.ptp(direction) <= 1e-6
+    motion = "constants are" if constant else f"a motion that is largest at unknown {np.argmax(np.abs(direction))} is"
+    return (
+        f"it is singular, {motion} in its kernel: Dirichlet conditions were not applied, or contact alone holds a "
+        "body, which is not covered; prescribe such motions, or add a weak foundation"
+    )
 
 
 def svd(a: Array) -> tuple[Array, Array, Array]:

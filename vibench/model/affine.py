@@ -14,8 +14,9 @@ import scipy.sparse.linalg
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
+from vibench.interfaces.absent_rows import is_absent, without_infinities, zero_rows
 from vibench.interfaces.affine import AffineSum, entries_of
-from vibench.interfaces.problem import MEMBERS, Problem, Sampler, is_absent, without_infinities
+from vibench.interfaces.problem import MEMBERS, Problem, Sampler
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct, svd
 from vibench.qp.scaling import ratio
@@ -86,13 +87,16 @@ def affine_decomposition(problem: Problem, training: Array, tolerance: float) ->
     check_affine(problem, training)
     varying = [name for name in MEMBERS if name not in problem.constant and name not in problem.affine]
     assembled = assembled_members(problem, training, varying) if varying else {}
+    vanishing = _vanishing_row(assembled.get("B", ()))
     members: dict[str, AffineMember] = {}
     for name in MEMBERS:
         if name in problem.constant:
             members[name] = AffineMember(Evaluation.CONSTANT, (getattr(first, name),))
         elif name in problem.affine:
             terms = problem.affine[name].terms
-            members[name] = AffineMember(Evaluation.AFFINE, tuple(map(without_infinities, terms)))
+            members[name] = AffineMember(Evaluation.AFFINE, tuple(terms))
+        elif vanishing and name in ("B", "g"):
+            members[name] = _exact(vanishing, problem.has_contact)
         else:
             entrywise = name in problem.entrywise
             members[name] = decomposed(name, assembled[name], problem.V, tolerance, entrywise, problem.has_contact)
@@ -124,7 +128,7 @@ def coefficients(
             sums.append((of, [name]))
 
     def evaluate(mu: Array) -> Mapping[str, Array]:
-        values = dict(sampler(mu))
+        values = {name: without_infinities(sample) for name, sample in sampler(mu).items()}
         for first, names in sums:
             values |= dict.fromkeys(names, first.coefficients(mu))
         return values
@@ -143,7 +147,7 @@ def check_affine(problem: Problem, training: Array) -> None:
     for mu in training[[0, len(training) // 2, -1]] if problem.affine else ():
         vi = checked_assembly(problem, mu)
         for name, declared in problem.affine.items():
-            exact, summed = getattr(vi, name), without_infinities(declared.at(mu))
+            exact, summed = getattr(vi, name), declared.at(mu)
             if summed.shape != exact.shape:
                 raise NumericalError(f"the affine sum of {name} has shape {summed.shape}, {name} itself {exact.shape}")
             # Absent rows are huge numbers in g, which would hide the differences of all others.
@@ -183,7 +187,7 @@ def decomposed(
     """
     if name == "g" and (sometimes := np.any([is_absent(g) ^ is_absent(values[0]) for g in values], axis=0)).any():
         reason = f"row {int(np.argmax(sometimes))} of g is infinite at some parameters and not at others"
-        return AffineMember(Evaluation.CONTACT, ()) if contact else AffineMember(Evaluation.FULL, (), reason=reason)
+        return _exact(reason, contact)
     entries = _Entries(values, symmetric=name == "A")
     weights = entries.weights(name, _units(V))
     if entries.is_constant(weights):
@@ -199,9 +203,21 @@ def decomposed(
             rows, columns = entries.rows[points], entries.columns[points]
             return AffineMember(Evaluation.INTERPOLATED, terms, rows, columns, interpolation.error)
         reason = f"{name} depends on mu, and interpolation needs {len(points)} terms for {len(values)} parameters"
-    if name in ("B", "g") and contact:
-        return AffineMember(Evaluation.CONTACT, ())
-    return AffineMember(Evaluation.FULL, (), reason=reason)
+    return _exact(reason, contact and name in ("B", "g"))
+
+
+def _vanishing_row(values: Sequence[SparseMatrix]) -> str:
+    """Why B and g are not interpolated: a row of B vanishes at some parameters alone; "" if none does."""
+    vanish = [zero_rows(B) for B in values]
+    if not (sometimes := np.any([rows ^ vanish[0] for rows in vanish], axis=0)).any():
+        return ""
+    # What interpolation leaves of such a row would be a constraint made of its error.
+    return f"row {int(np.argmax(sometimes))} of B is zero at some parameters and not at others"
+
+
+def _exact(reason: str, contact: bool) -> AffineMember:
+    """A member that is evaluated on the contact unknowns where the problem has them, else assembled in full."""
+    return AffineMember(Evaluation.CONTACT, ()) if contact else AffineMember(Evaluation.FULL, (), reason=reason)
 
 
 def held_out_error(name: str, member: AffineMember, values: Sequence[Any], V: InnerProduct) -> float:

@@ -22,7 +22,8 @@ from cachetools import LRUCache
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix, times_dense
 from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness
-from vibench.interfaces.problem import VariationalInequality, is_absent
+from vibench.interfaces.absent_rows import is_absent
+from vibench.interfaces.problem import VariationalInequality
 from vibench.qp.exact import Directions, Rows, rows_that_matter
 from vibench.qp.scaling import near_rows
 from vibench.qp.verification import round_off_of_terms

@@ -34,7 +34,8 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices, Mask
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import active_set_iterations
-from vibench.interfaces.problem import VariationalInequality, is_absent
+from vibench.interfaces.absent_rows import is_absent
+from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg import UNIT_ROUND_OFF
 from vibench.model.bound_terms import BoundNote, BoundTerms, Equalities, dual_gap, first_margin, in_dual_set
 from vibench.model.contact_form import ContactForm, Representer

@@ -17,8 +17,9 @@ import numpy as np
 from vibench.arrays import Array, Mask, SparseMatrix
 from vibench.highfidelity.active_set import solve_unverified
 from vibench.highfidelity.kkt_systems import CondensedStiffness
+from vibench.interfaces.absent_rows import is_absent
 from vibench.interfaces.outputs import Output
-from vibench.interfaces.problem import Problem, VariationalInequality, is_absent
+from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.model.contact_form import ContactForm, Representer, representers
 from vibench.qp.scaling import ratio

@@ -19,7 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.interfaces.problem import Problem, VariationalInequality, is_absent
+from vibench.interfaces.absent_rows import is_absent
+from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.bound_terms import in_dual_set
 from vibench.qp.verification import norms_by_solutions

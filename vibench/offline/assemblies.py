@@ -10,6 +10,7 @@ from cachetools import LRUCache
 
 from vibench.arrays import Array, digest
 from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.errors import EnergyNorm
@@ -28,7 +29,7 @@ class Assemblies:
         self._energies: LRUCache[bytes, EnergyNorm] = LRUCache(factor_limit or 3 * 2**28, getsizeof=self._own_bytes)
         self._last: tuple[bytes, EnergyNorm] | None = None
         self._solver = HighFidelitySolver(problem, condensing=True)
-        self._contact: ContactInfSup | None = None
+        self._contact: tuple[CondensedStiffness, ContactInfSup] | None = None
         # Quotients hold vectors of mesh size, unlike the constants below: keep one.
         self._quotients: LRUCache[bytes, Quotients] = LRUCache(1)
         self._alphas: LRUCache[bytes, Constant] = LRUCache(1000)
@@ -139,13 +140,16 @@ class Assemblies:
 
     def _contact_at(self, mu: Array) -> ContactInfSup:
         """A at mu (d,) as its factorisation has condensed it; one object where it is constant."""
-        if self._contact is None or "A" not in self._problem.constant:
-            stiffness, squares = self.energy_at(mu).stiffness, self.at(mu).A.diagonal()
+        # A constant A is condensed anew where B touches further unknowns.
+        stiffness = self.energy_at(mu).stiffness
+        if self._contact is None or self._contact[0] is not stiffness:
+            squares = self.at(mu).A.diagonal()
             schur, round_off = stiffness.schur_with_round_off(squares)
             lost = round_off / share if (share := self._share_at(mu)) > 0.0 else np.inf
             inverse = stiffness.inverse if stiffness.dense and "A" in self._problem.constant else None
-            self._contact = ContactInfSup(schur, squares[stiffness.retained], lost, inverse=inverse)
-        return self._contact
+            found = ContactInfSup(schur, squares[stiffness.retained], lost, inverse=inverse)
+            self._contact = stiffness, found
+        return self._contact[1]
 
     def _share_at(self, mu: Array) -> float:
         """A σ with A ≽ σ diag(A) at mu (d,), proved by α; 0 where α is not."""

@@ -26,7 +26,14 @@ from vibench.interfaces.strategies import (
     Stop,
     no_free,
 )
-from vibench.interfaces.validation import check_cone, check_enrichment, reference_assembly, training_parameters
+from vibench.interfaces.validation import (
+    check_cone,
+    check_enrichment,
+    checked_assembly,
+    reference_assembly,
+    training_parameters,
+)
+from vibench.linalg.inner_product import check_symmetric
 from vibench.model.affine import INTERPOLATION_RTOL, AffineMember, affine_decomposition
 from vibench.model.certificates.base import CertificateBase, certificate_base
 from vibench.model.certificates.bounds import OnlineCertificate, prepare
@@ -267,7 +274,10 @@ class Reduction:
             certificate.
         UnsupportedError
             If the problem does not have what it needs.
+        NumericalError
+            If A is not symmetric.
         """
+        self._check_symmetric()
         formulation = self.formulation
         # The default is found by its declaration: the core knows no formulation by name.
         if formulation is None:
@@ -284,6 +294,15 @@ class Reduction:
         if not formulation.has_certificate:
             raise RequestError(f"{name} has no certificate: no bounds at online cost")
         return replace(made, certificate=made.online.certificate(self))
+
+    def _check_symmetric(self) -> None:
+        """Refuse an A that is not symmetric, where the phase has no solutions of its own that show it."""
+        if "snapshots" in self.__dict__ and "snapshots" not in self.__dict__.get("_given", {}):
+            return
+        # Projections are symmetrised, and would hide it.
+        mus = self.parameters
+        for mu in mus[:1] if "A" in self.problem.constant else mus[[0, len(mus) // 2, -1]]:
+            check_symmetric(checked_assembly(self.problem, mu).A, f"A at mu = {mu.tolist()}")
 
     @cached_property
     def certificate(self) -> OnlineCertificate:

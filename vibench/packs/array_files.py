@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import gzip
 import io
@@ -182,7 +183,7 @@ class ArrayFiles:
     def _matrix_market(self, path: Path) -> Any:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
             comments = 2**16
-            head = file.read(comments)
+            head = file.read(comments).removeprefix(codecs.BOM_UTF8)
             rows, columns, entries, layout, field, symmetry = scipy.io.mminfo(io.BytesIO(head))
             if field == "pattern":
                 raise RequestError("the Matrix Market file has the field 'pattern', it holds no values")

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array
+from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError, RequestError, requested
+from vibench.highfidelity.active_set import HighFidelitySolution, solve_high_fidelity
+from vibench.interfaces.absent_rows import settled_bounds, zero_rows
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
-from vibench.linalg.cholesky import SparseCholesky
-from vibench.linalg.inner_product import asymmetry
+from vibench.interfaces.validation import at_parameter
+from vibench.linalg.inner_product import asymmetry, check_positive_definite
 from vibench.packs.manifest import read_manifest
 from vibench.packs.pack import ModelPack, PackSolutions
 from vibench.packs.reader import PackReader, naming, one_triangle
@@ -37,6 +39,28 @@ def read_model_pack(path: str | Path) -> ModelPack:
     with naming(path) as folder:
         pack = PackReader(folder, read_manifest(folder)).pack()
         return replace(pack, residual=_check(pack))
+
+
+def solve_at_training(pack: ModelPack) -> tuple[Array, HighFidelitySolution]:
+    """The high-fidelity solution of a pack with operators at its first training parameter (d,), which is the other one.
+
+    Raises
+    ------
+    RequestError
+        If there is none.
+    """
+    mu = pack.training[0]
+    try:
+        with at_parameter(mu):
+            return mu, solve_high_fidelity(pack.at(mu))
+    except NumericalError as error:
+        raise RequestError(f"there is no solution: {error}") from None
+
+
+def zero_rows_of(pack: ModelPack) -> Indices:
+    """The rows (k,) of B that are zero at every listed parameter."""
+    listed = pack.training if pack.validation is None else np.vstack([pack.training, pack.validation])
+    return np.flatnonzero(np.all([zero_rows(pack.members["B"].at(mu)) for mu in listed], axis=0))
 
 
 def _check(pack: ModelPack) -> float | None:
@@ -87,23 +111,25 @@ def _check_operators(pack: ModelPack, X_V: Any) -> None:
                     member.sum.coefficients(mu)
             except NumericalError as error:
                 raise RequestError(f"operators.{name}: {error}") from None
+    _check_rows(pack, listed)
     # Three samples: a run checks the definiteness of A wherever it solves.
     for mu in listed[np.linspace(0, len(listed) - 1, 3).round().astype(int)]:
         matrix = A.at(mu)
         _check_dirichlet(matrix, X_V)
         try:
-            SparseCholesky(sp.csc_array(matrix), f"A at mu = {mu.tolist()}")
+            check_positive_definite(matrix, f"A at mu = {mu.tolist()}")
         except NumericalError as error:
-            raise RequestError(f"operators: {error}; {_why_indefinite(matrix)}") from None
+            raise RequestError(f"operators: {error}") from None
 
 
-def _why_indefinite(A: Any) -> str:
-    # The diagonal of a negative definite matrix is negative.
-    if np.all(A.diagonal() < 0.0):
-        return "it is −A that is positive definite: the sign of A is the opposite one"
-    if np.abs(A @ np.ones(A.shape[0])).max() <= 1e-10 * abs(A).max():
-        return "constants are in its kernel: Dirichlet conditions were not applied, remove the rows and columns"
-    return "a coercive problem has a positive definite one on its free unknowns"
+def _check_rows(pack: ModelPack, listed: Array) -> None:
+    """Refuse a zero row of B with a negative bound at one of the listed parameters (P×d)."""
+    try:
+        for mu in listed:
+            with at_parameter(mu):
+                settled_bounds(pack.members["B"].at(mu), pack.members["g"].at(mu))
+    except NumericalError as error:
+        raise RequestError(f"operators: {error}") from None
 
 
 def _check_dirichlet(A: Any, X_V: Any) -> None:

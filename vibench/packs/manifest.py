@@ -200,7 +200,8 @@ def read_manifest(folder: Path) -> Manifest:
     if (size := path.stat().st_size) > (most := 2**24):
         raise RequestError(f"{FILE} has {size} bytes, at most {most} are read; write points to an array")
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        # Editors may put a byte-order mark in front, which TOML does not know.
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise RequestError(f"{FILE} cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:

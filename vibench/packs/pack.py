@@ -69,6 +69,11 @@ class TabulatedTheta:
     listing: Listing
     values: Array
 
+    @property
+    def constant(self) -> float | None:
+        """The value if it is one and the same at all listed parameters, else `None`."""
+        return float(self.values[0]) if np.ptp(self.values) == 0.0 else None
+
     def __call__(self, mu: Array) -> float:
         """The value at mu (d,), one of the listed parameters."""
         return float(self.values[self.listing.number(mu)])

@@ -17,10 +17,11 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError, RequestError, requested
+from vibench.interfaces.absent_rows import without_infinities
 from vibench.interfaces.affine import Expression, normal_names
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.parameters import ParameterBox
-from vibench.interfaces.problem import MEMBERS, without_infinities
+from vibench.interfaces.problem import MEMBERS
 from vibench.linalg.inner_product import InnerProduct
 from vibench.packs import manifest as schema
 from vibench.packs.array_files import ArrayFiles, memory_limit, safe_path, size_of, whole

@@ -20,7 +20,8 @@ from scipy.linalg.lapack import dtrtrs
 from scipy.optimize import nnls
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
-from vibench.interfaces.problem import ABSENT, VariationalInequality, is_absent
+from vibench.interfaces.absent_rows import ABSENT, is_absent, zero_rows
+from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import project_out
@@ -39,7 +40,7 @@ class Rows:
     # For equalities the row on the other side (k,), and the length of this row over that of the other.
     opposite: Indices
     ratio: Array
-    # Rows (m,) that need no check of their own: equalities, those parallel to them, and absent ones.
+    # Rows (m,) that need no check of their own: equalities, those parallel to them, absent and zero ones.
     implied: Mask
 
     @property
@@ -105,12 +106,14 @@ def rows_that_matter(
 ) -> Rows:
     """Find the rows of B (m×n) and g (m,) that matter: the tightest of parallel ones, one equality for opposite ones.
 
+    Absent rows, and zero ones that hold, do not matter.
     Opposite rows are an equality where there is at most some `room` (m,) between them, in the unit of g. It is
     represented by the row with the larger entry of `preferred` (m,), in units of its length. `directions` are those of
     the rows that are not absent, where they are known.
     """
     m = len(g)
     dropped, equal, opposite, ratio = is_absent(g), np.zeros(m, bool), np.arange(m), np.ones(m)
+    dropped |= zero_rows(B) & (g >= 0.0)
     implied = dropped.copy()
     directions = directions or Directions.of(sp.csr_array(B), ~dropped)
     if not len(directions.members):

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Mask, SparseMatrix
+from vibench.interfaces.absent_rows import zero_rows
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import VariationalInequality
 
@@ -85,9 +86,14 @@ def near_rows(program: VariationalInequality) -> Mask:
 def near(program: VariationalInequality, rows: Array, driven: Drive) -> Mask:
     """Constraints (m,) that are less than 1e4 lengths from 0, from the norms (m,) of its rows and its `Drive`.
 
-    Solvers lose their digits to the others, which the solution without them has to satisfy.
+    Solvers lose their digits to the others, which the solution without them has to satisfy; a zero row that holds has
+    no interior, which they may need.
     """
-    return np.asarray(program.g <= 1e4 * driven.length * rows)
+    near = np.asarray(program.g <= 1e4 * driven.length * rows)
+    # The norm of a zero row is set to 1.
+    if (unit := rows == 1.0).any():
+        near &= ~(unit & (program.g >= 0.0) & zero_rows(program.B))
+    return near
 
 
 def stiffness(A: SparseMatrix | Array) -> float:

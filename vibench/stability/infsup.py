@@ -115,6 +115,9 @@ def inf_sup(on_span: Array, on_generators: Array, cone: ConeBasis) -> InfSup:
     both. The constants are zero without primal vectors and infinite without multipliers.
     """
     span = beta_span(on_span)
+    # A generator without forces, as on a zero row of B alone, would leave round-off.
+    if not on_generators.any(axis=0).all():
+        span = 0.0
     if np.any(cone.free) and np.all(cone.free):  # the cone is its span
         return InfSup(span, span, span, "span/span")
     lower, upper, sharp = cone_interval(_with_few_rows(on_generators), cone.gram, span)

@@ -17,7 +17,6 @@ from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolve
 from vibench.interfaces.formulations import Snapshots
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import Fingerprint, ReferenceAssembly, checked_assembly, reference_assembly
-from vibench.linalg.inner_product import InnerProduct
 from vibench.model.certificates.greedy import GreedyTrainer
 from vibench.model.error_bounds import reference_bound
 from vibench.offline.assemblies import assemblies
@@ -124,7 +123,6 @@ class SnapshotStage(Stage):
                 yield
             except NumericalError:
                 refuse_shifted()
-                InnerProduct(vi.A, f"A at mu = {mu.tolist()}")
                 reference.refuse_false_declarations(mu, vi)
                 raise
 
@@ -145,8 +143,6 @@ class SnapshotStage(Stage):
                 vi = checked_assembly(problem, mu)
             with explained(mu, vi):
                 solution = solver.verify(mu, vi, unverified)
-            if k == 0 or "A" not in problem.constant:
-                solver.check_coercive(mu, vi)
             reference.refuse_false_declarations(mu, vi)
             solver.remember(mu, solution)
             solutions.append(solution)

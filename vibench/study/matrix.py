@@ -60,7 +60,8 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
     """
     path = find_study(request)
     try:
-        text = read_regular(path).decode()
+        # Without the byte-order mark of some editors, which TOML does not know.
+        text = read_regular(path).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise RequestError(f"{path}: cannot be read as text: {error}") from None
     try:

@@ -7,9 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import Varying, exact, spd
 
+from vibench import Array, Reduction, create
 from vibench.errors import NumericalError
 from vibench.highfidelity import active_set
 from vibench.interfaces.problem import VariationalInequality
+from vibench.interfaces.strategies import Stop
+from vibench.offline.checked_tools import solve_high_fidelity
 from vibench.qp.verification import kkt_residuals
 
 
@@ -127,3 +130,76 @@ def test_a_string_in_contact_is_as_accurate_beside_a_loaded_one(fraction: float)
     assert np.allclose(beside.lam, alone.lam, rtol=1e-9)
     hidden = kkt_residuals(both, beside.u, 2.0 * beside.lam)
     assert hidden.worst > 0.1
+
+
+def crooked(vi: VariationalInequality) -> VariationalInequality:
+    A = vi.A.tolil()
+    A[0, 1] *= 1.001
+    return replace(vi, A=sp.csc_array(A))
+
+
+class Crooked(Varying):
+    """The string with an A that is not symmetric, and does not depend on the parameter where it is `constant`."""
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi, first = super().assemble(mu), super().assemble(np.zeros(1))
+        return crooked(replace(vi, A=first.A) if "A" in self.constant else vi)
+
+
+@pytest.mark.parametrize("constant", [frozenset(), frozenset({"A"})], ids=["varying", "constant"])
+def test_a_stiffness_that_is_not_symmetric_is_refused_and_where(
+    constant: frozenset[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, mu = Crooked(), np.array([0.5])
+    monkeypatch.setattr(Crooked, "constant", constant)
+    with pytest.raises(NumericalError, match=r"^A is not symmetric"):
+        solve_high_fidelity(problem.assemble(mu))
+    with pytest.raises(NumericalError, match=r"^A at mu = \[0.5\] is not symmetric"):
+        active_set.HighFidelitySolver(problem).solve(mu)
+    dual, primal = create("dual strategy", "cpg"), create("primal strategy", "online-supremizers")
+    reduction = Reduction(problem, dual, primal, Stop(size=3), Stop(size=3))
+    with pytest.raises(NumericalError, match=r"^A at mu = \[0.0\] is not symmetric"):
+        reduction.model  # noqa: B018
+    # Snapshots of another code say nothing of this A, which projections would symmetrise.
+    with pytest.raises(NumericalError, match=r"^A at mu = \[0.0\] is not symmetric"):
+        reduction.given(snapshots=Reduction(Varying(), dual, primal, Stop(size=3), Stop(size=3)).snapshots).model  # noqa: B018
+
+
+def test_a_constant_stiffness_is_checked_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    checked, check = [], active_set.check_symmetric
+    monkeypatch.setattr(active_set, "check_symmetric", lambda A, name: checked.append(name) or check(A, name))
+    for constant, count in ((frozenset[str](), 3), (frozenset({"A"}), 1)):
+        problem = Crooked()
+        monkeypatch.setattr(Crooked, "constant", constant)
+        vi, solver = Varying().assemble(np.zeros(1)), active_set.HighFidelitySolver(problem)
+        monkeypatch.setattr(problem, "assemble", lambda mu, vi=vi: vi)
+        checked.clear()
+        for mu in problem.parameters.grid(3):
+            solver.solve(mu)
+        assert len(checked) == count
+
+
+@pytest.mark.parametrize("n", [5, 50, 5000])
+@pytest.mark.parametrize("rows", [1, 3])
+@pytest.mark.parametrize("condensing", [False, True])
+def test_a_body_that_contact_alone_holds_is_called_singular(n: int, rows: int, condensing: bool) -> None:
+    """Free springs above a table: of 5,000 the last pivot is positive by round-off."""
+    springs = sp.diags_array([-np.ones(n - 1), np.ones(n - 1)], offsets=[0, 1], shape=(n - 1, n))
+    B = -sp.eye_array(n, format="csr")[-rows:]
+    vi = VariationalInequality(sp.csr_array(n * springs.T @ springs), -np.ones(n) / n, B, np.zeros(rows))
+    problem = Varying(n, rows)
+    problem.assemble = lambda mu: vi  # type: ignore[method-assign]
+    reason = "not positive definite: it is singular, constants are in its kernel: .*contact alone holds a body"
+    with pytest.raises(NumericalError, match=f"^A is {reason}"):
+        solve_high_fidelity(vi)
+    with pytest.raises(NumericalError, match=rf"^A at mu = \[0.5\] is {reason}"):
+        active_set.HighFidelitySolver(problem, condensing=condensing).solve(np.array([0.5]))
+
+
+def test_reasons_name_the_parameter() -> None:
+    problem, mu = Varying(), np.array([0.5])
+    vi = problem.assemble(mu)
+    infeasible = replace(vi, B=sp.csr_array(sp.vstack([vi.B[:4], -vi.B[:4]])), g=-np.ones(8))
+    problem.assemble = lambda mu: infeasible  # type: ignore[method-assign]
+    with pytest.raises(NumericalError, match=r"^at mu = \[0.5\]: no active set solves .*; is it feasible\?$"):
+        active_set.HighFidelitySolver(problem).solve(mu)

@@ -20,6 +20,9 @@ from vibench import (
     ParameterBox,
     RequestError,
 )
+from vibench.interfaces.absent_rows import is_absent
+from vibench.interfaces.affine import Theta
+from vibench.interfaces.validation import checked_assembly
 from vibench.model.affine import Evaluation, affine_decomposition
 from vibench.testing import ConformanceError, check
 
@@ -151,3 +154,54 @@ def test_wrong_declarations_and_coefficients_are_refused() -> None:
     total = AffineSum.of([("x**2", np.ones(2)), (3.0, np.arange(2.0))], ("x",))
     again = pickle.loads(pickle.dumps(total))
     assert np.array_equal(again.at(np.array([2.0])), [4.0, 7.0])
+
+
+def declared(g: object) -> AffineProblem:
+    """Two unknowns above a table, the second one without, with a parameter between −1 and 1."""
+
+    class Table(AffineProblem):
+        parameters = ParameterBox(("tilt",), np.array([-1.0]), np.array([1.0]), ("1",))
+        V = W = InnerProduct(sp.eye_array(2))
+
+        def training_set(self) -> Array:
+            return self.parameters.grid(3)
+
+    problem = Table()
+    problem.declare(A=2.0 * sp.eye_array(2), f=-9.0 * np.ones(2), B=-sp.eye_array(2), g=g)
+    return problem
+
+
+INFINITE = np.array([0.0, np.inf])
+
+
+@pytest.mark.parametrize("theta", ["tilt", "2 + tilt", "-1", lambda mu: 1.0, -1.0, 0.0])
+def test_an_infinite_entry_needs_a_coefficient_that_is_a_positive_constant(theta: Theta) -> None:
+    line = "g: row 1 of term 1 is infinite, and its coefficient is no positive constant: give the infinite entries a"
+    with pytest.raises(NumericalError, match=f"^{line}"):
+        declared([(1.0, np.ones(2)), (theta, INFINITE)])
+    with pytest.raises(NumericalError, match="row 1 of term 0 is infinite"):
+        AffineSum((INFINITE,), lambda mu: np.ones(1))
+
+
+@pytest.mark.parametrize("theta", [1.0, 1e-9, 3e7, "2 * pi"])
+@pytest.mark.parametrize("other", [-2.0, "tilt", "-1e3 * tilt"])
+def test_an_absent_row_is_absent_whatever_is_added_to_it(theta: Theta, other: Theta) -> None:
+    problem = declared([(1.0, np.array([1.0, 0.0])), (theta, INFINITE), (other, np.array([0.0, 1e30]))])
+    twice = declared([(theta, INFINITE + np.array([1.0, 0.0])), (1.0, INFINITE)])
+    for mu in problem.training_set():
+        assert problem.assemble(mu).g[0] == 1.0
+        for each in (problem, twice):
+            assert is_absent(each.assemble(mu).g).tolist() == [False, True]
+        exact = HighFidelitySolver(problem).solve(mu)
+        np.testing.assert_allclose(exact.u, [-1.0, -4.5], rtol=1e-14)
+        assert exact.lam[1] == 0.0
+
+
+def test_infinite_loads_are_refused() -> None:
+    problem = declared(np.ones(2))
+    problem.declare(A=2.0 * sp.eye_array(2), f=-INFINITE, B=-sp.eye_array(2), g=np.ones(2))
+    with pytest.raises(NumericalError, match="f has entries"):
+        checked_assembly(problem, np.zeros(1))
+    problem.declare(A=2.0 * sp.eye_array(2), f=INFINITE, B=-sp.eye_array(2), g=np.ones(2))
+    with pytest.raises(NumericalError, match="f has entries"):
+        checked_assembly(problem, np.zeros(1))

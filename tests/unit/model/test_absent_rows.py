@@ -64,8 +64,14 @@ class Declared(AffineProblem):
         B, g = -sp.eye_array(n, format="csr")[8:20], 0.3 * np.ones(12)
         g[-4:] = absent
         kept = g != REMOVED
+        finite, infinite = np.where(g == 0.3, g, 0.0), np.where(g == 0.3, 0.0, g)
         self.V, self.W = InnerProduct(A), InnerProduct(sp.eye_array(np.count_nonzero(kept)))
-        self.declare(A=A, f=[("load", -np.ones(n))], B=sp.csr_array(B[kept]), g=[("1 + load", g[kept])])
+        self.declare(
+            A=A,
+            f=[("load", -np.ones(n))],
+            B=sp.csr_array(B[kept]),
+            g=[("1 + load", finite[kept]), (1.0, infinite[kept])],
+        )
 
     def training_set(self) -> Array:
         return self.parameters.grid(6)

@@ -281,6 +281,18 @@ in_arrays("a solution is missing", MISSING, u=lambda c: c.u[:, :2], lam=lambda c
 in_arrays("no contact", "no constraint is active, there is nothing to reduce", lam=lambda c: 0.0 * c.lam)
 
 
+@mistake("operators: at mu = .4.0, 0.2.: row 3 of B is zero and g is -0.0154 there: no u satisfies 0 ≤ -0.0154")
+def zero_row_below_its_bound(content: Content, cable: Cable, folder: Path) -> None:
+    cable.B = sp.csr_array(sp.diags_array(np.arange(SIZE) != 3, dtype=float) @ cable.B)
+    content["operators"]["g"]["affine"][0]["theta"] = "-depth"
+
+
+@mistake("operators.g: row 11 of term 0 is infinite, and its coefficient is no positive constant: give the infinite")
+def infinite_bound_with_a_coefficient_that_varies(content: Content, cable: Cable, folder: Path) -> None:
+    np.savez(folder / "far.npz", g=np.append(cable.mass[:-1], np.inf))
+    content["operators"]["g"]["affine"][0]["array"] = "far.npz:g"
+
+
 @mistake("probably the constraints are B u ≥ g: write B and g with the other sign")
 def other_constraint(content: Content, cable: Cable, folder: Path) -> None:
     cable.B = -cable.B

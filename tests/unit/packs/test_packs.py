@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import gzip
 import json
 import re
@@ -15,10 +16,12 @@ import scipy.io
 import scipy.sparse as sp
 from packs import DEPTH, SIZE, Cable, group, manifest, write_arrays, write_cable, write_manifest
 from running import Main
+from samples import write_study
 
 from vibench.errors import NumericalError, RequestError
 from vibench.highfidelity.active_set import HighFidelitySolver, solve_high_fidelity
-from vibench.interfaces.problem import ABSENT, MEMBERS, Problem, VariationalInequality
+from vibench.interfaces.absent_rows import ABSENT
+from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.packs import writer
 from vibench.packs.checks import read_model_pack
@@ -27,6 +30,7 @@ from vibench.packs.reader import pack_digest
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import create, find
+from vibench.study.matrix import read_study
 from vibench.testing import check
 
 MU = np.array([5.0, 0.2])
@@ -247,6 +251,46 @@ def test_import_says_what_a_pack_can_do(tmp_path: Path, main: Main) -> None:
         assert words in out
     assert "interpolates" not in out
     assert "outputs" not in out
+
+
+def test_import_solves_once_and_reads_a_byte_order_mark(tmp_path: Path, main: Main) -> None:
+    folder = write_cable(tmp_path / "pack")
+    (folder / "pack.toml").write_bytes(codecs.BOM_UTF8 + (folder / "pack.toml").read_bytes())
+    scipy.io.mmwrite(folder / "A.mtx", Cable().A)
+    (folder / "A.mtx").write_bytes(codecs.BOM_UTF8 + (folder / "A.mtx").read_bytes())
+    (folder / "pack.toml").write_bytes((folder / "pack.toml").read_bytes().replace(b"A.npz", b"A.mtx"))
+    code, out, _ = main("pack", str(folder))
+    assert code == 0
+    assert re.search(r"solved at mu = \[4.0, 0.2\]: \d+ of 12 multipliers are positive, KKT residuals up to \de-1", out)
+    content = {"name": "marked", "validation": 2, "solvers": ["piqp"], "dual": ["cpg"], "primal": ["decorrelated"]}
+    content |= {"tolerances": [{"N": [1], "R": [1]}]}
+    problem = {"name": "pack", "options": {"path": str(folder)}}
+    study = Path(write_study(tmp_path, content | {"problem": [problem]}))
+    study.write_bytes(codecs.BOM_UTF8 + study.read_bytes())
+    assert read_study(str(study)).name == "marked"
+
+
+def test_import_refuses_a_pack_without_a_solution_and_says_which_rows_constrain_nothing(
+    tmp_path: Path, main: Main
+) -> None:
+    cable, content = Cable(), manifest()
+    del content["solutions"]
+    kept = cable.B
+    cable.B = sp.csr_array(sp.vstack([kept[:6], -kept[:6]]))
+    content["operators"]["g"]["affine"][0]["theta"] = "-depth"
+    (tmp_path / "pack").mkdir()
+    write_arrays(tmp_path / "pack", cable)
+    write_manifest(tmp_path / "pack", content)
+    code, out, line = main("pack", str(tmp_path / "pack"))
+    assert (code, out) == (2, "")
+    assert "there is no solution: at mu = [4.0, 0.2]: no active set solves the high-fidelity problem" in line
+    cable.B = sp.csr_array(sp.diags_array(np.arange(SIZE) % 2, dtype=float) @ kept)
+    write_arrays(tmp_path / "pack", cable)
+    content["operators"]["g"]["affine"][0]["theta"] = "depth"
+    write_manifest(tmp_path / "pack", content)
+    code, out, _ = main("pack", str(tmp_path / "pack"))
+    assert code == 0
+    assert "6 rows of B are zero at every listed parameter, the first is 0" in out
 
 
 def test_import_says_which_members_are_interpolated_and_what_the_outputs_are(tmp_path: Path, main: Main) -> None:

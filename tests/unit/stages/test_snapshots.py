@@ -35,7 +35,7 @@ REASONS: Mapping[str, str] = {
     "NotANumberInACorner": "g has entries that are not finite at mu = [",
     "LoadOnAllNodes": "f has shape (49,) at mu = [1.0]; the spaces V and W require (25,)",
     "DualNormOfAllNodes": "B has shape (9, 54) at mu = ",
-    "ComplexStiffness": "A is complex at mu = [0.25, 0.05]",
+    "ComplexStiffness": "at mu = [0.25, 0.05]: A is complex",
     "DependsOnTheCallBefore": "two assemblies at one parameter are not the same",
     "ShiftsTheParameter": "assemble changes its argument mu",
 }

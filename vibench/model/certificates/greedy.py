@@ -370,7 +370,6 @@ class GreedyTrainer(Trainer):
         (vi, unverified), seconds = timed(work)
         # verification and checks are not timed
         solution = self._solver.verify(mu, vi, unverified)
-        self._solver.check_coercive(mu, vi)
         self._reference.refuse_false_declarations(mu, vi)
         self._solver.remember(mu, solution)
         if not self.solved:

@@ -1,0 +1,127 @@
+"""Members of any unambiguous type are sparse matrices and vectors of float64 afterwards; others are named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from numerics import Varying
+
+from vibench import AffineProblem, Array, InnerProduct, ParameterBox, Reduction, VariationalInequality, create
+from vibench.errors import NumericalError
+from vibench.interfaces.problem import Contact
+from vibench.interfaces.strategies import Stop
+from vibench.interfaces.validation import checked_assembly
+from vibench.offline.checked_tools import solve_high_fidelity
+
+MU = np.array([0.5])
+
+# Entries are numbers of single precision, and most of them integers.
+CONVERTED: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
+    "COO": (sp.coo_array, np.asarray), "COO matrix": (sp.coo_matrix, np.asarray), "DIA": (sp.dia_array, np.asarray),
+    "LIL": (sp.lil_array, np.asarray), "DOK": (sp.dok_array, np.asarray), "BSR": (sp.bsr_array, np.asarray),
+    "CSC": (sp.csc_array, np.asarray), "CSR matrix": (sp.csr_matrix, np.asarray),
+    "dense": (lambda M: M.toarray(), np.asarray), "np.matrix": (sp.csr_matrix.todense, np.asarray),
+    "integers": (lambda M: M.astype(int), lambda v: v.astype(int)),
+    "float32": (lambda M: M.astype(np.float32), lambda v: v.astype(np.float32)),
+    "long double": (lambda M: M.astype(np.longdouble), lambda v: v.astype(np.longdouble)),
+}  # fmt: skip
+REFUSED: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "list": (lambda v: v.toarray().tolist() if sp.issparse(v) else v.tolist(), "is a list, expected a"),
+    "none": (lambda v: None, "is a NoneType, expected a"),
+    "complex": (lambda v: v * 1j, "is complex"),
+    "objects": (
+        lambda v: (v.toarray() if sp.issparse(v) else v).astype(object), "has entries of the type object, expected real"
+    ),
+    "masked": (
+        lambda v: np.ma.masked_less(v.toarray() if sp.issparse(v) else v, -1.0), "is a masked array, expected numbers"
+    ),
+}  # fmt: skip
+
+
+class Chain(Varying):
+    """Springs above a table, in integers but for the load; `kinds` gives matrices and vectors their types."""
+
+    def __init__(self, kinds: tuple[Callable[[Any], Any], Callable[[Any], Any]] = (sp.csr_array, np.asarray)) -> None:
+        super().__init__(n=10, m=10, count=4)
+        self.V = InnerProduct(sp.csr_array(sp.eye_array(10)))
+        self.W, self.kinds = self.V, kinds
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        matrix, vector = self.kinds
+        A = sp.diags_array([4.0 * np.ones(10), -np.ones(9), -np.ones(9)], offsets=[0, 1, -1])
+        B, f = -sp.eye_array(10), -np.round(8.0 * (1.0 + mu[0])) * np.ones(10)
+        return VariationalInequality(
+            matrix(sp.csr_matrix(A)), vector(f), matrix(sp.csr_matrix(B)), vector(3.0 + 0.0 * f)
+        )
+
+
+@pytest.mark.parametrize("kind", CONVERTED)
+def test_unambiguous_types_give_the_numbers_of_float64(kind: str) -> None:
+    problem, usual = Chain(CONVERTED[kind]), Chain()
+    vi = checked_assembly(problem, MU)
+    for name in ("A", "f", "B", "g"):
+        value = getattr(vi, name)
+        assert value.dtype == np.float64
+        assert name in "fg" or isinstance(value, sp.csr_array | sp.csc_array)
+    exact = solve_high_fidelity(problem.assemble(MU))
+    np.testing.assert_allclose(exact.u, solve_high_fidelity(usual.assemble(MU)).u, rtol=1e-13)
+    assert np.any(exact.lam > 0.0)
+    dual, primal = create("dual strategy", "cpg"), create("primal strategy", "online-supremizers")
+    sizes = Stop(size=2), Stop(size=2)
+    found, same = (Reduction(each, dual, primal, *sizes).model.solve(MU) for each in (problem, usual))
+    assert found.status == "ok"
+    np.testing.assert_allclose(found.lam, same.lam, rtol=0.0, atol=1e-9)
+    assert found.error_bounds.u_energy == pytest.approx(same.error_bounds.u_energy, rel=1e-6)
+
+
+@pytest.mark.parametrize("member", ["A", "f", "B", "g"])
+@pytest.mark.parametrize("kind", REFUSED)
+def test_other_types_are_named(kind: str, member: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    (change, message), problem, usual = REFUSED[kind], Chain(), Chain()
+    members = vars(usual.assemble(MU))
+    wrong = members | {member: change(members[member])}
+    monkeypatch.setattr(problem, "assemble", lambda mu: VariationalInequality(**wrong))
+    with pytest.raises(NumericalError, match=rf"at mu = \[0.5\]: {member} {message}"):
+        checked_assembly(problem, MU)
+
+
+@pytest.mark.parametrize("kind", CONVERTED)
+def test_constraints_on_the_contact_norms_and_declared_terms_are_converted_too(kind: str) -> None:
+    matrix, vector = CONVERTED[kind]
+    eye = sp.csr_matrix(sp.eye_array(5))
+    contact = Contact(matrix(eye), vector(np.ones(5)))
+    assert (contact.B.dtype, contact.g.dtype) == (np.float64, np.float64)
+    norm = InnerProduct(matrix(eye))
+    assert norm.matrix.dtype == np.float64
+
+    class Declared(AffineProblem):
+        parameters = ParameterBox(("load",), np.array([1.0]), np.array([2.0]), ("1",))
+        V, W = norm, norm
+
+        def training_set(self) -> Array:
+            return self.parameters.grid(3)
+
+    problem = Declared()
+    problem.declare(A=matrix(4.0 * eye), f=[("load", vector(-np.ones(5)))], B=matrix(-eye), g=vector(np.zeros(5)))
+    vi = problem.assemble(MU)
+    assert checked_assembly(problem, MU).A is vi.A
+
+
+def test_an_infinite_bound_of_single_precision_is_an_absent_row() -> None:
+    vi = VariationalInequality(None, np.ones(1), None, np.array([np.inf, 1.0], np.float32))
+    assert vi.g.tolist() == [1e100, 1.0]
+
+
+def test_what_a_problem_raises_names_the_parameter(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = Chain()
+
+    def tangled(mu: Array) -> VariationalInequality:
+        raise ValueError("mesh tangled")
+
+    monkeypatch.setattr(problem, "assemble", tangled)
+    with pytest.raises(NumericalError, match=r"^at mu = \[0.5\]: ValueError: mesh tangled$"):
+        checked_assembly(problem, MU)
