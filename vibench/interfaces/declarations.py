@@ -9,7 +9,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, Mask
-from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality, is_absent
+from vibench.interfaces.absent_rows import is_absent
+from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
 
 
 def contradictions(problem: Problem, mu: Array, vi: VariationalInequality, *, elements: bool = True) -> Iterator[str]:

@@ -199,7 +199,7 @@ def check_symmetric(matrix: SparseMatrix, name: str) -> None:
 
 
 def check_positive_definite(matrix: SparseMatrix, name: str) -> None:
-    """Raise a `NumericalError` that says why a matrix is not symmetric and positive definite beyond round-off, if so."""
+    """Raise a `NumericalError` that says why a matrix is not symmetric positive definite beyond round-off, if so."""
     check_symmetric(matrix, name)
     try:
         solve = SparseCholesky(matrix, name).solve

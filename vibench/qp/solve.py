@@ -17,8 +17,9 @@ import scipy.sparse as sp
 from scipy.linalg.lapack import dposv, dtrtrs
 
 from vibench.arrays import Array
-from vibench.errors import NumericalError, message_of
+from vibench.errors import NumericalError, in_a_line, message_of
 from vibench.interfaces.problem import VariationalInequality
+from vibench.linalg.cholesky import SparseCholesky
 from vibench.provenance import solver_version
 from vibench.qp.scaling import Units, drive, near, row_norms, units_driven, units_of_dual
 from vibench.qp.settings import SETTINGS
@@ -110,8 +111,11 @@ def solve_qp(
     Raises
     ------
     NumericalError
-        If the solver does not return a `QPSolution` of the right shapes, with a text as its status.
+        If the solver does not return a `QPSolution` of the right shapes, with a text as its status. What it raises
+        itself becomes the status of an answer without x.
     """
+    if not len(program.g):
+        return _unconstrained(program, factor)
     if not program.f.any() and (program.g >= 0.0).all():
         return QPSolution(np.zeros_like(program.f), np.zeros_like(program.g), "nothing to solve: no constraint acts")
     if factor is None and isinstance(program.A, np.ndarray) and program.f.any():
@@ -142,6 +146,21 @@ def solve_qp(
     return _solve_dual(program, solve, factor, start, rows, driven.loaded)
 
 
+def _unconstrained(program: VariationalInequality, factor: Array | None) -> QPSolution:
+    """Solve a program without constraints, which many solvers do not take, by Cholesky; `factor` as in `solve_qp`."""
+    try:
+        if not isinstance(program.A, np.ndarray):
+            x = SparseCholesky(program.A, "A").solve(program.f)
+        elif len(program.f):
+            L = np.linalg.cholesky(program.A) if factor is None else factor
+            x = _solve_factor(L, _solve_factor(L, program.f.copy()), transposed=True)
+        else:
+            x = np.zeros(0)
+    except (NumericalError, np.linalg.LinAlgError) as error:
+        return QPSolution(None, None, message_of(error))
+    return QPSolution(x, np.zeros(0), "no constraints: solved by Cholesky")
+
+
 def _solve_in(
     units: Units,
     program: VariationalInequality,
@@ -155,15 +174,20 @@ def _solve_in(
     if not len(program.f):
         return QPSolution(np.zeros(0), np.zeros(len(program.g)), "nothing to solve: no unknowns")
     scaled = units.scaled_dual(program) if bounds else units.scaled(program)
-    if extra and solver in extra:
-        answer = extra[solver](scaled, accuracy)
-        if not isinstance(answer, QPSolution):
-            raise NumericalError(f"the solver returned a {type(answer).__name__}, expected a QPSolution")
-    else:
-        warm_start, starter = dict[str, Any](), SETTINGS[solver].start
-        if start is not None and starter is not None and start.x is not None and start.alpha is not None:
-            warm_start |= starter(*units.to(start.x, start.alpha))
-        answer = _call(scaled, solver, accuracy, warm_start, bounds)
+    warm_start, starter = dict[str, Any](), None if extra and solver in extra else SETTINGS[solver].start
+    if start is not None and starter is not None and start.x is not None and start.alpha is not None:
+        warm_start |= starter(*units.to(start.x, start.alpha))
+    try:
+        if extra and solver in extra:
+            answer = extra[solver](scaled, accuracy)
+        else:
+            answer = _call(scaled, solver, accuracy, warm_start, bounds)
+    except MemoryError:
+        raise
+    except Exception as error:  # noqa: BLE001  a solver may raise anything, and others go on
+        return QPSolution(None, None, in_a_line(error))
+    if not isinstance(answer, QPSolution):
+        raise NumericalError(f"the solver returned a {type(answer).__name__}, expected a QPSolution")
     status, iterations = _report(answer, program)
     if answer.x is None or answer.alpha is None:
         return QPSolution(None, None, status, iterations, answer.negative)
@@ -264,10 +288,7 @@ def _call(
         with warnings.catch_warnings():
             # Warnings repeat the status, which is part of the solution and is verified later.
             warnings.simplefilter("ignore")
-            try:
-                solution = qpsolvers.solve_problem(problem, solver=solver, **settings, **start)
-            except qpsolvers.SolverError as error:  # cvxopt raises one where no point is feasible
-                return QPSolution(None, None, message_of(error))
+            solution = qpsolvers.solve_problem(problem, solver=solver, **settings, **start)
     status, iterations = SETTINGS[solver].report(solution)
     z = solution.z
     if bounds and not isinstance(solution, DirectSolution):

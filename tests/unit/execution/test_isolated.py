@@ -48,10 +48,10 @@ def test_what_goes_wrong_is_said_and_costs_nobody_else_a_trial() -> None:
     found = attempts(["wrong", "raises", "leaves", "segfaults", "careful", "dies", "chatty"])
     assert list(found) == ["wrong", "raises", "leaves", "segfaults", "careful", "dies", "chatty"]
     assert {name: trial.status for name, trial in found.items()} == {
-        "wrong": Status.INACCURATE, "raises": Status.ERROR, "leaves": Status.ERROR, "segfaults": Status.CRASHED,
+        "wrong": Status.INACCURATE, "raises": Status.FAILED, "leaves": Status.ERROR, "segfaults": Status.CRASHED,
         "careful": Status.OK, "dies": Status.CRASHED, "chatty": Status.OK,
     }  # fmt: skip
-    assert found["raises"].reason == "RuntimeError: the solver gave in"
+    assert found["raises"].reason == "the solver returned nothing: RuntimeError: the solver gave in"
     assert "SystemExit" in found["leaves"].reason
     assert "7" in found["dies"].reason
     assert found["wrong"].residuals is not None

@@ -76,10 +76,10 @@ def test_of_parallel_rows_the_tightest_is_kept_and_rows_that_differ_are_all() ->
     B = sp.csr_array([[float(entry) for entry in line.split()] for line in lines.split(";")])
     g = np.array([1.0, -2.0, 5.0, 1.0, 2.0, 3.0, np.inf, 1.0, 0.1, 35.0, 0.0])
     rows = rows_that_matter(B, g, 1e-12 * np.abs(g), preferred=np.zeros(11))
-    assert rows.kept.tolist() in ([0, 2, 3, 5, 7, 10], [0, 3, 5, 7, 9, 10])
-    assert rows.equal.tolist() == [True, False, False, False, False, False]
+    assert rows.kept.tolist() in ([0, 2, 3, 5, 10], [0, 3, 5, 9, 10])
+    assert rows.equal.tolist() == [True, False, False, False, False]
     assert (rows.opposite[0], rows.ratio[0]) == (1, 0.5)
-    assert rows.implied.nonzero()[0].tolist() == [0, 1, 6, 8]
+    assert rows.implied.nonzero()[0].tolist() == [0, 1, 6, 7, 8]
     pressed = np.zeros(11)
     pressed[1] = 1.0
     other = rows_that_matter(B, g, 1e-12 * np.abs(g), preferred=pressed)

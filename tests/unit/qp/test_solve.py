@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import qpsolvers
 import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
@@ -40,15 +41,48 @@ def test_programs_sparse_or_without_unknowns_or_constraints_are_solved() -> None
     for bound, status in ((1.0, "ok"), (-1.0, "infeasible")):
         vi = VariationalInequality(np.zeros((0, 0)), np.zeros(0), np.zeros((1, 0)), np.array([bound]))
         assert verification.verify(vi, solve_qp(vi, "osqp", 1e-8), 1e-8)[0] == status
-    vi = VariationalInequality(np.eye(3), np.arange(3.0), np.zeros((0, 3)), np.zeros(0))
-    answer = solve_qp(vi, "piqp", 1e-8)
-    assert verification.verify(vi, answer, 1e-8)[0] is Status.OK
-    assert np.allclose(answer.x, np.arange(3.0), atol=1e-7)
     vi = program(3)
     sparse = VariationalInequality(sp.csc_array(vi.A), vi.f, sp.csr_array(vi.B), vi.g)
     answer = solve_qp(sparse, "piqp", 1e-9)
     assert np.allclose(answer.x, exact(vi)[0], atol=1e-7)
     assert verification.kkt_residuals(sparse, answer.x, answer.alpha).worst <= 1e-9
+
+
+@pytest.mark.parametrize("solver", [*installed_solvers(), "own"])
+@pytest.mark.parametrize("kind", ["none", "far"])
+def test_programs_without_constraints_are_solved_for_every_solver(solver: str, kind: str) -> None:
+    """Far constraints are left out at first, and none may be left."""
+    A, f = spd(4, np.random.default_rng(0)), np.arange(4.0)
+    B, g = (np.zeros((0, 4)), np.zeros(0)) if kind == "none" else (np.ones((2, 4)), np.full(2, 1e30))
+    x = np.linalg.solve(A, f)
+    own = {"own": lambda program, accuracy: pytest.fail("there is nothing to solve for a solver")}
+    for vi in (VariationalInequality(A, f, B, g), VariationalInequality(sp.csc_array(A), f, sp.csr_array(B), g)):
+        for factor in (None, np.linalg.cholesky(A)):
+            answer = solve_qp(vi, solver, 1e-8, own, factor if isinstance(vi.A, np.ndarray) else None)
+            assert verification.verify(vi, answer, 1e-12)[0] is Status.OK
+            np.testing.assert_allclose(answer.x, x, rtol=1e-13)
+            np.testing.assert_array_equal(answer.alpha, np.zeros(len(g)))
+    indefinite = VariationalInequality(-A, f, B[:0], g[:0])
+    assert solve_qp(indefinite, solver, 1e-8, own).x is None
+
+
+@pytest.mark.parametrize("error", [ValueError("no rows"), qpsolvers.exceptions.ProblemError("not convex"), KeyError(1)])
+def test_what_a_solver_raises_is_its_status(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    def raising(*given: Any, **settings: Any) -> Any:
+        raise error
+
+    monkeypatch.setattr(qpsolvers, "solve_problem", raising)
+    monkeypatch.setitem(DIRECT, "piqp", raising)  # type: ignore[misc]
+    vi, reason = program(0), f"{type(error).__name__}: "
+    for solver in ("osqp", "piqp", "own"):
+        answer = solve_qp(vi, solver, 1e-8, {"own": raising})
+        assert answer.x is None
+        assert answer.solver_status.startswith(reason)
+        status, why, _ = verification.verify(vi, answer, 1e-8)
+        assert (status, why.startswith(f"the solver returned nothing: {reason}")) == (Status.FAILED, True)
+    error = MemoryError()
+    with pytest.raises(MemoryError):
+        solve_qp(vi, "own", 1e-8, {"own": raising})
 
 
 @pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])
