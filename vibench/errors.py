@@ -6,7 +6,8 @@ import difflib
 import functools
 import inspect
 import typing
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
@@ -55,6 +56,22 @@ def _text_of(error: BaseException) -> str:
         return str(error)
     except Exception:  # noqa: BLE001  `__str__` of a plugin's exception may raise anything
         return "its message cannot be read"
+
+
+@contextmanager
+def at_parameter(mu: Any) -> Iterator[None]:
+    """Name mu (d,) in every error of the block; what a plugin raises becomes a `NumericalError`."""
+    where = f"mu = {mu.tolist()}"
+    try:
+        yield
+    except NumericalError as error:
+        if where in str(error):
+            raise
+        raise NumericalError(f"at {where}: {error}") from error
+    except (VibenchError, MemoryError):
+        raise
+    except Exception as error:
+        raise NumericalError(f"at {where}: {in_a_line(error)}") from error
 
 
 P = ParamSpec("P")

@@ -72,3 +72,23 @@ class Declared(Base, AffineProblem):
             B=[(1.0, self.rows - one), (share, one)],
             g=[(1.0, GAP * (1.0 - only)), (share, GAP * only)],
         )
+
+
+class Tangled(Declared):
+    """Its mesh is tangled at some of its fifteen training parameters, by their numbers."""
+
+    def __init__(self, *wrong: int) -> None:
+        super().__init__()
+        self.wrong = self.training_set()[list(wrong)]
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        if (self.wrong == mu).all(axis=1).any():
+            raise ValueError("mesh tangled")
+        return super().assemble(mu)
+
+
+class TangledThird(Tangled):
+    """The mesh is tangled at the third training parameter."""
+
+    def __init__(self) -> None:
+        super().__init__(2)

@@ -10,10 +10,10 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Mask, SparseMatrix
-from vibench.errors import NumericalError
+from vibench.errors import NumericalError, at_parameter
 from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness, condensed_stiffness
 from vibench.interfaces.problem import NestedStart, Problem, VariationalInequality
-from vibench.interfaces.validation import at_parameter, checked_assembly, in_float64, settled
+from vibench.interfaces.validation import checked_assembly, in_float64, settled
 from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import check_positive_definite, check_symmetric

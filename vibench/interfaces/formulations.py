@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, ClassVar, Protocol, TypeAlias
 
@@ -49,11 +49,14 @@ class Snapshots:
         Parameters (P×d).
     u, lam
         Columns u(mu) (n×P) and λ(mu) (m×P).
+    skipped
+        Reasons why other training parameters have no solution and are left out; each names its parameter.
     """
 
     mu: Array
     u: Array
     lam: Array
+    skipped: tuple[str, ...] = field(default=(), kw_only=True)
 
 
 class _Basis(Protocol):

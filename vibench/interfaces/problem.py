@@ -14,6 +14,7 @@ import scipy.sparse as sp
 from scipy.spatial import KDTree
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix, real_matrix, real_vector
+from vibench.errors import at_parameter
 from vibench.interfaces.absent_rows import settled_bounds, without_infinities
 from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.outputs import MeshFields, Output, Picture
@@ -230,11 +231,12 @@ class Problem(ABC):
 
     def constraint(self, mu: Array) -> tuple[SparseMatrix, Array]:
         """B (m×n) and g (m,) at mu (d,), from `contact` if implemented, else from `assemble`."""
-        contact = self.contact(mu)
-        if contact is None or self.contact_dofs is None:
-            vi = self.assemble(mu)
-            B = real_matrix(vi.B, "B")
-            return B, settled_bounds(B, real_vector(vi.g, "g"))
+        with at_parameter(mu):
+            contact = self.contact(mu)
+            if contact is None or self.contact_dofs is None:
+                vi = self.assemble(mu)
+                B = real_matrix(vi.B, "B")
+                return B, settled_bounds(B, real_vector(vi.g, "g"))
         # Columns of contact unknowns become those of all unknowns; the entries are shared.
         B = sp.csr_array(contact.B)
         entries = (B.data, self.contact_dofs[B.indices], B.indptr)

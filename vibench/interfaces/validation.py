@@ -6,7 +6,6 @@ A fingerprint of an assembled problem is equal for equal numbers, and small enou
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, real_matrix, real_vector
-from vibench.errors import NumericalError, VibenchError, in_a_line
+from vibench.errors import NumericalError, at_parameter
 from vibench.interfaces.absent_rows import ABSENT, is_absent, settled_bounds
 from vibench.interfaces.declarations import contradictions
 from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
@@ -106,22 +105,6 @@ def _finite_parameters(problem: Problem, name: str, mus: Array, count: int | Non
     if not np.all(np.isfinite(mus)):
         raise NumericalError(f"{name} has parameters that are not finite")
     return mus
-
-
-@contextmanager
-def at_parameter(mu: Array) -> Iterator[None]:
-    """Name mu (d,) in every error of the block; what a plugin raises becomes a `NumericalError`."""
-    where = f"mu = {mu.tolist()}"
-    try:
-        yield
-    except NumericalError as error:
-        if where in str(error):
-            raise
-        raise NumericalError(f"at {where}: {error}") from error
-    except (VibenchError, MemoryError):
-        raise
-    except Exception as error:
-        raise NumericalError(f"at {where}: {in_a_line(error)}") from error
 
 
 def in_float64(vi: VariationalInequality) -> VariationalInequality:
@@ -244,6 +227,17 @@ class ReferenceAssembly:
             raise NumericalError(f"a member declared `constant` is overwritten by later assemblies: {deviation}")
 
 
+def first_assembly(problem: Problem) -> VariationalInequality:
+    """The assembly at the first of the problem's own training parameters that has one; raises that of the first."""
+    errors = list[NumericalError]()
+    for mu in training_parameters(problem):
+        try:
+            return checked_assembly(problem, mu)
+        except NumericalError as error:
+            errors.append(error)
+    raise errors[0]
+
+
 def reference_assembly(problem: Problem) -> ReferenceAssembly:
-    """The assembly at the first training parameter, which those at others are compared with."""
-    return ReferenceAssembly(problem, checked_assembly(problem, training_parameters(problem)[0]))
+    """The `first_assembly`, which those at other parameters are compared with."""
+    return ReferenceAssembly(problem, first_assembly(problem))

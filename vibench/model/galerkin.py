@@ -14,7 +14,7 @@ from vibench.arrays import Array, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.interfaces.strategies import Enrichment
-from vibench.interfaces.validation import checked_assembly, training_parameters
+from vibench.interfaces.validation import checked_assembly, first_assembly
 from vibench.linalg.inner_product import orthonormal_range
 from vibench.reduction.supremizers import ContactCoordinates, projected_supremizers, proportionality
 
@@ -257,7 +257,7 @@ def projected_members(
     them. A and f have to be constant or affine, or among those left out.
     """
     names = [name for name in MEMBERS if name not in left_out]
-    of, vi = projections(Z, chi), checked_assembly(problem, training_parameters(problem)[0])
+    of, vi = projections(Z, chi), first_assembly(problem)
     constant = {name: of[name](getattr(vi, name)) for name in names if name in problem.constant}
     affine = {n: problem.affine[n].mapped(of[n]) for n in names if n in problem.affine and n not in constant}
     left = [name for name in names if name not in constant and name not in affine]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, TypeAlias, get_args
@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.errors import RequestError, UnsupportedError
+from vibench.errors import NumericalError, RequestError, UnsupportedError, message_of
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.formulations import Formulation, Snapshots, axes_of
 from vibench.interfaces.problem import Problem
@@ -57,11 +57,32 @@ Assembly: TypeAlias = Literal["full", "reduced"]
 """How a model assembles its programs, as in a study."""
 
 
-def high_fidelity_sweep(problem: Problem, mus: Array) -> Snapshots:
-    """High-fidelity solutions of a problem at parameters (P×d), one after the other."""
-    solver = HighFidelitySolver(problem)
-    solutions = [solver.solve(mu) for mu in mus]
-    return Snapshots(mus, np.column_stack([s.u for s in solutions]), np.column_stack([s.lam for s in solutions]))
+def high_fidelity_sweep(problem: Problem, mus: Array, *, skip: bool = False) -> Snapshots:
+    """High-fidelity solutions of a problem at parameters (P×d), one after the other.
+
+    Where `skip` is set, parameters without a solution are left out, as many as `check_skipped` allows.
+    """
+    solver, solutions, skipped, solved = HighFidelitySolver(problem), [], [], np.zeros(len(mus), bool)
+    for k, mu in enumerate(mus):
+        try:
+            solutions.append(solver.solve(mu))
+            solved[k] = True
+        except NumericalError as error:
+            if not skip:
+                raise
+            skipped.append(message_of(error))
+    check_skipped(skipped, len(solutions))
+    u, lam = (np.column_stack([getattr(s, name) for s in solutions]) for name in ("u", "lam"))
+    return Snapshots(mus[solved], u, lam, skipped=tuple(skipped))
+
+
+def check_skipped(skipped: Sequence[str], solved: int) -> None:
+    """Raise a `NumericalError` if more training parameters were skipped than a training set can lack."""
+    # With more failures it is the problem that fails, and the rest of the set trains for another box.
+    limit = max(1, (solved + len(skipped)) // 10)
+    if skipped and (len(skipped) > limit or not solved):
+        count = f"{len(skipped)} of {solved + len(skipped)} training parameters have no solution"
+        raise NumericalError(f"{count}, at most {limit} may be skipped; the first one: {skipped[0]}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +112,9 @@ class Reduction:
         The formulation of the model, by default that of studies which name none.
     bounds
         Whether the model has error bounds at online cost; that needs reduced assembly.
+    on_failure
+        What a training parameter without a solution does: "stop", or "skip", which leaves out a tenth of them at most;
+        `snapshots.skipped` says why. An adaptive sampling strategy skips none.
 
     Raises
     ------
@@ -111,6 +135,7 @@ class Reduction:
     accuracy: float = 1e-9
     formulation: Formulation | None = None
     bounds: bool = False
+    on_failure: Literal["stop", "skip"] = "stop"
 
     def __post_init__(self) -> None:
         classes = {
@@ -126,7 +151,8 @@ class Reduction:
                 raise RequestError(
                     f"{name} is {brief(repr(value), 80)}, expected a Stop: Stop(tolerance=…) or Stop(size=…)"
                 )
-        for name, choices in (("assembly", get_args(Assembly)), ("bounds", (True, False))):
+        choices_of = {"assembly": get_args(Assembly), "bounds": (True, False), "on_failure": ("stop", "skip")}
+        for name, choices in choices_of.items():
             value = getattr(self, name)
             if not isinstance(value, str | bool) or value not in choices:
                 right = " or ".join(map(repr, choices))
@@ -163,7 +189,8 @@ class Reduction:
     def snapshots(self) -> Snapshots:
         """High-fidelity solutions at the training parameters; an adaptive sampling strategy chooses these itself."""
         if not isinstance(self.training, AdaptiveSampling):
-            return high_fidelity_sweep(self.problem, training_parameters(self.problem, self.training))
+            mus = training_parameters(self.problem, self.training)
+            return high_fidelity_sweep(self.problem, mus, skip=self.on_failure == "skip")
         trainer = GreedyTrainer(self.problem, reference_assembly(self.problem))
         self.training.train(self.problem.parameters, trainer)
         mus, solutions = np.array([s.mu for s in trainer.solved]), [s.solution for s in trainer.solved]
@@ -171,8 +198,8 @@ class Reduction:
 
     @cached_property
     def parameters(self) -> Array:
-        """The training parameters (P×d): those of the snapshots, where these are known or chosen one by one."""
-        if "snapshots" in self.__dict__ or isinstance(self.training, AdaptiveSampling):
+        """The training parameters (P×d): those of the snapshots, where these are known, or it depends on solutions."""
+        if "snapshots" in self.__dict__ or isinstance(self.training, AdaptiveSampling) or self.on_failure == "skip":
             return self.snapshots.mu
         return training_parameters(self.problem, self.training)
 

@@ -10,11 +10,10 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
-from vibench.errors import NumericalError, RequestError, requested
+from vibench.errors import NumericalError, RequestError, at_parameter, requested
 from vibench.highfidelity.active_set import HighFidelitySolution, solve_high_fidelity
 from vibench.interfaces.absent_rows import settled_bounds, zero_rows
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
-from vibench.interfaces.validation import at_parameter
 from vibench.linalg.inner_product import asymmetry, check_positive_definite
 from vibench.packs.manifest import read_manifest
 from vibench.packs.pack import ModelPack, PackSolutions

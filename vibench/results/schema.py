@@ -149,6 +149,7 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "queries": integer("Number of queries, one per validation parameter."),
         "queries_ok": integer("Number of queries with status ok; means and maxima are over these.", "ok", 10),
         "snapshots": integer("High-fidelity solutions of the training, one per training parameter.", "solved", 11),
+        "skipped": integer("Training parameters without a solution, left out by `on_failure` = skip."),
         "dim_V": integer("Dimension n of V."),
         "dim_W": integer("Dimension m of W."),
         "N": integer("Dimension N of V_N; of other formulations most coefficients of u, those added apart.", "N", 11),

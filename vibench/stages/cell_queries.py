@@ -365,11 +365,14 @@ class _Queries(Items):
         for purpose, solved in (("training", self._training), ("validation", self._reference)):
             notes = [note for note in solved.fallbacks if note]
             fallbacks += [f"{len(notes)} of the {purpose} solutions: {notes[0]}"] if notes else []
+        if skipped := self._training.skipped:
+            fallbacks.append(f"{len(skipped)} training parameters without a solution were skipped: {skipped[0]}")
         if unbounded := int(np.sum(np.isinf(self._reference.bounds))):
             fallbacks.append(f"{unbounded} of the validation solutions have no error bound: residuals verify them")
         return {
             "model": self._stage.model, "dim_V": self._problem.V.dim, "dim_W": self._problem.W.dim,
-            "snapshots": len(self._training.mu), "fallbacks": "; ".join(fallbacks),
+            "snapshots": len(self._training.mu), "skipped": len(self._training.skipped),
+            "fallbacks": "; ".join(fallbacks),
             "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         }  # fmt: skip
 

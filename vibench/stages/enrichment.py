@@ -236,6 +236,7 @@ def _reduction(store: Store, pod: PODStage, cone: ConeStage, interpolation: floa
     reduction = Reduction(
         build_problem(pod.problem), cone.dual.create(), None, pod.stop, cone.stop, training=pod.training.strategy(),
         assembly="full" if interpolation is None else "reduced", interpolation=interpolation or Reduction.interpolation,
+        on_failure="skip" if pod.training.skips else "stop",
     )  # fmt: skip
     return reduction.given(pod=value_of(store, pod), cone=reduced.cone, multipliers=reduced.prepared)
 

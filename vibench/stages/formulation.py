@@ -9,7 +9,6 @@ from typing import Any
 
 from vibench.arrays import Array
 from vibench.interfaces.formulations import Formulation, Snapshots
-from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import Cone, Enrichment, Kind
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky
 from vibench.linalg.definite import BlockDiagonal
@@ -34,7 +33,7 @@ from vibench.stages.base import Result, Stage, build_problem, faults_of, value_o
 from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.offline import ConeStage, PODStage, ReducedCone
 from vibench.stages.serialisation import storable
-from vibench.stages.snapshots import gather, solution_stages
+from vibench.stages.snapshots import gather, parameters_in, solution_stages
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.timing import timed
 
@@ -61,16 +60,18 @@ class AffineDecomposition(Stage):
     tolerance: float
     training: ParameterSet = OWN_TRAINING
 
-    def run(self, store: Store) -> Result:  # noqa: ARG002
+    def inputs(self) -> tuple[Stage, ...]:
+        return solution_stages(self.problem, self.training) if self.training.skips else ()
+
+    def run(self, store: Store) -> Result:
         """An `AffineMember` by name."""
-        problem = build_problem(self.problem)
-        mus = self.parameters(problem)
+        problem, mus = build_problem(self.problem), self.parameters(store)
         return Result(*timed(lambda: affine_decomposition(problem, mus, self.tolerance)))
 
-    def parameters(self, problem: Problem) -> Array:
+    def parameters(self, store: Store) -> Array:
         """Parameters (P×d) at which members are assembled: the training set, or the problem's own."""
         # The decomposition needs no solutions, and an adaptive training has too few parameters for it.
-        return (OWN_TRAINING if self.training.is_adaptive else self.training).of(problem)
+        return parameters_in(store, self.problem, OWN_TRAINING if self.training.is_adaptive else self.training)
 
 
 @dataclass(frozen=True)
@@ -223,6 +224,7 @@ class FormulationStage(Stage):
             None if cone is None else cone.stop, None if enrichment is None else enrichment.tolerance,
             training=self.training.strategy(), assembly="full" if self.interpolation is None else "reduced",
             interpolation=self.interpolation or Reduction.interpolation, accuracy=accuracy, read=read,
+            on_failure="skip" if self.training.skips else "stop",
         ).given(**steps)  # fmt: skip
 
     def model(self, store: Store, solver: str | None = None, accuracy: float | None = None) -> Model:
@@ -253,7 +255,7 @@ class CertificateBaseStage(Stage):
     def run(self, store: Store) -> Result:
         problem = build_problem(self.decomposition.problem)
         members: Mapping[str, AffineMember] = value_of(store, self.decomposition)
-        training = self.decomposition.parameters(problem)
+        training = self.decomposition.parameters(store)
         return Result(*timed(lambda: certificate_base(problem, members, training)))
 
 
@@ -291,7 +293,7 @@ class CertificateStage(Stage):
         offline = model.offline.given(
             members=value_of(store, self.base.decomposition),
             certificate_base=value_of(store, self.base),
-            decomposed=self.base.decomposition.parameters(model.problem),
+            decomposed=self.base.decomposition.parameters(store),
         )
         model.reduced  # noqa: B018  assembled before the clock begins
         prepared, seconds = timed(lambda: model.online.certificate(offline))

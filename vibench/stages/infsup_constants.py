@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from vibench.errors import at_parameter
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.model.galerkin import ReducedModel
@@ -69,7 +70,9 @@ class EnergyConstants(Stage):
         matrices, (_, mus) = assemblies(problem), chunk_of(self.parameters.of(problem), self.chunk)
         # All constants of one parameter together, as long as its factorisation is there.
         for mu in mus:
-            constants.append((matrices.coercivity_at(mu), matrices.continuity_at(mu), matrices.energy_inf_sup_at(mu)))
+            with at_parameter(mu):
+                found = matrices.coercivity_at(mu), matrices.continuity_at(mu), matrices.energy_inf_sup_at(mu)
+            constants.append(found)
             PROGRESS.get()(len(constants) / len(mus))
         return Result(constants)
 

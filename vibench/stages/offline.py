@@ -102,8 +102,7 @@ class ConstraintMatrices(Stage):
     parameters: ParameterSet
 
     def inputs(self) -> tuple[Stage, ...]:
-        # The parameters of an adaptive training are known only with its solutions.
-        return solution_stages(self.problem, self.parameters) if self.parameters.is_adaptive else ()
+        return solution_stages(self.problem, self.parameters) if self.parameters.follows_solutions else ()
 
     def run(self, store: Store) -> Result:
         """The `ConstraintClasses`."""

@@ -12,14 +12,15 @@ from typing import TypeVar
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.errors import NumericalError
-from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolver
+from vibench.errors import NumericalError, at_parameter, message_of
+from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.formulations import Snapshots
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import Fingerprint, ReferenceAssembly, checked_assembly, reference_assembly
 from vibench.model.certificates.greedy import GreedyTrainer
 from vibench.model.error_bounds import reference_bound
 from vibench.offline.assemblies import assemblies
+from vibench.offline.reduction import check_skipped
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.qp.scaling import nearby
@@ -65,6 +66,44 @@ class _SetUp:
             self.solver, self.seconds = solver, seconds
 
 
+class _WrongProblemError(NumericalError):
+    """A problem is not what it declares, whatever its parameter is."""
+
+
+@dataclass(frozen=True)
+class _Work:
+    """The solver of a chunk of parameters (P×d), of which a copy was `given`, and the assembly to compare with."""
+
+    problem: Problem
+    solver: HighFidelitySolver
+    reference: ReferenceAssembly
+    mus: Array
+    given: Array
+
+    def solve(self, mu: Array) -> tuple[VariationalInequality, ActiveSetSolution]:
+        """The inequality at mu (d,) and its solution, which are timed."""
+        vi = checked_assembly(self.problem, mu)
+        with self.explained(mu, vi):
+            return vi, self.solver.solve_assembled(mu, vi)
+
+    @contextmanager
+    def explained(self, mu: Array, vi: VariationalInequality) -> Iterator[None]:
+        """Name the cause of a failed solution where the problem is at fault."""
+        try:
+            yield
+        except NumericalError:
+            try:
+                self.refuse_shifted()
+                self.reference.refuse_false_declarations(mu, vi)
+            except NumericalError as error:
+                raise _WrongProblemError(str(error)) from None
+            raise
+
+    def refuse_shifted(self) -> None:
+        if not np.array_equal(self.mus, self.given):
+            raise NumericalError("assemble changes its argument mu: work on a copy")
+
+
 @lru_cache(maxsize=1)
 def _set_up(problem: Problem) -> _SetUp:  # noqa: ARG001
     """The set-up that the chunks of a problem in one process share."""
@@ -105,59 +144,40 @@ class SnapshotStage(Stage):
 
     def _sweep(self, problem: Problem) -> Result:
         first, mus = chunk_of(self.parameters.of(problem), self.chunk)
-        given, reference = mus.copy(), reference_assembly(problem)
-        u, lam = np.zeros((problem.V.dim, len(mus))), np.zeros((problem.W.dim, len(mus)))
-        seconds, fallbacks, kept = [], [], _set_up(problem)
-        solver = kept.solver or HighFidelitySolver(problem)
+        kept = _set_up(problem)
+        work = _Work(problem, kept.solver or HighFidelitySolver(problem), reference_assembly(problem), mus, mus.copy())
         # No solution may depend on what this process has solved before.
-        solver.forget()
-
-        def refuse_shifted() -> None:
-            if not np.array_equal(mus, given):
-                raise NumericalError("assemble changes its argument mu: work on a copy")
-
-        @contextmanager
-        def explained(mu: Array, vi: VariationalInequality) -> Iterator[None]:
-            """Name the cause of a failed solution where the problem is at fault."""
-            try:
-                yield
-            except NumericalError:
-                refuse_shifted()
-                reference.refuse_false_declarations(mu, vi)
-                raise
-
-        def solve(mu: Array) -> tuple[VariationalInequality, ActiveSetSolution]:
-            vi = checked_assembly(problem, mu)
-            with explained(mu, vi):
-                return vi, solver.solve_assembled(mu, vi)
-
-        solutions: list[ActiveSetSolution] = []
+        work.solver.forget()
+        solutions, seconds = list[HighFidelitySolution](), list[Seconds]()
+        skipped, solved = list[str](), np.zeros(len(mus), bool)
         for k, mu in enumerate(mus):
-            # The first one without repetitions: its seconds from a known start are measured in the end.
-            runs, repeated = self._runs if k else 1, itertools.chain([mu], self._near(problem, mu, k))
-            (vi, unverified), taken = self._measure(solve, repeated, runs)
-            # The verification below is not timed.
-            seconds.append(taken)
-            # Repetitions at other parameters may have written into the arrays.
-            if runs > 1:
-                vi = checked_assembly(problem, mu)
-            with explained(mu, vi):
-                solution = solver.verify(mu, vi, unverified)
-            reference.refuse_false_declarations(mu, vi)
-            solver.remember(mu, solution)
-            solutions.append(solution)
-            u[:, k], lam[:, k] = solution.u, solution.lam
-            fallbacks.append(solution.fallback)
+            try:
+                vi, solution, taken = self._solved(work, k, mu)
+            except NumericalError as error:
+                if not self.parameters.skips or isinstance(error, _WrongProblemError):
+                    raise
+                skipped.append(message_of(error))
+            else:
+                work.reference.refuse_false_declarations(mu, vi)
+                work.solver.remember(mu, solution)
+                solutions.append(solution)
+                seconds.append(taken)
+                solved[k] = True
             PROGRESS.get()((k + 1) / len(mus))
+        mus = mus[solved]
+        u, lam = np.zeros((problem.V.dim, len(mus))), np.zeros((problem.W.dim, len(mus)))
+        for k, solution in enumerate(solutions):
+            u[:, k], lam[:, k] = solution.u, solution.lam
         if solutions:
-            beginning, seconds[0] = seconds[0], self._once_started(problem, solver, solve, solutions, mus)
-            kept.done(solver, beginning.beyond(seconds[0]))
-        self._probe(problem, reference)
-        reference.refuse_rewritten_constants()
-        refuse_shifted()
+            beginning, seconds[0] = seconds[0], self._once_started(work, solutions, mus)
+            kept.done(work.solver, beginning.beyond(seconds[0]))
+        self._probe(problem, work.reference)
+        work.reference.refuse_rewritten_constants()
+        work.refuse_shifted()
         setups = () if kept.seconds is None else (kept.seconds,)
-        measured = tuple(seconds), setups, tuple(fallbacks), reference.fingerprint
-        swept = TimedSnapshots(mus, u, lam, *measured, bounds=tuple(self._bounds(problem, mus, u, lam)))
+        fallbacks, bounds = (solution.fallback for solution in solutions), self._bounds(problem, mus, u, lam)
+        measured = tuple(seconds), setups, tuple(fallbacks), work.reference.fingerprint
+        swept = TimedSnapshots(mus, u, lam, *measured, bounds=tuple(bounds), skipped=tuple(skipped))
         return Result(swept, sum(seconds, NO_TIME), self._diagnostics(problem, mus, first))
 
     def _probe(self, problem: Problem, reference: ReferenceAssembly) -> None:
@@ -172,29 +192,35 @@ class SnapshotStage(Stage):
             for mu in problem.parameters.sample(missing, self.parameters.seed + 1):
                 reference.refuse_false_declarations(mu, checked_assembly(problem, mu))
 
+    def _solved(
+        self, work: _Work, number: int, mu: Array
+    ) -> tuple[VariationalInequality, HighFidelitySolution, Seconds]:
+        """The inequality at mu (d,), its verified solution, and the seconds of that without the verification."""
+        # The first one without repetitions: its seconds from a known start are measured in the end.
+        runs = self._runs if number else 1
+        repeated = itertools.chain([mu], self._near(work.problem, mu, number))
+        (vi, unverified), taken = self._measure(work.solve, repeated, runs)
+        # Repetitions at other parameters may have written into the arrays.
+        if runs > 1:
+            vi = checked_assembly(work.problem, mu)
+        with work.explained(mu, vi):
+            return vi, work.solver.verify(mu, vi, unverified), taken
+
     def _bounds(self, problem: Problem, mus: Array, u: Array, lam: Array) -> Iterator[float]:
         """Error bounds that verify reference solutions; none for training solutions."""
         matrices = assemblies(problem)
         for k, mu in enumerate(mus if self.parameters.role != "training" else ()):
-            try:
-                yield reference_bound(matrices.at(mu), matrices.energy_at(mu), u[:, k], lam[:, k])
-            except NumericalError as error:
-                raise NumericalError(f"at mu = {mu.tolist()}: {error}") from error
+            with at_parameter(mu):
+                bound = reference_bound(matrices.at(mu), matrices.energy_at(mu), u[:, k], lam[:, k])
+            yield bound
 
-    def _once_started(
-        self,
-        problem: Problem,
-        solver: HighFidelitySolver,
-        solve: Callable[[Array], object],
-        solutions: Sequence[ActiveSetSolution],
-        mus: Array,
-    ) -> Seconds:
+    def _once_started(self, work: _Work, solutions: Sequence[ActiveSetSolution], mus: Array) -> Seconds:
         """Seconds of the first solution from the contact set of the nearest of the others; if it is alone, its own."""
         # A start from none takes several times as long but happens once, however many solutions follow.
-        solver.forget()
+        work.solver.forget()
         for mu, solution in list(zip(mus, solutions, strict=True))[min(1, len(solutions) - 1) :]:
-            solver.remember(mu, solution)
-        return self._measure(solve, self._near(problem, mus[0], 0), self._runs)[1]
+            work.solver.remember(mu, solution)
+        return self._measure(work.solve, self._near(work.problem, mus[0], 0), self._runs)[1]
 
     @property
     def _runs(self) -> int:
@@ -273,8 +299,8 @@ def solution_stages(problem: Plugin, parameters: ParameterSet) -> tuple[Stage, .
 
 
 def parameters_in(store: Store, problem: Plugin, parameters: ParameterSet) -> Array:
-    """The parameters (P×d) of a set; those of an adaptive one are known once it is solved."""
-    if parameters.is_adaptive:
+    """The parameters (P×d) of a set, of those with solutions alone where these are known only once they are solved."""
+    if parameters.follows_solutions:
         return gather(store, solution_stages(problem, parameters)).mu
     return parameters.of(build_problem(problem))
 
@@ -289,7 +315,9 @@ def gather(store: Store, chunks: tuple[Stage, ...]) -> TimedSnapshots:
     """The snapshots of all chunks."""
     parts = [value_of(store, chunk) for chunk in chunks]
     (problem,) = {plugin for chunk in chunks for plugin in chunk.plugins if plugin.kind is PluginKind.PROBLEM}
+    skipped = tuple(reason for part in parts for reason in part.skipped)
     with faults_of(problem):
+        check_skipped(skipped, sum(len(part.mu) for part in parts))
         here = fingerprint_here(problem)
         for deviation in (text for part in parts for text in part.fingerprint.deviations(here)):
             raise NumericalError(
@@ -302,4 +330,5 @@ def gather(store: Store, chunks: tuple[Stage, ...]) -> TimedSnapshots:
         tuple(seconds for part in parts for seconds in part.setups),
         tuple(note for part in parts for note in part.fallbacks), here,
         sum((part.selecting for part in parts), NO_TIME), tuple(bound for part in parts for bound in part.bounds),
+        skipped=skipped,
     )  # fmt: skip

@@ -99,6 +99,8 @@ class Cell:
         # Keys of cells without correction are those from before there was a choice.
         if self.correction == CorrectionMode.NONE:
             del content["correction"]
+        if self.training.skips:
+            content["training_skips"] = True
         return content | {
             "seed": validation["seed"], "validation": validation["count"], "training": training["sampling"],
             "validation_sampling": validation["sampling"], "set_labels": (training["label"], validation["label"]),
@@ -128,7 +130,8 @@ class Cell:
         for name in ("labels", "nested_tolerances"):
             content[name] = tuple(content.get(name, ()))
         trained, validated = content.pop("set_labels", (OWN, OWN))
-        content["training"] = ParameterSet("training", 0, 0, content.get("training"), trained)
+        skips = content.pop("training_skips", False)
+        content["training"] = ParameterSet("training", 0, 0, content.get("training"), trained, skips)
         count, seed = content["validation"], content.pop("seed")
         # Older definitions do not have all of them.
         sampling = content.pop("validation_sampling", None)

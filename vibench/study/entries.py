@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from datetime import date, time
-from typing import Annotated, Any, Self, TypeAlias
+from typing import Annotated, Any, Literal, Self, TypeAlias
 
 from annotated_types import Ge, Le, MinLen
 from pydantic import (
@@ -127,6 +127,11 @@ class FormulationEntry(Entry):
 class SamplingEntry(Entry):
     """A parameter set: `own`, that of the problem itself, or a sampling strategy; other keys are its options."""
 
+    on_failure: Annotated[
+        Literal["stop", "skip"],
+        Field(description="Of a training set: `skip` leaves out parameters without a solution, a tenth at most."),
+    ] = "stop"
+
     @model_validator(mode="before")
     @classmethod
     def _from_name(cls, value: Any) -> Any:
@@ -153,6 +158,8 @@ def _number_or_table(value: Any) -> str:
 def _drawn(entry: SamplingEntry) -> SamplingEntry:
     if entry.name == OWN:
         raise ValueError("give the number of parameters in the problem's own set, or a sampling strategy")
+    if entry.on_failure == "skip":
+        raise ValueError("on_failure is for training sets: every query has a row")
     return entry
 
 

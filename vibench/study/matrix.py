@@ -249,7 +249,7 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
     return Study(**content, **settings)
 
 
-def _plugin_entry(plugin: Plugin, label: str) -> Any:
+def _plugin_entry(plugin: Plugin, label: str, **keys: Any) -> Any:
     given = plugin.registered
     name = given.given if isinstance(given, GivenPlugin) else plugin.name
     entries: dict[PluginKind, type[Entry]]
@@ -258,13 +258,16 @@ def _plugin_entry(plugin: Plugin, label: str) -> Any:
         PluginKind.SAMPLING: SamplingEntry,
         PluginKind.FORMULATION: FormulationEntry,
     }
-    content = {"name": name, "label": label, "options": json.loads(plugin.options)}
+    content = {"name": name, "label": label, "options": json.loads(plugin.options)} | keys
     return entries.get(plugin.kind, Entry).model_validate(content).at(json.loads(plugin.places))
 
 
 def _entry_of_set(parameters: ParameterSet) -> Any:
-    """The entry of a sampling strategy; `None` for the problem's own set."""
-    return None if parameters.sampling is None else _plugin_entry(parameters.sampling, parameters.label)
+    """The entry of a sampling strategy; `None` for the problem's own set, of which all parameters have solutions."""
+    skipping: dict[str, Any] = {"on_failure": "skip"} if parameters.skips else {}
+    if parameters.sampling is None:
+        return SamplingEntry(name=OWN, label=parameters.label, **skipping) if skipping else None
+    return _plugin_entry(parameters.sampling, parameters.label, **skipping)
 
 
 def _stop(tolerance: str, size: str, stop: Stop | None) -> tuple[str, list[float] | list[int]]:

@@ -28,18 +28,24 @@ class ParameterSet:
 
     # `count` is the number of parameters of a validation set, and `seed` that of a problem's own one, and of random
     # numbers in timings; both are 0 for training sets. `sampling` is `None` for the problem's own set. Sets that differ
-    # only in their labels are the same set.
+    # only in their labels are the same set. Training parameters without a solution are left out where the set `skips`.
 
     role: Literal["training", "validation"]
     count: int
     seed: int
     sampling: Plugin | None = None
     label: str = field(default=OWN, compare=False)
+    skips: bool = False
 
     @property
     def is_adaptive(self) -> bool:
         """Whether parameters are chosen one after the other from solutions; `of` returns candidates then."""
         return self.sampling is not None and issubclass(self.sampling.registered.load(), AdaptiveSampling)
+
+    @property
+    def follows_solutions(self) -> bool:
+        """Whether its parameters are known only once they are solved: those of an adaptive set, or with a solution."""
+        return self.is_adaptive or self.skips
 
     @property
     def is_ordered(self) -> bool:
@@ -106,6 +112,11 @@ def check_sets(problem: Plugin, training: ParameterSet, validation: ParameterSet
         raise RequestError(
             f"sampling strategy '{validation.sampling.name}' chooses training parameters by what solutions know; it "
             "makes no validation set"
+        )
+    if training.is_adaptive and training.skips and training.sampling is not None:
+        raise RequestError(
+            f"sampling strategy '{training.sampling.name}' chooses parameters by what solutions know; it has none to "
+            'skip: leave out on_failure = "skip"'
         )
     mus = parameters_of(problem, validation)
     if training.sampling is None and validation.sampling is None:

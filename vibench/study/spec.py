@@ -232,7 +232,10 @@ class Study(_Model):
 
     def training_sets(self, problem: ProblemEntry) -> list[ParameterSet]:
         entries = problem.training or self.training
-        return [ParameterSet("training", 0, 0, _sampling(entry), entry.title) for entry in entries]
+        return [
+            ParameterSet("training", 0, 0, _sampling(entry), entry.title, entry.on_failure == "skip")
+            for entry in entries
+        ]
 
     def validation_set(self, problem: ProblemEntry) -> ParameterSet:
         """The validation set of a problem; that of a sampling strategy has no size yet."""

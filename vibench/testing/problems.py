@@ -487,7 +487,7 @@ def high_fidelity_solution(case: ProblemCase) -> Iterator[str]:
         try:
             answer = solver.solve(mus[k].copy())
         except NumericalError as error:
-            raise ConformanceError(f"no solution {at(mus[k])}: {error}") from error
+            raise ConformanceError(f"no solution: {error}") from error
         # Exactly: the active set method leaves no negative multipliers.
         if np.min(answer.lam) < 0.0:
             yield f"the multiplier is not in W⁺ {at(mus[k])}: entry {np.argmin(answer.lam)} is {np.min(answer.lam):.1e}"

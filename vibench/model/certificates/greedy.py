@@ -23,6 +23,7 @@ import scipy.sparse as sp
 from cachetools import LRUCache
 
 from vibench.arrays import Array, Mask, SparseMatrix
+from vibench.errors import at_parameter
 from vibench.highfidelity.active_set import (
     ActiveSetSolution,
     HighFidelitySolution,
@@ -363,7 +364,8 @@ class GreedyTrainer(Trainer):
 
         def work() -> tuple[VariationalInequality, ActiveSetSolution]:
             if state is not None:
-                return state.vi, solve_unverified(state.vi, state.stiffness, state.pressed)
+                with at_parameter(mu):
+                    return state.vi, solve_unverified(state.vi, state.stiffness, state.pressed)
             vi = checked_assembly(self._problem, mu)
             return vi, self._solver.solve_assembled(mu, vi)
 
@@ -390,6 +392,7 @@ class GreedyTrainer(Trainer):
         return self._evaluate(self._model.estimate, mu)
 
     def _evaluate(self, judge: Callable[[Array], T], mu: Array) -> T:
-        value, seconds = timed(lambda: judge(np.array(mu, float)))
+        with at_parameter(mu):
+            value, seconds = timed(lambda: judge(np.array(mu, float)))
         self.selecting, self._evaluated = self.selecting + seconds, self._evaluated + int(value is not None)
         return value
