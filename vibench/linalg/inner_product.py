@@ -226,7 +226,7 @@ def check_regular(matrix: SparseMatrix, solve: Callable[[Array], Array], name: s
 
 
 def why_indefinite(matrix: SparseMatrix) -> str:
-    """What a symmetric matrix (n×n) is that is not positive definite."""
+    """Say whether a symmetric matrix (n×n) that is not positive definite is singular or indefinite."""
     diagonal = matrix.diagonal()
     if np.all(diagonal < 0.0):
         return "it is −A that is positive definite, the sign of A is the opposite one"

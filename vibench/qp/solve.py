@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.linalg.lapack import dposv, dtrtrs
 
-from vibench.arrays import Array
+from vibench.arrays import Array, Mask
 from vibench.errors import NumericalError, in_a_line, message_of
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
@@ -129,21 +129,34 @@ def solve_qp(
     rows = row_norms(program.B)
     driven = drive(program, rows)
     kept = near(program, rows, driven)
-    if not kept.all():
-        B = program.B[kept] if isinstance(program.B, np.ndarray) else sp.csr_array(program.B)[kept]
-        near_start = None if start is None or start.alpha is None else replace(start, alpha=start.alpha[kept])
-        near_program = replace(program, B=B, g=program.g[kept])
-        answer = solve_qp(near_program, solver, accuracy, extra, factor, near_start)
-        if answer.x is None or answer.alpha is None:
-            return answer
-        if np.all(program.B[~kept] @ answer.x <= program.g[~kept]):
-            alpha = np.zeros(len(kept))
-            alpha[kept] = answer.alpha
-            return replace(answer, alpha=alpha)
+    if not kept.all() and (answer := _solve_near(program, solver, accuracy, extra, factor, start, kept)) is not None:
+        return answer
     solve = partial(_solve_in, solver=solver, accuracy=accuracy, extra=extra)
     if factor is None or not len(program.f):
         return solve(units_driven(rows, driven), program, start)
     return _solve_dual(program, solve, factor, start, rows, driven.loaded)
+
+
+def _solve_near(
+    program: VariationalInequality,
+    solver: str,
+    accuracy: float,
+    extra: Mapping[str, QPSolver] | None,
+    factor: Array | None,
+    start: QPSolution | None,
+    kept: Mask,
+) -> QPSolution | None:
+    """Solve with the constraints that are `kept` (m,) alone; `None` if the solution violates one of the others."""
+    B = program.B[kept] if isinstance(program.B, np.ndarray) else sp.csr_array(program.B)[kept]
+    near_start = None if start is None or start.alpha is None else replace(start, alpha=start.alpha[kept])
+    answer = solve_qp(replace(program, B=B, g=program.g[kept]), solver, accuracy, extra, factor, near_start)
+    if answer.x is None or answer.alpha is None:
+        return answer
+    if not np.all(program.B[~kept] @ answer.x <= program.g[~kept]):
+        return None
+    alpha = np.zeros(len(kept))
+    alpha[kept] = answer.alpha
+    return replace(answer, alpha=alpha)
 
 
 def _unconstrained(program: VariationalInequality, factor: Array | None) -> QPSolution:
