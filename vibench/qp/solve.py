@@ -129,8 +129,8 @@ def solve_qp(
     rows = row_norms(program.B)
     driven = drive(program, rows)
     kept = near(program, rows, driven)
-    if not kept.all() and (answer := _solve_near(program, solver, accuracy, extra, factor, start, kept)) is not None:
-        return answer
+    if not kept.all() and (found := _solve_near(program, solver, accuracy, extra, factor, start, kept)) is not None:
+        return found
     solve = partial(_solve_in, solver=solver, accuracy=accuracy, extra=extra)
     if factor is None or not len(program.f):
         return solve(units_driven(rows, driven), program, start)

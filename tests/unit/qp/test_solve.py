@@ -73,7 +73,7 @@ def test_what_a_solver_raises_is_its_status(error: Exception, monkeypatch: pytes
 
     monkeypatch.setattr(qpsolvers, "solve_problem", raising)
     monkeypatch.setitem(DIRECT, "piqp", raising)  # type: ignore[misc]
-    vi, reason = program(0), f"{type(error).__name__}: "
+    vi, reason = pressed(0), f"{type(error).__name__}: "
     for solver in ("osqp", "piqp", "own"):
         answer = solve_qp(vi, solver, 1e-8, {"own": raising})
         assert answer.x is None
