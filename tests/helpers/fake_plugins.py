@@ -272,8 +272,8 @@ def segfaults(program: VariationalInequality, accuracy: float) -> QPSolution:
 
 
 def dies_sometimes(program: VariationalInequality, accuracy: float) -> QPSolution:
-    """Where the force is below 6 N/m: in units of what it moves, the way to the support is long there."""
-    if np.abs(program.g).max() > 0.35:
+    """Where the force is below 6 N/m: the first constraint of three modes is violated by less than the others there."""
+    if program.g[0] > -0.9993:
         os.kill(os.getpid(), signal.SIGKILL)
     return careful(program, accuracy)
 

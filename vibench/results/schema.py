@@ -11,7 +11,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 # Increase it with every change of the schema: a results file of another version is refused.
-VERSION = 20
+VERSION = 21
 
 
 class SqlType(StrEnum):

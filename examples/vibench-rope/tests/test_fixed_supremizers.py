@@ -31,6 +31,9 @@ class Weighted(Rope):
         vi = super().assemble(mu)
         return replace(vi, B=vi.B @ sp.diags_array(np.exp(mu[1] * self.x)))
 
+    def contact(self, mu: Array) -> None:
+        """Nothing: its constraint is that of `assemble`."""
+
 
 def offline(problem: Problem) -> Offline:
     """Two modes, three generators, nine training parameters."""

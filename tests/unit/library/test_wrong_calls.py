@@ -83,7 +83,7 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calls:
             vibench.Reduction,
             {"problem": pack, "dual": reduction.dual, "primal": None, "modes": Stop(size=2), "generators": Stop(size=2)}
             | {"tolerance": None, "training": None, "assembly": "full", "interpolation": 1e-9, "solver": "piqp"}
-            | {"accuracy": 1e-9, "formulation": reduction.formulation, "bounds": False},
+            | {"accuracy": 1e-9, "formulation": reduction.formulation, "bounds": False, "on_failure": "stop"},
         ),
         "Study": (vibench.Study, STUDY),
         "Stop": (Stop, {"tolerance": 0.1, "size": None}),

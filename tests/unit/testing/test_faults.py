@@ -66,7 +66,7 @@ FAULTS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "NamedByText": ("parameters", "the parameters' names are 'force'; expected a tuple"),
         "Unpicklable": ("pickling", "cannot be pickled", "attribute load"),
         "WrongSign": ("high-fidelity solution", "no constraint is active at any of 9", "B u ≤ g"),
-        "OutOfReach": ("high-fidelity solution", "no solution at mu = [8.0]", "more than the wire bears"),
+        "OutOfReach": ("high-fidelity solution", "no solution: at mu = [8.0]", "more than the wire bears"),
         "PaintsNothing": ("picture and diagnostics",
             "picture.values has shape (11,); expected (12,)", "points 0 to 12"),
         "InsideOut": ("picture and diagnostics", "mesh_fields.cells['tetra']: 1 of 1 cells are inside out or flat"),
