@@ -85,10 +85,10 @@ def measure(problem: Problem, count: int) -> None:
     mus = box.lower + np.random.default_rng(2022).random((count + 1, len(box.lower))) * (box.upper - box.lower)
     solver, kept = HighFidelitySolver(problem), Assemblies(problem)
     solver.solve(mus[0])
-    _judged(kept, mus[0], *_approximation(solver.solve(mus[0])))  # what is known of the problem
+    _judged(problem.V, kept, mus[0], *_approximation(solver.solve(mus[0])))  # what is known of the problem
     for mu in mus[1:]:
         solution, once = timed(partial(_solved, solver, problem, mu))
-        (bounds, parts), judging = timed(partial(_judged, kept, mu, *_approximation(solution)))
+        (bounds, parts), judging = timed(partial(_judged, problem.V, kept, mu, *_approximation(solution)))
         ratios.append(judging.cpu / once.cpu)
         named = ", ".join(f"{name} {seconds:.3f}" for name, seconds in parts.items())
         print(f"solution {once.cpu:.3f} s, constants and bounds {judging.cpu:.3f} s ({named}): {ratios[-1]:.2f} times")
@@ -105,12 +105,12 @@ def _approximation(solution: ActiveSetSolution) -> tuple[Array, Array]:
     return 0.99 * solution.u, 1.02 * solution.lam
 
 
-def _judged(kept: Assemblies, mu: Array, u: Array, lam: Array) -> tuple[ErrorBounds, dict[str, float]]:
+def _judged(V: InnerProduct, kept: Assemblies, mu: Array, u: Array, lam: Array) -> tuple[ErrorBounds, dict[str, float]]:
     """The error bounds of u (n,) and λ (m,), and the CPU seconds of their parts."""
     energy, factorising = timed(lambda: kept.energy_at(mu))
     alpha, of_alpha = timed(lambda: kept.coercivity_at(mu))
     beta, of_beta = timed(lambda: kept.energy_inf_sup_at(mu))
-    bounds, of_bounds = timed(lambda: bound_errors_at(kept.at(mu), energy, alpha, beta, u, lam))
+    bounds, of_bounds = timed(lambda: bound_errors_at(V, kept.at(mu), energy, alpha, beta, u, lam))
     parts = {"A": factorising, "α": of_alpha, "β_A": of_beta, "bounds": of_bounds}
     return bounds, {name: seconds.cpu for name, seconds in parts.items()}
 

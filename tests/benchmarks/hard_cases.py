@@ -88,7 +88,7 @@ def compared(problem: Problem, mus: Array) -> Iterator[tuple[str, float, float, 
             ("online, corrected", corrected.u, corrected.lam, corrected.bound),
         ]
         at_mesh = [("mesh", found.u, found.lam)] + [("mesh, corrected", pair.u, pair.lam) for pair in [pair] if pair]
-        bounds = [*online, *((*of, bound_errors_at(vi, energy, *constants, *of[1:])) for of in at_mesh)]
+        bounds = [*online, *((*of, bound_errors_at(problem.V, vi, energy, *constants, *of[1:])) for of in at_mesh)]
         sizes = energy.norm(exact.u), energy.dual_norm(vi.B.T @ exact.lam)
         for which, u, lam, bound in bounds:
             assert bound is not None

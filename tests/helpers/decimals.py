@@ -141,6 +141,27 @@ class ExactProgram:
                 self._next = violated | (active & ~pulling & (lam != Decimal(0)))
         raise AssertionError("no active set")
 
+    def errors(self, exact: tuple[Any, Any], u: np.ndarray, lam: np.ndarray) -> tuple[float, float]:
+        """The errors of u (n,) in the energy norm and of λ (m,) in the natural norm, from the solution."""
+        with localcontext() as context:
+            context.prec = DIGITS
+            pairs = zip(exact, (u, lam), strict=True)
+            e, epsilon = (one - exactly(np.asarray(of, float).astype(object)) for one, of in pairs)
+            force = np.full(self._n, Decimal(0), object)
+            for (indices, values), each in zip(self._rows, epsilon, strict=True):
+                for i, value in zip(indices, values, strict=True):
+                    force[i] += value * each
+            return float(self._energy(e).sqrt()), float((force @ self._solve(force)).sqrt())
+
+    def _energy(self, x: Any) -> Decimal:
+        """The square of the energy norm, by the factor."""
+        lower, n, x = self._lower, self._n, x[self._order]
+        total = Decimal(0)
+        for k in range(n):
+            count = min(self._band, n - 1 - k)
+            total += lower[k, 0] * (x[k] + lower[k, 1 : 1 + count] @ x[k + 1 : k + 1 + count]) ** 2
+        return total
+
     def _sets(self, guess: np.ndarray) -> Iterator[np.ndarray]:
         self._next = guess & self.present
         for _ in range(STEPS):

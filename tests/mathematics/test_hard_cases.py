@@ -8,7 +8,7 @@ from decimals import difference, exact_decimal
 from hard_problems import Beam, DoubleObstacle, Truss
 from other_problems import Covered, ThermalBlock, Torsion
 
-from vibench import AffineProblem, Array, Problem, Reduction, Stop, create
+from vibench import AffineProblem, Array, InnerProduct, Problem, Reduction, Stop, create
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky
 from vibench.linalg.definite import BlockDiagonal
@@ -94,12 +94,12 @@ def test_certified_models_of_hard_problems_have_bounds_that_hold(problem: Affine
         size = energy.norm(exact.u) + energy.dual_norm(vi.B.T @ exact.lam)
         pair = corrected_pair(vi, energy, found.u, found.lam)
         assert pair is not None
-        unknown = Constant(1.0, True), Constant(0.0, True)
+        in_energy, unknown = InnerProduct(vi.A), (Constant(1.0, True), Constant(0.0, True))
         for (u, lam), bound in (
             ((found.u, found.lam), found.bound),
             ((corrected.u, corrected.lam), corrected.bound),
-            ((found.u, found.lam), bound_errors_at(vi, energy, *unknown, found.u, found.lam)),
-            ((pair.u, pair.lam), bound_errors_at(vi, energy, *unknown, pair.u, pair.lam)),
+            ((found.u, found.lam), bound_errors_at(in_energy, vi, energy, *unknown, found.u, found.lam)),
+            ((pair.u, pair.lam), bound_errors_at(in_energy, vi, energy, *unknown, pair.u, pair.lam)),
         ):
             assert bound is not None
             assert getattr(bound, "guarantee", Guarantee.CERTIFIED) is Guarantee.CERTIFIED

@@ -30,6 +30,7 @@ class BoundNote(StrEnum):
     ON_ABSENT_ROW = "λ_N is not zero on a row whose g is infinite"
     NO_CORRECTION = "no w with B w ≥ s was found"
     ESTIMATED = "α is estimated"
+    ROUND_OFF = "no lower bound of A is known from which round-off in the norm of its inverse could be bounded"
     NOT_UNIQUE = "λ has no bound in W: no β_A > 0 is proved, as where rows are dependent or equalities"
     NOT_PREPARED = "no prepared correction satisfies B w ≥ s: the best w was computed at the parameter"
     NOT_COERCIVE = "no positive lower bound of the coercivity of A was found at this parameter"

@@ -71,12 +71,17 @@ class ContactForm:
         m, c = self.B.shape
         return 48 * int(self.B.nnz) + (8 * m * (c + 3 * m) if self.is_dense else 0)
 
+    @property
+    def retained(self) -> Indices:
+        """Positions (c,) of the retained unknowns, rising."""
+        return self._retained
+
     def values(self, u: Array) -> Array:
         """The retained unknowns (c,) of u (n,)."""
         return np.asarray(u[self._retained])
 
     def extended(self, values: Array) -> Array:
-        """The vector (n,) with these retained unknowns (c,) that has the smallest energy."""
+        """The vectors (n,) or (n, k) with these retained unknowns (c,) or (c, k) that have the smallest energy."""
         return self._stiffness.extend(values)
 
     @cached_property

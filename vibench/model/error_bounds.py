@@ -16,15 +16,15 @@ constraints are dependent and d is lost in round-off. Constants enter in the nor
 
 Δ_A is smallest for w = argmin ½‖w‖²_A + λ_NᵀB w subject to B w ≥ s, which has the structure of (7): the active set
 method starts from supp λ_N, where B w = s makes κ = 0. Any w with B w ≥ s is valid: optimality is not verified,
-feasibility is (`vibench.model.bound_terms`). The norms ρ, ρ_B and ω and the product κ are evaluated in floating-point
-arithmetic without a bound of their round-off. Where there are equalities (ii) holds for w', with ω + η, with
+feasibility is (`vibench.model.bound_terms`). The norms ρ, ρ_B and ω and the product κ are upper bounds of what they are
+in exact arithmetic (`vibench.model.proved_norms`). Where there are equalities (ii) holds for w', with ω + η, with
 ‖r + A w‖_{A⁻¹} + η in the duality gap, and with 2 λ_Nᵀ|B(w' − w)| added to 2κ. λ is not unique there: β_A is zero.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from math import hypot, inf
 
@@ -36,13 +36,16 @@ from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import active_set_iterations
 from vibench.interfaces.absent_rows import is_absent
 from vibench.interfaces.problem import VariationalInequality
-from vibench.linalg import UNIT_ROUND_OFF
+from vibench.linalg import EPS, UNIT_ROUND_OFF
+from vibench.linalg.inner_product import InnerProduct
 from vibench.model.bound_terms import BoundNote, BoundTerms, Equalities, dual_gap, first_margin, in_dual_set
 from vibench.model.contact_form import ContactForm, Representer
-from vibench.model.errors import EnergyNorm, riesz_representatives
+from vibench.model.errors import EnergyNorm, riesz_representatives, solutions
+from vibench.model.proved_norms import ProvedNorms
 from vibench.qp.exact import Rows, least_distance_solution, rows_that_matter
 from vibench.qp.scaling import ratio
-from vibench.stability.coercivity import Constant, Stability
+from vibench.qp.verification import extended
+from vibench.stability.coercivity import Constant, Stability, share_of_diagonal
 
 # largest error bound of a high-fidelity solution, relative to it in the energy norms
 REFERENCE = 1e-6
@@ -81,6 +84,7 @@ class ErrorBounds:
 
 
 def error_bounds(
+    V: InnerProduct,
     vis: Sequence[VariationalInequality],
     energies: Sequence[EnergyNorm],
     constants: Sequence[Stability],
@@ -96,16 +100,22 @@ def error_bounds(
     """
     residuals = residuals or [residual(vi, u[:, k], lam[:, k]) for k, vi in enumerate(vis)]
     starts = [None] * len(vis) if pressed is None else pressed.T
-    columns = zip(vis, energies, constants, u.T, lam.T, riesz_representatives(energies, residuals), starts, strict=True)
-    return [_bounds(vi, energy, c.coercivity, c.energy_inf_sup, *one) for vi, energy, c, *one in columns]
+    columns = zip(vis, energies, constants, u.T, lam.T, solutions(energies, residuals), starts, strict=True)
+    return [_bounds(V, vi, energy, c.coercivity, c.energy_inf_sup, *one) for vi, energy, c, *one in columns]
 
 
 def bound_errors_at(
-    vi: VariationalInequality, energy: EnergyNorm, alpha: Constant, beta: Constant, u: Array, lam: Array
+    V: InnerProduct,
+    vi: VariationalInequality,
+    energy: EnergyNorm,
+    alpha: Constant,
+    beta: Constant,
+    u: Array,
+    lam: Array,
 ) -> ErrorBounds:
     """Bounds (ii) of one reduced u (n,) and λ (m,), from lower bounds of α and of β_A."""
-    (riesz,) = riesz_representatives([energy], [residual(vi, u, lam)])
-    return _bounds(vi, energy, alpha, beta, u, lam, riesz)
+    (p,) = solutions([energy], [residual(vi, u, lam)])
+    return _bounds(V, vi, energy, alpha, beta, u, lam, p)
 
 
 def residual(vi: VariationalInequality, u: Array, lam: Array) -> Array:
@@ -114,30 +124,119 @@ def residual(vi: VariationalInequality, u: Array, lam: Array) -> Array:
 
 
 def _bounds(
+    V: InnerProduct,
     vi: VariationalInequality,
     energy: EnergyNorm,
     alpha: Constant,
     beta: Constant,
     u: Array,
     lam: Array,
-    riesz: Representer,
+    p: Array,
     pressed: Mask | None = None,
 ) -> ErrorBounds:
-    """Bounds (ii), with the representer A⁻¹r, and rows (m,) that the multiplier presses."""
+    """Bounds (ii), with a computed p ≈ A⁻¹r (n,), and rows (m,) that the multiplier presses."""
     if not in_dual_set(lam):
         return ErrorBounds.none(BoundNote.NOT_IN_CONE)
     if np.any(lam[is_absent(vi.g)]):
         return ErrorBounds.none(BoundNote.ON_ABSENT_ROW)
+    share = share_of_diagonal(V)
+    if not alpha.value * share.value > 0.0:
+        return ErrorBounds.none(BoundNote.ROUND_OFF)
     correction = find_correction(vi, energy, u, lam, pressed)
     if correction is None:
         return ErrorBounds.none(BoundNote.NO_CORRECTION)
-    of_u = bound_terms(correction, u, lam, riesz)
-    of_lam = min((of_u, *_constrained_terms(correction, u, lam, riesz)), key=lambda terms: terms.rho)
+    of_u, of_lam = _proved_terms(correction, alpha.value * share.value * V.matrix.diagonal(), energy, u, lam, p)
     in_V = of_u.primal / float(np.sqrt(alpha.value))
     in_W = of_lam.dual / beta.value if beta.value > 0.0 else inf
-    notes = [BoundNote.ESTIMATED] * (not alpha.proved) + [BoundNote.NOT_UNIQUE] * (not beta.value > 0.0)
+    estimated = not (alpha.proved and share.proved)
+    notes = [BoundNote.ESTIMATED] * estimated + [BoundNote.NOT_UNIQUE] * (not beta.value > 0.0)
     terms = of_u.rho, of_lam.rho, of_u.omega, of_u.kappa
     return ErrorBounds(of_u.primal, in_V, of_lam.dual, in_W, *terms, "; ".join(notes))
+
+
+def _proved_terms(
+    correction: Correction, floor: Array, energy: EnergyNorm, u: Array, lam: Array, p: Array
+) -> tuple[BoundTerms, BoundTerms]:
+    """Upper bounds of the terms for u_N (n,) and λ_N ≥ 0 (m,), and of those for λ; infinite where η is not proved.
+
+    p ≈ A⁻¹r (n,) is computed, `floor` (n,) that of `ProvedNorms`.
+    """
+    vi, found, before = correction.contact.vi, (BoundTerms(inf, inf, inf, inf),) * 2, inf
+    norms, solved = ProvedNorms(vi, floor, precise=False), p
+    # Double precision is enough where round-off is in the last digits of the bounds only. Elsewhere sums are in
+    # extended precision, and p is refined.
+    for attempt in range(4):
+        q, missed = norms.missed(u, solved, lam)
+        if attempt > 1 and not missed < 0.5 * before:
+            break
+        if not correction.constraints.proves_distances(norms):
+            missed = inf
+        found, share = _terms_of(correction, norms, u, lam, solved, missed)
+        before = missed
+        if missed <= 1e-3 * found[1].dual and share <= 1e-6:
+            break
+        if attempt == 0:
+            norms = ProvedNorms(vi, floor, precise=True)
+        else:
+            solved = extended(solved) + energy.stiffness.solve(q[:, None])[:, 0]
+    return found
+
+
+def _terms_of(
+    correction: Correction, norms: ProvedNorms, u: Array, lam: Array, p: Array, missed: float
+) -> tuple[tuple[BoundTerms, BoundTerms], float]:
+    """The terms from p (n,) and a bound of ‖r − A p‖_{A⁻¹}, and the share that round-off may have in norms of A.
+
+    Those for λ are of u + d, d = p − h, with the displacement h of the forces that hold B d = 0: the residual
+    r − A d = r − A p + A h is the part of r in the range of Bᵀ. Any d will do for which w is feasible.
+    """
+    contact, w, start = correction.contact, correction.values, correction.contact.values(u)
+    on_contact = contact.values(p).astype(float)
+    held = _held(correction, on_contact)
+    parts = contact.extended(np.column_stack([w] if held is None else [w, held])).astype(p.dtype)
+    if held is on_contact:  # h is p there
+        parts[contact.retained, 1] = contact.values(p)
+    lengths, share = norms.energies(np.column_stack([p, parts, parts[:, 0] + p, parts[:, 0] + parts[:, -1]]))
+    of_u = _with_round_off(correction, start, np.abs(start), lam, correction.eta, lengths[[0, 1, -2]], missed)
+    if held is None:
+        return (of_u, of_u), share
+    step = contact.values(p) - contact.values(parts[:, 1])
+    moved = (start + step).astype(float)
+    # what is rounded in d counts as a part of its terms
+    size = np.abs(moved) + norms.unit / UNIT_ROUND_OFF * np.abs(step).astype(float)
+    lacking, eta = correction.constraints.lacking(moved, w, size)
+    if not np.all(lacking <= 0.0):
+        return (of_u, of_u), share
+    return (of_u, _with_round_off(correction, moved, size, lam, eta, lengths[[2, 1, -1]], missed)), share
+
+
+def _held(correction: Correction, p: Array) -> Array | None:
+    """The displacement h (c,) for p (c,) of the forces that hold B d = 0; `None` where rows are dependent."""
+    contact = correction.contact
+    # any d will do for which w is feasible: far rows are left out, and the check covers them
+    rows = correction.constraints.rows.kept[contact.near[correction.constraints.rows.kept]]
+    if len(rows) == contact.B.shape[0] == contact.B.shape[1]:
+        # as many rows as unknowns: B d = 0 leaves nothing of d there
+        return p
+    try:
+        return contact.holding(rows, p).values
+    except (RuntimeError, np.linalg.LinAlgError):  # an exactly singular system
+        return None
+
+
+def _with_round_off(
+    correction: Correction, u: Array, size: Array, lam: Array, eta: float, lengths: Array, missed: float
+) -> BoundTerms:
+    """Upper bounds of the terms for contact values u (c,), from those of ‖p‖, ‖w‖ and ‖p + w‖ (3,).
+
+    `size` (c,) bounds the terms of u, and `missed` is ‖r − A p‖_{A⁻¹}.
+    """
+    contact, w, equalities = correction.contact, correction.values, correction.constraints.equalities
+    kappa = dual_gap(lam, _slack(contact, u, w) + _round_off(contact, size, w)) * (1.0 + (len(lam) + 16.0) * EPS)
+    if equalities is not None:
+        kappa += eta * float(lam @ equalities.reach)
+    rho, omega, feasible = lengths.tolist()
+    return BoundTerms(rho + missed, omega + eta, kappa, (feasible + missed + eta) ** 2 + 2.0 * kappa)
 
 
 def reference_bound(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam: Array) -> float:
@@ -158,7 +257,7 @@ def reference_bound(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam
     size = contact.contact_energy(lam)
     if not bound <= REFERENCE * size and not contact.least_contact:
         size = hypot(energy.norm(u), contact.force_norm(lam))
-    round_off = np.nan_to_num(_round_off(contact, contact.values(u), correction.values), posinf=0.0)
+    round_off = np.nan_to_num(_round_off(contact, np.abs(contact.values(u)), correction.values), posinf=0.0)
     # 2κ is at most twice λᵀ times the first margin and the round-off itself, where w was found at once
     open_by_round_off = np.sqrt(4.0 * float(lam @ first_margin(round_off)))
     if not bound <= max(REFERENCE * size, open_by_round_off):
@@ -221,9 +320,12 @@ class Constraints:
         moved[self.rows.equalities[self.equalities.chosen]] -= self.equalities.forces(missing)
         return w - self.equalities.step(missing), moved
 
-    def lacking(self, u: Array, w: Array) -> tuple[Array, float]:
-        """Upper bounds (m,) of what rows lack of B w' ≥ s in exact arithmetic, and η, a bound of ‖w' − w‖_A."""
-        slack, round_off = _slack(self.contact, u, w), _round_off(self.contact, u, w)
+    def lacking(self, u: Array, w: Array, size: Array) -> tuple[Array, float]:
+        """Upper bounds (m,) of what rows lack of B w' ≥ s in exact arithmetic, and η, a bound of ‖w' − w‖_A.
+
+        `size` (c,) bounds the terms of u.
+        """
+        slack, round_off = _slack(self.contact, u, w), _round_off(self.contact, size, w)
         if self.equalities is None:
             return np.where(self.rows.implied, 0.0, round_off - slack), 0.0
         equal = self.rows.equalities
@@ -235,6 +337,16 @@ class Constraints:
         missed[self.equalities.chosen] = False
         lacking[equal[missed]] = np.inf
         return lacking, eta
+
+    def proves_distances(self, norms: ProvedNorms) -> bool:
+        """Tell whether η is proved: its factor of two covers ‖M y‖_A ≤ 3/2 |y| and |B_E M y| ≥ 3/4 σ_min |y|."""
+        if (E := self.equalities) is None:
+            return True
+        chosen, M, unit = self.rows.equalities[E.chosen], E.liftings, 1.0 / E.lengths[:, None]
+        missed = np.linalg.norm(unit * (self.contact.B[chosen] @ M) - E.factor.T)
+        lost = unit * (self.contact.sizes[chosen] @ np.abs(M)) * (self.contact.entries[chosen] + 8.0)[:, None]
+        far = float(missed + EPS * (np.linalg.norm(lost) + 16.0 * len(chosen) ** 2))
+        return far <= 0.25 * E.smallest and norms.largest(extended(self.contact.extended(E.liftings))) <= 1.5
 
 
 @dataclass(frozen=True)
@@ -266,44 +378,17 @@ class Correction:
 
 
 def bound_terms(correction: Correction, u: Array, lam: Array, riesz: Representer) -> BoundTerms:
-    """The terms with a correction of u_N (n,) and λ_N ≥ 0 (m,), from A⁻¹r; A⁻¹(r + A w) = A⁻¹r + w."""
-    return _terms(correction, correction.contact.values(u), lam, riesz, riesz.norm)
+    """The terms with a correction of u_N (n,) and λ_N ≥ 0 (m,), from A⁻¹r, without a bound of their round-off.
 
-
-def _terms(correction: Correction, u: Array, lam: Array, riesz: Representer, largest: float) -> BoundTerms:
-    """As `bound_terms`, from contact values u (c,).
-
-    `largest` is the norm of the terms whose difference A⁻¹r is; it decides when A⁻¹r is recomputed.
+    A⁻¹(r + A w) = A⁻¹r + w.
     """
     contact, eta, equalities = correction.contact, correction.eta, correction.constraints.equalities
-    kappa = dual_gap(lam, _slack(contact, u, correction.values))
+    kappa = dual_gap(lam, _slack(contact, contact.values(u), correction.values))
     if equalities is not None:
         kappa += eta * float(lam @ equalities.reach)
     omega = Representer(correction.values, correction.load, 0.0).norm + eta
-    feasible = contact.norm(riesz.plus(correction.values, correction.load), largest) + eta
-    return BoundTerms(contact.norm(riesz, largest), omega, kappa, feasible**2 + 2.0 * kappa)
-
-
-def _constrained_terms(correction: Correction, u: Array, lam: Array, riesz: Representer) -> Iterator[BoundTerms]:
-    """The terms for u + d, whose residual is the part of r in the range of Bᵀ, if w is feasible for it and d exists.
-
-    d is A⁻¹r without the displacement A⁻¹Bᵀξ of the forces that hold B d = 0, which is A⁻¹ times the residual left.
-    """
-    contact, constraints = correction.contact, correction.constraints
-    # any d will do for which w is feasible: far rows are left out, and the check below covers them
-    rows = constraints.rows.kept[contact.near[constraints.rows.kept]]
-    if len(rows) == contact.B.shape[0] == contact.B.shape[1]:
-        # as many rows as unknowns: B d = 0 leaves nothing of d there, and w is feasible for u + d as for u
-        yield _terms(correction, contact.values(u), lam, replace(riesz, rest=0.0), riesz.norm)
-        return
-    try:
-        held = contact.holding(rows, riesz.values)
-    except (RuntimeError, np.linalg.LinAlgError):  # an exactly singular system
-        return
-    moved = contact.values(u) + (riesz.values - held.values)
-    lacking, eta = constraints.lacking(moved, correction.values)
-    if np.all(lacking <= 0.0):
-        yield _terms(replace(correction, eta=eta), moved, lam, held, riesz.norm)
+    feasible = contact.norm(riesz.plus(correction.values, correction.load), riesz.norm) + eta
+    return BoundTerms(riesz.norm, omega, kappa, feasible**2 + 2.0 * kappa)
 
 
 def find_correction(
@@ -318,7 +403,7 @@ def find_correction(
     constraints = Constraints.classify(energy, contact, u, lam)
     kept, equal = constraints.rows.kept, constraints.rows.equal
     excess = (contact.B @ u - vi.g)[kept]
-    margin = np.where(equal, 0.0, first_margin(_round_off(contact, u, np.zeros_like(u)))[kept])
+    margin = np.where(equal, 0.0, first_margin(_round_off(contact, np.abs(u), np.zeros_like(u)))[kept])
     # the largest multiplier s / b A⁻¹bᵀ that a row b w ≥ s would have alone, from above
     alone = float(np.max(excess * contact.stiffnesses[kept], initial=0.0))
     # multipliers 10⁸ times larger are those of dependent constraints, solved in round-off
@@ -330,7 +415,7 @@ def find_correction(
             multipliers = np.zeros(len(vi.g))
             multipliers[kept] = forces
             w, multipliers = constraints.moved(u, values, multipliers)
-            lacking, eta = constraints.lacking(u, w)
+            lacking, eta = constraints.lacking(u, w, np.abs(u))
             if not np.all(lacking <= 0.0):  # NaN is not
                 margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking[kept], nan=0.0, posinf=0.0))
                 continue
@@ -377,8 +462,8 @@ def _slack(contact: ContactForm, u: Array, w: Array) -> Array:
     return np.asarray(contact.B @ w - (contact.B @ u - contact.vi.g))
 
 
-def _round_off(contact: ContactForm, u: Array, w: Array) -> Array:
-    """Bound (m,) of the round-off in `_slack`."""
+def _round_off(contact: ContactForm, size: Array, w: Array) -> Array:
+    """Bound (m,) of the round-off in `_slack`, from a bound (c,) of the terms of u."""
     # a row of k terms and four operations more has at most γ_{k+4} < 1.01 (k + 4) u times its terms (Higham 2002, §3.1)
-    terms = contact.sizes @ (np.abs(w) + np.abs(u)) + np.abs(contact.vi.g)
+    terms = contact.sizes @ (np.abs(w) + size) + np.abs(contact.vi.g)
     return np.asarray(1.01 * (contact.entries + 4.0) * UNIT_ROUND_OFF * terms)

@@ -105,6 +105,15 @@ def riesz_representatives(energies: Sequence[EnergyNorm], functionals: Sequence[
     return [found[k] for k in range(len(energies))]
 
 
+def solutions(energies: Sequence[EnergyNorm], functionals: Sequence[Array]) -> list[Array]:
+    """The solutions A⁻¹ℓ (n,) for functionals (n,), as computed in `riesz_representatives`."""
+    found: dict[int, Array] = {}
+    for numbers in _with_one_stiffness(energies):
+        of_one = energies[numbers[0]].stiffness.solve(np.column_stack([functionals[k] for k in numbers]))
+        found |= dict(zip(numbers, of_one.T, strict=True))
+    return [found[k] for k in range(len(energies))]
+
+
 @dataclass(frozen=True)
 class ReferenceSolutions:
     """High-fidelity solutions, columns of u (n×P) and λ (m×P), and what is largest over the training set.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 from cachetools import LRUCache
@@ -153,13 +153,10 @@ class Assemblies:
 
     def _share_at(self, mu: Array) -> float:
         """A σ with A ≽ σ diag(A) at mu (d,), proved by α; 0 where α is not."""
-        alpha, X = self.coercivity_at(mu), self._problem.V.matrix
-        smallest = float(np.min(X.diagonal() / self.at(mu).A.diagonal()))
-        return alpha.value * self._norm_share * smallest if alpha.proved else 0.0
-
-    @cached_property
-    def _norm_share(self) -> float:
-        return share_of_diagonal(self._problem.V)
+        alpha, V = self.coercivity_at(mu), self._problem.V
+        share = share_of_diagonal(V)
+        smallest = float(np.min(V.matrix.diagonal() / self.at(mu).A.diagonal()))
+        return alpha.value * share.value * smallest if alpha.proved and share.proved else 0.0
 
     def _own_bytes(self, energy: EnergyNorm) -> int:
         """Memory of what is of one parameter alone."""

@@ -159,8 +159,9 @@ class Solution:
     def error_bounds(self) -> ErrorBounds:
         """Proved bounds on the errors of u and λ in four norms, at the cost of high-fidelity factorisations at mu."""
         cache = assemblies(self._model.problem)
-        alpha, beta = cache.coercivity_at(self.mu), cache.energy_inf_sup_at(self.mu)
-        return bound_errors_at(cache.at(self.mu), cache.energy_at(self.mu), alpha, beta, self.u, self.lam)
+        mu, constants = self.mu, (cache.coercivity_at(self.mu), cache.energy_inf_sup_at(self.mu))
+        of_V = self._model.problem.V
+        return bound_errors_at(of_V, cache.at(mu), cache.energy_at(mu), *constants, self.u, self.lam)
 
     @cached_property
     def high_fidelity_residuals(self) -> Residuals:

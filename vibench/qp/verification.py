@@ -151,9 +151,9 @@ def _residuals(program: VariationalInequality, x: Array, alpha: Array, inverse: 
     # u₀ + v: the factor allows for sums of as many terms as a reduced program has.
     if not left <= 64.0 * EPS * float(np.sqrt(np.abs(x) @ (abs(program.A) @ np.abs(x)))):
         return found
-    excess = np.asarray(_extended(B) @ (sum(free) + sum(moved)) - g, dtype=float)
+    excess = np.asarray(extended(B) @ (sum(free) + sum(moved)) - g, dtype=float)
     violated = np.flatnonzero(excess > 0.0)
-    rest = np.asarray(-force - _extended(program.A) @ sum(moved), dtype=float)
+    rest = np.asarray(-force - extended(program.A) @ sum(moved), dtype=float)
     lengths = inverse.dual_norms(np.column_stack([_dense_rows(B, violated).T, rest]))
     step = _largest_step(excess[violated], lengths[:-1])
     return min(found, Residuals.relative(step, float(lengths[-1]), _gap(alpha, excess), unit), key=lambda r: r.worst)
@@ -177,15 +177,15 @@ def _dense_rows(B: SparseMatrix | Array, rows: Indices) -> Array:
 def _refined_solution(A: SparseMatrix | Array, inverse: Inverse, load: Array) -> tuple[Any, Any]:
     """The solution A⁻¹f and its first correction (n,), whose sum in extended precision is exact to second order."""
     first = inverse.solve(load[:, None])[:, 0]
-    rest = np.asarray(load - _extended(A) @ _extended(first), dtype=float)
-    return _extended(first), _extended(inverse.solve(rest[:, None])[:, 0])
+    rest = np.asarray(load - extended(A) @ extended(first), dtype=float)
+    return extended(first), extended(inverse.solve(rest[:, None])[:, 0])
 
 
 def _least_contact(program: VariationalInequality, inverse: Inverse, free: tuple[Any, Any], rows: Rows) -> float:
     """F_low, a lower bound of F from u₀ alone; 0 where no row is violated there beyond the round-off of u₀."""
     B, g = program.B, program.g
     at = sum(free) if not len(rows.equalities) else inverse.holding(program, rows.equalities)
-    excess = np.asarray(_extended(B) @ at - g, dtype=float)
+    excess = np.asarray(extended(B) @ at - g, dtype=float)
     doubtful = round_off(B, np.asarray(at, dtype=float), g) + np.abs(np.asarray(B @ free[1].astype(float)))
     reached = np.flatnonzero((excess > doubtful) & ~rows.implied)
     # Every row gives a lower bound, and those that are farthest out the largest ones: a solution for each of thousands
@@ -201,12 +201,13 @@ def accurate_residuals(program: VariationalInequality, x: Array, alpha: Array) -
 
     For a stiff A, double precision would leave round-off times the condition number in the norm of A⁻¹.
     """
-    A, B, u, lam = map(_extended, (program.A, program.B, x, alpha))
+    A, B, u, lam = map(extended, (program.A, program.B, x, alpha))
     residual, excess = program.f - A @ u - B.T @ lam, B @ u - program.g
     return residual.astype(float), excess.astype(float)
 
 
-def _extended(array: Any) -> Any:
+def extended(array: Any) -> Any:
+    """An array, or a sparse matrix, in extended precision where the machine has one."""
     if not sp.issparse(array) or array.format not in ("csr", "csc"):
         return array.astype(np.longdouble)
     return type(array)((array.data.astype(np.longdouble), array.indices, array.indptr), shape=array.shape)

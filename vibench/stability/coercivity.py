@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 import scipy.linalg
@@ -116,14 +116,15 @@ def coercivity(quotients: Quotients, order: Indices | None = None) -> Constant:
     return moved(quotients.lowest, -1.0, lambda a: is_proved_definite([A, -a * V.matrix], chosen, order))
 
 
-def share_of_diagonal(X: InnerProduct) -> float:
-    """A ξ with X ≽ ξ diag(X), proved, of the order of the largest one; 0 where none is."""
+@lru_cache(maxsize=4)  # that of V is asked for at every parameter
+def share_of_diagonal(X: InnerProduct) -> Constant:
+    """A ξ with X ≽ ξ diag(X), of the order of the largest one."""
     diagonal = X.matrix.diagonal()
     # A rough estimate is enough: it is moved by the largest margin.
     estimate = _lowest(X.matrix, InnerProduct(sp.diags_array(diagonal)), X.riesz)(1e-2)
     xi = estimate / (1.0 + MARGINS[-1])
     scaled = sp.diags_array(-xi * diagonal)
-    return xi if proved_positive([X.matrix, scaled], np.sqrt(diagonal)) == X.dim else 0.0
+    return Constant(xi, proved_positive([X.matrix, scaled], np.sqrt(diagonal)) == X.dim)
 
 
 def continuity(quotients: Quotients) -> Constant:

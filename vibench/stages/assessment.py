@@ -50,7 +50,7 @@ def pair_columns(
     energies = [assemblies(problem).energy_at(mu) for mu in mus]
     forces = of_stiffness(energies, u)
     residuals = [vi.f - force - vi.B.T @ of_lam for vi, force, of_lam in zip(vis, forces.T, lam.T, strict=True)]
-    bounds = error_bounds(vis, energies, constants, u, lam, reference.lam > 0.0, residuals)
+    bounds = error_bounds(problem.V, vis, energies, constants, u, lam, reference.lam > 0.0, residuals)
     measured = zip(
         errors(problem, vis, energies, reference, u, lam),
         bounds,

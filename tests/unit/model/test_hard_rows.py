@@ -11,6 +11,7 @@ from numerics import spd
 from vibench.highfidelity.active_set import solve_high_fidelity
 from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
+from vibench.linalg.inner_product import InnerProduct
 from vibench.model.bound_terms import BoundNote
 from vibench.model.error_bounds import bound_errors_at, corrected_pair
 from vibench.model.errors import EnergyNorm
@@ -59,7 +60,7 @@ def test_solutions_are_right_and_bounds_exist_and_hold(kind: str, seed: int) -> 
     pair = corrected_pair(vi, norm, u_N, lam_N)
     assert pair is not None
     for v, nu in ((u_N, lam_N), (pair.u, pair.lam)):
-        found = bound_errors_at(vi, norm, Constant(1.0, True), Constant(0.0, True), v, nu)
+        found = bound_errors_at(InnerProduct(vi.A), vi, norm, Constant(1.0, True), Constant(0.0, True), v, nu)
         assert found.note == BoundNote.NOT_UNIQUE
         errors = norm.norm(difference(u, v)), norm.dual_norm(vi.B.T @ difference(lam, nu))
         assert errors[0] <= found.u_energy + 1e-13 * size

@@ -144,7 +144,9 @@ def test_fractions_of_diagonals_are_near_the_largest_and_wrong_entries_unproved(
         X = space(n, 7)
         unit = 1.0 / np.sqrt(X.matrix.diagonal())
         largest = float(np.linalg.eigvalsh(X.matrix.toarray() * np.outer(unit, unit))[0])
-        assert largest / 1.6 < share_of_diagonal(X) <= largest
+        share = share_of_diagonal(X)
+        assert share.proved
+        assert largest / 1.6 < share.value <= largest
     assert contact_infsup._proved_positive(np.eye(4) + 0.25, 1e-3)
     assert not contact_infsup._proved_positive(np.eye(4) + 0.25, 1.0)  # more is left out than the smallest eigenvalue
     for wrong, place in product([np.nan, np.inf, 0.0, -1.0], [(0, 0), (3, 3), (2, 1)]):

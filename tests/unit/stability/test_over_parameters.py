@@ -93,14 +93,14 @@ def test_errors_and_bounds_of_many_queries_are_those_of_each() -> None:
     energies = [energy(vi) for vi in vis]
     together = (
         errors(problem, vis, energies, reference, u, lam),
-        error_bounds(vis, energies, known, u, lam),
+        error_bounds(problem.V, vis, energies, known, u, lam),
         hsw_bounds(problem, vis, known, u, lam),
     )
     for k, vi in enumerate(vis):
         own = [energies[k]], u[:, [k]], lam[:, [k]]
         alone = (
             errors(problem, [vi], own[0], reference.restrict([k]), *own[1:])[0],
-            error_bounds([vi], own[0], [known[k]], *own[1:])[0],
+            error_bounds(problem.V, [vi], own[0], [known[k]], *own[1:])[0],
             hsw_bounds(problem, [vi], [known[k]], *own[1:])[0],
         )
         for found, expected in zip(together, alone, strict=True):
