@@ -205,9 +205,9 @@ def _terms_of(
     # what is rounded in d counts as a part of its terms
     size = np.abs(moved) + norms.unit / UNIT_ROUND_OFF * np.abs(step).astype(float)
     lacking, eta = correction.constraints.lacking(moved, w, size)
-    if not np.all(lacking <= 0.0):
-        return (of_u, of_u), share
-    return (of_u, _with_round_off(correction, moved, size, lam, eta, lengths[[2, 1, -1]], missed)), share
+    if np.all(lacking <= 0.0):
+        return (of_u, _with_round_off(correction, moved, size, lam, eta, lengths[[2, 1, -1]], missed)), share
+    return (of_u, of_u), share
 
 
 def _held(correction: Correction, p: Array) -> Array | None:
