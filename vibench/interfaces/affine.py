@@ -30,6 +30,12 @@ FUNCTIONS: Mapping[str, Callable[..., float]] = {
     "sinh": math.sinh, "cosh": math.cosh, "tanh": math.tanh,
 }  # fmt: skip
 
+BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
+    # not the power of Python, which leaves the real numbers where the base is negative
+    ast.Pow: math.pow,
+}  # fmt: skip
+
 
 def normal_names(names: Iterable[str]) -> tuple[str, ...]:
     """Names of parameters in the Unicode form NFKC, as in expressions: the micro sign becomes a μ.
@@ -125,9 +131,7 @@ def _check(node: ast.expr, text: str, names: Sequence[str]) -> None:
             if name not in CONSTANTS and name not in names:
                 hint = f"{name} is a function, it needs arguments in brackets" if name in FUNCTIONS else None
                 raise RequestError(f"'{text}': {hint or unknown_name('parameter', name, names)}")
-        case ast.BinOp(left=left, op=op, right=right) if isinstance(
-            op, ast.Add | ast.Sub | ast.Mult | ast.Div | ast.Pow
-        ):
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in BINARY:
             _check(left, text, names)
             _check(right, text, names)
         case ast.UnaryOp(op=op, operand=operand) if isinstance(op, ast.UAdd | ast.USub):
@@ -165,12 +169,7 @@ def _value(node: ast.expr, values: Mapping[str, float]) -> float:
         case ast.Name(id=name):
             return values[name]
         case ast.BinOp(left=left, op=op, right=right):
-            # Not the power of Python, which leaves the real numbers where the base is negative.
-            functions: dict[type[ast.operator], Callable[[float, float], float]] = {
-                ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
-                ast.Pow: math.pow,
-            }  # fmt: skip
-            return functions[type(op)](_value(left, values), _value(right, values))
+            return BINARY[type(op)](_value(left, values), _value(right, values))
         case ast.UnaryOp(op=op, operand=operand):
             value = _value(operand, values)
             return -value if isinstance(op, ast.USub) else value
