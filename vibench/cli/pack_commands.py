@@ -31,7 +31,7 @@ def pack(
     ],
     option: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="Option of the problem (repeatable).")] = None,
     validation: Annotated[int, Option(min=1, help="Number of validation parameters of a new pack.")] = 64,
-    seed: Annotated[int | None, Option(min=0, help="Seed of validation parameters, as in a study; default 0.")] = None,
+    seed: Annotated[int, Option(min=0, help="Seed of the validation parameters, as in a study.")] = 0,
     solutions: Annotated[bool, Option("--solutions", help="Add the high-fidelity solutions, as references.")] = False,
     cones: Annotated[bool, Option("--cones", help="Build cones from the multipliers of the pack.")] = False,
     dual: Annotated[list[str] | None, Option(help="Dual strategies; default: all.", autocompletion=duals)] = None,
@@ -52,7 +52,6 @@ def pack(
         from vibench.plugins.registry import find
 
         plugin = find(PluginKind.PROBLEM, problem[0])
-        seed = seed or 0
         made, source = plugin.create(dict(map(key_value, option or []))), f"{plugin} of {plugin.origin}"
         write_pack(made, folder, name=plugin.name, source=source, validation=validation, seed=seed, solutions=solutions)
         counts = f"{len(made.training_set())} training and {validation} validation parameters (seed {seed})"

@@ -77,7 +77,7 @@ def run_study_command(
             reason = "the connection is not authenticated: others who reach the scheduler can run code on its workers"
             warn(f"{unbroken(scheduler)}: {reason}")
     folder = out or Path("runs") / loaded.name
-    options = Options(jobs, fresh, retry, executor, scheduler, repeats)
+    options = Options(jobs or 0, fresh, retry, executor, scheduler, repeats or 0)
     with ProgressDisplay() as progress:
         outcome = run_study(loaded, folder, progress, options)
     _conclude(loaded.name, outcome, folder, draw=draw, fresh=fresh, strict=strict)

@@ -104,27 +104,27 @@ def identity(study: Study) -> dict[str, Any]:
 class Options:
     """How a study is run; only times depend on it.
 
-    `jobs` are worker processes, 0 or `None` for one per core. `fresh` removes earlier results and computes all
-    artefacts again, `retry` repeats cells that did not end ok. The `executor` is "local" or "dask", the `scheduler` the
-    address of one of dask, `None` for a cluster on this machine. `repeats` is the minimal number of cold processes in
-    which seconds are measured, 0 or `None` for as many as decide the comparisons.
+    `jobs` are worker processes, 0 for one per core. `fresh` removes earlier results and computes all artefacts again,
+    `retry` repeats cells that did not end ok. The `executor` is "local" or "dask", the `scheduler` the address of one
+    of dask, `None` for a cluster on this machine. `repeats` is the minimal number of cold processes in which seconds
+    are measured, 0 for as many as decide the comparisons.
 
     Raises a `RequestError` for too many worker processes or repeats.
     """
 
-    jobs: int | None = None
+    jobs: int = 0
     fresh: bool = False
     retry: bool = False
     executor: str = "local"
     scheduler: str | None = None
-    repeats: int | None = None
+    repeats: int = 0
 
     def __post_init__(self) -> None:
-        if not 0 <= (self.repeats or 0) <= 100:
+        if not 0 <= self.repeats <= 100:
             raise RequestError(f"repeats is {self.repeats}, expected 0 to 100 processes")
         # More than one process per core makes a run slower, and thousands stop the machine.
         most = 16 * provenance.cores()
-        if not 0 <= (self.jobs or 0) <= most:
+        if not 0 <= self.jobs <= most:
             what = f"at most {most} worker processes, 16 per core, or 0 for one per core"
             raise RequestError(f"jobs is {self.jobs}, expected {what}")
 
@@ -192,10 +192,9 @@ class _Run:
         goals = {cell: cell_queries(cell, seconds) for cell in cells if cell.key not in reasons}
         runnable = [cell for cell in todo if cell in goals]
         rounds, fewest = self.study.timing_rounds, self.study.timing_rounds_min
-        repeats = self.options.repeats or 0
-        requested = QUERY_SUBSETS * repeats
+        requested = QUERY_SUBSETS * self.options.repeats
         self.timing = TimingPlan(goals, max(rounds, requested), self.writer, max(fewest, requested))
-        self.offline = OfflinePlan(self.store, self.writer, max(repeats - 1, 0))
+        self.offline = OfflinePlan(self.store, self.writer, max(self.options.repeats - 1, 0))
         untimed = self.timing.start(runnable)
         workers: Executor | None = None
         interrupted = False
