@@ -28,7 +28,7 @@ from vibench.linalg.factorisations import DEFAULT, implementation
 from vibench.linalg.inner_product import check_regular
 from vibench.linalg.schur_complement import EliminationPattern, PrincipalSubmatrix, StaticCondensation
 from vibench.qp.scaling import row_norms
-from vibench.qp.verification import held_by_forces, norms_by_solutions
+from vibench.qp.verification import Inverse, norms_by_solutions
 
 
 def zone_of(B: SparseMatrix, rows: Mask) -> Indices:
@@ -86,7 +86,7 @@ MAX_BORDER = 16
 ActiveSolver = Callable[[Indices], tuple[Array, Array]]
 
 
-class CondensedStiffness:
+class CondensedStiffness(Inverse):
     """A stiffness matrix A (n×n), sparse SPD, condensed on the unknowns that constraints involve.
 
     The pattern retains at least all unknowns that B touches; by default every unknown is retained. The `factorisation`
@@ -145,7 +145,7 @@ class CondensedStiffness:
         try:
             return self.active_set_system(vi).holding(rows)[0]
         except (RuntimeError, np.linalg.LinAlgError):  # the rows are dependent
-            return held_by_forces(self, vi, rows)
+            return super().holding(vi, rows)
 
     @property
     def nbytes(self) -> int:

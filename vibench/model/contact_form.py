@@ -145,7 +145,7 @@ class ContactForm:
         return rows_that_matter(self.B, self.vi.g, room, directions=self.directions)
 
     def contact_energy(self, multiplier: Array) -> float:
-        """F of a multiplier η (m,): the norm of its force in A⁻¹, but for what equalities hold (MATH.md §12)."""
+        """F of a multiplier η (m,): the norm of its force in A⁻¹, but for what equalities hold."""
         if not len(self._matter.equalities):
             return self.force_norm(multiplier)
         held = replace(self.vi, f=np.asarray(self.vi.B.T @ multiplier), g=np.zeros_like(multiplier))

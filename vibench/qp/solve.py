@@ -89,7 +89,7 @@ def solve_qp(
 
     The data are scaled first (`Units`), every constraint row to unit norm and x and the objective by what drives them
     (`drive`), so that the absolute tolerances of the solvers correspond to the relative residuals of the benchmark.
-    A dense program is shifted by A⁻¹f before: its size is what contact does then, not the load (MATH.md §12).
+    A dense program is shifted by A⁻¹f before: its size is what contact does then, not the load.
     Constraints at a distance of more than 1e4 units are left out at first, and restored if the solution violates one of
     them. The solution is scaled back.
 

@@ -6,11 +6,12 @@ r = f − A x − Bᵀα and s = B x − g the *natural* residuals
 
     dual ‖r‖_{A⁻¹} / F,    primal max_i (s_i)₊ / ‖B_i‖_{A⁻¹} / F,    gap |αᵀs| / F²,    ‖B_i‖²_{A⁻¹} = B_i A⁻¹ B_iᵀ,
 
-are the same in all units of x and f, in any basis of x, and for any scaling of rows of B with g (MATH.md §12). Their
-unit is the F of the answer; where that does not suffice, the larger of it and of F_low = max_i (B_i u₀ − g_i)₊ /
-‖B_i‖_{A⁻¹} ≤ F. Without contact, F_low = 0, it is S, S² = ‖x‖²_A + ‖Bᵀα‖²_{A⁻¹}. Pairs of opposite rows are equalities
-and belong to u₀, or a loaded tie would hide the contact. Whether a row is violated is decided row by row, against the
-round-off of its own s_i: a far row, as one with g_i = ∞, says nothing of the others.
+are the same in all units of x and f, in any basis of x, and for any scaling of rows of B with g ("Residuals" in
+docs/mathematics.md). Their unit is the F of the answer; where that does not suffice, the larger of it and of
+F_low = max_i (B_i u₀ − g_i)₊ / ‖B_i‖_{A⁻¹} ≤ F. Without contact, F_low = 0, it is S, S² = ‖x‖²_A + ‖Bᵀα‖²_{A⁻¹}.
+Pairs of opposite rows are equalities and belong to u₀, or a loaded tie would hide the contact. Whether a row is
+violated is decided row by row, against the round-off of its own s_i: a far row, as one with g_i = ∞, says nothing of
+the others.
 
 Two solutions of one program whose residuals meet an accuracy have a bounded distance. For solutions k = 1, 2 with
 α_k ≥ 0, residuals r_k = f − Ax_k − Bᵀα_k and excesses s_k = Bx_k − g, the difference d = x₁ − x₂ satisfies
@@ -98,9 +99,14 @@ class Inverse(Protocol):
 
     def dual_norms(self, functionals: Array) -> Array:
         """Norms (k,) in A⁻¹ of functionals (n×k)."""
+        return norms_by_solutions(functionals, self.solve(functionals))
 
     def holding(self, program: VariationalInequality, rows: Indices) -> Array:
-        """The minimiser (n,) of ½ uᵀA u − fᵀu with these rows of B u ≤ g as equalities."""
+        """The minimiser (n,) of ½ uᵀA u − fᵀu with these rows of B u ≤ g, which may be dependent, as equalities."""
+        T, free = _dense_rows(program.B, rows), self.solve(program.f[:, None])[:, 0]
+        shifts = self.solve(T.T)
+        forces = np.linalg.lstsq(T @ shifts, T @ free - program.g[rows], rcond=None)[0]
+        return np.asarray(free - shifts @ forces)
 
 
 def kkt_residuals(
@@ -131,12 +137,13 @@ def kkt_residuals(
 def _residuals(program: VariationalInequality, x: Array, alpha: Array, inverse: Inverse, accuracy: float) -> Residuals:
     B, g = program.B, program.g
     residual, excess = accurate_residuals(program, x, alpha)
-    violated = np.flatnonzero(excess > round_off(B, x, g))
+    rounded = round_off(B, x, g)
+    violated = np.flatnonzero(excess > rounded)
     force = np.asarray(B.T @ alpha)
     # One solve for all costs the least.
     lengths = inverse.dual_norms(np.column_stack([_dense_rows(B, violated).T, force, residual]))
     step, left, contact = _largest_step(excess[violated], lengths[:-2]), float(lengths[-1]), float(lengths[-2])
-    rows = rows_that_matter(sp.csr_array(B), g, round_off(B, x, g))
+    rows = rows_that_matter(sp.csr_array(B), g, rounded)
     if len(rows.equalities):
         held = inverse.holding(replace(program, f=force, g=np.zeros_like(g)), rows.equalities)
         contact = _energy(program.A, held)
@@ -229,21 +236,15 @@ def inverse_of(A: SparseMatrix | Array) -> Inverse:
 
 
 @dataclass(frozen=True)
-class _SparseInverse:
+class _SparseInverse(Inverse):
     factor: SparseCholesky
 
     def solve(self, right: Array) -> Array:
         return self.factor.solve(right)
 
-    def dual_norms(self, functionals: Array) -> Array:
-        return norms_by_solutions(functionals, self.solve(functionals))
-
-    def holding(self, program: VariationalInequality, rows: Indices) -> Array:
-        return held_by_forces(self, program, rows)
-
 
 @dataclass(frozen=True)
-class _DenseInverse:
+class _DenseInverse(Inverse):
     L: Array
 
     def solve(self, right: Array) -> Array:
@@ -254,17 +255,6 @@ class _DenseInverse:
             return np.zeros(functionals.shape[1])
         whitened = scipy.linalg.solve_triangular(self.L, functionals, lower=True, check_finite=False)
         return np.asarray(np.linalg.norm(whitened, axis=0))
-
-    def holding(self, program: VariationalInequality, rows: Indices) -> Array:
-        return held_by_forces(self, program, rows)
-
-
-def held_by_forces(inverse: Inverse, program: VariationalInequality, rows: Indices) -> Array:
-    """`Inverse.holding` by the forces of the rows, which may be dependent."""
-    T, free = _dense_rows(program.B, rows), inverse.solve(program.f[:, None])[:, 0]
-    shifts = inverse.solve(T.T)
-    forces = np.linalg.lstsq(T @ shifts, T @ free - program.g[rows], rcond=None)[0]
-    return np.asarray(free - shifts @ forces)
 
 
 def norms_by_solutions(functionals: Array, solutions: Array) -> Array:
