@@ -229,3 +229,9 @@ def program_queries(
     mixed = Plugin("formulation", "mixed", "{}", "test")
     built = FormulationStage(pod.problem, mixed, pod.training, pod, cone, enrichment, interpolation)
     return CellQueries(built, validation, solver, accuracy, 20.0, warm_start, bounds)
+
+
+def pga_reduction(problem: vibench.Problem, generators: float, **more: Any) -> vibench.Reduction:
+    """A reduction with modes of 1e-4, cones by mCPG up to a tolerance, and offline PGA."""
+    strategies = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
+    return vibench.Reduction(problem, *strategies, vibench.Stop(1e-4), vibench.Stop(generators), tolerance=0.5, **more)

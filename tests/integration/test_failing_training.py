@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from samples import pga_reduction
 from vanishing import Declared, Tangled, TangledThird
 
 import vibench
-from vibench import NumericalError, Reduction, RequestError, Study, create
-from vibench.interfaces.strategies import Stop
+from vibench import NumericalError, Reduction, RequestError, Study
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, study_of_cell
 
@@ -42,16 +42,7 @@ def test_the_third_training_parameter_ends_the_cells_or_is_skipped_and_recorded(
 
 
 def reduction(problem: Declared, on_failure: str) -> Reduction:
-    return Reduction(
-        problem,
-        create("dual strategy", "mcpg"),
-        create("primal strategy", "offline-pga"),
-        Stop(1e-4),
-        Stop(1e-3),
-        tolerance=0.5,
-        assembly="reduced",
-        on_failure=on_failure,  # type: ignore[arg-type]
-    )
+    return pga_reduction(problem, 1e-3, assembly="reduced", on_failure=on_failure)
 
 
 @pytest.mark.parametrize("number", [0, 2, 14])

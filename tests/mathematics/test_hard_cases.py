@@ -7,8 +7,9 @@ import pytest
 from decimals import difference, exact_decimal
 from hard_problems import Beam, DoubleObstacle, Truss
 from other_problems import Covered, ThermalBlock, Torsion
+from samples import pga_reduction
 
-from vibench import AffineProblem, Array, InnerProduct, Problem, Reduction, Stop, create
+from vibench import AffineProblem, Array, InnerProduct, Problem, create
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky
 from vibench.linalg.definite import BlockDiagonal
@@ -76,16 +77,7 @@ EVERYWHERE = [
 )
 def test_certified_models_of_hard_problems_have_bounds_that_hold(problem: AffineProblem) -> None:
     """At online cost and at that of the mesh, of the pair and of the corrected one."""
-    reduction = Reduction(
-        problem,
-        create("dual strategy", "mcpg"),
-        create("primal strategy", "offline-pga"),
-        Stop(1e-4),
-        Stop(1e-2),
-        tolerance=0.5,
-        assembly="reduced",
-        bounds=True,
-    )
+    reduction = pga_reduction(problem, 1e-2, assembly="reduced", bounds=True)
     model, solver, kept = reduction.model, HighFidelitySolver(problem), assemblies(problem)
     for mu in problem.parameters.sample(10, 7):
         exact, found, corrected = solver.solve(mu), model.solve(mu), model.solve(mu, corrected=True)

@@ -8,13 +8,13 @@ import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
 from numerics import spd
+from samples import pga_reduction
 from vanishing import BOX, DOFS, Base, Declared, OnContact, Vanishing, share
 
-from vibench import NumericalError, Reduction, VariationalInequality, create
+from vibench import NumericalError, VariationalInequality
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.absent_rows import settled_bounds, zero_rows
 from vibench.interfaces.problem import Contact
-from vibench.interfaces.strategies import Stop
 from vibench.model.affine import Evaluation, affine_decomposition
 from vibench.offline.assemblies import Assemblies
 from vibench.offline.checked_tools import solve_high_fidelity
@@ -58,9 +58,7 @@ def test_qp_solvers_leave_zero_rows_out(solver: str) -> None:
 def test_a_row_that_vanishes_in_half_of_the_box_is_solved_reduced_and_bounded(kind: type[Base], assembly: str) -> None:
     problem = kind()
     bounds = assembly == "reduced" and kind is not Vanishing
-    strategies = create("dual strategy", "mcpg"), create("primal strategy", "offline-pga")
-    sizes = Stop(1e-4), Stop(1e-3)
-    model = Reduction(problem, *strategies, *sizes, tolerance=0.5, assembly=assembly, bounds=bounds).model  # type: ignore[arg-type]
+    model = pga_reduction(problem, 1e-3, assembly=assembly, bounds=bounds).model
     for mu in BOX.sample(6, 1):
         exact, found = model.high_fidelity(mu), model.solve(mu)
         assert found.status == "ok"

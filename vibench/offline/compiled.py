@@ -43,7 +43,14 @@ class CompiledModel:
 
     @classmethod
     def of(cls, reduced: AnyReducedModel, accuracy: float) -> CompiledModel:
-        """Interpolate the members of a reduced model."""
+        """Interpolate the members of a reduced model.
+
+        Raises
+        ------
+        UnsupportedError
+            If there is none: the basis depends on the parameter, polynomials of the members are not accurate enough or
+            too large.
+        """
         try:
             _, polynomials = member_polynomials(reduced, TOLERANCE, EVALUATIONS, fixed=True, check=_refuse_large)
         except RequestError as error:
@@ -65,7 +72,13 @@ class CompiledModel:
         return c_source.source(self.members, {"lower": self.lower, "upper": self.upper}, about, "model")[0]
 
     def program(self) -> CompiledProgram:
-        """Compile and load the program."""
+        """Compile and load the program.
+
+        Raises
+        ------
+        UnsupportedError
+            If there is no C compiler, or it fails.
+        """
         sizes = (self.members[name].terms.shape[1] for name in "fg")
         return CompiledProgram.compiled(self.source, *sizes)
 
@@ -90,7 +103,13 @@ class CompiledProgram:
 
     @classmethod
     def compiled(cls, source: str, unknowns: int, constraints: int) -> CompiledProgram:
-        """Compile a source and load the program."""
+        """Compile a source and load the program.
+
+        Raises
+        ------
+        UnsupportedError
+            If there is no C compiler, or it fails.
+        """
         # A library that is loaded needs its file no longer.
         with TemporaryDirectory(prefix="vibench-") as folder:
             loaded = ctypes.CDLL(str(_compiled(source, Path(folder))))

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from numerics import Varying
+from samples import pga_reduction
 
-from vibench import AffineProblem, Array, InnerProduct, ParameterBox, Problem, Reduction, VariationalInequality, create
+from vibench import AffineProblem, Array, InnerProduct, ParameterBox, Problem, Reduction, VariationalInequality
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import Sampler
-from vibench.interfaces.strategies import Stop
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.affine import Evaluation, affine_decomposition
 from vibench.qp.solve import installed_solvers, solve_qp
@@ -78,15 +78,7 @@ class Declared(AffineProblem):
 
 
 def reduced(problem: Problem, assembly: str) -> Reduction:
-    return Reduction(
-        problem,
-        create("dual strategy", "mcpg"),
-        create("primal strategy", "offline-pga"),
-        Stop(1e-4),
-        Stop(1e-3),
-        tolerance=0.5,
-        assembly=assembly,  # type: ignore[arg-type]
-    )
+    return pga_reduction(problem, 1e-3, assembly=assembly)
 
 
 @pytest.mark.parametrize("absent", [INFINITE, FAR])

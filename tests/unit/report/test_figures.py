@@ -20,6 +20,7 @@ from matplotlib.lines import Line2D
 from PIL import Image
 from running import DECIDED, Changed, execute
 
+from vibench.errors import RequestError
 from vibench.report import figures
 from vibench.report.figures import OF_DUAL, OF_PROBLEM, constants, convergence, costs, draw_all
 from vibench.report.figures import problem_tables as of_file
@@ -259,12 +260,16 @@ def test_a_solver_that_failed_takes_no_strategy_out_of_a_figure(change: Callable
     assert {"decorrelated", "decorrelated (k = 1)"} <= set(labels)
 
 
-def test_without_a_fixed_enrichment_there_is_no_enrichment_figure(change: Callable[..., None], draw: Draw) -> None:
+def test_without_a_fixed_enrichment_there_is_no_enrichment_figure(
+    change: Callable[..., None], draw: Draw, results: Path
+) -> None:
     """Nor does one need cones: where every snapshot has no contact there is no generator, so no e_orth."""
     change("DELETE FROM queries WHERE primal = 'offline-pga'", "DELETE FROM histories WHERE stage = 'cone'")
     drawn = draw(*kinds_of_histories(), "inf-sup", "total-cost", "work-precision")
     assert not [name for name in drawn if name.endswith("enrichment")]
     assert "obstacle-mcpg-inf-sup" in drawn
+    with pytest.raises(RequestError, match="the run has no data for the figure 'enrichment' of obstacle"):
+        figures.draw(results, "enrichment", "obstacle", "mcpg")
 
 
 def test_a_fixed_enrichment_without_tolerance_is_named_without_one(change: Callable[..., None], draw: Draw) -> None:
