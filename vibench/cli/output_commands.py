@@ -14,7 +14,7 @@ import typer
 from typer import Argument, Exit, Option
 
 from vibench.cli.completion import cells
-from vibench.cli.console import echo, run_argument
+from vibench.cli.console import echo, run_argument, warn
 from vibench.cli.result_commands import At, RunArgument, RunsArgument, places_of
 from vibench.errors import RequestError
 
@@ -67,11 +67,13 @@ def draw_run(path: Path, folder: Path, formats: tuple[str, ...] = ("png", "svg")
     # The run is complete at this point: Ctrl-C costs pictures alone, and says how to get them.
     try:
         with DrawingDisplay() as display:
-            drawn = figures.draw_all(path, folder, formats, display.show)
+            drawn, failures = figures.draw_all(path, folder, formats, display.show)
     except KeyboardInterrupt:
         missing = f"some figures are missing; `vibench figures {run_argument(path.parent)}` draws them"
         echo(f"interrupted while drawing: results and tables are complete, {missing}")
         raise Exit(130) from None
+    for line in failures:
+        warn(line)
     echo(f"{len(drawn)} figures: {folder}")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
@@ -174,12 +175,18 @@ class Run:
     def write_figures(
         self, folder: Path | str | None = None, formats: Sequence[Literal["png", "svg", "pdf"]] = ("png", "svg")
     ) -> list[Path]:
-        """Write every figure, and their captions; into `figures` beside the results file by default."""
+        """Write every figure, and their captions; into `figures` beside the results file by default.
+
+        A figure that cannot be drawn is left out with a warning.
+        """
         from vibench.report.figures import draw_all  # noqa: PLC0415  loads matplotlib
 
         target = self.path.parent / "figures" if folder is None else Path(folder)
         with writing(target):
-            return draw_all(self.path, target, tuple(formats))
+            files, failures = draw_all(self.path, target, tuple(formats))
+        for line in failures:
+            warnings.warn(line, stacklevel=3)
+        return files
 
     @requested
     def report(self, path: Path | str | None = None, *, figures: bool = True) -> Path:

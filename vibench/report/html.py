@@ -184,7 +184,7 @@ def page(path: Path, *, figures: bool = True) -> str:
     certified = ranking.certified_errors(read["queries"])
     first_plots = [p for name, data in data_of.items() for p in plots.overview(name, data, rows, paired, certified)]
     tasks = [task for name, data in data_of.items() for task in tasks_of(name, data)] if figures else []
-    images = render(tasks, image_of)
+    images, failures = render(tasks, image_of)
     templates = files("vibench.report") / "templates"
     style, script = ((templates / f"report.{end}").read_text(encoding="utf-8").strip() for end in ("css", "js"))
     template = environment("templates", trim_blocks=True, lstrip_blocks=True).get_template("report.html.j2")
@@ -202,7 +202,7 @@ def page(path: Path, *, figures: bool = True) -> str:
         more_findings=[(subject, list(group)) for subject, group in groupby(rest, key=lambda one: one.subject)],
         cells=len(cells),
         failed=int((cells["status"] != Status.OK).sum()),
-        missing=[f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason],
+        missing=failures + [f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason],
         grids=grids,
         drawn=figures,
         images=images,

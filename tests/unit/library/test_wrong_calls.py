@@ -113,7 +113,7 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calls:
 
 
 def test_every_wrong_argument_is_refused_in_a_line(calls: Calls, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vibench.report.figures.draw_all", lambda *_, **__: [])
+    monkeypatch.setattr("vibench.report.figures.draw_all", lambda *_, **__: ([], []))
     warnings.simplefilter("ignore")  # parameters outside the box
     refused, wrong = 0, list[str]()
     for name, (function, right) in calls.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,7 +19,7 @@ from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from PIL import Image
-from running import DECIDED, Changed, execute
+from running import DECIDED, Changed, Main, execute
 
 from vibench.errors import RequestError
 from vibench.report import figures
@@ -26,6 +27,7 @@ from vibench.report.figures import OF_DUAL, OF_PROBLEM, constants, convergence, 
 from vibench.report.figures import problem_tables as of_file
 from vibench.report.figures.data import Extent, _per_combination
 from vibench.report.figures.style import save, styled
+from vibench.report.html import page as report_page
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
 from vibench.study.matrix import read_study
@@ -64,7 +66,8 @@ def drawn_from(results: Path, folder: Path, *kinds: str, rendered: bool = False)
         for group in ("OF_PROBLEM", "OF_DUAL"):
             chosen = {kind: draw for kind, draw in getattr(figures, group).items() if not kinds or kind in kinds}
             patch.setattr(figures, group, chosen)
-        files = draw_all(results, folder, ("png", "svg"))
+        files, failures = draw_all(results, folder, ("png", "svg"))
+    assert failures == []
     assert [path.stem for path in files] == [name for name in kept for _ in ("png", "svg")]
     captions = ["captions.json"] * bool(files)
     assert sorted([path.name for path in files] + captions) == sorted(path.name for path in folder.glob("*"))
@@ -235,7 +238,7 @@ def test_a_logarithmic_panel_with_nothing_to_show_stays_empty(change: Callable[.
 
 def test_without_queries_nothing_is_drawn(change: Callable[..., None], results: Path, tmp_path: Path) -> None:
     change("DELETE FROM queries")
-    assert draw_all(results, tmp_path / "figures", ("png", "svg")) == []
+    assert draw_all(results, tmp_path / "figures", ("png", "svg")) == ([], [])
 
 
 def test_cells_that_failed_do_not_stop_the_others(change: Callable[..., None], draw: Draw) -> None:
@@ -438,6 +441,19 @@ def test_progress_names_every_figure_and_shows_the_end(
     assert shown == [(name, k, len(names) - 1) for k, name in enumerate(names)]
 
 
+def test_a_figure_that_fails_costs_itself_and_has_a_line(
+    change: Callable[..., None], results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, main: Main
+) -> None:
+    change("DELETE FROM queries WHERE problem = 'hertz' OR dual = 'cpg'")
+    monkeypatch.setattr(figures, "OF_PROBLEM", {"solvers": lambda _: {}["nan"], "total-cost": OF_PROBLEM["total-cost"]})
+    monkeypatch.setattr(figures, "OF_DUAL", {})
+    line = "the figure 'obstacle-solvers' could not be drawn: KeyError: 'nan'"
+    code, out, err = main("figures", str(results), "--out", str(tmp_path / "here"), "--format", "svg")
+    assert (code, err) == (0, f"vibench: {line}\n")
+    assert "\n1 figures: " in out
+    assert html.escape(line) in report_page(results)
+
+
 def test_the_tightest_enrichment_is_the_one_that_went_farthest(results: Path) -> None:
     """Whichever way its tolerance runs, and however many training parameters there are."""
     mine = dict(of_file(results))["obstacle"].restrict_to_dual("mcpg")
@@ -469,7 +485,7 @@ def test_a_long_figure_is_drawn_in_parts(results: Path) -> None:
     data = dict(of_file(results))["obstacle"].restrict_to_dual("mcpg")
     pairs = pd.concat([data.queries.assign(pair=f"pair {k}") for k in range(8)])
     task = ("name", figures.inf_sup, replace(data, queries=pairs, extent=Extent.PAGES))
-    drawn = dict(figures.render([task], lambda name, figure: (name, figure)))
+    drawn = dict(figures.render([task], lambda name, figure: (name, figure))[0])
     assert list(drawn) == ["name", "name-2"]
     assert [len([axes for axes in figure.axes if axes.get_title()]) for figure in drawn.values()] == [6, 2]
     assert [figure.caption[-12:] for figure in drawn.values()] == ["Part 1 of 2.", "Part 2 of 2."]

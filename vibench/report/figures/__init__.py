@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from matplotlib.figure import Figure
 
-from vibench.errors import RequestError, unknown_name
+from vibench.errors import RequestError, in_a_line, unknown_name
 from vibench.files import read_regular, write_atomically
 from vibench.report.figures.constants import inf_sup
 from vibench.report.figures.convergence import enrichment, projection_errors
@@ -105,20 +105,21 @@ def read_captions(folder: Path) -> dict[str, str]:
 def draw_all(
     path: Path, folder: Path, formats: tuple[str, ...],
     progress: Callable[[str, int, int], None] = lambda *_: None,
-) -> list[Path]:  # fmt: skip
-    """Draw every figure that a results file has data for, in every format; returns the files written to the folder.
+) -> tuple[list[Path], list[str]]:  # fmt: skip
+    """Draw every figure that a results file has data for, in every format.
 
-    Beside them is `captions.json`, with the caption of every figure by the name of its files.
+    Returns the files written to the folder, and a line for every figure that could not be drawn. Beside them is
+    `captions.json`, with the caption of every figure by the name of its files.
 
     Formats are "png", "svg" and "pdf". `progress` is called before a figure is drawn, with its name, the number of
     those done, and that of all there may be.
     """
-    pages = render(list(drawings(path)), partial(_save, folder, formats), progress)
+    pages, failures = render(list(drawings(path)), partial(_save, folder, formats), progress)
     if pages:
         captions = read_captions(folder) | {name: caption for name, caption, _ in pages}
         text = json.dumps(captions, ensure_ascii=False, indent=1) + "\n"
         write_atomically(folder / "captions.json", text.encode("utf-8"))
-    return [file for *_, files in pages for file in files]
+    return [file for *_, files in pages for file in files], failures
 
 
 def _save(folder: Path, formats: tuple[str, ...], name: str, figure: Figure) -> tuple[str, str, list[Path]]:
@@ -130,15 +131,21 @@ def _save(folder: Path, formats: tuple[str, ...], name: str, figure: Figure) -> 
 def render(
     tasks: Sequence[FigureTask], finish: Callable[[str, Figure], Made],
     progress: Callable[[str, int, int], None] = lambda *_: None,
-) -> list[Made]:  # fmt: skip
-    """Draw figures; returns the results of `finish(name, page)` of all their pages."""
+) -> tuple[list[Made], list[str]]:  # fmt: skip
+    """Draw figures; returns the results of `finish(name, page)` of all their pages, and a line for each that fails."""
     rendered: list[Made] = []
+    failures: list[str] = []
     for k, task in enumerate(tasks):
         progress(task[0], k, len(tasks))
         with styled():
-            rendered += [finish(name, page) for name, page in pages_of(task)]
+            try:
+                rendered += [finish(name, page) for name, page in pages_of(task)]
+            except OSError:
+                raise
+            except Exception as error:  # noqa: BLE001  results nobody thought of cost their figure, not the run
+                failures.append(f"the figure '{task[0]}' could not be drawn: {in_a_line(error)}")
     progress("", len(tasks), len(tasks))
-    return rendered
+    return rendered, failures
 
 
 def pages_of(task: FigureTask) -> Iterator[tuple[str, Figure]]:
