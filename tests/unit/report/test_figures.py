@@ -451,7 +451,7 @@ def test_a_figure_that_fails_costs_itself_and_has_a_line(
     code, out, err = main("figures", str(results), "--out", str(tmp_path / "here"), "--format", "svg")
     assert (code, err) == (0, f"vibench: {line}\n")
     assert "\n1 figures: " in out
-    assert html.escape(line) in report_page(results)
+    assert line in html.unescape(report_page(results))
 
 
 def test_the_tightest_enrichment_is_the_one_that_went_farthest(results: Path) -> None:
