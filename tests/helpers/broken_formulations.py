@@ -10,16 +10,8 @@ from typing import Any, ClassVar
 import numpy as np
 from formulations import Program, ProgramModel
 
-from vibench import (
-    Array,
-    FormulationAnswer,
-    FormulationModel,
-    Multiplier,
-    OfflinePhase,
-    Outcome,
-    QuerySettings,
-    solve_qp,
-)
+import vibench
+from vibench import Array, FormulationAnswer, FormulationModel, Multiplier, OfflinePhase, Outcome, QuerySettings
 
 
 def _wrong(name: str, **members: Any) -> type[Program]:
@@ -80,7 +72,7 @@ def _stepped_on(answer: FormulationAnswer, mu: Array) -> FormulationAnswer:
 
 
 def _same_solver(self: Any, mu: Array, settings: QuerySettings) -> FormulationAnswer:
-    found = solve_qp(self.assembled.assemble(mu).program, "piqp", settings.accuracy)
+    found = vibench.solve_qp(self.assembled.assemble(mu).program, "piqp", settings.accuracy)
     return FormulationAnswer(found.x, found.alpha)
 
 

@@ -2,23 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
 from fake_plugins import Wire
 
-from vibench import (
-    Array,
-    Contact,
-    InnerProduct,
-    MeshFields,
-    Output,
-    ParameterBox,
-    Picture,
-    Problem,
-    VariationalInequality,
-)
+import vibench
+from vibench import Array, Contact, InnerProduct, MeshFields, Output, ParameterBox, Picture, VariationalInequality
 
 
 class Declared(Wire):
@@ -46,40 +38,54 @@ class Declared(Wire):
         return Picture(points, np.array([[0], [1], [2]]), u, "deflection [m]", x[None], lam, "multiplier [N/m²]")
 
 
-def _variant(name: str, base: type[Problem] = Wire, **members: Any) -> type[Problem]:
-    return type(name, (base,), {"__module__": __name__, **members})
+def variant(module: str, name: str, base: Any = Wire, **members: Any) -> Any:
+    return type(name, (base,), {"__module__": module, **members})
 
 
-def _changed(name: str, member: str, wrong: Callable[[Any, Array], Any], above: float = -np.inf) -> type[Problem]:
-    """A wire of which one member is made wrong from some force on."""
+def changed(module: str, name: str, member: str, wrong: Callable[..., Any], base: Any = Wire, above: Any = None) -> Any:
+    """A problem of which one member is made wrong, from some force on, by its value, mu and the problem."""
 
     def assemble(self: Any, mu: Array) -> VariationalInequality:
-        vi = Wire.assemble(self, mu)
-        return vi if mu[0] < above else replace(vi, **{member: wrong(getattr(vi, member), mu)})
+        vi = base.assemble(self, mu)
+        return vi if above and mu[0] < above else replace(vi, **{member: wrong(getattr(vi, member), mu, self)})
 
-    return _variant(name, assemble=assemble)
+    return variant(module, name, base, assemble=assemble)
+
+
+def built(module: str, name: str, base: Any = Wire, **members: Callable[[Any], Any]) -> Any:
+    """A problem of which members are replaced when it is made."""
+
+    def init(self: Any) -> None:
+        base.__init__(self)
+        for member, made in members.items():
+            setattr(self, member, made(self))
+
+    return variant(module, name, base, __init__=init)
+
+
+_variant, _changed, _built = (partial(make, __name__) for make in (variant, changed, built))
 
 
 def _infinite(B: sp.csr_array) -> sp.csr_array:
     return sp.csr_array((np.where(np.arange(12) == 5, np.inf, B.data), B.indices, B.indptr))
 
 
-Asymmetric = _changed("Asymmetric", "A", lambda A, mu: A + sp.csr_array(([1e-3 * mu[0]], ([2], [3])), shape=A.shape))
-Indefinite = _changed("Indefinite", "A", lambda A, mu: A - 4.0 * (mu[0] - 4.0) * Wire().mass / 0.9)
-NotFinite = _changed("NotFinite", "f", lambda f, mu: np.where(np.arange(len(f)) == 7, np.nan, f), above=5.0)
-InfiniteMatrix = _changed("InfiniteMatrix", "B", lambda B, mu: _infinite(B))
-WrongShape = _changed("WrongShape", "B", lambda B, mu: B[:, :-1])
-Integers = _changed("Integers", "g", lambda g, mu: np.zeros(len(g), dtype=int))
-Column = _changed("Column", "f", lambda f, mu: f[:, None])
-Dense = _changed("Dense", "A", lambda A, mu: A.toarray())
-RowList = _changed("RowList", "B", lambda B, mu: B.tolil())
+Asymmetric = _changed("Asymmetric", "A", lambda A, mu, _: A + sp.csr_array(([1e-3 * mu[0]], ([2], [3])), shape=A.shape))
+Indefinite = _changed("Indefinite", "A", lambda A, mu, wire: A - 4.0 * (mu[0] - 4.0) * Wire().mass / 0.9)
+NotFinite = _changed("NotFinite", "f", lambda f, mu, wire: np.where(np.arange(len(f)) == 7, np.nan, f), above=5.0)
+InfiniteMatrix = _changed("InfiniteMatrix", "B", lambda B, mu, wire: _infinite(B))
+WrongShape = _changed("WrongShape", "B", lambda B, mu, wire: B[:, :-1])
+Integers = _changed("Integers", "g", lambda g, mu, wire: np.zeros(len(g), dtype=int))
+Column = _changed("Column", "f", lambda f, mu, wire: f[:, None])
+Dense = _changed("Dense", "A", lambda A, mu, wire: A.toarray())
+RowList = _changed("RowList", "B", lambda B, mu, wire: B.tolil())
 # The support gives way by a hundredth above a force of 5.4321 N/m.
-Jumps = _changed("Jumps", "g", lambda g, mu: 1.01 * g, above=5.4321)
+Jumps = _changed("Jumps", "g", lambda g, mu, wire: 1.01 * g, above=5.4321)
 # At one force alone it is another wire.
-JumpsAtTheCentre = _changed("JumpsAtTheCentre", "A", lambda A, mu: 2.0 * A if mu[0] == 6.0 else A)
-Random = _changed("Random", "f", lambda f, mu: f * (1.0 + 1e-15 * np.random.default_rng().random(len(f))))
+JumpsAtTheCentre = _changed("JumpsAtTheCentre", "A", lambda A, mu, wire: 2.0 * A if mu[0] == 6.0 else A)
+Random = _changed("Random", "f", lambda f, mu, wire: f * (1.0 + 1e-15 * np.random.default_rng().random(len(f))))
 # The wire is pulled off its support.
-WrongSign = _changed("WrongSign", "B", lambda B, mu: -B)
+WrongSign = _changed("WrongSign", "B", lambda B, mu, wire: -B)
 
 FalselyConstant = _variant("FalselyConstant", constant=frozenset({"A", "f"}))
 ConstantOfNothing = _variant("ConstantOfNothing", constant=frozenset({"a"}))
@@ -139,16 +145,9 @@ class IndefiniteDualNorm(Wire):
         self.W = InnerProduct(self.mass - 2.0 * self.step * sp.eye_array(self.mass.shape[0]), "X_W")
 
 
-class NoSpace(Wire):
-    def __init__(self) -> None:
-        super().__init__()
-        self.V = self.stiffness  # type: ignore[assignment]
-
-
-class NoConstraint(Wire):
-    def __init__(self) -> None:
-        super().__init__()
-        self.W = InnerProduct(sp.csr_array((0, 0)))
+NoSpace = _built("NoSpace", V=lambda wire: wire.stiffness)
+NoConstraint = _built("NoConstraint", W=lambda wire: InnerProduct(sp.csr_array((0, 0))))
+Unpicklable = _built("Unpicklable", load=lambda wire: lambda force: -force)
 
 
 class NoInequality(Wire):
@@ -170,16 +169,6 @@ class NormChangedLater(Wire):
         self.V.matrix.data *= -1.0
 
 
-class Remembers(Wire):
-    """The load depends on the force before."""
-
-    last = 4.0
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        vi, before, self.last = super().assemble(mu), self.last, float(mu[0])
-        return replace(vi, f=vi.f + 1e-9 * before)
-
-
 class CountsInstances(Wire):
     """Every instance has finer steps than the one before."""
 
@@ -189,13 +178,6 @@ class CountsInstances(Wire):
         super().__init__()
         CountsInstances.made += 1
         self.depth += 1e-6 * CountsInstances.made
-
-
-class ChangesTheParameter(Wire):
-    def assemble(self, mu: Array) -> VariationalInequality:
-        vi = super().assemble(mu)
-        mu -= self.parameters.lower
-        return vi
 
 
 class OneBuffer(Wire):
@@ -237,12 +219,6 @@ class SamplesWrong(Declared):
         return wrong
 
 
-class Unpicklable(Wire):
-    def __init__(self) -> None:
-        super().__init__()
-        self.load = lambda force: -force
-
-
 class Worse(Outside, Unpicklable):
     """Wrong in two ways."""
 
@@ -259,6 +235,6 @@ class InsideOut(Declared):
         return MeshFields(corners, {"tetra": np.arange(4)[None]}, {}, {})
 
 
-class Unfinished(Problem):
+class Unfinished(vibench.Problem):
     def training_set(self) -> Array:
         return np.zeros((2, 1))

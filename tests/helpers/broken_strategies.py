@@ -6,22 +6,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from vibench import (
-    Array,
-    Cone,
-    DualStrategy,
-    Enrichment,
-    InnerProduct,
-    Kind,
-    NestedStrategy,
-    Offline,
-    PrimalStrategy,
-    Step,
-    Stop,
-    greedy_cone,
-    project_on_cone,
-    supremizers,
-)
+from vibench import Array, InnerProduct, NestedStrategy, Step, greedy_cone, project_on_cone, supremizers
+from vibench.interfaces.strategies import Cone, DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, Stop
 
 
 class Greedy(DualStrategy):

@@ -6,29 +6,18 @@ Where the docstring of a class says nothing else, `vibench check` names the mist
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
+from broken_problems import built, changed
 from other_problems import Block, Put, Torsion, nodal
-from skfem import Basis, ElementTriP1, MeshTri
 
-from vibench import (
-    Array,
-    Contact,
-    Indices,
-    InnerProduct,
-    ParameterBox,
-    Problem,
-    QPSolution,
-    Sampler,
-    VariationalInequality,
-    fem,
-    solve_qp,
-)
+import vibench
+from vibench import Array, Contact, Indices, InnerProduct, Problem, QPSolution, Sampler, VariationalInequality
 
 
 class Bar(Problem):
@@ -120,51 +109,27 @@ class AllElements(ByElements):
         return super().element_sampler(np.arange(self.V.dim + 1))
 
 
-def _changed(
-    name: str, base: type[Problem], change: Callable[[Any, VariationalInequality, Array], Any]
-) -> type[Problem]:
-    """A problem with other members A, f, B, g."""
-
-    def assemble(self: Any, mu: Array) -> VariationalInequality:
-        vi = base.assemble(self, mu)
-        return replace(vi, **change(self, vi, mu))
-
-    return type(name, (base,), {"__module__": __name__, "assemble": assemble})
-
-
-def _built(name: str, base: type[Problem], **members: Callable[[Any], Any]) -> type[Problem]:
-    """A problem of which members are replaced when it is made."""
-
-    def init(self: Any) -> None:
-        base.__init__(self)
-        for member, made in members.items():
-            setattr(self, member, made(self))
-
-    return type(name, (base,), {"__module__": __name__, "__init__": init})
-
+_changed, _built = (partial(make, __name__) for make in (changed, built))
 
 # The reaction has the wrong sign, which matters where the rate is large and the volatility small.
 IndefiniteSomewhere = _changed(
-    "IndefiniteSomewhere", Option, lambda self, vi, mu: {"A": sp.csr_array(vi.A - 1.6 * mu[1] * self._M[1:-1, 1:-1])}
+    "IndefiniteSomewhere", "A", lambda A, mu, put: sp.csr_array(A - 1.6 * mu[1] * put._M[1:-1, 1:-1]), Option
 )
 # u ≥ −ψ in place of u ≤ ψ: no constraint is ever active.
-WrongSide = _changed("WrongSide", Bar, lambda self, vi, mu: {"B": -vi.B})
+WrongSide = _changed("WrongSide", "B", lambda B, mu, bar: -B, Bar)
 # g has the wrong sign: u ≤ −ψ, which sticks everywhere.
-NegativeGap = _changed("NegativeGap", Bar, lambda self, vi, mu: {"g": -vi.g})
+NegativeGap = _changed("NegativeGap", "g", lambda g, mu, bar: -g, Bar)
 # B, declared constant, turns with the place of the apex.
-ConstantConstraint = _changed(
-    "ConstantConstraint", Cube, lambda self, vi, mu: {"B": sp.csr_array(vi.B * (1.0 + 0.1 * mu[1]))}
-)
+ConstantConstraint = _changed("ConstantConstraint", "B", lambda B, mu, _: sp.csr_array(B * (1.0 + 0.1 * mu[1])), Cube)
 NoisyLoad = _changed(
-    "NoisyLoad", Bar, lambda self, vi, mu: {"f": vi.f * (1.0 + 1e-6 * np.random.default_rng().random(len(vi.f)))}
+    "NoisyLoad", "f", lambda f, mu, bar: f * (1.0 + 1e-6 * np.random.default_rng().random(len(f))), Bar
 )
 # The load has an entry for the nodes on the boundary, too.
-LoadOnAllNodes = _changed("LoadOnAllNodes", Bar, lambda self, vi, mu: {"f": np.full(49, mu[0] / 36.0)})
+LoadOnAllNodes = _changed("LoadOnAllNodes", "f", lambda f, mu, bar: np.full(49, mu[0] / 36.0), Bar)
 # κ is the root of a complex number.
-ComplexStiffness = _changed("ComplexStiffness", Option, lambda self, vi, mu: {"A": sp.csr_array(vi.A.astype(complex))})
-IntegerBound = _changed("IntegerBound", Cube, lambda self, vi, mu: {"f": np.zeros(self.V.dim, dtype=int)})
+ComplexStiffness = _changed("ComplexStiffness", "A", lambda A, mu, put: sp.csr_array(A.astype(complex)), Option)
 # The twist is not used.
-IgnoresTheParameter = _changed("IgnoresTheParameter", Bar, lambda self, vi, mu: {"f": 6.0 * self._weights})
+IgnoresTheParameter = _changed("IgnoresTheParameter", "f", lambda f, mu, bar: 6.0 * bar._weights, Bar)
 
 EuclideanNorm = _built("EuclideanNorm", Cube, V=lambda cube: InnerProduct(sp.eye_array(cube.V.dim, format="csc")))
 # X_W is that of all nodes, and not of those of the top.
@@ -186,15 +151,6 @@ class PermutedNorm(Option):
         super().__init__()
         order = np.random.default_rng(0).permutation(self.V.dim)
         self.V = InnerProduct(self.V.matrix[order][:, order])
-
-
-class MassNorm(Bar):
-    def __init__(self) -> None:
-        super().__init__()
-        cells = np.linspace(0.0, 1.0, 7)
-        basis = Basis(MeshTri.init_tensor(cells, cells), ElementTriP1())
-        free = basis.complement_dofs(basis.get_dofs())
-        self.V = InnerProduct(fem.mass(basis)[free][:, free])
 
 
 class SingularDualNorm(Bar):
@@ -219,15 +175,6 @@ class ConstantStiffness(Option):
     constant: ClassVar[frozenset[str]] = frozenset({"A"})
 
 
-class RandomMesh(Bar):
-    """The mesh of every instance has other nodes."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        stretch = 1.0 + 0.01 * np.random.default_rng().random(self.V.dim)
-        self._stiffness = sp.csr_array(sp.diags_array(stretch) @ self._stiffness @ sp.diags_array(stretch))
-
-
 class NamesOfNodes(Bar):
     """The unknowns are numbered in the order of a set of texts, which differs between processes."""
 
@@ -240,18 +187,6 @@ class NamesOfNodes(Bar):
         self.V = InnerProduct(self.V.matrix[order][:, order])
 
 
-class OneVector(Bar):
-    """Every load is written into the same vector."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._load = np.zeros(self.V.dim)
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        self._load[:] = mu[0] * self._weights
-        return replace(super().assemble(mu), f=self._load)
-
-
 class NotANumberInACorner(Option):
     """The root of a negative number where the rate is largest."""
 
@@ -260,18 +195,6 @@ class NotANumberInACorner(Option):
             factor = np.sqrt(0.07999 - mu[1]) / np.sqrt(abs(0.07999 - mu[1]))
         vi = super().assemble(mu)
         return replace(vi, g=vi.g * factor)
-
-
-class UpsideDownBox(Bar):
-    parameters = ParameterBox(("twist",), np.array([8.0]), np.array([1.0]), ("1/m",))
-
-
-class OtherSamples(Cube):
-    """Entry by entry the apex is elsewhere."""
-
-    def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
-        sample = super().sampler(wanted)
-        return lambda mu: sample(mu + np.array([0.0, 0.01]))
 
 
 class OtherContact(Cube):
@@ -324,7 +247,7 @@ class Unannotated(Bar):
 
 
 def exact(program: VariationalInequality, accuracy: float) -> QPSolution:
-    return solve_qp(program, "piqp", accuracy)
+    return vibench.solve_qp(program, "piqp", accuracy)
 
 
 def other_sign(program: VariationalInequality, accuracy: float) -> QPSolution:

@@ -14,25 +14,9 @@ import numpy as np
 import scipy.sparse as sp
 from annotated_types import Ge, Le
 
-from vibench import (
-    Array,
-    Cone,
-    DualStrategy,
-    Enrichment,
-    Indices,
-    InnerProduct,
-    Kind,
-    Offline,
-    ParameterBox,
-    PrimalStrategy,
-    Problem,
-    QPSolution,
-    Sampler,
-    Stop,
-    VariationalInequality,
-    greedy_cone,
-    solve_qp,
-)
+from vibench import Array, Indices, InnerProduct, ParameterBox, Problem, QPSolution, Sampler, VariationalInequality
+from vibench.interfaces.strategies import Cone, DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, Stop
+from vibench.offline.checked_tools import greedy_cone, solve_qp
 
 
 class Wire(Problem):

@@ -5,21 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 from fake_plugins import Wire, careful
 
-from vibench import (
-    Array,
-    Cone,
-    DualStrategy,
-    Enrichment,
-    InnerProduct,
-    Kind,
-    Offline,
-    ParameterBox,
-    Picture,
-    PrimalStrategy,
-    QPSolution,
-    Stop,
-    VariationalInequality,
-)
+from vibench import Array, InnerProduct, ParameterBox, Picture, QPSolution, VariationalInequality
+from vibench.interfaces.strategies import Cone, DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, Stop
 
 LABEL = "=1+1 [/b] [red] $x^{ $ `a` | <img src=x onerror=alert(1)> </script> \x1b[31m\n@ [x](javascript:y)"
 
