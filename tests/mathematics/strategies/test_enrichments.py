@@ -1,5 +1,6 @@
-"""Fixed enrichments by supremizers that look at the inf-sup constant, or at all supremizers at once."""
+"""Primal strategies: none, supremizers at every query, PGA, greedy and POD choices, and what each of them promises."""
 
+import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -14,7 +15,7 @@ from numerics import Varying
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.strategies import Cone, Offline, Stop, no_free
+from vibench.interfaces.strategies import Cone, Kind, Offline, Stop, no_free
 from vibench.interfaces.validation import check_enrichment
 from vibench.linalg.inner_product import orthonormal_range, project_out, singular_values
 from vibench.reduction.cones import LazyMaximum
@@ -26,9 +27,11 @@ from vibench.testing import check
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies import infsup_greedy, offline_pga
+from vibench_strategies.decorrelated import Decorrelated
 from vibench_strategies.infsup_greedy import InfSupGreedy
 from vibench_strategies.mcpg import ModifiedCPG
 from vibench_strategies.offline_pga import OfflinePGA
+from vibench_strategies.online_supremizers import OnlineSupremizers
 from vibench_strategies.pod_supremizers import PODSupremizers
 
 
@@ -71,12 +74,116 @@ def whitened_supremizers(data: Offline) -> list[Array]:
     return [orthonormal_range(V.whiten(supremizers(V, B, data.span))) for B in forms]
 
 
+BOTH = pytest.mark.parametrize("setting", ["varying", "obstacle"])
+SIZES = st.integers(12, 40), st.integers(3, 9), st.integers(1, 6), st.integers(1, 5), st.integers(1, 4)
+
+
+def drawn(n: int, m: int, count: int, modes: int, generators: int) -> Offline:
+    """A small problem of which hypothesis draws the dimensions."""
+    return offline(Varying(n, m, count), count, modes, min(generators, count))
+
+
+def test_decorrelated_adds_nothing(varying: Offline) -> None:
+    assert Decorrelated().build(varying, None).kind is Kind.NONE
+
+
+def test_online_supremizers_reach_the_whole_space_at_every_parameter(varying: Offline) -> None:
+    enrichment = pickle.loads(pickle.dumps(OnlineSupremizers().build(varying, None)))
+    assert enrichment.kind is Kind.PER_PARAMETER
+    problem, cone = varying.problem, cone_basis(varying.cone.generators, varying.problem.W)
+    for mu in (np.array([0.05]), np.array([0.61])):
+        vi = problem.assemble(mu)
+        added = supremizers(problem.V, vi.B, enrichment.eta)
+        Z = np.hstack([varying.basis, problem.V.orthonormalise(added, varying.basis)])
+        assert np.isclose(inf_sup_on(Z, vi.B, cone).span, inf_sup_full(problem.V, vi.B, cone).span, rtol=1e-10)
+
+
+def assert_pga_keeps_its_promise(data: Offline, delta: float) -> None:
+    """σ falls to δ, and no further, and β_S ≥ √(1 − σ²) β_on over the training set."""
+    problem, V = data.problem, data.problem.V
+    enrichment = OfflinePGA().build(data, delta)
+    sigma = enrichment.history["sigma"]
+    assert np.all(np.diff(sigma) <= 1e-9)
+    assert len(sigma) == enrichment.vectors.shape[1] + 1
+    assert sigma[-1] <= delta < (sigma[-2] if len(sigma) > 1 else 1.0)
+    Z = np.hstack([data.basis, enrichment.vectors])
+    assert np.allclose(V.gram(Z, Z), np.eye(Z.shape[1]), atol=1e-11)
+    cone, worst = cone_basis(data.cone.generators, problem.W), 0.0
+    for mu, target in zip(data.training, whitened_supremizers(data), strict=True):
+        B = problem.assemble(mu).B
+        sine = float(singular_values(project_out(V.whiten(Z), target)).max(initial=0.0))
+        worst = max(worst, sine)
+        own, online = inf_sup_on(Z, B, cone), inf_sup_full(V, B, cone)
+        for what in ("span", "cone_upper"):
+            assert getattr(own, what) >= np.sqrt(1.0 - sine**2) * getattr(online, what) * (1.0 - 1e-9) - 1e-12
+    assert worst <= delta + 1e-9
+    assert np.isclose(worst, sigma[-1], atol=1e-8)
+
+
+@pytest.mark.parametrize("delta", [0.95, 0.5, 1e-3])
+@BOTH
+def test_pga_keeps_its_promise_at_every_training_parameter(request, setting: str, delta: float) -> None:
+    assert_pga_keeps_its_promise(request.getfixturevalue(setting), delta)
+
+
+@given(st.builds(drawn, *SIZES), st.floats(1e-6, 0.99))
+@settings(max_examples=40)
+def test_pga_on_any_small_problem(data: Offline, delta: float) -> None:
+    assert_pga_keeps_its_promise(data, delta)
+
+
+def test_pga_adds_vectors_from_the_training_supremizers(varying: Offline) -> None:
+    problem, V = varying.problem, varying.problem.V
+    enrichment = OfflinePGA().build(varying, 0.1)
+    everything = [supremizers(V, problem.assemble(mu).B, varying.span) for mu in varying.training]
+    space = orthonormal_range(V.whiten(np.hstack([varying.basis, *everything])))
+    assert np.abs(project_out(space, V.whiten(enrichment.vectors))).max() < 1e-9
+    assert enrichment.vectors.shape[1] > varying.span.shape[1]  # B(mu) varies: one parameter's are not enough
+
+
+def test_with_one_supremizer_space_sigma_is_the_sines_of_the_principal_angles(obstacle: Offline) -> None:
+    V = obstacle.problem.V
+    B = obstacle.problem.assemble(obstacle.training[4]).B
+    target = orthonormal_range(V.whiten(supremizers(V, B, obstacle.span)))
+    sines = singular_values(project_out(V.whiten(obstacle.basis), target))
+    sigma = OfflinePGA().build(obstacle, 1e-10).history["sigma"]
+    steps = min(len(sigma), len(sines))
+    assert np.allclose(sigma[:steps], sines[:steps], atol=1e-9)
+    assert len(sigma) - 1 == np.count_nonzero(sines > 1e-10) <= obstacle.span.shape[1]
+
+
+def test_with_a_tiny_tolerance_offline_and_online_spaces_coincide(obstacle: Offline) -> None:
+    V = obstacle.problem.V
+    B = obstacle.problem.assemble(obstacle.training[7]).B
+    added = OfflinePGA().build(obstacle, 1e-10).vectors
+    online = V.orthonormalise(supremizers(V, B, obstacle.span), obstacle.basis)
+    assert added.shape == online.shape
+    assert np.allclose(singular_values(V.gram(added, online)), 1.0, atol=1e-9)
+
+
+def test_the_tolerance_between_offline_and_online_constants(obstacle: Offline) -> None:
+    """0 ≤ 1 − β_off/β_on ≤ 1 − √(1 − δ²) where all parameters share one supremizer space."""
+    problem = obstacle.problem
+    cone = cone_basis(obstacle.cone.generators, problem.W)
+    for delta in (0.3, 0.9):
+        Z = np.hstack([obstacle.basis, OfflinePGA().build(obstacle, delta).vectors])
+        for mu in problem.validation_set(4, 1):
+            B = problem.assemble(mu).B
+            loss = 1.0 - inf_sup_on(Z, B, cone).span / inf_sup_full(problem.V, B, cone).span
+            assert -1e-9 <= loss <= 1.0 - np.sqrt(1.0 - delta**2) + 1e-9
+
+
+def test_pga_without_a_tolerance_is_refused(varying: Offline) -> None:
+    with pytest.raises(ValueError, match="needs a tolerance"):
+        OfflinePGA().build(varying, None)
+
+
 ON_BETA = pytest.mark.parametrize("strategy", [InfSupGreedy(), OfflinePGA(stop="beta")], ids=["inf-sup", "PGA"])
 
 
 @ON_BETA
 @pytest.mark.parametrize("rho", [0.2, 0.9])
-@pytest.mark.parametrize("setting", ["varying", "obstacle"])
+@BOTH
 def test_the_share_is_kept_at_every_training_parameter_and_not_with_a_vector_less(
     request, setting: str, strategy: NestedStrategy, rho: float
 ) -> None:
@@ -91,18 +198,10 @@ def test_the_share_is_kept_at_every_training_parameter_and_not_with_a_vector_les
     assert shares(data, found.vectors[:, :-1]).min() < rho
 
 
-@given(
-    st.integers(12, 40),
-    st.integers(3, 9),
-    st.integers(1, 6),
-    st.integers(1, 5),
-    st.integers(1, 4),
-    st.floats(0.05, 0.99),
-)
-@example(n=12, m=9, count=4, modes=2, generators=4, rho=0.5)  # β_on vanishes at the last parameter
+@given(st.builds(drawn, *SIZES), st.floats(0.05, 0.99))
+@example(drawn(n=12, m=9, count=4, modes=2, generators=4), 0.5)  # β_on vanishes at the last parameter
 @settings(max_examples=15)
-def test_the_share_is_kept_anywhere(n: int, m: int, count: int, modes: int, generators: int, rho: float) -> None:
-    data = offline(Varying(n, m, count), count, modes, min(generators, count))
+def test_the_share_is_kept_anywhere(data: Offline, rho: float) -> None:
     for strategy in (InfSupGreedy(), OfflinePGA(stop="beta")):
         found = check_enrichment(strategy.build(data, rho), data.problem.V, data.basis)
         assert shares(data, found.vectors).min() >= rho * (1.0 - 1e-8)
@@ -138,32 +237,38 @@ def test_every_vector_is_the_supremizer_of_the_least_stable_multiplier(hertz: Of
 
 
 @pytest.mark.parametrize(
-    ("module", "strategy"),
-    [(infsup_greedy, InfSupGreedy()), (offline_pga, OfflinePGA(stop="beta"))],
-    ids=["inf-sup", "PGA"],
+    ("module", "strategy", "tolerance", "measure"),
+    [
+        (infsup_greedy, InfSupGreedy(), 0.8, "beta_share"),
+        (offline_pga, OfflinePGA(stop="beta"), 0.8, "beta_share"),
+        (offline_pga, OfflinePGA(), 0.3, "sigma"),
+    ],
+    ids=["inf-sup", "PGA on beta", "PGA"],
 )
 def test_lazy_and_plain_choose_the_same_vectors_and_lazy_looks_less_often(
-    monkeypatch: pytest.MonkeyPatch, hertz: Offline, module, strategy: NestedStrategy
+    monkeypatch: pytest.MonkeyPatch, hertz: Offline, module, strategy: NestedStrategy, tolerance: float, measure: str
 ) -> None:
-    made: dict[type[LazyMaximum], int] = {}
+    made = {LazyMaximum: 0, Plain: 0}
 
     def counting(kind: type[LazyMaximum]) -> type[LazyMaximum]:
         class Counted(kind):  # type: ignore[misc, valid-type]
             def next(self, evaluate: Callable[[int], float]) -> tuple[int, float]:
-                return super().next(lambda p: (made.update({kind: made.get(kind, 0) + 1}), evaluate(p))[1])
+                return super().next(lambda p: (made.update({kind: made[kind] + 1}), evaluate(p))[1])
 
         return Counted
 
     found = []
-    for kind in (LazyMaximum, Plain):
+    for kind in made:
         monkeypatch.setattr(module, "LazyMaximum", counting(kind))
-        found.append(strategy.build(hertz, 0.8))
+        found.append(strategy.build(hertz, tolerance))
     assert np.allclose(found[0].vectors, found[1].vectors, atol=1e-8)
-    assert np.allclose(found[0].history["beta_share"], found[1].history["beta_share"], atol=1e-9)
-    assert made[LazyMaximum] < 0.5 * made[Plain]
+    assert np.allclose(found[0].history[measure], found[1].history[measure], atol=1e-9)
+    if measure == "sigma":
+        assert made[Plain] == 81 * len(found[1].history["sigma"])
+    assert made[LazyMaximum] <= 0.45 * made[Plain]
 
 
-@pytest.mark.parametrize("setting", ["varying", "obstacle"])
+@BOTH
 def test_pod_supremizers_are_modes_of_all_supremizers_and_the_tail_sums_squared_sines(request, setting: str) -> None:
     data: Offline = request.getfixturevalue(setting)
     V, bases = data.problem.V, whitened_supremizers(request.getfixturevalue(setting))
@@ -205,6 +310,7 @@ def test_the_unreachable_has_a_reason(varying: Offline) -> None:
     for strategy, tolerance, measure in (
         (InfSupGreedy(), 1.5, "β_S/β_on = 1"),
         (OfflinePGA(stop="beta"), 1.5, "σ = "),
+        (OfflinePGA(), 0.0, "σ = "),
         (PODSupremizers(), -1.0, r"the relative tail is 0e\+00"),
     ):
         reason = rf"tolerance {tolerance:g} is not reached: with all supremizers added, {measure}"
