@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from skfem import Basis, BilinearForm, ElementTriP1, LinearForm, MeshTri, condense, solve
+from skfem import Basis, BilinearForm, ElementTriP1, LinearForm, MeshTri
 from skfem.helpers import dot, grad
 
 from vibench.highfidelity.active_set import HighFidelitySolver
@@ -29,11 +29,6 @@ def laplacian(u, v, _):
     return dot(grad(u), grad(v))
 
 
-@LinearForm
-def paraboloid(v, w):
-    return dot(w.x, w.x) * v
-
-
 @BilinearForm
 def product_of(u, v, _):
     return u * v
@@ -50,15 +45,11 @@ def areas(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return (b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0]
 
 
-def disc_parameters(seed: int, count: int = 1) -> np.ndarray:
-    return EGG.parameters.sample(count, seed)
-
-
 @given(seeds)
 @settings(max_examples=50)
 def test_forms_are_those_assembled_on_the_moved_mesh(seed: int) -> None:
     """Everything anew on the mesh with its nodes moved; ψ is a function of the reference point, in the same rule."""
-    mu = disc_parameters(seed)[0]
+    mu = EGG.parameters.sample(1, seed)[0]
     vi, disc = EGG.assemble(mu), EGG.mesh.subdomains["disc"]
     moved = MeshTri(EGG.points(mu), EGG.mesh.t, sort_t=False, validate=False)
     basis = Basis(moved, ElementTriP1())
@@ -79,7 +70,7 @@ def test_forms_are_those_assembled_on_the_moved_mesh(seed: int) -> None:
 @given(seeds)
 @settings(max_examples=50)
 def test_what_is_assembled_in_parts_is_the_whole(seed: int) -> None:
-    rng, mu = np.random.default_rng(seed), disc_parameters(seed)[0]
+    rng, mu = np.random.default_rng(seed), EGG.parameters.sample(1, seed)[0]
     vi, contact, dofs = EGG.assemble(mu), EGG.contact(mu), EGG.contact_dofs
     B = vi.B.toarray()
     assert np.array_equal(contact.B.toarray(), B[:, dofs])
@@ -110,7 +101,7 @@ def test_the_map_is_conformal_on_the_disc_and_fixes_the_boundary(mu: np.ndarray)
 
 def test_no_triangle_turns_over_or_degenerates_in_the_whole_box() -> None:
     """With a boundary that stays this makes the map injective."""
-    for mu in (*corners(), *disc_parameters(0, 50)):
+    for mu in (*corners(), *EGG.parameters.sample(50, 0)):
         ratio = areas(EGG.points(mu), EGG.mesh.t) / areas(EGG.mesh.p, EGG.mesh.t)
         assert ratio.min() > 0.3, mu
         assert EGG.diagnostics(mu)["aspect_ratio"] < 3.2, mu
@@ -156,7 +147,7 @@ def test_members_are_sums_of_few_terms() -> None:
     assert {name: member.way for name, member in members.items()} == ways
     assert [len(members[name].terms) for name in "Bg"] == [3, 3]
     sample = EGG.sampler({name: (members[name].rows, members[name].columns) for name in "Af"})
-    for mu in disc_parameters(1, 3):
+    for mu in EGG.parameters.sample(3, 1):
         vi, theta = EGG.assemble(mu), {**sample(mu), **{name: EGG.affine[name].coefficients(mu) for name in "Bg"}}
         for name, tolerance in (("A", 1e-4), ("f", 1e-10), ("B", 1e-14), ("g", 1e-14)):
             exact = getattr(vi, name)
@@ -184,7 +175,7 @@ def test_the_pressure_is_that_of_the_obstacle_carried_along() -> None:
 
 
 def test_without_a_bulge_it_is_the_problem_of_the_paper() -> None:
-    for mu in disc_parameters(2, 3):
+    for mu in EGG.parameters.sample(3, 2):
         one, two = EGG.assemble(np.append(mu[:3], 0.0)), ROUND.assemble(mu[:3])
         for name in ("A", "f", "B", "g"):
             exact = getattr(two, name)
@@ -194,29 +185,3 @@ def test_without_a_bulge_it_is_the_problem_of_the_paper() -> None:
     assert EGG.validation_set(5, 1).shape == (5, 4)
     assert np.array_equal(EGG.V.matrix.data, ROUND.V.matrix.data)
     assert np.array_equal(EGG.W.matrix.data, ROUND.W.matrix.data)
-
-
-def test_with_the_option_off_the_map_is_affine_on_the_disc() -> None:
-    """The formulae of the affine map, written out."""
-    mu, mesh, basis = OFF[:3], ROUND.mesh, Basis(ROUND.mesh, ElementTriP1())
-    area = mu[0] ** 2
-    integrals = paraboloid.assemble(basis.with_elements("disc"))[ROUND.disc_nodes]
-    contact = ROUND.contact(mu)
-    assert np.allclose(contact.B.toarray(), (-area * ROUND.W.matrix).toarray(), rtol=1e-15, atol=0.0)
-    assert np.allclose(contact.g, -area * ROUND.obstacle * integrals, rtol=1e-15, atol=0.0)
-    form, fixed = laplacian.assemble(basis), np.union1d(basis.get_dofs().all(), ROUND.disc_nodes)
-
-    def continued(values: np.ndarray | float) -> np.ndarray:
-        on_disc = np.zeros(ROUND.nodes)
-        on_disc[ROUND.disc_nodes] = values
-        return solve(*condense(form, np.zeros(ROUND.nodes), x=on_disc, D=fixed))
-
-    x, y, one = (continued(values) for values in (*mesh.p[:, ROUND.disc_nodes], 1.0))
-    zero = np.zeros(ROUND.nodes)
-    modes = np.stack([mesh.p, np.stack([x, y]), np.stack([one, zero]), np.stack([zero, one])])
-    points = np.tensordot(np.array([1.0, mu[0] - 1.0, mu[1], mu[2]]), modes, axes=1)
-    assert np.array_equal(ROUND.points(mu), points)
-    moved = Basis(MeshTri(points, mesh.t, sort_t=False, validate=False), ElementTriP1())
-    stiffness = laplacian.assemble(moved)[ROUND.free][:, ROUND.free].toarray()
-    assert np.allclose(ROUND.assemble(mu).A.toarray(), stiffness, rtol=0.0, atol=1e-14 * np.abs(stiffness).max())
-    assert np.array_equal(ROUND.training_set(), ROUND.parameters.grid(5, 5, 5))

@@ -28,7 +28,9 @@ def coarse() -> Hertz:
     return Hertz("coarse")
 
 
-def test_sizes_of_the_paper() -> None:
+def test_sizes_and_resolutions() -> None:
+    for resolution, nodes in (("coarse", 1000), (2000, 2000), (4000, 4000)):
+        assert Hertz(resolution).nodes == pytest.approx(nodes, rel=0.05)
     problem = Hertz("paper")
     assert problem.nodes == pytest.approx(6130, rel=0.03)
     assert problem.W.dim == 280
@@ -36,59 +38,40 @@ def test_sizes_of_the_paper() -> None:
     assert problem.training_set().ravel() == pytest.approx(0.7 + 0.0075 * np.arange(81))
 
 
-@pytest.mark.parametrize(("resolution", "nodes"), [("coarse", 1000), (2000, 2000), (4000, 4000)])
-def test_resolutions(resolution: str | int, nodes: int) -> None:
-    assert Hertz(resolution).nodes == pytest.approx(nodes, rel=0.05)
-
-
-@pytest.fixture(scope="module")
-def small_load() -> tuple[Hertz, HighFidelitySolver]:
+def test_small_loads_agree_with_the_theory_and_larger_ones_less() -> None:
     problem = Hertz(3065, growth=1.05, approach=0.01)
-    return problem, HighFidelitySolver(problem)
-
-
-@pytest.mark.parametrize("mu", RADII)
-def test_small_loads_agree_with_the_theory(small_load: tuple[Hertz, HighFidelitySolver], mu: float) -> None:
-    problem, solver = small_load
     assert problem.W.dim == 140
-    width, peak = differences(problem, solver, mu)
-    assert abs(width) < 0.005
-    assert abs(peak) < 0.005
-
-
-def test_the_load_of_the_paper_agrees_less_and_less_with_the_approach() -> None:
-    errors = {}
+    solver = HighFidelitySolver(problem)
+    for mu in RADII:
+        assert np.abs(differences(problem, solver, mu)).max() < 0.005
+    before = np.full(2, 0.05)
     for approach in (0.09, 0.045, 0.02):
         problem = Hertz(3065, growth=1.2, approach=approach)
-        errors[approach] = np.abs(differences(problem, HighFidelitySolver(problem), 1.0))
-    assert np.all(errors[0.09] < 0.05)
-    assert np.all(errors[0.045] < errors[0.09])
-    assert np.all(errors[0.02] < errors[0.045])
+        errors = np.abs(differences(problem, HighFidelitySolver(problem), 1.0))
+        assert np.all(errors < before)
+        before = errors
 
 
-@pytest.fixture(scope="module", params=["free", "clamped"])
-def held(request: pytest.FixtureRequest) -> tuple[Hertz, str]:
-    """A problem by what happens to the flat sides."""
-    return Hertz("coarse", flats=request.param), request.param
-
-
-@pytest.mark.parametrize("mu", RADII)
-def test_equilibrium_and_no_interpenetration(held: tuple[Hertz, str], mu: float) -> None:
-    problem, flats = held
-    found = HighFidelitySolver(problem).solve(np.array([mu]))
-    vi = problem.assemble(np.array([mu]))
+@pytest.mark.parametrize("options", [{}, {"flats": "clamped"}, {"approach": "parameter"}], ids=str)
+@pytest.mark.parametrize("point", [(0.7, 0.075), (1.0, 0.15), (1.3, 0.09)], ids=str)
+def test_equilibrium_and_no_interpenetration(options: dict[str, Any], point: tuple[float, float]) -> None:
+    problem = Hertz("coarse", **options)
+    mu = np.array(point)[: problem.parameters.dim]
+    found, vi, moving = HighFidelitySolver(problem).solve(mu), problem.assemble(mu), mu[1] if len(mu) > 1 else 0.09
     assert found.residuals.worst <= 1e-10
-    upper, lower = problem.resultants(np.array([mu]), found.u)
+    upper, lower = problem.resultants(mu, found.u)
     assert upper == pytest.approx(lower, rel=1e-8)
     assert upper == pytest.approx(problem.macro_lengths @ found.lam, rel=1e-8)
     assert np.max((vi.B @ found.u - vi.g) / problem.macro_lengths) < 1e-10
     assert np.all(found.lam >= 0.0)
-    moved = problem.displacement(np.array([mu]), found.u)
+    moved = problem.displacement(mu, found.u)
     second = problem.slave.mesh.p.shape[1]
-    assert np.allclose(moved[1, problem.slave.flat], -0.09)
-    assert np.allclose(moved[1, second + problem.master.flat], 0.09)
+    assert np.allclose(moved[1, problem.slave.flat], -moving)
+    assert np.allclose(moved[1, second + problem.master.flat], moving)
     assert np.allclose(moved[0, problem.slave.axis], 0.0)
-    assert np.allclose(moved[0, problem.slave.flat], 0.0) == (flats == "clamped")
+    assert np.allclose(moved[0, problem.slave.flat], 0.0) == ("flats" in options)
+    points = problem.picture(mu, found.u, found.lam).points
+    assert (points[1].min(), points[1].max()) == pytest.approx((moving - mu[0], 1.001 - moving))
 
 
 def test_a_and_f_are_constant_as_declared_and_b_truly_varies(coarse: Hertz) -> None:
@@ -98,15 +81,6 @@ def test_a_and_f_are_constant_as_declared_and_b_truly_varies(coarse: Hertz) -> N
     assert np.array_equal(one.f, two.f)
     assert proportionality(one.B, two.B) is None
     assert not np.allclose(one.g, two.g)
-
-
-def test_scaling_a_disc_leaves_its_energy_unchanged(coarse: Hertz) -> None:
-    """What makes A constant: the two-dimensional stiffness of a body does not know its size."""
-    larger = Hertz("coarse")
-    found = HighFidelitySolver(coarse).solve(np.array([1.0]))
-    assert found.u @ (larger.assemble(np.array([0.7])).A @ found.u) == pytest.approx(
-        found.u @ (coarse.assemble(np.array([1.3])).A @ found.u)
-    )
 
 
 def test_condensed_and_sparse_solutions_agree(coarse: Hertz) -> None:
@@ -151,12 +125,10 @@ def test_the_picture_shows_deformed_discs_and_pressures(coarse: Hertz) -> None:
     assert picture.triangles.max() == coarse.nodes - 1
     assert picture.positions.shape == (1, 45)
     assert picture.positions[0, np.argmax(picture.multiplier)] < 0.1
-    assert picture.points[1].max() == pytest.approx(1.001 - 0.09)
-    assert picture.points[1].min() == pytest.approx(-1.2 + 0.09)
 
 
 @pytest.mark.parametrize("options", [{}, {"quadrature": 3}, {"approach": "parameter"}, {"ratio": 2.0}], ids=str)
-@pytest.mark.parametrize("rows", [slice(0, 1), slice(3, 11), slice(None)], ids=str)
+@pytest.mark.parametrize("rows", [slice(0, 1), slice(3, 11), slice(None), slice(0)], ids=str)
 def test_loads_of_multipliers_are_those_of_the_matrix_at_every_radius(options: dict[str, Any], rows: slice) -> None:
     problem = Hertz(resolution="coarse", **options)
     eta = np.zeros((problem.W.dim, 3))
@@ -175,10 +147,3 @@ def test_loads_of_multipliers_are_those_of_the_matrix_at_every_radius(options: d
         assert np.allclose(bounds, eta.T @ contact.g, rtol=1e-13, atol=1e-16)
     with pytest.raises(NumericalError, match="the radius of disc 2 is too small"):
         loads.varying(np.array([0.5, 0.11])[: problem.parameters.dim])
-
-
-def test_multipliers_that_are_zero_have_no_loads() -> None:
-    problem = Hertz(resolution="coarse")
-    loads = problem.contact_loads(np.zeros((problem.W.dim, 2)))
-    varying, bounds = loads.varying(np.ones(1))
-    assert not any(array.any() for array in (loads.fixed, varying, bounds))

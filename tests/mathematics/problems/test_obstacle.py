@@ -19,31 +19,13 @@ def coarse() -> Obstacle:
     return Obstacle("coarse")
 
 
-@pytest.fixture(scope="module")
-def paper() -> Obstacle:
-    return Obstacle("paper")
-
-
-@pytest.fixture(scope="module")
-def fine() -> Obstacle:
-    return Obstacle("fine")
-
-
-def test_sizes_of_the_paper(paper: Obstacle) -> None:
-    problem = paper
-    assert problem.nodes == pytest.approx(3594, rel=0.05)
+def test_sizes_and_resolutions() -> None:
+    for resolution, nodes in (("coarse", 400), ("medium", 1200), (2500, 2500), ("paper", 3594)):
+        problem = Obstacle(resolution)
+        assert problem.nodes == pytest.approx(nodes, rel=0.05)
+        boundary = np.abs(problem.mesh.p).max(axis=0) > 0.5 - 1e-9
+        assert problem.V.dim == problem.nodes - np.count_nonzero(boundary)
     assert problem.W.dim == pytest.approx(467, rel=0.05)
-    boundary = np.abs(problem.mesh.p).max(axis=0) > 0.5 - 1e-9
-    assert problem.V.dim == problem.nodes - np.count_nonzero(boundary)
-
-
-@pytest.mark.parametrize(("resolution", "nodes"), [("coarse", 400), ("medium", 1200), (2500, 2500)])
-def test_resolutions(resolution: str | int, nodes: int) -> None:
-    assert Obstacle(resolution).nodes == pytest.approx(nodes, rel=0.05)
-
-
-def test_fine_has_four_times_the_nodes_of_the_paper(fine: Obstacle) -> None:
-    assert fine.nodes == pytest.approx(14376, rel=0.05)
 
 
 def test_parameters_of_the_paper(coarse: Obstacle) -> None:
@@ -105,8 +87,8 @@ def test_the_norm_is_that_of_equation_44() -> None:
 
 
 @pytest.mark.parametrize("mu", [CENTRE, OFF])
-def test_the_membrane_lies_on_the_obstacle_where_the_multiplier_is(paper: Obstacle, mu: np.ndarray) -> None:
-    problem = paper
+def test_the_membrane_lies_on_the_obstacle_where_the_multiplier_is(mu: np.ndarray) -> None:
+    problem = Obstacle("paper")
     vi = problem.assemble(mu)
     found = active_set.solve_high_fidelity(vi)
     assert found.fallback == ""
@@ -134,9 +116,10 @@ def test_options_change_what_they_name(coarse: Obstacle) -> None:
     assert np.allclose(v, 2.0 * u, atol=1e-12)
 
 
-@pytest.fixture(scope="module")
-def convergence(fine: Obstacle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mesh widths and errors of u in V and λ in L² at the off-centre parameter, against a very fine mesh."""
+def test_displacements_converge_with_order_one_and_multipliers_with_a_half() -> None:
+    """Errors of u in V and of λ in L² at the off-centre parameter, against a very fine mesh."""
+    fine = Obstacle("fine")
+    assert fine.nodes == pytest.approx(14376, rel=0.05)
     vi = active_set.HighFidelitySolver(fine).solve(OFF)
     mesh = MeshTri(fine.points(OFF), fine.mesh.t)
     basis = Basis(mesh, ElementTriP1(), intorder=3)
@@ -158,19 +141,8 @@ def convergence(fine: Obstacle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         widths.append(1.0 / np.sqrt(problem.nodes))
         errors_u.append(np.sqrt(square))
         errors_lam.append(np.sqrt(Functional(lambda w: w["e"] ** 2).assemble(inside, e=jump)))
-    return np.array(widths), np.array(errors_u), np.array(errors_lam)
-
-
-def test_displacements_converge_with_order_one(convergence) -> None:
-    widths, errors, _ = convergence
-    rate = fitted_rate(widths, errors)
-    assert 0.9 < rate < 1.25, (rate, errors)
-
-
-def test_multipliers_converge_with_order_one_half(convergence) -> None:
-    widths, _, errors = convergence
-    rate = fitted_rate(widths, errors)
-    assert 0.35 < rate < 0.75, (rate, errors)
+    assert 0.9 < fitted_rate(widths, errors_u) < 1.25, errors_u
+    assert 0.35 < fitted_rate(widths, errors_lam) < 0.75, errors_lam
 
 
 @pytest.mark.parametrize(("asymmetric", "ties"), [(False, True), (True, False)])
