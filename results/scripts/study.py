@@ -51,7 +51,7 @@ def main(run: str, target: str) -> None:
         machine=origin(cells),
     )
     if name in PAPER:
-        ((_, data),) = figures.problems(path)
+        ((_, data),) = figures.problem_tables(path)
         evidence = Evidence(data)
         page.section(
             f"Comparison with Table {evidence.paper.table} of Niakh, Drouet, Ehrlacher and Ern (2022), δ_PGA = "

@@ -85,7 +85,7 @@ def _reduce_cones(folder: Path, dual: list[str], dual_tol: float, out: Path) -> 
     with naming(folder):
         pack_multipliers(pack)
     wanted = dual or [name for name, plugin in registered(PluginKind.DUAL).items() if not plugin.missing]
-    rows, errors = [], {}
+    rows, steps = [], list[tuple[str, int, float]]()
     for name in wanted:
         try:
             cone, other_error = reduce_multipliers(pack, find(PluginKind.DUAL, name).create({}), dual_tol)
@@ -93,14 +93,13 @@ def _reduce_cones(folder: Path, dual: list[str], dual_tol: float, out: Path) -> 
         except NumericalError as error:
             echo(f"failed: {name}: {error}")
             continue
-        errors[name] = cone.errors
+        steps += [(name, r, float(error)) for r, error in enumerate(cone.errors)]
         rows.append((name, cone.size, cone.errors[-1], other_error, len(cone.fallbacks)))
     columns = ("dual", "R", "error, training", "error, other parameters", "fallbacks")
     print_frame(pd.DataFrame(rows, columns=columns), f"cones of tolerance {dual_tol:g}")
     out.mkdir(parents=True, exist_ok=True)
-    steps = [(name, r, error) for name, history in errors.items() for r, error in enumerate(history)]
-    table = out / "errors.csv"
-    write_atomically(table, to_csv(pd.DataFrame(steps, columns=("dual", "step", "value"))).encode())
+    table, errors = out / "errors.csv", pd.DataFrame(steps, columns=("dual", "step", "value"))
+    write_atomically(table, to_csv(errors).encode())
     with styled():
         drawn = save(cone_errors(pack.manifest.name or folder.name, errors), out, "errors")
     echo(f"table: {table}, figures: {', '.join(map(str, drawn))}")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -63,6 +65,28 @@ class ComparedRun:
                 by_name.setdefault(name, set()).add(str(version))
         return {name: ", ".join(sorted(several)) for name, several in sorted(by_name.items())}
 
+    @property
+    def facts(self) -> Iterator[tuple[str, str]]:
+        """Origin of the numbers, in lines of a name and a text."""
+        rows = self.cells.values()
+        yield "study", "{study}, seed {seed}, validation parameters: {validation}".format(**self.identity)
+        for axis in AXES:
+            if axis != "asked":
+                yield axis, ", ".join(dict.fromkeys(str(row[axis]) for row in rows))
+        counts = Counter(row["status"] for row in rows).most_common()
+        yield "cells", f"{len(rows)}: " + ", ".join(f"{count} {status}" for status, count in counts)
+        yield "machine", "; ".join(self.machines)
+        disturbed, timed = (sum(row["disturbed"] in values for row in rows) for values in ((1,), (0, 1)))
+        seconds = "CPU seconds on one thread; the offline time of a cell includes every stage it depends on"
+        yield "seconds", f"{seconds}; {disturbed} of {timed} timed cells were timed on a disturbed machine"
+        yield "versions", ", ".join(f"{name} {text}" for name, text in self.versions.items() if text)
+        yield "code", self.code
+        yield "study file", ", ".join(sorted({str(row["study_hash"]) for row in rows if row["study_hash"]}))
+
+    @property
+    def code(self) -> str:
+        return ", ".join(sorted({str(row["code"]) for row in self.cells.values() if row["code"]}))
+
     @cached_property
     def ok_queries(self) -> pd.DataFrame:
         """Rows of the ok queries, by cell and number."""
@@ -112,12 +136,18 @@ def run_names(paths: Sequence[Path]) -> list[str]:
         names = ["/".join(some[-depth:]) for some in parts]
         if len(set(names)) == len(set(parts)):
             break
-    seen: dict[str, int] = {}
     # One run may be named twice.
-    for k, name in enumerate(names):
-        seen[name] = seen.get(name, 0) + 1
-        names[k] = name if seen[name] == 1 else f"{name} ({seen[name]})"
-    return names
+    return numbered(names, "{} ({})")
+
+
+def numbered(names: Iterable[str], form: str) -> list[str]:
+    """Names of which those that differ in case alone, or not at all, have numbers from 2 on in a given form."""
+    taken: dict[str, str] = {}
+    for name in names:
+        choices = chain([name], (form.format(name, k) for k in count(2)))
+        chosen = next(one for one in choices if one.lower() not in taken)
+        taken[chosen.lower()] = chosen
+    return list(taken.values())
 
 
 # Columns of a cell that are means or maxima over its ok queries: the column of a query, and which of the two.
@@ -184,7 +214,7 @@ def number_differences(one: Mapping[str, Any], two: Mapping[str, Any], limit: fl
 
 def _solvers_part(cell: Mapping[str, Any], error: str) -> float:
     """Largest contribution of the QP solver to an error; by the triangle inequality a mean moves by no more."""
-    largest = cell.get(f"solver_{error.rpartition('_')[0]}_max") if error in ERRORS else None
+    largest = cell.get(f"solver_{error.rpartition('_')[0]}_max")
     return 0.0 if largest is None or pd.isna(largest) else float(largest)
 
 

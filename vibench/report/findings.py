@@ -17,7 +17,6 @@ from vibench.model.bound_terms import CorrectionMode
 from vibench.model.errors import UNMEASURABLE
 from vibench.qp.status import Status
 from vibench.report.figures.data import (
-    PRIMAL,
     Comparable,
     ProblemTables,
     best_solver,
@@ -128,10 +127,7 @@ def _whole_run(read: Mapping[str, pd.DataFrame]) -> Iterator[tuple[Weight, str]]
     if len(many := cells[cells["R"] > cells["dim_W"]]):
         most = many.loc[many["R"].idxmax()]
         sizes = f"{most['R']:.0f} generators for {most['dim_W']:.0f} multipliers"
-        yield (
-            Weight.WHOLE_RUN,
-            f"{most['dual']} has {sizes}: one for each is a smaller cone, and exact.",
-        )
+        yield Weight.WHOLE_RUN, f"{most['dual']} has {sizes}: one for each is a smaller cone, and exact."
     few = cells[cells["queries_ok"] < 0.5 * cells["queries"]]
     if len(few):
         having = f"{_number(len(few), 'cell')} {'has' if len(few) == 1 else 'have'}"
@@ -204,7 +200,7 @@ def _stability(cells: pd.DataFrame, compared: Comparable) -> Iterator[str]:
                 f"{row.beta_cone_lower_min:.3g}{_mean_error(errors.get(row.cell), compared.over)}."
             )
     fixed = cells[(cells["enrichment_kind"] == Kind.FIXED) & np.isfinite(cells["beta_span_min"])]
-    for row in fixed.drop_duplicates(PRIMAL).itertuples():
+    for row in fixed.drop_duplicates(["primal", "primal_tol"]).itertuples():
         yield (
             f"{label(row.primal, row.primal_tol)} adds {row.enrichment:.0f} vectors, with which min β over the span is "
             f"{row.beta_span_min:.3g}, at every validation parameter at least {100.0 * row.share_validation:.0f} % of "
@@ -256,7 +252,7 @@ def _off_training(data: ProblemTables) -> Iterator[str]:
     """Stability of fixed enrichments at validation parameters against that at training parameters."""
     # Ratios that differ by less are equal up to round-off.
     margin = 1e-8
-    fixed = data.cells[data.cells["share_training"].notna()].drop_duplicates([*PRIMAL, "dual", "pair"])
+    fixed = data.cells[data.cells["share_training"].notna()].drop_duplicates(["primal", "primal_tol", "dual", "pair"])
     lost = fixed["share_training"] - fixed["share_validation"]
     if lost.max() > margin:
         worst = fixed.loc[lost.idxmax()]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.qp.status import Status
 from vibench.report import findings, plots
+from vibench.report.differences import ComparedRun
 from vibench.report.figures import FigureTask, figures_of, render
 from vibench.report.figures.data import Extent, ProblemTables, label_of, problem_tables, whole
 from vibench.report.plots import image_of, script_safe, short
@@ -28,7 +28,6 @@ from vibench.results.ranking import LARGEST_BAND, Criterion, Winner, leaderboard
 from vibench.results.read import in_order, read_table
 from vibench.results.schema import STORED, TABLES, Column
 from vibench.results.selection import short_keys
-from vibench.results.sqlite import read_meta, study_of
 from vibench.stability.infsup import VANISHES
 from vibench.text import printable
 
@@ -168,7 +167,7 @@ def write(path: Path, target: Path, *, figures: bool = True) -> Path:
 
 def page(path: Path, *, figures: bool = True) -> str:
     """The page of a results file."""
-    study, read = study_of(path, read_meta(path)), {name: read_table(path, name) for name in TABLES}
+    run, read = ComparedRun(path, ""), {name: read_table(path, name) for name in TABLES}
     cells, data_of = in_order(read["cells"]), dict(problem_tables(path, read))
     # Histories may have millions of rows, and `data_of` has them.
     del read["histories"]
@@ -189,8 +188,8 @@ def page(path: Path, *, figures: bool = True) -> str:
     style, script = ((templates / f"report.{end}").read_text(encoding="utf-8").strip() for end in ("css", "js"))
     template = environment("templates", trim_blocks=True, lstrip_blocks=True).get_template("report.html.j2")
     return template.render(
-        study=study.get("name", path.parent.name),
-        facts=list(_facts(study, cells)),
+        study=run.identity["study"] or path.parent.name,
+        facts=list(run.facts),
         standings=leaderboard(cells, paired),
         criteria=Criterion,
         largest_band=LARGEST_BAND,
@@ -244,19 +243,6 @@ def way(winner: Winner) -> str:
     # The offline phase involves no QP solver.
     solver = "" if winner.criterion is Criterion.OFFLINE else f"; {cell['solver']}"
     return f"{label_of(cell)}; {cell['dual']}, {size}{solver}"
-
-
-def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, str]]:
-    yield "study", ", ".join(f"{key} {value}" for key, value in study.items())
-    for axis in ("problem", "formulation", "dual", "primal", "solver", "accuracy", "assembly", "bounds", "correction"):
-        yield axis, ", ".join(str(name) for name in cells[axis].unique())
-    yield "cells", f"{len(cells)}, {int(cells['queries'].fillna(0).sum())} queries"
-    yield "machine", "; ".join(str(name) for name in cells["machine"].unique())
-    versions = {name: text for row in cells["versions"].dropna().unique() for name, text in json.loads(row).items()}
-    yield "versions", ", ".join(f"{name} {text}" for name, text in versions.items())
-    disturbed, timed = int((cells["disturbed"] == 1).sum()), int(cells["disturbed"].notna().sum())
-    seconds = "CPU seconds of one process; the offline time of a cell includes every stage it depends on"
-    yield "seconds", f"{seconds}; {disturbed} of {timed} timed cells were timed on a disturbed machine"
 
 
 def _grids(read: Mapping[str, pd.DataFrame]) -> Iterator[TableGrid]:

@@ -21,7 +21,6 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from vibench.arrays import Array
-from vibench.report.figures.costs import ERRORS
 from vibench.report.figures.data import ProblemTables, best_solver, label, on_common_queries
 from vibench.report.figures.style import Look, Looks, Series, caption_of
 from vibench.results import ranking
@@ -39,17 +38,6 @@ def library() -> str:
 
 
 @dataclass(frozen=True)
-class PlotPanel:
-    """A panel of a plot: its columns and their labels."""
-
-    x: str
-    y: str
-    x_label: str
-    y_label: str
-    line: float | None = None  # abscissa of the high-fidelity model, which has no error
-
-
-@dataclass(frozen=True)
 class Plot:
     """A plot of one problem."""
 
@@ -63,9 +51,9 @@ def plots(name: str, data: ProblemTables, rows: Mapping[str, int]) -> Iterator[P
     compared = on_common_queries(best_solver(data.cells), data.queries)
     shown = compared.cells.assign(online_ms=1e3 * compared.cells["online_s"])
     solver = f", {shown['solver'].iloc[0]}" if len(shown) else ""
-    panels = [PlotPanel("online_ms", error, "time of a query [ms]", y_label) for error, y_label in ERRORS.items()]
+    errors = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
     title = f"{data.problem}{solver}: work and precision{compared.over}"
-    yield from _plot(f"{name}-work-precision", title, shown, panels, rows)
+    yield from _plot(f"{name}-work-precision", title, shown, errors, rows)
 
 
 def overview(
@@ -79,21 +67,19 @@ def overview(
     solution, bounds = 1e3 * float(np.exp(np.log(cells["hf_s"]).mean())), cells["cell"].map(certified).astype(float)
     relative = cells["online_s"] / cells["hf_s"]
     shown = cells.assign(online_ms=solution * relative, error=errors, certified=bounds)
-    panels = [
-        PlotPanel("online_ms", column, "time of a query [ms]", label_, line=solution)
-        for column, label_ in (("error", "larger mean error of u and λ"), ("certified", "certified error, in energy"))
-    ]
-    for plot in _plot(f"{name}-overview", f"{data.problem}: which model, for how many queries", shown, panels, rows):
-        looks = Looks([Series(*way) for way in zip(cells["primal"], cells["way"], strict=True)])
-        yield replace(plot, data=plot.data | {"costs": _costs(cells, errors, paired, rows, looks)})
+    columns = {"error": "larger mean error of u and λ", "certified": "certified error, in energy"}
+    title = f"{data.problem}: which model, for how many queries"
+    for plot in _plot(f"{name}-overview", title, shown, columns, rows, short(solution, 4)):
+        colours = [plot.data["series"][k]["colour"] for k in plot.data["of"]]
+        costs = _costs(cells, errors, paired, rows, dict(zip(cells["cell"], colours, strict=True)))
+        yield replace(plot, data=plot.data | {"costs": costs})
 
 
 def _costs(
-    cells: pd.DataFrame, errors: pd.Series, paired: PairedTiming, rows: Mapping[str, int], looks: Looks
+    cells: pd.DataFrame, errors: pd.Series, paired: PairedTiming, rows: Mapping[str, int], colours: Mapping[str, str]
 ) -> dict[str, Any]:
     """Total costs over the number of queries with their 95 % bands, of the high-fidelity model and of the cheapest."""
     numbers = np.logspace(0.0, 6.0, 61)
-    ways = dict(zip(cells["cell"], (Series(*w) for w in zip(cells["primal"], cells["way"], strict=True)), strict=True))
     every = {one.key: one for one in ranking.candidates(cells, paired)}
     winners: dict[str | None, None] = {None: None}
     for level in ranking.reached_errors(errors):
@@ -106,9 +92,8 @@ def _costs(
         one = every[key]
         drawn = one.offline_draws[:, None] + one.online_draws[:, None] * numbers
         low, high = np.quantile(drawn, (TAIL, 1.0 - TAIL), axis=0)
-        look = None if key is None else looks[ways[key]]
         name = HIGH_FIDELITY if key is None else label(one.row["primal"], one.row["primal_tol"], str(one.row["way"]))
-        drawn_as = {"colour": "#000000" if look is None else look.colour, "dashed": key is None}
+        drawn_as = {"colour": "#000000" if key is None else colours[key], "dashed": key is None}
         bounds = {"y": one.offline + numbers * one.online, "low": low, "high": high}
         ordinates = {side: [short(value, 4) for value in values] for side, values in bounds.items()}
         curves.append({"name": printable(name), "row": None if key is None else rows[key]} | drawn_as | ordinates)
@@ -116,11 +101,19 @@ def _costs(
 
 
 def _plot(
-    name: str, title: str, cells: pd.DataFrame, panels: list[PlotPanel], rows: Mapping[str, int]
+    name: str, title: str, cells: pd.DataFrame, columns: Mapping[str, str], rows: Mapping[str, int], line: Any = None
 ) -> Iterator[Plot]:
-    """A plot, unless no cell has a point in it."""
-    drawn = [(panel, _coordinates(cells, panel)) for panel in panels]
-    drawn = [(panel, points) for panel, points in drawn if points.notna().to_numpy().any()]
+    """Columns of cells, with their labels, against the time of a query; no plot if no cell has a point in it.
+
+    The line is the abscissa of the high-fidelity model, which has no error.
+    """
+    drawn: dict[str, pd.DataFrame] = {}
+    for column in columns:
+        values = cells[["online_ms", column]].astype(float)
+        # Both values are missing if one of them is, or is not positive.
+        points = values.where(np.isfinite(values).all(axis=1) & (values > 0.0).all(axis=1))
+        if points.notna().to_numpy().any():
+            drawn[column] = points
     if not drawn:
         return
     ways = [Series(*way) for way in zip(cells["primal"], cells["way"], strict=True)]
@@ -132,14 +125,10 @@ def _plot(
         # Opacity distinguishes the dual strategies.
         "fills": [(0.85, 0.0, 0.4)[duals.index(dual) % 3] for dual in cells["dual"]],
         "panels": [
-            {
-                "x_label": panel.x_label,
-                "y_label": panel.y_label,
-                # Four digits are more than a screen shows.
-                "line": None if panel.line is None else short(panel.line, 4),
-                **{end: [short(value, 4) for value in points[getattr(panel, end)]] for end in ("x", "y")},
-            }
-            for panel, points in drawn
+            {"x_label": "time of a query [ms]", "y_label": columns[column], "line": line}
+            # Four digits are more than a screen shows.
+            | {end: [short(value, 4) for value in points[of]] for end, of in (("x", "online_ms"), ("y", column))}
+            for column, points in drawn.items()
         ],
     }
     yield Plot(name, printable(title), data)
@@ -154,13 +143,6 @@ def _series(way: Series, look: Look) -> dict[str, Any]:
     }  # fmt: skip
     name = printable(label(way.name, None, str(way.variant)))
     return {"name": name, "colour": look.colour, "marker": markers[look.marker], "edge": 1.0 + 1.4 * look.rank}
-
-
-def _coordinates(cells: pd.DataFrame, panel: PlotPanel) -> pd.DataFrame:
-    """Both values of every cell; missing if one of them is, or is not positive."""
-    values = cells[[panel.x, panel.y]].astype(float)
-    fine = np.isfinite(values).all(axis=1) & (values > 0.0).all(axis=1)
-    return values.where(fine)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from vibench.provenance import distribution_version
 from vibench.report import html
 from vibench.report.citation import Citation, requirements
 from vibench.report.comparison import Comparison, compare
-from vibench.report.differences import ComparedRun, compared_runs
+from vibench.report.differences import ComparedRun, compared_runs, numbered
 from vibench.report.figures.data import way
 from vibench.report.identifying import cleaned, left
 from vibench.results import formats
@@ -150,25 +150,8 @@ class PublishedRun:
         return {"study": [study], **axes, "machine": self.run.machines, "vibench": versions.split(", ")}
 
     @property
-    def code(self) -> str:
-        return ", ".join(sorted({str(row["code"]) for row in self.run.cells.values() if row["code"]}))
-
-    @property
     def facts(self) -> Iterator[tuple[str, str]]:
-        """Origin of the numbers, in lines of a name and a text."""
-        rows = self.run.cells.values()
-        yield "study", "{study}, seed {seed}, validation parameters: {validation}".format(**self.run.identity)
-        for axis in ("problem", "dual", "primal", "solver"):
-            yield axis, ", ".join(self.values[axis])
-        counts = pd.Series([row["status"] for row in rows], dtype=object).value_counts()
-        yield "cells", f"{len(rows)}: " + ", ".join(f"{count} {status}" for status, count in counts.items())
-        yield "machine", "; ".join(self.run.machines)
-        disturbed = sum(row["disturbed"] == 1 for row in rows)
-        timed = f"{disturbed} of {len(rows)} cells were timed on a disturbed machine"
-        yield "seconds", f"CPU seconds on one thread; {timed}"
-        yield "versions", ", ".join(f"{name} {text}" for name, text in self.run.versions.items() if text)
-        yield "code", self.code
-        yield "study file", ", ".join(sorted({str(row["study_hash"]) for row in rows if row["study_hash"]}))
+        yield from self.run.facts
         if self.note:
             yield "note", self.note
 
@@ -176,7 +159,7 @@ class PublishedRun:
     def provenance(self) -> dict[str, Any]:
         return {
             **self.run.identity, "cells": len(self.run.cells), "ok": self.run.ok, "machines": self.run.machines,
-            "versions": self.run.versions, "code": self.code.split(", "), "values": self.values, "note": self.note,
+            "versions": self.run.versions, "code": self.run.code.split(", "), "values": self.values, "note": self.note,
         }  # fmt: skip
 
     @property
@@ -214,13 +197,7 @@ def _model(row: Mapping[str, Any]) -> str:
 
 def folder_names(names: Sequence[str]) -> list[str]:
     """Names of folders for runs of these names: they need no escapes in links, and differ in more than case."""
-    folders: list[str] = []
-    for name in names:
-        plain = re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "run"
-        taken = {other.lower() for other in folders}
-        same = (plain if k == 1 else f"{plain}-{k}" for k in range(1, len(names) + 2))
-        folders.append(next(one for one in same if one.lower() not in taken))
-    return folders
+    return numbered((re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "run" for name in names), "{}-{}")
 
 
 def publish(
@@ -238,7 +215,9 @@ def publish(
     """
     check(site)
     with tempfile.TemporaryDirectory(prefix=TEMPORARY) as scratch:
-        copies = [Path(scratch, name, FILE) for name in _names(paths)]
+        # The last folder or the file alone, since other folders could identify somebody.
+        names = numbered((one.absolute().parent.name if one.name == FILE else one.stem for one in paths), "{} ({})")
+        copies = [Path(scratch, name, FILE) for name in names]
         for path, copy in zip(paths, copies, strict=True):
             cleaned(path, copy)
         runs = compared_runs(copies)
@@ -248,16 +227,6 @@ def publish(
         published = list(map(PublishedRun, runs, folder_names(names), remarks))
         write(site, lambda new: _fill(new, published, citation, figures=figures))
     return site / "index.html"
-
-
-def _names(paths: Sequence[Path]) -> list[str]:
-    """Different names of runs: the last folder or the file alone, since other folders could identify somebody."""
-    names: list[str] = []
-    for path in paths:
-        name = path.absolute().parent.name if path.name == FILE else path.stem
-        count = 1 + sum(one.rpartition(" (")[0] == name or one == name for one in names)
-        names.append(name if count == 1 else f"{name} ({count})")
-    return names
 
 
 def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation, *, figures: bool) -> None:
@@ -292,7 +261,7 @@ def _write_run(own: Path, run: PublishedRun, pages: _Pages, figures: bool) -> No
     for name in published:
         rows = whole_numbers(in_order(read_table(run.run.path, name)))
         _write(own / "tables" / f"{name}.csv", formats.to_csv(rows))
-    _write(own / "requirements.txt", requirements(run.run.versions, run.code))
+    _write(own / "requirements.txt", requirements(run.run.versions, run.run.code))
     _write(own / "provenance.json", json.dumps(run.provenance, indent=1, ensure_ascii=True, sort_keys=True) + "\n")
     columns = ("N", "R", "enrichment", "error_u_mean", "error_lambda_mean", "online_s", "offline_s")
     shown = {"cells": run.cells(columns), "columns": columns, "tables": published}

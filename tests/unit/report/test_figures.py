@@ -23,7 +23,7 @@ from running import DECIDED, Changed, Main, execute
 
 from vibench.errors import RequestError
 from vibench.report import figures
-from vibench.report.figures import OF_DUAL, OF_PROBLEM, constants, convergence, costs, draw_all
+from vibench.report.figures import KINDS, convergence, costs, draw_all
 from vibench.report.figures import problem_tables as of_file
 from vibench.report.figures.data import Extent, _per_combination
 from vibench.report.figures.style import save, styled
@@ -63,9 +63,7 @@ def drawn_from(results: Path, folder: Path, *kinds: str, rendered: bool = False)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", keep)
-        for group in ("OF_PROBLEM", "OF_DUAL"):
-            chosen = {kind: draw for kind, draw in getattr(figures, group).items() if not kinds or kind in kinds}
-            patch.setattr(figures, group, chosen)
+        patch.setattr(figures, "KINDS", {kind: draw for kind, draw in KINDS.items() if not kinds or kind in kinds})
         files, failures = draw_all(results, folder, ("png", "svg"))
     assert failures == []
     assert [path.stem for path in files] == [name for name in kept for _ in ("png", "svg")]
@@ -110,11 +108,6 @@ def line_called(axes: Axes, label: str) -> Line2D:
     return line
 
 
-def kinds_of_histories() -> list[str]:
-    """The figures that read histories."""
-    return [kind for kind, draw in (OF_PROBLEM | OF_DUAL).items() if draw.__module__ == convergence.__name__]
-
-
 ONE_CONE = "DELETE FROM queries WHERE dual = 'cpg'"
 """All kinds of figures are drawn of one dual strategy, too, with half as many panels."""
 
@@ -135,7 +128,7 @@ def test_every_figure_can_be_read(drawn: Drawn, folder: Path) -> None:
     """
     captions, names = figures.read_captions(folder), {path.stem for path in folder.glob("*.png")}
     for problem in problems():
-        assert {f"{problem}-{kind}" for kind in OF_PROBLEM} <= names
+        assert {f"{problem}-{kind}" for kind, (_, of_dual) in KINDS.items() if not of_dual} <= names
         for dual in read_study("quick").dual:
             assert {f"{problem}-{dual.title}-enrichment", f"{problem}-{dual.title}-inf-sup"} <= names
     assert {path.stem for path in folder.glob("*.svg")} == names == {*drawn} == {*captions} != set()
@@ -268,7 +261,7 @@ def test_without_a_fixed_enrichment_there_is_no_enrichment_figure(
 ) -> None:
     """Nor does one need cones: where every snapshot has no contact there is no generator, so no e_orth."""
     change("DELETE FROM queries WHERE primal = 'offline-pga'", "DELETE FROM histories WHERE stage = 'cone'")
-    drawn = draw(*kinds_of_histories(), "inf-sup", "total-cost", "work-precision")
+    drawn = draw("errors", "enrichment", "inf-sup", "total-cost", "work-precision")
     assert not [name for name in drawn if name.endswith("enrichment")]
     assert "obstacle-mcpg-inf-sup" in drawn
     with pytest.raises(RequestError, match="the run has no data for the figure 'enrichment' of obstacle"):
@@ -335,7 +328,7 @@ def test_every_strategy_is_drawn_ten_to_a_panel(count: int, results: Path) -> No
     fixed = replace(mine, queries=many(mine.queries, "primal", "offline-pga"),
                     histories=many(mine.histories, "primal", "offline-pga"))  # fmt: skip
     assert in_tens(next(convergence.enrichment(fixed)).axes[::3]) == count
-    spans = [axes for axes in next(constants.inf_sup(fixed)).axes if axes.get_ylabel().endswith("span")]
+    spans = [axes for axes in next(convergence.inf_sup(fixed)).axes if axes.get_ylabel().endswith("span")]
     assert in_tens(spans) == count + len(spans)  # the high-fidelity pair is in each
 
 
@@ -420,7 +413,7 @@ def test_a_profile_ends_at_the_share_that_was_solved(
 
 def test_the_same_results_give_the_same_files(results: Path, tmp_path: Path) -> None:
     data = dict(of_file(results))["hertz"]
-    for name, drawing in (("solutions", OF_PROBLEM["solutions"]), ("errors", OF_PROBLEM["errors"])):
+    for name, drawing in ((name, KINDS[name][0]) for name in ("solutions", "errors")):
         files = []
         for folder in ("one", "two"):
             (tmp_path / folder).mkdir(exist_ok=True)
@@ -434,10 +427,11 @@ def test_progress_names_every_figure_and_shows_the_end(
     change: Callable[..., None], results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     change("DELETE FROM queries WHERE problem = 'hertz' OR dual = 'cpg'")
-    monkeypatch.setattr(figures, "OF_PROBLEM", {"solvers": OF_PROBLEM["solvers"]})
+    chosen = ("solvers", "enrichment", "inf-sup")
+    monkeypatch.setattr(figures, "KINDS", {kind: KINDS[kind] for kind in chosen})
     shown: list[tuple[str, int, int]] = []
     draw_all(results, tmp_path, ("svg",), lambda *now: shown.append(now))
-    names = ["obstacle-solvers", *(f"obstacle-mcpg-{kind}" for kind in OF_DUAL), ""]
+    names = ["obstacle-solvers", *(f"obstacle-mcpg-{kind}" for kind in chosen[1:]), ""]
     assert shown == [(name, k, len(names) - 1) for k, name in enumerate(names)]
 
 
@@ -445,8 +439,8 @@ def test_a_figure_that_fails_costs_itself_and_has_a_line(
     change: Callable[..., None], results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, main: Main
 ) -> None:
     change("DELETE FROM queries WHERE problem = 'hertz' OR dual = 'cpg'")
-    monkeypatch.setattr(figures, "OF_PROBLEM", {"solvers": lambda _: {}["nan"], "total-cost": OF_PROBLEM["total-cost"]})
-    monkeypatch.setattr(figures, "OF_DUAL", {})
+    failing = {"solvers": (lambda _: {}["nan"], False), "total-cost": KINDS["total-cost"]}
+    monkeypatch.setattr(figures, "KINDS", failing)
     line = "the figure 'obstacle-solvers' could not be drawn: KeyError: 'nan'"
     code, out, err = main("figures", str(results), "--out", str(tmp_path / "here"), "--format", "svg")
     assert (code, err) == (0, f"vibench: {line}\n")
@@ -517,7 +511,7 @@ def test_a_report_has_half_a_page_of_a_long_figure_and_the_whole_of_any_other(re
     queries = pd.concat([long(mine.queries), data.restrict_to_dual("cpg").queries])
     many = replace(data, cells=long(mine.cells), queries=queries)
     tasks = list(figures.figures_of(name, replace(many, extent=Extent.BEGINNING), ["cpg"]))
-    assert {one.removeprefix("obstacle-") for one, *_ in tasks} >= {*OF_PROBLEM, "cpg-inf-sup"}
+    assert {one.removeprefix("obstacle-") for one, *_ in tasks} >= {"errors", "solvers", "cpg-inf-sup"}
     assert "obstacle-mcpg-inf-sup" not in [one for one, *_ in tasks]
     found = {one: list(draw(part)) for one, draw, part in tasks}
     assert max(map(len, found.values())) == 1

@@ -6,7 +6,6 @@ import json
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -14,8 +13,7 @@ from matplotlib.figure import Figure
 
 from vibench.errors import RequestError, in_a_line, unknown_name
 from vibench.files import read_regular, write_atomically
-from vibench.report.figures.constants import inf_sup
-from vibench.report.figures.convergence import enrichment, projection_errors
+from vibench.report.figures.convergence import enrichment, inf_sup, projection_errors
 from vibench.report.figures.costs import solvers, total_cost, work_precision
 from vibench.report.figures.data import Extent, ProblemTables, file_names, problem_tables
 from vibench.report.figures.solutions import solutions
@@ -24,13 +22,12 @@ from vibench.text import json_object
 
 DrawPages = Callable[[ProblemTables], Pages]
 
-# Figures of every problem, by the end of their file names.
-OF_PROBLEM: dict[str, DrawPages] = {
-    "solutions": solutions, "errors": projection_errors, "work-precision": work_precision, "solvers": solvers,
-    "total-cost": total_cost,
+# Figures by the end of their file names, and whether every dual strategy of a problem has one.
+KINDS: dict[str, tuple[DrawPages, bool]] = {
+    "solutions": (solutions, False), "errors": (projection_errors, False), "work-precision": (work_precision, False),
+    "solvers": (solvers, False), "total-cost": (total_cost, False), "enrichment": (enrichment, True),
+    "inf-sup": (inf_sup, True),
 }  # fmt: skip
-# Figures of every problem and dual strategy.
-OF_DUAL: dict[str, DrawPages] = {"enrichment": enrichment, "inf-sup": inf_sup}
 
 # A figure to be drawn: name of its first file, function that draws its pages, and their data.
 FigureTask = tuple[str, DrawPages, ProblemTables]
@@ -45,29 +42,29 @@ def drawings(path: Path) -> Iterator[FigureTask]:
 
 def figures_of(name: str, data: ProblemTables, duals: Collection[str]) -> Iterator[FigureTask]:
     """The figures of a problem, whose names begin with its name, and of some of its dual strategies."""
-    yield from ((f"{name}-{kind}", draw, data) for kind, draw in OF_PROBLEM.items())
+    yield from ((f"{name}-{kind}", draw, data) for kind, (draw, of_dual) in KINDS.items() if not of_dual)
     for dual, file in zip(data.duals, file_names(data.duals), strict=True):
         if dual in duals:
             of_cone = data.restrict_to_dual(dual)
-            yield from ((f"{name}-{file}-{kind}", draw, of_cone) for kind, draw in OF_DUAL.items())
+            yield from ((f"{name}-{file}-{kind}", draw, of_cone) for kind, (draw, of_dual) in KINDS.items() if of_dual)
 
 
 def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
     """One figure of a results file.
 
-    Its kind is a key of `OF_PROBLEM` or `OF_DUAL`. The problem is given by its label ("LABEL, TRAINING" where it has
-    several training sets), the dual strategy for a kind of `OF_DUAL` by its own; `None` is for the only one.
+    Its kind is a key of `KINDS`. The problem is given by its label ("LABEL, TRAINING" where it has several training
+    sets), the dual strategy for a kind that every one has by its own; `None` is for the only one.
 
     Raises a `RequestError` if there is no such figure, or nothing to draw in it.
     """
     by_problem = {data.problem: data for _, data in problem_tables(path)}
-    if kind not in OF_PROBLEM | OF_DUAL:
-        raise unknown_name("figure", kind, (*OF_PROBLEM, *OF_DUAL))
-    data = _only("problem", by_problem, problem)
-    if kind in OF_DUAL:
+    if kind not in KINDS:
+        raise unknown_name("figure", kind, KINDS)
+    data, (pages, of_dual) = _only("problem", by_problem, problem), KINDS[kind]
+    if of_dual:
         data = _only("dual strategy", {name: data.restrict_to_dual(name) for name in data.duals}, dual)
     with styled():
-        figure = next((OF_PROBLEM | OF_DUAL)[kind](data), None)
+        figure = next(pages(data), None)
     if figure is None:
         raise RequestError(f"the run has no data for the figure '{kind}' of {data.problem}")
     return figure
@@ -86,7 +83,7 @@ def _only(noun: str, by_label: Mapping[str, ProblemTables], label: str | None) -
 
 def remove(folder: Path) -> None:
     """Remove the figures that an earlier call of `draw_all` may have left in a folder; other files stay."""
-    own = re.compile(rf".*-({'|'.join(map(re.escape, (*OF_PROBLEM, *OF_DUAL)))})(-\d+)?\.(png|svg|pdf)")
+    own = re.compile(rf".*-({'|'.join(map(re.escape, KINDS))})(-\d+)?\.(png|svg|pdf)")
     captioned = {f"{name}.{form}" for name in read_captions(folder) for form in ("png", "svg", "pdf")}
     for file in folder.glob("*"):
         if file.is_file() and (file.name in captioned or file.name == "captions.json" or own.fullmatch(file.name)):
@@ -114,18 +111,17 @@ def draw_all(
     Formats are "png", "svg" and "pdf". `progress` is called before a figure is drawn, with its name, the number of
     those done, and that of all there may be.
     """
-    pages, failures = render(list(drawings(path)), partial(_save, folder, formats), progress)
+
+    def write(name: str, figure: Figure) -> tuple[str, str, list[Path]]:
+        folder.mkdir(parents=True, exist_ok=True)
+        return name, caption_of(figure), save(figure, folder, name, formats)
+
+    pages, failures = render(list(drawings(path)), write, progress)
     if pages:
         captions = read_captions(folder) | {name: caption for name, caption, _ in pages}
         text = json.dumps(captions, ensure_ascii=False, indent=1) + "\n"
         write_atomically(folder / "captions.json", text.encode("utf-8"))
     return [file for *_, files in pages for file in files], failures
-
-
-def _save(folder: Path, formats: tuple[str, ...], name: str, figure: Figure) -> tuple[str, str, list[Path]]:
-    """Write a page; returns its name, caption and files."""
-    folder.mkdir(parents=True, exist_ok=True)
-    return name, caption_of(figure), save(figure, folder, name, formats)
 
 
 def render(

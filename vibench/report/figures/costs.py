@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from vibench.model.bound_terms import CorrectionMode
 from vibench.qp.status import Status
 from vibench.report.figures.data import (
     ProblemTables,
     best_solver,
     by_dimensions,
-    correction_in_words,
     label,
     of_solvers,
     on_common_queries,
     parts,
-    point_names,
     program_columns,
     series,
     titled_parts,
+    whole,
 )
 from vibench.report.figures.style import HIGH_FIDELITY_LOOK, Layout, Looks, Pages, Series, Sheet, plot, scatter
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
-
-ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
 
 
 def work_precision(data: ProblemTables) -> Pages:
@@ -37,24 +33,31 @@ def work_precision(data: ProblemTables) -> Pages:
     """
     cells = best_solver(data.cells)
     compared = on_common_queries(cells, data.queries)
-    cells = compared.cells[compared.cells[list(ERRORS)].notna().any(axis=1)]
+    cells = compared.cells[compared.cells[["error_u_mean", "error_lambda_mean"]].notna().any(axis=1)]
     over, seconds = compared.over or f" over all {compared.asked} queries", 1e3 * cells["online_s"]
     rows_of = "dual strategy" + " and way of a query" * (cells["way"].nunique() > 1)
     looks = Looks(Series(str(primal)) for primal in cells["primal"].unique())
-    for rows, part in data.pages(list(_ways(cells)), 4):
+    # Dual strategies and ways of a query: title, cells, and as many primal strategies as a panel takes.
+    ways = [
+        (title, mine, names)
+        for (dual, way), mine in cells.groupby(["dual", "way"], sort=False)
+        for title, names in titled_parts(f"{dual}{f', {way}' * bool(way)}", list(map(str, mine["primal"].unique())))
+    ]
+    for rows, part in data.pages(ways, 4):
         heading = f"{data.problem}, {cells['solver'].iloc[0]}: work and precision{compared.over}"
         sheet = Sheet(len(rows), 2, heading, Layout(4.4, 3.3), "all", "col")
         for row, (way, mine, names) in enumerate(rows):
-            for place, (column, ylabel) in enumerate(ERRORS.items()):
+            for place, (column, symbol) in enumerate((("error_u_mean", "u"), ("error_lambda_mean", "λ"))):
                 panel, drawn = sheet.panel(row, place), mine[mine[column].notna()]
                 for name in names:
                     own = drawn.index[drawn["primal"] == name]
                     scatter(panel, seconds[own], drawn[column][own], looks[Series(str(name))], str(name))
-                for index, text in point_names(drawn[drawn["primal"].isin(names)]).items():
+                for index, text in _point_names(drawn[drawn["primal"].isin(names)]).items():
                     sheet.label(panel, seconds[index], drawn[column][index], text)
                 best = drawn.index[_front(seconds[drawn.index].to_numpy(float), drawn[column].to_numpy(float))]
                 panel.plot(seconds[best], drawn[column][best], c="0.6", lw=0.8, drawstyle="steps-post", zorder=0)
-                panel.set(xlabel="mean time of a query [ms]", ylabel=ylabel, title=way, xscale="log", yscale="log")
+                panel.set(xlabel="mean time of a query [ms]", ylabel=f"mean relative error of {symbol}", title=way)
+                panel.set(xscale="log", yscale="log")
         yield sheet.finish(
             f"Relative errors of u (left) and of λ (right) of the reduced models of {data.problem}, means{over}, "
             f"against the mean time of a query; solver {cells['solver'].iloc[0]}. A row for every {rows_of}, a point "
@@ -64,14 +67,16 @@ def work_precision(data: ProblemTables) -> Pages:
         )
 
 
-def _ways(cells: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
-    """Dual strategies and ways of a query: title, cells, and as many primal strategies as a panel takes."""
-    ways = cells.groupby(["dual", "assembly", "bounds", "correction"], sort=False)
-    for (dual, assembly, bounds, correction), mine in ways:
-        title = f"{dual}{f', {assembly} assembly' * (assembly != 'full')}{' with bounds' * bool(bounds)}"
-        title += f", {correction_in_words(correction)}" * (correction != CorrectionMode.NONE)
-        for part, names in titled_parts(title, [str(name) for name in mine["primal"].unique()]):
-            yield part, mine, names
+def _point_names(cells: pd.DataFrame) -> dict[Any, str]:
+    """Labels of the points of cells, (N, R) and δ, by index; of several tolerances only the first has (N, R)."""
+    names, named = {}, set()
+    for index, cell in cells.iterrows():
+        size = f"({whole(cell['N'])}, {whole(cell['R'])})"
+        tolerance = "" if pd.isna(cell["primal_tol"]) else f"{cell['primal_tol']:g}"
+        key = (cell["primal"], cell["dual"], size)
+        names[index] = tolerance if tolerance and key in named else size + f", δ = {tolerance}" * bool(tolerance)
+        named.add(key)
+    return names
 
 
 def _front(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -85,12 +90,14 @@ def _front(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def total_cost(data: ProblemTables) -> Pages:
     """Offline and online seconds against the number of queries; triangles mark where two models break even."""
     cells, queries = best_solver(data.cells), np.geomspace(1.0, 1e6, 61)
-    panels = [
-        (part, models.iloc[places])
-        for title, mine in by_dimensions(cells)
-        for models in [_most_vectors(mine)]
-        for part, places in titled_parts(title, list(range(len(models))), "models", beside_reference=True)
-    ]
+    panels = []
+    for title, mine in by_dimensions(cells):
+        # The cells with the most vectors of every strategy and way: a line per tolerance would hide the crossings.
+        added = mine.assign(added=mine["enrichment"].fillna(0))
+        most = added.sort_values(["added", "primal_tol"], ascending=[False, True], kind="stable")
+        models = most.drop_duplicates(["primal", "way"]).sort_index()
+        groups = titled_parts(title, list(range(len(models))), "models", beside_reference=True)
+        panels += [(part, models.iloc[places]) for part, places in groups]
     for shown, part in data.pages(panels, 12):
         sheet = Sheet.with_panels(len(shown), f"{data.problem}, {cells['solver'].iloc[0]}: total cost", share="all")
         drawn = [cell for _, mine in shown for cell in mine.itertuples()]
@@ -113,13 +120,6 @@ def total_cost(data: ProblemTables) -> Pages:
             "intervals of that number of queries.",
             part,
         )
-
-
-def _most_vectors(cells: pd.DataFrame) -> pd.DataFrame:
-    """The cells with the most vectors of every strategy and way: a line per tolerance would hide the crossings."""
-    by = {"by": ["added", "primal_tol"], "ascending": [False, True], "kind": "stable"}
-    added = cells.assign(added=cells["enrichment"].fillna(0)).sort_values(**by)
-    return added.drop_duplicates(["primal", "primal_options", "way"]).sort_index()
 
 
 def _marks(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame, most: float) -> None:

@@ -24,8 +24,6 @@ from vibench.results.schema import KEYS
 from vibench.study.cells import NO_SUCH_AXIS
 from vibench.text import json_object
 
-PRIMAL = ["primal", "primal_options", "primal_tol"]
-
 Panel = TypeVar("Panel")
 
 
@@ -209,21 +207,17 @@ def by_dimensions(cells: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     return [(f"{dual}, {dimensions(group)}", group) for (dual, _), group in groups]
 
 
-def by_strategy(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Rows by primal strategy and tolerance, with the label of each group."""
+def by_strategy(rows: pd.DataFrame) -> Iterator[tuple[str, Series, pd.DataFrame]]:
+    """Rows by primal strategy and tolerance, with the label and the key in legends of each group."""
     for (primal, tolerance), group in rows.groupby(["primal", "primal_tol"], dropna=False):
-        yield label(primal, tolerance), group
-
-
-def correction_in_words(correction: Any) -> Any:
-    """A correction in labels; "" for none, and what is no correction as it is."""
-    return {"none": "", "feasible": "corrected", "auto": "corrected where ω > ρ"}.get(correction, correction)
+        yield label(primal, tolerance), series(primal, tolerance), group
 
 
 def way(assembly: Any, bounds: Any, correction: Any) -> str:
     """Assembly, bounds and correction of queries in labels; "" for full assembly without correction."""
     assembled = assembly if isinstance(assembly, str) and assembly != "full" else ""
-    parts = (f"{assembled}{' with bounds' * bool(bounds == 1)}", correction_in_words(correction))
+    corrected = {"none": "", "feasible": "corrected", "auto": "corrected where ω > ρ"}.get(correction, correction)
+    parts = (f"{assembled}{' with bounds' * bool(bounds == 1)}".strip(), corrected)
     return ", ".join(part for part in parts if isinstance(part, str) and part)
 
 
@@ -231,12 +225,6 @@ def series(name: Any, tolerance: Any = None, way: str = "") -> Series:
     """Legend key: primal strategy with tolerance, assembly and correction."""
     variant = "" if pd.isna(tolerance) else float(tolerance)
     return Series(str(name), f"{way} {variant}" if way else variant)
-
-
-def some(values: Any) -> str:
-    """Numbers as an enumeration, in their order; of more than six the middle is left out."""
-    texts = [f"{value:g}" for value in np.unique(np.asarray(values, float))]
-    return ", ".join(texts if len(texts) <= 6 else [*texts[:5], "…", texts[-1]])
 
 
 def parts(items: list[Any], *, beside_reference: bool = False) -> list[list[Any]]:
@@ -272,25 +260,6 @@ def label_of(row: Any) -> str:
     return label(row["primal"], row["primal_tol"], way(row["assembly"], row["bounds"], row["correction"]))
 
 
-def point_names(cells: pd.DataFrame) -> dict[Any, str]:
-    """Labels of the points of cells, (N, R) and δ, by index; of several tolerances only the first has (N, R)."""
-    names, named = {}, set()
-    for index, cell in cells.iterrows():
-        size = f"({whole(cell['N'])}, {whole(cell['R'])})"
-        tolerance = "" if pd.isna(cell["primal_tol"]) else f"{cell['primal_tol']:g}"
-        key = (cell["primal"], cell["dual"], size)
-        names[index] = tolerance if tolerance and key in named else size + f", δ = {tolerance}" * bool(tolerance)
-        named.add(key)
-    return names
-
-
-def one_solver(queries: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFrame:
-    """One row per strategy, tolerance, query and values on the `axes`, sorted by these."""
-    # Inf-sup constants depend on no solver, assembly or correction.
-    rows = queries.drop_duplicates([*axes, *PRIMAL, "query"])
-    return rows.iloc[np.argsort(rows.groupby(list(axes), sort=False).ngroup(), kind="stable")] if axes else rows
-
-
 def best_solver(cells: pd.DataFrame) -> pd.DataFrame:
     """Timed cells, not `too_loose`, of the solver and accuracy with the most ok queries; the fastest of several."""
     timed = cells[cells["online_s"].notna() & ~too_loose(cells, "solver") & ~too_loose(cells, "assembly")]
@@ -299,31 +268,6 @@ def best_solver(cells: pd.DataFrame) -> pd.DataFrame:
     ways = timed.groupby(["solver", "accuracy"]).agg(ok=("queries_ok", "sum"), seconds=("online_s", "mean"))
     solver, accuracy = ways.sort_values(["ok", "seconds"], ascending=[False, True]).index[0]
     return timed[(timed["solver"] == solver) & (timed["accuracy"] == accuracy)]
-
-
-def at_best_tolerance(rows: pd.DataFrame, score: pd.Series) -> pd.DataFrame:
-    """Rows of every primal strategy at the tolerance of its largest score by (primal, primal_tol), or without one."""
-    scores = score.dropna().rename("score").reset_index()
-    top = scores.groupby("primal")["score"].transform("max")
-    # The largest tolerance of scores equal up to 1e-6: figures do not depend on the last digits of a run.
-    near = scores[scores["score"] >= top - 1e-6 * top.abs()]
-    tolerances = near.groupby("primal")["primal_tol"].max()
-    return rows[rows["primal_tol"].isna() | (rows["primal_tol"] == rows["primal"].map(tolerances))]
-
-
-def common_tolerances(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows at tolerances that a strategy has at every pair, where it has such ones."""
-    pairs = rows.groupby(["primal", "primal_tol"])["pair"].nunique()
-    everywhere = pairs[pairs == rows.groupby("primal")["pair"].nunique().reindex(pairs.index, level="primal")]
-    common = pd.MultiIndex.from_frame(rows[["primal", "primal_tol"]]).isin(everywhere.index)
-    return rows[common | ~rows["primal"].isin(everywhere.index.get_level_values("primal"))]
-
-
-def longest(histories: pd.DataFrame) -> Iterator[tuple[Any, pd.DataFrame]]:
-    """The longest history for each dual strategy."""
-    # It contains the others: POD and cones are nested, so a looser tolerance stops at an earlier step.
-    for dual, group in histories.groupby("dual", dropna=False):
-        yield dual, group[group["artefact"] == group.groupby("artefact")["step"].max().idxmax()]
 
 
 def file_names(labels: list[str]) -> list[str]:
