@@ -54,14 +54,9 @@ class HighFidelitySolver:
     current active set until the set no longer changes. If the sets cycle, the method restarts from the active set of an
     interior-point solution; it never returns that solution itself, since greedy cones need multipliers with exact zeros
     off the contact set. Systems are condensed on the constrained unknowns where these are few. The elimination order is
-    computed once, and a stiffness that does not depend on the parameter is factorised once.
-
-    Parameters
-    ----------
-    problem
-        Its declarations `constant` and `contact_dofs` decide what is computed once.
-    condensing
-        Whether systems are condensed on the constrained unknowns in any case: error bounds are of that size.
+    computed once, and a stiffness that does not depend on the parameter is factorised once, as the problem declares by
+    `constant` and `contact_dofs`. `condensing` tells whether systems are condensed on the constrained unknowns in any
+    case: error bounds are of that size.
     """
 
     def __init__(self, problem: Problem, *, condensing: bool = False) -> None:
@@ -175,21 +170,11 @@ class HighFidelitySolver:
 def solve_high_fidelity(
     vi: VariationalInequality, stiffness: CondensedStiffness | None = None, start: Mask | None = None
 ) -> HighFidelitySolution:
-    """Solve one variational inequality to `ACCURACY`; see `HighFidelitySolver`.
+    """Solve one variational inequality, with sparse A and B, to `ACCURACY`; see `HighFidelitySolver`.
 
-    Parameters
-    ----------
-    vi
-        Sparse A, B and vectors f, g at one parameter.
-    stiffness
-        A condensed already; by default it is used as it is.
-    start
-        Initial active set (m,); empty by default.
-
-    Raises
-    ------
-    NumericalError
-        If A is not symmetric positive definite, or neither the active set method nor its fallback reaches `ACCURACY`.
+    `stiffness` is A condensed already, by default it is used as it is; `start` is the initial active set (m,), empty by
+    default. Raises a `NumericalError` if A is not symmetric positive definite, or neither the active set method nor its
+    fallback reaches `ACCURACY`.
     """
     vi = settled(in_float64(vi))
     check_symmetric(vi.A, "A")

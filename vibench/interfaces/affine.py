@@ -217,10 +217,8 @@ class AffineSum:
         Function from mu (d,) to θ (Q,). A problem can be copied to another process only if this function can: a lambda
         cannot.
 
-    Raises
-    ------
-    NumericalError
-        If there is no term, the terms differ in their shapes, or an infinite entry has another coefficient.
+    Raises a `NumericalError` if there is no term, the terms differ in their shapes, or an infinite entry has another
+    coefficient.
     """
 
     terms: tuple[Any, ...]
@@ -238,24 +236,13 @@ class AffineSum:
     def of(cls, pairs: Sequence[tuple[Theta, Any]], names: Sequence[str]) -> AffineSum:
         """The sum of pairs (θ_q, term_q); expressions are in these names of the parameters.
 
-        Raises
-        ------
-        RequestError
-            If an expression is not arithmetic on numbers and these names.
-        NumericalError
-            As the class itself.
+        Raises a `RequestError` if an expression is not arithmetic on numbers and these names.
         """
         thetas = tuple(Expression.parse(theta, names) if isinstance(theta, str) else theta for theta, _ in pairs)
         return cls(tuple(term for _, term in pairs), Thetas(thetas))
 
     def coefficients(self, mu: Array) -> Array:
-        """θ(mu) (Q,).
-
-        Raises
-        ------
-        NumericalError
-            If they are not as many finite numbers as there are terms.
-        """
+        """θ(mu) (Q,); raises a `NumericalError` if they are not as many finite numbers as there are terms."""
         theta = np.asarray(self.thetas(mu), float)
         if theta.shape != (len(self.terms),) or not np.isfinite(theta).all():
             where = f"at mu = {mu.tolist()}: {theta.tolist()}"

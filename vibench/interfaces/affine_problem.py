@@ -40,7 +40,9 @@ class AffineProblem(Problem):
         """Declare the members.
 
         Each is a constant, sparse matrix or vector, or a list of pairs (θ_q, term_q). θ_q is a number, an expression in
-        the names of the parameters, such as "load * cos(angle)", or a function of mu (d,).
+        the names of the parameters, such as "load * cos(angle)", or a function of mu (d,). Raises a `RequestError` for
+        another expression, and a `NumericalError` if a member has a wrong shape, or an infinite entry of g a
+        coefficient that is no positive constant.
 
         Parameters
         ----------
@@ -58,13 +60,6 @@ class AffineProblem(Problem):
         dirichlet_lift
             Prescribed values (N,) of the other unknowns, any values elsewhere; zero by default. The unknowns of the
             model are those of u minus this lift: f − A·lift and g − B·lift take the place of f and g.
-
-        Raises
-        ------
-        RequestError
-            If an expression is not arithmetic in the names of the parameters.
-        NumericalError
-            If a member has a wrong shape, or an infinite entry of g a coefficient that is no positive constant.
         """
         n, m = self.V.dim, self.W.dim
         given = {"A": A, "f": f, "B": B, "g": g}

@@ -254,10 +254,7 @@ class FormulationModel(ABC):
     def certificate(self, offline: OfflinePhase) -> Certificate:
         """The certificate of `reduced`, prepared offline and timed, for formulations that declare `has_certificate`.
 
-        Raises
-        ------
-        UnsupportedError
-            If the problem or the assembly allows none.
+        Raises an `UnsupportedError` if the problem or the assembly allows none.
         """
         return offline.certificate_of(self.reduced)
 
@@ -300,12 +297,8 @@ class Formulation(ABC):
         What `model` needs and `offline` does not have, by name: numbers, texts, `None`, arrays, sparse matrices, the
         `pod`, `cone` and `enrichment` of another offline phase (without a supply), and tuples, lists and dictionaries
         of these. It is stored as arrays and JSON, so nothing else is taken, and must be the same whenever it is built.
-        {} if there is nothing.
-
-        Raises
-        ------
-        UnsupportedError
-            If the problem does not have what the formulation needs; its cells say so.
+        {} if there is nothing. Raises an `UnsupportedError` if the problem does not have what the formulation needs;
+        its cells say so.
         """
         return {}
 
@@ -321,10 +314,7 @@ class Formulation(ABC):
 def axes_of(formulation: type[Formulation] | Formulation, title: str) -> tuple[str, ...]:
     """The axes that a formulation declares, in the order of `AXES`.
 
-    Raises
-    ------
-    RequestError
-        If there is no such axis, or an enrichment without V_N and cone.
+    Raises a `RequestError` if there is no such axis, or an enrichment without V_N and cone.
     """
     declared = formulation.uses
     if not isinstance(declared, tuple) or not set(declared) <= set(AXES):

@@ -47,10 +47,7 @@ class Output:
     def values(self, mus: Array, u: Array, lam: Array) -> Array:
         """Values (P,) of the output at parameters (P×d) and solutions, columns of u (n×P) and λ (m×P).
 
-        Raises
-        ------
-        NumericalError
-            If its coefficients have the wrong shape, its function fails, or a value is not finite.
+        Raises a `NumericalError` if coefficients have the wrong shape, the function fails, or a value is not finite.
         """
         if self.function is None:
             outputs = np.zeros(len(mus))

@@ -64,10 +64,7 @@ class ParameterBox:
     def from_unit(self, unit: Array, log: Sequence[str] = ()) -> Array:
         """The points (P×d) of the box at the places `unit` (P×d) of the unit cube, some parameters on a log scale.
 
-        Raises
-        ------
-        RequestError
-            If `log` names no parameter, or one whose lower bound is not positive.
+        Raises a `RequestError` if `log` names no parameter, or one whose lower bound is not positive.
         """
         linear = np.asarray(self.lower + unit * (self.upper - self.lower))
         for i in self.logarithmic(log):

@@ -219,10 +219,7 @@ class Sampling(ABC):
     def parameters(self, box: ParameterBox) -> Array:
         """Parameters (P×d) in the box, the same in every process.
 
-        Raises
-        ------
-        RequestError
-            If the options do not fit the box, or a file cannot be read.
+        Raises a `RequestError` if the options do not fit the box, or a file cannot be read.
         """
 
 

@@ -22,13 +22,7 @@ from vibench.linalg.inner_product import InnerProduct
 
 
 def check_cone(cone: object, W: InnerProduct) -> Cone:
-    """Refuse a cone whose generators have the wrong shape, are not finite, of unit norm in W, or in W⁺ unless free.
-
-    Raises
-    ------
-    NumericalError
-        Naming the violated property.
-    """
+    """Refuse a cone whose generators have the wrong shape, are not finite, of unit norm in W, or in W⁺ unless free."""
     if not isinstance(cone, Cone):
         raise NumericalError(f"the dual strategy returned a {type(cone).__name__}, expected a Cone")
     chi = _matrix("generators", cone.generators, W.dim)
@@ -50,13 +44,7 @@ def check_cone(cone: object, W: InnerProduct) -> Cone:
 
 
 def check_enrichment(enrichment: object, V: InnerProduct, basis: Array) -> Enrichment:
-    """Refuse an enrichment whose fixed vectors are not finite, orthonormal in V and orthogonal to V_N.
-
-    Raises
-    ------
-    NumericalError
-        Naming the violated property.
-    """
+    """Refuse an enrichment whose fixed vectors are not finite, orthonormal in V and orthogonal to V_N."""
     if not isinstance(enrichment, Enrichment):
         raise NumericalError(f"the primal strategy returned a {type(enrichment).__name__}, expected an Enrichment")
     if enrichment.vectors is not None:
@@ -124,11 +112,8 @@ def settled(vi: VariationalInequality) -> VariationalInequality:
 def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
     """`problem.assemble(mu)` in sparse matrices and vectors of float64.
 
-    Raises
-    ------
-    NumericalError
-        If it fails, shapes are wrong, values not real and finite, or out of range, naming mu, the member, the fault and
-        the expected value.
+    Raises a `NumericalError`, with mu, the member, the fault and the expected value, if it fails, shapes are wrong,
+    values not real and finite, or out of range.
     """
     with at_parameter(mu):
         vi = in_float64(problem.assemble(mu))

@@ -42,26 +42,15 @@ def factorised_later() -> Iterator[None]:
 
 
 class InnerProduct:
-    """The inner product ⟨u, v⟩ = uᵀ X v of a space, X sparse symmetric positive definite.
+    """The inner product ⟨u, v⟩ = uᵀ X v of a space, X sparse symmetric positive definite (n×n).
 
     X = FᵀF is factorised once. In whitened coordinates F v the inner product is Euclidean. Singular values, QR and
     nonnegative least squares are computed there and not from Gram matrices, whose eigenvalues keep half the digits.
 
-    Parameters
-    ----------
-    matrix
-        X, sparse (n×n).
-    name
-        Its name in error messages.
-    factorisation
-        Implementation that factorises X where no explicit F is needed, see `factorised_by`.
-
-    Raises
-    ------
-    NumericalError
-        If X is not square, not finite, not symmetric or not positive definite.
-    RequestError
-        If X is no matrix of real numbers, no factorisation has the name, or what a method is given is not of the space.
+    `name` is that of X in error messages, `factorisation` the implementation that factorises X where no explicit F is
+    needed, see `factorised_by`. Raises a `NumericalError` if X is not square, not finite, not symmetric or not positive
+    definite, a `RequestError` if it is no matrix of real numbers, no factorisation has the name, or what a method is
+    given is not of the space.
     """
 
     def __init__(self, matrix: SparseMatrix, name: str = "the Gram matrix", factorisation: str = DEFAULT) -> None:

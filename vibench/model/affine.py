@@ -37,28 +37,18 @@ class Evaluation(StrEnum):
 
 @dataclass(frozen=True)
 class AffineMember:
-    """One of A, f, B, g with its affine decomposition Σ_q θ_q(mu) · terms_q, if it has one.
-
-    Attributes
-    ----------
-    way
-        Its evaluation at a parameter.
-    terms
-        Matrices or vectors; one for a constant member, none where there is no decomposition.
-    rows, columns
-        Positions (Q,) of the entries whose values at mu are the θ_q of an interpolated member; `columns` is zero for
-        vectors. The θ_q of a declared affine member are those of `Problem.affine`.
-    error
-        Largest relative error over the training set.
-    reason
-        Reason why it has to be assembled in full; "" otherwise.
-    """
+    """One of A, f, B, g with its affine decomposition Σ_q θ_q(mu) · terms_q, if it has one."""
 
     way: Evaluation
+    # Matrices or vectors; one for a constant member, none where there is no decomposition.
     terms: tuple[Any, ...]
+    # Positions (Q,) of the entries whose values at mu are the θ_q of an interpolated member; `columns` is zero for
+    # vectors. The θ_q of a declared affine member are those of `Problem.affine`.
     rows: Indices = field(default_factory=lambda: np.zeros(0, np.intp))
     columns: Indices = field(default_factory=lambda: np.zeros(0, np.intp))
+    # Largest relative error over the training set.
     error: float = 0.0
+    # Why it has to be assembled in full; "" otherwise.
     reason: str = ""
 
     def interpolated(self, value: Any) -> Any:
@@ -77,11 +67,7 @@ def affine_decomposition(problem: Problem, training: Array, tolerance: float) ->
     do not vary there are constants, too. Members that the problem evaluates entry by entry are interpolated where that
     takes few terms; a matrix that is one matrix times a function of mu takes one. Else B and g are left to
     `Problem.contact`, if the problem has it. `training` is (P×d), `tolerance` the largest relative interpolation error.
-
-    Raises
-    ------
-    NumericalError
-        If an assembly is invalid, or a declared affine sum differs from it.
+    Raises a `NumericalError` if an assembly is invalid, or a declared affine sum differs from it.
     """
     first = checked_assembly(problem, training[0]).copy()
     check_affine(problem, training)
@@ -137,12 +123,9 @@ def coefficients(
 
 
 def check_affine(problem: Problem, training: Array) -> None:
-    """Refuse affine sums that are not the assembled members, at the first, the middle and the last parameter (P×d).
+    """Raise a `NumericalError` for an affine sum that is not the assembled member.
 
-    Raises
-    ------
-    NumericalError
-        For the first member that differs.
+    They are compared at the first, the middle and the last parameter (P×d).
     """
     for mu in training[[0, len(training) // 2, -1]] if problem.affine else ():
         vi = checked_assembly(problem, mu)
@@ -315,20 +298,13 @@ class _Entries:
 
 @dataclass(frozen=True)
 class Interpolation:
-    """Empirical interpolation v(mu) ≈ Σ_q v(mu)[points_q] · modes_q from a few entries of the vector.
+    """Empirical interpolation v(mu) ≈ Σ_q v(mu)[points_q] · modes_q from a few entries of the vector."""
 
-    Attributes
-    ----------
-    points
-        Interpolation points: entries (Q,), rising.
-    modes
-        Cardinal modes (k×Q): mode q is 1 at its own point and 0 at the others.
-    error
-        Largest relative Euclidean error over the snapshots.
-    """
-
+    # Interpolation points: entries (Q,), rising.
     points: Indices
+    # Cardinal modes (k×Q): mode q is 1 at its own point and 0 at the others.
     modes: Array
+    # Largest relative Euclidean error over the snapshots.
     error: float
 
 

@@ -73,14 +73,8 @@ def dual_gap(lam: Array, slack: Array) -> float:
 class BoundTerms:
     """Terms of the bounds (ii) of one pair u_N and λ_N with one correction w, or upper bounds of these terms.
 
-    Attributes
-    ----------
-    rho, omega
-        ρ = ‖r‖_{A⁻¹} and ω = ‖w‖_A.
-    kappa
-        κ, see `dual_gap`.
-    gap
-        ‖r + A w‖²_{A⁻¹} + 2κ, twice the duality gap of λ_N and the feasible u_N − w.
+    ρ = ‖r‖_{A⁻¹}, ω = ‖w‖_A, κ (see `dual_gap`) and the `gap` ‖r + A w‖²_{A⁻¹} + 2κ, twice the duality gap of λ_N and
+    the feasible u_N − w.
     """
 
     rho: float
@@ -112,26 +106,15 @@ def first_margin(round_off: Array) -> Array:
 
 @dataclass(frozen=True)
 class Equalities:
-    """Rows that hold as equalities.
+    """Rows that hold as equalities."""
 
-    Attributes
-    ----------
-    chosen
-        Positions (r,) among them of independent ones.
-    lengths
-        Norms (r,) of these in X⁻¹.
-    factor, smallest
-        R (r×r) in units of these norms, in which no scaling of rows changes σ_min, and σ_min.
-    liftings
-        M (·×r).
-    reach
-        ‖b M‖ (m,) of all rows b.
-    """
-
+    # Positions (r,) among them of independent ones, and the norms (r,) of these in X⁻¹.
     chosen: Indices
     lengths: Array
+    # R (r×r) in units of these norms, in which no scaling of rows changes σ_min, and σ_min.
     factor: Array
     smallest: float
+    # M (·×r), and ‖b M‖ (m,) of all rows b.
     liftings: Array
     reach: Array
 

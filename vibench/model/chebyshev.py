@@ -23,26 +23,17 @@ MEASURED = 100
 
 @dataclass(frozen=True)
 class AffinePolynomial:
-    """An array Σ_q θ_q(mu) · terms_q whose coefficients θ_q are polynomials on a box.
+    """An array Σ_q θ_q(mu) · terms_q whose coefficients θ_q are polynomials on a box."""
 
-    Attributes
-    ----------
-    indices
-        Degrees (K×d) of the products of Chebyshev polynomials that occur, in (2 mu − lower − upper)/(upper − lower).
-    coefficients
-        Coefficients of θ in these products (K×Q), zero where no value needs them.
-    terms
-        Flat terms (Q×size).
-    error
-        Largest Euclidean error at `MEASURED` random points of the box and at its corners, over the largest norm there.
-    scale
-        The largest norm.
-    """
-
+    # Degrees (K×d) of the products of Chebyshev polynomials that occur, in (2 mu − lower − upper)/(upper − lower).
     indices: Indices
+    # Coefficients of θ in these products (K×Q), zero where no value needs them.
     coefficients: Array
+    # Flat terms (Q×size).
     terms: Array
+    # Largest Euclidean error at `MEASURED` random points of the box and at its corners, over the largest norm there.
     error: float
+    # The largest norm.
     scale: float
 
     @property

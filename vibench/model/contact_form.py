@@ -226,10 +226,7 @@ class ContactForm:
     def holding(self, rows: Indices, values: Array) -> Representer:
         """The representer of the force Bᵀξ of some rows (k,) with B A⁻¹Bᵀξ = B v there, v (c,) on retained unknowns.
 
-        Raises
-        ------
-        RuntimeError, numpy.linalg.LinAlgError
-            If the rows are linearly dependent.
+        Raises a `RuntimeError` or a `LinAlgError` if the rows are linearly dependent.
         """
         prescribed, multiplier = (self.B @ values)[rows], np.zeros(self.B.shape[0])
         if self.is_dense:

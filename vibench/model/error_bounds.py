@@ -53,28 +53,20 @@ REFERENCE = 1e-6
 
 @dataclass(frozen=True)
 class ErrorBounds:
-    """Absolute error bounds of one reduced solution, infinite where there are none.
+    """Absolute error bounds of one reduced solution, infinite where there are none."""
 
-    Attributes
-    ----------
-    u_energy, u
-        Bounds of ‖u − u_N‖ in the norms of A and of V.
-    lambda_natural, lam
-        Bounds of ‖Bᵀ(λ − λ_N)‖ in the norm of A⁻¹ and of ‖λ − λ_N‖ in the norm of W.
-    rho, rho_range, omega, kappa
-        ρ, ρ_B and ω, in the unit of `u_energy`, and κ in that of its square.
-    note
-        Why there are none, or none in W, or which constant in them is estimated; "" where all are proved.
-    """
-
+    # Bounds of ‖u − u_N‖ in the norms of A and of V.
     u_energy: float
     u: float
+    # Bounds of ‖Bᵀ(λ − λ_N)‖ in the norm of A⁻¹ and of ‖λ − λ_N‖ in the norm of W.
     lambda_natural: float
     lam: float
+    # ρ, ρ_B and ω, in the unit of `u_energy`, and κ in that of its square.
     rho: float
     rho_range: float
     omega: float
     kappa: float
+    # Why there are none, or none in W, or which constant in them is estimated; "" where all are proved.
     note: str = ""
 
     @classmethod
@@ -243,11 +235,7 @@ def reference_bound(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam
     """Δ_A / F of a high-fidelity solution u (n,) and λ ≥ 0 (m,), or over S without contact; infinite without a w.
 
     Residuals say less: what is κ in Δ_A is only the square of an error. `vi` and `energy` are of the same parameter.
-
-    Raises
-    ------
-    NumericalError
-        If it is above `REFERENCE`, and Δ_A above what the round-off of B u − g leaves open.
+    Raises a `NumericalError` if it is above `REFERENCE`, and Δ_A above what the round-off of B u − g leaves open.
     """
     correction = find_correction(vi, energy, u, lam)
     if correction is None:

@@ -157,35 +157,25 @@ class ReferenceSolutions:
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of one reduced solution against the high-fidelity one at the same parameter, named as in the results.
+    """Errors of one reduced solution against the high-fidelity one at the same parameter, named as in the results."""
 
-    Attributes
-    ----------
-    error_u, error_lambda
-        Relative errors in the norms of V and of W; `None` where u or λ, respectively, is zero: see `zeros`.
-    error_u_energy, error_lambda_natural
-        Relative errors ‖u − u_N‖ in the norm of A(mu), and ‖Bᵀ(λ − λ_N)‖ in that of A(mu)⁻¹ over ‖Bᵀλ‖.
-    error_u_absolute, error_lambda_absolute, error_u_energy_absolute, error_lambda_natural_absolute
-        The errors above without the division.
-    error_u_scaled, error_lambda_scaled
-        The first two over the largest training norms, or as they are where those are zero.
-    violation
-        Largest (B u_N − g)₊, each row over the integral of its multiplier function [unit of u].
-    complementarity
-        λᵀ(B u_N − g) with the high-fidelity multiplier; with λ_N it would only repeat the gap of the QP solver.
-    """
-
+    # Relative, in the norms of V and of W; `None` where u or λ, respectively, is zero: see `zeros`.
     error_u: float | None
     error_lambda: float | None
+    # Relative, ‖u − u_N‖ in the norm of A(mu), and ‖Bᵀ(λ − λ_N)‖ in that of A(mu)⁻¹ over ‖Bᵀλ‖.
     error_u_energy: float | None
     error_lambda_natural: float | None
+    # These four without the division.
     error_u_absolute: float
     error_lambda_absolute: float
     error_u_energy_absolute: float
     error_lambda_natural_absolute: float
+    # The first two over the largest training norms, or as they are where those are zero.
     error_u_scaled: float
     error_lambda_scaled: float
+    # Largest (B u_N − g)₊, each row over the integral of its multiplier function [unit of u].
     violation: float
+    # The product λᵀ(B u_N − g) with the high-fidelity λ; with λ_N it would only repeat the gap of the QP solver.
     complementarity: float
 
 
@@ -323,12 +313,7 @@ def residual_multiplier(vi: VariationalInequality, energy: EnergyNorm, u: Array)
     """The λ ≥ 0 (m,) whose residual f − A u − Bᵀλ is the smallest in the norm of A⁻¹.
 
     Its KKT conditions are those of the variational inequality with the load f − A u and g = 0 where it is finite:
-    A w + Bᵀλ = f − A u, B w ≤ 0, λ ≥ 0 and λᵀB w = 0.
-
-    Raises
-    ------
-    NumericalError
-        If none is found.
+    A w + Bᵀλ = f − A u, B w ≤ 0, λ ≥ 0 and λᵀB w = 0. Raises a `NumericalError` if none is found.
     """
     g = np.where(is_absent(vi.g), vi.g, 0.0)
     homogeneous = VariationalInequality(vi.A, vi.f - vi.A @ u, vi.B, g)

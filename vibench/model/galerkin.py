@@ -21,24 +21,15 @@ from vibench.reduction.supremizers import ContactCoordinates, projected_supremiz
 
 @dataclass(frozen=True)
 class Evaluated:
-    """Data that a hyper-reduced assembly evaluates at one parameter; none for an assembly in full.
+    """Data that a hyper-reduced assembly evaluates at one parameter; none for an assembly in full."""
 
-    Attributes
-    ----------
-    samples
-        Values of the sampled entries, by member.
-    contact
-        The constraint on the contact unknowns, where B or g are evaluated there; valid until the problem evaluates
-        another one, which may be written into the same arrays.
-    coordinates
-        Coordinates of the primal basis Z in the space Φ of the model, without those at the end that are zero in all of
-        Z; `None` where Z is Φ.
-    dim
-        d, the dimension of Φ, where there are coordinates.
-    """
-
+    # Values of the sampled entries, by member.
     samples: Mapping[str, Array] = field(default_factory=dict)
+    # The constraint on the contact unknowns, where B or g are evaluated there; valid until the problem evaluates
+    # another one, which may be written into the same arrays.
     contact: Contact | None = None
+    # Coordinates of the primal basis Z in the space Φ (of dimension `dim`) of the model, without those at the end that
+    # are zero in all of Z; `None` where Z is Φ.
     coordinates: Array | None = None
     dim: int | None = None
 
@@ -53,22 +44,13 @@ class Evaluated:
 
 @dataclass(frozen=True)
 class ReducedProblem:
-    """The reduced variational inequality at one parameter.
+    """The reduced variational inequality at one parameter."""
 
-    Attributes
-    ----------
-    program
-        Dense A (N'×N'), f (N',), B (R×N'), g (R,) in coordinates of the primal basis and of the generators.
-    reconstruct
-        From coordinates (N'×k) in the V-orthonormal primal basis Z at this parameter to vectors (n×k): u = Z x.
-    factor
-        Cholesky factor (lower, N'×N') of A, where it was computed offline.
-    evaluated
-        Data that a hyper-reduced assembly evaluated at the parameter.
-    """
-
+    # Dense A (N'×N'), f (N',), B (R×N'), g (R,) in coordinates of the primal basis and of the generators.
     program: VariationalInequality
+    # From coordinates (N'×k) in the V-orthonormal primal basis Z at this parameter to vectors (n×k): u = Z x.
     reconstruct: Callable[[Array], Array]
+    # Cholesky factor (lower, N'×N') of A, where it was computed offline.
     factor: Array | None = None
     evaluated: Evaluated = Evaluated()
 
@@ -81,26 +63,10 @@ class ReducedProblem:
 class ReducedModel:
     """A reduced primal space, V_N and its enrichment, with a reduced multiplier cone.
 
-    Parameters
-    ----------
-    problem
-        The high-fidelity problem.
-    basis
-        V-orthonormal basis of V_N (n×N).
-    enrichment
-        The enrichment of the primal strategy.
-    generators
-        χ (m×R), unit norm in W, all with nonnegative coefficients: a free generator appears with both signs
-        (`Cone.rays`), and its two inequalities are an equality.
-    span
-        W-orthonormal basis of span χ (m×rank), from which per-parameter enrichments are computed.
-
-    Attributes
-    ----------
-    fixed_basis
-        The part of the primal basis that does not depend on the parameter (n×(N+S)).
-    kind
-        Dependence of the enrichment on the parameter.
+    `basis` is a V-orthonormal one of V_N (n×N), `fixed_basis` the part of the primal basis that does not depend on the
+    parameter (n×(N+S)). `generators` are χ (m×R), unit norm in W, all with nonnegative coefficients: a free generator
+    appears with both signs (`Cone.rays`), and its two inequalities are an equality. `span` is a W-orthonormal basis of
+    span χ (m×rank), from which per-parameter enrichments are computed.
     """
 
     def __init__(self, problem: Problem, basis: Array, enrichment: Enrichment, generators: Array, span: Array) -> None:

@@ -27,23 +27,14 @@ Samples = Mapping[str, Array]
 
 @dataclass(frozen=True)
 class ProjectedMember:
-    """A member in reduced coordinates: Σ_q θ_q(mu) · terms_q, or a constant.
+    """A member in reduced coordinates: Σ_q θ_q(mu) · terms_q, or a constant."""
 
-    Attributes
-    ----------
-    terms
-        Flattened terms (Q×size); symmetric ones are stored as upper triangles.
-    shape
-        Shape of the member.
-    constant
-        Whether the only term is the member itself.
-    unpack
-        Positions of the entries of a symmetric matrix in its packed triangle (d²,); `None` for full storage.
-    """
-
+    # Flattened terms (Q×size); symmetric ones are stored as upper triangles.
     terms: Array
     shape: tuple[int, ...]
+    # Whether the only term is the member itself.
     constant: bool
+    # Positions of the entries of a symmetric matrix in its packed triangle (d²,); `None` for full storage.
     unpack: Indices | None = None
 
     @classmethod
@@ -85,41 +76,26 @@ class ProjectedMember:
 
 @dataclass(frozen=True)
 class ReducedOperators:
-    """Offline data of a hyper-reduced model: a space Φ of dimension d and the members projected on it.
+    """Offline data of a hyper-reduced model: a space Φ of dimension d and the members projected on it."""
 
-    Attributes
-    ----------
-    sampled_entries
-        Entries of the members that are evaluated at a parameter: rows and columns by member.
-    affine
-        Members whose coefficients are those of `Problem.affine`.
-    A, f
-        Stiffness (d×d) and load (d,) on Φ.
-    g
-        Bound (R,); `None` where it is evaluated by `Problem.contact_loads`.
-    B
-        Constraint (R×d) on the generators χ, or ((k+R)×d) on (η, χ) for a per-parameter enrichment; `None` where it is
-        evaluated by `Problem.contact_loads`.
-    contact_basis
-        Rows of Φ at the contact unknowns (|E|×d), for a fixed space and a constraint from `Problem.contact_loads`.
-    supremizer_coordinates
-        Coordinates of Φ = V_N + supremizers for a per-parameter enrichment that varies in it, else `None`.
-    basis
-        Φ itself (n×d), for reconstruction, where it is neither of the above nor the model's fixed basis.
-    factor
-        Cholesky factor (lower, d×d) of a constant stiffness on a fixed space, for queries that solve the dual program.
-        `None` for more than d or linearly dependent generators, with which the dual is singular.
-    """
-
+    # Entries of the members that are evaluated at a parameter: rows and columns by member.
     sampled_entries: Mapping[str, tuple[Indices, Indices]]
+    # Members whose coefficients are those of `Problem.affine`.
     affine: tuple[str, ...]
+    # Stiffness (d×d), load (d,) and bound (R,), where `Problem.contact_loads` does not evaluate it.
     A: ProjectedMember
     f: ProjectedMember
     g: ProjectedMember | None
+    # Constraint (R×d) on the generators χ, or ((k+R)×d) on (η, χ) for a per-parameter enrichment; `None` as for g.
     B: ProjectedMember | None
+    # Rows of Φ at the contact unknowns (|E|×d), for a fixed space and a constraint from `Problem.contact_loads`.
     contact_basis: Array | None
+    # Coordinates of Φ = V_N + supremizers for a per-parameter enrichment that varies in it.
     supremizer_coordinates: PlainCoordinates | None
+    # Φ itself (n×d), for reconstruction, where it is neither of the above nor the model's fixed basis.
     basis: Array | None
+    # Cholesky factor (lower, d×d) of a constant stiffness on a fixed space, for queries that solve the dual program.
+    # `None` for more than d or linearly dependent generators, with which the dual is singular.
     factor: Array | None
 
 
@@ -193,21 +169,9 @@ def _combination(model: ReducedModel, eta: Array) -> Array:
 
 
 class HyperReducedModel:
-    """A reduced model whose queries use no array of mesh size.
+    """A reduced `model` whose queries use no array of mesh size, from its offline data, those of `hyper_reduce`.
 
-    Parameters
-    ----------
-    model
-        The reduced model.
-    operators
-        Its offline data, from `hyper_reduce`.
-
-    Attributes
-    ----------
-    model, problem, generators, fixed_basis
-        The reduced model, and these of its attributes.
-    kind
-        How the enrichment depends on the parameter, in the coordinates of the queries.
+    `kind` says how the enrichment depends on the parameter in the coordinates of the queries.
     """
 
     def __init__(self, model: ReducedModel, operators: ReducedOperators) -> None:
@@ -221,13 +185,7 @@ class HyperReducedModel:
         return coefficients(self.problem, self._operators.sampled_entries, self._operators.affine)
 
     def assemble(self, mu: Array) -> ReducedProblem:
-        """The reduced problem at mu (d,).
-
-        Raises
-        ------
-        NumericalError
-            If the reduced problem has entries that are not finite.
-        """
+        """The reduced problem at mu (d,); raises a `NumericalError` if it has entries that are not finite."""
         samples, contact = self.coefficients(mu), None
         if self._loads is not None and self._loads.from_contact is not None:
             # a certificate needs the constraint, too: pass on the one that the loads come from
@@ -238,13 +196,7 @@ class HyperReducedModel:
         return self._in_basis(mu, samples, self._members(samples, varying), contact)
 
     def assemble_all(self, mus: Array) -> list[ReducedProblem]:
-        """The reduced problems at mus (P×d): those of `assemble` up to round-off, sums of terms in one product each.
-
-        Raises
-        ------
-        NumericalError
-            As `assemble`.
-        """
+        """The reduced problems at mus (P×d): those of `assemble` up to round-off, sums of terms in one product each."""
         if not len(mus):
             return []
         samples = [self.coefficients(mu) for mu in mus]

@@ -93,26 +93,13 @@ def solve_qp(
     Constraints at a distance of more than 1e4 units are left out at first, and restored if the solution violates one of
     them. The solution is scaled back.
 
-    Parameters
-    ----------
-    program
-        A, f, B, g; dense, or sparse for solvers that take sparse data.
-    solver
-        A name that qpsolvers knows, or one of `extra`.
-    accuracy
-        Relative accuracy, translated to the solver's tolerances by `vibench.qp.settings`.
-    extra
-        Solvers registered through the entry point group `vibench.qp_solvers`.
-    factor
-        Cholesky factor (lower) of a dense A, if known: the dual program is solved then.
-    start
-        Warm start of the same dimensions, for solvers with `takes_start`.
+    The program is dense, or sparse for solvers that take sparse data. `solver` is a name that qpsolvers knows, or one
+    of `extra`, those registered through the entry point group `vibench.qp_solvers`. The relative `accuracy` is
+    translated to its tolerances by `vibench.qp.settings`. With the Cholesky `factor` (lower) of a dense A the dual
+    program is solved. `start` is a warm start of the same dimensions, for solvers with `takes_start`.
 
-    Raises
-    ------
-    NumericalError
-        If the solver does not return a `QPSolution` of the right shapes, with a text as its status. What it raises
-        itself becomes the status of an answer without x.
+    Raises a `NumericalError` if the solver does not return a `QPSolution` of the right shapes, with a text as its
+    status. What it raises itself becomes the status of an answer without x.
     """
     if not len(program.g):
         return _unconstrained(program, factor)

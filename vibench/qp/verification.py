@@ -112,23 +112,10 @@ class Inverse(Protocol):
 def kkt_residuals(
     program: VariationalInequality, x: Array, alpha: Array, inverse: Inverse | None = None, accuracy: float = 0.0
 ) -> Residuals:
-    """Natural residuals of x (n,), α (m,) ≥ 0.
+    """Natural residuals of x (n,), α (m,) ≥ 0 for a dense or sparse program.
 
-    Parameters
-    ----------
-    program
-        A, f, B, g, dense or sparse; g may be infinite in rows that constrain nothing.
-    x, alpha
-        The solution.
-    inverse
-        The factorisation of A where there is one already.
-    accuracy
-        Residuals up to this are good enough: F of the answer is their unit then, and no other one is computed.
-
-    Raises
-    ------
-    NumericalError
-        If A is not positive definite.
+    `inverse` is the factorisation of A where there is one already. Residuals up to the `accuracy` are good enough: F of
+    the answer is their unit then, and no other one is computed. Raises a `NumericalError` if A is not definite.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # a diverging solver returns infinite residuals
         return _residuals(program, x, alpha, inverse or inverse_of(program.A), accuracy)

@@ -17,20 +17,8 @@ ACCEPTED = 1e-9
 def subtract_cone_component(theta: Array, generators: Array, W: InnerProduct) -> tuple[Array, str]:
     """Subtract from θ the closest Υ of the cone with θ − Υ ≥ 0 coefficientwise: line 9 of Algorithm 2 of Niakh et al.
 
-    Parameters
-    ----------
-    theta
-        Snapshot θ ≥ 0 (m,).
-    generators
-        Generators ν ≥ 0 of the cone (m×r).
-    W
-        Inner product of the multiplier space.
-
-    Returns
-    -------
-    tuple
-        θ − Υ (m,), without negative entries, and with exact zeros in place of round-off; and a note, empty where Υ is
-        optimal to `ACCEPTED`.
+    θ ≥ 0 (m,) is a snapshot, the generators of the cone are ν ≥ 0 (m×r). The result is θ − Υ (m,), without negative
+    entries, and with exact zeros in place of round-off; and a note, empty where Υ is optimal to `ACCEPTED`.
     """
     # A generator that is positive where θ is zero must have the coefficient 0. Without such generators, and restricted
     # to the support of θ, the problem has strictly feasible points; otherwise it has none, and QP solvers break down.

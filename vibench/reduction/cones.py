@@ -119,16 +119,9 @@ class GrowingCone:
     """A cone that grows by one generator at a time, and the snapshot that is farthest from it.
 
     Greedy algorithms with the relative maximum criterion (paper, equations (13) and (34)) are a loop over `farthest`
-    and `add`. Cones are nested, so distances only fall and the maximum is taken lazily.
-
-    Attributes
-    ----------
-    generators
-        Generators so far (m×r), unit norm.
-    farthest
-        Index of the snapshot farthest from the cone.
-    error
-        Its distance, relative to the largest norm of a snapshot.
+    and `add`. Cones are nested, so distances only fall and the maximum is taken lazily. `generators` are those so far
+    (m×r), of unit norm, `farthest` is the index of the snapshot farthest from the cone, and `error` its distance,
+    relative to the largest norm of a snapshot.
 
     Raises a `NumericalError` if a snapshot θ_q (m×Q) has a negative coefficient: it would not be in W⁺.
     """

@@ -18,18 +18,11 @@ from vibench.timing import Seconds, Stopwatch
 
 @dataclass(frozen=True)
 class Step:
-    """A fixed enrichment that grows, after some of its vectors.
+    """A fixed enrichment that grows, after `count` of its vectors.
 
-    Attributes
-    ----------
-    count
-        Number S of vectors so far.
-    measure
-        What a tolerance bounds: from above, or from below where the strategy says `larger_is_tighter`.
-    vectors
-        From a number k: the vectors (n×(S−k)) from the k-th on, V-orthonormal, orthogonal to V_N and to those before.
-    history
-        Quantity → values over the steps so far.
+    A tolerance bounds its `measure` from above, or from below where the strategy says `larger_is_tighter`. `vectors`
+    maps k to the vectors (n×(S−k)) from the k-th on, V-orthonormal, orthogonal to V_N and to those before. `history`
+    has the values over the steps so far, by quantity.
     """
 
     count: int
