@@ -27,10 +27,10 @@ from vibench.interfaces.strategies import (
     no_free,
 )
 from vibench.interfaces.validation import (
+    ReferenceAssembly,
     check_cone,
     check_enrichment,
     checked_assembly,
-    reference_assembly,
     training_parameters,
 )
 from vibench.linalg.inner_product import check_symmetric
@@ -191,7 +191,7 @@ class Reduction:
         if not isinstance(self.training, AdaptiveSampling):
             mus = training_parameters(self.problem, self.training)
             return high_fidelity_sweep(self.problem, mus, skip=self.on_failure == "skip")
-        trainer = GreedyTrainer(self.problem, reference_assembly(self.problem))
+        trainer = GreedyTrainer(self.problem, ReferenceAssembly(self.problem))
         self.training.train(self.problem.parameters, trainer)
         mus, solutions = np.array([s.mu for s in trainer.solved]), [s.solution for s in trainer.solved]
         return Snapshots(mus, np.column_stack([s.u for s in solutions]), np.column_stack([s.lam for s in solutions]))

@@ -75,7 +75,7 @@ SETTINGS: Mapping[str, SolverSettings] = {
         "info.status", "info.iter", bounds=True,
     ),
     "proxqp": SolverSettings(
-        lambda accuracy: {"eps_rel": 0.0, "max_iter": 1000, **_duality_gap(accuracy)},
+        lambda accuracy: {"max_iter": 1000, **_duality_gap(accuracy)},
         "info.status", "info.iter", start=_proxqp_start,
     ),
     # A first-order method, whose iteration limit trades time for accuracy.

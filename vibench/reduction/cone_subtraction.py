@@ -10,15 +10,12 @@ from vibench.linalg.inner_product import InnerProduct
 from vibench.qp.scaling import peak, ratio
 from vibench.qp.solve import solve_qp
 
-# A solution of line 9 with a larger residual is recorded as a fallback; Remark 4.1 holds for any feasible one.
-ACCEPTED = 1e-9
-
 
 def subtract_cone_component(theta: Array, generators: Array, W: InnerProduct) -> tuple[Array, str]:
     """Subtract from θ the closest Υ of the cone with θ − Υ ≥ 0 coefficientwise: line 9 of Algorithm 2 of Niakh et al.
 
     θ ≥ 0 (m,) is a snapshot, the generators of the cone are ν ≥ 0 (m×r). The result is θ − Υ (m,), without negative
-    entries, and with exact zeros in place of round-off; and a note, empty where Υ is optimal to `ACCEPTED`.
+    entries, and with exact zeros in place of round-off; and a note, empty where Υ is optimal.
     """
     # A generator that is positive where θ is zero must have the coefficient 0. Without such generators, and restricted
     # to the support of θ, the problem has strictly feasible points; otherwise it has none, and QP solvers break down.
@@ -26,24 +23,23 @@ def subtract_cone_component(theta: Array, generators: Array, W: InnerProduct) ->
     usable = generators[:, ~np.any(generators[~support] > 0.0, axis=0)]
     if not usable.shape[1]:
         return theta.copy(), ""
-    coefficients, residual = _least_squares(theta, usable, support, W)
+    coefficients, note = _least_squares(theta, usable, support, W)
     part = usable @ coefficients
     over = part > theta
     # The solver may violate Υ ≤ θ. Scaling Υ down restores that and stays in the cone; round-off is clamped below.
     if np.any(over):
         shrink = float(np.min(theta[over] / part[over]))
-        part *= shrink if shrink < 1.0 - ACCEPTED else 1.0
+        part *= shrink if shrink < 1.0 - 1e-9 else 1.0
     rest = np.maximum(theta - part, 0.0)
     units = np.sqrt(W.matrix.diagonal())
     # Round-off left there would exclude generators later. Entries are compared in units of the norms of their basis
     # functions, so that the scaling of a row decides nothing.
     rest[units * rest < 1e-12 * (units * theta).max()] = 0.0
-    note = "" if residual <= ACCEPTED else f"line 9 solved only to {residual:.0e}, made feasible"
     return rest, note
 
 
-def _least_squares(theta: Array, generators: Array, support: Mask, W: InnerProduct) -> tuple[Array, float]:
-    """Coefficients α ≥ 0 (r,) that minimise ‖θ − Σ α_i ν_i‖_W with Σ α_i ν_i ≤ θ, and the largest KKT residual."""
+def _least_squares(theta: Array, generators: Array, support: Mask, W: InnerProduct) -> tuple[Array, str]:
+    """Coefficients α ≥ 0 (r,) that minimise ‖θ − Σ α_i ν_i‖_W with Σ α_i ν_i ≤ θ, and a note where they are inexact."""
     whitened, target = W.whiten(generators), W.whiten(theta)
     count, units = generators.shape[1], np.sqrt(W.matrix.diagonal())[support]
     program = VariationalInequality(
@@ -62,9 +58,10 @@ def _least_squares(theta: Array, generators: Array, support: Mask, W: InnerProdu
         residual = _largest_residual(program, solution.x, solution.alpha)
         if residual < smallest:
             best, smallest = np.maximum(solution.x, 0.0), residual
-        if smallest <= ACCEPTED:
-            break
-    return best, smallest
+        # A larger residual is recorded as a fallback; Remark 4.1 holds for any feasible solution.
+        if smallest <= 1e-9:
+            return best, ""
+    return best, f"line 9 solved only to {smallest:.0e}, made feasible"
 
 
 def _largest_residual(program: VariationalInequality, x: Array, alpha: Array) -> float:

@@ -16,7 +16,7 @@ from vibench.errors import NumericalError, at_parameter, message_of
 from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.formulations import Snapshots
 from vibench.interfaces.problem import Problem, VariationalInequality
-from vibench.interfaces.validation import Fingerprint, ReferenceAssembly, checked_assembly, reference_assembly
+from vibench.interfaces.validation import Fingerprint, ReferenceAssembly, checked_assembly
 from vibench.model.certificates.greedy import GreedyTrainer
 from vibench.model.error_bounds import reference_bound
 from vibench.offline.assemblies import assemblies
@@ -145,7 +145,7 @@ class SnapshotStage(Stage):
     def _sweep(self, problem: Problem) -> Result:
         first, mus = chunk_of(self.parameters.of(problem), self.chunk)
         kept = _set_up(problem)
-        work = _Work(problem, kept.solver or HighFidelitySolver(problem), reference_assembly(problem), mus, mus.copy())
+        work = _Work(problem, kept.solver or HighFidelitySolver(problem), ReferenceAssembly(problem), mus, mus.copy())
         # No solution may depend on what this process has solved before.
         work.solver.forget()
         solutions, seconds = list[HighFidelitySolution](), list[Seconds]()
@@ -269,7 +269,7 @@ class AdaptiveTraining(Stage):
         assert self.training.sampling is not None
         with faults_of(self.problem):
             problem, strategy = build_problem(self.problem), self.training.sampling.create()
-            reference = reference_assembly(problem)
+            reference = ReferenceAssembly(problem)
             trainer = GreedyTrainer(problem, reference)
             strategy.train(problem.parameters, trainer)
             reference.refuse_rewritten_constants()
@@ -308,7 +308,7 @@ def parameters_in(store: Store, problem: Plugin, parameters: ParameterSet) -> Ar
 @lru_cache(maxsize=4)
 def fingerprint_here(problem: Plugin) -> Fingerprint:
     """The fingerprint of a problem in this process."""
-    return reference_assembly(build_problem(problem)).fingerprint
+    return ReferenceAssembly(build_problem(problem)).fingerprint
 
 
 def gather(store: Store, chunks: tuple[Stage, ...]) -> TimedSnapshots:

@@ -11,9 +11,8 @@ from fake_plugins import Wire
 
 from vibench.errors import NumericalError
 from vibench.interfaces.affine import AffineSum
-from vibench.interfaces.declarations import contradictions
 from vibench.interfaces.problem import Contact, ContactLoads, Problem
-from vibench.interfaces.validation import reference_assembly
+from vibench.interfaces.validation import ReferenceAssembly, contradictions
 
 
 def variant(base: type[Problem], **members: Any) -> Problem:
@@ -89,7 +88,7 @@ def test_what_assembly_does_not_confirm_is_named_with_its_parameter(what: str) -
     (said, *_) = contradictions(problem, mu, problem.assemble(mu))
     assert said.startswith(what.removesuffix(" at some parameters"))
     with pytest.raises(NumericalError, match=rf"refuted at mu = \[{mu[0]}.*\]: `"):
-        reference_assembly(problem).refuse_false_declarations(mu, problem.assemble(mu))
+        ReferenceAssembly(problem).refuse_false_declarations(mu, problem.assemble(mu))
 
 
 def test_what_is_true_is_confirmed_whatever_the_units_and_absent_rows() -> None:
@@ -97,7 +96,7 @@ def test_what_is_true_is_confirmed_whatever_the_units_and_absent_rows() -> None:
         mu = middle(problem)
         vi = problem.assemble(mu)
         assert not [*contradictions(problem, mu, vi)]
-        reference_assembly(problem).refuse_false_declarations(mu, vi)
+        ReferenceAssembly(problem).refuse_false_declarations(mu, vi)
     absent = variant(Declared, contact=lambda self, mu: Contact(-self.mass, np.where(np.arange(12) == 3, np.inf, 0.0)))
     vi = absent.assemble(mu := middle(absent))
     said = [*contradictions(absent, mu, vi)]

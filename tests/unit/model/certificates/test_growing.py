@@ -119,7 +119,7 @@ class Rewriting(Problem):
 def test_a_solution_starts_from_what_a_bound_has_left_only_at_its_parameter(rewritten: bool) -> None:
     obstacle = create("problem", "obstacle", {"resolution": 160})
     problem = Rewriting(obstacle) if rewritten else obstacle
-    trainer = GreedyTrainer(problem, ReferenceAssembly(problem, problem.assemble(problem.training_set()[0])))
+    trainer = GreedyTrainer(problem, ReferenceAssembly(problem))
     first, *others, last = problem.parameters.sample(8, 5)
     trainer.solve(first)
     for mu in others:
@@ -167,7 +167,7 @@ def test_what_is_kept_of_a_candidate_changes_no_estimate(kept: int) -> None:
 def test_without_contact_unknowns_there_are_no_estimates() -> None:
     problem = Varying()
     first, second = problem.parameters.sample(2, 1)
-    trainer = GreedyTrainer(problem, ReferenceAssembly(problem, problem.assemble(first)))
+    trainer = GreedyTrainer(problem, ReferenceAssembly(problem))
     trainer.solve(first)
     assert trainer.estimate(second) is None
     assert trainer.bound(second) > 0.0
@@ -201,7 +201,7 @@ def test_a_model_without_contact_has_bounds_of_u_alone() -> None:
 
 def test_a_trainer_counts_bounds_and_seconds() -> None:
     problem = Varying()
-    trainer = GreedyTrainer(problem, ReferenceAssembly(problem, problem.assemble(np.array([0.0]))))
+    trainer = GreedyTrainer(problem, ReferenceAssembly(problem))
     given = np.array([0.5])
     trainer.solve(given)
     given[0] = 7.0  # what is kept is a copy
