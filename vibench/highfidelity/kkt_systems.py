@@ -17,7 +17,7 @@ import scipy.linalg
 import scipy.sparse as sp
 from scipy.optimize import nnls
 from scipy.sparse.csgraph import reverse_cuthill_mckee
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse.linalg import splu
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix, times_dense
 from vibench.interfaces.problem import VariationalInequality
@@ -49,11 +49,10 @@ def zone_of(B: SparseMatrix, rows: Mask) -> Indices:
 
 def watched(B: SparseMatrix, zone: Indices) -> Mask:
     """Rows (m,) of B (m×n) that touch no unknown outside of a zone."""
-    inside = np.zeros(B.shape[1], bool)
-    inside[zone] = True
-    outside = sp.csr_array(B).copy()
-    outside.data = (~inside[outside.indices]).astype(float)
-    return np.asarray(np.ravel(outside.sum(axis=1)) == 0.0)
+    outside, B = np.ones(B.shape[1], bool), sp.csr_array(B)
+    outside[zone] = False
+    rows = np.repeat(np.arange(B.shape[0]), np.diff(B.indptr))
+    return np.asarray(np.bincount(rows, outside[B.indices], B.shape[0]) == 0.0)
 
 
 def coarse_contact(solve: Callable[[Array], Array], vi: VariationalInequality) -> Mask:
@@ -452,16 +451,22 @@ class _BorderedFactorisation:
     """The LU factorisation of a symmetric system K (k×k), solved with borders of a few rows and columns.
 
     Raises a `RuntimeError` if it is exactly singular. A system that is singular up to round-off may still be
-    consistent; its solution is verified by the active set method.
+    consistent; its solution is verified by the active set method. `pivots` are those of a saddle point system whose
+    `last` unknowns are multipliers, in natural order, where all have their signs beyond round-off.
     """
 
     def __init__(self, matrix: SparseMatrix, last: int | None = None) -> None:
-        self._matrix, self.pivots = matrix, None
+        self._matrix = matrix
+        self.pivots: Array | None = None
         self._unbordered: Array | None = None
         self._columns = dict[int, Array]()
         if last is not None:
             self._factor = symmetric_lu(matrix, "NATURAL")
-            self.pivots = _definite_pivots(self._factor, last)
+            pivots, size = np.asarray(self._factor.U.diagonal()), matrix.shape[0] - last
+            # Rows have length 1 and A the diagonal 1: smaller pivots may consist of round-off alone.
+            regular = np.all(pivots[:size] > 16.0 * EPS * size) and np.all(pivots[size:] < -1e-12)
+            natural = np.array_equal(self._factor.perm_r, np.arange(len(pivots)))
+            self.pivots = pivots if regular and natural else None
         if self.pivots is None:
             self._factor = splu(matrix)
 
@@ -497,16 +502,6 @@ class _BorderedFactorisation:
         x, y = bordered(self._unbordered, values)
         dx, dy = bordered(self._factor.solve(right - self._matrix @ x - border @ y), values - border.T @ x)
         return x + dx, y + dy
-
-
-def _definite_pivots(factor: SuperLU, last: int) -> Array | None:
-    """The pivots of a saddle point system in natural order; `None` unless all have their signs beyond round-off."""
-    pivots = np.asarray(factor.U.diagonal())
-    size = len(pivots) - last
-    # Rows have length 1 and A the diagonal 1: smaller pivots may consist of round-off alone.
-    regular = np.all(pivots[:size] > 16.0 * EPS * size) and np.all(pivots[size:] < -1e-12)
-    natural = np.array_equal(factor.perm_r, np.arange(len(pivots)))
-    return pivots if regular and natural else None
 
 
 def _regular(schur: Array, sizes: Array) -> bool:

@@ -3,11 +3,9 @@
 `vibench.model.error_bounds` states the bounds. A *correction* is any w with B w ≥ s, s = B u_N − g. In floating-point
 arithmetic margins show that: s is raised above its round-off, and w is accepted if it satisfies the rows by more than
 the round-off of B w and s. Equalities leave no room for a margin. There w misses B_E w = s_E by δ, and w' = w + d holds
-it, with the smallest d such that B_E d = δ. With K = F⁻ᵀB_Eᵀ = Q R for the inner product X = FᵀF,
-
-    d = M R⁻ᵀδ,    M = F⁻¹Q,    ‖d‖_X ≤ η = ‖δ‖ / σ_min(R),    |b d| ≤ ‖b M‖ η    for any row b,
-
-so that w' satisfies all rows if w satisfies the others by ‖b M‖ η, and the bounds hold for it with ω + η.
+it, with the smallest d such that B_E d = δ. With K = F⁻ᵀB_Eᵀ = Q R for the inner product X = FᵀF, d = M R⁻ᵀδ, M = F⁻¹Q,
+‖d‖_X ≤ η = ‖δ‖ / σ_min(R) and |b d| ≤ ‖b M‖ η for any row b, so that w' satisfies all rows if w satisfies the others by
+‖b M‖ η, and the bounds hold for it with ω + η.
 """
 
 from __future__ import annotations

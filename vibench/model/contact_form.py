@@ -51,13 +51,13 @@ class ContactForm:
     """The constraints and the energy norm of one parameter on the c retained unknowns.
 
     `stiffness` is A, condensed on unknowns that include those that B touches. `shared` tells whether bounds of many
-    pairs share D and K, `is_dense` whether these are computed. `B` and `sizes` are B on the retained unknowns and its
-    absolute values, sparse (m×c).
+    pairs share D and K, `is_dense` whether these are computed. `B` and `sizes` are B on the retained unknowns, whose
+    positions (c,) rise, and its absolute values, sparse (m×c).
     """
 
     def __init__(self, vi: VariationalInequality, stiffness: CondensedStiffness, *, shared: bool) -> None:
-        self.vi, self._stiffness, self._retained = vi, stiffness, stiffness.retained
-        self.B: SparseMatrix = sp.csr_array(sp.csc_array(vi.B)[:, self._retained])
+        self.vi, self._stiffness, self.retained = vi, stiffness, stiffness.retained
+        self.B: SparseMatrix = sp.csr_array(sp.csc_array(vi.B)[:, self.retained])
         self.sizes: SparseMatrix = abs(self.B)
         m, c = self.B.shape
         # For a sparse Ŝ a D that is large, or not reused by the next pair, costs more than a sparse system per set.
@@ -71,14 +71,9 @@ class ContactForm:
         m, c = self.B.shape
         return 48 * int(self.B.nnz) + (8 * m * (c + 3 * m) if self.is_dense else 0)
 
-    @property
-    def retained(self) -> Indices:
-        """Positions (c,) of the retained unknowns, rising."""
-        return self._retained
-
     def values(self, u: Array) -> Array:
         """The retained unknowns (c,) of u (n,)."""
-        return np.asarray(u[self._retained])
+        return np.asarray(u[self.retained])
 
     def extended(self, values: Array) -> Array:
         """The vectors (n,) or (n, k) with these retained unknowns (c,) or (c, k) that have the smallest energy."""
@@ -102,7 +97,7 @@ class ContactForm:
     @cached_property
     def stiffnesses(self) -> Array:
         """Upper bounds b A bᵀ / |b|⁴ (m,) of the stiffness 1 / b A⁻¹ bᵀ of a row, by Cauchy and Schwarz."""
-        B, A = self.B, sp.csr_array(self.vi.A)[self._retained][:, self._retained]
+        B, A = self.B, sp.csr_array(self.vi.A)[self.retained][:, self.retained]
         squares, energies = (np.asarray((B * other).sum(axis=1)) for other in (B, B @ A))
         return np.asarray(np.divide(energies, squares**2, out=np.zeros_like(squares), where=squares > 0.0))
 
@@ -126,6 +121,11 @@ class ContactForm:
         """The compliance K (m×m)."""
         # not symmetrised: then K η agrees to the last digit with B applied to the displacements D η
         return np.ascontiguousarray(times_dense(self.B, self.liftings.T))
+
+    def representer(self, functional: Array) -> Representer:
+        """The representer A⁻¹ℓ of a functional ℓ (n,)."""
+        load, values, rest = self._stiffness.represent(functional[:, None])
+        return Representer(values[:, 0], load[:, 0], float(rest[0]))
 
     def force_representer(self, multiplier: Array) -> Representer:
         """The representer of a force Bᵀη of a multiplier η (m,)."""
@@ -158,7 +158,7 @@ class ContactForm:
         if len(self._matter.equalities):
             free = self.values(self._stiffness.holding(self.vi, self._matter.equalities))
         else:
-            free = representers(self._stiffness, self.vi.f[:, None])[0].values
+            free = self.representer(self.vi.f).values
         excess = self.B @ free - self.vi.g
         doubtful = round_off_of_terms(self.entries, self.sizes @ np.abs(free) + np.abs(self.vi.g))
         reached = np.flatnonzero((excess > doubtful) & ~self._matter.implied)
@@ -249,12 +249,6 @@ class ContactForm:
                 compliance = np.asarray(self.B[rows] @ self.liftings[rows].T)
             self._factors[key] = _Factor(compliance)
         return self._factors[key]
-
-
-def representers(stiffness: CondensedStiffness, functionals: Array) -> list[Representer]:
-    """The representers A⁻¹ℓ of functionals, the columns (n×k), solved in one block."""
-    loads, values, rest = stiffness.represent(functionals)
-    return [Representer(*one) for one in zip(values.T, loads.T, rest.tolist(), strict=True)]
 
 
 class _Factor:

@@ -6,18 +6,15 @@ s = B u_N − g. For any w with B w ≥ s, with ρ = ‖r‖_{A⁻¹}, ω = ‖w
     ‖e‖²_A + ‖Bᵀε‖²_{A⁻¹} + 2 λ_Nᵀ(g − B u) = ρ² + 2 λᵀs − 2 λ_Nᵀs,                                        (i)
     ‖e‖_A ≤ Δ_A = √(ρ² + ω² + 2κ),        ‖Bᵀε‖_{A⁻¹} ≤ min(√(Δ_A² + 2 rᵀw), ω + Δ_A)                     (ii)
 
-(docs/mathematics.md, "Error bounds"). The second bound is twice the duality gap of λ_N and
-the feasible u_N − w. It is evaluated as ‖r + A w‖²_{A⁻¹} + 2κ: Δ_A² + 2 rᵀw loses half of the digits, and all of them
-where λ is small beside the error of u_N. It holds for u_N + d, too, where A d + Bᵀξ = r and B d = 0: the same ε is
-bounded with ρ_B = ‖Bᵀξ‖_{A⁻¹} ≤ ρ in the place of ρ, by any d for which w is feasible. d = 0 where w is not, or where
-constraints are dependent and d is lost in round-off. Constants enter in the norms of V and W alone,
+as docs/mathematics.md shows, "Error bounds". The second bound is twice the duality gap of λ_N and the feasible u_N − w.
+It is evaluated as ‖r + A w‖²_{A⁻¹} + 2κ: Δ_A² + 2 rᵀw loses half of the digits, and all of them where λ is small beside
+the error of u_N. It holds for u_N + d, too, where A d + Bᵀξ = r and B d = 0, with ρ_B = ‖Bᵀξ‖_{A⁻¹} ≤ ρ in place of ρ,
+by any d for which w is feasible. Constants enter in the norms of V and W alone, ‖e‖_V ≤ Δ_A / √α and
+‖ε‖_W ≤ ‖Bᵀε‖_{A⁻¹} / β_A.
 
-    ‖e‖_V ≤ Δ_A / √α,        ‖ε‖_W ≤ ‖Bᵀε‖_{A⁻¹} / β_A.
-
-Δ_A is smallest for w = argmin ½‖w‖²_A + λ_NᵀB w subject to B w ≥ s, which has the structure of (7): the active set
-method starts from supp λ_N, where B w = s makes κ = 0. Any w with B w ≥ s is valid: optimality is not verified,
-feasibility is (`vibench.model.bound_terms`). The norms ρ, ρ_B and ω and the product κ are upper bounds of what they are
-in exact arithmetic (`vibench.model.proved_norms`). Where there are equalities (ii) holds for w', with ω + η, with
+Δ_A is smallest for w = argmin ½‖w‖²_A + λ_NᵀB w subject to B w ≥ s, found by the active set method; the optimality of w
+is not verified, its feasibility is (`vibench.model.bound_terms`). ρ, ρ_B, ω and κ are upper bounds of what they are in
+exact arithmetic (`vibench.model.proved_norms`). Where there are equalities (ii) holds for w', with ω + η, with
 ‖r + A w‖_{A⁻¹} + η in the duality gap, and with 2 λ_Nᵀ|B(w' − w)| added to 2κ. λ is not unique there: β_A is zero.
 """
 
@@ -40,7 +37,7 @@ from vibench.linalg import EPS, UNIT_ROUND_OFF
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.bound_terms import BoundNote, BoundTerms, Equalities, dual_gap, first_margin, in_dual_set
 from vibench.model.contact_form import ContactForm, Representer
-from vibench.model.errors import EnergyNorm, riesz_representatives, solutions
+from vibench.model.errors import EnergyNorm, solutions
 from vibench.model.proved_norms import ProvedNorms
 from vibench.qp.exact import Rows, least_distance_solution, rows_that_matter
 from vibench.qp.scaling import ratio
@@ -93,7 +90,12 @@ def error_bounds(
     residuals = residuals or [residual(vi, u[:, k], lam[:, k]) for k, vi in enumerate(vis)]
     starts = [None] * len(vis) if pressed is None else pressed.T
     columns = zip(vis, energies, constants, u.T, lam.T, solutions(energies, residuals), starts, strict=True)
-    return [_bounds(V, vi, energy, c.coercivity, c.energy_inf_sup, *one) for vi, energy, c, *one in columns]
+    return [bound_errors_at(V, vi, energy, c.coercivity, c.energy_inf_sup, *one) for vi, energy, c, *one in columns]
+
+
+def residual(vi: VariationalInequality, u: Array, lam: Array) -> Array:
+    """The residual r = f − A u − Bᵀλ (n,)."""
+    return np.asarray(vi.f - vi.A @ u - vi.B.T @ lam)
 
 
 def bound_errors_at(
@@ -104,29 +106,13 @@ def bound_errors_at(
     beta: Constant,
     u: Array,
     lam: Array,
-) -> ErrorBounds:
-    """Bounds (ii) of one reduced u (n,) and λ (m,), from lower bounds of α and of β_A."""
-    (p,) = solutions([energy], [residual(vi, u, lam)])
-    return _bounds(V, vi, energy, alpha, beta, u, lam, p)
-
-
-def residual(vi: VariationalInequality, u: Array, lam: Array) -> Array:
-    """The residual r = f − A u − Bᵀλ (n,)."""
-    return np.asarray(vi.f - vi.A @ u - vi.B.T @ lam)
-
-
-def _bounds(
-    V: InnerProduct,
-    vi: VariationalInequality,
-    energy: EnergyNorm,
-    alpha: Constant,
-    beta: Constant,
-    u: Array,
-    lam: Array,
-    p: Array,
+    p: Array | None = None,
     pressed: Mask | None = None,
 ) -> ErrorBounds:
-    """Bounds (ii), with a computed p ≈ A⁻¹r (n,), and rows (m,) that the multiplier presses."""
+    """Bounds (ii) of one reduced u (n,) and λ (m,), from lower bounds of α and of β_A.
+
+    p ≈ A⁻¹r (n,) and rows (m,) that the multiplier presses are given where they are known.
+    """
     if not in_dual_set(lam):
         return ErrorBounds.none(BoundNote.NOT_IN_CONE)
     if np.any(lam[is_absent(vi.g)]):
@@ -137,6 +123,8 @@ def _bounds(
     correction = find_correction(vi, energy, u, lam, pressed)
     if correction is None:
         return ErrorBounds.none(BoundNote.NO_CORRECTION)
+    if p is None:
+        (p,) = solutions([energy], [residual(vi, u, lam)])
     of_u, of_lam = _proved_terms(correction, alpha.value * share.value * V.matrix.diagonal(), energy, u, lam, p)
     in_V = of_u.primal / float(np.sqrt(alpha.value))
     in_W = of_lam.dual / beta.value if beta.value > 0.0 else inf
@@ -240,8 +228,7 @@ def reference_bound(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam
     correction = find_correction(vi, energy, u, lam)
     if correction is None:
         return inf
-    (riesz,) = riesz_representatives([energy], [residual(vi, u, lam)])
-    bound, contact = bound_terms(correction, u, lam, riesz).primal, correction.contact
+    bound, contact = bound_terms(correction, u, lam).primal, correction.contact
     size = contact.contact_energy(lam)
     if not bound <= REFERENCE * size and not contact.least_contact:
         size = hypot(energy.norm(u), contact.force_norm(lam))
@@ -275,8 +262,7 @@ def corrected_pair(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam:
     correction = find_correction(vi, energy, u, lam)
     if correction is None:
         return None
-    (riesz,) = riesz_representatives([energy], [residual(vi, u, lam)])
-    terms = bound_terms(correction, u, lam, riesz)
+    terms = bound_terms(correction, u, lam)
     return CorrectedPair(u - correction.w, np.maximum(correction.nu, 0.0), terms.omega, terms.rho)
 
 
@@ -365,12 +351,13 @@ class Correction:
         return self.contact.extended(self.values)
 
 
-def bound_terms(correction: Correction, u: Array, lam: Array, riesz: Representer) -> BoundTerms:
-    """The terms with a correction of u_N (n,) and λ_N ≥ 0 (m,), from A⁻¹r, without a bound of their round-off.
+def bound_terms(correction: Correction, u: Array, lam: Array) -> BoundTerms:
+    """The terms with a correction of u_N (n,) and λ_N ≥ 0 (m,), without a bound of their round-off.
 
     A⁻¹(r + A w) = A⁻¹r + w.
     """
     contact, eta, equalities = correction.contact, correction.eta, correction.constraints.equalities
+    riesz = contact.representer(residual(contact.vi, u, lam))
     kappa = dual_gap(lam, _slack(contact, contact.values(u), correction.values))
     if equalities is not None:
         kappa += eta * float(lam @ equalities.reach)

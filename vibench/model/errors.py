@@ -21,7 +21,7 @@ from vibench.interfaces.absent_rows import is_absent
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.model.contact_form import ContactForm, Representer, representers
+from vibench.model.contact_form import ContactForm
 from vibench.qp.scaling import ratio
 from vibench.qp.verification import Residuals, accurate_residuals, round_off_of_terms
 
@@ -96,17 +96,8 @@ def _with_one_stiffness(energies: Sequence[EnergyNorm]) -> list[list[int]]:
     return list(numbers.values())
 
 
-def riesz_representatives(energies: Sequence[EnergyNorm], functionals: Sequence[Array]) -> list[Representer]:
-    """A⁻¹ℓ of functionals (n,), each at its own parameter; those of one A are solved in one block."""
-    found: dict[int, Representer] = {}
-    for numbers in _with_one_stiffness(energies):
-        of_one = representers(energies[numbers[0]].stiffness, np.column_stack([functionals[k] for k in numbers]))
-        found |= dict(zip(numbers, of_one, strict=True))
-    return [found[k] for k in range(len(energies))]
-
-
 def solutions(energies: Sequence[EnergyNorm], functionals: Sequence[Array]) -> list[Array]:
-    """The solutions A⁻¹ℓ (n,) for functionals (n,), as computed in `riesz_representatives`."""
+    """The solutions A⁻¹ℓ (n,) for functionals (n,), each at its own parameter; those of one A in one block."""
     found: dict[int, Array] = {}
     for numbers in _with_one_stiffness(energies):
         of_one = energies[numbers[0]].stiffness.solve(np.column_stack([functionals[k] for k in numbers]))
@@ -295,7 +286,7 @@ def high_fidelity_residuals(
     values = on.values(u)
     if not np.isfinite(rho):
         residual, _ = accurate_residuals(vi, u, lam)
-        rho = representers(energy.stiffness, residual[:, None])[0].norm
+        rho = on.representer(residual).norm
     excess = np.asarray(on.in_extended_precision @ values.astype(np.longdouble) - vi.g, dtype=float)
     # u_N may miss contact altogether: F_low is that of the unconstrained solution.
     least = on.least_contact

@@ -1,14 +1,8 @@
 """A-posteriori error bounds (Haasdonk, Salomon and Wohlmuth, 2012), derived for inexact reduced solutions.
 
-Recorded for comparison with those of `vibench.model.error_bounds`. β is computed to round-off by a dense singular value
-decomposition, which proves nothing: the bounds are estimates as far as β is. With the W-projection π of the representer
-of s = B u_N − g on W⁺ and the residual r, let
-
-    δ_r = ‖r‖_V',    δ_s1 = ‖π‖_W,    δ_s2 = ⟨π, λ_N⟩_W + max(0, −sᵀλ_N),
-    c₁ = (δ_r + δ_s1 γ_a/β)/(2α),    c₂ = (δ_s1 δ_r/β + δ_s2)/α.
-
-Then ‖u − u_N‖_V ≤ Δ_u = c₁ + √(c₁² + c₂) and ‖λ − λ_N‖_W ≤ (δ_r + γ_a Δ_u)/β, see docs/mathematics.md, "Error bounds".
-The last term of δ_s2 vanishes where λ_N and u_N are exactly complementary, which an inexact QP solution is not.
+Recorded for comparison with those of `vibench.model.error_bounds`; their formulas are in docs/mathematics.md, "Error
+bounds". β is computed to round-off by a dense singular value decomposition, which proves nothing: the bounds are
+estimates as far as β is.
 """
 
 from __future__ import annotations

@@ -18,11 +18,9 @@ Two solutions of one program whose residuals meet an accuracy have a bounded dis
 
     ‖d‖²_A = dᵀ(r₂ − r₁) − (α₁ − α₂)ᵀ(s₁ − s₂) ≤ ‖d‖_A (‖r₁‖ + ‖r₂‖) + |α₁ᵀs₁| + |α₂ᵀs₂| + α₁ᵀ(s₂)₊ + α₂ᵀ(s₁)₊
 
-in the norm of A⁻¹. Where every natural residual is at most ε in the units U_k, ‖r_k‖ ≤ ε U_k, |α_kᵀs_k| ≤ ε U_k² and
-(s_k)_i ≤ ε U_k ‖B_i‖; with p_k = Σ_i ‖B_i‖ (α_k)_i the last terms are at most ε U_k p_l ≤ ε (U_k² + p_l²)/2. This
-gives ‖d‖²_A ≤ (l₁ + l₂)‖d‖_A + c₁ + c₂, each term from data of one solution alone, and the smallest eigenvalue of A
-the distance ‖d‖. In a V-orthonormal basis ‖d‖ is the distance of the two displacements in V. Solvers that are `ok` on
-the same reduced problem and farther apart reveal a bug.
+in the norm of A⁻¹. Where every natural residual is at most ε in the units U_k, the last terms are at most
+ε U_k p_l ≤ ε (U_k² + p_l²)/2, with p_k = Σ_i ‖B_i‖ (α_k)_i. This gives ‖d‖²_A ≤ (l₁ + l₂)‖d‖_A + c₁ + c₂, each term
+from data of one solution alone, and the smallest eigenvalue of A the distance ‖d‖, in V for a V-orthonormal basis.
 """
 
 from __future__ import annotations

@@ -4,16 +4,12 @@ With an orthonormal basis Z of the primal space and generators χ of unit norm, 
 
     β_span = min ‖Cα‖ / ‖χα‖_W over all α,    β_cone = the same minimum over α ≥ 0   (paper, (14), (18), (30)).
 
-The second is NP-hard in general and is bounded from both sides. β_span is a singular value, never the square root of an
-eigenvalue of M, which has a floor of √eps.
+The second is NP-hard in general and is bounded from both sides, see docs/mathematics.md, "Inf-sup constants". β_span is
+a singular value, never the square root of an eigenvalue of M, which has a floor of √eps.
 
-Lower bounds of β_cone: L0, β_span; L1, min_i yᵀc_i with y = Cα*/‖Cα*‖ and α* the minimiser of ‖Cα‖ over the simplex,
-valid because ‖χα‖ ≤ Σα; L½, √min M_ij/G_ij; SDP, the semidefinite bound. Upper bounds: U0, the best single generator;
-U1, the quotient at α*; U2, the quotient at a vector rounded from the semidefinite program.
-
-The semidefinite program: t is a lower bound of αᵀMα / αᵀGα exactly where M − tG is copositive. Deciding that is
-NP-hard; a sum of a positive semidefinite and an entrywise nonnegative matrix is copositive (up to order 4 every
-copositive matrix is one, by Diananda's theorem), and the largest such t is the value of a semidefinite program.
+A t is a lower bound of αᵀMα / αᵀGα exactly where M − tG is copositive. Deciding that is NP-hard; a sum of a positive
+semidefinite and an entrywise nonnegative matrix is copositive, and the largest such t is the value of a semidefinite
+program.
 """
 
 from __future__ import annotations
@@ -237,12 +233,12 @@ def cone_interval(C: Array, G: Array, span: float) -> tuple[float, float, str]:
         return float("inf"), float("inf"), ""
     M, noise = C.T @ C, ABSOLUTE * float(np.linalg.norm(C, 2)) if C.size else 0.0
     lowers, uppers = _cheap_bounds(C, M, G, span)
-    low, high = _sharpest(lowers, uppers)
+    low, high = max(lowers, key=lowers.__getitem__), min(uppers, key=uppers.__getitem__)
     narrow = lowers[low] >= 0.99 * uppers[high] or uppers[high] <= noise
     if not narrow and _is_nonnegative(G):
         squares = semidefinite_bounds(M, G, uppers[high] ** 2, fraction=0.995**2)
         lowers["SDP"], uppers["U2"] = (float(np.sqrt(max(square, 0.0))) for square in squares)
-        low, high = _sharpest(lowers, uppers)
+        low, high = max(lowers, key=lowers.__getitem__), min(uppers, key=uppers.__getitem__)
     if uppers[high] < lowers[low] <= uppers[high] * (1.0 + RELATIVE) + noise:  # equal but for round-off
         return uppers[high], uppers[high], f"{low}/{high}"
     return lowers[low], uppers[high], f"{low}/{high}"
@@ -259,10 +255,6 @@ def _cheap_bounds(C: Array, M: Array, G: Array, span: float) -> tuple[dict[str, 
     # Use ‖Cα‖, not √(αᵀMα), which would lose half of the digits; the denominator has no cancellation.
     uppers = {"U0": float(np.sqrt(np.min(np.diag(M) / np.diag(G)))), "U1": norm / float(np.sqrt(alpha @ G @ alpha))}
     return lowers, uppers
-
-
-def _sharpest(lowers: dict[str, float], uppers: dict[str, float]) -> tuple[str, str]:
-    return max(lowers, key=lowers.__getitem__), min(uppers, key=uppers.__getitem__)
 
 
 def simplex_minimiser(C: Array) -> Array:
@@ -310,14 +302,18 @@ def semidefinite_bounds(M: Array, G: Array, upper: float, fraction: float) -> tu
     X, P, N = np.zeros_like(M), np.zeros_like(M), np.zeros_like(M)
     for iteration in range(1, 1501):  # most programs need a few hundred
         t = (float(np.sum(G * (M - P - N))) - penalty * (float(np.sum(G * X)) - 1.0)) / G_squared
-        P = _positive_semidefinite_part(M - t * G - N - penalty * X)
+        rest = M - t * G - N - penalty * X
+        values, vectors = np.linalg.eigh(0.5 * (rest + rest.T))
+        P = (vectors * np.maximum(values, 0.0)) @ vectors.T  # the positive semidefinite part
         N = np.maximum(M - t * G - P - penalty * X, 0.0)
         residual = t * G + P + N - M
         X += 1.6 / penalty * residual  # a step of up to (1 + √5)/2 converges
         if iteration % 50:  # the certified bounds cost an eigenvalue decomposition each
             continue
         lower = max(lower, t + min(float(np.linalg.eigvalsh(M - t * G - N)[0]), 0.0))
-        upper = min(upper, _rounded_quotient(X, M, G))
+        leading = np.linalg.eigh(X)[1][:, -1]
+        alpha = np.maximum(leading if leading.sum() >= 0.0 else -leading, 0.0)
+        upper = min(upper, float(alpha @ M @ alpha) / float(alpha @ G @ alpha))
         if lower >= fraction * upper:
             break
         primal = abs(float(np.sum(G * X)) - 1.0) + float(np.linalg.norm(np.minimum(X, 0.0)))
@@ -325,14 +321,3 @@ def semidefinite_bounds(M: Array, G: Array, upper: float, fraction: float) -> tu
         # Balance the residuals: neither may lag far behind the other.
         penalty *= 0.6 if dual < 0.1 * primal else 1.6 if primal < 0.1 * dual else 1.0
     return scale * lower, scale * upper
-
-
-def _positive_semidefinite_part(a: Array) -> Array:
-    values, vectors = np.linalg.eigh(0.5 * (a + a.T))
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
-
-
-def _rounded_quotient(X: Array, M: Array, G: Array) -> float:
-    leading = np.linalg.eigh(X)[1][:, -1]
-    alpha = np.maximum(leading if leading.sum() >= 0.0 else -leading, 0.0)
-    return float(alpha @ M @ alpha) / float(alpha @ G @ alpha)

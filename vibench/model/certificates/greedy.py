@@ -41,8 +41,8 @@ from vibench.linalg.inner_product import orthonormal_range
 from vibench.linalg.schur_complement import EliminationPattern, StaticCondensation
 from vibench.model.bound_terms import BoundTerms
 from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction
-from vibench.model.error_bounds import bound_terms, find_correction, residual
-from vibench.model.errors import EnergyNorm, T, riesz_representatives
+from vibench.model.error_bounds import bound_terms, find_correction
+from vibench.model.errors import EnergyNorm, T
 from vibench.model.galerkin import contact_at, project
 from vibench.qp.exact import ExactSolution, exact_solution
 from vibench.qp.scaling import ratio
@@ -299,8 +299,7 @@ class IncrementalModel:
         if corrected is None:
             return inf
         self._state = BoundState(mu, vi, energy.stiffness, corrected.nu > 0.0)
-        (riesz,) = riesz_representatives([energy], [residual(vi, u, lam)])
-        terms = bound_terms(corrected, u, lam, riesz)
+        terms = bound_terms(corrected, u, lam)
         of_u = ratio(terms.primal, energy.norm(u))
         pressed, W = corrected.contact.force_representer(lam).norm, self._problem.W
         if not pressed > 0.0:
