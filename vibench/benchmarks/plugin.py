@@ -58,6 +58,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Register the plugin with the state of a session."""
+    if config.option.progress:
+        # The command prints reasons alone: tracebacks took longer than all that is timed.
+        config.option.tbstyle = "no"
     config.pluginmanager.register(Passes(config), "vibench-passes")
 
 
