@@ -13,14 +13,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from vibench.execution.run import Agenda, Observer
 from vibench.plugins.kinds import PluginKind
-from vibench.plugins.plugin import Plugin
 from vibench.qp.status import Status
 from vibench.stages.base import Stage
 from vibench.study.cells import Cell
 from vibench.text import new_console, print_line, printable
 
-# Stages of one problem that take about as long: the problem, and `Stage.kind_of_work`.
-_Sort = tuple[Plugin | None, str]
+# Stages of one problem that take about as long: its name and options, and `Stage.kind_of_work`.
+_Sort = tuple[str, str]
 
 
 class _Running:
@@ -98,7 +97,7 @@ class TimeLeft:
             means.setdefault(one.sort, one.seconds)
         if not means:
             return None
-        paces = {problem: self._pace(means, problem) for problem, _ in self._left}
+        paces = {problem: self._pace(means, problem) for problem in {sort[0] for sort in self._left}}
         left = 0.0
         for sort, count in self._left.items():
             expected = paces[sort[0]] * self._effort[sort] / max(self._planned[sort], 1)
@@ -106,7 +105,7 @@ class TimeLeft:
             left += max(count, 0) * means.get(sort, expected)
         return max(0.0, left - sum(one.last[0] * means[one.sort] for one in telling)) / self._jobs
 
-    def _pace(self, means: Mapping[_Sort, float], problem: Plugin | None) -> float:
+    def _pace(self, means: Mapping[_Sort, float], problem: str) -> float:
         """Seconds per unit of effort, from the seen sorts of a problem, or of all if there are none."""
         seen = [sort for sort in means if sort[0] == problem] or list(means)
         wall = sum(means[sort] * self._planned[sort] for sort in seen)
@@ -114,7 +113,8 @@ class TimeLeft:
 
 
 def _sort(stage: Stage) -> _Sort:
-    return next((plugin for plugin in stage.plugins if plugin.kind is PluginKind.PROBLEM), None), stage.kind_of_work
+    problems = (f"{one.name} {one.options}" for one in stage.plugins if one.kind is PluginKind.PROBLEM)
+    return next(problems, ""), stage.kind_of_work
 
 
 def duration(seconds: float) -> str:
