@@ -14,8 +14,7 @@ from typing import Any
 import pytest
 from running import PATIENCE, seal
 
-from vibench.cli.output_commands import export, write_report
-from vibench.cli.result_commands import replay_query, show
+from vibench.cli.result_commands import export, replay_query, show, write_report
 from vibench.errors import NumericalError, RequestError
 from vibench.execution.recording import REPORT, claimed
 from vibench.files import locked, write_atomically

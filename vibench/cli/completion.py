@@ -20,9 +20,6 @@ from vibench.errors import VibenchError
 from vibench.plugins.kinds import CHECKED, PluginKind
 from vibench.results.schema import STORED, TABLES
 
-# Tables that `vibench show` prints.
-SHOWN = ("summary", "best", "benefits", *TABLES)
-
 
 def examples(command: str) -> str:
     """The last paragraph of a command's help; the leading backspace makes click keep its line breaks."""
@@ -108,7 +105,7 @@ problems, primals, duals, formulations = map(
 solvers, runs, error_measures = map(words, (_solvers, _runs, _error_measures))
 corrections = words(lambda: ("none", "feasible", "auto"))
 lists = words(lambda: (kind.plural for kind in PluginKind))
-table_names = words(lambda: SHOWN)
+table_names = words(lambda: ("summary", "best", "benefits", *TABLES))
 cell_columns = words(lambda: STORED["cells"])
 
 

@@ -22,13 +22,11 @@ from typing import Annotated, Any
 import typer.core
 from typer import Argument, Option
 
-from vibench.cli.bench_command import bench_plugins
-from vibench.cli.completion import SHOWN, examples, whole_words
+from vibench.cli import plugin_commands as plugins
+from vibench.cli import result_commands as results
+from vibench.cli.completion import examples, whole_words
 from vibench.cli.console import echo, fitted, warn
-from vibench.cli.output_commands import draw_figures, export, publish_runs, write_report
 from vibench.cli.pack_commands import pack
-from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
-from vibench.cli.result_commands import compare_runs, replay_query, show
 from vibench.cli.run_command import run_study_command
 from vibench.errors import RequestError, VibenchError, unknown_name
 from vibench.interrupts import Interrupted, interruptible
@@ -116,13 +114,14 @@ def help_on(
     ] = "",
 ) -> None:
     """Explain a command, or a word of studies and results."""
-    if word in ("", *COMMANDS):
+    commands = [str(one.name) for one in app.registered_commands]
+    if word in ("", *commands):
         app(args=[*word.split(), "--help"], standalone_mode=False)
         return
     from vibench.cli.console import shown
     from vibench.text import new_console
 
-    known = list(COMMANDS)
+    known = commands
     lines = [f"`vibench {word}` is now `vibench {shlex.join(new)}`"] if (new := renamed([word])) else []
     for names, line in chain(_keys(), _columns(), _tables_and_plugins(), glossary()):
         known += names
@@ -169,8 +168,9 @@ def _columns() -> Explained:
 def _tables_and_plugins() -> Explained:
     from vibench.plugins.registry import registered
     from vibench.qp.settings import SETTINGS
+    from vibench.results.show import VIEWS
 
-    for table in SHOWN:
+    for table in VIEWS:
         yield [table], f"{table}, a table of a run: `vibench show RUN --table {table}`"
     for kind in PluginKind:
         for name, plugin in registered(kind).items():
@@ -196,14 +196,6 @@ def glossary() -> Explained:
         yield [word.strip() for word in (head, *words) if word.strip()], f"{head}: {plain}"
 
 
-COMMANDS: dict[str, Callable[..., None]] = {
-    "run": run_study_command, "list": list_plugins, "show": show, "report": write_report, "figures": draw_figures,
-    "compare": compare_runs, "replay": replay_query, "export": export, "pack": pack, "check": check_plugin,
-    "new": new_plugin, "bench": bench_plugins, "publish": publish_runs, "clean": clean, "doctor": doctor,
-    "help": help_on,
-}  # fmt: skip
-
-
 class _Command(typer.core.TyperCommand):
     """A command whose usage shows its arguments as `RUN [CELL]`, without the braces and dots of typer."""
 
@@ -212,7 +204,12 @@ class _Command(typer.core.TyperCommand):
         return [piece.removesuffix("...") if " " in piece else piece for piece in pieces]
 
 
-for _name, _command in COMMANDS.items():
+for _name, _command in dict[str, Callable[..., None]](
+    run=run_study_command, list=plugins.list_plugins, show=results.show, report=results.write_report,
+    figures=results.draw_figures, compare=results.compare_runs, replay=results.replay_query, export=results.export,
+    pack=pack, check=plugins.check_plugin, new=plugins.new_plugin, bench=plugins.bench_plugins,
+    publish=results.publish_runs, clean=clean, doctor=doctor, help=help_on,
+).items():  # fmt: skip
     # Without an own default map a command would take the default above of an option of the same name for its own.
     app.command(_name, cls=_Command, epilog=examples(_name), context_settings={"default_map": {}})(
         interruptible(_command)

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer import Argument, Option
 
-from vibench.cli import output_commands
 from vibench.cli.completion import corrections, duals, formulations, primals, problems, solvers, studies
 from vibench.cli.console import echo, print_frame, run_argument, warn
-from vibench.cli.result_commands import At, places_of
+from vibench.cli.result_commands import At, draw_run, places_of
 from vibench.errors import RequestError, VibenchError
 from vibench.interrupts import interrupted_at_once
 from vibench.qp.status import Status
@@ -109,10 +108,9 @@ def _conclude(name: str, outcome: RunResult, folder: Path, *, draw: bool, fresh:
         figures.remove(folder / "figures")
     if nothing_ran:
         reasons = list(dict.fromkeys(str(row["reason"]) for row in outcome.rows))
-        more = [f"{len(reasons) - REASONS} other reasons"] if len(reasons) > REASONS else []
-        raise VibenchError(f"no cell could run here: {'; '.join([*reasons[:REASONS], *more])}")
+        raise VibenchError(f"no cell could run here: {'; '.join(_first(reasons, 'other reasons'))}")
     if draw:
-        output_commands.draw_run(path, folder / "figures")
+        draw_run(path, folder / "figures")
     table = "this table again" if whole else f"all {len(statuses)} cells"
     next_steps(folder, table, all_ok=set(statuses) == {Status.OK}, figures=draw)
     if strict and any(status not in (Status.OK, Status.UNAVAILABLE) for status in statuses):
@@ -140,8 +138,10 @@ def _study(request: str, key: str, overrides: dict[str, list[Any]], at: list[str
     return study_of_cell(cell, study.name, limits=study.limits, **rounds)
 
 
-# Reasons for which cells are not ok, and violated invariants, that are printed one by one.
-REASONS = 10
+def _first(lines: Sequence[str], others: str) -> list[str]:
+    """The first ten of some lines, all that a screen has room for, and the number of the others."""
+    return [*lines[:10], *[f"{len(lines) - 10} {others}"] * bool(lines[10:])]
+
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -169,11 +169,9 @@ def print_summary(study: str, path: Path, rows: Rows) -> bool:
     for part in read_in_parts(path, "queries"):
         queries += len(part)
         violations += consistency.violations(part, kinds)
-    violations = consistency.added_up(violations)
-    for violation in violations[:REASONS]:
-        echo(f"invariant: {violation}; this is a bug of vibench or of a plugin's inner products")
-    if violations[REASONS:]:
-        echo(f"invariant: {len(violations) - REASONS} more like these")
+    bug = "this is a bug of vibench or of a plugin's inner products"
+    violated = [f"invariant: {violation}; {bug}" for violation in consistency.added_up(violations)]
+    echo(*_first(violated, "more violated invariants"))
     if queries and not violations:
         echo(f"invariants of the constants and the error bounds hold in all {queries} queries")
     if agreement := consistency.agreement_sentence(read_table(path, "disagreements"), cells["solver"].nunique()):
@@ -195,7 +193,7 @@ def failures(rows: Rows, run: str) -> Iterator[str]:
             groups.setdefault(kind_of_failure(row), []).append(row)
     # The reason of most cells comes first: it is the one to mend.
     ranked = sorted(groups.values(), key=len, reverse=True)
-    for group in ranked[:REASONS]:
+    for group in ranked[:10]:
         first = group[0]
         count = f"{len(group)} cells " * (len(group) > 1)
         if first["status"] == Status.UNAVAILABLE:
@@ -212,8 +210,8 @@ def failures(rows: Rows, run: str) -> Iterator[str]:
             fine = ", ".join(sorted({row["solver"] for row in same if row["status"] == Status.OK}))
             remedy = f"; ok with {fine}" if fine else f"; `vibench replay {run} {first['cell']}` tries other solvers"
         yield f"{count}{first['status']}: {which}{formats.name_of_cell(first)}: {queries}; {first['reason']}{remedy}"
-    if others := sum(map(len, ranked[REASONS:])):
-        yield f"{others} cells not ok for {len(ranked) - REASONS} other reasons"
+    if ranked[10:]:
+        yield f"{sum(map(len, ranked[10:]))} cells not ok for {len(ranked) - 10} other reasons"
 
 
 def next_steps(folder: Path, table: str, *, all_ok: bool, figures: bool) -> None:

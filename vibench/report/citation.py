@@ -44,13 +44,18 @@ class Citation:
 
     def cff(self) -> str:
         """The file CITATION.cff (Citation File Format 1.2.0)."""
+        authors = list[str]()
+        for author in self.authors or ("unnamed",):
+            family, comma, given = map(str.strip, author.partition(","))
+            names = {"family-names": family, "given-names": given} if comma else {"name": family}
+            authors.append("  - " + "\n    ".join(f"{key}: {_yaml(text)}" for key, text in names.items()))
         lines = [
             "cff-version: 1.2.0",
             'message: "If you use these results, please cite them, and vibench, which computed them."',
             "type: dataset",
             f"title: {_yaml(self.title)}",
             "authors:",
-            *(line for author in self.authors or ("unnamed",) for line in _cff_author(author)),
+            *authors,
             f"doi: {_yaml(self.doi)}" if self.doi else "# doi: 10.…/…   of the deposit, once it has one",
             *([f"url: {_yaml(self.url)}"] if self.url else []),
             *([f"date-released: {_yaml(self.date)}"] if "-" in self.date else []),
@@ -97,21 +102,9 @@ def _in_braces(text: str) -> str:
     return escaped.replace("\\{", "\\textbraceleft{}").replace("\\}", "\\textbraceright{}")
 
 
-def is_known(distribution: str) -> bool:
-    """Whether a distribution is installed here, or that of a QP solver that vibench has settings for."""
-    return bool(distribution_version(distribution)) or distribution in map(solver_distribution, SETTINGS)
-
-
 def _yaml(text: str) -> str:
     """A string of YAML: JSON's strings are a subset of its double-quoted ones."""
     return json.dumps(unbroken(text), ensure_ascii=False)
-
-
-def _cff_author(author: str) -> list[str]:
-    family, comma, given = author.partition(",")
-    if not comma:
-        return [f"  - name: {_yaml(author.strip())}"]
-    return [f"  - family-names: {_yaml(family.strip())}", f"    given-names: {_yaml(given.strip())}"]
 
 
 def requirements(versions: Mapping[str, str], code: str) -> str:
@@ -120,10 +113,16 @@ def requirements(versions: Mapping[str, str], code: str) -> str:
     Versions are by name of distribution or solver, as the cells record them; several versions of one, separated by
     ", ", become a comment, and so do the hashes of the code: a vibench under development has no release.
     """
-    # Without distributions that are unknown here: the author of a results file could make others install anything.
-    uninstalled = {"protocol", "python"}
+    # Without distributions that are neither installed here nor those of QP solvers that vibench has settings for: the
+    # author of a results file could make others install anything.
+    uninstalled, solvers = {"protocol", "python"}, {*map(solver_distribution, SETTINGS)}
     lines = [f"# versions recorded in the results file; code of the cells: {unbroken(code)}"]
-    known = {name: one for name in versions if name in uninstalled or is_known(one := solver_distribution(name))}
+    distributions = {name: solver_distribution(name) for name in versions}
+    known = {
+        name: one
+        for name, one in distributions.items()
+        if name in uninstalled or one in solvers or distribution_version(one)
+    }
     if unknown := len(versions) - len(known):
         lines.append(f"# left out: {unknown} that the machine which published this does not know")
     for name, distribution in sorted(known.items()):

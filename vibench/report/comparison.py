@@ -47,7 +47,13 @@ class Comparison:
     def changes(self) -> pd.DataFrame:
         """Changes for better or worse, a row per column of a cell, in the order of the cells."""
         columns = ["run", "against", *AXES, "what", "before", "after", "ratio", "ratio_low", "ratio_high", "verdict"]
-        rows = [_row(*names, one) for names, found in self.pairs.items() for one in found if one.verdict.is_change]
+        rows = []
+        for (run, against), one in ((names, one) for names, found in self.pairs.items() for one in found):
+            if one.verdict.is_change:
+                ends = dict(zip(("ratio_low", "ratio_high"), one.interval or (np.nan, np.nan), strict=True))
+                values = {"before": formats.cell_text(one.before), "after": formats.cell_text(one.after)}
+                about = {"run": run, "against": against, "what": one.what, "verdict": one.verdict.value}
+                rows.append(about | _named(one.cell) | values | {"ratio": one.ratio} | ends)
         return pd.DataFrame(rows, columns=[*columns, "cell"])
 
     @property
@@ -208,14 +214,6 @@ def _on_common_queries(one: ComparedRun, two: ComparedRun, shared: Sequence[str]
         means = {column: common[name].agg(how).reindex(keys) for column, (name, how) in ERRORS.items()}
         both_means.append({key: {column: float(values[key]) for column, values in means.items()} for key in keys})
     return both_means[0], both_means[1]
-
-
-def _row(run: str, against: str, one: Difference) -> dict[str, Any]:
-    shown = {"before": formats.cell_text(one.before), "after": formats.cell_text(one.after)}
-    low, high = one.interval or (float("nan"), float("nan"))
-    ratio = {"ratio": one.ratio, "ratio_low": low, "ratio_high": high}
-    about = {"run": run, "against": against, "what": one.what, "verdict": one.verdict.value}
-    return about | _named(one.cell) | shown | ratio
 
 
 def _named(cell: Mapping[str, Any]) -> dict[str, Any]:

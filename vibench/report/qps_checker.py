@@ -25,7 +25,7 @@ import numpy as np
 
 
 def residuals(
-    P: np.ndarray, q: np.ndarray, G: np.ndarray, h: np.ndarray, x: np.ndarray, z: np.ndarray, accuracy: float = 0.0
+    P: np.ndarray, q: np.ndarray, G: np.ndarray, h: np.ndarray, x: np.ndarray, z: np.ndarray, accuracy: float
 ) -> list[float]:
     """Primal and dual residual and gap, as defined above."""
     L = np.linalg.cholesky(P)

@@ -17,7 +17,7 @@ from typing import Any
 import pandas as pd
 
 from vibench.errors import RequestError
-from vibench.files import PART, TEMPORARY
+from vibench.files import PART, TEMPORARY, write_atomically
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import default_formulation, registered
 from vibench.provenance import distribution_version
@@ -34,9 +34,6 @@ from vibench.results.ranking import Criterion, Standings, leaderboard
 from vibench.results.read import in_order, read_table, whole_numbers
 from vibench.results.sqlite import FILE, open_read_only
 from vibench.text import parsed_json
-
-# File that lists the files of a site with their digests: a later `vibench publish` may replace these.
-CATALOGUE = "vibench-site.json"
 
 
 def check(site: Path) -> None:
@@ -83,8 +80,7 @@ def _replace_files(site: Path, new: Path, files: Mapping[str, str]) -> None:
             raise RequestError(f"'{site / name}' was not written by vibench, or changed since; move it elsewhere")
     # An interruption of the next steps leaves no file that is not in the catalogue.
     both = {name: [*before.get(name, ()), *([files[name]] if name in files else [])] for name in {**before, **files}}
-    _write_catalogue(new, both)
-    (new / CATALOGUE).replace(site / CATALOGUE)
+    _write_catalogue(site, both)
     for name in sorted(files, key=lambda name: name == "index.html"):
         (site / name).parent.mkdir(parents=True, exist_ok=True)
         (new / name).replace(site / name)
@@ -95,15 +91,14 @@ def _replace_files(site: Path, new: Path, files: Mapping[str, str]) -> None:
             while folder != site and not any(folder.iterdir()):
                 folder.rmdir()
                 folder = folder.parent
-    _write_catalogue(new, {name: [digest] for name, digest in files.items()})
-    (new / CATALOGUE).replace(site / CATALOGUE)
+    _write_catalogue(site, {name: [digest] for name, digest in files.items()})
 
 
 def _refuse_links(site: Path, name: str) -> None:
     """Refuse names that lead out of the site, by themselves or through links."""
     parts = Path(name).parts
     if not parts or ".." in parts or Path(name).is_absolute():
-        raise RequestError(f"'{site / CATALOGUE}' lists '{name}', which is not in the site; move the file elsewhere")
+        raise RequestError(f"'{catalogue(site)}' lists '{name}', which is not in the site; move the file elsewhere")
     for depth in range(1, len(parts) + 1):
         if site.joinpath(*parts[:depth]).is_symlink():
             raise RequestError(f"'{site.joinpath(*parts[:depth])}' is a symbolic link; move it elsewhere")
@@ -113,21 +108,25 @@ def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
-def _write_catalogue(folder: Path, files: Mapping[str, Sequence[str]]) -> None:
+def catalogue(site: Path) -> Path:
+    """The list of the files of a site with their digests: a later `vibench publish` may replace these."""
+    return site / "vibench-site.json"
+
+
+def _write_catalogue(site: Path, files: Mapping[str, Sequence[str]]) -> None:
     content = {"format": "vibench-site 1", "files": dict(sorted(files.items()))}
-    (folder / CATALOGUE).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_atomically(catalogue(site), f"{json.dumps(content, indent=1, ensure_ascii=False)}\n".encode())
 
 
 def _written(site: Path) -> dict[str, list[str]]:
     """Files that vibench has written into a site, with the digests of what it wrote."""
-    catalogue = site / CATALOGUE
-    if not catalogue.is_file():
+    if not catalogue(site).is_file():
         raise RequestError(f"'{site}' is not empty and was not written by `vibench publish`; choose another folder")
     try:
-        files = parsed_json(catalogue.read_text(encoding="utf-8"))["files"]
+        files = parsed_json(catalogue(site).read_text(encoding="utf-8"))["files"]
         return {str(name): [str(digest) for digest in digests] for name, digests in dict(files).items()}
     except (OSError, ValueError, KeyError, TypeError):
-        raise RequestError(f"'{catalogue}' cannot be read as the list of the files of a site") from None
+        raise RequestError(f"'{catalogue(site)}' cannot be read as the list of the files of a site") from None
 
 
 @dataclass(frozen=True, eq=False)

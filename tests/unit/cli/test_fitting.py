@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from rich.cells import cell_len
 from running import Main, refused
 
-from vibench.cli.completion import SHOWN
 from vibench.cli.console import new_console, print_frame
 from vibench.results import formats, show
 from vibench.results.read import read_table, results_file
@@ -28,7 +27,7 @@ def printed(frame: pd.DataFrame, width: int, priority: Sequence[str] = (), **mor
     return out.getvalue().splitlines()
 
 
-@pytest.mark.parametrize("table", SHOWN)
+@pytest.mark.parametrize("table", show.VIEWS)
 def test_every_table_of_a_run_fits(table: str, main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every printed word with a digit in it is a whole word of the table: none is cut, and none is wrapped."""
     found = show.look_up(results_file(str(quick_run)), table, limit=60)
@@ -152,7 +151,7 @@ class TestShow:
         _, out, _ = main("show", run, "--columns", "cell,solver", "--limit", "3")
         for line in out.splitlines()[3:]:  # keys that replay takes
             assert cells["cell"].str.startswith(line.split()[0]).sum() == 1
-        for table in SHOWN:
+        for table in show.VIEWS:
             _, out, _ = main("show", str(quick_run), "--table", table, "--format", "json", "--limit", "20")
             found = pd.read_json(io.StringIO(out))
             source = read_table(results_file(str(quick_run)), show.VIEWS[table].source)

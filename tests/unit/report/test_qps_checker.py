@@ -28,4 +28,4 @@ def test_its_residuals_are_those_of_the_verification(
     P, q, G = 10.0**unit * spd(5, rng), load * rng.standard_normal(5), rng.standard_normal((3, 5))
     h, x, z = rng.random(3) - closed, share * rng.standard_normal(5), share * 10.0**unit * rng.random(3)
     found = kkt_residuals(VariationalInequality(P, -q, G, h), x, z)
-    assert residuals(P, q, G, h, x, z) == pytest.approx([found.primal, found.dual, found.gap], rel=1e-9, abs=1e-15)
+    assert residuals(P, q, G, h, x, z, 0.0) == pytest.approx([found.primal, found.dual, found.gap], rel=1e-9, abs=1e-15)

@@ -79,7 +79,7 @@ def test_every_link_of_every_page_leads_to_a_file_of_the_site_and_to_its_anchor(
             assert linked.is_relative_to(site)
             assert not anchor or anchor in pages[linked].ids, (page, target)
             reached.add(linked)
-    assert {path for path in site.rglob("*") if path.is_file()} - reached == {site / folder.CATALOGUE}
+    assert {path for path in site.rglob("*") if path.is_file()} - reached == {folder.catalogue(site)}
 
 
 OBSERVE = """
@@ -327,7 +327,7 @@ def test_links_in_a_site_are_not_followed(small: Path, three: list[Path], tmp_pa
 def test_a_list_of_files_that_cannot_be_trusted_is_refused(small: Path, three: list[Path]) -> None:
     outside = ('{"files": {"../../outside": ["x"]}}', '{"files": {"/etc/hostname": []}}')
     for catalogue in ("", "[]", '{"files": 3}', *outside):
-        (small / folder.CATALOGUE).write_text(catalogue)
+        folder.catalogue(small).write_text(catalogue)
         with pytest.raises(RequestError, match=r"vibench-site.json' (cannot be read|lists)"):
             publish(three[:1], small, CITATION)
 

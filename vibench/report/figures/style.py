@@ -20,6 +20,7 @@ import numpy as np
 from matplotlib import ticker
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 
 from vibench.arrays import Array
 from vibench.text import printable
@@ -29,7 +30,6 @@ from vibench.text import printable
 COLOURS = ("#520186", "#91071B", "#A22174", "#615CDB", "#DF5225", "#2CA980", "#AEA0F2", "#E4BD20")
 
 Share = Literal["none", "all", "row", "col"]
-Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -320,40 +320,34 @@ def _label_points(axes: Axes, points: list[tuple[float, float, str]]) -> int:
         return 0
     scale = 72.0 / float(axes.figure.dpi)
     places = scale * axes.transData.transform([(x, y) for x, y, _ in drawn])
-    left, bottom, right, top = (scale * float(end) for end in axes.bbox.extents)
+    panel = Bbox(scale * axes.bbox.get_points())
     # Lengths are in points (1/72 inch): a label keeps 3.5 clear around every point.
     clear, missing = 3.5, 0
-    taken: list[Box] = [(x - clear, y - clear, x + clear, y + clear) for x, y in places]
+    taken = [Bbox.from_extents(x - clear, y - clear, x + clear, y + clear) for x, y in places]
     for (x, y, text), place in zip(drawn, places, strict=True):
         if not text:
             continue
-        inside = (
-            b for b in _boxes(place, text, clear) if left <= b[0] and bottom <= b[1] and b[2] <= right and b[3] <= top
-        )
-        box = next((box for box in inside if not any(_overlap(box, other) for other in taken)), None)
+        inside = (box for box in _boxes(place, text, clear) if all(panel.contains(*end) for end in box.get_points()))
+        box = next((box for box in inside if not box.count_overlaps(taken)), None)
         if box is None:
             missing += 1
             continue
         taken.append(box)
-        offset = (box[0] - place[0], box[1] - place[1])
+        offset = tuple(box.min - place)
         axes.annotate(
             text, (x, y), offset, textcoords="offset points", fontsize=6.0, color="0.25", va="bottom", ha="left"
         )
     return missing
 
 
-def _boxes(place: Array, text: str, clear: float) -> Iterator[Box]:
+def _boxes(place: Array, text: str, clear: float) -> Iterator[Bbox]:
     """Boxes of a text beside a point, those first that are tried first: right, left, above, below, corners."""
     # In a font of 6 points; no text is rendered to measure it.
     width, height = 0.62 * 6.0 * len(text), 1.15 * 6.0
     for across, up in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1)):
         x = place[0] + (clear + 1.0 if across > 0 else -clear - 1.0 - width if across < 0 else -0.5 * width)
         y = place[1] + (clear if up > 0 else -clear - height if up < 0 else -0.5 * height)
-        yield x, y, x + width, y + height
-
-
-def _overlap(one: Box, other: Box) -> bool:
-    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+        yield Bbox.from_bounds(x, y, width, height)
 
 
 @cache
