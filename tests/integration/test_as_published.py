@@ -18,7 +18,7 @@ import as_published
 import published
 
 
-@pytest.mark.parametrize(("problem", "nodes"), [("obstacle", 200), pytest.param("hertz", 700, marks=pytest.mark.long)])
+@pytest.mark.parametrize(("problem", "nodes"), [("obstacle", 100), pytest.param("hertz", 700, marks=pytest.mark.long)])
 def test_both_sides_make_one_model(
     problem: str, nodes: int, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,7 +16,7 @@ STUDY = {
 }  # fmt: skip
 ORIGIN = {"cell", "problem_options", "model", "study_hash", "code", "definition", "artefact", "cell_a", "cell_b"}
 
-RESOLUTION = {"obstacle": 160, "hertz": 300}
+RESOLUTION = {"obstacle": 150, "hertz": 300}
 
 
 def numbers(folder: Path, table: str, problem: str) -> pd.DataFrame:

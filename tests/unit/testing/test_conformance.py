@@ -25,7 +25,8 @@ from vibench.testing.case import difference, find_jump
 from vibench.testing.checks import Check, Doubt, Note, Verdict
 
 BUILT_IN = [
-    (word, entry.name)
+    # The checks of two spheres take as long as those of ten other problems.
+    pytest.param(word, entry.name, marks=[pytest.mark.long] if entry.name == "hertz3d" else [])
     for word, kind in CHECKED.items()
     for entry in importlib.metadata.distribution("vibench").entry_points.select(group=kind.entry_points)
 ]
