@@ -11,7 +11,7 @@ import os
 import statistics
 import sys
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -63,7 +63,7 @@ def measure_stages(sides: Pair, repeats: int) -> Seconds:
     for name in STAGES:
         for _ in range(repeats):
             for side, spent in zip(sides, seconds[name], strict=True):
-                spent.append(timed(lambda: side.do(name))[1].cpu)  # noqa: B023  called at once
+                spent.append(timed(partial(side.do, name))[1].cpu)
         _tell(name, seconds[name])
     for side in range(2):
         seconds[TOTAL_NAME][side].extend(np.sum([seconds[name][side] for name in TOTAL], axis=0).tolist())
@@ -78,7 +78,7 @@ def measure_queries(sides: Pair, mus: Array, repeats: int) -> tuple[Seconds, Fig
     seconds: Seconds = defaultdict(lambda: Pair([], []))
     found: Figures = {}
     problem = sides.published.problem
-    u, lam = published.snapshots(problem, mus)
+    V, W, (u, lam) = problem.V, problem.W, published.snapshots(problem, mus)
     for side in sides:
         side.prepare()
     for name in QUERIES:
@@ -86,17 +86,12 @@ def measure_queries(sides: Pair, mus: Array, repeats: int) -> tuple[Seconds, Fig
         for repeat in range(repeats):
             for k, mu in enumerate(mus):
                 for i, side in enumerate(sides):
-                    (program, x, alpha, Z), spent = median_seconds(
-                        lambda: side.answer(name, mu),  # noqa: B023  called at once
-                        enough=0.05,
-                    )
+                    (program, x, alpha, Z), spent = median_seconds(partial(side.do, name, mu), enough=0.05)
                     seconds[name][i].append(spent.cpu)
                     if repeat:
                         continue
-                    error_u[i].append(_relative(problem.V.norm(u[:, k] - Z() @ x), problem.V.norm(u[:, k])))
-                    error_lam[i].append(
-                        _relative(problem.W.norm(lam[:, k] - side.chi @ alpha), problem.W.norm(lam[:, k]))
-                    )
+                    error_u[i].append(float(V.norm(u[:, k] - Z() @ x) / V.norm(u[:, k])))
+                    error_lam[i].append(float(W.norm(lam[:, k] - side.chi @ alpha) / W.norm(lam[:, k])))
                     residual[i].append(verification.kkt_residuals(program, x, alpha).worst)
         found[f"error of u, {name}"] = Pair(*map(statistics.mean, error_u))
         found[f"error of λ, {name}"] = Pair(*map(statistics.mean, error_lam))
@@ -119,10 +114,6 @@ def _measure_ours(ours: Ours, mus: Array, seconds: Seconds, found: Figures) -> N
             for of_side in seconds[name]:
                 of_side.append(spent)
         _tell(name, seconds[name])
-
-
-def _relative(value: Array, scale: Array) -> float:
-    return float(value / scale)
 
 
 def _tell(name: str, seconds: Pair) -> None:
@@ -160,8 +151,8 @@ Check = tuple[str, float, float]
 def checks(sides: Pair, found: Figures) -> list[Check]:
     """Whether both sides came to the same: figures and their bounds."""
     case, problem = sides.published.case, sides.published.problem
-    names = ("N", "R of CPG", "R of mCPG")
-    result = [(f"difference of {name}", float(abs(found[name].ours - found[name].published)), 0.0) for name in names]
+    sized = [(name, found[name]) for name in ("N", "R of CPG", "R of mCPG")]
+    result = [(f"difference of {name}", float(abs(pair.ours - pair.published)), 0.0) for name, pair in sized]
     result += [("relative difference of the vectors added", _difference(found["vectors added by PGA"]), case.ties)]
     result += [(f"σ, {side}", sigma, case.pga) for side, sigma in found["largest σ"]._asdict().items()]
     for name, space in (("u", problem.V), ("lam", problem.W)):
@@ -184,33 +175,26 @@ def _difference(pair: Pair) -> float:
 
 
 def broken(of: list[Check]) -> list[Check]:
-    """Checks that do not hold."""
     return [check for check in of if not check[1] <= check[2]]
 
 
-def time_table(seconds: Seconds, paper: Mapping[str, float]) -> pd.DataFrame:
+def time_table(seconds: Seconds, paper: Sequence[float]) -> pd.DataFrame:
     """Medians and their ratio, by stage, and the seconds that the paper gives."""
     rows = [(name, *(statistics.median(spent) for spent in pair), len(pair.ours)) for name, pair in seconds.items()]
     frame = pd.DataFrame(rows, columns=["stage", "transcription [s]", "ours [s]", "times measured"])
     frame.insert(3, "transcription / ours", frame["transcription [s]"] / frame["ours [s]"])
-    frame["paper, on its machine [s]"] = frame["stage"].map(dict(paper))
+    frame["paper, on its machine [s]"] = frame["stage"].map(dict(zip((TOTAL_NAME, *QUERIES[:2]), paper, strict=True)))
     return frame
 
 
 def ratio_table(seconds: Seconds) -> pd.DataFrame:
     """Ratios of medians that answer what a user would ask."""
     published_, ours = ({name: statistics.median(pair[side]) for name, pair in seconds.items()} for side in range(2))
-    reduced = ours["query offline, reduced"]
+    reduced, with_reduction = ours["query offline, reduced"], ours[TOTAL_NAME] + ours["reduction"]
     rows = [
         ("offline, transcription over ours", published_[TOTAL_NAME] / ours[TOTAL_NAME]),
-        (
-            "offline with the reduction, transcription over ours",
-            published_[TOTAL_NAME] / (ours[TOTAL_NAME] + ours["reduction"]),
-        ),
-        *(
-            (f"{name}, transcription over ours", published_[name] / ours[name])
-            for name in ("CPG", "mCPG", "PGA", "PGA, residuals kept")
-        ),
+        ("offline with the reduction, transcription over ours", published_[TOTAL_NAME] / with_reduction),
+        *((f"{name}, transcription over ours", published_[name] / ours[name]) for name in STAGES[2:6]),
         ("offline query, our full over our reduced assembly", ours["query offline"] / reduced),
         ("online query, our full over our reduced assembly", ours["query online"] / ours["query online, reduced"]),
         ("online query of the transcription over our reduced offline query", published_["query online"] / reduced),
@@ -223,7 +207,6 @@ def ratio_table(seconds: Seconds) -> pd.DataFrame:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, print, write; 1 if a check does not hold."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("problem", choices=CASES)
     parser.add_argument("--repeats", type=int, default=3)

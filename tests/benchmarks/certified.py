@@ -88,13 +88,11 @@ class Tally:
                 above = zip(errors[which], (bound.u_energy, bound.lambda_natural, bound.lam), sizes, strict=True)
                 self.violations += any(is_violated(error, limit, size) for error, limit, size in above)
         if (bound := answers["reduced"].bound) is not None:
-            self.effectivities.append(
-                (bound.u_energy / errors["reduced"][0], bound.lambda_natural / errors["reduced"][1])
-            )
+            of_u, of_lam, _ = errors["reduced"]
+            self.effectivities.append((bound.u_energy / of_u, bound.lambda_natural / of_lam))
             for which in answers.keys() - {"reduced"}:
                 if answers[which].is_corrected:
-                    gain = errors["reduced"][2] / errors[which][2]
-                    self.gains[which].append((gain, bound.omega > bound.rho))
+                    self.gains[which].append((errors["reduced"][2] / errors[which][2], bound.omega > bound.rho))
 
     def time(self, mu: Array, x: Array, alpha: Array, solved: float) -> None:
         """Seconds of the assembly and the solution, of which `solved` are known, and of the certificate, at mu (d,)."""
@@ -108,7 +106,7 @@ class Tally:
         self.seconds.append((1e-9 * (middle - start) + solved, 1e-9 * (end - middle), 1e-9 * (corrected - end)))
 
     def __str__(self) -> str:
-        """One line."""
+
         of_u, of_lam = np.median(self.effectivities, axis=0)
         query, certify, correct = 1e3 * np.median(self.seconds, axis=0)
         least = np.min(self.effectivities, axis=0)

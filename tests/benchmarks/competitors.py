@@ -60,7 +60,6 @@ FORMULATIONS: dict[str, tuple[str, dict[str, Any], Plain]] = {
 
 
 def offline_phase(problem: Problem, dual: str, pod: float, cone: float, snapshots: Snapshots) -> Reduction:
-    """The offline phase of a cell of the study."""
     strategies = create("dual strategy", dual), create("primal strategy", "offline-pga")
     stops = Stop(tolerance=pod), Stop(tolerance=cone)
     phase = Reduction(problem, *strategies, *stops, 0.5, assembly="reduced", accuracy=ACCURACY)
@@ -70,10 +69,8 @@ def offline_phase(problem: Problem, dual: str, pod: float, cone: float, snapshot
 def row(name: str, offline: Reduction, mus: Array, exact: Snapshots, repeats: int) -> dict[str, Any]:
     """One row of the table: both versions in turns, of which the quickest of some repetitions counts."""
     plugin, options, plainly = FORMULATIONS[name]
-    model, solve_qp = (
-        offline.with_formulation(create("formulation", plugin, options)).model,
-        CellSolver("piqp", ACCURACY),
-    )
+    model = offline.with_formulation(create("formulation", plugin, options)).model
+    solve_qp = CellSolver("piqp", ACCURACY)
     settings, query = QuerySettings(ACCURACY, solve_qp), plainly(offline, solve_qp, model.built)
     V, W, seconds, errors = offline.problem.V, offline.problem.W, np.zeros((2, len(mus))), np.zeros((4, len(mus)))
     steps = []
@@ -94,14 +91,11 @@ def row(name: str, offline: Reduction, mus: Array, exact: Snapshots, repeats: in
             errors[which::2, k] = V.norm(pair[0] - u) / V.norm(u), W.norm(pair[1] - lam) / W.norm(lam)
     ours, plain_seconds = np.median(seconds, axis=1)
     measured = {"ours [ms]": 1e3 * ours, "plain [ms]": 1e3 * plain_seconds, "ratio": ours / plain_seconds}
-    names = "error of u", "plain, of u", "error of λ", "plain, of λ"
-    return {"formulation": name, **measured, "steps": np.median(steps)} | dict(
-        zip(names, errors.mean(axis=1), strict=True)
-    )
+    reached = zip(("error of u", "plain, of u", "error of λ", "plain, of λ"), errors.mean(axis=1), strict=True)
+    return {"formulation": name, **measured, "steps": np.median(steps), **dict(reached)}
 
 
 def main() -> int:
-    """Measure and print; 1 if a formulation is slower than its plain version allows."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("problems", nargs="*", default=["obstacle", "hertz", "bearing", "american-put"])
     parser.add_argument("--dual", nargs="+", default=["mcpg"])

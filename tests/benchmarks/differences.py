@@ -18,15 +18,8 @@ import vibench
 from vibench.results.schema import STORED
 
 OF_THE_RUN = {
-    "code",
-    "versions",
-    "machine",
-    "peak_memory_mib",
-    "slowdown",
-    "disturbed",
-    "timed_rounds",
-    "timing_reason",
-}
+    "code", "versions", "machine", "peak_memory_mib", "slowdown", "disturbed", "timed_rounds", "timing_reason",
+}  # fmt: skip
 """Columns that differ between two runs of the same numbers, beside those of seconds."""
 
 

@@ -19,9 +19,8 @@ if __name__ == "__main__":  # before NumPy is imported
 from functools import partial
 
 import numpy as np
-import scipy.sparse as sp
-from skfem import Basis, BilinearForm, ElementHex1, ElementVector, MeshHex
-from skfem.helpers import ddot, eye, sym_grad, trace
+from skfem import Basis, ElementHex1, ElementVector, MeshHex
+from skfem.models.elasticity import linear_elasticity
 
 from vibench import AffineProblem, Array, InnerProduct, ParameterBox, Problem, fem
 from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolver
@@ -33,47 +32,26 @@ from vibench.stages.base import build_problem
 from vibench.timing import timed
 
 
-@BilinearForm
-def dilatation(u, v, _):  # type: ignore[no-untyped-def]
-    """∫ tr ε(u) tr ε(v)."""
-    return ddot(eye(trace(sym_grad(u)), 3), sym_grad(v))
-
-
-@BilinearForm
-def shearing(u, v, _):  # type: ignore[no-untyped-def]
-    """2 ∫ ε(u) : ε(v)."""
-    return 2.0 * ddot(sym_grad(u), sym_grad(v))
-
-
 class Block(AffineProblem):
     """A unit cube on a fixed floor, pressed by a rigid paraboloid of radius 1; the depth and Lamé's constants vary."""
 
     parameters = ParameterBox(
-        names=("lame", "shear", "depth"),
-        lower=np.array([0.5, 0.5, 0.02]),
-        upper=np.array([2.0, 2.0, 0.06]),
-        units=("Pa", "Pa", "m"),
+        ("lame", "shear", "depth"), np.array([0.5, 0.5, 0.02]), np.array([2.0, 2.0, 0.06]), ("Pa", "Pa", "m")
     )
 
     def __init__(self, cells: int = 21) -> None:
         mesh = MeshHex.init_tensor(*[np.linspace(0.0, 1.0, cells + 1)] * 3)
         basis = Basis(mesh, ElementVector(ElementHex1()))
-        free = np.setdiff1d(np.arange(basis.N), basis.get_dofs(lambda x: x[2] == 0.0).all())
-        top = np.flatnonzero(mesh.p[2] == 1.0)
-        vertical = basis.nodal_dofs[2, top]
-        facets = mesh.facets_satisfying(lambda x: x[2] == 1.0)
-        area = fem.lumped_mass(Basis(mesh, ElementHex1()).boundary(facets))[top]
-        self.V = InnerProduct(fem.h1_gram(basis, free))
-        self.W = InnerProduct(sp.diags_array(area))
-        B = sp.csr_array((area, (np.arange(len(top)), vertical)), shape=(len(top), basis.N))
-        gap = 0.5 * np.sum((mesh.p[:2, top] - 0.5) ** 2, axis=0)
-        self.declare(
-            A=[("lame", dilatation.assemble(basis)), ("shear", shearing.assemble(basis))],
-            f=np.zeros(basis.N),
-            B=B,
-            g=[(1.0, area * gap), ("depth", -area)],
-            free=free,
-        )
+        free = basis.complement_dofs(basis.get_dofs(lambda x: x[2] == 0.0))
+        contact = fem.normal_constraint(basis, mesh.facets_satisfying(lambda x: x[2] == 1.0), free=free)
+        self.V, self.W = InnerProduct(fem.h1_gram(basis, free)), contact.W
+        gap = 0.5 * np.sum((contact.points[:2] - 0.5) ** 2, axis=0)
+        A = [
+            ("lame", linear_elasticity(1.0, 0.0).assemble(basis)),
+            ("shear", linear_elasticity(0.0, 1.0).assemble(basis)),
+        ]
+        g = [(1.0, contact.bound(gap)), ("-depth", contact.bound(np.ones_like(gap)))]
+        self.declare(A=A, f=np.zeros(basis.N), B=contact.B, g=g, free=free)
 
     def training_set(self) -> Array:
         return self.parameters.grid(2, 2, 2)
@@ -116,7 +94,7 @@ def _judged(V: InnerProduct, kept: Assemblies, mu: Array, u: Array, lam: Array) 
 
 
 def main() -> None:
-    """Read the command line."""
+
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument("problem", choices=["block", "obstacle", "hertz"])
     parser.add_argument("--cells", type=int, default=21)

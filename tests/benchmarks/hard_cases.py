@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vibench import AffineProblem, Array, Problem, Reduction, Stop, create
+from vibench import AffineProblem, Array, Problem, create
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.linalg.cholesky import SparseCholesky
@@ -30,6 +30,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 from decimals import difference, exact_decimal
 from hard_problems import Beam, DoubleObstacle, Truss
 from other_problems import Covered, ThermalBlock, Torsion
+from samples import pga_reduction
 
 LARGE: list[AffineProblem] = [
     *(Beam(elements) for elements in (40, 80, 160, 320, 640)),
@@ -73,8 +74,7 @@ def solved(problem: Problem, count: int) -> str:
 
 def compared(problem: Problem, mus: Array) -> Iterator[tuple[str, float, float, float]]:
     """Kind of a bound, bound, error, and the size that round-off is relative to, of a certified model at `mus`."""
-    dual, primal = create("dual strategy", "mcpg"), create("primal strategy", "offline-pga")
-    reduction = Reduction(problem, dual, primal, Stop(1e-4), Stop(1e-2), tolerance=0.5, assembly="reduced", bounds=True)
+    reduction = pga_reduction(problem, 1e-2, assembly="reduced", bounds=True)
     model, solver, kept, constants = reduction.model, HighFidelitySolver(problem), assemblies(problem), None
     for mu in mus:
         exact, found, corrected = solver.solve(mu), model.solve(mu), model.solve(mu, corrected=True)
@@ -83,10 +83,8 @@ def compared(problem: Problem, mus: Array) -> Iterator[tuple[str, float, float, 
         if constants is None or "A" not in problem.constant:
             constants = coercivity_and_continuity(vi.A, problem.V)[0], energy_inf_sup(vi.A, vi.B, problem.W)
         pair = corrected_pair(vi, energy, found.u, found.lam)
-        online = [
-            ("online", found.u, found.lam, found.bound),
-            ("online, corrected", corrected.u, corrected.lam, corrected.bound),
-        ]
+        both = ("online", found), ("online, corrected", corrected)
+        online = [(which, one.u, one.lam, one.bound) for which, one in both]
         at_mesh = [("mesh", found.u, found.lam)] + [("mesh, corrected", pair.u, pair.lam) for pair in [pair] if pair]
         bounds = [*online, *((*of, bound_errors_at(problem.V, vi, energy, *constants, *of[1:])) for of in at_mesh)]
         sizes = energy.norm(exact.u), energy.dual_norm(vi.B.T @ exact.lam)
@@ -95,15 +93,9 @@ def compared(problem: Problem, mus: Array) -> Iterator[tuple[str, float, float, 
             force = energy.dual_norm(vi.B.T @ (exact.lam - lam))
             yield f"{which}: u", bound.u_energy, energy.norm(exact.u - u), sizes[0]
             yield f"{which}: λ", bound.lambda_natural, force, sizes[1]
-            yield (
-                f"{which}: λ in W",
-                bound.lam,
-                float(problem.W.norm(exact.lam - lam)),
-                float(problem.W.norm(exact.lam)),
-            )
+            yield f"{which}: λ in W", bound.lam, *(float(problem.W.norm(of)) for of in (exact.lam - lam, exact.lam))
             if which.startswith("mesh"):
-                in_V = float(problem.V.norm(exact.u - u))
-                yield f"{which}: u in V", bound.u, in_V, float(problem.V.norm(exact.u))
+                yield f"{which}: u in V", bound.u, *(float(problem.V.norm(of)) for of in (exact.u - u, exact.u))
 
 
 def certified(problem: Problem, count: int) -> Iterator[str]:
@@ -124,7 +116,6 @@ def certified(problem: Problem, count: int) -> Iterator[str]:
 
 
 def main(count: int = 1000, queries: int = 20, *packs: str) -> None:
-    """Print both tables, or the second one of packs."""
     if not packs:
         print("problem            n     m   ok        error u  error λ  CPU s per query")
         for problem in LARGE:

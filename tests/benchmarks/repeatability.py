@@ -21,7 +21,6 @@ from vibench.results.paired_timing import PairedTiming
 
 
 def main() -> None:
-    """Print the agreement of the runs that are named."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--loaded", action="append", default=[], type=Path)
@@ -46,9 +45,8 @@ def main() -> None:
 
 def spread(runs: list[pd.DataFrame], *, others: bool) -> str:
     """How much larger the largest gain of a row is than the smallest one over all runs: quantiles over the rows."""
-    columns = [
-        rows[(rows["primal_a"] == HIGH_FIDELITY) != others].set_index(["cell_a", "cell_b"])["gain"] for rows in runs
-    ]
+    chosen = (rows[(rows["primal_a"] == HIGH_FIDELITY) != others] for rows in runs)
+    columns = [rows.set_index(["cell_a", "cell_b"])["gain"] for rows in chosen]
     gains = pd.concat(columns, axis=1, join="inner").to_numpy(dtype=float)
     factors = np.max(gains, axis=1) / np.min(gains, axis=1) - 1.0
     half, most, largest = np.quantile(factors, (0.5, 0.95, 1.0))

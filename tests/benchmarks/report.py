@@ -56,7 +56,6 @@ def opened(page: Path, folder: Path) -> float:
 
 
 def main() -> int:
-    """Measure, print and judge."""
     folder = Path(sys.argv[1])
     run = Path(sys.argv[2]) if len(sys.argv) > 2 else folder / "quick"
     if not (run / FILE).exists():
@@ -70,11 +69,8 @@ def main() -> int:
         written, used = command("report", str(results), "--out", str(page))
         most = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20  # of one process, in KiB on Linux
         size, seconds = page.stat().st_size / 1e6, opened(page, folder)
-        print(
-            f"{cells} cells: {written:.1f} s to write ({used:.1f} s of CPU, {most:.1f} GiB), {size:.2f} MB, "
-            f"{seconds:.2f} s to open",
-            flush=True,
-        )
+        taken = f"{written:.1f} s to write ({used:.1f} s of CPU, {most:.1f} GiB)"
+        print(f"{cells} cells: {taken}, {size:.2f} MB, {seconds:.2f} s to open", flush=True)
         asked = written < SECONDS_TO_WRITE and size < MEGABYTES and seconds < SECONDS_TO_OPEN
         missed |= cells == min(SIZES) and not asked
     return int(missed)

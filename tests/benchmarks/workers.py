@@ -14,16 +14,12 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 
 from running import assert_same_numbers
 
-WAYS = {
-    "one worker": ("--jobs", "1"),
-    "two workers": ("--jobs", "2"),
-    "dask, two workers": ("--jobs", "2", "--executor", "dask"),
-}
-ASKED = 0.65
+TWO = ("--jobs", "2")
+WAYS = {"one worker": ("--jobs", "1"), "two workers": TWO, "dask, two workers": (*TWO, "--executor", "dask")}
 
 
 def wall(folder: Path, study: str, arguments: Sequence[str]) -> float:
@@ -41,13 +37,13 @@ def wall(folder: Path, study: str, arguments: Sequence[str]) -> float:
 
 
 def main(folder: Path, study: str, more: Sequence[str]) -> int:
-    """Run all ways, print their seconds, compare their numbers."""
+
     slow, alone = False, 0.0
     for way, arguments in WAYS.items():
         place = folder / way.replace(",", "").replace(" ", "-")
         seconds = wall(place, study, [*arguments, *more])
         alone = alone or seconds
-        slow |= way != next(iter(WAYS)) and seconds > ASKED * alone
+        slow |= way != next(iter(WAYS)) and seconds > 0.65 * alone
         print(f"{way:20s} {seconds:8.1f} s  {seconds / alone:5.0%}", flush=True)
         assert_same_numbers(folder / "one-worker" / "run", place / "run")
     print("numbers besides times are the same; those of solvers that do not repeat themselves, to round-off")
