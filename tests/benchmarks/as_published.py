@@ -229,21 +229,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     figures = pd.DataFrame([(name, *pair) for name, pair in found.items()], columns=["figure", "transcription", "ours"])
     held = pd.DataFrame([(*v, "no" if v in broken(verdicts) else "yes") for v in verdicts])
     held.columns = pd.Index(["check", "found", "at most", "holds"])
-    page = Page(
-        asked.out or Path(),
-        f"{asked.problem}, resolution {resolution}: the published algorithms and ours",
-        f"python tests/benchmarks/as_published.py {asked.problem} --repeats {asked.repeats}"
-        + (f" --out {asked.out}" if asked.out else ""),
-        ABOUT + (f" No compiled program: {sides.ours.not_compiled}." if sides.ours.not_compiled else ""),
-        machine=where,
-        file=f"as-published-{asked.problem}.md",
-    )
+    title = f"{asked.problem}, resolution {resolution}: the published algorithms and ours"
+    command = f"python tests/benchmarks/as_published.py {asked.problem} --repeats {asked.repeats}"
+    command += f" --out {asked.out}" if asked.out else ""
+    about = ABOUT + (f" No compiled program: {sides.ours.not_compiled}." if sides.ours.not_compiled else "")
+    file = f"as-published-{asked.problem}.md"
+    page = Page(asked.out or Path(), title, command, about, machine=where, file=file)
     page.add(times, ratio_table(seconds | of_queries), figures, held)
     print(page.text)
     if asked.out:
         page.write()
-        about = {"problem": asked.problem, "resolution": resolution, "solver": asked.solver, "machine": where}
-        page.link(f"as-published-{asked.problem}", times.assign(**about))
+        same = {"problem": asked.problem, "resolution": resolution, "solver": asked.solver, "machine": where}
+        page.link(f"as-published-{asked.problem}", times.assign(**same))
     return int(bool(broken(verdicts)))
 
 

@@ -140,25 +140,16 @@ class Tally:
         """One row of a table: what does not depend on the machine."""
         quantiles = {"least": 0.0, "median": 0.5, "largest": 1.0}
         named = ("problem", "training", "dual", "primal", "primal_tol", "pod_tol", "dual_tol", "snapshots")
-        return {
-            **{name: self.row[name] for name in named},
-            "certificate": self.certificate.base.guarantee.value,
-            **{"parameters": self.parameters, "violations": self.violations, "without a bound": self.without},
-            **{
-                f"{name} effectivity of {vector}": float(np.quantile(values, level))
-                for vector, values in zip("uλ", np.array(self.effectivities).reshape(-1, 2).T, strict=True)
-                for name, level in quantiles.items()
-            },
-            **{
-                f"{what}, corrected {which}, {name}": value
-                for which, name, divided in self._divided()
-                for what, value in (
-                    ("queries", len(divided)),
-                    ("error of λ divided by (median)", float(np.median(divided))),
-                    ("smaller in", float(np.mean(divided > 1.0))),
-                )
-            },
-        }
+        row = {name: self.row[name] for name in named} | {"certificate": self.certificate.base.guarantee.value}
+        row |= {"parameters": self.parameters, "violations": self.violations, "without a bound": self.without}
+        for vector, values in zip("uλ", np.array(self.effectivities).reshape(-1, 2).T, strict=True):
+            for name, level in quantiles.items():
+                row[f"{name} effectivity of {vector}"] = float(np.quantile(values, level))
+        for which, name, divided in self._divided():
+            row[f"queries, corrected {which}, {name}"] = len(divided)
+            row[f"error of λ divided by (median), corrected {which}, {name}"] = float(np.median(divided))
+            row[f"smaller in, corrected {which}, {name}"] = float(np.mean(divided > 1.0))
+        return row
 
 
 def compare(tallies: list[Tally], kept: Assemblies, mu: Array, exact: HighFidelitySolution) -> None:

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from numerics import exact
 from odd_plugins import LABEL, ODD
 from outputs import clean, elements
-from samples import cell_row, query_rows
+from samples import cell_row, filled, query_rows
 
 from vibench.cli.console import print_frame
 from vibench.interfaces.problem import VariationalInequality
@@ -38,11 +38,9 @@ ANYTHING = st.text(st.characters(), max_size=50) | st.sampled_from([LABEL, ODD, 
 
 COUNTS = st.integers() | st.floats() | st.none() | st.text() | st.booleans()
 
-SAMPLES = {"TEXT": "text", "REAL": 0.5, "INTEGER": 3, "BLOB": b""}
-
 
 def sample(table: str, **columns: Any) -> dict[str, Any]:
-    row = {name: SAMPLES[column.kind.split()[0]] for name, column in STORED[table].items()}
+    row = filled(table)
     return row | {name: value for name, value in columns.items() if name in row}
 
 
@@ -66,14 +64,8 @@ def recorded(folder: Path, text: str, count: Any) -> Path:
     names = dict.fromkeys(("problem", "dual", "primal", "solver", "solver_a", "solver_b", "primal_a", "primal_b"), text)
     options = {f"{axis}_options": json.dumps({"of": text}) for axis in ("problem", "dual", "primal")}
     said = names | options | {"fallbacks": text, "quantity": text, "versions": json.dumps({"numpy": text})}
-    said |= {
-        "stage": "cone",
-        "meaning": "never",
-        "assembly": "full",
-        "solver_share_mean": 0.01,
-        "assembly_share_mean": 0.01,
-        "definition": json.dumps(names),
-    }
+    said |= {"stage": "cone", "meaning": "never", "assembly": "full", "definition": json.dumps(names)}
+    said |= {"solver_share_mean": 0.01, "assembly_share_mean": 0.01}
     of_cells, of_queries = ({k: v for k, v in said.items() if k in STORED[table]} for table in ("cells", "queries"))
     with contextlib.closing(ResultsDatabase(folder, {"name": text, "seed": 1, "validation": 2})) as database:
         database.write_cell(cell_row(**of_cells), query_rows(**of_queries | answered(text, count)))

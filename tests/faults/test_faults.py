@@ -86,22 +86,14 @@ def kill_at_random(arguments: list[str], place: Path, plugins: Path, rng: random
     return True
 
 
-@pytest.mark.parametrize(
-    ("kills", "executor", "length"),
-    [
-        (2, "local", "short"),
-        *(pytest.param(50, executor, "long", marks=pytest.mark.long) for executor in ("local", "dask")),
-    ],
-)
+LONGER = [pytest.param(50, executor, "long", marks=pytest.mark.long) for executor in ("local", "dask")]
+
+
+@pytest.mark.parametrize(("kills", "executor", "length"), [(2, "local", "short"), *LONGER])
 def test_a_run_that_is_killed_again_and_again_loses_and_doubles_nothing(
-    kills: int,
-    executor: str,
-    length: str,
-    undisturbed: Callable[[str], Undisturbed],
-    plugins_folder: Path,
-    vibench: Vibench,
-    place: Path,
-) -> None:
+    kills: int, executor: str, length: str, undisturbed: Callable[[str], Undisturbed], plugins_folder: Path,
+    vibench: Vibench, place: Path,
+) -> None:  # fmt: skip
     rng, killed, number, at_work = random.Random(kills), 0, 0, 0
     whole = undisturbed(length)
     seconds = 0.8 * whole.seconds

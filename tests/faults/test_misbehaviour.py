@@ -21,10 +21,7 @@ BAD_PROBLEMS: Mapping[str, tuple[set[str], str]] = {
     "wire-sleeps": ({"timeout"}, "in high-fidelity solutions: stopped after cell_seconds = 20 s"),
     "wire-exits": ({"crashed"}, "in high-fidelity solutions: the worker process died with exit code 3"),
     "wire-segfaults": ({"crashed"}, "in high-fidelity solutions: the worker process died with signal SIGSEGV"),
-    "wire-infeasible": (
-        {"error"},
-        "]: no active set solves the high-fidelity problem; is it feasible?",
-    ),
+    "wire-infeasible": ({"error"}, "]: no active set solves the high-fidelity problem; is it feasible?"),
     "wire-crooked": ({"error"}, "in high-fidelity solutions: X_V is not positive definite"),
 }
 BAD_DUALS: Mapping[str, tuple[set[str], str]] = {
@@ -86,25 +83,14 @@ def run(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Run:
     primals = [bad(name, "enrichment-bad") for name in list(BAD_PRIMALS)[1:]]
     limits = {"cell_seconds": 20.0, "query_seconds": 3.0}  # a busy machine may take seconds for what is fine
     studies = [
-        wire_study(
-            problem=[*FINE["problem"], *BAD_PROBLEMS],
-            dual=FINE["dual"],
-            primal=FINE["primal"],
-            solvers=FINE["solver"],
-            limits=limits,
-            timing_rounds=2,
-        ),
-        wire_study(
-            dual=[*FINE["dual"], "cone-raises", waits, *duals],
-            primal=["decorrelated", "enrichment-raises", *primals],
-            solvers=[*FINE["solver"], *BAD_SOLVERS],
-            limits=limits,
-            timing_rounds=2,
-        ),
-    ]
+        {"problem": [*FINE["problem"], *BAD_PROBLEMS], "dual": FINE["dual"], "primal": FINE["primal"],
+         "solvers": FINE["solver"]},
+        {"dual": [*FINE["dual"], "cone-raises", waits, *duals],
+         "primal": ["decorrelated", "enrichment-raises", *primals], "solvers": [*FINE["solver"], *BAD_SOLVERS]},
+    ]  # fmt: skip
     found = Run([], [], [], [])
     for number, study in enumerate(studies):
-        path = write_study(folder, study, f"{number}.toml")
+        path = write_study(folder, wire_study(limits=limits, timing_rounds=2, **study), f"{number}.toml")
         done = vibench(folder, "run", path, "--jobs", "2", "--out", str(number))
         found.folders.append(folder / str(number))
         found.codes.append(done.returncode)

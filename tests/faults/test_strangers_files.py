@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from running import PATIENCE, seal
+from running import PATIENCE, execute
 
 from vibench.cli.result_commands import export, replay_query, show, write_report
 from vibench.errors import NumericalError, RequestError
@@ -43,15 +43,6 @@ def run(quick_run: Path, tmp_path: Path) -> Path:
     folder.mkdir()
     shutil.copy(quick_run / FILE, folder)
     return folder
-
-
-def change(folder: Path, *statements: str) -> None:
-    db = sqlite3.connect(folder / FILE)
-    for statement in statements:
-        db.execute(statement)
-    seal(db)
-    db.commit()
-    db.close()
 
 
 def test_a_planted_artefact_runs_no_code(tmp_path: Path) -> None:
@@ -96,7 +87,7 @@ def test_a_cell_that_would_name_a_file_elsewhere_is_refused(run: Path, tmp_path:
     (cell,) = sqlite3.connect(run / FILE).execute("SELECT cell FROM cells LIMIT 1").fetchone()
     before = sorted(tmp_path.rglob("*"))
     for name in ("../../outside", "/tmp/outside", "", "0123456789ABCDEF", "0123456789abcde\n"):
-        change(run, "PRAGMA foreign_keys=OFF", f"UPDATE cells SET cell = '{name}' WHERE cell = '{cell}'")
+        execute(run, "PRAGMA foreign_keys=OFF", f"UPDATE cells SET cell = '{name}' WHERE cell = '{cell}'")
         cell = name
         with pytest.raises(RequestError, match="expected 16 hexadecimal digits"):
             export(str(run), [str(tmp_path / "set")])
@@ -110,11 +101,11 @@ def test_a_results_file_with_code_of_its_own_is_refused(run: Path) -> None:
         ("trigger", "CREATE TRIGGER t AFTER INSERT ON cells BEGIN DELETE FROM queries; END"),
         ("view", "CREATE VIEW t AS SELECT load_extension('x')"),
     ):
-        change(run, planted)
+        execute(run, planted)
         for command in (show, write_report, partial(export, words=["set"])):
             with pytest.raises(RequestError, match=f"is not a results file of vibench: it has a {kind}"):
                 command(str(run))
-        change(run, f"DROP {kind} t")
+        execute(run, f"DROP {kind} t")
 
 
 def test_a_damaged_page_is_found(run: Path) -> None:

@@ -119,13 +119,8 @@ class ExactProgram:
 
     def _wrong(self, u: Any, lam: Any) -> tuple[np.ndarray, np.ndarray]:
         excess = np.array([self._times(i, u) - self._g[i] for i in range(len(self._rows))], object)
-        terms = np.array(
-            [
-                sum((abs(v * u[j]) for j, v in zip(*self._rows[i], strict=True)), Decimal(0)) + abs(self._g[i])
-                for i in range(len(self._rows))
-            ],
-            object,
-        )
+        pairs = (zip(*row, strict=True) for row in self._rows)
+        terms = abs(self._g) + np.array([sum((abs(v * u[j]) for j, v in row), Decimal(0)) for row in pairs], object)
         largest = max((abs(value) for value in lam), default=Decimal(0))
         return (excess > ZERO * terms) & self.present, lam < -ZERO * largest
 

@@ -9,21 +9,19 @@ from vibench import Array, InnerProduct
 M = 12
 
 
-def line_mass() -> InnerProduct:
+def line_mass(m: int, scale: float) -> InnerProduct:
     """The consistent mass matrix of a line: whitening destroys signs, as on the meshes."""
-    return InnerProduct(sp.diags_array([4.0 * np.ones(M), np.ones(M - 1), np.ones(M - 1)], offsets=[0, 1, -1]) / M)
+    return InnerProduct(sp.diags_array([4.0 * np.ones(m), np.ones(m - 1), np.ones(m - 1)], offsets=[0, 1, -1]) / scale)
 
 
-W = line_mass()
+W = line_mass(M, M)
 
 
 def bumps(count: int = 12, m: int = 40) -> tuple[Array, InnerProduct]:
     """Shifted and scaled bumps with exact zeros, and the mass matrix of their mesh."""
     x = np.linspace(0.0, 1.0, m)
     centres, widths = np.linspace(0.35, 0.65, count), 0.15 + 0.1 * np.sin(np.arange(count))
-    theta = np.maximum(0.0, 1.0 - ((x[:, None] - centres) / widths) ** 2)
-    mass = sp.diags_array([4.0 * np.ones(m), np.ones(m - 1), np.ones(m - 1)], offsets=[0, 1, -1]) / (6.0 * m)
-    return theta, InnerProduct(mass)
+    return np.maximum(0.0, 1.0 - ((x[:, None] - centres) / widths) ** 2), line_mass(m, 6.0 * m)
 
 
 @st.composite
@@ -34,14 +32,9 @@ def families(draw: st.DrawFn) -> Array:
     kinds = st.sampled_from(["new", "bump", "zero", "copy", "multiple", "nearly"])
     for kind in draw(st.lists(kinds, min_size=1, max_size=8)):
         source = columns[rng.integers(len(columns))] if columns else rng.random(M)
-        columns.append(
-            {
-                "new": rng.random(M) * (rng.random(M) < 0.6),
-                "bump": np.maximum(0.0, 1.0 - ((np.arange(M) - 11.0 * rng.random()) / 4.0) ** 2),
-                "zero": np.zeros(M),
-                "copy": source.copy(),
-                "multiple": 10.0 ** rng.integers(-6, 3) * source,
-                "nearly": source * (1.0 + 1e-9 * rng.random(M)),
-            }[kind]
-        )
+        columns.append({
+            "new": rng.random(M) * (rng.random(M) < 0.6), "zero": np.zeros(M), "copy": source.copy(),
+            "bump": np.maximum(0.0, 1.0 - ((np.arange(M) - 11.0 * rng.random()) / 4.0) ** 2),
+            "multiple": 10.0 ** rng.integers(-6, 3) * source, "nearly": source * (1.0 + 1e-9 * rng.random(M)),
+        }[kind])  # fmt: skip
     return np.column_stack(columns)

@@ -149,14 +149,12 @@ def _started() -> str:
     ours, theirs = socket.socketpair()
     address = f"{folder}/socket"
     with theirs:
+        environment = {name: value for name, value in os.environ.items() if name != "VIBENCH_WORKER"}
+        environment |= {"PYTHONPATH": os.pathsep.join(paths()), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         process = subprocess.Popen(
-            [sys.executable, "-P", __file__, str(theirs.fileno()), address],
-            env={name: value for name, value in os.environ.items() if name != "VIBENCH_WORKER"}
-            | {"PYTHONPATH": os.pathsep.join(paths()), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
-            pass_fds=[theirs.fileno()],
-            stdin=subprocess.DEVNULL,
-            start_new_session=True,
-        )
+            [sys.executable, "-P", __file__, str(theirs.fileno()), address], env=environment,
+            pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True,
+        )  # fmt: skip
     assert ours.recv(1) == b"+"
     atexit.register(process.wait)
     atexit.register(ours.close)  # first: the template ends when it is closed

@@ -121,12 +121,8 @@ class DoubleObstacle(AffineProblem):
         varying[-2:] = 1.0, -1.0
         self.V, self.W = InnerProduct(A), InnerProduct(sp.eye_array(len(varying), format="csc"))
         load = h * np.sin(2.0 * np.pi * x) * 6.0
-        self.declare(
-            A=A,
-            f=[("load", load), ("bias", h * np.ones(nodes))],
-            B=sp.csr_array(sp.vstack(rows)),
-            g=[(1.0, np.concatenate(fixed)), ("mean", varying)],
-        )
+        g = [(1.0, np.concatenate(fixed)), ("mean", varying)]
+        self.declare(A=A, f=[("load", load), ("bias", h * np.ones(nodes))], B=sp.csr_array(sp.vstack(rows)), g=g)
 
     def training_set(self) -> Array:
         return self.parameters.grid(5, 4, 3)

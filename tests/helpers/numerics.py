@@ -29,9 +29,8 @@ class Varying(Problem):
         self._laplacian = sp.csc_array(laplacian)
         self._n, self._m = n, m
         self.V = InnerProduct(laplacian + sp.eye_array(n) / (n + 1))
-        self.W = InnerProduct(
-            sp.diags_array([4.0 * np.ones(m), np.ones(m - 1), np.ones(m - 1)], offsets=[0, 1, -1]) / (6.0 * m)
-        )
+        mass = sp.diags_array([4.0 * np.ones(m), np.ones(m - 1), np.ones(m - 1)], offsets=[0, 1, -1]) / (6.0 * m)
+        self.W = InnerProduct(mass)
 
     def training_set(self) -> Array:
         return self.parameters.grid(self.count)
@@ -40,13 +39,9 @@ class Varying(Problem):
         x = np.linspace(0.0, 1.0, self._n + 2)[1:-1]
         centres = np.linspace(0.25, 0.75, self._m) + 0.1 * mu[0] * np.sin(7.0 * np.arange(self._m))
         hats = np.maximum(0.0, 1.0 - np.abs(x[None, :] - centres[:, None]) * (self._n + 1) / (2.0 + mu[0]))
-        weights = hats / self._m
-        return VariationalInequality(
-            A=self._laplacian * (1.0 + mu[0]),
-            f=-np.ones(self._n) / (self._n + 1) * 8.0,
-            B=sp.csr_array(-weights),
-            g=weights @ (0.3 + 0.2 * x * mu[0]),
-        )
+        weights, f = hats / self._m, -np.ones(self._n) / (self._n + 1) * 8.0
+        A, g = self._laplacian * (1.0 + mu[0]), weights @ (0.3 + 0.2 * x * mu[0])
+        return VariationalInequality(A, f, sp.csr_array(-weights), g)
 
 
 class Tied(Varying):

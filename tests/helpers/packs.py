@@ -17,25 +17,18 @@ SIZE = 12
 LOADS, DEPTH = [4.0, 6.0, 8.0], 0.2
 
 MANIFEST: Mapping[str, Any] = {
-    "format": 1,
-    "name": "cable",
+    "format": 1, "name": "cable",
     "parameters": {
-        "names": ["load", "depth"],
-        "units": ["N/m", "m"],
-        "lower": [4.0, 0.1],
-        "upper": [8.0, 0.4],
-        "training": [[load, DEPTH] for load in LOADS],
-        "validation": [[5.0, 0.2], [7.0, 0.3]],
+        "names": ["load", "depth"], "units": ["N/m", "m"], "lower": [4.0, 0.1], "upper": [8.0, 0.4],
+        "training": [[load, DEPTH] for load in LOADS], "validation": [[5.0, 0.2], [7.0, 0.3]],
     },
     "spaces": {"X_V": "spaces.npz:X_V", "X_W": "spaces.npz:X_W"},
     "operators": {
-        "A": "A.npz",
-        "f": {"affine": [{"theta": "-load", "array": "vectors.npz:mass"}]},
-        "B": "B.npz",
-        "g": {"affine": [{"theta": "depth", "array": "vectors.npz:mass"}]},
+        "A": "A.npz", "f": {"affine": [{"theta": "-load", "array": "vectors.npz:mass"}]},
+        "B": "B.npz", "g": {"affine": [{"theta": "depth", "array": "vectors.npz:mass"}]},
     },
     "solutions": {"u": "solutions.npz:u", "lam": "solutions.npz:lam"},
-}
+}  # fmt: skip
 
 
 class Cable:

@@ -119,12 +119,8 @@ def workers(pid: int) -> list[int]:
     found: list[int] = []
     for children in Path(f"/proc/{pid}/task").glob("*/children"):
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):
-            numbers = children.read_text().split()
-            found += [
-                int(number)
-                for number in numbers
-                if "vibench.execution.worker" in Path(f"/proc/{number}/cmdline").read_text()
-            ]
+            lines = {number: Path(f"/proc/{number}/cmdline").read_text() for number in children.read_text().split()}
+            found += [int(number) for number, line in lines.items() if "vibench.execution.worker" in line]
     return found
 
 

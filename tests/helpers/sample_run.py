@@ -66,12 +66,8 @@ def _keys(problem: str, dual: str, primal: str, tolerance: float | None) -> Row:
     own = {"problem": problem, "training": "own", "dual": dual, "primal": primal, "primal_tol": tolerance}
     own["formulation"] = "mixed"
     stops = {"pod_tol": 1e-3, "pod_size": None, "dual_tol": 1e-2, "dual_size": None}
-    return (
-        options
-        | own
-        | stops
-        | {"solver": "piqp", "accuracy": 1e-8, "assembly": "full", "bounds": 0, "correction": "none"}
-    )
+    own |= {"solver": "piqp", "accuracy": 1e-8, "assembly": "full", "bounds": 0, "correction": "none"}
+    return options | own | stops
 
 
 def _cell(key: str, keys: Row, kind: Kind, rng: np.random.Generator, *, failed: bool) -> Row:

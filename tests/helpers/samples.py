@@ -82,15 +82,15 @@ def write_study(folder: Path, content: Mapping[str, Any] = STUDY, name: str = "s
     return str(path)
 
 
+def filled(table: str) -> dict[str, Any]:
+    """A row in which every column has a value."""
+    samples = {"TEXT": "text", "REAL": 0.5, "INTEGER": 3, "BLOB": b""}
+    return {name: samples[column.kind.split()[0]] for name, column in STORED[table].items()}
+
+
 def cell_row(cell: str = "c1", **columns: Any) -> dict[str, Any]:
-    samples = {"TEXT": "text", "REAL": 0.5, "INTEGER": 3}
-    row = {name: samples[column.kind.split()[0]] for name, column in STORED["cells"].items()}
-    return (
-        row
-        | {"cell": cell, "status": "ok", "enrichment_kind": "fixed", "versions": "{}"}
-        | {"formulation": "mixed", "bounds": 0}
-        | columns
-    )
+    row = filled("cells") | {"cell": cell, "status": "ok", "enrichment_kind": "fixed", "versions": "{}"}
+    return row | {"formulation": "mixed", "bounds": 0} | columns
 
 
 def row_of(cell: str, error: float | None, online: float | None, **more: Any) -> dict[str, Any]:
@@ -109,12 +109,8 @@ def cells_of(*rows: dict[str, Any]) -> pd.DataFrame:
 
 def query_rows(cell: str = "c1", count: int = 2, **columns: Any) -> list[dict[str, Any]]:
     """Rows of the queries table in which every column is filled, for a problem with two parameters."""
-    samples = {"TEXT": "text", "REAL": 0.5, "INTEGER": 3}
-    row = {name: samples[column.kind.split()[0]] for name, column in STORED["queries"].items()}
-    return [
-        row | {"cell": cell, "query": k, "mu_1": 0.1 * k, "mu_2": 2.0 + k, "status": "ok"} | columns
-        for k in range(count)
-    ]
+    varying = ({"cell": cell, "query": k, "mu_1": 0.1 * k, "mu_2": 2.0 + k, "status": "ok"} for k in range(count))
+    return [filled("queries") | mine | columns for mine in varying]
 
 
 FAKES: Mapping[str, Mapping[str, str]] = {

@@ -66,12 +66,8 @@ class Declared(Base, AffineProblem):
         Base.__init__(self, bound)
         only = np.eye(len(DOFS))[4]
         one = sp.csr_array(sp.diags_array(only) @ self.rows)
-        self.declare(
-            A=self.A,
-            f=[("load", -0.1 * np.ones(N))],
-            B=[(1.0, self.rows - one), (share, one)],
-            g=[(1.0, GAP * (1.0 - only)), (share, GAP * only)],
-        )
+        B, g = [(1.0, self.rows - one), (share, one)], [(1.0, GAP * (1.0 - only)), (share, GAP * only)]
+        self.declare(A=self.A, f=[("load", -0.1 * np.ones(N))], B=B, g=g)
 
 
 class Tangled(Declared):

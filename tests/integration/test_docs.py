@@ -74,9 +74,8 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
             if title:
                 parts[title] = parts.get(title, "") + text
     for title, text in parts.items():
-        (folder / "vibench_mine" / title if title.endswith(".py") else folder / title).write_text(
-            text, encoding="utf-8"
-        )
+        place = folder / "vibench_mine" if title.endswith(".py") else folder
+        (place / title).write_text(text, encoding="utf-8")
     project = tomllib.loads(parts["pyproject.toml"])["project"]
     information = folder / "vibench_mine-0.1.0.dist-info"
     information.mkdir()
@@ -127,17 +126,13 @@ def test_the_plugins_of_the_pages_run_through_a_benchmark(package: Path, vibench
     assert {(cell["status"], cell["reason"]) for cell in cells} == {("ok", "")}
     penalised = [cell for cell in cells if cell["formulation"] == "penalised"]
     assert {cell["problem"] for cell in penalised} == {"cable", "declared-cable", "separable-cable"}
-    assert {(cell["dual"], cell["primal"], cell["solver"], cell["assembly"]) for cell in penalised} == {
-        ("–", "–", "–", "full")
-    }
+    axes = ("dual", "primal", "solver", "assembly")
+    assert {tuple(cell[axis] for axis in axes) for cell in penalised} == {("–", "–", "–", "full")}
     cells = [cell for cell in cells if cell["formulation"] == "mixed"]
     assert len(cells) == 3 * 2 * 4 * 2
-    assert {cell["primal"]: cell["enrichment_kind"] for cell in cells} == {
-        "centre": "fixed",
-        "pivoted": "fixed",
-        "at-every-query": "per-parameter",
-        "unconstrained": "per-parameter",
-    }
+    kinds = dict.fromkeys(("centre", "pivoted"), "fixed")
+    kinds |= dict.fromkeys(("at-every-query", "unconstrained"), "per-parameter")
+    assert {cell["primal"]: cell["enrichment_kind"] for cell in cells} == kinds
     for cell in cells:
         can_be_reduced = cell["problem"] != "cable" and cell["primal"] != "unconstrained"
         assert (cell["fallbacks"] == "") is can_be_reduced, cell

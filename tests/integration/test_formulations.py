@@ -46,13 +46,8 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def test_a_formulation_is_not_repeated_over_axes_that_it_does_not_have() -> None:
-    asked = study(
-        formulation=["mixed", Program, Nearest],
-        assembly=["full", "reduced"],
-        bounds=[True],
-        correction=["none", "auto"],
-    )
-    cells = expand(asked)
+    ways = {"assembly": ["full", "reduced"], "bounds": [True], "correction": ["none", "auto"]}
+    cells = expand(study(formulation=["mixed", Program, Nearest], **ways))
     count = {label: sum(cell.formulation_label == label for cell in cells) for label in ("mixed", "Program", "Nearest")}
     assert count == {"mixed": 2 * 2 * 2 * 2 * 2 * 2, "Program": 2 * 2 * 2 * 2 * 2, "Nearest": 1}
     (nearest,) = (cell for cell in cells if cell.formulation_label == "Nearest")

@@ -230,13 +230,11 @@ def test_edits_beside_numbers_run_nothing(
 
 
 def test_the_number_of_jobs_changes_no_result(vibench: Vibench, tmp_path: Path) -> None:
-    study = wire_study(
-        problem=[{"name": "wire", "label": "long", "options": {"nodes": 40}}],
+    write_study(tmp_path, wire_study(
+        problem=[{"name": "wire", "label": "long", "options": {"nodes": 40}}], solvers=["piqp", "osqp", "gives-up"],
         primal=["online-supremizers", "offline-pga"],
-        solvers=["piqp", "osqp", "gives-up"],
         tolerances=[{"pod": [1e-3], "dual": [1e-2], "primal": {"offline-pga": [0.5]}}],
-    )
-    write_study(tmp_path, study)
+    ))  # fmt: skip
     for jobs in ("1", "2"):
         done = vibench(tmp_path, "run", "study.toml", "--jobs", jobs, "--out", jobs, "--fresh")
         assert done.returncode == 0, done.stderr

@@ -23,11 +23,8 @@ from vibench.stages.offline import ConeStage, PODStage
 from vibench.study.parameter_sets import ParameterSet
 
 BASES: Mapping[str, dict[str, Any]] = {
-    "obstacle": {"resolution": 100},
-    "radial-obstacle": {"resolution": 100},
-    "hertz": {"resolution": 200},
-    "pack": {},
-}
+    "obstacle": {"resolution": 100}, "radial-obstacle": {"resolution": 100}, "hertz": {"resolution": 200}, "pack": {},
+}  # fmt: skip
 SOLVERS = ("piqp", "proxqp", "cvxopt", "osqp")
 QUERIES = 2
 WHOLE = ("status", "N", "R", "enrichment", "queries_ok", "fallbacks")
@@ -77,16 +74,10 @@ def rows(register: Register, tmp_path: Path) -> Rows:
     return lambda base, solver, **transformation: of(base, solver, json.dumps(transformation))
 
 
-transformations = st.fixed_dictionaries(
-    {
-        "length": st.integers(-9, 9),
-        "force": st.integers(-9, 9),
-        "rows": st.sampled_from([0.0, 8.0]),
-        "unknowns": st.sampled_from([0.0, 3.0]),
-        "far": st.sampled_from([0.0, 1e20]),
-        "seed": st.integers(0, 100),
-    }
-)
+transformations = st.fixed_dictionaries({
+    "length": st.integers(-9, 9), "force": st.integers(-9, 9), "rows": st.sampled_from([0.0, 8.0]),
+    "unknowns": st.sampled_from([0.0, 3.0]), "far": st.sampled_from([0.0, 1e20]), "seed": st.integers(0, 100),
+})  # fmt: skip
 
 
 @pytest.mark.parametrize("base", BASES)

@@ -114,14 +114,9 @@ class Patch(AffineProblem):
         self.V, self.W = InnerProduct(fem.h1_gram(self.basis, self.free)), contact.W
         self.full = laplace.assemble(self.basis), contact.B, contact.bound(np.full(len(contact.nodes), -depth))
         stiffness, B, g = self.full
-        self.declare(
-            A=[("tension", stiffness)],
-            f=np.zeros(self.basis.N),
-            B=B,
-            g=g,
-            free=self.free,
-            dirichlet_lift=[("slope", self.edge(MESH.p[0])), ("offset", self.edge(np.ones(self.basis.N)))],
-        )
+        lift = [("slope", self.edge(MESH.p[0])), ("offset", self.edge(np.ones(self.basis.N)))]
+        f = np.zeros(self.basis.N)
+        self.declare(A=[("tension", stiffness)], f=f, B=B, g=g, free=self.free, dirichlet_lift=lift)
 
     def edge(self, values: Array) -> Array:
         return np.where(np.isin(np.arange(self.basis.N), self.free), 0.0, values)
@@ -141,9 +136,8 @@ def test_dirichlet_data_that_depend_on_the_parameter_are_lifted(mu: list[float],
     assert vi.dirichlet_lift is not None
     assert np.allclose(whole + vi.dirichlet_lift, mu[0] * MESH.p[0] + mu[1], atol=1e-13)
     stiffness, B, g = problem.full
-    by_hand = fem.eliminate(
-        VariationalInequality(mu[2] * stiffness, np.zeros(problem.basis.N), B, g), problem.free, vi.dirichlet_lift
-    )
+    full = VariationalInequality(mu[2] * stiffness, np.zeros(problem.basis.N), B, g)
+    by_hand = fem.eliminate(full, problem.free, vi.dirichlet_lift)
     for name in ("f", "g"):
         assert np.allclose(getattr(vi, name), getattr(by_hand, name), rtol=1e-13, atol=1e-14)
     assert abs(vi.A - by_hand.A).max() <= 1e-14
@@ -154,13 +148,10 @@ def test_lifted_problems_pass_the_checks_and_keep_their_constants() -> None:
     check(partial(Patch, depth=0.2))
     problem = Patch()
     stiffness, B, g = problem.full
-    problem.declare(
-        A=stiffness, f=np.ones(problem.basis.N), B=B, g=g, free=problem.free, dirichlet_lift=problem.edge(MESH.p[0])
-    )
+    ones, lift = np.ones(problem.basis.N), problem.edge(MESH.p[0])
+    problem.declare(A=stiffness, f=ones, B=B, g=g, free=problem.free, dirichlet_lift=lift)
     assert problem.constant == {"A", "f", "B", "g"}
-    assert np.allclose(
-        problem.assemble(np.ones(3)).f, (np.ones(problem.basis.N) - stiffness @ problem.edge(MESH.p[0]))[problem.free]
-    )
+    assert np.allclose(problem.assemble(np.ones(3)).f, (ones - stiffness @ lift)[problem.free])
 
 
 def test_contact_of_a_block_is_that_of_scikit_fem_alone() -> None:
