@@ -81,6 +81,14 @@ def everything(path: Path) -> list[Any]:
     return [study_of(found, read_meta(found)), *read]
 
 
+def change(path: Path, *statements: str) -> None:
+    """Change rows behind the back of their digests."""
+    with closing(sqlite3.connect(path)) as db:
+        for statement in statements:
+            db.execute(statement)
+        db.commit()
+
+
 def refusal(path: Path) -> str:
     with pytest.raises(RequestError) as caught:
         everything(path)
@@ -138,11 +146,9 @@ def test_every_number_of_a_results_file_is_watched(results: Path) -> None:
 
 
 def test_commands_refuse_a_damaged_cell_by_its_name(results: Path, main: Main) -> None:
-    with closing(sqlite3.connect(results)) as db:
-        (cell,) = db.execute("SELECT cell FROM cells LIMIT 1").fetchone()
-        db.execute("UPDATE cells SET online_s = online_s * (1 + 1e-15) WHERE cell = ?", (cell,))
-        db.execute("UPDATE queries SET error_u = error_u * (1 + 1e-15) WHERE cell = ?", (cell,))
-        db.commit()
+    cell = rows(results.parent)[0]["cell"]
+    tables = {"cells": "online_s", "queries": "error_u"}
+    change(results, *(f"UPDATE {t} SET {c} = {c} * (1 + 1e-15) WHERE cell = '{cell}'" for t, c in tables.items()))
     folder = str(results.parent)
     line = f"vibench: '{results}' is damaged: rows of the cell {cell} in the table"
     for command in (
@@ -164,31 +170,22 @@ def test_of_the_first_rows_alone_damage_is_noticed_in_their_cells(results: Path,
     with closing(sqlite3.connect(results)) as db:
         order = "problem, dual, primal, primal_tol DESC, solver, pod_tol DESC, dual_tol DESC"
         first, *_, last = [cell for (cell,) in db.execute(f"SELECT cell FROM cells ORDER BY {order}")]
-        db.execute("UPDATE queries SET error_u = error_u * (1 + 1e-15) WHERE cell = ?", (last,))
-        db.commit()
+    change(results, f"UPDATE queries SET error_u = error_u * (1 + 1e-15) WHERE cell = '{last}'")
     shown = ("show", str(results.parent), "--table", "queries", "--limit", "1")
     assert main(*shown)[0] == 0
     code, _, errors = main("show", str(results.parent), last, "--table", "queries", "--limit", "1")
     assert (code, f"rows of the cell {last} in the table 'queries'" in errors) == (2, True)
-    with closing(sqlite3.connect(results)) as db:
-        db.execute("DELETE FROM queries WHERE cell = ? AND query = 1", (first,))
-        db.commit()
+    change(results, f"DELETE FROM queries WHERE cell = '{first}' AND query = 1")
     code, _, errors = main(*shown)
     assert (code, f"rows of the cell {first} in the table 'queries'" in errors) == (2, True)
 
 
-def study(path: Path) -> dict[str, Any]:
-    return study_of(path, read_meta(path))
-
-
 def test_a_resumed_run_computes_damaged_cells_again(made: Path, results: Path, vibench: Callable[..., Any]) -> None:
     shutil.copy(made / "study.toml", results.parent.parent)
-    with closing(sqlite3.connect(results)) as db:
-        first, second = (cell for (cell,) in db.execute("SELECT cell FROM cells ORDER BY cell LIMIT 2"))
-        db.execute("UPDATE queries SET error_u = 0.0 WHERE cell = ?", (first,))
-        db.execute("UPDATE solutions SET x = NULL WHERE cell = ?", (second,))
-        db.execute("UPDATE thresholds SET benefit_threshold = 1.0")  # made anew by every run
-        db.commit()
+    first, second = sorted(row["cell"] for row in rows(results.parent))[:2]
+    change(results, f"UPDATE queries SET error_u = 0.0 WHERE cell = '{first}'")
+    change(results, f"UPDATE solutions SET x = NULL WHERE cell = '{second}'")
+    change(results, "UPDATE thresholds SET benefit_threshold = 1.0")  # made anew by every run
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("VIBENCH_CACHE", str(made / "cache"))
         done = vibench(results.parent.parent, "run", "study.toml", "--jobs", "1", "--out", "run")
@@ -210,7 +207,7 @@ def test_a_damaged_index_is_made_again(made: Path, results: Path) -> None:
     assert damaged != content[page]
     results.write_bytes(content[: page.start] + damaged + content[page.stop :])
     assert everything(results) == everything(made / "out" / FILE)
-    database = ResultsDatabase(results.parent, study(results))
+    database = ResultsDatabase(results.parent, study_of(results, read_meta(results)))
     assert database.damaged == ()
     assert len(database.fine_queries(cell)) == STUDY["validation"]
     database.close()
@@ -220,13 +217,11 @@ def test_a_run_is_not_resumed_where_no_cell_explains_the_damage(results: Path) -
     content = results.read_bytes()
     for table in ("histories", "pictures"):
         results.write_bytes(content)
-        with closing(sqlite3.connect(results)) as db:
-            db.execute(f"DELETE FROM {table} WHERE rowid = 1")
-            db.commit()
+        change(results, f"DELETE FROM {table} WHERE rowid = 1")
         before = rows(results.parent, table)
         said = f"is damaged: rows of the table '{table}' have changed; use another --out"
         with pytest.raises(RequestError, match=said):
-            ResultsDatabase(results.parent, study(results))
+            ResultsDatabase(results.parent, study_of(results, read_meta(results)))
         assert rows(results.parent, table) == before
         assert [path.name for path in results.parent.iterdir()] == [FILE]
 

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import forking
 import pytest
@@ -51,6 +52,12 @@ def run(shared: Supervisor, tmp_path: Path) -> Run:
     return go
 
 
+def values(found: Done | Failed | Unstored) -> list[tuple[int, Any]]:
+    """The number of each item with its process, or with how it failed."""
+    assert isinstance(found, Done)
+    return found.value
+
+
 def test_a_stage_that_goes_well_is_stored_and_reports_its_progress(
     run: Run, shared: Supervisor, tmp_path: Path
 ) -> None:
@@ -81,56 +88,49 @@ def test_the_process_is_kept_from_one_stage_to_the_next(run: Run) -> None:
 @pytest.mark.parametrize("how", ["sleep", "hang"])
 def test_an_item_beyond_its_limit_costs_itself(run: Run, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervisor._JobState, "grace", 0.1)
-    found = run(InItems(("fine", how, "fine", "fine")), query=3.0)
-    assert isinstance(found, Done)
-    assert [number for number, _ in found.value] == [0, 1, 2, 3]
-    assert found.value[1][1] == Failed(Status.TIMEOUT, "stopped after query_seconds = 3 s")
-    assert all(isinstance(process, int) for number, process in found.value if number != 1)
+    found = values(run(InItems(("fine", how, "fine", "fine")), query=3.0))
+    assert [number for number, _ in found] == [0, 1, 2, 3]
+    assert found[1][1] == Failed(Status.TIMEOUT, "stopped after query_seconds = 3 s")
+    assert all(isinstance(process, int) for number, process in found if number != 1)
 
 
 @pytest.mark.usefixtures("new_workers")
 def test_an_item_that_kills_its_process_costs_itself(run: Run) -> None:
-    found = run(InItems(("exit", "fine", "segfault", "fine")))
-    assert isinstance(found, Done)
+    found = values(run(InItems(("exit", "fine", "segfault", "fine"))))
     for number, words in ((0, "exit code 5"), (2, "signal SIGSEGV")):
-        assert found.value[number][1] == Failed(Status.CRASHED, f"the worker process died with {words}")
-    assert found.value[1][1] != found.value[3][1]  # each death takes another process
+        assert found[number][1] == Failed(Status.CRASHED, f"the worker process died with {words}")
+    assert found[1][1] != found[3][1]  # each death takes another process
 
 
 def test_what_an_item_raises_costs_itself_and_a_death_before_its_limit_begins(run: Run) -> None:
-    found = run(InItems(("interrupt", "fine", "fine"), unlimited=("", "exit", "")))
-    assert isinstance(found, Done)
-    assert [isinstance(value, Failed) for _, value in found.value] == [True, True, False]
-    assert found.value[0][1].status is Status.ERROR
-    assert "KeyboardInterrupt" in found.value[0][1].reason
+    found = values(run(InItems(("interrupt", "fine", "fine"), unlimited=("", "exit", ""))))
+    assert [isinstance(value, Failed) for _, value in found] == [True, True, False]
+    assert found[0][1].status is Status.ERROR
+    assert "KeyboardInterrupt" in found[0][1].reason
 
 
 def test_beyond_the_limit_of_the_cell_the_items_done_are_kept(run: Run) -> None:
-    found = run(InItems(("fine", "fine", "sleep", "fine")), query=60.0, cell=4.0)
-    assert isinstance(found, Done)
-    assert [isinstance(value, Failed) for _, value in found.value] == [False, False, True, True]
-    assert found.value[3][1] == Failed(Status.TIMEOUT, "stopped after cell_seconds = 4 s")
+    found = values(run(InItems(("fine", "fine", "sleep", "fine")), query=60.0, cell=4.0))
+    assert [isinstance(value, Failed) for _, value in found] == [False, False, True, True]
+    assert found[3][1] == Failed(Status.TIMEOUT, "stopped after cell_seconds = 4 s")
 
 
 def test_many_quick_items_have_the_limit_of_the_cell_too(run: Run) -> None:
-    found = run(InItems(("moment",) * 400), cell=2.0)
-    assert isinstance(found, Done)
-    lost = [value for _, value in found.value if isinstance(value, Failed)]
+    found = values(run(InItems(("moment",) * 400), cell=2.0))
+    lost = [value for _, value in found if isinstance(value, Failed)]
     assert 300 < len(lost) < 400
     assert set(lost) == {Failed(Status.TIMEOUT, "stopped after cell_seconds = 2 s")}
 
 
 def test_a_death_beyond_the_limit_is_not_the_reason_of_items_never_asked(run: Run) -> None:
-    found = run(InItems(("fine", "sleep", "exit", "fine")), query=600.0, cell=1.0)
-    assert isinstance(found, Done)
-    assert {value.status for _, value in found.value[1:]} == {Status.TIMEOUT}
+    found = values(run(InItems(("fine", "sleep", "exit", "fine")), query=600.0, cell=1.0))
+    assert {value.status for _, value in found[1:]} == {Status.TIMEOUT}
 
 
 def test_a_process_without_memory_is_replaced(run: Run) -> None:
-    found = run(InItems(("fine", "hunger", "fine")))
-    assert isinstance(found, Done)
-    assert found.value[1][1] == Failed(Status.ERROR, "out of memory: the limit is memory_gib = 8")
-    assert found.value[0][1] != found.value[2][1]
+    found = values(run(InItems(("fine", "hunger", "fine"))))
+    assert found[1][1] == Failed(Status.ERROR, "out of memory: the limit is memory_gib = 8")
+    assert found[0][1] != found[2][1]
     starved = run(Whole("hunger"))
     assert isinstance(starved, Failed)
     assert "out of memory" in starved.reason
@@ -152,9 +152,8 @@ def test_what_a_plugin_started_ends_with_its_process(watcher: Supervisor, tmp_pa
 @pytest.mark.usefixtures("new_workers")
 def test_a_daemon_does_not_outlive_a_process_that_dies(run: Run) -> None:
     seconds = unique()
-    found = run(InItems((f"daemon {seconds}", "exit", "fine")))
-    assert isinstance(found, Done)
-    assert [isinstance(value, Failed) for _, value in found.value] == [False, True, False]
+    found = values(run(InItems((f"daemon {seconds}", "exit", "fine"))))
+    assert [isinstance(value, Failed) for _, value in found] == [False, True, False]
     assert not sleepers(seconds)
 
 
@@ -243,9 +242,8 @@ def test_a_whole_stage_that_hangs_or_dies_is_said_so(run: Run) -> None:
 
 def test_a_process_that_forks_answers_once(run: Run) -> None:
     for _ in range(3):
-        found = run(InItems(("fine", "fork", "fine")))
-        assert isinstance(found, Done)
-        assert len({process for _, process in found.value}) == 1
+        found = values(run(InItems(("fine", "fork", "fine"))))
+        assert len({process for _, process in found}) == 1
 
 
 def test_what_cannot_be_stored_is_not_the_fault_of_the_stage(watcher: Supervisor, tmp_path: Path) -> None:
@@ -307,9 +305,8 @@ def test_a_worker_does_not_outlive_its_supervisor(tmp_path: Path) -> None:
 
 def test_an_operation_that_raised_has_no_limit(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervisor._JobState, "grace", 0.1)
-    found = run(InItems(("fine", "interrupt"), at_end=f"linger {tmp_path / 'diary'}"), query=1.0)
-    assert isinstance(found, Done)
-    assert found.value[1][1].status is Status.ERROR
+    found = values(run(InItems(("fine", "interrupt"), at_end=f"linger {tmp_path / 'diary'}"), query=1.0))
+    assert found[1][1].status is Status.ERROR
     assert (tmp_path / "diary").read_text() == "begun\n"  # by one process, none was stopped and replaced
 
 

@@ -1,15 +1,22 @@
-"""A study on the packs of problems gives the numbers of the problems, in full and in reduced assembly."""
+"""Studies on packs give the numbers of problems; packs are found beside the study, moved ones where the user says."""
 
+import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from running import MEASURED, Vibench
-from samples import write_study
+import pytest
+import scipy.sparse as sp
+from packs import MANIFEST, Cable, write_cable, write_manifest
+from running import MEASURED, Main, Shared, Vibench, refused, rows
+from samples import toml, write_study
 
+import vibench as library
 from vibench.results.read import read_table
+from vibench.results.sqlite import FILE
 
-STUDY = {
+PACKED = {
     "name": "packed", "seed": 2022, "validation": 4, "accuracy": 1e-8, "solvers": ["piqp"], "dual": ["mcpg"],
     "primal": ["offline-pga"], "assembly": ["full", "reduced"], "timing_rounds": 1,
     "tolerances": [{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
@@ -41,12 +48,12 @@ def test_a_study_on_packs_gives_the_numbers_of_their_problems(vibench: Vibench, 
     entries = []
     for problem, resolution in RESOLUTION.items():
         option = f"resolution={resolution}"
-        sets = ["--validation", str(STUDY["validation"]), "--seed", str(STUDY["seed"])]
+        sets = ["--validation", str(PACKED["validation"]), "--seed", str(PACKED["seed"])]
         done = vibench(tmp_path, "pack", problem, f"{problem}-pack", "--option", option, *sets)
         assert done.returncode == 0, done.stderr
         entries.append({"name": problem, "label": problem, "options": {"resolution": resolution}})
         entries.append({"name": "pack", "label": f"{problem}-pack", "options": {"path": f"{problem}-pack"}})
-    write_study(tmp_path, STUDY | {"problem": entries})
+    write_study(tmp_path, PACKED | {"problem": entries})
     done = vibench(tmp_path, "run", "study.toml", "--strict", timeout=600.0)
     assert done.returncode == 0, done.stdout + done.stderr
     for problem in RESOLUTION:
@@ -58,3 +65,90 @@ def test_a_study_on_packs_gives_the_numbers_of_their_problems(vibench: Vibench, 
                     np.testing.assert_allclose(found[name], expected[name], rtol=1e-10, atol=1e-10, err_msg=name)
                 elif not isinstance(expected[name].iloc[0], bytes):
                     assert found[name].equals(expected[name]), name
+
+
+STUDY: dict[str, Any] = {
+    "name": "cables", "validation": 2, "solvers": ["piqp"], "dual": ["mcpg"], "primal": ["decorrelated"],
+    "timing_rounds": 1, "problem": [{"name": "pack", "options": {"path": "packs/cable"}}],
+    "tolerances": [{"N": [2], "R": [2]}],
+}  # fmt: skip
+
+
+@pytest.fixture
+def made(main: Main, shared: Shared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a study, its pack and its run, which was started elsewhere, as whatever follows is."""
+
+    def make(folder: Path) -> None:
+        write_cable(folder / "packs" / "cable")
+        (folder / "study.toml").write_text(toml(STUDY))
+        out = ("--out", str(folder / "run"), "--jobs", "1", "--no-figures")
+        code, _, err = main("run", str(folder / "study.toml"), *out)
+        assert (code, err) == (0, "")
+
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    return shutil.copytree(shared("cables", make), tmp_path / "home")
+
+
+def key(folder: Path) -> str:
+    return str(rows(folder / "run")[0]["cell"])
+
+
+def test_what_results_say_of_a_pack_is_its_path_beside_the_study(made: Path, main: Main) -> None:
+    (row,) = rows(made / "run")
+    assert row["problem_options"] == '{"path": "packs/cable"}'
+    assert row["status"] == "ok"
+    code, out, _ = main("run", str(made / "study.toml"), "--dry-run")  # of the copy
+    assert (code, out.split()[0]) == (0, row["cell"])
+
+
+def test_a_pack_that_was_moved_and_renamed_is_where_the_user_says(made: Path, main: Main, tmp_path: Path) -> None:
+    run, at = str(made / "run"), "packs/cable=../new/rope"
+    (tmp_path / "new").mkdir()
+    (made / "packs" / "cable").rename(tmp_path / "new" / "rope")
+    line = refused(main("replay", run, key(made)[:6], "--at", "packs/cable=nowhere"), "there is no such folder")
+    assert "--at packs/cable=PATH" in line
+    refused(main("replay", run, key(made)[:6], "--at", "cable=x"), "no file or folder of the cell is called 'cable'")
+    refused(main("replay", run, key(made)[:6], "--at", "cable"), "expected NAME=PATH")
+    code, out, err = main("replay", run, key(made)[:6], "--at", at, "--out", "program.npz")
+    assert (code, err) == (0, "")
+    assert "piqp (recorded)" in out
+    assert main("export", run, key(made), "model.npz", "--at", at)[0] == 0
+    assert main("export", run, "set", "--at", at)[0] == 0
+    code, _, err = main(
+        "run", f"{run}/{FILE}", "--cell", key(made), "--at", at, "--out", "again", "--jobs", "1", "--no-figures"
+    )
+    assert (code, err) == (0, "")
+    (row,) = rows(Path("again"))
+    assert (row["cell"], row["status"], row["problem_options"]) == (key(made), "ok", '{"path": "packs/cable"}')
+    model = library.open_run(run, at={"packs/cable": "../new/rope"}).model(key(made))
+    assert np.isfinite(model.solve([5.0, 0.2]).u).all()
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_an_edited_pack_is_noticed_wherever_it_is(moved: bool, made: Path, main: Main, tmp_path: Path) -> None:
+    pack, at = made / "packs" / "cable", ["--at", f"packs/cable={made / 'packs' / 'cable'}"]
+    if moved:
+        pack = pack.rename(tmp_path / "rope")
+        at = ["--at", f"packs/cable={pack}"]
+    sp.save_npz(pack / "A.npz", 2.0 * Cable().A)
+    for command in (["replay"], ["export"]):
+        files = ["model.npz"] if command == ["export"] else []
+        refused(main(*command, str(made / "run"), key(made), *files, *at), "from files that were changed since")
+
+
+def test_two_packs_of_one_name_elsewhere_are_refused(main: Main, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_cable(tmp_path / name / "cable")
+    sp.save_npz(tmp_path / "b" / "cable" / "B.npz", 2.0 * Cable().B)
+    write_manifest(tmp_path / "b" / "cable", {name: part for name, part in MANIFEST.items() if name != "solutions"})
+    (tmp_path / "study").mkdir()
+    problems = [{"name": "pack", "options": {"path": f"../{name}/cable"}} for name in ("a", "b")]
+    (tmp_path / "study" / "study.toml").write_text(toml(STUDY | {"problem": problems}))
+    refused(main("run", str(tmp_path / "study" / "study.toml"), "--dry-run"), "files of one name in different folders")
+    (tmp_path / "study.toml").write_text(
+        toml(STUDY | {"problem": [{"name": "pack", "options": {"path": f"{name}/cable"}} for name in ("a", "b")]})
+    )
+    code, out, _ = main("run", str(tmp_path / "study.toml"), "--dry-run")
+    assert (code, out.splitlines()[-1]) == (0, "2 cells")

@@ -1,5 +1,7 @@
 """Degenerate input through the whole chain: nothing to reduce, no contact, contact everywhere, copies, near copies."""
 
+import importlib.metadata
+
 import numpy as np
 import pytest
 from fake_plugins import Wire
@@ -80,21 +82,10 @@ class ShortValidation(Wire):
 
 
 CASES = [member for member in list(vars().values()) if isinstance(member, type) and issubclass(member, Wire)]
-EVERYTHING = [
-    *(("vibench.problems", case.__name__, f"{__name__}:{case.__name__}") for case in CASES),
-    ("vibench.dual_strategies", "cpg", "vibench_strategies.cpg:CPG"),
-    ("vibench.dual_strategies", "mcpg", "vibench_strategies.mcpg:ModifiedCPG"),
-    ("vibench.primal_strategies", "decorrelated", "vibench_strategies.decorrelated:Decorrelated"),
-    ("vibench.primal_strategies", "online-supremizers", "vibench_strategies.online_supremizers:OnlineSupremizers"),
-    ("vibench.primal_strategies", "offline-pga", "vibench_strategies.offline_pga:OfflinePGA"),
-    ("vibench.dual_strategies", "angle-greedy", "vibench_strategies.angle_greedy:AngleGreedy"),
-    ("vibench.dual_strategies", "dictionary", "vibench_strategies.dictionary:Dictionary"),
-    ("vibench.dual_strategies", "enlarged-cpg", "vibench_strategies.enlarged_cpg:EnlargedCPG"),
-    ("vibench.dual_strategies", "nmf", "vibench_strategies.nmf:NonnegativeFactors"),
-    ("vibench.dual_strategies", "orthant", "vibench_strategies.orthant:Orthant"),
-    ("vibench.dual_strategies", "pod-dual", "vibench_strategies.pod_dual:PODDual"),
-    ("vibench.primal_strategies", "infsup-greedy", "vibench_strategies.infsup_greedy:InfSupGreedy"),
-    ("vibench.primal_strategies", "pod-supremizers", "vibench_strategies.pod_supremizers:PODSupremizers"),
+STRATEGIES = [
+    (entry.group, entry.name, entry.value)
+    for entry in importlib.metadata.distribution("vibench").entry_points
+    if entry.group in {"vibench.dual_strategies", "vibench.primal_strategies"}
 ]
 
 
@@ -107,7 +98,8 @@ def store(tmp_path_factory) -> SampleStore:
 @pytest.fixture
 def rows(register, store):
     """Function that runs one cell of a case and returns its rows."""
-    register(*EVERYTHING)
+    problems = (("vibench.problems", case.__name__, f"{__name__}:{case.__name__}") for case in CASES)
+    register(*problems, *STRATEGIES)
 
     def run(case: type[Wire], dual: str, primal: str) -> CellRows:
         problem = Plugin("problem", case.__name__, "{}", find(PluginKind.PROBLEM, case.__name__).code)

@@ -156,14 +156,16 @@ def test_the_penalty_converges_linearly_in_epsilon_and_from_outside() -> None:
 def test_the_penalty_starts_at_its_epsilon_and_continues_only_where_full_steps_run_in_circles() -> None:
     for seed, n, m, circles in ((4, 6, 9, False), (9, 3, 6, True), (19, 6, 9, True)):
         whitened = Whitened.of(program(seed, n, m))
-        z, nu, steps, converged = penalised(whitened, 1e-6, 0.1)
-        assert converged
-        assert (steps > 6) == circles
-        assert (penalised(whitened, 1e-6, 0.5)[2] > steps) == circles
-        # the minimiser of a strictly convex function has this gradient, however it was found
-        excess = np.maximum(whitened.Y @ z - whitened.g, 0.0)
-        assert np.allclose(z + whitened.Y.T @ excess / 1e-6, 0.0, atol=1e-9)
-        assert np.allclose(nu, excess / 1e-6, atol=1e-8)
+        taken = []
+        for reduction in (0.1, 0.5, 1e-6):
+            z, nu, steps, converged = penalised(whitened, 1e-6, reduction)
+            assert converged
+            taken.append(steps)
+            # the minimiser of a strictly convex function has this gradient, however it was found
+            excess = np.maximum(whitened.Y @ z - whitened.g, 0.0)
+            assert np.allclose(z + whitened.Y.T @ excess / 1e-6, 0.0, atol=1e-9)
+            assert np.allclose(nu, excess / 1e-6, atol=1e-8)
+        assert (taken[0] > 6) == (taken[1] > taken[0]) == circles
 
 
 def test_parts_of_rows_are_exact_after_choices_and_drops_of_nearly_dependent_ones() -> None:
@@ -185,16 +187,6 @@ def test_parts_of_rows_are_exact_after_choices_and_drops_of_nearly_dependent_one
     assert len(chosen.rows) == 6
     assert chosen.drop(5) == 7
     assert chosen.rows == [0, 1, 3, 6, 4]
-
-
-@pytest.mark.parametrize("reduction", [1e-6, 0.5])
-def test_neither_start_nor_path_of_the_penalty_matters(reduction: float) -> None:
-    whitened = Whitened.of(program(5, n=20, m=60))
-    z, nu, _, converged = penalised(whitened, 1e-6, reduction)
-    direct = penalised(whitened, 1e-6, 0.1)
-    assert converged
-    assert np.allclose(z, direct[0], atol=1e-9)
-    assert np.allclose(nu, direct[1], atol=1e-7)
 
 
 @pytest.mark.parametrize("seed", range(3))

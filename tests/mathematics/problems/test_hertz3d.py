@@ -43,9 +43,6 @@ def excess(cells: int, mu: np.ndarray, **options: str) -> float:
     return problem(cells, **options).force(solved(cells, mu, **options).lam) / problem(cells).theory(mu).force - 1.0
 
 
-# --- the closed form ---
-
-
 def test_round_paraboloids_have_hertz_circular_contact() -> None:
     found = elliptic_contact(2.0, 2.0, 0.003, 5.0)
     a = np.sqrt(2.0 * 0.003)
@@ -76,9 +73,6 @@ def test_the_pressure_pushes_the_surface_onto_the_paraboloid(radii: tuple[float,
     x, y = x * contact.a, y * contact.b
     depth = approach - x**2 / (2.0 * radii[0]) - y**2 / (2.0 * radii[1])
     assert settled(contact, modulus, x, y) == pytest.approx(depth, abs=1e-9 * approach)
-
-
-# --- the far field ---
 
 
 def boussinesq(points: np.ndarray, poisson: float) -> tuple[np.ndarray, np.ndarray]:
@@ -131,9 +125,6 @@ def test_energies_outside_are_the_work_on_the_sides_and_the_force_is_that_of_the
     assert energy == pytest.approx(work, rel=1e-6)
 
 
-# --- the mesh and the forms ---
-
-
 def test_the_block_is_filled_and_its_zone_and_sides_are_covered() -> None:
     block = graded_block(4, 5, 0.5, 3.0)
     assert block.mesh.t.shape[1] == 4**3 + 5 * 3 * 4**2
@@ -160,9 +151,6 @@ def test_forms_by_components_are_those_of_displacements() -> None:
     for form, density in expected.items():
         value = sum(v[j] @ form(products, i, j) @ u[i] for i in AXES for j in AXES)
         assert value == pytest.approx(np.sum(density * basis.dx), rel=1e-12)
-
-
-# --- the solution ---
 
 
 @pytest.mark.parametrize("mu", MUS, ids=str)

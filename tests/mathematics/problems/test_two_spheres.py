@@ -28,9 +28,6 @@ def spheres(cells: int, extent: float) -> tuple[TwoSpheres, HighFidelitySolver]:
     return one, HighFidelitySolver(one)
 
 
-# --- grids that do not match ---
-
-
 @settings(max_examples=50)
 @given(
     st.lists(st.floats(0.05, 1.0), min_size=1, max_size=6),
@@ -111,9 +108,6 @@ def test_loads_of_given_pressures_are_those_of_the_assembled_condition() -> None
         assert bound == pytest.approx(eta.T @ contact.g, abs=1e-15)
 
 
-# --- the mesh and the forms ---
-
-
 @pytest.mark.parametrize("width", [0.02, 0.4])
 def test_the_mesh_fills_a_quarter_of_the_hemisphere(width: float) -> None:
     shape = hemisphere(4, 3, width)
@@ -156,9 +150,6 @@ def test_the_exported_mesh_has_both_bodies_the_right_way_round() -> None:
     assert (fields.points[:, 2].min(), fields.points[:, 2].max()) == (-1.0, pytest.approx(1.2))
     moved = fields.at_points["u [m]"][fields.points[:, 2] == 1.2]
     assert moved[:, 2] == pytest.approx(-0.07)
-
-
-# --- the solution ---
 
 
 @pytest.mark.parametrize(("radius", "poisson"), [(1.0, 0.3), (0.8, 0.4), (1.25, 0.2)])
@@ -237,9 +228,6 @@ def test_the_published_case_is_that_of_axisymmetric_elements() -> None:
 def test_contact_beyond_the_zone_is_refused() -> None:
     with pytest.raises(NumericalError, match="reaches the end of the potential contact zone"):
         spheres(4, 0.2)[1].solve(np.array([1.25, 0.15, 0.3]))
-
-
-# --- the option of the plugin ---
 
 
 def test_the_plugin_has_both_obstacles_and_refuses_options_of_the_other() -> None:
