@@ -69,7 +69,7 @@ def cost(cells: int, folder: Path) -> tuple[float, float]:
 
 
 def seconds_of(*arguments: str) -> float:
-    """CPU seconds of a command of vibench."""
+    """CPU seconds of a command of vibench and of its processes."""
     before = os.times()
     subprocess.run([str(Path(sysconfig.get_path("scripts")) / "vibench"), *arguments], check=True, capture_output=True)
     after = os.times()

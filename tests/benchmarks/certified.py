@@ -43,28 +43,18 @@ EVERY = 10
 
 @dataclass
 class Tally:
-    """What the queries of one certified model gave so far.
-
-    Attributes
-    ----------
-    row, model, certificate
-        Of the cell.
-    parameters, violations, without
-        All parameters, those with an error above its bound, and those without a bound.
-    effectivities, seconds
-        Of u and λ by parameter, and of the query, its certificate, and that with the correction, by timed parameter.
-    gains
-        Errors of λ in W over those of the pairs corrected at online and at high-fidelity cost, and whether ω > ρ.
-    """
+    """Results of the queries of one certified model so far."""
 
     row: Mapping[str, Any]
     model: Model
     certificate: OnlineCertificate
     parameters: int = 0
-    violations: int = 0
-    without: int = 0
+    violations: int = 0  # parameters with an error above its bound
+    without: int = 0  # parameters without a bound
+    # of u and λ by parameter; seconds of the query, its certificate, and that with the correction, by timed parameter
     effectivities: list[tuple[float, float]] = field(default_factory=list)
     seconds: list[tuple[float, float, float]] = field(default_factory=list)
+    # errors of λ in W over those of the pairs corrected at online and at high-fidelity cost, and whether ω > ρ
     gains: dict[str, list[tuple[float, bool]]] = field(default_factory=lambda: {"online": [], "in full": []})
 
     def answers(self, mu: Array) -> Iterator[tuple[str, Answer]]:

@@ -31,20 +31,10 @@ CONE_ACCURACY = 1e-12
 def quadratic_program(
     P: Array | SparseMatrix, q: Array, G: Array | SparseMatrix, h: Array, accuracy: float
 ) -> tuple[Array, Array]:
-    """min ½ xᵀP x + qᵀx subject to G x ≤ h by cvxopt.solvers.qp.
+    """The minimiser x (n,) of ½ xᵀP x + qᵀx subject to G x ≤ h, and multipliers (m,), by cvxopt: its last iterate.
 
-    Parameters
-    ----------
-    P, q, G, h
-        Data (n×n), (n,), (m×n), (m,); matrices dense or sparse.
-    accuracy
-        Of the gap and the residuals, relative as cvxopt defines them. An absolute gap is accepted that is far smaller:
-        the values of these programs are small themselves.
-
-    Returns
-    -------
-    tuple
-        x (n,) and multipliers (m,); the last iterate where cvxopt does not get so far.
+    The accuracy is that of the gap and the residuals, relative as cvxopt defines them. An absolute gap is accepted that
+    is far smaller: the values of these programs are small themselves.
     """
     options = {"show_progress": False, "abstol": 1e-3 * accuracy, "reltol": accuracy, "feastol": accuracy}
     found = cvxopt.solvers.qp(_matrix(P), _matrix(q), _matrix(G), _matrix(h), options=options)
@@ -96,15 +86,9 @@ def _polished(vi: VariationalInequality, active: Mask, tries: int = 10) -> tuple
 
 
 def pod(U: Array, X: SparseMatrix, stop: Stop) -> Array:
-    """POD basis of V_N (n×N) by the method of snapshots: eigenvalues of UᵀX_V U, (10) and (11).
+    """POD basis of V_N (n×N) by the method of snapshots U (n×P): eigenvalues of UᵀX_V U, (10) and (11).
 
-    Parameters
-    ----------
-    U, X
-        Snapshots u(mu_p) (n×P), and X_V (n×n).
-    stop
-        Relative tail, or number of modes. The tail floors at 1e-8; modes with small eigenvalues are not orthogonal to
-        round-off and are made so.
+    The tail floors at 1e-8; modes with small eigenvalues are not orthogonal to round-off and are made so.
     """
     values, vectors = np.linalg.eigh(U.T @ (X @ U))
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
@@ -225,18 +209,8 @@ def supremizers(factor: SuperLU, B: SparseMatrix, chi: Array) -> Array:
 def pga(problem: Problem, basis: Array, chi: Array, delta: float, kept: bool = False) -> Array:
     """S^red (n×S), orthonormal and orthogonal to V_N: Algorithm 1, σ_S(mu) for every training mu at every step.
 
-    As printed, every step applies I − Π_{V_N+S} to every S_R(mu).
-
-    Parameters
-    ----------
-    problem
-        The problem; D_train is its training set.
-    basis, chi
-        Orthonormal basis of V_N (n×N), and generators (m×R).
-    delta
-        Largest σ_S(mu) accepted, (27).
-    kept
-        Keep what V_N + S leaves of every S_R(mu) and take only the new vector out of it: less work than printed.
+    As printed, every step applies I − Π_{V_N+S} to every S_R(mu), until no σ_S(mu) is above δ, (27). With `kept` it
+    keeps what V_N + S leaves of every S_R(mu) and takes only the new vector out of it: less work than printed.
     """
     X, factor = sp.csr_array(problem.V.matrix), factorise(problem.V.matrix)
     matrices = (problem.assemble(mu).B for mu in problem.training_set())

@@ -8,17 +8,15 @@ largest process. The command ends with exit code 1 if the report of 704 cells ta
 megabytes, or two seconds to open, or if one of the pages does not open.
 """
 
-import os
 import resource
-import subprocess
 import sys
-import sysconfig
 import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 
 from browsing import chromium, complaints, look
+from cells import seconds_of
 from many_cells import write_many
 
 from vibench.results.sqlite import FILE
@@ -37,10 +35,8 @@ return [entry.loadEventEnd / 1e3, document.querySelectorAll('[data-table="summar
 
 def command(*arguments: str) -> tuple[float, float]:
     """Wall seconds of a vibench command, and CPU seconds of its processes."""
-    start, before = time.perf_counter(), os.times()
-    subprocess.run([str(Path(sysconfig.get_path("scripts")) / "vibench"), *arguments], check=True, capture_output=True)
-    after = os.times()
-    used = after.children_user + after.children_system - before.children_user - before.children_system
+    start = time.perf_counter()
+    used = seconds_of(*arguments)
     return time.perf_counter() - start, used
 
 

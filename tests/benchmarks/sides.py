@@ -30,29 +30,17 @@ TOTAL_NAME = "offline total: " + ", ".join(TOTAL)
 
 @dataclass(frozen=True)
 class Case:
-    """One pair of reduced spaces of the paper.
-
-    Attributes
-    ----------
-    problem
-        Class of the problem.
-    pod, cone, pga
-        Where V_N and the cones stop, and δ_PGA.
-    queries
-        Number of validation parameters.
-    ties
-        Share by which numbers of supremizers may differ. Where B(mu) varies, many σ equal 1 at first, and which of the
-        vectors that belong to them is added depends on the basis of S_R(mu).
-    paper
-        Seconds of the paper's own tables, on its authors' machine: offline, and of queries online and offline.
-    """
+    """One pair of reduced spaces of the paper: where V_N and the cones stop, δ_PGA, and the number of queries."""
 
     problem: type[Problem]
     pod: Stop
     cone: Stop
     pga: float
     queries: int
+    # seconds of the paper's own tables, on its authors' machine: offline, and of queries online and offline
     paper: tuple[float, float, float]
+    # Relative difference of numbers of supremizers. Where B(mu) varies, many σ equal 1 at first, and which of the
+    # vectors that belong to them is added depends on the basis of S_R(mu).
     ties: float = 0.0
 
 
@@ -64,25 +52,16 @@ CASES: Mapping[str, Case] = {
 
 
 class Side:
-    """What one side has made so far, and how it goes on.
-
-    Attributes
-    ----------
-    u, lam
-        Snapshots (n×P), (m×P).
-    basis, plain, chi, space
-        V_N (n×N), generators of CPG and of mCPG (m×R), V_N + S^red (n×N').
-    """
+    """What one side has made so far: snapshots u (n×P) and λ (m×P), V_N (n×N), generators of both greedies (m×R), …"""
 
     u: Array
     lam: Array
     basis: Array
-    plain: Array
-    chi: Array
-    space: Array
+    plain: Array  # of CPG
+    chi: Array  # of mCPG
+    space: Array  # V_N + S^red (n×N')
 
     def __init__(self, problem: Problem, case: Case, solver: str, accuracy: float) -> None:
-        """`solver` is that of our queries, `accuracy` that of all."""
         self.problem, self.case, self.solver, self.accuracy = problem, case, solver, accuracy
 
     def do(self, stage: str, *given: Array) -> Any:

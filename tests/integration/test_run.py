@@ -117,15 +117,6 @@ def test_an_edited_plugin_is_run_again(vibench: Vibench, again: Path, plugins_fo
     assert [row["status"] for row in after] == ["ok"] * 3
 
 
-def test_a_solver_that_leaves_takes_only_its_cell_along(vibench: Vibench, tmp_path: Path) -> None:
-    """`sys.exit` in a plugin ends neither the run nor the other cells."""
-    done = vibench(tmp_path, "run", write_study(tmp_path, wire_study(solvers=["leaves", "piqp"])), "--jobs", "1")
-    assert done.returncode == 0
-    found = by_solver(tmp_path / "runs" / "wire")
-    assert {solver: row["status"] for solver, row in found.items()} == {"leaves": "error", "piqp": "ok"}
-    assert "SystemExit" in found["leaves"]["reason"]
-
-
 def test_too_little_memory_is_a_reason(vibench: Vibench, tmp_path: Path) -> None:
     """Less than a worker needs to come to life; numerical libraries may then wait until their time is over."""
     study = wire_study(limits={"memory_gib": 0.05, "cell_seconds": 5.0})

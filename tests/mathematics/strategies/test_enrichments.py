@@ -121,7 +121,7 @@ def assert_pga_keeps_its_promise(data: Offline, delta: float) -> None:
 
 
 @pytest.mark.parametrize("delta", [0.95, 0.5, 1e-3])
-@BOTH
+@pytest.mark.parametrize("setting", ["varying", "obstacle", "hertz"])
 def test_pga_keeps_its_promise_at_every_training_parameter(request, setting: str, delta: float) -> None:
     assert_pga_keeps_its_promise(request.getfixturevalue(setting), delta)
 
@@ -263,6 +263,7 @@ def test_lazy_and_plain_choose_the_same_vectors_and_lazy_looks_less_often(
         found.append(strategy.build(hertz, tolerance))
     assert np.allclose(found[0].vectors, found[1].vectors, atol=1e-8)
     assert np.allclose(found[0].history[measure], found[1].history[measure], atol=1e-9)
+    assert found[0].vectors.shape[1] > hertz.span.shape[1]  # one parameter's supremizers are not enough
     if measure == "sigma":
         assert made[Plain] == 81 * len(found[1].history["sigma"])
     assert made[LazyMaximum] <= 0.45 * made[Plain]
