@@ -173,6 +173,14 @@ def exact_decimal(vi: VariationalInequality, guess: np.ndarray) -> tuple[Any, An
     return ExactProgram(vi).solve(guess)
 
 
+def relative_errors(vi: VariationalInequality, u: np.ndarray, lam: np.ndarray) -> tuple[float, float]:
+    """Errors of u (n,) in the energy norm and of λ (m,) in the natural norm, relative to the solution of `vi`."""
+    program = ExactProgram(vi)
+    exact = program.solve(lam > 0.0)
+    errors, sizes = program.errors(exact, u, lam), program.errors(exact, 0.0 * u, 0.0 * lam)
+    return errors[0] / sizes[0], errors[1] / max(sizes[1], np.finfo(float).tiny)
+
+
 def difference(exact: Any, approximate: np.ndarray) -> np.ndarray:
     with localcontext() as context:
         context.prec = DIGITS

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import scipy.sparse as sp
@@ -55,15 +55,23 @@ class UnevenWire(Wire):
         return lambda mu: {"f": self.assemble(mu).f[wanted["f"][0]]}
 
 
-class Raises(Wire):
-    def assemble(self, mu: Array) -> VariationalInequality:
-        raise ArithmeticError("the wire\nsnapped")
-
-
-def _changed(name: str, change: Callable[[VariationalInequality], VariationalInequality]) -> type[Wire]:
+def _changed(name: str, change: Callable[[VariationalInequality], Any]) -> type[Wire]:
     return type(name, (Wire,), {"__module__": __name__, "assemble": lambda self, mu: change(Wire.assemble(self, mu))})
 
 
+def throw(error: BaseException) -> Any:
+    raise error
+
+
+def segfault() -> Any:
+    print("the last words")
+    ctypes.string_at(0)
+
+
+Raises = _changed("Raises", lambda vi: throw(ArithmeticError("the wire\nsnapped")))
+Sleeps = _changed("Sleeps", lambda vi: time.sleep(3600))
+Exits = _changed("Exits", lambda vi: os._exit(3))
+Segfaults = _changed("Segfaults", lambda vi: segfault())
 NotANumber = _changed("NotANumber", lambda vi: replace(vi, f=vi.f * np.nan))
 WrongShape = _changed("WrongShape", lambda vi: replace(vi, g=vi.g[:-1]))
 Indefinite = _changed("Indefinite", lambda vi: replace(vi, A=-vi.A))
@@ -78,23 +86,6 @@ class Hungry(Wire):
     def __init__(self) -> None:
         super().__init__()
         self.meal = np.ones(2**36)
-
-
-class Sleeps(Wire):
-    def assemble(self, mu: Array) -> VariationalInequality:
-        time.sleep(3600)
-        return super().assemble(mu)
-
-
-class Exits(Wire):
-    def assemble(self, mu: Array) -> VariationalInequality:
-        os._exit(3)
-
-
-class Segfaults(Wire):
-    def assemble(self, mu: Array) -> VariationalInequality:
-        segfault()
-        return super().assemble(mu)
 
 
 Infeasible = _changed(
@@ -121,11 +112,6 @@ class Chatty(Wire):
             self.forked = True
             os.fork()  # two go on from here
         return super().assemble(mu)
-
-
-def segfault() -> None:
-    print("the last words")
-    ctypes.string_at(0)
 
 
 class BadCone(DualStrategy):
@@ -161,26 +147,16 @@ def flat_supply(V: InnerProduct, vi: VariationalInequality, span: Array) -> Arra
     return np.ones(V.dim)
 
 
-class NeedyCone(DualStrategy):
-    requires = ("no-such-distribution",)
-
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        raise ImportError("no-such-distribution")
+def _reducing(name: str, act: Callable[[], Any], **members: Any) -> type[DualStrategy]:
+    return type(name, (DualStrategy,), {"__module__": __name__, "reduce": lambda *_: act(), **members})
 
 
-class RaisingCone(DualStrategy):
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        raise LookupError("no generator found")
-
-
-class ExitingCone(DualStrategy):
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        os._exit(3)
-
-
-class InterruptingCone(DualStrategy):
-    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        raise KeyboardInterrupt
+RaisingCone = _reducing("RaisingCone", lambda: throw(LookupError("no generator found")))
+ExitingCone = _reducing("ExitingCone", lambda: os._exit(3))
+InterruptingCone = _reducing("InterruptingCone", lambda: throw(KeyboardInterrupt()))
+NeedyCone = _reducing(
+    "NeedyCone", lambda: throw(ImportError("no-such-distribution")), requires=("no-such-distribution",)
+)
 
 
 class WaitingCone(DualStrategy):

@@ -59,6 +59,12 @@ class Tied(Varying):
         return VariationalInequality(vi.A, vi.f, B, g)
 
 
+def doubled_areas(points: Array, triangles: Array) -> Array:
+    """Signed areas of triangles, doubled."""
+    a, b, c = (points[:, corner] for corner in triangles)
+    return np.asarray((b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0])
+
+
 def fitted_rate(widths: Sequence[float], errors: Sequence[float]) -> float:
     """Slope of the errors over the mesh widths, both logarithmic."""
     return float(np.polyfit(np.log(widths), np.log(errors), 1)[0])

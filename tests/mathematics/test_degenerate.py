@@ -21,59 +21,31 @@ from vibench.stages.offline import ConeStage, PODStage
 from vibench.study.parameter_sets import ParameterSet
 
 
-class NoContact(Wire):
-    def __init__(self) -> None:
-        super().__init__(depth=10.0)
+def at_depth(name: str, depth: float) -> type[Wire]:
+    return type(name, (Wire,), {"__module__": __name__, "__init__": lambda self: Wire.__init__(self, depth=depth)})
 
 
-class AllInContact(Wire):
-    """The support pushes the whole wire up."""
-
-    def __init__(self) -> None:
-        super().__init__(depth=-0.1)
+def trained_at(name: str, mus: object) -> type[Wire]:
+    return type(name, (Wire,), {"__module__": __name__, "training_set": lambda self: np.array(mus, float)})
 
 
-class Resting(Wire):
-    """The wire lies on its support from the beginning: u = 0 and all energies with it, λ the load."""
-
-    def __init__(self) -> None:
-        super().__init__(depth=0.0)
+NoContact = at_depth("NoContact", 10.0)
+# The support pushes the whole wire up.
+AllInContact = at_depth("AllInContact", -0.1)
+# The wire lies on its support from the beginning: u = 0 and all energies with it, λ the load.
+Resting = at_depth("Resting", 0.0)
+OneSnapshot = trained_at("OneSnapshot", [[6.0]])
+Copies = trained_at("Copies", [[7.0], [5.0], [7.0], [5.0], [5.0]])
+NearlyParallel = trained_at("NearlyParallel", 6.0 * (1.0 + 1e-11 * np.arange(6.0))[:, None])
+NoSnapshot = trained_at("NoSnapshot", np.zeros((0, 1)))
+FlatSnapshots = trained_at("FlatSnapshots", [5.0, 6.0, 7.0])
+LostSnapshot = trained_at("LostSnapshot", [[5.0], [np.nan]])
 
 
 class NoLoad(Wire):
     def assemble(self, mu: Array) -> VariationalInequality:
         vi = super().assemble(mu)
         return VariationalInequality(vi.A, 0.0 * vi.f, vi.B, vi.g)
-
-
-class OneSnapshot(Wire):
-    def training_set(self) -> Array:
-        return np.array([[6.0]])
-
-
-class Copies(Wire):
-    def training_set(self) -> Array:
-        return np.array([[7.0], [5.0], [7.0], [5.0], [5.0]])
-
-
-class NearlyParallel(Wire):
-    def training_set(self) -> Array:
-        return 6.0 * (1.0 + 1e-11 * np.arange(6.0))[:, None]
-
-
-class NoSnapshot(Wire):
-    def training_set(self) -> Array:
-        return np.zeros((0, 1))
-
-
-class FlatSnapshots(Wire):
-    def training_set(self) -> Array:
-        return np.array([5.0, 6.0, 7.0])
-
-
-class LostSnapshot(Wire):
-    def training_set(self) -> Array:
-        return np.array([[5.0], [np.nan]])
 
 
 class ShortValidation(Wire):

@@ -132,11 +132,9 @@ def test_processes_are_those_of_scikit_learn_and_multipliers_are_projected_on_th
     from sklearn.gaussian_process import GaussianProcessRegressor  # noqa: PLC0415
     from sklearn.gaussian_process.kernels import ConstantKernel, Matern  # noqa: PLC0415
 
-    problem, basis, W = STRING.problem, STRING.pod.basis, STRING.problem.W
-    fitted = processes
-    of, places = fitted.built["u"], fitted.built["places"]
+    problem, basis, W, fitted = STRING.problem, STRING.pod.basis, STRING.problem.W, processes
+    of, places, variance = (fitted.built[name] for name in ("u", "places", "left_out"))
     found, place = fitted.solve(MU), problem.parameters.to_unit(MU)
-    variance = fitted.built["left_out"]
     for k, values in enumerate(problem.V.gram(basis, STRING.snapshots.u)):
         kernel = ConstantKernel(of["variances"][k]) * Matern(of["lengths"][k], nu=2.5)
         process = GaussianProcessRegressor(kernel, alpha=1e-8, optimizer=None, normalize_y=True).fit(places, values)
@@ -152,18 +150,21 @@ def test_processes_are_those_of_scikit_learn_and_multipliers_are_projected_on_th
     assert np.abs(slope[alpha > 0.0]).max() <= 1e-8 * W.norm(predicted)
 
 
-def test_regression_interpolates_the_snapshots_and_its_uncertainty_has_the_size_of_the_error(processes: Model) -> None:
-    problem, V, W = STRING.problem, STRING.problem.V, STRING.problem.W
-    fitted = processes
+def assert_interpolates(fitted: Model) -> None:
+    V, W, known = STRING.problem.V, STRING.problem.W, STRING.snapshots
     for k in (0, 7):
-        known = STRING.snapshots.u[:, k], STRING.snapshots.lam[:, k]
-        found = fitted.solve(STRING.snapshots.mu[k])
-        assert V.norm(found.u - known[0]) <= 1e-3 * V.norm(known[0])
-        assert W.norm(found.lam - known[1]) <= 1e-2 * W.norm(known[1])
+        found = fitted.solve(known.mu[k])
+        assert V.norm(found.u - known.u[:, k]) <= 1e-3 * V.norm(known.u[:, k])
+        assert W.norm(found.lam - known.lam[:, k]) <= 1e-2 * W.norm(known.lam[:, k])
         assert found.lam.min() >= 0.0
-    ratios = []
+        assert (found.uncertainty is None) == (fitted.formulation.kind == "radial")
+
+
+def test_regression_interpolates_the_snapshots_and_its_uncertainty_has_the_size_of_the_error(processes: Model) -> None:
+    problem, V, ratios = STRING.problem, STRING.problem.V, []
+    assert_interpolates(processes)
     for mu in problem.validation_set(12, 0):
-        found, exact = fitted.solve(mu), vibench.solve_high_fidelity(problem.assemble(mu))
+        found, exact = processes.solve(mu), vibench.solve_high_fidelity(problem.assemble(mu))
         assert found.uncertainty is not None
         ratios.append(V.norm(found.u - exact.u) / found.uncertainty)
         assert V.norm(found.u - exact.u) <= found.error_bounds.u  # the proved bound knows nothing of the regression
@@ -172,15 +173,8 @@ def test_regression_interpolates_the_snapshots_and_its_uncertainty_has_the_size_
 
 def test_radial_basis_functions_interpolate_the_snapshots_and_reproduce_what_is_linear() -> None:
     pytest.importorskip("sklearn")  # which the formulation requires
-    problem, V = STRING.problem, STRING.problem.V
-    fitted = STRING.with_formulation(Regression("radial")).model
-    known = STRING.snapshots
-    for k in (0, 7):
-        found = fitted.solve(known.mu[k])
-        assert V.norm(found.u - known.u[:, k]) <= 1e-3 * V.norm(known.u[:, k])
-        assert problem.W.norm(found.lam - known.lam[:, k]) <= 1e-2 * problem.W.norm(known.lam[:, k])
-        assert found.lam.min() >= 0.0
-        assert found.uncertainty is None
+    V, known = STRING.problem.V, STRING.snapshots
+    assert_interpolates(STRING.with_formulation(Regression("radial")).model)
     # snapshots that are linear in the parameter, which few basis functions fit exactly
     first, slope = known.u[:, 0], known.u[:, -1] - known.u[:, 0]
     linear = Snapshots(known.mu, first[:, None] + slope[:, None] * known.mu.T, known.lam)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+import scipy.linalg
 from numerics import exact, fitted_rate, spd
 
 from vibench import Array, NumericalError, VariationalInequality
@@ -18,25 +19,16 @@ Solved = tuple[Array, Array]
 def program(seed: int, n: int = 6, m: int = 9, ahead: float = 0.4) -> VariationalInequality:
     """A random program that 0 satisfies strictly, with more constraints than unknowns."""
     rng = np.random.default_rng(seed)
-    return VariationalInequality(
-        spd(n, rng, 100.0), rng.standard_normal(n), rng.standard_normal((m, n)), ahead * rng.random(m) * 0.1
-    )
+    A, f, B = spd(n, rng, 100.0), rng.standard_normal(n), rng.standard_normal((m, n))
+    return VariationalInequality(A, f, B, ahead * rng.random(m) * 0.1)
 
 
-def by_penalty(of: Whitened) -> Solved:
-    return penalised(of, 1e-11, 0.1)[:2]
-
-
-def by_proximal_points(of: Whitened) -> Solved:
-    return latent_proximal(of, 1e-11, 1.0, 2.0)[:2]
-
-
-def by_greedy(of: Whitened) -> Solved:
-    return greedy_active_set(of, 1e-13, None)[:2]
-
-
-WAYS: list[Callable[[Whitened], Solved]] = [by_penalty, by_proximal_points, by_greedy]
-EACH = pytest.mark.parametrize("solve", WAYS)
+WAYS: dict[str, Callable[[Whitened], Solved]] = {
+    "penalty": lambda of: penalised(of, 1e-11, 0.1)[:2],
+    "proximal points": lambda of: latent_proximal(of, 1e-11, 1.0, 2.0)[:2],
+    "greedy": lambda of: greedy_active_set(of, 1e-13, None)[:2],
+}
+EACH = pytest.mark.parametrize("solve", WAYS.values(), ids=WAYS)
 
 
 @EACH
@@ -58,12 +50,8 @@ def test_all_agree_with_the_mixed_formulation(solve: Callable[[Whitened], Solved
 )
 def test_a_load_beside_the_contact_hides_no_error(solve: Callable[[Whitened], Solved], fraction: float) -> None:
     vi = program(2)
-    beside = VariationalInequality(
-        np.block([[vi.A, np.zeros((6, 1))], [np.zeros((1, 6)), np.eye(1)]]),
-        np.append(vi.f, np.linalg.norm(vi.f) / fraction),
-        np.column_stack([vi.B, np.zeros(9)]),
-        vi.g,
-    )
+    A, f = scipy.linalg.block_diag(vi.A, 1.0), np.append(vi.f, np.linalg.norm(vi.f) / fraction)
+    beside = VariationalInequality(A, f, np.column_stack([vi.B, np.zeros(9)]), vi.g)
     alone, loaded = ((of := Whitened.of(each)).back(*solve(of)) for each in (vi, beside))
     _, multipliers = exact(vi)
     # √(2 · 1e-8) of the force, times what the greedy and the proximal points leave of it
@@ -77,12 +65,8 @@ def test_no_unit_plays_a_part(solve: Callable[[Whitened], Solved]) -> None:
     known = (whitened := Whitened.of(vi)).back(*solve(whitened))
     unknowns, rows = 10.0 ** rng.integers(-6, 7, 6), 10.0 ** rng.integers(-6, 7, 9)
     length, force = 1e-7, 1e5
-    scaled = VariationalInequality(
-        vi.A * np.outer(unknowns, unknowns) * (force / length),
-        vi.f * unknowns * force,
-        vi.B * np.outer(rows, unknowns),
-        vi.g * rows * length,
-    )
+    A, B = vi.A * np.outer(unknowns, unknowns) * (force / length), vi.B * np.outer(rows, unknowns)
+    scaled = VariationalInequality(A, vi.f * unknowns * force, B, vi.g * rows * length)
     x, alpha = (whitened := Whitened.of(scaled)).back(*solve(whitened))
     assert np.allclose(x * unknowns / length, known[0], rtol=1e-6, atol=1e-7)
     assert np.allclose(alpha * rows / force, known[1], rtol=1e-6, atol=1e-7)
@@ -228,4 +212,4 @@ def test_the_greedy_names_an_infeasible_program() -> None:
     vi = program(0)
     B, g = np.vstack([vi.B, -vi.B[:1]]), np.append(vi.g, -vi.g[0] - 1.0)
     with pytest.raises(NumericalError, match="no coefficients satisfy all constraints"):
-        by_greedy(Whitened.of(VariationalInequality(vi.A, vi.f, B, g)))
+        WAYS["greedy"](Whitened.of(VariationalInequality(vi.A, vi.f, B, g)))
