@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from forking import forked
-from running import PATIENCE, Main, Vibench, read_until, rows, run_again, started, without_seconds, workers
+from running import PATIENCE, Main, Vibench, read_until, rows, run_wire, started, without_seconds, workers
 from samples import ROUNDS, wire_study, write_study
 
 from vibench.results import read
@@ -44,7 +44,7 @@ def test_a_run_that_was_stopped_goes_on_later(
         assert len(pd.read_csv(folder / "tables" / "cells.csv")) == 1
 
     (waiting / "go on").touch()
-    printed, after = run_again(vibench, waiting)
+    printed, after = run_wire(vibench, waiting)
     assert "2 cells, 1 to run" in printed
     assert without_seconds(after[0]) == without_seconds(before[0])
     assert all(row["online_s"] > 0.0 and row["timing_rounds"] == ROUNDS for row in after)
@@ -134,7 +134,7 @@ def test_a_run_whose_folder_is_gone_ends(swapped: bool, plugins_folder: Path, vi
     assert "results:" not in out
     assert [row["dual"] for row in rows(waiting / "elsewhere")] == ["cpg"]
     shutil.rmtree(folder, ignore_errors=True)
-    printed, after = run_again(vibench, waiting)
+    printed, after = run_wire(vibench, waiting)
     assert "2 cells, 2 to run" in printed
     assert "high-fidelity solutions" not in printed
     assert [row["status"] for row in after] == ["ok", "ok"]

@@ -5,7 +5,7 @@ from pathlib import Path
 import fake_plugins
 import meddling
 import pytest
-from running import Vibench, rows, without_seconds
+from running import Vibench, rows, run_wire, without_seconds
 from samples import FAKES, ROUNDS, install, wire_study, write_study
 
 
@@ -49,10 +49,8 @@ def test_a_name_that_two_packages_use_costs_the_cells_that_use_it(
     vibench: Vibench, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     site = add(install(tmp_path / "site", fake_plugins, FAKES), tmp_path_factory, meddling.TAKEN)
-    write_study(tmp_path, wire_study(dual=["cpg", "mcpg"], solvers=["piqp", "careful", "osqp", "counts"]))
-    done = vibench(tmp_path, "run", "study.toml", "--jobs", "1", plugins=site)
-    assert (done.returncode, done.stderr) == (0, "")
-    found = {(row["dual"], row["solver"]): row for row in rows(tmp_path / "runs" / "wire")}
+    study = wire_study(dual=["cpg", "mcpg"], solvers=["piqp", "careful", "osqp", "counts"])
+    found = {(row["dual"], row["solver"]): row for row in run_wire(vibench, tmp_path, study=study, plugins=site)[1]}
     ok = {key for key, row in found.items() if row["status"] == "ok"}
     assert ok == {("mcpg", "piqp"), ("mcpg", "counts")}
     assert {row["status"] for key, row in found.items() if key not in ok} == {"unavailable"}

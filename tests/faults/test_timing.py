@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import pytest
-from running import Vibench, by_solver, execute, rows, run_again
-from samples import ROUNDS, wire_study, write_study
+from running import Vibench, by_solver, execute, rows, run_wire
+from samples import ROUNDS, wire_study
 
 ANSWERS = 6
 """Calls of the solver before the timing begins: two for each of three queries."""
@@ -17,9 +17,7 @@ def test_a_solver_that_dies_in_a_round_costs_that_round(
     """Where it dies at an answer, in the last case, it costs that query and no round of the others."""
     monkeypatch.setenv("FAKE_CALLS", str(tmp_path / "calls"))
     monkeypatch.setenv("FAKE_LAST_CALL", str(last_call))
-    write_study(tmp_path, wire_study(solvers=["dies-once", "piqp"]))
-    done = vibench(tmp_path, "run", "study.toml", "--jobs", "1")
-    assert (done.returncode, done.stderr) == (0, "")
+    run_wire(vibench, tmp_path, study=wire_study(solvers=["dies-once", "piqp"]))
     found = by_solver(tmp_path / "runs" / "wire")
     unlucky, other = found["dies-once"], found["piqp"]
     assert (unlucky["status"], unlucky["queries_ok"]) == (("ok", 3) if lost else ("crashed", 2))
@@ -32,9 +30,8 @@ def test_a_solver_that_dies_in_a_round_costs_that_round(
 
 
 def test_a_cell_that_never_answers_leaves_the_seconds_of_the_others(vibench: Vibench, tmp_path: Path) -> None:
-    write_study(tmp_path, wire_study(solvers=["dies", "raises", "piqp"], dual=["cone-raises", "cpg"]))
-    vibench(tmp_path, "run", "study.toml", "--jobs", "1")
-    found = {(row["dual"], row["solver"]): row for row in rows(tmp_path / "runs" / "wire")}
+    study = wire_study(solvers=["dies", "raises", "piqp"], dual=["cone-raises", "cpg"])
+    found = {(row["dual"], row["solver"]): row for row in run_wire(vibench, tmp_path, study=study)[1]}
     assert len(found) == 6
     assert [key for key, row in found.items() if row["online_s"] is not None] == [("cpg", "piqp")]
     assert found["cpg", "piqp"]["timing_rounds"] == ROUNDS
@@ -42,19 +39,15 @@ def test_a_cell_that_never_answers_leaves_the_seconds_of_the_others(vibench: Vib
 
 def test_what_was_answered_but_not_timed_is_timed_by_the_next_run(vibench: Vibench, tmp_path: Path) -> None:
     """As after an interruption between the last answer and the first round; a study may ask for more rounds."""
-    write_study(tmp_path, wire_study())
     folder = tmp_path / "runs" / "wire"
-    vibench(tmp_path, "run", "study.toml", "--jobs", "1")
+    run_wire(vibench, tmp_path, study=wire_study())
     execute(folder, "UPDATE cells SET timing_rounds = NULL, online_s = NULL", "DELETE FROM timings")
-    printed, (row,) = run_again(vibench, tmp_path)
+    printed, (row,) = run_wire(vibench, tmp_path)
     assert "1 cells, 0 to run, 1 stages" in printed
     assert row["online_s"] > 0.0
     assert len(rows(folder, "timings")) == ROUNDS
-    printed, _ = run_again(vibench, tmp_path)
-    assert "1 cells, 0 to run, 0 stages" in printed
+    assert "1 cells, 0 to run, 0 stages" in run_wire(vibench, tmp_path)[0]
     assert {row["meaning"] for row in rows(folder, "thresholds")} == {"undecided"}
-    write_study(tmp_path, wire_study(timing_rounds=7))
-    printed, _ = run_again(vibench, tmp_path)
-    assert "0 to run, 1 stages" in printed
+    assert "0 to run, 1 stages" in run_wire(vibench, tmp_path, study=wire_study(timing_rounds=7))[0]
     assert len(rows(folder, "timings")) == 7
     assert {row["timing_rounds"] for row in rows(folder)} == {7}

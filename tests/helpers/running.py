@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from samples import write_study
 from typer.testing import CliRunner
 
 from vibench.cli.main import app
@@ -99,10 +100,14 @@ def by_solver(folder: Path) -> dict[str, dict[str, Any]]:
     return {row["solver"]: row for row in rows(folder)}
 
 
-def run_again(vibench: Vibench, folder: Path, *options: str, **more: Any) -> tuple[str, list[dict[str, Any]]]:
-    """Run the study of a folder once more; gives what was printed and the rows of the cells."""
+def run_wire(
+    vibench: Vibench, folder: Path, *options: str, study: Mapping[str, Any] | None = None, **more: Any
+) -> tuple[str, list[dict[str, Any]]]:
+    """Run a study of a wire, or that of a folder once more; gives what was printed and the rows of the cells."""
+    if study is not None:
+        write_study(folder, study)
     done = vibench(folder, "run", "study.toml", "--jobs", "1", *options, **more)
-    assert done.returncode == 0, done.stderr
+    assert (done.returncode, done.stderr) == (0, "")
     return done.stdout, rows(folder / "runs" / "wire")
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from running import Vibench, assert_same_numbers, by_solver, execute, rows, run_again, without_seconds
+from running import Vibench, assert_same_numbers, by_solver, execute, rows, run_wire, without_seconds
 from samples import wire_study, write_study
 
 import vibench.execution.run  # noqa: F401  lists the classes of all stages
@@ -44,7 +44,7 @@ def test_results_are_where_the_study_is_named_and_a_second_run_does_nothing_new(
     assert {one.name for one in (folder / "tables").iterdir()} == {*(f"{table}.csv" for table in TABLES), "summary.md"}
     assert list((folder / "figures").glob("*.png"))
     before = {table: rows(again / "runs" / "wire", table) for table in TABLES if table != "histories"}
-    printed, _ = run_again(vibench, again)
+    printed, _ = run_wire(vibench, again)
     assert "3 cells, 0 to run, 0 stages" in printed
     assert {table: rows(again / "runs" / "wire", table) for table in before} == before
     assert "3 cells, 2 ok, 1 not ok" in printed
@@ -53,7 +53,7 @@ def test_results_are_where_the_study_is_named_and_a_second_run_does_nothing_new(
 def test_retry_redoes_what_was_not_ok(vibench: Vibench, again: Path) -> None:
     before = by_solver(again / "runs" / "wire")
     execute(again / "runs" / "wire", "UPDATE cells SET reason = 'old'")
-    printed, after = run_again(vibench, again, "--retry")
+    printed, after = run_wire(vibench, again, "--retry")
     assert "3 cells, 1 to run, 1 stages" in printed
     reasons = {row["solver"]: row["reason"] for row in after}
     assert reasons == {"piqp": "old", "careful": "old", "gives-up": before["gives-up"]["reason"]}
@@ -68,7 +68,7 @@ def test_fresh_starts_over_and_leaves_the_notes_somebody_made(vibench: Vibench, 
     for note in notes:
         note.parent.mkdir(exist_ok=True)
         note.write_text("precious")
-    printed, after = run_again(vibench, again, "--fresh")
+    printed, after = run_wire(vibench, again, "--fresh")
     assert "3 cells, 3 to run" in printed
     assert len(after) == 3
     assert "old" not in {row["reason"] for row in after}
@@ -83,7 +83,7 @@ def test_a_cell_without_row_is_done_again(vibench: Vibench, again: Path, artefac
     for artefact in lost:
         artefact.unlink()
     before = by_solver(folder)
-    printed, after = run_again(vibench, again)
+    printed, after = run_wire(vibench, again)
     assert "3 cells, 1 to run, 2 stages" in printed
     assert any(artefact.exists() for artefact in lost)
     assert {row["solver"]: row["status"] for row in after} == {"piqp": "ok", "careful": "ok", "gives-up": "failed"}
@@ -94,7 +94,7 @@ def test_a_cell_without_row_is_done_again(vibench: Vibench, again: Path, artefac
 
 
 def test_other_cells_join_those_of_the_same_study(vibench: Vibench, again: Path) -> None:
-    printed, after = run_again(vibench, again, "--solver", "osqp", "--pod-tol", "0.1")
+    printed, after = run_wire(vibench, again, "--solver", "osqp", "--pod-tol", "0.1")
     assert "1 cells, 1 to run" in printed
     assert [row["solver"] for row in after] == [*SOLVERS, "osqp"]
     assert len(pd.read_csv(again / "runs" / "wire" / "tables" / "cells.csv")) == 4
@@ -107,23 +107,19 @@ def test_strict_fails_where_a_cell_is_not_ok(vibench: Vibench, again: Path) -> N
         assert (done.returncode, done.stderr) == (code, "")
 
 
-def test_an_edited_plugin_is_run_again(vibench: Vibench, again: Path, plugins_folder: Path, tmp_path: Path) -> None:
+def test_an_edited_plugin_is_run_wire(vibench: Vibench, again: Path, plugins_folder: Path, tmp_path: Path) -> None:
     """Problem and solvers come from the package that was edited, and one of them now does its work."""
     shutil.copytree(plugins_folder, tmp_path / "edited")
     with (tmp_path / "edited" / "fake_plugins.py").open("a", encoding="utf-8") as source:
         source.write("\n\ngives_up = careful\n")
-    printed, after = run_again(vibench, again, plugins=tmp_path / "edited")
+    printed, after = run_wire(vibench, again, plugins=tmp_path / "edited")
     assert "3 cells, 3 to run" in printed
     assert [row["status"] for row in after] == ["ok"] * 3
 
 
 def test_too_little_memory_is_a_reason(vibench: Vibench, tmp_path: Path) -> None:
     """Less than a worker needs to come to life; numerical libraries may then wait until their time is over."""
-    study = wire_study(limits={"memory_gib": 0.05, "cell_seconds": 5.0})
-    done = vibench(tmp_path, "run", write_study(tmp_path, study), "--jobs", "1")
-    assert "Traceback" not in done.stderr
-    assert done.returncode == 0
-    (row,) = rows(tmp_path / "runs" / "wire")
+    _, (row,) = run_wire(vibench, tmp_path, study=wire_study(limits={"memory_gib": 0.05, "cell_seconds": 5.0}))
     assert row["status"] in ("error", "crashed", "timeout")
     assert row["reason"]
 
@@ -131,44 +127,36 @@ def test_too_little_memory_is_a_reason(vibench: Vibench, tmp_path: Path) -> None
 def test_a_run_in_which_nothing_works_comes_to_its_end(vibench: Vibench, tmp_path: Path) -> None:
     """One problem raises, and of the other every query takes too long."""
     study = wire_study(problem=["wire-raises", "wire"], limits={"query_seconds": 1e-9})
-    done = vibench(tmp_path, "run", write_study(tmp_path, study), "--jobs", "1")
-    assert (done.returncode, done.stderr) == (0, "")
-    found = {row["problem"]: row for row in rows(tmp_path / "runs" / "wire")}
+    printed, after = run_wire(vibench, tmp_path, study=study)
+    found = {row["problem"]: row for row in after}
     assert {problem: row["status"] for problem, row in found.items()} == {"wire-raises": "error", "wire": "timeout"}
     assert "the limit is 1e-09 s" in found["wire"]["reason"]
     assert {row["queries_ok"] for row in found.values()} == {0}
-    assert "2 cells, 0 ok, 2 not ok" in done.stdout
+    assert "2 cells, 0 ok, 2 not ok" in printed
 
     # with a larger limit the cell that it had ended is run again, once; what raises is not
-    longer = write_study(tmp_path, study | {"limits": {"query_seconds": 20.0}})
-    done = vibench(tmp_path, "run", longer, "--jobs", "1")
-    assert "2 cells, 1 to run" in done.stdout + done.stderr
-    assert {row["problem"]: row["status"] for row in rows(tmp_path / "runs" / "wire")} == {
-        "wire-raises": "error", "wire": "ok"
-    }  # fmt: skip
-    done = vibench(tmp_path, "run", longer, "--jobs", "1")
-    assert "2 cells, 0 to run" in done.stdout + done.stderr
+    printed, after = run_wire(vibench, tmp_path, study=study | {"limits": {"query_seconds": 20.0}})
+    assert "2 cells, 1 to run" in printed
+    assert {row["problem"]: row["status"] for row in after} == {"wire-raises": "error", "wire": "ok"}
+    assert "2 cells, 0 to run" in run_wire(vibench, tmp_path)[0]
 
 
 def test_a_problem_that_fails_first_leaves_the_one_beside_it_alone(vibench: Vibench, tmp_path: Path) -> None:
     """What the good problem waits for is not dropped when the stages of the bad one fail before it could begin."""
     study = wire_study(problem=["wire-raises", "wire"], primal=["decorrelated", "online-supremizers"])
-    done = vibench(tmp_path, "run", write_study(tmp_path, study), "--jobs", "1")
-    assert (done.returncode, done.stderr) == (0, "")
-    found = {(row["problem"], row["primal"]): row["status"] for row in rows(tmp_path / "runs" / "wire")}
+    _, after = run_wire(vibench, tmp_path, study=study)
+    found = {(row["problem"], row["primal"]): row["status"] for row in after}
     statuses = {"wire-raises": "error", "wire": "ok"}
     assert found == {(problem, primal): status for problem, status in statuses.items() for primal in study["primal"]}
 
 
 def test_a_plugin_whose_requirements_are_missing_is_unavailable(vibench: Vibench, tmp_path: Path) -> None:
-    study = write_study(tmp_path, wire_study(dual=["cone-needs", "cpg"]))
-    done = vibench(tmp_path, "run", study, "--jobs", "1", "--strict")
-    assert (done.returncode, done.stderr) == (0, "")
-    found = {row["dual"]: row for row in rows(tmp_path / "runs" / "wire")}
+    printed, after = run_wire(vibench, tmp_path, "--strict", study=wire_study(dual=["cone-needs", "cpg"]))
+    found = {row["dual"]: row for row in after}
     assert {dual: row["status"] for dual, row in found.items()} == {"cone-needs": "unavailable", "cpg": "ok"}
     reason = "the dual strategy 'cone-needs' needs no-such-distribution, which is not installed"
     assert found["cone-needs"]["reason"] == f"{reason}: `pip install no-such-distribution`"
-    assert done.stdout.count(reason) == 2  # when the run begins, and among what is not ok
+    assert printed.count(reason) == 2  # when the run begins, and among what is not ok
 
 
 def test_a_run_of_which_nothing_can_run_here_is_an_error(vibench: Vibench, tmp_path: Path) -> None:
@@ -269,7 +257,7 @@ def test_clean_shows_and_frees_artefacts_asked(
     vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
-    vibench(tmp_path, "run", write_study(tmp_path, wire_study()), "--jobs", "1")
+    run_wire(vibench, tmp_path, study=wire_study())
     artefacts = tmp_path / "cache" / "artefacts"
     count = len(list(artefacts.glob("*.artefact")))
     refused = vibench(tmp_path, "clean")
@@ -292,7 +280,7 @@ def test_fresh_begins_anew_where_the_results_file_is_damaged(vibench: Vibench, a
     assert refused.returncode == 2
     assert refused.stderr.count("\n") == 1
     assert "or --fresh, which keeps it as results.sqlite.damaged" in refused.stderr
-    printed, after = run_again(vibench, again, "--fresh")
+    printed, after = run_wire(vibench, again, "--fresh")
     assert f"is kept as 'runs/wire/{FILE}.damaged'" in printed.splitlines()[0]
     assert "3 cells, 3 to run" in printed
     assert len(after) == 3

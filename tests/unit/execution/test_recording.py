@@ -90,7 +90,7 @@ def database(tmp_path: Path) -> Iterator[ResultsDatabase]:
     found.close()
 
 
-def test_cells_ended_by_a_limit_of_their_row_are_run_again_where_it_is_larger(database: ResultsDatabase) -> None:
+def test_cells_ended_by_a_limit_of_their_row_are_run_wire_where_it_is_larger(database: ResultsDatabase) -> None:
     for changed, again in (
         ({}, set()),
         ({"query_seconds": 1.0, "cell_seconds": 1.0, "memory_gib": 1.0}, set()),

@@ -63,7 +63,7 @@ def test_a_recorded_cell_solves_as_it_did(run: Path) -> None:
     assert model.fixed_basis.shape[1] == recorded.row["N"] + recorded.row["enrichment"]
 
 
-def test_stages_whose_artefacts_are_gone_are_run_again(run: Path, artefacts: Path) -> None:
+def test_stages_whose_artefacts_are_gone_are_run_wire(run: Path, artefacts: Path) -> None:
     for file in artefacts.glob("*stage-*"):
         file.unlink()
     before = recorded_cell(str(run), key(run)).rows("queries")[1]["primal_residual"]
