@@ -88,9 +88,9 @@ def test_the_process_is_kept_from_one_stage_to_the_next(run: Run) -> None:
 @pytest.mark.parametrize("how", ["sleep", "hang"])
 def test_an_item_beyond_its_limit_costs_itself(run: Run, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervisor._JobState, "grace", 0.1)
-    found = values(run(InItems(("fine", how, "fine", "fine")), query=3.0))
+    found = values(run(InItems(("fine", how, "fine", "fine")), query=1.5))
     assert [number for number, _ in found] == [0, 1, 2, 3]
-    assert found[1][1] == Failed(Status.TIMEOUT, "stopped after query_seconds = 3 s")
+    assert found[1][1] == Failed(Status.TIMEOUT, "stopped after query_seconds = 1.5 s")
     assert all(isinstance(process, int) for number, process in found if number != 1)
 
 
@@ -110,9 +110,9 @@ def test_what_an_item_raises_costs_itself_and_a_death_before_its_limit_begins(ru
 
 
 def test_beyond_the_limit_of_the_cell_the_items_done_are_kept(run: Run) -> None:
-    found = values(run(InItems(("fine", "fine", "sleep", "fine")), query=60.0, cell=4.0))
+    found = values(run(InItems(("fine", "fine", "sleep", "fine")), query=60.0, cell=2.0))
     assert [isinstance(value, Failed) for _, value in found] == [False, False, True, True]
-    assert found[3][1] == Failed(Status.TIMEOUT, "stopped after cell_seconds = 4 s")
+    assert found[3][1] == Failed(Status.TIMEOUT, "stopped after cell_seconds = 2 s")
 
 
 def test_many_quick_items_have_the_limit_of_the_cell_too(run: Run) -> None:
