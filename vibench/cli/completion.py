@@ -18,7 +18,9 @@ import typer
 
 from vibench.errors import VibenchError
 from vibench.plugins.kinds import CHECKED, PluginKind
+from vibench.qp.settings import SETTINGS
 from vibench.results.schema import STORED, TABLES
+from vibench.results.sqlite import FILE
 
 
 def examples(command: str) -> str:
@@ -80,19 +82,6 @@ def _beginning(word: str, choices: Iterable[str]) -> list[str]:
         return []
 
 
-def _solvers() -> Iterable[str]:
-    """QP solvers, installed or not."""
-    from vibench.qp.settings import SETTINGS
-
-    return {*SETTINGS, *_registered(PluginKind.SOLVER)}
-
-
-def _runs() -> Iterable[str]:
-    from vibench.results.sqlite import FILE
-
-    return (path.parent.name for path in Path("runs").glob(f"*/{FILE}"))
-
-
 def _error_measures() -> Iterable[str]:
     from vibench.results.ranking import columns_of_measures
 
@@ -102,7 +91,10 @@ def _error_measures() -> Iterable[str]:
 problems, primals, duals, formulations = map(
     names, (PluginKind.PROBLEM, PluginKind.PRIMAL, PluginKind.DUAL, PluginKind.FORMULATION)
 )
-solvers, runs, error_measures = map(words, (_solvers, _runs, _error_measures))
+# QP solvers, installed or not.
+solvers = words(lambda: {*SETTINGS, *_registered(PluginKind.SOLVER)})
+runs = words(lambda: (path.parent.name for path in Path("runs").glob(f"*/{FILE}")))
+error_measures = words(_error_measures)
 corrections = words(lambda: ("none", "feasible", "auto"))
 lists = words(lambda: (kind.plural for kind in PluginKind))
 table_names = words(lambda: ("summary", "best", "benefits", *TABLES))

@@ -47,9 +47,9 @@ class Comparison:
     def changes(self) -> pd.DataFrame:
         """Changes for better or worse, a row per column of a cell, in the order of the cells."""
         columns = ["run", "against", *AXES, "what", "before", "after", "ratio", "ratio_low", "ratio_high", "verdict"]
-        rows = []
+        rows, moved = [], (ChangeKind.CHANGED, ChangeKind.BETTER, ChangeKind.WORSE)
         for (run, against), one in ((names, one) for names, found in self.pairs.items() for one in found):
-            if one.verdict.is_change:
+            if one.verdict in moved:
                 ends = dict(zip(("ratio_low", "ratio_high"), one.interval or (np.nan, np.nan), strict=True))
                 values = {"before": formats.cell_text(one.before), "after": formats.cell_text(one.after)}
                 about = {"run": run, "against": against, "what": one.what, "verdict": one.verdict.value}
@@ -134,18 +134,15 @@ class Comparison:
 
 
 def compare(paths: Sequence[Path], limit: float) -> Comparison:
-    """Compare results files cell by cell; cells of the same definition are the same cell.
+    """Compare results files with the first one, cell by cell; cells of the same definition are the same cell.
 
     Changes for the worse are: a missing cell, fewer ok queries, a more severe status, an error, seconds or a dimension
-    that grew by more than the factor `limit`, a constant that shrank by more than this factor, and a break-even that
-    moved by more than this factor because the reduced model itself became slower.
+    that grew by more than the factor `limit` ≥ 1, a constant that shrank by more than this factor, and a break-even
+    that moved by more than this factor because the reduced model itself became slower.
 
     An error has not changed where the difference is at most the sum of what the QP solver contributed to it in the two
     runs. Seconds are compared only where one machine measured both, and have changed only where the 95 % interval of
     their ratio, from resampled rounds, does not contain 1; with fewer than six rounds they are undecided.
-
-    The first of the files is what the others are compared with; a number may change within the factor `limit`, at least
-    1.
 
     Raises a `RequestError` if there are fewer than two files, or one cannot be read.
     """

@@ -101,19 +101,15 @@ class ComparedRun:
 
     def thresholds_of(self, cells: Collection[str]) -> pd.DataFrame:
         """Rows of the break-evens in which no other cells take part."""
-        thresholds, keys = self._thresholds, set(cells)
+        thresholds, keys = read_table(self.path, "thresholds"), set(cells)
         of_a, of_b = (thresholds[end].isin(keys) for end in ("cell_a", "cell_b"))
         return thresholds[(of_a | thresholds["cell_a"].isna()) & of_b]
 
-    @cached_property
-    def _thresholds(self) -> pd.DataFrame:
-        return read_table(self.path, "thresholds")
-
     def measured_beside(self, other: ComparedRun, unless: Sequence[ComparedRun]) -> list[str]:
         """Cells whose seconds compare with those of the other run, and with those of none of the runs `unless`."""
-        others = [{run.measured_by(key) for run in unless} for key in self.cells]
-        mine = [(key, self.measured_by(key), several) for key, several in zip(self.cells, others, strict=True)]
-        return [key for key, one, several in mine if other.measured_by(key) == one and one not in several]
+        own = {key: self.measured_by(key) for key in self.cells}
+        mine = [key for key, one in own.items() if other.measured_by(key) == one]
+        return [key for key in mine if own[key] not in [run.measured_by(key) for run in unless]]
 
     def measured_by(self, cell: str) -> tuple[str, str] | None:
         """Machine and version of the benchmark protocol that measured a cell; `None` without it."""
@@ -168,10 +164,6 @@ class ChangeKind(StrEnum):
     CHANGED = "changed"
     BETTER = "better"
     WORSE = "worse"
-
-    @property
-    def is_change(self) -> bool:
-        return self in (ChangeKind.CHANGED, ChangeKind.BETTER, ChangeKind.WORSE)
 
 
 class Difference(NamedTuple):

@@ -28,35 +28,31 @@ def cleaned(path: Path, copy: Path) -> None:
     """
     read_meta(path)
     try:
-        _write_cleaned(path, copy)
+        copy.parent.mkdir(parents=True)
+        with open_read_only(path) as db:
+            db.execute("VACUUM INTO ?", (str(copy.absolute()),))
+        parents = {Path(place).parent for place in _places(path)}
+        # Longer names first: those of folders in others would leave parts of them.
+        folders = sorted((str(one) for one in parents if len(one.parts) > 2), key=len, reverse=True)
+        inside = [re.compile(rf"(?<!\w){re.escape(folder)}(?![\w-])") for folder in folders]
+        texts = {
+            table: [name for name in columns if columns[name].kind == SqlType.TEXT] for table, columns in STORED.items()
+        }
+        with closing(sqlite3.connect(copy)) as db, db:
+            db.text_factory = text_reader()
+            for table, columns in {"meta": ("value",), **texts}.items():
+                if table != "meta":
+                    # Refuses damage, which new digests would hide.
+                    read_rows(path, table)
+                if sum(_clean(db, table, column, inside) for column in columns):
+                    digests = Digests(db)
+                    digests.forget(name=table)
+                    digests.count(table)
+        with closing(sqlite3.connect(copy)) as db:
+            # Free pages still have the replaced values.
+            db.execute("VACUUM")
     except (OSError, sqlite3.Error) as error:
         raise RequestError(f"a copy of '{path}' cannot be written to '{copy.parent}': {error}") from None
-
-
-def _write_cleaned(path: Path, copy: Path) -> None:
-    copy.parent.mkdir(parents=True)
-    with open_read_only(path) as db:
-        db.execute("VACUUM INTO ?", (str(copy.absolute()),))
-    parents = {Path(place).parent for place in _places(path)}
-    # Longer names first: those of folders in others would leave parts of them.
-    folders = sorted((str(one) for one in parents if len(one.parts) > 2), key=len, reverse=True)
-    inside = [re.compile(rf"(?<!\w){re.escape(folder)}(?![\w-])") for folder in folders]
-    texts = {
-        table: [name for name in columns if columns[name].kind == SqlType.TEXT] for table, columns in STORED.items()
-    }
-    with closing(sqlite3.connect(copy)) as db, db:
-        db.text_factory = text_reader()
-        for table, columns in {"meta": ("value",), **texts}.items():
-            if table != "meta":
-                # Refuses damage, which new digests would hide.
-                read_rows(path, table)
-            if sum(_clean(db, table, column, inside) for column in columns):
-                digests = Digests(db)
-                digests.forget(name=table)
-                digests.count(table)
-    with closing(sqlite3.connect(copy)) as db:
-        # Free pages still have the replaced values.
-        db.execute("VACUUM")
 
 
 def left(paths: Sequence[Path], names: Sequence[str], authors: Sequence[str]) -> Iterator[str]:

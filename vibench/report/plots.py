@@ -17,10 +17,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from PIL import Image
 
-from vibench.arrays import Array
 from vibench.report.figures.data import ProblemTables, best_solver, label, on_common_queries
 from vibench.report.figures.style import Look, Looks, Series, caption_of
 from vibench.results import ranking
@@ -181,54 +179,24 @@ def seen(figure: Figure) -> str:
 
 
 def _panel_text(panel: Axes) -> str:
+    """Title, axes, and every line of a panel with its range; of more than six lines the range of all."""
     if not panel.axison and not panel.collections:
         return ""
-    # Fields drawn in colours, for a panel without lines.
-    values = [one.get_array() for one in panel.collections]
-    fields = [array for array in values if array is not None and np.isfinite(array).any()]
-    said = list(_series_text(panel)) or [f"a field between {np.nanmin(a):.3g} and {np.nanmax(a):.3g}" for a in fields]
-    if not said:
+    named = [(unbroken(str(line.get_label())), np.asarray(line.get_ydata(), dtype=float)) for line in panel.lines]
+    drawn = [(name, values[np.isfinite(values)]) for name, values in named if np.isfinite(values).any()]
+    if len(drawn) > 6:
+        drawn = [(f"{len(drawn)} series", np.concatenate([values for _, values in drawn]))]
+    if not drawn:
+        fields = [np.asarray(array) for one in panel.collections if (array := one.get_array()) is not None]
+        drawn = [("a field", field[np.isfinite(field)]) for field in fields if np.isfinite(field).any()]
+    if not drawn:
         return ""
+    # Matplotlib calls a line without a label "_child".
+    ranges = [(name * (not name.startswith("_child")), values.min(), values.max()) for name, values in drawn]
+    said = "; ".join(f"{name} between {low:.3g} and {high:.3g}".strip() for name, low, high in ranges)
     title, x, y = (unbroken(text) for text in (panel.get_title(), panel.get_xlabel(), panel.get_ylabel()))
     what = f"{y} over {x}" if x and y else x or y
-    return f"{': '.join(filter(None, (title, what)))}: {'; '.join(said)}."
-
-
-def _series_text(panel: Axes) -> Iterator[str]:
-    """Lines with their ranges; of more than six, their number and the range of all."""
-    lines = [line for line in panel.lines if _values(line).size]
-    if len(lines) <= 6:
-        for line in lines:
-            yield _line(line)
-        return
-    values = np.concatenate([_values(line) for line in lines])
-    lowest = min(lines, key=lambda line: float(_values(line).min()))
-    highest = max(lines, key=lambda line: float(_values(line).max()))
-    yield f"{len(lines)} series between {values.min():.3g} and {values.max():.3g}"
-    for which, line, value in (("lowest", lowest, values.min()), ("highest", highest, values.max())):
-        if _name(line):
-            yield f"the {which} is {value:.3g} of {_name(line)}"
-
-
-def _line(line: Line2D) -> str:
-    values, name = _values(line), _name(line)
-    before = f"{name} " if name else ""
-    if values.size == 1:
-        return f"{before}at {values[0]:.3g}"
-    if line.get_linestyle() in ("None", "none", "", " "):
-        return f"{before}{values.size} points between {values.min():.3g} and {values.max():.3g}"
-    between = "" if values.min() >= min(values[0], values[-1]) else f", at least {values.min():.3g}"
-    return f"{before}from {values[0]:.3g} to {values[-1]:.3g}{between}"
-
-
-def _name(line: Line2D) -> str:
-    label = unbroken(str(line.get_label()))
-    return "" if label.startswith("_child") else label
-
-
-def _values(line: Line2D) -> Array:
-    values: Array = np.asarray(line.get_ydata(), dtype=float).ravel()
-    return values[np.isfinite(values)]
+    return f"{': '.join(filter(None, (title, what)))}: {said}."
 
 
 def script_safe(value: Any) -> str:

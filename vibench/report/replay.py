@@ -122,19 +122,12 @@ def export(run: str, folder: Path, places: Mapping[str, str] = {}, *, sequence: 
             # An interruption leaves nothing under the name of the folder.
             new = Path(scratch) / folder.name
             new.mkdir()
-            count = _write_set(list(models.values()), new)
+            programs = [rows for cells in models.values() for rows in _exported(cells, new)]
+            (new / "rows.csv").write_text(to_csv(pd.DataFrame(chain.from_iterable(programs))), encoding="utf-8")
+            (new / "check.py").write_bytes((files("vibench.report") / "qps_checker.py").read_bytes())
             if sequence:
                 _write_sequences([cells[0] for cells in models.values()], new)
             new.replace(folder)
-    return count
-
-
-def _write_set(models: Sequence[list[RecordedCell]], folder: Path) -> int:
-    """Write the programs of some reduced models, each given by its cells; returns their number."""
-    programs = [rows for cells in models for rows in _exported(cells, folder)]
-    table = to_csv(pd.DataFrame(chain.from_iterable(programs)))
-    (folder / "rows.csv").write_text(table, encoding="utf-8")
-    (folder / "check.py").write_bytes((files("vibench.report") / "qps_checker.py").read_bytes())
     return len(programs)
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from jinja2 import Environment
 
 from vibench.errors import RequestError
 from vibench.files import PART, TEMPORARY, write_atomically
@@ -229,7 +230,9 @@ def publish(
 
 
 def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation, *, figures: bool) -> None:
-    pages = _Pages(citation)
+    pages = html.environment("templates/site")
+    pages.filters["number"] = formats.cell_text
+    pages.globals |= {"citation": citation, "vibench": distribution_version("vibench"), "criteria": list(Criterion)}
     limit = 1.25
     comparisons = {study: compare([run.run.path for run in group], limit) for study, group in _comparable(runs)}
     for run in runs:
@@ -240,16 +243,16 @@ def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation, *, figur
         timings = PairedTiming(read_table(run.run.path, "timings").to_dict("records"))
         boards.append((run, leaderboard(in_order(read_table(run.run.path, "cells")), timings)))
     links = {run.run.name: f"runs/{run.folder}/index.html" for run in runs}
-    pages.write(site / "leaderboard.html", "leaderboard", "", boards=boards, links=links, way=html.way)
+    _write_page(pages, site / "leaderboard.html", "leaderboard", "", boards=boards, links=links, way=html.way)
     sections = [_section(site, number, *item) for number, item in enumerate(comparisons.items(), start=1)]
-    pages.write(site / "comparison.html", "comparison", "", sections=sections, limit=limit)
+    _write_page(pages, site / "comparison.html", "comparison", "", sections=sections, limit=limit)
     filters = {name: sorted({value for run in runs for value in run.values[name]}) for name in runs[0].values}
-    pages.write(site / "index.html", "index", "", runs=runs, filters=filters)
+    _write_page(pages, site / "index.html", "index", "", runs=runs, filters=filters)
     _write(site / "CITATION.cff", citation.cff())
     _write(site / "citation.bib", citation.bibtex())
 
 
-def _write_run(own: Path, run: PublishedRun, pages: _Pages, figures: bool) -> None:
+def _write_run(own: Path, run: PublishedRun, pages: Environment, figures: bool) -> None:
     """Write the folder of one run: its page and report, its data, and a file of requirements."""
     (own / "tables").mkdir(parents=True)
     with open_read_only(run.run.path) as db:
@@ -264,7 +267,7 @@ def _write_run(own: Path, run: PublishedRun, pages: _Pages, figures: bool) -> No
     _write(own / "provenance.json", json.dumps(run.provenance, indent=1, ensure_ascii=True, sort_keys=True) + "\n")
     columns = ("N", "R", "enrichment", "error_u_mean", "error_lambda_mean", "online_s", "offline_s")
     shown = {"cells": run.cells(columns), "columns": columns, "tables": published}
-    pages.write(own / "index.html", "run", "../../", run=run, **shown)
+    _write_page(pages, own / "index.html", "run", "../../", run=run, **shown)
 
 
 def _comparable(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, list[PublishedRun]]]:
@@ -288,19 +291,10 @@ def _section(site: Path, number: int, study: str, comparison: Comparison) -> dic
     return {"study": study, "file": file, "notes": comparison.notes, "count": len(comparison.changes), "tables": frames}
 
 
+def _write_page(pages: Environment, path: Path, name: str, root: str, **content: Any) -> None:
+    """Write a page of the template of that name; `root` leads from it to the folder of the site."""
+    _write(path, pages.get_template(f"{name}.html.j2").render(**content, root=root, page=name))
+
+
 def _write(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8", newline="\n")
-
-
-class _Pages:
-    """Writes pages from templates, with the content that they share."""
-
-    def __init__(self, citation: Citation) -> None:
-        self._environment = html.environment("templates/site")
-        self._environment.filters["number"] = formats.cell_text
-        self._shared = {"citation": citation, "vibench": distribution_version("vibench"), "criteria": list(Criterion)}
-
-    def write(self, path: Path, name: str, root: str, **content: Any) -> None:
-        """Write a page of the template of that name; `root` leads from it to the folder of the site."""
-        template = self._environment.get_template(f"{name}.html.j2")
-        _write(path, template.render(**self._shared, **content, root=root, page=name))
