@@ -154,6 +154,14 @@ def test_a_share_that_does_not_hold_off_the_training_set_is_said(said: Said) -> 
     assert "is not reached at a validation parameter in 1 of 2" in texts[1]
 
 
+def test_with_bounds_of_declarations_their_tests_are_counted(said: Said) -> None:
+    """With 16 random parameters a share of 0.17 of the box would be met at 95 %; 3/16 is above that."""
+    (text,) = said("UPDATE cells SET certificate = 'certified' WHERE problem = 'hertz'")["hertz, declarations"]
+    assert text.startswith("Declarations agree with the assembly at all 16 validation parameters")
+    assert text.endswith("a declaration is false in at most 0.19 of the box, at 95 %.")
+    assert "obstacle, declarations" not in said()
+
+
 def test_of_one_solver_no_agreement_is_told_and_without_a_plain_basis_nothing_is_said_of_it(said: Said) -> None:
     one = [f"DELETE FROM {table} WHERE solver != 'piqp'" for table in ("queries", "cells")]
     whole = said(*one, "DELETE FROM disagreements")[""]
