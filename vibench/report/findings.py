@@ -237,8 +237,8 @@ def _declarations(cells: pd.DataFrame) -> Iterator[str]:
         count = int(cells["queries"].max())
         # If a share p of the box were false, k random parameters would all miss it with probability (1 - p)^k.
         yield (
-            f"Declarations agree with the assembly at all {count} validation parameters. Where these are drawn at random, "
-            f"as by default, a declaration is false in at most {3.0 / count:.2g} of the box, at 95 %."
+            f"Declarations agree with the assembly at all {count} validation parameters. Where these are drawn at "
+            f"random, as by default, a declaration is false in at most {3.0 / count:.2g} of the box, at 95 %."
         )
 
 
