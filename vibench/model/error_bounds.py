@@ -28,7 +28,7 @@ from math import hypot, inf
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices, Mask
+from vibench.arrays import Array, Mask
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import active_set_iterations
 from vibench.interfaces.absent_rows import is_absent
@@ -386,7 +386,7 @@ def find_correction(
     starts, doubtful = [chosen[kept] for chosen in (pressed, lam > 0.0) if chosen is not None], None
     for _ in range(4):
         least = excess + margin
-        for values, forces in _minimisers(contact, energy, kept, lam, least, equal, starts, largest):
+        for values, forces in _minimisers(constraints, energy, lam, least, starts, largest):
             multipliers = np.zeros(len(vi.g))
             multipliers[kept] = forces
             w, multipliers = constraints.moved(u, values, multipliers)
@@ -405,20 +405,14 @@ def find_correction(
 
 
 def _minimisers(
-    contact: ContactForm,
-    energy: EnergyNorm,
-    kept: Indices,
-    lam: Array,
-    least: Array,
-    equal: Mask,
-    starts: Sequence[Mask],
-    largest: float,
+    constraints: Constraints, energy: EnergyNorm, lam: Array, least: Array, starts: Sequence[Mask], largest: float
 ) -> Iterator[tuple[Array, Array]]:
-    """Minimisers of ½‖w‖²_A + λᵀB w with B w ≥ s in the rows `kept` (k,), on retained unknowns (c,), and forces (k,).
+    """Minimisers of ½‖w‖²_A + λᵀB w with B w ≥ s in the k kept rows, on retained unknowns (c,), and forces (k,).
 
     Up to round-off, by active sets, then as a least distance problem: active sets of constraints that are dependent but
     for round-off may have a w that is feasible and huge, with a multiplier above `largest`. `least` is s (k,).
     """
+    contact, kept, equal = constraints.contact, constraints.rows.kept, constraints.rows.equal
     system = contact.correction_system(kept, lam, least)
     for active in (*starts, np.zeros_like(equal)):
         settled = active_set_iterations(system, active, equal)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import inf
 from typing import Any, TypeVar
 
 import numpy as np
@@ -271,12 +272,7 @@ def summarise_outputs(
 
 
 def high_fidelity_residuals(
-    vi: VariationalInequality,
-    energy: EnergyNorm,
-    u: Array,
-    lam: Array,
-    rho: float = np.inf,
-    u_energy: float | None = None,
+    vi: VariationalInequality, energy: EnergyNorm, u: Array, lam: Array, rho: float = inf, u_energy: float | None = None
 ) -> Residuals:
     """Residuals of u (n,) and λ (m,).
 

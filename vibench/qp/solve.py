@@ -116,8 +116,10 @@ def solve_qp(
     rows = row_norms(program.B)
     driven = drive(program, rows)
     kept = near(program, rows, driven)
-    if not kept.all() and (found := _solve_near(program, solver, accuracy, extra, factor, start, kept)) is not None:
-        return found
+    if not kept.all():
+        solve = partial(solve_qp, solver=solver, accuracy=accuracy, extra=extra, factor=factor)
+        if (found := _solve_near(program, kept, start, solve)) is not None:
+            return found
     solve = partial(_solve_in, solver=solver, accuracy=accuracy, extra=extra)
     if factor is None or not len(program.f):
         return solve(units_driven(rows, driven), program, start)
@@ -125,18 +127,12 @@ def solve_qp(
 
 
 def _solve_near(
-    program: VariationalInequality,
-    solver: str,
-    accuracy: float,
-    extra: Mapping[str, QPSolver] | None,
-    factor: Array | None,
-    start: QPSolution | None,
-    kept: Mask,
+    program: VariationalInequality, kept: Mask, start: QPSolution | None, solve: Callable[..., QPSolution]
 ) -> QPSolution | None:
     """Solve with the constraints that are `kept` (m,) alone; `None` if the solution violates one of the others."""
     B = program.B[kept] if isinstance(program.B, np.ndarray) else sp.csr_array(program.B)[kept]
     near_start = None if start is None or start.alpha is None else replace(start, alpha=start.alpha[kept])
-    answer = solve_qp(replace(program, B=B, g=program.g[kept]), solver, accuracy, extra, factor, near_start)
+    answer = solve(replace(program, B=B, g=program.g[kept]), start=near_start)
     if answer.x is None or answer.alpha is None:
         return answer
     if not np.all(program.B[~kept] @ answer.x <= program.g[~kept]):

@@ -107,6 +107,7 @@ class Inverse(Protocol):
         return np.asarray(free - shifts @ forces)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a diverging solver returns infinite residuals
 def kkt_residuals(
     program: VariationalInequality, x: Array, alpha: Array, inverse: Inverse | None = None, accuracy: float = 0.0
 ) -> Residuals:
@@ -115,12 +116,7 @@ def kkt_residuals(
     `inverse` is the factorisation of A where there is one already. Residuals up to the `accuracy` are good enough: F of
     the answer is their unit then, and no other one is computed. Raises a `NumericalError` if A is not definite.
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # a diverging solver returns infinite residuals
-        return _residuals(program, x, alpha, inverse or inverse_of(program.A), accuracy)
-
-
-def _residuals(program: VariationalInequality, x: Array, alpha: Array, inverse: Inverse, accuracy: float) -> Residuals:
-    B, g = program.B, program.g
+    B, g, inverse = program.B, program.g, inverse or inverse_of(program.A)
     residual, excess = accurate_residuals(program, x, alpha)
     rounded = round_off(B, x, g)
     violated = np.flatnonzero(excess > rounded)

@@ -17,14 +17,11 @@ where DᵀR is round-off: its entries are at most |S d_i||S⁻¹r_j|. So K − b
 symmetric part K of the computed BD, by a Cholesky factorisation of it that succeeds after a shift by all that was left
 out (Rump 2006). Products of matrices have bounded round-off (Higham 2002, §3.5), and there is none with an inverse.
 
-The same with A in place of Ŝ, all unknowns in place of c and δ = 0 takes nothing for granted of who computed D.
-
-Where A is constant and B is not, R is not computed anew: for a computed Ĉ ≈ Ŝ⁻¹ and E = I − ŜĈ, D = ĈBᵀ has R = EBᵀ,
-and the columns of S D and S⁻¹R are at most the sums of those of SĈ and S⁻¹E with weights |B|. A new B costs K alone.
-
-Where B = θX_W, of one multiplier for each unknown of c, B Ŝ⁻¹Bᵀ ≽ b² X_W means θ² X_W ≽ b² Ŝ, and D = τI, τ = b²/θ, is
-enough: BD + DᵀBᵀ − DᵀŜD = τ(B + Bᵀ) − τ²Ŝ ≽ b² X_W just for these b. Nothing is dense there, where Ŝ is sparse, and the
-largest of these b is θ over the root of the largest eigenvalue of Ŝ against X_W.
+The same with A in place of Ŝ, all unknowns in place of c and δ = 0 takes nothing for granted of who computed D. Where A
+is constant and B is not, R is not computed anew: for a computed Ĉ ≈ Ŝ⁻¹ and E = I − ŜĈ, D = ĈBᵀ has R = EBᵀ, and the
+columns of S D and S⁻¹R are at most the sums of those of SĈ and S⁻¹E with weights |B|. Where B = θX_W, of one multiplier
+for each unknown of c, D = τI, τ = b²/θ, is enough: τ(B + Bᵀ) − τ²Ŝ ≽ b² X_W just where θ² X_W ≽ b² Ŝ. Nothing is dense
+there, where Ŝ is sparse, and the largest of these b is θ over the root of the largest eigenvalue of Ŝ against X_W.
 """
 
 from __future__ import annotations

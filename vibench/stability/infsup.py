@@ -232,7 +232,14 @@ def cone_interval(C: Array, G: Array, span: float) -> tuple[float, float, str]:
     if not len(G):
         return float("inf"), float("inf"), ""
     M, noise = C.T @ C, ABSOLUTE * float(np.linalg.norm(C, 2)) if C.size else 0.0
-    lowers, uppers = _cheap_bounds(C, M, G, span)
+    alpha = simplex_minimiser(C)
+    nearest = C @ alpha
+    norm = float(np.linalg.norm(nearest))
+    lowers = {"L0": span, "L1": max(0.0, float(np.min(nearest @ C)) / norm) if norm > 0.0 else 0.0}
+    if _is_nonnegative(G):
+        lowers["L½"] = float(np.sqrt(entrywise_bound(M, G)))
+    # Use ‖Cα‖, not √(αᵀMα), which would lose half of the digits; the denominator has no cancellation.
+    uppers = {"U0": float(np.sqrt(np.min(np.diag(M) / np.diag(G)))), "U1": norm / float(np.sqrt(alpha @ G @ alpha))}
     low, high = max(lowers, key=lowers.__getitem__), min(uppers, key=uppers.__getitem__)
     narrow = lowers[low] >= 0.99 * uppers[high] or uppers[high] <= noise
     if not narrow and _is_nonnegative(G):
@@ -242,19 +249,6 @@ def cone_interval(C: Array, G: Array, span: float) -> tuple[float, float, str]:
     if uppers[high] < lowers[low] <= uppers[high] * (1.0 + RELATIVE) + noise:  # equal but for round-off
         return uppers[high], uppers[high], f"{low}/{high}"
     return lowers[low], uppers[high], f"{low}/{high}"
-
-
-def _cheap_bounds(C: Array, M: Array, G: Array, span: float) -> tuple[dict[str, float], dict[str, float]]:
-    """Lower and upper bounds by name that need no iteration but one nonnegative least squares problem."""
-    alpha = simplex_minimiser(C)
-    nearest = C @ alpha
-    norm = float(np.linalg.norm(nearest))
-    lowers = {"L0": span, "L1": max(0.0, float(np.min(nearest @ C)) / norm) if norm > 0.0 else 0.0}
-    if _is_nonnegative(G):
-        lowers["L½"] = float(np.sqrt(entrywise_bound(M, G)))
-    # Use ‖Cα‖, not √(αᵀMα), which would lose half of the digits; the denominator has no cancellation.
-    uppers = {"U0": float(np.sqrt(np.min(np.diag(M) / np.diag(G)))), "U1": norm / float(np.sqrt(alpha @ G @ alpha))}
-    return lowers, uppers
 
 
 def simplex_minimiser(C: Array) -> Array:
