@@ -1,3 +1,4 @@
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -6,14 +7,18 @@ import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
 from numerics import Varying, exact, spd
+from scipy.spatial import KDTree
 
-from vibench import Array, Reduction, create
+from vibench import Array, HighFidelitySolver, NestedStart, Reduction, create
+from vibench.arrays import Mask
 from vibench.errors import NumericalError
 from vibench.highfidelity import active_set
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Stop
 from vibench.offline.checked_tools import solve_high_fidelity
 from vibench.qp.verification import kkt_residuals
+from vibench_problems import obstacle
+from vibench_problems.obstacle import Obstacle
 
 
 def string(n: int, gap: float, load: float) -> VariationalInequality:
@@ -195,3 +200,57 @@ def test_reasons_name_the_parameter() -> None:
     problem.assemble = lambda mu: infeasible  # type: ignore[method-assign]
     with pytest.raises(NumericalError, match=r"^at mu = \[0.5\]: no active set solves .*; is it feasible\?$"):
         active_set.HighFidelitySolver(problem).solve(mu)
+
+
+MU = np.array([1.1, 0.02, -0.03])
+
+
+def places(problem: Obstacle) -> Array:
+    return problem.mesh.p[:, problem.disc_nodes]
+
+
+def test_coarser_meshes_save_iterations_and_change_no_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+    coarse, fine = Obstacle(700), Obstacle(2800)
+    cold = HighFidelitySolver(fine).solve(MU)
+    nested = NestedStart(coarse, places(coarse), places(fine))
+    coarsely = HighFidelitySolver(coarse).solve(MU).lam > 0.0
+    start, contact, spacing = coarsely[nested.nearest], cold.lam > 0.0, 1.1 / np.sqrt(coarse.nodes)
+    for wrong, others in ((start & ~contact, contact), (~start & contact, ~contact)):  # near the edge of the contact
+        distances, _ = KDTree(places(fine)[:, others].T).query(places(fine)[:, wrong].T)
+        assert np.max(distances, initial=0.0) < 1.5 * spacing
+    fine.start = lambda mu, nearest: nested  # type: ignore[method-assign]
+    found = HighFidelitySolver(fine).solve(MU)
+    assert found.iterations < 0.6 * cold.iterations
+    assert found.fallback == ""
+    assert np.array_equal(found.lam > 0.0, cold.lam > 0.0)
+    assert np.allclose(found.u, cold.u, rtol=0.0, atol=1e-12)
+    cold = HighFidelitySolver(Obstacle(1500)).solve(MU)
+    monkeypatch.setattr(obstacle, "NESTED", 1000)
+    problem = Obstacle(1500)
+    solver = HighFidelitySolver(problem)
+    first = solver.solve(MU)
+    assert first.iterations < cold.iterations
+    assert np.allclose(first.u, cold.u, rtol=0.0, atol=1e-12)
+    nearest = first.lam > 0.0
+    assert problem.start(MU, nearest) is nearest
+    assert solver.solve(MU).iterations == 1  # from its own contact set
+
+
+def test_a_start_depends_on_the_parameter_alone_and_can_be_copied_after_use() -> None:
+    coarse, fine = Obstacle(300), Obstacle(700)
+    nested = NestedStart(coarse, places(coarse), places(fine))
+    fine.start = lambda mu, nearest: nested  # type: ignore[method-assign]
+    solver, other = HighFidelitySolver(fine), HighFidelitySolver(fine)
+    first = solver.solve(MU).iterations
+    other.solve(fine.parameters.lower)
+    assert other.solve(MU).iterations == solver.solve(MU).iterations == first
+    assert np.array_equal(pickle.loads(pickle.dumps(nested)).nearest, nested.nearest)
+
+
+@pytest.mark.parametrize("start", [np.zeros(3, bool), np.zeros(100)], ids=["too short", "not of booleans"])
+def test_a_start_of_the_wrong_kind_is_named(start: Mask) -> None:
+    problem = Obstacle(400)
+    problem.start = lambda mu, nearest: start  # type: ignore[method-assign]
+    expected = rf"start returns .*; expected \({problem.W.dim},\) and bool, a NestedStart, or None"
+    with pytest.raises(NumericalError, match=expected):
+        HighFidelitySolver(problem).solve(MU)

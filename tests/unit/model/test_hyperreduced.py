@@ -119,8 +119,11 @@ def separation(problem: Problem) -> Mapping[str, Any]:
     return affine_decomposition(problem, problem.training_set(), 1e-11)
 
 
-def reduced_model(problem: Problem, kind: str, modes: int, generators: int, mus: np.ndarray) -> ReducedModel:
+def reduced_model(
+    problem: Problem, kind: str, modes: int = 3, generators: int = 2, mus: np.ndarray | None = None
+) -> ReducedModel:
     """A reduced model from some solutions; the fixed enrichment is the supremizers at the first parameter."""
+    mus = problem.training_set()[:5] if mus is None else mus
     u, lam = solutions(problem, tuple(map(tuple, mus.tolist())))
     lam = lam[:, lam.any(axis=0)][:, :generators]
     cone = cone_basis(lam / problem.W.norm(lam), problem.W)
@@ -135,8 +138,8 @@ def reduced_model(problem: Problem, kind: str, modes: int, generators: int, mus:
     return ReducedModel(problem, basis, enrichment, cone.chi, cone.span)
 
 
-def online(model: ReducedModel) -> HyperReducedModel:
-    members = separation(model.problem)
+def online(model: ReducedModel, members: Mapping[str, Any] | None = None) -> HyperReducedModel:
+    members = members or separation(model.problem)
     assert reason_for_full_assembly(model, members) == ""
     return HyperReducedModel(model, hyper_reduce(model, members))
 
@@ -162,6 +165,14 @@ def assert_same_program(model: ReducedModel, reduced: HyperReducedModel, mu: np.
         assert np.array_equal(found.program.A, found.program.A.T)
 
 
+def assert_same_programs(problem: Problem, kind: str, accuracy: float) -> None:
+    """At new parameters, of a model with three modes and two generators."""
+    model = reduced_model(problem, kind)
+    reduced = online(model)
+    for mu in NEW:
+        assert_same_program(model, reduced, mu, accuracy)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("constraint", WAYS)
 @pytest.mark.parametrize("stiffness", ["constant", "several"])
@@ -172,10 +183,7 @@ def test_programs_are_those_of_the_full_assembly(constraint: str, stiffness: str
         {"constant": 1, "several": 2}[stiffness],
         {"constant": 1, "one": 1, "several": 3, "contact": 0}[constraint],
     ]
-    model = reduced_model(problem, kind, 3, 2, problem.training_set()[:5])
-    reduced = online(model)
-    for mu in NEW:
-        assert_same_program(model, reduced, mu, 1e-9)
+    assert_same_programs(problem, kind, 1e-9)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -189,10 +197,7 @@ def test_declared_terms_give_the_program_up_to_round_off(constraint: str, kind: 
     }
     members = separation(problem)
     assert {name for name in MEMBERS if members[name].way is Evaluation.AFFINE} == set(declared)
-    model = reduced_model(problem, kind, 3, 2, problem.training_set()[:5])
-    accuracy = 1e-13 if declared == "ABfg" else 1e-9
-    for mu in NEW:
-        assert_same_program(model, HyperReducedModel(model, hyper_reduce(model, members)), mu, accuracy)
+    assert_same_programs(problem, kind, 1e-13 if declared == "ABfg" else 1e-9)
 
 
 class Mixed(Rope):
@@ -212,9 +217,7 @@ def test_members_on_the_contact_and_interpolated_ones_go_together(entrywise: str
     problem.entrywise = frozenset(entrywise)
     members = separation(problem)
     assert {name for name in MEMBERS if members[name].way is Evaluation.CONTACT} == set(on_contact)
-    model = reduced_model(problem, kind, 3, 2, problem.training_set()[:5])
-    for mu in NEW:
-        assert_same_program(model, HyperReducedModel(model, hyper_reduce(model, members)), mu, 1e-9)
+    assert_same_programs(problem, kind, 1e-9)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -222,7 +225,7 @@ def test_members_on_the_contact_and_interpolated_ones_go_together(entrywise: str
 @pytest.mark.parametrize(("modes", "generators"), [(3, 0), (0, 2), (0, 0)])
 def test_without_modes_or_without_generators(constraint: str, kind: str, modes: int, generators: int) -> None:
     problem = rope(constraint, "constant")
-    model = reduced_model(problem, kind, modes, generators, problem.training_set()[:5])
+    model = reduced_model(problem, kind, modes, generators)
     reduced = online(model)
     for mu in NEW[:2]:
         assert_same_program(model, reduced, mu, 1e-9)
@@ -245,10 +248,10 @@ def test_programs_of_spaces_that_depend_on_mu_are_right_in_all_dimensions(
 
 def test_a_loose_tolerance_gives_a_program_that_is_as_inexact() -> None:
     problem = rope("several")
-    model = reduced_model(problem, "none", 3, 2, problem.training_set()[:5])
+    model = reduced_model(problem, "none")
     members = affine_decomposition(problem, problem.training_set(), 0.2)
     assert members["B"].error > 1e-3
-    reduced, mu = HyperReducedModel(model, hyper_reduce(model, members)), NEW[0]
+    reduced, mu = online(model, members), NEW[0]
     exact = model.assemble(mu).program.B
     assert 1e-3 < np.linalg.norm(reduced.assemble(mu).program.B - exact) / np.linalg.norm(exact) < 0.5
 
@@ -256,7 +259,7 @@ def test_a_loose_tolerance_gives_a_program_that_is_as_inexact() -> None:
 def test_operators_travel() -> None:
     """Pickled ones give the same programs, and their factor is still that of A."""
     for constraint, kind in product(WAYS, KINDS):
-        model = reduced_model(rope(constraint, "constant"), kind, 3, 2, rope(constraint).training_set()[:5])
+        model = reduced_model(rope(constraint, "constant"), kind)
         operators = hyper_reduce(model, separation(model.problem))
         here, there = (HyperReducedModel(model, each) for each in (operators, pickle.loads(pickle.dumps(operators))))
         one, other = here.assemble(NEW[0]), there.assemble(NEW[0])
@@ -282,7 +285,7 @@ def test_a_factor_comes_with_a_constant_stiffness_on_a_fixed_space(
     stiffness: str, constraint: str, kind: str, modes: int, dual: bool
 ) -> None:
     problem = rope(constraint, stiffness)
-    model = reduced_model(problem, kind, modes, 3, problem.training_set()[:5])
+    model = reduced_model(problem, kind, modes, 3)
     query = online(model).assemble(NEW[1])
     assert (query.factor is not None) == dual
     primal = solve_qp(query.program, "piqp", 1e-10)
@@ -313,7 +316,7 @@ def test_values_that_are_not_finite_are_refused(
     monkeypatch: pytest.MonkeyPatch, constraint: str, member: str, kind: str, value: float
 ) -> None:
     problem = rope(constraint)
-    reduced = online(reduced_model(problem, kind, 3, 2, problem.training_set()[:5]))
+    reduced = online(reduced_model(problem, kind))
     sampler, contact = problem.sampler, problem.contact
 
     def spoiled(wanted):
@@ -346,7 +349,7 @@ def test_reduced_queries_of_real_problems_are_as_good_as_full_ones(name: str, ki
     assert [members[member].way for member in MEMBERS] == ways
     training = problem.training_set()
     model = reduced_model(problem, kind, 5, 4, training[np.linspace(0, len(training) - 1, 6).astype(int)])
-    reduced, solver = HyperReducedModel(model, hyper_reduce(model, members)), HighFidelitySolver(problem)
+    reduced, solver = online(model, members), HighFidelitySolver(problem)
     for mu in problem.validation_set(4, 5):
         assert_same_program(model, reduced, mu, 1e-5)
         exact, errors = solver.solve(mu), []
@@ -410,7 +413,7 @@ def test_a_query_makes_no_array_of_mesh_size(name: str, kind: str, dim: int, gen
     assert problem.V.dim == dim
     training = problem.training_set()
     model = reduced_model(problem, kind, 4, generators, training[np.linspace(0, len(training) - 1, 5).astype(int)])
-    reduced, mu = HyperReducedModel(model, hyper_reduce(model, members)), problem.validation_set(1, 0)[0]
+    reduced, mu = online(model, members), problem.validation_set(1, 0)[0]
     reduced.assemble(mu)  # what is set up once is set up
     found = largest_step(lambda: reduced.assemble(mu))
     assert 0 < found[0] < 8 * dim, found

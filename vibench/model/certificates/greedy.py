@@ -210,13 +210,8 @@ class IncrementalModel:
 
     Its space is spanned by the u(µ_i) and supremizers T(µ_i)ν_i (Haasdonk, Salomon and Wohlmuth 2012, §5), its cone by
     the ν_i: every λ(µ_i) without its part in the cone before it (line 9 of Algorithm 2 of Niakh et al. 2022), which
-    makes the cone larger than that of the λ(µ_i). Bounds are (ii) of `vibench.model.error_bounds`, at the cost of the
-    mesh.
-
-    Attributes
-    ----------
-    generators
-        The ν_i (m×R), unit norm in W.
+    makes the cone larger than that of the λ(µ_i). The ν_i (m×R) are the `generators`, of unit norm in W. Bounds are
+    (ii) of `vibench.model.error_bounds`, at the cost of the mesh.
     """
 
     def __init__(self, problem: Problem, solver: HighFidelitySolver) -> None:
@@ -336,16 +331,8 @@ class GreedyTrainer(Trainer):
     """High-fidelity solutions, and bounds of the model that they make, with the seconds of both.
 
     A solution where a bound was computed last starts from what that has left: its assembly and its factors of A are
-    among the seconds of bounds.
-
-    Attributes
-    ----------
-    solved
-        The solutions in their order.
-    setup
-        Seconds of the set-up: what the first solution took beyond its repetition.
-    selecting
-        Seconds of bounds and of the growth of their model.
+    among the seconds of bounds. `solved` has the solutions in their order, `setup` the seconds that the first one took
+    beyond its repetition, `selecting` those of bounds and of the growth of their model.
     """
 
     def __init__(self, problem: Problem, reference: ReferenceAssembly) -> None:
