@@ -5,7 +5,7 @@ import os
 import signal
 import sqlite3
 import subprocess
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -80,19 +80,28 @@ def failures(results: Sequence[CheckResult]) -> dict[str, str]:
 
 def execute(folder: Path, *statements: str) -> None:
     """Change the results in a folder by SQL, with their digests: as somebody would who wrote the file."""
-    db = sqlite3.connect(folder / FILE)
+    db, touched = sqlite3.connect(folder / FILE), set[str]()
+
+    def note(action: int, table: str | None, *_: str | None) -> int:
+        # what foreign keys take along is told, too
+        if action in (sqlite3.SQLITE_INSERT, sqlite3.SQLITE_UPDATE, sqlite3.SQLITE_DELETE):
+            touched.add(str(table))
+        return sqlite3.SQLITE_OK
+
     db.execute("PRAGMA foreign_keys=ON")
+    db.set_authorizer(note)
     for statement in statements:
         db.execute(statement)
-    seal(db)
+    db.set_authorizer(None)
+    seal(db, touched)
     db.commit()
     db.close()
 
 
-def seal(db: sqlite3.Connection) -> None:
+def seal(db: sqlite3.Connection, tables: Collection[str] = ("meta", *STORED)) -> None:
     db.text_factory = read_text
-    db.execute("DELETE FROM digests")
-    for table in ("meta", *STORED):
+    for table in {"meta", *STORED}.intersection(tables):
+        Digests(db).forget(name=table)
         Digests(db).count(table)
 
 
