@@ -73,7 +73,7 @@ from .offline.checked_tools import supremizers as supremizers
 from .offline.compiled import CompiledModel as CompiledModel
 from .offline.compiled import CompiledProgram as CompiledProgram
 from .offline.models import Model as Model
-from .offline.program_model import ProgramModel as ProgramModel
+from .offline.models import ProgramModel as ProgramModel
 from .offline.reduction import Reduction as Reduction
 from .offline.solution import Solution as Solution
 from .plugins.registry import create as create

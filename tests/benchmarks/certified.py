@@ -27,8 +27,8 @@ from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.offline.assemblies import Assemblies
-from vibench.offline.correction import Answer, Corrector
 from vibench.offline.models import Model
+from vibench.offline.solution import Answer, Corrector
 from vibench.plugins.plugin import Plugin
 from vibench.stages.assessment import is_violated
 

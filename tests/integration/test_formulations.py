@@ -150,7 +150,7 @@ def test_a_recorded_formulation_answers_and_is_refused_where_it_makes_no_sense(f
     problem = Wire()
     assert problem.V.norm(again.u - exact.u) <= again.error_bounds.u
     nearest = open_run(found.path).model(key)
-    with pytest.raises(RequestError, match="the formulation Nearest has no quadratic program"):
+    with pytest.raises(RequestError, match="the formulation Nearest has no program"):
         nearest.reduced  # noqa: B018
     with pytest.raises(RequestError, match="the formulation Nearest uses no QP solver"):
         nearest.solve([5.0], solver="piqp")

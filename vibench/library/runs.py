@@ -59,10 +59,7 @@ class Run:
     def table(self, name: str) -> pd.DataFrame:
         """A table of the results file, its rows in the order of the axes; the documentation lists the columns.
 
-        Raises
-        ------
-        RequestError
-            If there is no such table.
+        Raises a `RequestError` if there is no such table.
         """
         if name not in TABLES:
             raise unknown_name("table", name, TABLES)

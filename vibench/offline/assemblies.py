@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from operator import attrgetter
 
 import numpy as np
-from cachetools import LRUCache
+from cachetools import LRUCache, cachedmethod
 
 from vibench.arrays import Array, digest
 from vibench.highfidelity.active_set import HighFidelitySolver
@@ -37,14 +38,10 @@ class Assemblies:
         self._digests: LRUCache[tuple[str, bytes], bytes] = LRUCache(2000)
         self._betas: LRUCache[tuple[bytes, bytes], Constant] = LRUCache(1000)
 
+    @cachedmethod(attrgetter("_kept"), key=lambda _, mu: _key(mu))
     def at(self, mu: Array) -> VariationalInequality:
         """A copy of `checked_assembly` at mu (d,), which later assemblies leave as it is."""
-        vi = self._kept.get(_key(mu))
-        if vi is None:
-            vi = checked_assembly(self._problem, mu).copy()
-            if _bytes(vi) <= self._kept.maxsize:
-                self._kept[_key(mu)] = vi
-        return vi
+        return checked_assembly(self._problem, mu).copy()
 
     def energy_at(self, mu: Array) -> EnergyNorm:
         """Factorisations of A at mu (d,) and what errors and bounds at mu share; a constant A is factorised once."""
@@ -74,52 +71,34 @@ class Assemblies:
         """Factorisations of an assembled A, which are not kept unless it is constant: this may be timed."""
         return EnergyNorm(vi.A, self._solver.condensed(vi))
 
+    @cachedmethod(attrgetter("_digests"), key=lambda _, mu, member: (member, _key(mu)))
+    def _digest_at(self, mu: Array, member: str) -> bytes:
+        """The digest of A or B at mu (d,), the key of all parameters with it; "" where it is constant."""
+        # A often depends on a few components of the parameter alone.
+        return b"" if member in self._problem.constant else digest(getattr(self.at(mu), member))
+
+    @cachedmethod(attrgetter("_alphas"), key=lambda self, mu: self._digest_at(mu, "A"))
     def coercivity_at(self, mu: Array) -> Constant:
         """Lower bound of α at mu (d,), with the factorisation of `energy_at`; computed once for all mu with one A."""
-        key = self._stiffness_at(mu)
-        if key not in self._alphas:
-            order = self.energy_at(mu).stiffness.order
-            self._alphas[key] = coercivity(self._quotients_at(mu), order)
-        return self._alphas[key]
+        order = self.energy_at(mu).stiffness.order
+        return coercivity(self._quotients_at(mu), order)
 
+    @cachedmethod(attrgetter("_gammas"), key=lambda self, mu: self._digest_at(mu, "A"))
     def continuity_at(self, mu: Array) -> Constant:
         """Upper bound of γ_a, likewise."""
-        key = self._stiffness_at(mu)
-        if key not in self._gammas:
-            self._gammas[key] = continuity(self._quotients_at(mu))
-            # γ_a is asked for last, and the vectors are large.
-            self._quotients.clear()
-        return self._gammas[key]
+        found = continuity(self._quotients_at(mu))
+        # γ_a is asked for last, and the vectors are large.
+        self._quotients.clear()
+        return found
 
+    @cachedmethod(attrgetter("_quotients"), key=lambda self, mu: self._digest_at(mu, "A"))
     def _quotients_at(self, mu: Array) -> Quotients:
-        """Estimates of both, those of the last A."""
-        key = self._stiffness_at(mu)
-        if key not in self._quotients:
-            self._quotients[key] = Quotients(self.at(mu).A, self._problem.V, self.energy_at(mu).stiffness.solve)
-        return self._quotients[key]
+        return Quotients(self.at(mu).A, self._problem.V, self.energy_at(mu).stiffness.solve)
 
-    def _stiffness_at(self, mu: Array) -> bytes:
-        """Key of all parameters with the A of mu (d,): A often depends on a few components alone."""
-        return self._digest_at(mu, "A")
-
-    def _digest_at(self, mu: Array, member: str) -> bytes:
-        """The digest of A or B at mu (d,); "" where it is constant."""
-        if member in self._problem.constant:
-            return b""
-        key = member, _key(mu)
-        if key not in self._digests:
-            self._digests[key] = digest(getattr(self.at(mu), member))
-        return self._digests[key]
-
+    @cachedmethod(attrgetter("_betas"), key=lambda self, mu: (self._digest_at(mu, "A"), self._digest_at(mu, "B")))
     def energy_inf_sup_at(self, mu: Array) -> Constant:
         """Lower bound of β_A at mu (d,), computed once for all mu with one A and one B."""
-        key = self._digest_at(mu, "A"), self._digest_at(mu, "B")
-        if key not in self._betas:
-            self._betas[key] = self._energy_inf_sup(mu)
-        return self._betas[key]
-
-    def _energy_inf_sup(self, mu: Array) -> Constant:
-        """By matrices of contact size, dense but for multiples of X_W; where they are large, by sparse ones."""
+        # By matrices of contact size, dense but for multiples of X_W; where they are large, by sparse ones.
         vi, energy, W = self.at(mu), self.energy_at(mu), self._problem.W
         on, stiffness = energy.contact_form(vi), energy.stiffness
         if stiffness.has_known_round_off and (theta := multiple_of(on.B, W)):

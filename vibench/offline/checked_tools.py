@@ -51,9 +51,8 @@ def checked(**expected: Shape | type) -> Callable[[Callable[P, T]], Callable[P, 
                 for size, count in _sizes(f"{name} of {function.__name__}", value, expected[name], name):
                     known, whose = sizes.setdefault(size, (count, name))
                     if known != count:
-                        raise RequestError(
-                            f"{name} of {function.__name__} has {size} = {count}, but that of {whose} is {known}"
-                        )
+                        what = f"{name} of {function.__name__} has {size} = {count}"
+                        raise RequestError(f"{what}, but that of {whose} is {known}")
             return function(*given, **named)
 
         call.__module__ = __name__  # by which it is pickled

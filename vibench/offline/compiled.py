@@ -45,11 +45,8 @@ class CompiledModel:
     def of(cls, reduced: AnyReducedModel, accuracy: float) -> CompiledModel:
         """Interpolate the members of a reduced model.
 
-        Raises
-        ------
-        UnsupportedError
-            If there is none: the basis depends on the parameter, polynomials of the members are not accurate enough or
-            too large.
+        Raises an `UnsupportedError` if there is none: the basis depends on the parameter, polynomials of the members
+        are not accurate enough or too large.
         """
         try:
             _, polynomials = member_polynomials(reduced, TOLERANCE, EVALUATIONS, fixed=True, check=_refuse_large)
@@ -72,15 +69,8 @@ class CompiledModel:
         return c_source.source(self.members, {"lower": self.lower, "upper": self.upper}, about, "model")[0]
 
     def program(self) -> CompiledProgram:
-        """Compile and load the program.
-
-        Raises
-        ------
-        UnsupportedError
-            If there is no C compiler, or it fails.
-        """
-        sizes = (self.members[name].terms.shape[1] for name in "fg")
-        return CompiledProgram.compiled(self.source, *sizes)
+        """Compile and load the program; raises an `UnsupportedError` if there is no C compiler, or it fails."""
+        return CompiledProgram(self.source, *(self.members[name].terms.shape[1] for name in "fg"))
 
 
 def _refuse_large(program: VariationalInequality) -> None:
@@ -95,25 +85,17 @@ def _refuse_large(program: VariationalInequality) -> None:
 
 
 class CompiledProgram:
-    """A loaded program of `unknowns` and `constraints`."""
+    """A program of `unknowns` and `constraints`, compiled from its source and loaded.
 
-    def __init__(self, loaded: Any, unknowns: int, constraints: int) -> None:
-        self._solve, self._sizes = loaded.model_solve, (unknowns, constraints)
-        self._solve.argtypes, self._solve.restype = [ctypes.c_void_p] * 4, ctypes.c_int
+    Raises an `UnsupportedError` if there is no C compiler, or it fails.
+    """
 
-    @classmethod
-    def compiled(cls, source: str, unknowns: int, constraints: int) -> CompiledProgram:
-        """Compile a source and load the program.
-
-        Raises
-        ------
-        UnsupportedError
-            If there is no C compiler, or it fails.
-        """
+    def __init__(self, source: str, unknowns: int, constraints: int) -> None:
         # A library that is loaded needs its file no longer.
         with TemporaryDirectory(prefix="vibench-") as folder:
-            loaded = ctypes.CDLL(str(_compiled(source, Path(folder))))
-        return cls(loaded, unknowns, constraints)
+            self._solve = ctypes.CDLL(str(_compiled(source, Path(folder)))).model_solve
+        self._sizes = unknowns, constraints
+        self._solve.argtypes, self._solve.restype = [ctypes.c_void_p] * 4, ctypes.c_int
 
     def __call__(self, mu: Array) -> QPSolution:
         """The solution at mu (d,), verified by the program alone."""
@@ -122,8 +104,8 @@ class CompiledProgram:
         code = self._solve(at.ctypes.data, x.ctypes.data, alpha.ctypes.data, residuals.ctypes.data)
         # The program adds 16 to its code at parameters outside the box.
         outcome = code % 16
-        texts = ["solved", "inaccurate", "the constraints contradict each other", "not solved"]
-        text = texts[outcome] if outcome < len(texts) else f"code {code}"
+        texts = dict(enumerate(["solved", "inaccurate", "the constraints contradict each other", "not solved"]))
+        text = texts.get(outcome, f"code {code}")
         return QPSolution(x, alpha, text) if outcome in {0, 1} else QPSolution(None, None, text)
 
 
@@ -135,10 +117,8 @@ def compiler() -> list[str]:
             return command
     if named:
         raise UnsupportedError(f"the environment variable CC names the C compiler '{named[0]}', which is not found")
-    raise UnsupportedError(
-        f"there is no C compiler: none of {', '.join(usual)} is on the PATH; install one, or name it in the "
-        "environment variable CC"
-    )
+    advice = "install one, or name it in the environment variable CC"
+    raise UnsupportedError(f"there is no C compiler: none of {', '.join(usual)} is on the PATH; {advice}")
 
 
 def _compiled(source: str, folder: Path) -> Path:

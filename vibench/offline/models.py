@@ -29,6 +29,7 @@ from vibench.interfaces.formulations import (
 )
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.strategies import Kind
 from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import output_weights
 from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate
@@ -68,19 +69,13 @@ class CellSolver:
         self.last: tuple[VariationalInequality, QPSolution] | None = None
 
     def __call__(
-        self,
-        program: VariationalInequality,
-        *,
-        factor: Array | None = None,
-        start: tuple[Array, Array] | None = None,
+        self, program: VariationalInequality, *, factor: Array | None = None, start: tuple[Array, Array] | None = None
     ) -> QPSolution:
         """The solution of a dense program; see `vibench.interfaces.formulations.SolveQP`."""
         if self._solver is None:
             raise NumericalError("the formulation solves a quadratic program without 'solvers' among its axes (`uses`)")
         # Other solvers cannot use a start.
-        begun = None
-        if start is not None and takes_start(self._solver):
-            begun = QPSolution(*start, "the start")
+        begun = None if start is None or not takes_start(self._solver) else QPSolution(*start, "the start")
         solution = solve_qp(program, self._solver, self._accuracy, self._extra, factor, begun)
         self.last = program, solution
         return solution
@@ -171,10 +166,7 @@ class Model:
     def online(self) -> FormulationModel:
         """The model of the formulation, which answers queries.
 
-        Raises
-        ------
-        NumericalError
-            If the formulation makes something else.
+        Raises a `NumericalError` if the formulation makes something else.
         """
         made = self.formulation.model(self.offline, self.built)
         if not isinstance(made, FormulationModel):
@@ -191,16 +183,11 @@ class Model:
     def reduced(self) -> AnyReducedModel:
         """The reduced model that assembles the programs: `reduced.assemble(mu)` has `program` and `reconstruct`.
 
-        Raises
-        ------
-        RequestError
-            If the formulation has no programs.
+        Raises a `RequestError` if the formulation has no programs.
         """
         if not self.formulation.has_program:
-            raise RequestError(
-                f"the formulation {type(self.formulation).__name__} has no quadratic program that could be replayed, "
-                "corrected or exported"
-            )
+            name = type(self.formulation).__name__
+            raise RequestError(f"the formulation {name} has no program to be replayed, corrected or exported")
         reduced: AnyReducedModel = self.online.reduced
         return reduced
 
@@ -233,10 +220,7 @@ class Model:
 
         Residuals may be `slackened` times the accuracy.
 
-        Raises
-        ------
-        NumericalError
-            If the answer is of another type or size.
+        Raises a `NumericalError` if the answer is of another type or size.
         """
         if not isinstance(answer, FormulationAnswer):
             raise NumericalError(f"`solve` returned a {type(answer).__name__}, expected a FormulationAnswer")
@@ -376,12 +360,7 @@ class Model:
         return self._program_solution(at, assembled, found, (assembly, solution.cpu), settings)
 
     def _program_solution(
-        self,
-        at: Array,
-        assembled: ReducedProblem,
-        found: QPSolution,
-        seconds: tuple[float, float],
-        settings: _Settings,
+        self, at: Array, assembled: ReducedProblem, found: QPSolution, seconds: tuple[float, float], settings: _Settings
     ) -> Solution:
         """The verified answer to a program, with its bounds."""
         status, reason, residuals = verify(assembled.program, found, settings.accuracy)
@@ -433,10 +412,7 @@ class Model:
         Reduced assembly evaluates the sums of terms of up to `BLOCK` programs at once, and each row has an equal part
         of the seconds; programs are solved one after the other.
 
-        Raises
-        ------
-        RequestError
-            As `solve`, or if the array has another shape.
+        Raises a `RequestError` as `solve`, or if the array has another shape.
         """
         import pandas as pd  # noqa: PLC0415  workers load models, and no tables
 
@@ -497,10 +473,8 @@ def parameter_in(box: ParameterBox, mu: Parameters) -> Array:
     if at.shape != (box.dim,) or not np.all(np.isfinite(at)):
         raise RequestError(f"mu is {np.asarray(mu).tolist()}, expected finite numbers ({', '.join(box.names)})")
     if outside := [name for name, out in zip(box.names, box.outside(at), strict=True) if out]:
-        warnings.warn(
-            f"{', '.join(outside)}: outside the parameter domain, where the model was not trained",
-            stacklevel=3,
-        )
+        text = f"{', '.join(outside)}: outside the parameter domain, where the model was not trained"
+        warnings.warn(text, stacklevel=3)
     return at
 
 
@@ -523,3 +497,29 @@ def _refuse_other_size(what: str, vector: object, size: int | None = None) -> No
     if array is None or array.dtype != np.float64 or array.shape != (array.size if size is None else size,):
         found = f"the type {type(vector).__name__}" if array is None else f"{array.dtype} and the shape {array.shape}"
         raise NumericalError(f"{what} {found}, expected float64 and ({'count' if size is None else size},)")
+
+
+class ProgramModel(FormulationModel):
+    """Assembles the program of a reduced model at a parameter, and leaves its solution to the QP solver of the cell."""
+
+    def __init__(self, reduced: AnyReducedModel) -> None:
+        self.reduced = reduced
+        spaces = reduced.model if isinstance(reduced, HyperReducedModel) else reduced
+        varying = spaces.span.shape[1] if spaces.enrichment.kind is Kind.PER_PARAMETER else 0
+        self.dimension = int(reduced.fixed_basis.shape[1] + varying)
+        self.generators = int(reduced.generators.shape[1])
+
+    def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
+        """The solution of the program at mu (d,)."""
+        assembled = self.program(mu)
+        found = settings.solve_qp(assembled.program, factor=assembled.factor)
+        if found.x is None or found.alpha is None:
+            return FormulationAnswer.none(found.solver_status)
+        return FormulationAnswer(found.x, found.alpha, reason=found.solver_status, iterations=found.iterations)
+
+    def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:
+        """The pair u = Z x and λ = χ α; it assembles again."""
+        assert answer.x is not None
+        assert answer.alpha is not None
+        u = self.program(mu).reconstruct(answer.x[:, None])[:, 0]
+        return np.asarray(u), np.asarray(self.reduced.generators @ answer.alpha)

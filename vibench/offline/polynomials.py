@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
-from functools import partial
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 import numpy as np
@@ -70,17 +69,28 @@ def member_polynomials(
         packed = _packed(first, len(first.f), box.lower)
         constant = {name: packed[name][None, :] for name in reduced.problem.constant if name not in terms}
         terms |= constant
-        evaluate = partial(_evaluated, queried, len(first.f), theta_of, tuple(constant), beside)
-        alike = ["A", *rotated] if rotated else []
-        polynomials = interpolate_on_box(
-            evaluate, box.lower, box.upper, tolerance, evaluations, terms=terms, alike=alike
-        )
+
+        def evaluate(mu: Array) -> dict[str, Array]:
+            theta = coefficients_of(queried, mu)
+            found = _packed(members_of(queried, mu, theta), len(first.f), mu)
+            found |= {} if beside is None else beside(theta)
+            # In place of a sum of known terms its θ.
+            found |= {name: theta[member] for name, member in theta_of.items()}
+            return found | {name: np.ones(1) for name in constant}
+
+        grid, alike = (box.lower, box.upper, tolerance, evaluations), ["A", *rotated] if rotated else []
+        polynomials = interpolate_on_box(evaluate, *grid, terms=terms, alike=alike)
     except NumericalError as error:
         raise RequestError(f"the model cannot be evaluated in the whole parameter box: {error}") from None
     except (ArithmeticError, ValueError, LookupError) as error:
         # The code of a problem may raise any of these at the corners of its box.
         raise RequestError(f"the model cannot be evaluated in the whole parameter box: {in_a_line(error)}") from None
-    _refuse_inaccurate(polynomials, tolerance)
+    worst = max(polynomials, key=lambda name: polynomials[name].error)
+    if (reached := polynomials[worst].error) > tolerance:
+        degrees = ", ".join(map(str, polynomials[worst].degrees))
+        why = "depends on mu through the code of the problem, which the file cannot hold"
+        inaccurate = f"polynomials of degree ({degrees}) reach a relative error of {reached:.1e}, not {tolerance:.0e}"
+        raise InaccurateError(f"{worst} {why}, and {inaccurate}", reached)
     return queried, polynomials
 
 
@@ -129,27 +139,10 @@ def members_of(queried: AnyReducedModel, mu: Array, theta: Mapping[str, Array]) 
     if isinstance(queried, HyperReducedModel):
         return queried.members(mu, theta)
     if queried.kind is Kind.PER_PARAMETER:
-        raise RequestError(
-            "the enrichment changes the basis at every parameter, the cell assembles in full, and its problem does not "
-            'declare all members constant or affine; export the same cell with assembly = "reduced"'
-        )
+        changes = "the enrichment changes the basis at every parameter, the cell assembles in full"
+        why = f"{changes}, and its problem does not declare all members constant or affine"
+        raise RequestError(f'{why}; export the same cell with assembly = "reduced"')
     return queried.assemble(mu).program
-
-
-def _evaluated(
-    queried: AnyReducedModel,
-    size: int,
-    theta_of: Mapping[str, str],
-    constant: Collection[str],
-    beside: Beside | None,
-    mu: Array,
-) -> dict[str, Array]:
-    """Flat arrays of the members and those of `beside`; in place of a sum of known terms its θ."""
-    theta = coefficients_of(queried, mu)
-    found = _packed(members_of(queried, mu, theta), size, mu)
-    others = dict(beside(theta) if beside is not None else {})
-    sums = {name: theta[member] for name, member in theta_of.items()}
-    return found | others | sums | {name: np.ones(1) for name in constant}
 
 
 def _packed(found: VariationalInequality, size: int, mu: Array) -> dict[str, Array]:
@@ -161,16 +154,3 @@ def _packed(found: VariationalInequality, size: int, mu: Array) -> dict[str, Arr
     if not all(np.all(np.isfinite(array)) for array in arrays.values()):
         raise NumericalError(f"it has entries that are not finite at mu = {mu.tolist()}")
     return {name: array.ravel() for name, array in arrays.items()}
-
-
-def _refuse_inaccurate(members: Mapping[str, AffinePolynomial], tolerance: float) -> None:
-    missed = {name: member for name, member in members.items() if member.error > tolerance}
-    if not missed:
-        return
-    worst = max(missed, key=lambda name: missed[name].error)
-    error, degrees = missed[worst].error, ", ".join(map(str, missed[worst].degrees))
-    raise InaccurateError(
-        f"{worst} depends on mu through the code of the problem, which the file cannot hold, and polynomials of degree "
-        f"({degrees}) reach a relative error of {error:.1e}, not {tolerance:.0e}",
-        error,
-    )

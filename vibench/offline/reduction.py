@@ -138,9 +138,7 @@ class Reduction:
     on_failure: Literal["stop", "skip"] = "stop"
 
     def __post_init__(self) -> None:
-        classes = {
-            "problem": Problem, "dual": DualStrategy, "primal": PrimalStrategy, "formulation": Formulation,
-        }  # fmt: skip
+        classes = {"problem": Problem, "dual": DualStrategy, "primal": PrimalStrategy, "formulation": Formulation}
         for name, kind in classes.items():
             value = getattr(self, name)
             if not isinstance(value, kind) and not (name != "problem" and value is None):
@@ -148,9 +146,8 @@ class Reduction:
                 raise RequestError(f"{name} is {got}, expected an instance of a subclass of {kind.__name__}")
         for name, by in (("modes", self.primal), ("generators", self.dual)):
             if not isinstance(value := getattr(self, name), Stop) and not (value is None and by is None):
-                raise RequestError(
-                    f"{name} is {brief(repr(value), 80)}, expected a Stop: Stop(tolerance=…) or Stop(size=…)"
-                )
+                right = "a Stop: Stop(tolerance=…) or Stop(size=…)"
+                raise RequestError(f"{name} is {brief(repr(value), 80)}, expected {right}")
         choices_of = {"assembly": get_args(Assembly), "bounds": (True, False), "on_failure": ("stop", "skip")}
         for name, choices in choices_of.items():
             value = getattr(self, name)
@@ -161,14 +158,10 @@ class Reduction:
             value = getattr(self, name)
             if not isinstance(value, int | float | np.number) or not 0.0 < value < 1.0:
                 raise RequestError(f"{name} is {brief(repr(value), 80)}, expected a number between 0 and 1")
-        self._check_tolerance()
-
-    def _check_tolerance(self) -> None:
-        if self.primal is None and self.tolerance is not None:
-            raise RequestError("without a primal strategy there is no tolerance")
-        if self.primal is not None and self.primal.takes_tolerance == (self.tolerance is None):
-            needed = "needs a" if self.primal.takes_tolerance else "takes no"
-            raise RequestError(f"{type(self.primal).__qualname__} {needed} tolerance")
+        takes = self.primal is not None and self.primal.takes_tolerance
+        if takes == (self.tolerance is None):
+            of_one = f"{type(self.primal).__qualname__} {'needs a' if takes else 'takes no'} tolerance"
+            raise RequestError("without a primal strategy there is no tolerance" if self.primal is None else of_one)
 
     def given(self, **steps: Any) -> Reduction:
         """A reduction with the same inputs and these steps prescribed, by the names of the attributes.
@@ -207,10 +200,7 @@ class Reduction:
     def pod(self) -> POD:
         """V_N, and the error of the POD for every number of modes (paper, (10) and (11)).
 
-        Raises
-        ------
-        RequestError
-            If `modes` is `None`.
+        Raises a `RequestError` if `modes` is `None`.
         """
         if self.modes is None:
             raise RequestError("the offline phase has no V_N: modes is None")
@@ -278,31 +268,21 @@ class Reduction:
     def certificate_of(self, reduced: AnyReducedModel) -> OnlineCertificate:
         """The certificate of a reduced model of the problem, which bounds errors at online cost (`docs/certified.md`).
 
-        Raises
-        ------
-        UnsupportedError
-            If the model is assembled in full, or the problem does not allow it.
+        Raises an `UnsupportedError` if the model is assembled in full, or the problem does not allow it.
         """
         if not isinstance(reduced, HyperReducedModel):
             why = "as asked for" if self.assembly == "full" else self.operators
-            raise UnsupportedError(
-                f"a certificate at online cost needs reduced assembly, and the model is assembled in full: {why}"
-            )
+            needed = "a certificate at online cost needs reduced assembly"
+            raise UnsupportedError(f"{needed}, and the model is assembled in full: {why}")
         return prepare(reduced, self.members, self.certificate_base, self.decomposed)
 
     @cached_property
     def model(self) -> Model:
         """The model of the formulation, which is built now: `model.solve(mu)` answers queries at any parameter.
 
-        Raises
-        ------
-        RequestError
-            If the formulation uses steps that the offline phase does not have, or bounds are asked for and it has no
-            certificate.
-        UnsupportedError
-            If the problem does not have what it needs.
-        NumericalError
-            If A is not symmetric.
+        Raises a `RequestError` if the formulation uses steps that the offline phase does not have, or bounds are asked
+        for and it has no certificate, an `UnsupportedError` if the problem does not have what it needs, and a
+        `NumericalError` if A is not symmetric.
         """
         self._check_symmetric()
         formulation = self.formulation
@@ -333,13 +313,7 @@ class Reduction:
 
     @cached_property
     def certificate(self) -> OnlineCertificate:
-        """The certificate of the reduced model of this phase.
-
-        Raises
-        ------
-        UnsupportedError
-            As `certificate_of`.
-        """
+        """The certificate of the reduced model of this phase; raises an `UnsupportedError` as `certificate_of`."""
         return self.certificate_of(self.assembled)
 
     def with_formulation(self, formulation: Formulation) -> Reduction:

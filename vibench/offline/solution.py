@@ -1,4 +1,4 @@
-"""Solutions of reduced models at one parameter."""
+"""Solutions of reduced models at one parameter: the reduced solution, or the corrected pair of its certificate."""
 
 from __future__ import annotations
 
@@ -7,34 +7,93 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
 from math import inf
-from typing import Any, Protocol
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import RequestError
-from vibench.interfaces.problem import Problem
-from vibench.model.bound_terms import CorrectionMode
-from vibench.model.certificates.base import contact_unknowns
+from vibench.interfaces.problem import VariationalInequality
+from vibench.model.bound_terms import BoundNote, CorrectionMode, in_dual_set
+from vibench.model.certificates.base import Guarantee, contact_unknowns
 from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate, OnlineCorrection, output_error_bound
-from vibench.model.error_bounds import ErrorBounds, bound_errors_at
+from vibench.model.error_bounds import CorrectedPair, ErrorBounds, bound_errors_at, corrected_pair
 from vibench.model.errors import high_fidelity_residuals
-from vibench.model.hyperreduced import AnyReducedModel
-from vibench.offline.assemblies import assemblies
-from vibench.offline.correction import Answer, Corrector
+from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel
+from vibench.offline.assemblies import Assemblies, assemblies
 from vibench.qp.status import Status
 from vibench.qp.verification import Residuals
 
 
-class SolvingModel(Protocol):
-    """The parts of a `Model` that its solutions use."""
+class Answer(NamedTuple):
+    """The pair u (n,), λ (m,), whether it is corrected, and a note why it is not although that is asked for."""
+
+    # `bound` has its bounds at online cost, where the model has them; `share` is ω/ρ of the reduced solution.
+
+    u: Array
+    lam: Array
+    bound: OnlineBound | None = None
+    is_corrected: bool = False
+    share: float | None = None
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Corrector:
+    """Corrects solutions of a reduced model: at online cost where it has a certificate, else at high-fidelity cost."""
+
+    model: AnyReducedModel
+    certificate: OnlineCertificate | None
+    mode: CorrectionMode
 
     @property
-    def problem(self) -> Problem: ...
-    @property
-    def certificate(self) -> OnlineCertificate | None: ...
-    @property
-    def reduced(self) -> AnyReducedModel: ...
-    @property
-    def output_weights(self) -> Mapping[str, tuple[float, float] | None]: ...
+    def cost(self) -> str:
+        """Cost of a correction: "online" or "high-fidelity", or "" without any."""
+        if self.mode is CorrectionMode.NONE:
+            return ""
+        return "high-fidelity" if self.certificate is None else "online"
+
+    def answer(self, mu: Array, x: Array, alpha: Array, u: Array, lam: Array) -> Answer:
+        """The answer at mu (d,) from x (N',) and α (R,), with u_N (n,) and λ_N (m,) reconstructed from these."""
+        if self.certificate is None or not isinstance(self.model, HyperReducedModel):
+            return Answer(u, lam) if self.mode is CorrectionMode.NONE else self.in_full(mu, u, lam)
+        problem, certify = self.model.problem, self.certificate.certify
+        bound, correction = certify(problem, mu, self.model.assemble(mu), x, alpha, self.mode)
+        share = None if bound.guarantee is Guarantee.NONE else _share(bound.omega, bound.rho)
+        if correction is not None:
+            v = self.certificate.corrected(u, correction, contact_unknowns(problem))
+            return Answer(v, correction.nu, correction.bound, is_corrected=True, share=share)
+        applies = share is None or self.mode.applies(bound.omega, bound.rho)
+        if self.mode is CorrectionMode.NONE or not applies:
+            return Answer(u, lam, bound, share=share)
+        # The bound exists, but its correction has no multiplier ν ≥ 0 that would make it a pair.
+        no_pair = "the certificate found a correction, but no multiplier ν ≥ 0 that belongs to it"
+        return Answer(u, lam, bound, share=share, note=bound.note if bound.guarantee is Guarantee.NONE else no_pair)
+
+    def in_full(self, mu: Array, u: Array, lam: Array) -> Answer:
+        """The answer at high-fidelity cost."""
+        # Corrections are defined for λ_N ≥ 0 only (docs/mathematics.md, "Error bounds").
+        if not in_dual_set(lam):
+            return Answer(u, lam, note=BoundNote.NOT_IN_CONE)
+        cache = assemblies(self.model.problem)
+        pair = corrected_pair(cache.at(mu), cache.energy_at(mu), u, lam)
+        if pair is None:
+            return Answer(u, lam, note=BoundNote.NO_CORRECTION)
+        is_corrected, share = self.mode.applies(pair.omega, pair.rho), _share(pair.omega, pair.rho)
+        u, lam = (pair.u, pair.lam) if is_corrected else (u, lam)
+        return Answer(u, lam, is_corrected=is_corrected, share=share)
+
+
+def corrected_in_full(
+    model: AnyReducedModel, cache: Assemblies, mu: Array, vi: VariationalInequality, x: Array, alpha: Array
+) -> CorrectedPair | None:
+    """The correction at high-fidelity cost of x (N',), α (R,), with factorisations of an assembled A."""
+    u = np.asarray(model.reconstruct(mu, vi, x[:, None])[:, 0])
+    return corrected_pair(vi, cache.energy_of(vi), u, np.maximum(model.generators @ alpha, 0.0))
+
+
+def _share(omega: float, rho: float) -> float:
+    return omega / rho if rho > 0.0 else inf if omega > 0.0 else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +131,7 @@ class Solution:
     residuals: Residuals | None
     assembly: float
     solution: float
-    _model: SolvingModel = field(repr=False)
+    _model: Any = field(repr=False)  # the `Model`, whose module imports this one
     _pair: Callable[[], tuple[Array, Array] | None] = field(repr=False)
     bound: OnlineBound | None = None
     tolerance: float | None = None
@@ -159,9 +218,12 @@ class Solution:
     def error_bounds(self) -> ErrorBounds:
         """Proved bounds on the errors of u and λ in four norms, at the cost of high-fidelity factorisations at mu."""
         cache = assemblies(self._model.problem)
-        mu, constants = self.mu, (cache.coercivity_at(self.mu), cache.energy_inf_sup_at(self.mu))
-        of_V = self._model.problem.V
-        return bound_errors_at(of_V, cache.at(mu), cache.energy_at(mu), *constants, self.u, self.lam)
+        mu, V, constants = (
+            self.mu,
+            self._model.problem.V,
+            (cache.coercivity_at(self.mu), cache.energy_inf_sup_at(self.mu)),
+        )
+        return bound_errors_at(V, cache.at(mu), cache.energy_at(mu), *constants, self.u, self.lam)
 
     @cached_property
     def high_fidelity_residuals(self) -> Residuals:

@@ -66,7 +66,8 @@ class ArrayFiles:
     """
 
     def __init__(self, folder: Path, index_base: int, limit: int) -> None:
-        self._folder, self._base, self._limit, self._left = folder, index_base, limit, limit
+        self._folder, self._base, self._limit = folder, index_base, limit
+        self.left = limit  # bytes that arrays may still take
 
     def dense(self, reference: str, what: str, infinite: bool = False) -> Array:
         """A dense array; a sparse matrix of one column or row is a vector. It may have +inf where that is allowed."""
@@ -161,11 +162,9 @@ class ArrayFiles:
     def _array(self, file: IO[bytes], size: int) -> Array:
         """A .npy file of so many bytes; sizes are checked before it is read, and Python objects are refused."""
         # The header is read by hand: `np.load` would allocate what it declares.
-        version = np.lib.format.read_magic(file)
-        if version == (1, 0):
-            shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-        else:
-            shape, fortran, dtype = np.lib.format.read_array_header_2_0(file)
+        first = np.lib.format.read_magic(file) == (1, 0)
+        read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+        shape, fortran, dtype = read_header(file)
         if dtype.hasobject:
             raise RequestError("it holds Python objects (a pickle), which are not loaded; save numbers")
         if dtype.kind not in "biufcS":
@@ -194,13 +193,13 @@ class ArrayFiles:
             # Indices and values as triplets and as rows, and the pointers; what is read as text is given back.
             self.take((40 + 40 * (symmetry != "general")) * entries + 8 * min(rows, columns) + 16 * max(rows, columns))
             # An entry takes at most 128 bytes: a longer file holds more entries than it declares.
-            text = head + file.read(min(entries * 128, self._left) + 1)
+            text = head + file.read(min(entries * 128, self.left) + 1)
             if len(text) > entries * 128 + comments:
                 raise RequestError(f"the Matrix Market file is longer than the {entries} entries that it declares")
         self.take(len(text))
         matrix = scipy.io.mmread(io.BytesIO(text))
         # The text is released, the matrix stays.
-        self._left += len(text)
+        self.left += len(text)
         return np.asarray(matrix) if layout == "array" else _checked(sp.csr_array(matrix))
 
     def _hdf5(self, path: Path, inner: str) -> Any:
@@ -238,13 +237,10 @@ class ArrayFiles:
     def _matrix(self, stored: Any) -> SparseMatrix:
         if sp.issparse(stored):
             return stored
-        missing = {"data", "shape"} - stored.keys()
         compressed = stored.keys() >= {"indices", "indptr"}
-        if missing or not (compressed or stored.keys() >= {"row", "col"}):
-            raise RequestError(
-                f"it has the arrays {', '.join(sorted(stored)) or 'none'}; a sparse matrix has data and shape, and "
-                "either row and col, or indices and indptr"
-            )
+        if not (stored.keys() >= {"data", "shape"} and (compressed or stored.keys() >= {"row", "col"})):
+            right = "a sparse matrix has data and shape, and either row and col, or indices and indptr"
+            raise RequestError(f"it has the arrays {', '.join(sorted(stored)) or 'none'}; {right}")
         rows, columns = whole(stored["shape"], "shape", 0, np.iinfo(np.int64).max, 2).tolist()
         self.take(8 * (rows + columns))
         data = self._real(np.ravel(stored["data"]))
@@ -294,24 +290,16 @@ class ArrayFiles:
             raise RequestError(f"{wrong} of its entries are not finite ({allowed})")
         return np.asarray(values, dtype=float)
 
-    @property
-    def left(self) -> int:
-        """Bytes that arrays may still take."""
-        return self._left
-
     def take(self, count: int) -> None:
         """Count bytes that are about to be taken; a `RequestError` if they are more than are left."""
-        self._left -= count
-        if self._left < 0:
-            needed, limit = (self._limit - self._left) / 2**30, self._limit / 2**30
-            raise RequestError(
-                f"too big for memory: the arrays of the pack take {needed:.3g} GiB, {limit:.3g} GiB are allowed"
-            )
+        self.left -= count
+        if self.left < 0:
+            needed, limit = (f"{size / 2**30:.3g} GiB" for size in (self._limit - self.left, self._limit))
+            raise RequestError(f"too big for memory: the arrays of the pack take {needed}, {limit} are allowed")
 
 
-def whole(values: Any, what: str, low: int | None = None, high: int | None = None, count: int | None = None) -> Indices:
+def whole(values: Any, what: str, low: int = -(2**62), high: int = 2**62, count: int | None = None) -> Indices:
     """Integers of any type as int64; compiled code checks neither types nor ranges of indices."""
-    low, high = -(2**62) if low is None else low, 2**62 if high is None else high
     values = np.ravel(values)
     if values.dtype.kind not in "iuf" or np.any(values != np.round(values)):
         raise RequestError(f"{what} has values that are no whole numbers; expected indices")

@@ -41,13 +41,7 @@ def read_model_pack(path: str | Path) -> ModelPack:
 
 
 def solve_at_training(pack: ModelPack) -> tuple[Array, HighFidelitySolution]:
-    """The high-fidelity solution of a pack with operators at its first training parameter (d,), which is the other one.
-
-    Raises
-    ------
-    RequestError
-        If there is none.
-    """
+    """The first training parameter (d,) of a pack with operators, and the solution; a `RequestError` if it has none."""
     mu = pack.training[0]
     try:
         with at_parameter(mu):
@@ -58,8 +52,7 @@ def solve_at_training(pack: ModelPack) -> tuple[Array, HighFidelitySolution]:
 
 def zero_rows_of(pack: ModelPack) -> Indices:
     """The rows (k,) of B that are zero at every listed parameter."""
-    listed = pack.training if pack.validation is None else np.vstack([pack.training, pack.validation])
-    return np.flatnonzero(np.all([zero_rows(pack.members["B"].at(mu)) for mu in listed], axis=0))
+    return np.flatnonzero(np.all([zero_rows(pack.members["B"].at(mu)) for mu in pack.listed], axis=0))
 
 
 def _check(pack: ModelPack) -> float | None:
@@ -75,9 +68,8 @@ def _check(pack: ModelPack) -> float | None:
     if not np.any(reference.lam):
         raise RequestError("solutions.lam is zero everywhere: no constraint is active, there is nothing to reduce")
     solved = pack.V is not None and reference.u is not None
-    residuals = (
-        [_Solution.from_pack(pack, reference, k).residual for k in range(len(reference.parameters))] if solved else []
-    )
+    numbers = range(len(reference.parameters)) if solved else ()
+    residuals = [_Solution.from_pack(pack, reference, k).residual for k in numbers]
     # Negative entries up to 1e-8 of the largest one are round-off.
     if reference.lam.min() < -1e-8 * np.abs(reference.lam).max():
         if solved:
@@ -90,8 +82,7 @@ def _check(pack: ModelPack) -> float | None:
 
 
 def _check_operators(pack: ModelPack, X_V: Any) -> None:
-    A, B = pack.members["A"], pack.members["B"]
-    listed = pack.training if pack.validation is None else np.vstack([pack.training, pack.validation])
+    A, B, listed = pack.members["A"], pack.members["B"], pack.listed
     for k, matrix in enumerate(A.arrays):
         what = "operators.A" if len(A.arrays) == 1 else f"operators.A, array {k}"
         one_triangle(matrix, what)
@@ -102,33 +93,21 @@ def _check_operators(pack: ModelPack, X_V: Any) -> None:
             raise RequestError(f"{what} is not symmetric: entries differ by {off:.1e}{hint}")
     if all(matrix.nnz == 0 or not np.any(matrix.data) for matrix in B.arrays):
         raise RequestError("operators.B is zero: no constraint acts on any unknown")
-    for name in MEMBERS:
-        member = pack.members[name]
-        if member.thetas:
-            try:
-                for mu in listed:
-                    member.sum.coefficients(mu)
-            except NumericalError as error:
-                raise RequestError(f"operators.{name}: {error}") from None
-    _check_rows(pack, listed)
+    for name, member in pack.members.items():
+        try:
+            for mu in listed if member.thetas else ():
+                member.sum.coefficients(mu)
+        except NumericalError as error:
+            raise RequestError(f"operators.{name}: {error}") from None
+    # A zero row of B must not have a negative bound.
+    for mu in listed:
+        with at_parameter(mu):
+            settled_bounds(B.at(mu), pack.members["g"].at(mu))
     # Three samples: a run checks the definiteness of A wherever it solves.
     for mu in listed[np.linspace(0, len(listed) - 1, 3).round().astype(int)]:
         matrix = A.at(mu)
         _check_dirichlet(matrix, X_V)
-        try:
-            check_positive_definite(matrix, f"A at mu = {mu.tolist()}")
-        except NumericalError as error:
-            raise RequestError(f"operators: {error}") from None
-
-
-def _check_rows(pack: ModelPack, listed: Array) -> None:
-    """Refuse a zero row of B with a negative bound at one of the listed parameters (P×d)."""
-    try:
-        for mu in listed:
-            with at_parameter(mu):
-                settled_bounds(pack.members["B"].at(mu), pack.members["g"].at(mu))
-    except NumericalError as error:
-        raise RequestError(f"operators: {error}") from None
+        check_positive_definite(matrix, f"A at mu = {mu.tolist()}")
 
 
 def _check_dirichlet(A: Any, X_V: Any) -> None:

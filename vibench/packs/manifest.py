@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
 from annotated_types import Ge, Gt, MinLen
 from pydantic import AllowInfNan, BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -17,9 +17,6 @@ from vibench.packs.array_files import safe_path
 # Name of the manifest in its folder.
 FILE = "pack.toml"
 
-# Version of the format that is read and written.
-VERSION = 1
-
 Finite: TypeAlias = Annotated[float, AllowInfNan(False)]
 Text: TypeAlias = Annotated[str, MinLen(1)]
 Points: TypeAlias = Annotated[list[Annotated[list[Finite], MinLen(1)]], MinLen(1)]
@@ -27,11 +24,21 @@ Points: TypeAlias = Annotated[list[Annotated[list[Finite], MinLen(1)]], MinLen(1
 
 class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+    alternatives: ClassVar[tuple[str, ...]] = ()  # keys of which a table has exactly one
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        given = [key for key in self.alternatives if getattr(self, key) is not None]
+        if self.alternatives and len(given) != 1:
+            found = " and ".join(given) or "none"
+            raise ValueError(f"give exactly one of {', '.join(self.alternatives)} (found {found})")
+        return self
 
 
 class PointSet(_Table):
     """Parameters: an array (P×d), a list of points, or the counts of a regular grid in the box; exactly one."""
 
+    alternatives = ("array", "points", "grid")
     array: Annotated[str | None, Field(description="An array (P×d).")] = None
     points: Annotated[Points | None, Field(description="A list of points.")] = None
     grid: Annotated[list[Annotated[int, Ge(1)]] | None, Field(description="Points of a grid per parameter.")] = None
@@ -42,11 +49,6 @@ class PointSet(_Table):
         if isinstance(value, list):
             return {"points": [point if isinstance(point, list) else [point] for point in value]}
         return {"array": value} if isinstance(value, str) else value
-
-    @model_validator(mode="after")
-    def _one(self) -> PointSet:
-        _exactly_one(self, "array", "points", "grid")
-        return self
 
 
 class Parameters(_Table):
@@ -63,34 +65,24 @@ class Parameters(_Table):
 class Term(_Table):
     """One term θ_q(µ)·term_q of an affine sum; θ_q is an expression, or tabulated at the listed parameters."""
 
+    alternatives = ("theta", "table")
     theta: Annotated[str | Finite | None, Field(description="Expression in the names of the parameters.")] = None
     table: Annotated[str | None, Field(description="Or an array of values at the listed parameters.")] = None
     array: Annotated[str, Field(description="The matrix or vector.")]
-
-    @model_validator(mode="after")
-    def _one(self) -> Term:
-        _exactly_one(self, "theta", "table")
-        return self
 
 
 class Member(_Table):
     """One of A, f, B, g: an array, an affine sum, or one array per listed parameter; exactly one."""
 
+    alternatives = ("constant", "affine", "each")
     constant: Annotated[str | None, Field(description="An array that does not depend on the parameter.")] = None
     affine: Annotated[list[Term] | None, MinLen(1), Field(description="Terms of an affine sum.")] = None
-    each: Annotated[str | None, Field(description="Arrays by listed parameter, {} its number; vectors: columns.")] = (
-        None
-    )
+    each: Annotated[str | None, Field(description="Arrays by listed parameter, {} its number; or columns.")] = None
 
     @model_validator(mode="before")
     @classmethod
     def _short(cls, value: Any) -> Any:
         return {"constant": value} if isinstance(value, str) else value
-
-    @model_validator(mode="after")
-    def _one(self) -> Member:
-        _exactly_one(self, "constant", "affine", "each")
-        return self
 
 
 class Spaces(_Table):
@@ -130,9 +122,7 @@ class Mesh(_Table):
 
     file: Annotated[str, Field(description="A file with the whole mesh that meshio reads, such as .vtu or .msh.")]
     points: Annotated[str, Field(description="Indices (k,) of mesh points.")]
-    unknowns: Annotated[
-        str | None, Field(description="Indices (k,) of the unknowns there; by default all in order.")
-    ] = None
+    unknowns: Annotated[str | None, Field(description="Indices (k,) of the unknowns there; else all in order.")] = None
     positions: Annotated[str, Field(description="Points of the multipliers (m×1 or m×2).")]
     value: Annotated[str, Field(description="Name of the solution, with its unit.")] = "u"
     multiplier: Annotated[str, Field(description="Name of the multiplier, with its unit.")] = "λ"
@@ -171,18 +161,15 @@ class Manifest(_Table):
     mesh: Annotated[Mesh | None, Field(description="A mesh, for pictures.")] = None
     outputs: Annotated[list[LinearOutput], Field(description="Quantities of interest.")] = []
 
-    def references(self) -> Iterator[tuple[str, str]]:
-        """The arrays that the manifest names, "FILE" or "FILE:NAME", and the mesh, each after its place."""
-        yield from _references(self)
 
-
-def _references(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
+def references(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
+    """The arrays that a manifest names, "FILE" or "FILE:NAME", and the mesh, each after its place."""
     if isinstance(value, BaseModel):
         for name, part in value:
-            yield from _references(part, (*place, name))
+            yield from references(part, (*place, name))
     elif isinstance(value, list):
         for k, part in enumerate(value):
-            yield from _references(part, (*place, str(k)))
+            yield from references(part, (*place, str(k)))
     # Keys whose texts refer to files.
     elif isinstance(value, str) and place[-1] in {
         "X_V", "X_W", "free", "contact", "integrals", "constant", "each", "table", "array", "u", "lam", "file",
@@ -192,10 +179,7 @@ def _references(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[str, 
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """Read and check the manifest of a pack.
-
-    Raises a `RequestError` naming the key, what is wrong with it, and what is expected.
-    """
+    """Read and check a manifest; a `RequestError` names the key, what is wrong with it, and what is expected."""
     path = safe_path(folder, FILE)
     if (size := path.stat().st_size) > (most := 2**24):
         raise RequestError(f"{FILE} has {size} bytes, at most {most} are read; write points to an array")
@@ -207,9 +191,8 @@ def read_manifest(folder: Path) -> Manifest:
     except (ValueError, RecursionError) as error:
         raise RequestError(f"{FILE}: not valid TOML: {error}") from None
     # Before the schema: keys of another version would be faults of this one.
-    version = content.get("format", VERSION)
-    if isinstance(version, int) and version != VERSION:
-        raise RequestError(f"{FILE}: format is {version}; this version of vibench reads format {VERSION}")
+    if isinstance(version := content.get("format", 1), int) and version != 1:
+        raise RequestError(f"{FILE}: format is {version}; this version of vibench reads format 1")
     try:
         manifest = Manifest.model_validate(content)
         _check_parameters(manifest.parameters)
@@ -243,10 +226,3 @@ def _check_parameters(given: Parameters) -> None:
     # Neither has points from which a box could be taken.
     if given.lower is None and (given.training.grid is not None or given.validation is None):
         raise RequestError("parameters: a grid, or a random validation set, needs the box: give 'lower' and 'upper'")
-
-
-def _exactly_one(table: BaseModel, *keys: str) -> None:
-    given = [key for key in keys if getattr(table, key) is not None]
-    if len(given) != 1:
-        keys_given = " and ".join(given) or "none"
-        raise ValueError(f"give exactly one of {', '.join(keys)} (found {keys_given})")

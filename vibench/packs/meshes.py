@@ -32,14 +32,10 @@ FORMATS = {
 
 
 def format_of(path: Path) -> str:
-    """The name that meshio has for the format of a file.
-
-    Raises a `RequestError` if it is not one of `FORMATS`.
-    """
+    """The name that meshio has for the format of a file; a `RequestError` if it is not one of `FORMATS`."""
     if (form := FORMATS.get(path.suffix.lower())) is None:
-        raise RequestError(
-            f"'{path.name}' has a format that is not read; expected one whose mesh is in one file: {', '.join(FORMATS)}"
-        )
+        expected = f"expected one whose mesh is in one file: {', '.join(FORMATS)}"
+        raise RequestError(f"'{path.name}' has a format that is not read; {expected}")
     return form
 
 

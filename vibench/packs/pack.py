@@ -34,16 +34,12 @@ class Listing:
     parameters: Array
     widths: Array
 
-    @staticmethod
-    def _are_same(distance: float) -> bool:
-        # Far above round-off, since assemblies are timed next to a parameter, far below distances of listed ones.
-        return distance <= 1e-8
-
     def number(self, mu: Array) -> int:
         """Number of the listed parameter that equals mu (d,); raises a `NumericalError` if there is none."""
         away = np.abs((self.parameters - mu) / self.widths).max(axis=1)
         nearest = int(away.argmin())
-        if not self._are_same(away[nearest]):
+        # Far above round-off, since assemblies are timed next to a parameter, far below distances of listed ones.
+        if away[nearest] > 1e-8:
             raise NumericalError(f"the pack has arrays at its listed parameters only; mu = {mu.tolist()} is not listed")
         return nearest
 
@@ -51,15 +47,15 @@ class Listing:
         """Numbers of two listed parameters that count as the same, if there are any."""
         from scipy.spatial import KDTree  # noqa: PLC0415  slow to import
 
-        places = (self.parameters - self.parameters.min(axis=0)) / self.widths
-        _, first, number = np.unique(places, axis=0, return_index=True, return_inverse=True)
+        first = np.unique(self.parameters, axis=0, return_index=True)[1]
         # A tree would find all pairs of equal points, which may be very many.
-        if len(first) < len(places):
-            again = int(np.setdiff1d(np.arange(len(places)), first)[0])
-            return int(first[number.ravel()[again]]), again
+        if len(first) < len(self.parameters):
+            again = int(np.setdiff1d(np.arange(len(self.parameters)), first)[0])
+            return self.number(self.parameters[again]), again
+        places = (self.parameters - self.parameters.min(axis=0)) / self.widths
         away, nearest = KDTree(places).query(places, k=2, p=np.inf)
         k = int(away[:, 1].argmin())
-        return (k, int(nearest[k, 1])) if self._are_same(away[k, 1]) else None
+        return (k, int(nearest[k, 1])) if away[k, 1] <= 1e-8 else None  # as in `number`
 
 
 @dataclass(frozen=True)
@@ -81,21 +77,11 @@ class TabulatedTheta:
 
 @dataclass(frozen=True)
 class PackMember:
-    """A matrix or vector: one array that is constant, the terms of an affine sum, or an array per listed parameter.
-
-    Attributes
-    ----------
-    arrays
-        The arrays it is made of.
-    thetas
-        Coefficients of the terms of an affine sum; of no other member.
-    listing
-        The listed parameters of a member with an array for each of them; of no other member.
-    """
+    """A matrix or vector: one array that is constant, the terms of an affine sum, or an array per listed parameter."""
 
     arrays: tuple[Any, ...]
-    thetas: tuple[Expression | TabulatedTheta, ...] = ()
-    listing: Listing | None = None
+    thetas: tuple[Expression | TabulatedTheta, ...] = ()  # coefficients of the terms of an affine sum
+    listing: Listing | None = None  # the listed parameters of a member with an array for each of them
 
     @property
     def constant(self) -> bool:
@@ -203,6 +189,11 @@ class ModelPack:
     residual: float | None = None
 
     @property
+    def listed(self) -> Array:
+        """The training parameters, then the validation parameters where these are listed."""
+        return self.training if self.validation is None else np.vstack([self.training, self.validation])
+
+    @property
     def constant(self) -> frozenset[str]:
         """Members that do not depend on the parameter."""
         return frozenset(name for name, member in self.members.items() if member.constant)
@@ -210,8 +201,7 @@ class ModelPack:
     @property
     def entrywise(self) -> frozenset[str]:
         """Members that reduced assembly interpolates."""
-        operators = self.manifest.operators
-        given = None if operators is None else operators.entrywise
+        given = self.manifest.operators and self.manifest.operators.entrywise
         return frozenset(self.members if given is None else map(str, given)) - self.constant
 
     @property
@@ -246,28 +236,21 @@ class ModelPack:
     def at(self, mu: Array) -> VariationalInequality:
         """The variational inequality at mu (d,).
 
-        Raises
-        ------
-        NumericalError
-            If a member has arrays for listed parameters only and mu is not one of them, or θ(µ) is not finite.
+        Raises a `NumericalError` if a member has arrays for listed parameters only and mu is not one of them, or θ(µ)
+        is not finite.
         """
         return VariationalInequality(**{name: self.members[name].at(mu) for name in MEMBERS})
 
     def validation_set(self, count: int, seed: int) -> Array:
         """The first `count` listed validation parameters, or as many random ones in the box if none are listed.
 
-        Raises
-        ------
-        NumericalError
-            If fewer are listed.
+        Raises a `NumericalError` if fewer are listed.
         """
         if self.validation is None:
             return self.box.sample(count, seed)
         if count > len(self.validation):
-            raise NumericalError(
-                f"the pack lists {len(self.validation)} validation parameters, the study asks for {count}: "
-                f"set validation = {len(self.validation)}"
-            )
+            most, asked = len(self.validation), f"the study asks for {count}"
+            raise NumericalError(f"the pack lists {most} validation parameters, {asked}: set validation = {most}")
         return self.validation[:count]
 
 

@@ -25,24 +25,18 @@ from vibench.interfaces.problem import MEMBERS
 from vibench.linalg.inner_product import InnerProduct
 from vibench.packs import manifest as schema
 from vibench.packs.array_files import ArrayFiles, memory_limit, safe_path, size_of, whole
-from vibench.packs.manifest import FILE, Manifest, read_manifest
+from vibench.packs.manifest import FILE, Manifest, read_manifest, references
 from vibench.packs.meshes import read_mesh
 from vibench.packs.pack import Listing, ModelPack, PackMember, PackMesh, PackSolutions, TabulatedTheta
 
 
 @requested
 def pack_digest(path: str | Path) -> str:
-    """Digest of the manifest and of the files it names.
-
-    Raises
-    ------
-    RequestError
-        If the manifest is invalid or a file is missing.
-    """
+    """Digest of the manifest and of the files it names; a `RequestError` if that is invalid, or a file is missing."""
     content = hashlib.sha256()
     with naming(path) as folder:
         manifest = read_manifest(folder)
-        for place, reference in (("manifest", FILE), *manifest.references()):
+        for place, reference in (("manifest", FILE), *references(manifest)):
             for file in _files(folder, place, reference.partition(":")[0], manifest.index_base):
                 state = file.stat()
                 content.update(_file_digest(file, state.st_size, state.st_mtime_ns, state.st_ino))
@@ -70,10 +64,7 @@ def _file_digest(path: Path, size: int, changed: int, inode: int) -> bytes:  # n
 
 @contextlib.contextmanager
 def naming(path: str | Path) -> Iterator[Path]:
-    """The folder of a pack; errors raised in the block name it.
-
-    Raises a `RequestError` if it is no folder.
-    """
+    """The folder of a pack; errors raised in the block name it. A `RequestError` if it is no folder."""
     if not os.path.isdir(path):  # noqa: PTH112  methods of Path raise OSError for names too long for a file
         raise RequestError(f"pack '{path}': there is no such folder")
     try:
@@ -106,11 +97,10 @@ class PackReader:
         V = None if operators is None or spaces.X_V is None else self._primal_space(spaces.X_V)
         n, m = 0 if V is None else V.dim, W.dim
         members = {} if operators is None else self._members(operators, n, m)
-        if members and validation is None and not all(member.everywhere for member in members.values()):
-            raise RequestError(
-                "parameters.validation: required, since arrays or tables are given at listed parameters only"
-            )
         if not all(member.everywhere for member in members.values()):
+            if validation is None:
+                why = "since arrays or tables are given at listed parameters only"
+                raise RequestError(f"parameters.validation: required, {why}")
             _refuse_repeated(self._listing, "parameters.training and parameters.validation together")
             box = replace(box, listed=self._listed)
         outputs = self._manifest.outputs
@@ -132,17 +122,14 @@ class PackReader:
         units = tuple(given.units or ["1"] * len(self._names))
         if given.lower is not None:
             self._box = ParameterBox(self._names, np.array(given.lower), np.array(given.upper), units)
-        training, validation = self._parameters(given.training, "parameters.training"), None
-        self._listed = training
-        if given.validation is not None:
-            validation = self._parameters(given.validation, "parameters.validation")
-            self._listed = np.vstack([training, validation])
+        roles = [("training", given.training), ("validation", given.validation)]
+        sets = {role: self._parameters(points, f"parameters.{role}") for role, points in roles if points is not None}
+        self._listed, self._training = np.vstack([*sets.values()]), len(sets["training"])
         box = self._box or ParameterBox(self._names, self._listed.min(axis=0), self._listed.max(axis=0), units)
-        self._listing, self._training = Listing(self._listed, box.widths), len(training)
-        _refuse_repeated(Listing(training, box.widths), "parameters.training")
-        if validation is not None:
-            _refuse_repeated(Listing(validation, box.widths), "parameters.validation")
-        return training, validation, box
+        self._listing = Listing(self._listed, box.widths)
+        for role, mus in sets.items():
+            _refuse_repeated(Listing(mus, box.widths), f"parameters.{role}")
+        return sets["training"], sets.get("validation"), box
 
     def _parameters(self, given: schema.PointSet, what: str) -> Array:
         box, d = self._box, len(self._names)
@@ -160,9 +147,8 @@ class PackReader:
             mus = np.array(given.points, dtype=float)
         if mus.ndim != 2 or mus.shape[1] != d or not len(mus):
             transposed = "; it is transposed" if mus.ndim == 2 and mus.shape[0] == d != mus.shape[1] else ""
-            raise RequestError(
-                f"{what}: an array {size_of(mus.shape)}; expected P×{d} with P > 0, a row per parameter{transposed}"
-            )
+            expected = f"P×{d} with P > 0, a row per parameter"
+            raise RequestError(f"{what}: an array {size_of(mus.shape)}; expected {expected}{transposed}")
         if box is not None:
             for k, i in np.argwhere(box.outside(mus))[:1]:
                 sides, name = f"[{box.lower[i]:g}, {box.upper[i]:g}]", self._names[i]
@@ -259,24 +245,20 @@ class PackReader:
         contact = np.isin(numbers, named)
         missing = numbers[touched & ~contact] + self._manifest.index_base
         if len(missing):
-            raise RequestError(
-                f"spaces.contact: {len(missing)} unknowns that B touches are not in it, the first is {missing[0]}; "
-                "leave it out, and they are found"
-            )
+            untold = f"{len(missing)} unknowns that B touches are not in it, the first is {missing[0]}"
+            raise RequestError(f"spaces.contact: {untold}; leave it out, and they are found")
         return np.flatnonzero(contact)
 
     def _reference(self, given: schema.Solutions, n: int, m: int) -> PackSolutions:
         lam = self._columns(given.lam, "solutions.lam", m, None)
         count = lam.shape[1]
+        mus = self._listed[: self._training] if count == self._training else self._listed
         if given.parameters is not None:
             mus = self._parameters(given.parameters, "solutions.parameters")
-        else:
-            mus = self._listed[: self._training] if count == self._training else self._listed
         if len(mus) != count:
             raise RequestError(f"solutions.lam has {count} columns for {len(mus)} parameters")
-        u = None
-        if given.u is not None and n:
-            u = self._kept(self._columns(given.u, "solutions.u", self._all, count))
+        has_u = given.u is not None and n > 0
+        u = self._kept(self._columns(str(given.u), "solutions.u", self._all, count)) if has_u else None
         return PackSolutions(mus, u, lam, given.tolerance)
 
     def _mesh(self, given: schema.Mesh, n: int, m: int) -> PackMesh:
@@ -317,12 +299,10 @@ class PackReader:
     def _expect(self, what: str, array: Any, shape: tuple[int, ...]) -> None:
         if array.shape == shape:
             return
-        hint = ""
-        if len(shape) == 2 and array.shape == shape[::-1]:
-            hint = "; it is transposed"
-        elif self._free is None and self._manifest.operators is not None and max(array.shape) > max(shape):
+        hint = "; it is transposed" if len(shape) == 2 and array.shape == shape[::-1] else ""
+        if not hint and self._free is None and self._manifest.operators is not None and max(array.shape) > max(shape):
             hint = "; if it has the Dirichlet unknowns, too, leave them out, or name the free ones in spaces.free"
-        raise RequestError(f"{what}: {size_of(array.shape)}; expected {'×'.join(map(str, shape))}{hint}")
+        raise RequestError(f"{what}: {size_of(array.shape)}; expected {size_of(shape)}{hint}")
 
 
 def _refuse_repeated(listing: Listing, what: str) -> None:
@@ -336,7 +316,5 @@ def one_triangle(matrix: Any, what: str) -> None:
     """Refuse a matrix of which one triangle is stored and the other is empty."""
     below, above = sp.tril(matrix, -1).nnz, sp.triu(matrix, 1).nnz
     if bool(below) != bool(above):
-        side = "lower" if below else "upper"
-        raise RequestError(
-            f"{what} has its {side} triangle only; store both, or in Matrix Market the lower one as 'symmetric'"
-        )
+        advice = "store both, or in Matrix Market the lower one as 'symmetric'"
+        raise RequestError(f"{what} has its {'lower' if below else 'upper'} triangle only; {advice}")

@@ -18,7 +18,7 @@ from vibench.errors import RequestError
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import MEMBERS, Problem
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
-from vibench.packs.manifest import FILE, VERSION
+from vibench.packs.manifest import FILE
 
 _save_arrays: Callable[..., None] = partial(np.savez_compressed, allow_pickle=False)
 
@@ -37,7 +37,7 @@ def write_pack(
     training = training_parameters(problem)
     listed = np.vstack([training, validation_parameters(problem, validation, seed)])
     with _new_folder(folder) as part:
-        lines = [f"format = {VERSION}", f"name = {_toml_text(name)}", f"source = {_toml_text(source)}", ""]
+        lines = ["format = 1", f"name = {_toml_text(name)}", f"source = {_toml_text(source)}", ""]
         box = problem.parameters
         _save_arrays(part / "parameters.npz", training=training, validation=listed[len(training) :])
         names, units = (", ".join(map(_toml_text, texts)) for texts in (box.names, box.units))

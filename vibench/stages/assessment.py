@@ -29,7 +29,7 @@ from vibench.model.galerkin import ReducedModel
 from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
 from vibench.model.hyperreduced import AnyReducedModel
 from vibench.offline.assemblies import assemblies
-from vibench.offline.correction import Answer, Corrector
+from vibench.offline.solution import Answer, Corrector
 from vibench.qp.exact import ExactSolution
 from vibench.qp.scaling import ratio
 from vibench.qp.status import Status

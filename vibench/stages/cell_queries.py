@@ -19,7 +19,7 @@ from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import Guarantee
 from vibench.model.errors import ReferenceSolutions, output_scales, summarise_outputs, zeros
 from vibench.offline.assemblies import assemblies
-from vibench.offline.correction import Corrector
+from vibench.offline.solution import Corrector
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find

@@ -18,7 +18,7 @@ from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel
 from vibench.offline.assemblies import Assemblies
-from vibench.offline.correction import corrected_in_full
+from vibench.offline.solution import corrected_in_full
 from vibench.provenance import machine
 from vibench.results.break_even import SCATTER, offline_factor
 from vibench.results.paired_timing import beside, blocks_of, mean_seconds, paces

@@ -60,4 +60,4 @@ class CompiledFormulationModel(ProgramModel):
 @lru_cache(maxsize=32)
 def _loaded(source: str, unknowns: int, constraints: int) -> CompiledProgram:
     # Cells that differ only in their corrections share a program: the compiler takes about a second.
-    return CompiledProgram.compiled(source, unknowns, constraints)
+    return CompiledProgram(source, unknowns, constraints)

@@ -11,9 +11,9 @@ import vibench
 from vibench.interfaces.validation import validation_parameters
 from vibench.model.bound_terms import BoundNote, CorrectionMode
 from vibench.model.certificates.bounds import OnlineCertificate
-from vibench.offline import correction as module
+from vibench.offline import solution as module
 from vibench.offline.assemblies import assemblies
-from vibench.offline.correction import Corrector
+from vibench.offline.solution import Corrector
 
 PROBLEMS = [
     {"name": "obstacle", "options": {"resolution": "coarse"}},
