@@ -206,23 +206,18 @@ class Solution:
 
         There are none without `bound`, of outputs that are not linear, and of those of λ without a bound in W.
         """
-        bound, certificate, found = self.bound, self._model.certificate, self._model.output_weights
-        if bound is None or certificate is None:
-            return dict.fromkeys(found, inf)
-        return {
-            name: inf if weight is None else output_error_bound(weight, certificate.base, bound)
-            for name, weight in found.items()
-        }
+        bound, certificate, bounds = self.bound, self._model.certificate, dict.fromkeys(self._model.output_weights, inf)
+        for name, weight in self._model.output_weights.items():
+            if bound is not None and certificate is not None and weight is not None:
+                bounds[name] = output_error_bound(weight, certificate.base, bound)
+        return bounds
 
     @cached_property
     def error_bounds(self) -> ErrorBounds:
         """Proved bounds on the errors of u and λ in four norms, at the cost of high-fidelity factorisations at mu."""
         cache = assemblies(self._model.problem)
-        mu, V, constants = (
-            self.mu,
-            self._model.problem.V,
-            (cache.coercivity_at(self.mu), cache.energy_inf_sup_at(self.mu)),
-        )
+        V, mu = self._model.problem.V, self.mu
+        constants = cache.coercivity_at(mu), cache.energy_inf_sup_at(mu)
         return bound_errors_at(V, cache.at(mu), cache.energy_at(mu), *constants, self.u, self.lam)
 
     @cached_property
