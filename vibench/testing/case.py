@@ -21,7 +21,7 @@ import scipy.sparse as sp
 from vibench.arrays import Array
 from vibench.errors import NumericalError, in_a_line
 from vibench.execution.isolated import NotImportableError
-from vibench.plugins.options import options_of
+from vibench.plugins.options import Option, options_of
 from vibench.stages.serialisation import dumps, loads
 from vibench.testing.checks import SECONDS, Check, ConformanceError, Doubt, Note, call_in_other_process, kind_of
 from vibench.timing import timed
@@ -46,7 +46,7 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
     checks: ClassVar[tuple[Check[Any], ...]]
     round_off: ClassVar[float] = 0.0
 
-    create: Callable[[], PluginT]
+    create: Callable[..., PluginT]
     _: KW_ONLY
     seconds: float = SECONDS
 
@@ -95,13 +95,16 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
         if not isinstance(plugin, self.base):
             yield f"a {type(plugin).__name__} was made; expected a subclass of vibench.{self.base.__name__}"
 
+    @property
+    def constructor_options(self) -> Mapping[str, Option]:
+        """Options of the class by name; none of a function that makes an instance."""
+        constructor = getattr(self.create, "func", self.create)
+        return options_of(constructor) if isinstance(constructor, type) else {}
+
     def options(self) -> Iterator[str]:
         """Every option has an annotation that its default conforms to: study files may set no other to anything."""
-        constructor = getattr(self.create, "func", self.create)
-        if isinstance(constructor, type):
-            for option in options_of(constructor).values():
-                if doubt := option.doubt:
-                    yield Doubt(f"the option '{option.name}' {doubt}")
+        doubts = {option.name: option.doubt for option in self.constructor_options.values()}
+        yield from (Doubt(f"the option '{name}' {doubt}") for name, doubt in doubts.items() if doubt)
 
     def duration(self) -> Iterator[str]:
         """The constructor and every call stay below the limit."""
@@ -158,13 +161,12 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
         self, source: str, again: Callable[[str], Arrays], names: Iterable[str], rtol: float
     ) -> Iterator[str]:
         """Arrays that differ from those of all results, or of some, each named once."""
-        named: set[str] = set()
+        faults: dict[str, str] = {}
         # The reverse order reveals results that depend on the previous call.
         for name in reversed([*names]):
             for array, what in differences(again(name), self.arrays(self.results[name]), rtol):
-                if array not in named:
-                    named.add(array)
-                    yield f"{name}: {source} gives different values of {array}: {what}"
+                faults.setdefault(array, f"{name}: {source} gives different values of {array}: {what}")
+        yield from faults.values()
 
 
 def _evaluated(case: type[Case[Any, Any, Any]], create: Any, arguments: Mapping[str, Any]) -> dict[str, Arrays]:

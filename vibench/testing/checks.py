@@ -63,13 +63,9 @@ class CheckResult:
 class Note(str):
     """A remark of a check that is not a fault."""
 
-    __slots__ = ()
-
 
 class Doubt(str):
     """A remark on what is allowed but probably unintended; it turns a passed check into a warning."""
-
-    __slots__ = ()
 
 
 class ConformanceError(AssertionError):
@@ -106,8 +102,7 @@ class Check(Generic[CaseT_contra]):
             lines.append(str(error) if isinstance(error, ConformanceError) else raised(error))
         faults = [line for line in lines if not isinstance(line, Note | Doubt)]
         # A fault may repeat at every parameter.
-        if len(faults) > 5:
-            faults[5:] = ["and more"]
+        faults[5:] = ["and more"] * (len(faults) > 5)
         doubtful = any(isinstance(line, Doubt) for line in lines)
         verdict = Verdict.FAILED if faults else Verdict.WARNING if doubtful else Verdict.PASSED
         return CheckResult(self.name, verdict, "; ".join(faults or lines))
@@ -215,8 +210,7 @@ class Examination:
         """Result of one check, made when it is first asked for, after those that it needs."""
         if name not in self._results:
             # pytest may have selected this check alone.
-            earlier = [self.result(needed) for needed in self.checks[name].needs]
-            self._results[name] = self._make(name, earlier)
+            self._results[name] = self._make(name, list(map(self.result, self.checks[name].needs)))
         return self._results[name]
 
     def results(self) -> Iterator[CheckResult]:
@@ -247,8 +241,8 @@ class Examination:
 def _check_here(kind: str, pickled: bytes, name: str, earlier: list[CheckResult]) -> tuple[CheckResult, float]:
     """Make a check in this process; returns its result and the wall seconds that it took."""
     begin, case = time.monotonic(), _case(kind, pickled)
-    result = next(one for one in case.checks if one.name == name).result(case, earlier)
-    return result, time.monotonic() - begin
+    (one,) = (one for one in case.checks if one.name == name)
+    return one.result(case, earlier), time.monotonic() - begin
 
 
 @lru_cache(maxsize=1)

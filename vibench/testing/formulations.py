@@ -58,15 +58,11 @@ class FormulationCase(Case[Formulation, Array, Answered]):
     def phase(self, plugin: Formulation) -> _Seen:
         """The offline phase that a formulation gets, without the steps that it does not use."""
         uses, whole = axes_of(plugin, f"{type(plugin).__name__}"), self.whole
-        pod, dual, primal = (axis in uses for axis in ("pod", "dual", "primal"))
-        given: dict[str, Any] = {"snapshots": whole.snapshots}
-        given |= {"pod": whole.pod} if pod else {}
-        given |= {"cone": whole.cone, "multipliers": whole.multipliers} if dual else {}
-        given |= {"enrichment": whole.enrichment} if primal else {}
-        cone = (whole.dual, whole.generators) if dual else (None, None)
-        enrichment = (whole.primal, whole.tolerance) if primal else (None, None)
-        modes = whole.modes if pod else None
-        phase = _Seen(whole.problem, cone[0], enrichment[0], modes, cone[1], enrichment[1]).given(**given)
+        steps = {"pod": ("pod",), "dual": ("cone", "multipliers"), "primal": ("enrichment",)}
+        given = {name: getattr(whole, name) for axis, names in steps.items() if axis in uses for name in names}
+        inputs = {"dual": "dual", "primal": "primal", "modes": "pod", "generators": "dual", "tolerance": "primal"}
+        own: dict[str, Any] = {name: getattr(whole, name) if axis in uses else None for name, axis in inputs.items()}
+        phase = _Seen(whole.problem, **own).given(snapshots=whole.snapshots, **given)
         assert isinstance(phase, _Seen)
         # The attributes that this function has read are no use by the formulation.
         phase.seen.clear()
@@ -106,9 +102,8 @@ class FormulationCase(Case[Formulation, Array, Answered]):
 
     def stored(self, result: Answered) -> Answered:
         """A result with the coefficients of the answer as a run stores them."""
-        answer = result.answer
-        coefficients = loads(dumps({"x": answer.x, "alpha": answer.alpha}))
-        return replace(result, answer=replace(answer, **coefficients))
+        coefficients = loads(dumps({"x": result.answer.x, "alpha": result.answer.alpha}))
+        return replace(result, answer=replace(result.answer, **coefficients))
 
     def axes(self) -> Iterator[str]:
         """`uses`, `multiplier` and `takes_start` are declared as they should be."""
@@ -139,22 +134,21 @@ class FormulationCase(Case[Formulation, Array, Answered]):
 
     def answers(self) -> Iterator[str]:
         """Answers are finite vectors of at most the sizes declared, with an outcome, and most are ok."""
-        model, outcomes = self.model_of(self.plugin).online, list[Outcome]()
+        of, outcomes = self.model_of(self.plugin), list[Outcome]()
         for name, mu in self.arguments.items():
-            of = self.model_of(self.plugin)
             answer: object = of.online.solve(mu.copy(), of.settings()[0])
             if not isinstance(answer, FormulationAnswer):
                 yield f"{name}: `solve` returns a {type(answer).__name__}; expected a vibench.FormulationAnswer"
                 return
-            yield from (f"{name}: {fault}" for fault in _faults_of(answer, model))
+            yield from (f"{name}: {fault}" for fault in _faults_of(answer, of.online))
             outcomes.append(answer.outcome)
         if Outcome.OK not in outcomes:
             yield f"no answer at {len(outcomes)} parameters is ok: the outcomes are {', '.join(map(str, outcomes))}"
 
     def pairs(self) -> Iterator[str]:
         """`reconstruct` gives u (n,) and λ (m,) ≥ 0; λ is `None` exactly for `Multiplier.RESIDUAL`."""
+        of = self.model_of(self.plugin)
         for name, mu in self.arguments.items():
-            of = self.model_of(self.plugin)
             settings, solver = of.settings()
             answer = of.online.solve(mu.copy(), settings)
             if answer.outcome is not Outcome.OK:

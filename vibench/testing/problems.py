@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Generator, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -155,9 +155,8 @@ def definiteness(case: ProblemCase) -> None:
 
 def independence(case: ProblemCase) -> Iterator[str]:
     """Members declared `constant` do not depend on the parameter; every parameter has an effect."""
-    yield from _undeclarable("constant", case.plugin.constant)
     first = at(case.mus[0])
-    for name in (name for name in MEMBERS if name in case.plugin.constant):
+    for name in (yield from _declared("constant", case.plugin.constant)):
         reference = case.results[first][name]
         for where, arrays in case.results.items():
             # 1e-13: the round-off with which reduced assembly tells constants, too
@@ -201,9 +200,8 @@ def continuity(case: ProblemCase) -> Iterator[str]:
             first, _, last = (arrays[jump.name] for arrays in jump.values)
             step = (jump.right - jump.left) * float(np.linalg.norm(end - start))
             where = at(start + jump.right * (end - start))
-            raise ConformanceError(
-                f"{jump.name} jumps {where}: {difference(first, last, 0.0)} over a step of {step:.0e}"
-            )
+            what = f"{difference(first, last, 0.0)} over a step of {step:.0e}"
+            raise ConformanceError(f"{jump.name} jumps {where}: {what}")
 
 
 def on_contact(case: ProblemCase) -> Iterator[str]:
@@ -219,8 +217,7 @@ def on_contact(case: ProblemCase) -> Iterator[str]:
     for where, mu in case.arguments.items():
         full = case.results[where]
         if dofs is not None:
-            outside = np.setdiff1d(full["B"].indices[full["B"].data != 0.0], dofs)
-            if len(outside):
+            if len(outside := np.setdiff1d(full["B"].indices[full["B"].data != 0.0], dofs)):
                 what = f"{len(outside)} unknowns outside `contact_dofs` {where}; the first is {outside[0]}"
                 raise ConformanceError(f"B touches {what}")
             if defined:
@@ -263,16 +260,12 @@ def _check_contact(case: ProblemCase, dofs: Indices, mu: Array, full: Arrays) ->
 def affine(case: ProblemCase) -> Iterator[str]:
     """Sums declared in `affine` agree with `assemble`."""
     problem = case.plugin
-    yield from _undeclarable("affine", problem.affine)
-    declared = {name: each for name, each in problem.affine.items() if name in MEMBERS}
-    if not declared:
-        yield Note("not declared")
-        return
-    yield Note(", ".join(f"{name}: {len(each.terms)} terms" for name, each in declared.items()))
+    names = yield from _declared("affine", problem.affine)
+    yield Note(", ".join(f"{name}: {len(problem.affine[name].terms)} terms" for name in names) or "not declared")
     for where, mu in case.arguments.items():
-        for name, each in declared.items():
+        for name in names:
             try:
-                summed = each.at(mu.copy())
+                summed = problem.affine[name].at(mu.copy())
             except NumericalError as error:
                 raise ConformanceError(f"the affine sum of {name} {where}: {error}") from error
             _compare(case, "affine", mu, {name: summed}, case.results[where])
@@ -281,8 +274,7 @@ def affine(case: ProblemCase) -> Iterator[str]:
 def by_entries(case: ProblemCase) -> Iterator[str]:
     """`sampler` agrees with `assemble` on entries of every member alone, and of all at once."""
     problem = case.plugin
-    yield from _undeclarable("entrywise", problem.entrywise)
-    names = [name for name in MEMBERS if name in problem.entrywise]
+    names = yield from _declared("entrywise", problem.entrywise)
     if not names:
         yield Note("not declared")
         if type(problem).sampler is not Problem.sampler:
@@ -311,8 +303,7 @@ def by_entries(case: ProblemCase) -> Iterator[str]:
 def by_elements(case: ProblemCase) -> Iterator[str]:
     """`element_sampler` agrees with `assemble`: summed over all elements, and on some of them with those of all."""
     problem = case.plugin
-    yield from _undeclarable("elementwise", problem.elementwise)
-    names = [name for name in MEMBERS if name in problem.elementwise]
+    names = yield from _declared("elementwise", problem.elementwise)
     if not names:
         yield Note("not declared")
         return
@@ -371,12 +362,13 @@ def _compare(case: ProblemCase, function: str, mu: Array, arrays: Arrays, full: 
         raise ConformanceError(f"{name} of `{function}` differs from that of `assemble` {at(mu)}: {what}")
 
 
-def _undeclarable(declaration: str, names: Iterable[str]) -> Iterator[str]:
-    """Faults of `constant`, `entrywise` or `elementwise`: names that are not members."""
+def _declared(declaration: str, names: Collection[str]) -> Generator[str, None, list[str]]:
+    """Faults of `constant`, `affine`, `entrywise` or `elementwise`: names that are not members; returns the others."""
     if isinstance(names, str):
         raise ConformanceError(f"`{declaration}` is the string {names!r}; expected a set: frozenset({{{names!r}}})")
     for name in sorted(set(names) - set(MEMBERS)):
         yield f"`{declaration}` names '{name}'; expected {', '.join(MEMBERS)}"
+    return [name for name in MEMBERS if name in names]
 
 
 def spaces(case: ProblemCase) -> Iterator[str]:
@@ -476,8 +468,7 @@ def constants(case: ProblemCase) -> Iterator[str]:
 def high_fidelity_solution(case: ProblemCase) -> Iterator[str]:
     """High-fidelity solutions exist; their multipliers lie in W⁺ and are not all zero."""
     mus, solver = training_parameters(case.plugin), active_set.HighFidelitySolver(case.plugin)
-    solved: list[active_set.HighFidelitySolution] = []
-    contacts = 0
+    solved, contacts = list[active_set.HighFidelitySolution](), 0
     # Five evenly spread parameters; those between them only while no constraint is active.
     spread = [k for count in (5, 50) for k in np.linspace(0, len(mus) - 1, count).round().astype(int)]
     least = min(5, case.points)
@@ -565,8 +556,7 @@ def _picture_faults(picture: Picture, m: int) -> Iterator[str]:
 def quantities_of_interest(case: ProblemCase) -> Iterator[str]:
     """Quantities of interest have names and units, and finite values that a second call repeats."""
     declared, mu = case.plugin.outputs, training_parameters(case.plugin)[:1]
-    strange = [type(one).__name__ for one in declared if not isinstance(one, Output)]
-    if strange:
+    if strange := [type(one).__name__ for one in declared if not isinstance(one, Output)]:
         yield f"outputs holds a {strange[0]}; expected objects of vibench.Output"
         return
     for one in declared:

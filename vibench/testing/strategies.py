@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import KW_ONLY, dataclass, field, replace
@@ -54,12 +53,10 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.snapshots is not None and self.W is not None:
-            self.lam, self.space = self.snapshots, self.W
-        elif self.snapshots is None and self.W is None:
-            self.lam, self.space = sample_snapshots()
-        else:
+        if (self.snapshots is None) != (self.W is None):
             raise TypeError("pass both snapshots and W, or neither")
+        own = None if self.snapshots is None or self.W is None else (self.snapshots, self.W)
+        self.lam, self.space = own or sample_snapshots()
 
     @cached_property
     def arguments(self) -> dict[str, Stop]:
@@ -373,14 +370,14 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
 
     def size(self) -> Iterator[str]:
         """There are as many points as an option `size` says."""
-        if not self._takes("size"):
+        if "size" not in self.constructor_options:
             yield Note("no option is called 'size'")
             return
         given = getattr(self.create, "keywords", {}).get("size", 16)
         for size in dict.fromkeys([1, 5, 16, given]):
             for name, box in self.arguments.items():
                 try:
-                    points = self.evaluate(box, self._with(size=size))
+                    points = self.evaluate(box, self.create(size=size))
                 except RequestError as error:
                     yield Note(f"{name}: size {size} is refused, {error}")
                     continue
@@ -389,10 +386,10 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
 
     def seed(self) -> Iterator[str]:
         """Another value of an option `seed` gives other points; without one nothing is random."""
-        if not self._takes("seed"):
+        if "seed" not in self.constructor_options:
             yield Note("no option is called 'seed'")
             return
-        seeds = [self._with(seed=seed) for seed in range(4)]
+        seeds = [self.create(seed=seed) for seed in range(4)]
         for name, box in self.arguments.items():
             samples = [self.evaluate(box, plugin) for plugin in seeds]
             # One point may be a rule of its own, such as the centre.
@@ -418,25 +415,15 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
             return
         for name, box in self.arguments.items():
             first, again = (_train(plugin, box) for plugin in (self.plugin, self.create()))
-            if not first:
-                yield f"{name}: train solves nowhere; expected a training parameter at least"
-                continue
             try:
                 check_sample(box, np.array(first))
             except (RequestError, ValueError) as error:
-                yield f"{name}: train: {error}"
+                nowhere = "solves nowhere; expected a training parameter at least"
+                yield f"{name}: train: {error}" if first else f"{name}: train {nowhere}"
                 continue
             same = len(first) == len(again) and all(map(np.array_equal, first, again))
             fault = f"{name}: a second call solves at other parameters"
             yield Note(f"{name}: {len(first)} solutions") if same else fault
-
-    def _with(self, **options: int) -> Sampling:
-        create: Callable[..., Sampling] = self.create
-        return create(**options)
-
-    def _takes(self, option: str) -> bool:
-        constructor = getattr(self.create, "func", self.create)
-        return isinstance(constructor, type) and option in inspect.signature(constructor).parameters
 
     checks = (
         Check("construction", Case.construction), Check("options", Case.options, ("construction",)),
