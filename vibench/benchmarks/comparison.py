@@ -121,43 +121,33 @@ def _row(name: str, one: Measured) -> dict[str, Any]:
 
 
 def _change(name: str, was: Measured, now: Measured, limit: float) -> dict[str, Any]:
-    names = dict.fromkeys([*was.accuracy, *now.accuracy])
-    figures = [_Figure(figure, was.accuracy.get(figure), now.accuracy.get(figure)) for figure in names]
-    figure = max(figures, key=lambda one: (one.is_worse, one.growth), default=_Figure("", None, None))
+    pairs = {name: (was.accuracy.get(name), now.accuracy.get(name)) for name in [*was.accuracy, *now.accuracy]}
+    figure = max(pairs, key=lambda name: (_is_worse(*pairs[name]), _growth(*pairs[name])), default="")
+    before, after = pairs.get(figure, (None, None))
     changes = ["slower"] * _is_slower(was, now, limit) + ["faster"] * _is_slower(now, was, limit)
-    changes += ["less accurate"] if figure.is_worse else []
+    changes += ["less accurate"] * _is_worse(before, after)
     changes += [f"{was.status}, now {now.status or 'nothing'}"] if was.status == "ok" != now.status else []
     return {
         "benchmark": name, "group": was.group, **{axis: was.axes.get(axis, "") for axis in AXES},
         "before_s": was.seconds, "after_s": now.seconds,
         "ratio": now.seconds / was.seconds if was.seconds > 0.0 else math.nan,
         "apart": "yes" if now.low > was.high or was.low > now.high else "no",
-        "figure": figure.name, "before": figure.before, "after": figure.after, "verdict": ", ".join(changes),
+        "figure": figure, "before": before, "after": after, "verdict": ", ".join(changes),
     }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Figure:
-    """A figure of accuracy before and after; `None` where there is none or it is not finite."""
+def _is_worse(before: float | None, after: float | None) -> bool:
+    """Return if a figure of accuracy grew by more than round-off may, ten times and beyond 1e-9, or is gone."""
+    if before is None or after is None:
+        return before is not None
+    return after > 1e-9 and after > 10.0 * before
 
-    name: str
-    before: float | None
-    after: float | None
 
-    @property
-    def is_worse(self) -> bool:
-        """True if it grew by more than round-off may: ten times, and beyond 1e-9."""
-        if self.before is None or self.after is None:
-            return self.before is not None
-        return self.after > 1e-9 and self.after > 10.0 * self.before
-
-    @property
-    def growth(self) -> tuple[float, float]:
-        """Factor by which it grew, and its size; the factor is infinite if there is none any more."""
-        if self.after is None:
-            return (0.0 if self.before is None else math.inf), 0.0
-        # Growth from below 1e-10 is round-off.
-        return (0.0 if self.before is None else self.after / max(self.before, 1e-10)), self.after
+def _growth(before: float | None, after: float | None) -> tuple[float, float]:
+    """Factor by which a figure grew, and its size; the factor is infinite if there is none any more."""
+    # Growth from below 1e-10 is round-off.
+    factor = math.inf if after is None else after / max(before or 0.0, 1e-10)
+    return 0.0 if before is None else factor, after or 0.0
 
 
 def _is_slower(was: Measured, now: Measured, limit: float) -> bool:

@@ -98,11 +98,9 @@ class TimeLeft:
         if not means:
             return None
         paces = {problem: self._pace(means, problem) for problem in {sort[0] for sort in self._left}}
-        left = 0.0
-        for sort, count in self._left.items():
-            expected = paces[sort[0]] * self._effort[sort] / max(self._planned[sort], 1)
-            # A stage may be done twice, after a worker was lost.
-            left += max(count, 0) * means.get(sort, expected)
+        expected = {sort: paces[sort[0]] * self._effort[sort] / max(self._planned[sort], 1) for sort in self._left}
+        # A stage may be done twice, after a worker was lost.
+        left = sum(max(count, 0) * means.get(sort, expected[sort]) for sort, count in self._left.items())
         return max(0.0, left - sum(one.last[0] * means[one.sort] for one in telling)) / self._jobs
 
     def _pace(self, means: Mapping[_Sort, float], problem: str) -> float:
@@ -119,7 +117,6 @@ def _sort(stage: Stage) -> _Sort:
 
 def duration(seconds: float) -> str:
     """A duration in words: "40 s", "3 min", "1 h 20 min"."""
-    # Below two minutes seconds are the clearer unit.
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)

@@ -138,13 +138,11 @@ def _in_words(schema: Mapping[str, Any]) -> str:
 class Key(NamedTuple):
     """A key of a TOML file, in words."""
 
-    # `table` is the name of the model of its table, "" for the file itself; `default` is JSON, "" where there is none.
-
-    table: str
+    table: str  # name of the model of its table, "" for the file itself
     name: str
     expected: str
     required: bool
-    default: str
+    default: str  # as JSON, "" where there is none
     meaning: str
 
 
@@ -164,10 +162,9 @@ def keys(schema: Mapping[str, Any], link: Callable[[str], str] = lambda _: "tabl
 
 def places(schema: Mapping[str, Any], model: str) -> list[str]:
     """The keys whose values are tables of a model."""
-    reference = json.dumps(f"#/$defs/{model}")
-    tables = [schema, *schema["$defs"].values()]
-    holders = [key for table in tables for key, field in table["properties"].items() if reference in json.dumps(field)]
-    return list(dict.fromkeys(holders))
+    reference, tables = json.dumps(f"#/$defs/{model}"), [schema, *schema["$defs"].values()]
+    fields = [field for table in tables for field in table["properties"].items()]
+    return list(dict.fromkeys(key for key, field in fields if reference in json.dumps(field)))
 
 
 def _expected(schema: Mapping[str, Any], link: Callable[[str], str]) -> str:

@@ -106,22 +106,17 @@ class Plugin:
         """The command that checks the plugin with these options, or the function for a given one."""
         if self.is_given:
             return "vibench.testing.check"
-        options = (f"{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in self.arguments.items())
-        check = ["vibench", "check", f"{self.kind.cli_name}:{self.name}", *(f"--option={text}" for text in options)]
-        return shlex.join(check)
+        options = (f"--option={k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in self.arguments.items())
+        return shlex.join(["vibench", "check", f"{self.kind.cli_name}:{self.name}", *options])
 
 
 @dataclass(frozen=True)
 class GivenPlugin(RegisteredPlugin):
     """A class or an object passed to a study in Python; known only to that process and to its workers."""
 
-    # `fingerprint` is "object " and the hash of its code and state. `pickled` is the class or the object by
-    # cloudpickle, empty where only another process has it. `modules` are versions of the modules that it imports, by
-    # name.
-
-    fingerprint: str = ""
-    pickled: bytes = b""
-    modules: Mapping[str, str] = field(default_factory=dict, compare=False)
+    fingerprint: str = ""  # "object " and the hash of its code and state
+    pickled: bytes = b""  # by cloudpickle; empty where only another process has it
+    modules: Mapping[str, str] = field(default_factory=dict, compare=False)  # versions of those that it imports
 
     def __reduce__(self) -> Any:
         return GivenPlugin, (self.kind, self.name, (), self.fingerprint, self.pickled, self.modules)
@@ -130,10 +125,8 @@ class GivenPlugin(RegisteredPlugin):
     def given(self) -> Any:
         """The class or the object; a `RequestError` if this process does not have it, or cannot import its modules."""
         if not self.pickled:
-            raise RequestError(
-                f"the {self} is a class or an object that a study was given in another process, or before it was "
-                "edited: run the study again with what it is now"
-            )
+            given = f"the {self} is a class or an object that a study was given in another process"
+            raise RequestError(f"{given}, or before it was edited: run the study again with what it is now")
         try:
             return cloudpickle.loads(self.pickled)
         except Exception as error:  # noqa: BLE001  importing it runs third-party code
@@ -187,9 +180,8 @@ def give(kind: PluginKind, name: str, given: Any) -> GivenPlugin:
     assert base is not None
     if not issubclass(cls, base):
         instead = f"the class {cls.__name__}" if given is cls else f"a {cls.__name__}"
-        raise RequestError(
-            f"{kind}: expected a name, or a class or an object of vibench.{base.__name__}, found {instead}"
-        )
+        expected = f"a name, or a class or an object of vibench.{base.__name__}"
+        raise RequestError(f"{kind}: expected {expected}, found {instead}")
     try:
         # The study is of the present state of the object, even if the user changes it before the run.
         snapshot = given
@@ -203,10 +195,9 @@ def give(kind: PluginKind, name: str, given: Any) -> GivenPlugin:
         needs = {one: distribution_version(one) for one in getattr(cls, "requires", ())}
         code, modules = fingerprint_of([snapshot, needs])
     except Exception as error:  # noqa: BLE001  pickling runs third-party code
-        raise RequestError(
-            f"the {kind} '{name}' cannot be sent to worker processes: {message_of(error)}; keep such objects out of "
-            "attributes and global names, or make them where they are used"
-        ) from None
+        why = f"the {kind} '{name}' cannot be sent to worker processes: {message_of(error)}"
+        advice = "keep such objects out of attributes and global names, or make them where they are used"
+        raise RequestError(f"{why}; {advice}") from None
     plugin = GivenPlugin(kind, name, (), f"object {code}", file.getvalue(), modules)
     # Keep the original: unpickled here, a class of a notebook would lose its global names.
     plugin.__dict__["given"] = snapshot

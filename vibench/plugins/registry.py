@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.metadata import Distribution, EntryPoint
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,7 +91,8 @@ class RegisteredPlugin:
     def summary(self) -> str:
         """First line of its docstring, or first sentence of the comment at the top of a study."""
         if self.kind is not PluginKind.STUDY:
-            return docstring(self._entry.module, self._entry.attr)
+            documented = next(_definitions(self._entry.module, self._entry.attr), None)
+            return ((documented and ast.get_docstring(documented)) or "").split("\n")[0]
         try:
             return top_comment(Path(self.load()))
         except RequestError:
@@ -98,7 +100,13 @@ class RegisteredPlugin:
 
     @property
     def names_of_options(self) -> list[str]:
-        return [option for entry in self.entries for option in names_of_options(entry.module, entry.attr)]
+        """Names of the arguments of the constructor of its class, own or inherited."""
+        found = list[str]()
+        for entry in self.entries:
+            members = (member for one in _definitions(entry.module, entry.attr) for member in one.body)
+            constructors = (m.args for m in members if isinstance(m, ast.FunctionDef) and m.name == "__init__")
+            found += [one.arg for args in islice(constructors, 1) for one in (*args.args[1:], *args.kwonlyargs)]
+        return found
 
     def load(self) -> Any:
         """The object that its entry point refers to."""
@@ -162,18 +170,16 @@ class RegisteredPlugin:
             return dict(given), {}
         from vibench.linalg.factorisations import DEFAULT, implementation
 
-        own, name = dict(given), implementation(given["factorisation"]).name
-        del own["factorisation"]
+        own = dict(given)
+        name = implementation(own.pop("factorisation")).name
         return own, {} if name == DEFAULT else {"factorisation": name}
 
     def canonical_options(self, given: Mapping[str, Any]) -> str:
         """Checked options as canonical JSON, without those that equal their default."""
         from vibench.plugins.options import options_as_json
 
-        checked, options = self.check_options(given), {} if self.conflict else self.options
-        return options_as_json(
-            {name: v for name, v in checked.items() if name not in options or v != options[name].preset}
-        )
+        checked, options = self.check_options(given).items(), {} if self.conflict else self.options
+        return options_as_json({name: v for name, v in checked if name not in options or v != options[name].preset})
 
     def data_digest(self, options: Mapping[str, Any]) -> str:
         """Digest of the files that it reads with these options; "" if it reads none, or is not available here."""
@@ -213,11 +219,8 @@ def registered(kind: PluginKind) -> dict[str, RegisteredPlugin]:
 def default_formulation() -> str:
     """Name of the formulation of studies that name none, whose class says `is_default = True`; "" without any."""
     # The class is read, not imported: results are shown by this name. Raises a `RequestError` if there are several.
-    names = [
-        name
-        for name, plugin in registered(PluginKind.FORMULATION).items()
-        if not plugin.conflict and _is_default(plugin.entries[0].module, plugin.entries[0].attr)
-    ]
+    unique = {name: one.entries[0] for name, one in registered(PluginKind.FORMULATION).items() if not one.conflict}
+    names = [name for name, entry in unique.items() if _is_default(entry.module, entry.attr)]
     if len(names) > 1:
         raise RequestError(f"several formulations say that they are the default: {', '.join(names)}")
     return names[0] if names else ""
@@ -236,10 +239,8 @@ def find_named(text: str, kinds: Mapping[str, PluginKind], solvers: Sequence[str
     prefix, colon, rest = text.partition(":")
     name = rest if colon else text
     searched = {word: kind for word, kind in kinds.items() if not colon or word == prefix}
-    names = {
-        word: solvers if kind is PluginKind.SOLVER else [*registered(kind)]
-        for word, kind in (searched or kinds).items()
-    }
+    kept = (searched or kinds).items()
+    names = {word: solvers if kind is PluginKind.SOLVER else [*registered(kind)] for word, kind in kept}
     matching = [word for word in searched if name in names[word]]
     if not matching:
         what = kinds.get(prefix, "plugin") if colon else "plugin"
@@ -309,20 +310,6 @@ def _distribution_name(distribution: Distribution) -> str:
         return str(getattr(distribution, "_normalized_name", None) or distribution.metadata["Name"])
     except Exception:  # noqa: BLE001  as above
         return str(distribution)
-
-
-def docstring(module: str, name: str) -> str:
-    """The first line of the documentation of a class."""
-    documented = next(_definitions(module, name), None)
-    text = "" if documented is None else ast.get_docstring(documented)
-    return (text or "").split("\n")[0]
-
-
-def names_of_options(module: str, name: str) -> list[str]:
-    """Names of the arguments of the constructor of a class, its own or inherited."""
-    methods = (node for one in _definitions(module, name) for node in one.body if isinstance(node, ast.FunctionDef))
-    constructor = next((node.args for node in methods if node.name == "__init__"), None)
-    return [] if constructor is None else [one.arg for one in (*constructor.args[1:], *constructor.kwonlyargs)]
 
 
 def _definitions(module: str, name: str, below: tuple[tuple[str, str], ...] = ()) -> Iterator[ast.ClassDef]:
