@@ -87,10 +87,7 @@ def setting(study: str) -> Setting:
 
 
 def chosen_plugins(plugins: Sequence[str]) -> dict[str, list[str]]:
-    """Group names of plugins, as `vibench list` shows them, or KIND:NAME, by the word for their kind.
-
-    Raises a `RequestError` if there is no such plugin, several have the name, or a solver is not installed.
-    """
+    """Group names of plugins, as `vibench list` shows them, or KIND:NAME, by kind; a `RequestError` refuses others."""
     # Samplings and studies are no part of what is timed.
     kinds = {word: kind for word, kind in CHECKED.items() if kind is not PluginKind.SAMPLING}
     chosen, solvers = dict[str, list[str]](), installed_solvers(registered(PluginKind.SOLVER))

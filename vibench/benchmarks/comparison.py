@@ -102,10 +102,7 @@ def _seconds(stats: Mapping[str, Any], name: str) -> float:
 
 
 def table_of(timed: Timed, earlier: Timed | None, limit: float) -> pd.DataFrame:
-    """A row for every benchmark; with an earlier file, for every one of both, and what changed.
-
-    A row of two files has both medians, and of the figures of accuracy the one that got worse most.
-    """
+    """A row for every benchmark; with an earlier file, for every one of both, with what changed."""
     if earlier is None:
         return pd.DataFrame([_row(name, one) for name, one in timed.benchmarks.items()])
     both = (name for name in earlier.benchmarks if name in timed.benchmarks)
@@ -151,10 +148,7 @@ def _growth(before: float | None, after: float | None) -> tuple[float, float]:
 
 
 def _is_slower(was: Measured, now: Measured, limit: float) -> bool:
-    """Return if the seconds grew beyond a limit, beyond their spread, and beyond what the machine was slower by.
-
-    The calibration is fixed work that was timed beside both.
-    """
+    """Return if the seconds grew beyond a limit, beyond their spread, and beyond what the machine was slower by."""
     # Clocks and caches do not resolve 10 µs.
     if now.seconds - was.seconds <= 10e-6 or now.low <= was.high:
         return False

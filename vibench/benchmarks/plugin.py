@@ -2,9 +2,8 @@
 
     pytest -p vibench.benchmarks.plugin --pyargs vibench.benchmarks.stages --plugin NAME --benchmark-json a.json
 
-Statistics, files and tables are those of pytest-benchmark. It has no passes: rounds in succession do not see how a
-machine changes within minutes, so that everything is timed once, then all once more, and so on, and the rounds are put
-together. Plugins may end their process, which costs the current benchmark alone.
+pytest-benchmark has no passes: rounds in succession do not see how a machine changes within minutes. Everything is
+timed once, then once more, and the rounds are put together. A plugin that ends its process costs one benchmark.
 """
 
 from __future__ import annotations
@@ -105,11 +104,9 @@ class Passes:
 
     @pytest.fixture
     def timing(self, benchmark: Any, inputs: StageInputs, number: int) -> Timing:
-        """A function that times some work, whose result the first pass judges; if that raises, nothing is timed.
-
-        `fresh` gives a new argument of the work for every round, where it takes one. A round has `together` calls,
-        where each does something else.
-        """
+        """A function that times some work, whose result the first pass judges; if that raises, nothing is timed."""
+        # `fresh` gives a new argument of the work for every round, where it takes one. A round has `together` calls,
+        # where each does something else.
 
         def measure(group: str, work: Work, judge: Judge, fresh: Work | None = None, together: int = 1) -> None:
             def once() -> tuple[Any, Any]:

@@ -57,10 +57,7 @@ class Run:
 
     @requested
     def table(self, name: str) -> pd.DataFrame:
-        """A table of the results file, its rows in the order of the axes; the documentation lists the columns.
-
-        Raises a `RequestError` if there is no such table.
-        """
+        """A table of the results file in the order of the axes; a `RequestError` if there is no such table."""
         if name not in TABLES:
             raise unknown_name("table", name, TABLES)
         return in_order(read_table(self.path, name))

@@ -45,8 +45,7 @@ class CompiledModel:
     def of(cls, reduced: AnyReducedModel, accuracy: float) -> CompiledModel:
         """Interpolate the members of a reduced model.
 
-        Raises an `UnsupportedError` if there is none: the basis depends on the parameter, polynomials of the members
-        are not accurate enough or too large.
+        Raises an `UnsupportedError` if the basis depends on the parameter, or polynomials are inaccurate or too large.
         """
         try:
             _, polynomials = member_polynomials(reduced, TOLERANCE, EVALUATIONS, fixed=True, check=_refuse_large)
@@ -85,10 +84,7 @@ def _refuse_large(program: VariationalInequality) -> None:
 
 
 class CompiledProgram:
-    """A program of `unknowns` and `constraints`, compiled from its source and loaded.
-
-    Raises an `UnsupportedError` if there is no C compiler, or it fails.
-    """
+    """A program of `unknowns` and `constraints`, compiled and loaded; an `UnsupportedError` if the compiler fails."""
 
     def __init__(self, source: str, unknowns: int, constraints: int) -> None:
         # A library that is loaded needs its file no longer.

@@ -89,15 +89,12 @@ class CellSolver:
 
 @dataclass(frozen=True)
 class QueryStatus:
-    """The status of an answer and why it is not ok, and its pair u (n,), λ (m,) unless it is broken or has a program.
-
-    `residuals` are those of the program, or of the last quadratic program that it took, if any.
-    """
+    """Status of an answer, why it is not ok, and its pair u (n,), λ (m,) unless it is broken or has a program."""
 
     status: Status
     reason: str
     pair: tuple[Array, Array] | None = None
-    residuals: Residuals | None = None
+    residuals: Residuals | None = None  # of the program, or of the last one that the formulation solved
 
 
 class _Settings(NamedTuple):
@@ -164,10 +161,7 @@ class Model:
 
     @cached_property
     def online(self) -> FormulationModel:
-        """The model of the formulation, which answers queries.
-
-        Raises a `NumericalError` if the formulation makes something else.
-        """
+        """The model of the formulation, which answers queries; a `NumericalError` if it makes something else."""
         made = self.formulation.model(self.offline, self.built)
         if not isinstance(made, FormulationModel):
             raise NumericalError(f"the formulation made a {type(made).__name__}, expected a FormulationModel")
@@ -181,10 +175,7 @@ class Model:
 
     @property
     def reduced(self) -> AnyReducedModel:
-        """The reduced model that assembles the programs: `reduced.assemble(mu)` has `program` and `reconstruct`.
-
-        Raises a `RequestError` if the formulation has no programs.
-        """
+        """The model that assembles: `reduced.assemble(mu)` has `program` and `reconstruct`; refused if it has none."""
         if not self.formulation.has_program:
             name = type(self.formulation).__name__
             raise RequestError(f"the formulation {name} has no program to be replayed, corrected or exported")
@@ -218,9 +209,7 @@ class Model:
     ) -> QueryStatus:
         """The status of an answer of the formulation at mu (d,), found with this solver, or of its `program`.
 
-        Residuals may be `slackened` times the accuracy.
-
-        Raises a `NumericalError` if the answer is of another type or size.
+        Residuals may be `slackened` times the accuracy. A `NumericalError` names another type or size of the answer.
         """
         if not isinstance(answer, FormulationAnswer):
             raise NumericalError(f"`solve` returned a {type(answer).__name__}, expected a FormulationAnswer")
@@ -249,10 +238,7 @@ class Model:
         return QueryStatus(status, reason, (u, lam), residuals)
 
     def pair(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:
-        """The pair u (n,), λ (m,) of an answer, of the right sizes; λ from the residual where the formulation has none.
-
-        Raises a `NumericalError` that names the fault.
-        """
+        """The pair u (n,), λ (m,) of an answer, its sizes checked; λ from the residual if the formulation has none."""
         problem, declared = self.problem, self.formulation.multiplier
         made = self.online.reconstruct(mu, answer)
         if not isinstance(made, tuple) or len(made) != 2:

@@ -58,10 +58,7 @@ Assembly: TypeAlias = Literal["full", "reduced"]
 
 
 def high_fidelity_sweep(problem: Problem, mus: Array, *, skip: bool = False) -> Snapshots:
-    """High-fidelity solutions of a problem at parameters (P×d), one after the other.
-
-    Where `skip` is set, parameters without a solution are left out, as many as `check_skipped` allows.
-    """
+    """High-fidelity solutions at parameters (P×d); `skip` leaves out those without one, as many as may be skipped."""
     solver, solutions, skipped, solved = HighFidelitySolver(problem), [], [], np.zeros(len(mus), bool)
     for k, mu in enumerate(mus):
         try:
@@ -164,10 +161,8 @@ class Reduction:
             raise RequestError("without a primal strategy there is no tolerance" if self.primal is None else of_one)
 
     def given(self, **steps: Any) -> Reduction:
-        """A reduction with the same inputs and these steps prescribed, by the names of the attributes.
-
-        Steps that were given before are kept, steps that were computed are computed again: they may depend on the new.
-        """
+        """A reduction with the same inputs and these steps, by attributes; steps computed before are computed again."""
+        # Steps that were given before are kept; computed ones may depend on the new.
         other, kept = replace(self), self.__dict__.get("_given", {}) | steps
         # Cached properties look at the attributes of the instance first, so that these steps are never computed.
         other.__dict__.update(kept, _given=kept)
@@ -198,10 +193,7 @@ class Reduction:
 
     @cached_property
     def pod(self) -> POD:
-        """V_N, and the error of the POD for every number of modes (paper, (10) and (11)).
-
-        Raises a `RequestError` if `modes` is `None`.
-        """
+        """V_N, and the error of the POD for every number of modes (paper, (10) and (11)); needs `modes`."""
         if self.modes is None:
             raise RequestError("the offline phase has no V_N: modes is None")
         return pod(self.snapshots.u, self.problem.V, self.modes)
@@ -266,10 +258,7 @@ class Reduction:
         return certificate_base(self.problem, self.members, self.decomposed)
 
     def certificate_of(self, reduced: AnyReducedModel) -> OnlineCertificate:
-        """The certificate of a reduced model of the problem, which bounds errors at online cost (`docs/certified.md`).
-
-        Raises an `UnsupportedError` if the model is assembled in full, or the problem does not allow it.
-        """
+        """The certificate of a reduced model (`docs/certified.md`); an `UnsupportedError` where none is possible."""
         if not isinstance(reduced, HyperReducedModel):
             why = "as asked for" if self.assembly == "full" else self.operators
             needed = "a certificate at online cost needs reduced assembly"

@@ -26,10 +26,7 @@ from vibench.provenance import memory
 
 
 def safe_path(folder: Path, name: str) -> Path:
-    """Path of a file in a folder.
-
-    Raises a `RequestError` if the name leads elsewhere, there is no such file, or it is a link or no regular file.
-    """
+    """Path of a file in a folder; a `RequestError` if the name leads elsewhere, or it is a link or no regular file."""
     parts = PurePosixPath(name).parts
     if not parts or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name:
         raise RequestError(f"'{name}' is not the name of a file inside the pack's folder")

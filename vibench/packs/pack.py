@@ -1,7 +1,4 @@
-"""A model pack in memory: a variational inequality, its spaces, parameters, reference solutions and mesh.
-
-Its dual half needs λ and X_W alone: `reduce_multipliers` builds cones of the multipliers.
-"""
+"""A model pack in memory: a variational inequality, its spaces, parameters, reference solutions and mesh."""
 
 from __future__ import annotations
 
@@ -211,10 +208,7 @@ class ModelPack:
         return {name: member.sum for name, member in members.items() if member.thetas}
 
     def interpolation_errors(self, tolerance: float) -> dict[str, float]:
-        """Relative errors, at the listed validation parameters, of members that reduced assembly interpolates.
-
-        `tolerance` is that of the interpolation at the training parameters. Declared affine members have no error.
-        """
+        """Relative errors at listed validation parameters of members that are interpolated to a tolerance."""
         errors, others = dict[str, float](), () if self.validation is None else self.validation
         for name in MEMBERS:
             if self.V is not None and name in self.entrywise and name not in self.affine:
@@ -234,18 +228,11 @@ class ModelPack:
         return {"B": self.members["B"].mapped(lambda B: sp.csr_array(B)[:, self.contact]), "g": self.members["g"]}
 
     def at(self, mu: Array) -> VariationalInequality:
-        """The variational inequality at mu (d,).
-
-        Raises a `NumericalError` if a member has arrays for listed parameters only and mu is not one of them, or θ(µ)
-        is not finite.
-        """
+        """The variational inequality at mu (d,); a `NumericalError` if mu has to be listed, or θ(µ) is not finite."""
         return VariationalInequality(**{name: self.members[name].at(mu) for name in MEMBERS})
 
     def validation_set(self, count: int, seed: int) -> Array:
-        """The first `count` listed validation parameters, or as many random ones in the box if none are listed.
-
-        Raises a `NumericalError` if fewer are listed.
-        """
+        """Validation parameters, the first listed ones or random ones; a `NumericalError` if fewer are listed."""
         if self.validation is None:
             return self.box.sample(count, seed)
         if count > len(self.validation):
@@ -255,10 +242,7 @@ class ModelPack:
 
 
 def pack_multipliers(pack: ModelPack) -> tuple[Array, Array]:
-    """The multipliers of a pack at training parameters (m×P), and the others (m×Q).
-
-    Raises a `RequestError` if it has none, or none at training parameters.
-    """
+    """The multipliers at training parameters (m×P), of which there has to be one, and the others (m×Q)."""
     if pack.reference is None:
         raise RequestError("the pack has no multipliers; [solutions] lam would give them")
     of_training = {tuple(mu) for mu in pack.training.tolist()}
@@ -271,10 +255,7 @@ def pack_multipliers(pack: ModelPack) -> tuple[Array, Array]:
 
 
 def reduce_multipliers(pack: ModelPack, strategy: DualStrategy, tolerance: float) -> tuple[Cone, float | None]:
-    """A cone of the multipliers at training parameters, and its largest error at others, relative to the largest norm.
-
-    Raises a `NumericalError` if the strategy fails, or what it returns is no cone.
-    """
+    """A cone of the multipliers at training parameters, and its largest error at others by the largest norm."""
     training, others = pack_multipliers(pack)
     cone = check_cone(strategy.reduce(training, pack.W, Stop(tolerance=tolerance)), pack.W)
     distances = [project_on_cone(cone.rays, column, pack.W).distance for column in others.T]

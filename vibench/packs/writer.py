@@ -29,10 +29,7 @@ def write_pack(
     """Write a pack of a problem at its training set and its validation set into a new folder, whole or not at all.
 
     The manifest has `name` and `source`. `validation` parameters are drawn with `seed`; with `solutions` the problem is
-    solved at every parameter, and the solutions are added.
-
-    Raises a `RequestError` if the folder exists, and a `NumericalError` if an assembly is invalid or a parameter has no
-    solution.
+    solved at every parameter. Raises a `RequestError` if the folder exists.
     """
     training = training_parameters(problem)
     listed = np.vstack([training, validation_parameters(problem, validation, seed)])

@@ -30,17 +30,13 @@ from vibench.provenance import distribution_version, package_hash
 
 @dataclass(frozen=True)
 class Plugin:
-    """A plugin with its `options` as canonical JSON.
-
-    `code` is the version of its code, with a digest of the files that its options name. `places` are the absolute paths
-    of these, as JSON by option; they are not part of the identity.
-    """
+    """A plugin with its options; places of files are not part of its identity."""
 
     kind: PluginKind
     name: str
-    options: str
-    code: str
-    places: str = field(default="{}", compare=False)
+    options: str  # canonical JSON
+    code: str  # version of its code, with a digest of the files that its options name
+    places: str = field(default="{}", compare=False)  # absolute paths of these, as JSON by option
 
     def __post_init__(self) -> None:
         # The kind is a text in a results file.
@@ -171,10 +167,7 @@ _given: dict[tuple[str, str, str], GivenPlugin] = {}
 
 
 def give(kind: PluginKind, name: str, given: Any) -> GivenPlugin:
-    """Register a class or an object in its present state as a plugin of this process.
-
-    Raises a `RequestError` if it is not of the kind, or cannot be sent to worker processes.
-    """
+    """Register a class or an object in its present state as a plugin; a `RequestError` if it cannot be sent."""
     cls, base = given if isinstance(given, type) else type(given), kind.base
     # Plugins of the axes are classes.
     assert base is not None
@@ -235,10 +228,9 @@ def _received(kind: PluginKind, name: str, options: str, code: str, places: str,
 
 
 def fingerprint_of(value: Any) -> tuple[str, dict[str, str]]:
-    """Hash of a value and of its code, equal in all processes that make it in the same way."""
+    """Hash of a value and of its code, equal in all processes that make it in the same way; versions of its modules."""
     # Functions and classes of scripts and notebooks count with their bytecode and the global names that it uses, those
     # of modules with the `module_version`. Values of cached properties do not count.
-    # Returns also the versions of the modules that it uses. Raises a `TypeError` if the value cannot be pickled.
     seen: dict[int, tuple[int, Any]] = {}
     own = _hash_of(value, seen)
     modules = [one for _, one in seen.values() if isinstance(one, ModuleType)]

@@ -1,7 +1,4 @@
-"""A plugin under examination, checks that plugins of several kinds share, and comparisons that name the entry at fault.
-
-Arrays are dense arrays and sparse matrices by name.
-"""
+"""A plugin under examination, checks that several kinds share, and comparisons that name the entry at fault."""
 
 from __future__ import annotations
 
@@ -31,7 +28,7 @@ ArgumentT = TypeVar("ArgumentT")
 ResultT = TypeVar("ResultT")
 T = TypeVar("T")
 
-Arrays = dict[str, Any]
+Arrays = dict[str, Any]  # dense arrays and sparse matrices by name
 
 
 @dataclass(eq=False)
@@ -39,16 +36,13 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
     """A plugin under examination, the arguments it is called with, and the results."""
 
     # Every call receives copies, so that a plugin that writes to its input fails the check "no mutation" alone.
-    # `seconds` limits each call; `round_off` is the largest relative difference that arrays of another process may
-    # have.
-
     base: ClassVar[type]
     checks: ClassVar[tuple[Check[Any], ...]]
-    round_off: ClassVar[float] = 0.0
+    round_off: ClassVar[float] = 0.0  # largest relative difference that arrays of another process may have
 
     create: Callable[..., PluginT]
     _: KW_ONLY
-    seconds: float = SECONDS
+    seconds: float = SECONDS  # limit of each call
 
     def __post_init__(self) -> None:
         kind_of(self.create)  # refuses an instance

@@ -80,8 +80,7 @@ class ConformanceWarning(UserWarning):
 class Check(Generic[CaseT_contra]):
     """A name, a function from a case to its faults and notes, and the names of checks that must pass before."""
 
-    # A function that reports its faults by a `ConformanceError` alone returns `None`; a `SkipTest` ends the check as
-    # skipped, for its reason.
+    # A function may report faults by a `ConformanceError` alone; a `SkipTest` ends the check as skipped.
 
     name: str
     faults: Callable[[CaseT_contra], Iterable[str] | None]
@@ -193,10 +192,7 @@ def _report(examination: Examination, name: str) -> None:
 
 
 class Examination:
-    """The checks of a plugin in another process: one that ends the process or exceeds the time fails alone.
-
-    `seconds` limits the wall time of all of them; the other parameters are those of `check`.
-    """
+    """The checks of a plugin in another process, all within `seconds`: one that ends it fails alone."""
 
     def __init__(self, plugin: Any, kind: str | None = None, seconds: float = SECONDS, **given: Any) -> None:
         self.kind, self.title, self.seconds = kind or kind_of(plugin), _title(plugin), seconds
