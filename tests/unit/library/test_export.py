@@ -444,24 +444,20 @@ def test_models_without_an_export_are_refused(
         export_model(model, tmp_path / "deep" / "model.npz")
 
 
-def test_coefficients_are_evaluated_once_per_parameter(run: vibench.Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    model = model_of(run, "radial-obstacle")
-    (mu,), points = model.parameters.sample(1, seed=0), []
-    evaluate, size = model.reduced.coefficients, len(model.reduced.assemble(mu).program.f)
-    monkeypatch.setattr(model.reduced, "coefficients", lambda at: points.append(at) or evaluate(at))
-    assert polynomials._evaluated(model.reduced, size, {}, (), None, mu).keys() == {"A", "f", "B", "g"}
-    assert len(points) == 1
-
-
-def test_a_constant_member_is_not_sampled(run: vibench.Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_constant_member_is_not_sampled_and_coefficients_are_evaluated_once(
+    run: vibench.Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Thousands of copies of a constant A of 281 unknowns took 6 GiB."""
-    reduced, sampled = model_of(run, "radial-obstacle").reduced, []
-    interpolate = polynomials.interpolate_on_box
+    reduced, sampled, points = model_of(run, "radial-obstacle").reduced, [], []
+    interpolate, coefficients = polynomials.interpolate_on_box, reduced.coefficients
 
     def sizes(evaluate: Any, lower: np.ndarray, *given: Any, **named: Any) -> Any:
+        points.clear()
         sampled.append({name: array.size for name, array in evaluate(lower).items()})
+        assert len(points) == 1
         return interpolate(evaluate, lower, *given, **named)
 
+    monkeypatch.setattr(reduced, "coefficients", lambda at: points.append(at) or coefficients(at))
     monkeypatch.setattr(polynomials, "interpolate_on_box", sizes)
     _, found = polynomials.member_polynomials(reduced, 1e-11, 4096, fixed=True)
     assert reduced.problem.constant
