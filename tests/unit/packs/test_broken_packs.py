@@ -7,7 +7,7 @@ import io
 import os
 import pickle
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,34 +31,35 @@ MISTAKES: dict[str, tuple[str, Mistake]] = {}
 """By name: what the line says, and a function that changes the manifest, the arrays, or, at the end, the files."""
 
 
-def mistake(line: str) -> Callable[[Mistake], Mistake]:
-    def add(function: Mistake) -> Mistake:
-        MISTAKES[function.__name__] = (line, function)
-        return function
+def changed(
+    name: str, line: str, content: dict[str, Any], more: Mapping[str, Callable[[Cable], Any]] = {}, **arrays: Any
+) -> None:
+    """A mistake in values of the manifest by path, `...` for what is missing, in `more.npz`, and in other arrays."""
 
-    return add
+    def change(manifest: Content, cable: Cable, folder: Path) -> None:
+        computed = {key: compute(cable) for key, compute in arrays.items()}
+        if more:
+            np.savez(folder / "more.npz", **{key: compute(cable) for key, compute in more.items()})
+        vars(cable).update(computed)
+        for path, to in content.items():
+            *steps, last = (int(step) if step.isdigit() else step for step in path.split("."))
+            place: Any = manifest
+            for step in steps:
+                place = place[step]
+            if to is ...:
+                del place[last]
+            else:
+                place[last] = to
+
+    MISTAKES[name] = (line, change)
 
 
 def simple(name: str, line: str, path: str, to: Any) -> None:
-    """A mistake in one value of the manifest, at a path of keys and indices."""
-
-    def change(content: Content, cable: Cable, folder: Path) -> None:
-        *steps, last = (int(step) if step.isdigit() else step for step in path.split("."))
-        place: Any = content
-        for step in steps:
-            place = place[step]
-        place[last] = to
-
-    MISTAKES[name] = (line, change)
+    changed(name, line, {path: to})
 
 
-def in_arrays(name: str, line: str, **changes: Callable[[Cable], Any]) -> None:
-    """A mistake in some of the arrays."""
-
-    def change(content: Content, cable: Cable, folder: Path) -> None:
-        vars(cable).update({key: compute(cable) for key, compute in changes.items()})
-
-    MISTAKES[name] = (line, change)
+def in_arrays(name: str, line: str, **arrays: Callable[[Cable], Any]) -> None:
+    changed(name, line, {}, **arrays)
 
 
 def in_files(name: str, line: str, change: Callable[[Path], object], A: str = "A.npz") -> None:
@@ -122,29 +123,13 @@ simple("columns", r"operators.g.each: an array 12×3; expected 12×5", "operator
 NO_B = {"A": "A.npz", "f": "f.npz", "g": "g.npz"}
 simple("B is missing", "operators.B: required, but not given", "operators", NO_B)
 simple("no X_V", "spaces.X_V: required with", "spaces", {"X_W": "spaces.npz:X_W"})
-
-
-@mistake("give both 'lower' and 'upper', or neither")
-def one_bound(content: Content, cable: Cable, folder: Path) -> None:
-    del content["parameters"]["upper"]
-
-
-@mistake(r"without the table \[operators\] a pack consists of")
-def nothing_to_do(content: Content, cable: Cable, folder: Path) -> None:
-    del content["operators"], content["solutions"]
-
-
-@mistake("together: the points 1 and 4 are the same")
-def a_point_that_is_trained_and_validated(content: Content, cable: Cable, folder: Path) -> None:
-    content["parameters"]["validation"][1] = [6.0, 0.2]
-    content["operators"]["g"] = {"each": "g.npz"}
-    np.savez(folder / "g.npz", g=np.ones((SIZE, 5)))
-
-
-@mistake("parameters.validation: required, since arrays")
-def nothing_to_validate_on(content: Content, cable: Cable, folder: Path) -> None:
-    del content["parameters"]["validation"]
-    content["operators"]["g"] = {"each": "solutions.npz:lam"}
+simple("one bound", "give both 'lower' and 'upper', or neither", "parameters.upper", ...)
+changed("nothing to do", r"without the table \[operators\] a pack consists of", {"operators": ..., "solutions": ...})
+changed("nothing to validate on", "parameters.validation: required, since arrays",
+        {"parameters.validation": ..., "operators.g": {"each": "solutions.npz:lam"}})  # fmt: skip
+changed("a point that is trained and validated", "together: the points 1 and 4 are the same",
+        {"parameters.validation.1": [6.0, 0.2], "operators.g": {"each": "more.npz:g"}},
+        {"g": lambda c: np.ones((SIZE, 5))})  # fmt: skip
 
 
 def link(folder: Path) -> None:
@@ -205,34 +190,26 @@ in_files("pattern", "the field 'pattern', it holds no values", lambda folder: sc
     folder / "A.mtx", sp.coo_array(Cable().A), field="pattern"), "A.mtx")  # fmt: skip
 
 
-@mistake("they count from 1, so the manifest needs index_base = 1")
-def indices_from_one(content: Content, cable: Cable, folder: Path) -> None:
-    content["operators"]["A"] = "triplets.npz"
-    A = sp.coo_array(cable.A)
-    np.savez(folder / "triplets.npz", row=A.coords[0] + 1, col=A.coords[1] + 1, data=A.data, shape=np.array(A.shape))
+def moved(A: sp.csr_array) -> sp.csr_array:
+    A.indices = A.indices + 5
+    return A
 
 
-@mistake("indices do not fit the shape 12×12")
-def indices_beyond_the_matrix(content: Content, cable: Cable, folder: Path) -> None:
-    cable.A.indices = cable.A.indices + 5
-
-
-@mistake("operators.f.affine.0: 1 of its entries are not finite")
-def not_a_number(content: Content, cable: Cable, folder: Path) -> None:
-    cable.mass[3] = np.nan
-
-
-@mistake("parameters.training: an array 0×2; expected P×2 with P > 0, a row per parameter$")
-def no_points(content: Content, cable: Cable, folder: Path) -> None:
-    np.savez(folder / "points.npz", none=np.empty((0, 2)))
-    content["parameters"]["training"] = "points.npz:none"
-
-
-@mistake("spaces.contact: 9 unknowns that B touches are not in it, the first is 1; leave it out, and they are found")
-def contact_without_unknowns_of_constraints(content: Content, cable: Cable, folder: Path) -> None:
-    """As of numbers that were stored in a type too small for them."""
-    np.savez(folder / "contact.npz", few=np.array([0, 2, 2, 3], np.uint8))
-    content["spaces"]["contact"] = "contact.npz:few"
+TRIPLETS = {
+    "row": lambda c: c.A.tocoo().coords[0] + 1, "col": lambda c: c.A.tocoo().coords[1] + 1, "data": lambda c: c.A.data,
+    "shape": lambda c: np.array(c.A.shape),
+}  # fmt: skip
+FROM_ONE = "they count from 1, so the manifest needs index_base = 1"
+changed("indices from one", FROM_ONE, {"operators.A": "more.npz"}, TRIPLETS)
+in_arrays("indices beyond the matrix", "indices do not fit the shape 12×12", A=lambda c: moved(c.A))
+in_arrays("not a number", "operators.f.affine.0: 1 of its entries are not finite",
+          mass=lambda c: np.where(np.arange(SIZE) == 3, np.nan, c.mass))  # fmt: skip
+NO_POINTS = "parameters.training: an array 0×2; expected P×2 with P > 0, a row per parameter$"
+changed("no points", NO_POINTS, {"parameters.training": "more.npz:none"}, {"none": lambda c: np.empty((0, 2))})
+# As of numbers that were stored in a type too small for them.
+UNTOUCHED = "spaces.contact: 9 unknowns that B touches are not in it, the first is 1; leave it out, and they are found"
+changed("contact without unknowns of constraints", UNTOUCHED, {"spaces.contact": "more.npz:few"},
+        {"few": lambda c: np.array([0, 2, 2, 3], np.uint8)})  # fmt: skip
 
 
 def edited(A: sp.csr_array, place: Any, to: Any) -> sp.csr_array:
@@ -279,42 +256,21 @@ in_arrays("transposed solutions", TRANSPOSED, u=lambda c: c.u.T)
 MISSING = "solutions.lam has 2 columns for 5 parameters"
 in_arrays("a solution is missing", MISSING, u=lambda c: c.u[:, :2], lam=lambda c: c.lam[:, :2])
 in_arrays("no contact", "no constraint is active, there is nothing to reduce", lam=lambda c: 0.0 * c.lam)
-
-
-@mistake("operators: at mu = .4.0, 0.2.: row 3 of B is zero and g is -0.0154 there: no u satisfies 0 ≤ -0.0154")
-def zero_row_below_its_bound(content: Content, cable: Cable, folder: Path) -> None:
-    cable.B = sp.csr_array(sp.diags_array(np.arange(SIZE) != 3, dtype=float) @ cable.B)
-    content["operators"]["g"]["affine"][0]["theta"] = "-depth"
-
-
-@mistake("operators.g: row 11 of term 0 is infinite, and its coefficient is no positive constant: give the infinite")
-def infinite_bound_with_a_coefficient_that_varies(content: Content, cable: Cable, folder: Path) -> None:
-    np.savez(folder / "far.npz", g=np.append(cable.mass[:-1], np.inf))
-    content["operators"]["g"]["affine"][0]["array"] = "far.npz:g"
-
-
-@mistake("probably the constraints are B u ≥ g: write B and g with the other sign")
-def other_constraint(content: Content, cable: Cable, folder: Path) -> None:
-    cable.B = -cable.B
-    content["operators"]["g"]["affine"][0]["theta"] = "-depth"
-
-
-@mistake("probably the constraints are B u ≥ g and λ ≤ 0")
-def other_constraint_and_multiplier(content: Content, cable: Cable, folder: Path) -> None:
-    other_constraint(content, cable, folder)
-    cable.lam = -cable.lam
-
-
-@mistake("solutions.lam has both signs")
-def both_signs(content: Content, cable: Cable, folder: Path) -> None:
-    del content["operators"], content["solutions"]["u"]
-    cable.lam[3, 1] *= -1.0
-
-
-@mistake("solutions.lam is negative: λ has the other sign")
-def negative_snapshots(content: Content, cable: Cable, folder: Path) -> None:
-    del content["operators"], content["solutions"]["u"]
-    cable.lam = -cable.lam
+OTHER_G = {"operators.g.affine.0.theta": "-depth"}
+BELOW = "operators: at mu = .4.0, 0.2.: row 3 of B is zero and g is -0.0154 there: no u satisfies 0 ≤ -0.0154"
+changed("zero row below its bound", BELOW, OTHER_G,
+        B=lambda c: sp.csr_array(sp.diags_array(np.arange(SIZE) != 3, dtype=float) @ c.B))  # fmt: skip
+VARIES = "operators.g: row 11 of term 0 is infinite, and its coefficient is no positive constant: give the infinite"
+changed("infinite bound with a coefficient that varies", VARIES, {"operators.g.affine.0.array": "more.npz:g"},
+        {"g": lambda c: np.append(c.mass[:-1], np.inf)})  # fmt: skip
+OTHER_WAY = "probably the constraints are B u ≥ g: write B and g with the other sign"
+changed("other constraint", OTHER_WAY, OTHER_G, B=lambda c: -c.B)
+BOTH_WAYS = "probably the constraints are B u ≥ g and λ ≤ 0"
+changed("other constraint and multiplier", BOTH_WAYS, OTHER_G, B=lambda c: -c.B, lam=lambda c: -c.lam)
+DUAL_HALF = {"operators": ..., "solutions.u": ...}
+ONE = np.arange(SIZE * 3).reshape(SIZE, 3) == 10
+changed("both signs", "solutions.lam has both signs", DUAL_HALF, lam=lambda c: np.where(ONE, -c.lam, c.lam))
+changed("negative snapshots", "solutions.lam is negative: λ has the other sign", DUAL_HALF, lam=lambda c: -c.lam)
 
 
 @pytest.fixture
@@ -345,11 +301,6 @@ def test_a_mistake_has_its_line(name: str, broken: Callable[[str], Path]) -> Non
     assert str(caught.value).startswith("pack '")
     with pytest.raises(RequestError, match="pack '"):  # and no study on it is started
         read_study(write_study(folder.parent, study_on(folder, 2)))
-
-
-def test_there_are_many_mistakes_and_as_many_lines() -> None:
-    lines = [line for line, _ in MISTAKES.values()]
-    assert len(set(lines)) == len(lines) > 40
 
 
 def study_on(folder: Path, validation: int) -> Content:
