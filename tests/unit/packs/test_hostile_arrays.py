@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -110,11 +111,9 @@ def test_index_arrays_of_any_type_are_checked_before_compiled_code_has_them(tmp_
     good = float(abs(A @ np.arange(N)).sum())
     folders = [write(tmp_path / name, **PARTS | parts) for name, (_, parts) in REFUSED.items()]
     folders += [write(tmp_path / name, **TRIPLETS | parts) for name, (_, parts) in REFUSED_TRIPLETS.items()]
-    for name, change in ACCEPTED.items():
-        folders.append(write(tmp_path / name, **{n: change(a) if n != "data" else a for n, a in PARTS.items()}))
-        folders.append(
-            write(tmp_path / f"triplets {name}", **{n: change(a) if n != "data" else a for n, a in TRIPLETS.items()})
-        )
+    for (name, change), (prefix, parts) in product(ACCEPTED.items(), (("", PARTS), ("triplets ", TRIPLETS))):
+        changed = {n: a if n == "data" else change(a) for n, a in parts.items()}
+        folders.append(write(tmp_path / f"{prefix}{name}", **changed))
     for name, (text, _) in MARKET.items():
         folders.append(write_cable(tmp_path / name))
         write_manifest(folders[-1], with_operator("A.mtx"))

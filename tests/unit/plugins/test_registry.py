@@ -4,7 +4,7 @@ import datetime
 import importlib.metadata
 import sys
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -17,8 +17,7 @@ from running import Register
 from samples import FAKES, install
 
 from vibench.errors import RequestError
-from vibench.interfaces.problem import Problem
-from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
+from vibench.interfaces.strategies import DualStrategy
 from vibench.plugins import registry
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
@@ -34,7 +33,12 @@ class Colour(StrEnum):
     BLUE = "blue"
 
 
-class Choosy(DualStrategy):
+class Idle(DualStrategy):
+    def reduce(self, snapshots: Any, W: Any, stop: Any) -> Any:
+        raise NotImplementedError
+
+
+class Choosy(Idle):
     """A strategy with an option of every sort.
 
     More about it.
@@ -57,13 +61,9 @@ class Choosy(DualStrategy):
             "point": point, "colour": colour, "anything": anything,
         }  # fmt: skip
 
-    def reduce(self, snapshots: Any, W: Any, stop: Any) -> Any:
-        raise NotImplementedError
 
-
-class Plain(DualStrategy):
-    def reduce(self, snapshots: Any, W: Any, stop: Any) -> Any:
-        raise NotImplementedError
+class Plain(Idle):
+    pass
 
 
 class Heir(Choosy):
@@ -71,19 +71,13 @@ class Heir(Choosy):
 
 
 @dataclass
-class Record(DualStrategy):
+class Record(Idle):
     width: Annotated[float, Gt(0.0)] = 1.0
 
-    def reduce(self, snapshots: Any, W: Any, stop: Any) -> Any:
-        raise NotImplementedError
 
-
-class Open(DualStrategy):
+class Open(Idle):
     def __init__(self, width: float = 1.0, **others: float) -> None:
         self.given = {"width": width, **others}
-
-    def reduce(self, snapshots: Any, W: Any, stop: Any) -> Any:
-        raise NotImplementedError
 
 
 def no_strategy() -> None:
@@ -107,27 +101,20 @@ def refusal(action: Callable[..., Any], *arguments: Any) -> str:
     return line
 
 
-BASES: Mapping[PluginKind, type] = {
-    PluginKind.PROBLEM: Problem,
-    PluginKind.DUAL: DualStrategy,
-    PluginKind.PRIMAL: PrimalStrategy,
-}
-
-
-@pytest.mark.parametrize("kind", BASES)
-def test_built_in_plugins_are_found_with_a_summary_and_options_with_defaults(kind: str) -> None:
+@pytest.mark.parametrize("kind", [PluginKind.PROBLEM, PluginKind.DUAL, PluginKind.PRIMAL])
+def test_built_in_plugins_are_found_with_a_summary_and_options_with_defaults(kind: PluginKind) -> None:
     entries = importlib.metadata.distribution("vibench").entry_points.select(group=kind.entry_points)
     assert entries
     for entry in entries:
         assert entry.name in registered(kind)
-        assert issubclass(find(kind, entry.name).load(), BASES[kind])
+        assert issubclass(find(kind, entry.name).load(), kind.base)
         assert find(kind, entry.name).origin == f"vibench {importlib.metadata.version('vibench')}"
-    for name in registered(kind):
-        assert (find(kind, name).load().__doc__ or "").strip()
-        assert all(option.expected for option in find(kind, name).options.values())
-        required = [option.name for option in find(kind, name).options.values() if option.required]
+    for name, plugin in registered(kind).items():
+        assert (plugin.load().__doc__ or "").strip()
+        assert all(option.expected for option in plugin.options.values())
+        required = [option.name for option in plugin.options.values() if option.required]
         assert required == (["path"] if name == "pack" else [])
-        assert find(kind, name).check_options(dict.fromkeys(required, "text")) == dict.fromkeys(required, Path("text"))
+        assert plugin.check_options(dict.fromkeys(required, "text")) == dict.fromkeys(required, Path("text"))
 
 
 def test_registered_studies_and_solvers_are_used(register: Register, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -223,21 +210,15 @@ def built_in() -> list[tuple[str, str, str]]:
 
 
 ACCEPTED = [
-    {"weight": 0.5},
-    {"weight": 0.5, "count": 9},
-    {"weight": 0.5, "mode": "fast"},
-    {"weight": 0.5, "grid": "fine"},
-    {"weight": 0.5, "grid": 7},
-    {"weight": 0.5, "exact": True},
-    {"weight": 0.5, "names": ["x", "y"]},
-    {"weight": 0.5, "anything": {"deep": [1]}},
-]
+    {}, {"count": 9}, {"mode": "fast"}, {"grid": "fine"}, {"grid": 7}, {"exact": True}, {"names": ["x", "y"]},
+    {"anything": {"deep": [1]}},
+]  # fmt: skip
 
 
 @pytest.mark.usefixtures("_own")
 def test_options_that_fit_reach_the_constructor_and_others_are_refused_with_what_is_expected() -> None:
     """TOML knows neither tuples nor enumerations; a float may be written as an integer."""
-    for options in ACCEPTED:
+    for options in ({"weight": 0.5} | more for more in ACCEPTED):
         made = find(PluginKind.DUAL, "choosy").create(options)
         assert {name: made.given[name] for name in options} == options
     made = Plugin(PluginKind.DUAL, "choosy", '{"weight": 0.5, "point": [1.0, 2.0], "colour": "blue"}', "").create()
@@ -246,14 +227,11 @@ def test_options_that_fit_reach_the_constructor_and_others_are_refused_with_what
     for options, words in REFUSED:
         line = refusal(find(PluginKind.DUAL, "choosy").check_options, options)
         assert [word for word in ("'choosy'", *words) if word not in line] == [], line
-    options = find(PluginKind.DUAL, "choosy").options
-    listed = {name: (option.expected, str(option).partition(" = ")[2]) for name, option in options.items()}
-    assert listed["weight"] == ("float > 0 and < 1", "")
-    assert listed["count"] == ("int ≥ 1 and ≤ 9", "3")
-    assert listed["mode"] == ("'slow', 'fast'", "'slow'")
-    assert listed["grid"] == ("'coarse', 'fine' or int ≥ 2", "'coarse'")
-    assert listed["exact"] == ("bool", "False")
-    assert listed["anything"][0] == "any value"
+    listed = {name: str(option).partition(": ")[2] for name, option in find(PluginKind.DUAL, "choosy").options.items()}
+    assert listed | {
+        "weight": "float > 0 and < 1", "count": "int ≥ 1 and ≤ 9 = 3", "mode": "'slow', 'fast' = 'slow'",
+        "grid": "'coarse', 'fine' or int ≥ 2 = 'coarse'", "exact": "bool = False", "anything": "any value = None",
+    } == listed  # fmt: skip
 
 
 REFUSED = [
