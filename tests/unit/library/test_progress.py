@@ -217,15 +217,16 @@ def test_a_long_first_part_says_how_long_the_run_will_take(report: Make, monkeyp
 def test_high_fidelity_parts_are_reported_four_by_four(report: Make) -> None:
     made, printed = report()
     made.start(agenda(1, CHUNK, 2))
-    for chunk in CHUNK[:-1]:
-        made.stage(chunk, 0.1)
-    made.stage(PODS[0], 0.1)
+    for stage in (*CHUNK[:-1], PODS[0]):
+        made.stage(stage, 0.1)
     assert len(printed.getvalue().splitlines()) == 1  # neither parts before the fourth nor other stages
     made.stage(CHUNK[-1], 0.1)
     assert f"high-fidelity solutions: {CHUNKS} of {CHUNKS} parts" in printed.getvalue()
 
 
-def test_every_cell_has_a_line(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
+def test_every_cell_has_a_line_and_beside_a_bar_what_fell_short(
+    report: Make, cells: list[Cell], queries: list[Stage]
+) -> None:
     made, printed = report()
     made.start(agenda(len(cells), queries, 2))
     made.cell(cells[0], OK)
@@ -237,6 +238,14 @@ def test_every_cell_has_a_line(report: Make, cells: list[Cell], queries: list[St
     assert text.splitlines()[1:3] == [ok, timeout]
     assert len(text.splitlines()) == 4
     assert not {"\x1b", "\r"} & set(text)
+    made, printed = report(terminal=True)
+    with made:
+        made.start(agenda(len(cells), queries, 2))
+        made.stage(queries[0], 30.0)
+        made.cell(cells[0], OK)
+        made.cell(cells[1], {"status": "error", "reason": "broke"})
+    words = ("\x1b", f"1/{len(queries)}", "left", f"error: {cells[1]}", f"ok: {cells[0]}")
+    assert [word in printed.getvalue() for word in words] == [True, True, True, True, False]
 
 
 @pytest.mark.parametrize("terminal", [False, True])
@@ -250,17 +259,6 @@ def test_a_label_is_no_markup(terminal: bool, report: Make, queries: list[Stage]
     (line,) = [line for line in printed.getvalue().splitlines() if "error: " in line]
     assert r"error: [/b] [red]a :warning:\u001b[2J\n[1/1] ok: b · " in line
     assert line.endswith(r"([/i] \u001b[31m:smile:\ud800)")
-
-
-def test_a_terminal_gets_a_bar_and_only_what_fell_short(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
-    made, printed = report(terminal=True)
-    with made:
-        made.start(agenda(len(cells), queries, 2))
-        made.stage(queries[0], 30.0)
-        made.cell(cells[0], OK)
-        made.cell(cells[1], {"status": "error", "reason": "broke"})
-    words = ("\x1b", f"1/{len(queries)}", "left", f"error: {cells[1]}", f"ok: {cells[0]}")
-    assert [word in printed.getvalue() for word in words] == [True, True, True, True, False]
 
 
 def test_a_stage_is_named_when_it_begins(report: Make, cells: list[Cell], queries: list[Stage]) -> None:

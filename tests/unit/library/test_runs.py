@@ -20,15 +20,10 @@ from vibench.report import figures
 from vibench.results import formats, show
 
 SETTINGS: dict[str, Any] = {
-    "name": "small",
-    "problem": [{"name": "radial-obstacle", "options": {"resolution": 200}}],
-    "dual": ["cpg", "mcpg"],
-    "primal": ["decorrelated", "offline-pga"],
+    "name": "small", "problem": [{"name": "radial-obstacle", "options": {"resolution": 200}}], "dual": ["cpg", "mcpg"],
+    "primal": ["decorrelated", "offline-pga"], "solvers": ["piqp"], "validation": 4, "timing_rounds": 2,
     "tolerances": [{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
-    "solvers": ["piqp"],
-    "validation": 4,
-    "timing_rounds": 2,
-}
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +53,10 @@ def test_a_run_has_its_tables(run: vibench.Run) -> None:
     assert len(run.thresholds)
     pd.testing.assert_frame_equal(run.summary, formats.summary(run.cells))
     assert run.study == {"name": "small", "seed": 0, "validation": 4}
+    shown = run._repr_html_()
+    assert run.study["name"] in shown
+    assert shown.count("<tr") == len(run.summary) + 1
+    assert all(f"<th>{escape(heading)}</th>" in shown for heading in run.summary.columns)
 
 
 def test_a_run_is_opened_where_it_is(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,13 +92,6 @@ def test_figures_and_findings(run: vibench.Run) -> None:
     ):
         with pytest.raises(vibench.RequestError, match=line):
             run.figure(kind, **options)
-
-
-def test_a_notebook_shows_the_summary_of_a_run(run: vibench.Run) -> None:
-    shown = run._repr_html_()
-    assert run.study["name"] in shown
-    assert shown.count("<tr") == len(run.summary) + 1
-    assert all(f"<th>{escape(heading)}</th>" in shown for heading in run.summary.columns)
 
 
 def test_progress_in_a_notebook_is_lines(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

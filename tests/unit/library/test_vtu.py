@@ -76,17 +76,15 @@ def test_requests_that_cannot_be_met_are_one_line(tmp_path: Path, monkeypatch: p
     right = model.problem.mesh_fields(mu, np.zeros(model.problem.V.dim), np.zeros(model.problem.W.dim))
     wrong = replace(right, cells={"polygon7": np.arange(7)[None]}, in_cells={})
     several = iter([right, replace(right, at_points={})])
-    for given, line in (
-        (lambda *_: wrong, r"mesh_fields.cells\['polygon7'\]: no type"),
-        (lambda *_: next(several), "two"),
+    for what, given, line in (
+        ("mesh_fields", lambda *_: wrong, r"mesh_fields.cells\['polygon7'\]: no type"),
+        ("mesh_fields", lambda *_: next(several), "two"),
+        ("picture", lambda *_: None, "neither mesh_fields nor a picture"),
     ):
         with monkeypatch.context() as patched:
-            patched.setattr(type(model.problem), "mesh_fields", given)
+            patched.setattr(type(model.problem), what, given)
             with pytest.raises(RequestError, match=line):
                 export_vtu(model, mu, tmp_path / "fields.vtu")
-    monkeypatch.setattr(type(model.problem), "picture", lambda *_: None)
-    with pytest.raises(RequestError, match="neither mesh_fields nor a picture"):
-        export_vtu(model, mu, tmp_path / "fields.vtu")
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     with pytest.raises(RequestError, match="needs meshio"):
         export_vtu(model, mu, tmp_path / "fields.vtu")

@@ -49,9 +49,8 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calls:
     reduction = vibench.Reduction(pack, vibench.create("dual strategy", "mcpg"), None, Stop(size=2), Stop(size=2))
     model, mu = reduction.model, [5.0, 0.2]
     space, few = vibench.InnerProduct(sp.eye_array(5)), vibench.InnerProduct(sp.eye_array(3))
-    vi = vibench.VariationalInequality(
-        sp.eye_array(5, format="csr"), np.ones(5), sp.eye_array(3, 5, format="csr"), np.ones(3)
-    )
+    A, B = sp.eye_array(5, format="csr"), sp.eye_array(3, 5, format="csr")
+    vi = vibench.VariationalInequality(A, np.ones(5), B, np.ones(3))
     spaces: dict[str, Any] = {"snapshots": np.eye(3, 4), "W": few, "stop": Stop(size=1)}
     bases, coordinates = {"problem": "membrane", "dual": "wide"}, {"x": np.zeros(2), "alpha": np.zeros(2)}
     return {

@@ -1,5 +1,6 @@
 """The offline phase as an object."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -13,47 +14,35 @@ PROBLEM = {"name": "radial-obstacle", "options": {"resolution": 200}}
 
 
 @pytest.fixture(scope="module")
-def problem() -> vibench.Problem:
-    found: vibench.Problem = vibench.create("problem", PROBLEM["name"], PROBLEM["options"])
-    return found
-
-
-@pytest.fixture(scope="module")
-def reduce(problem: vibench.Problem) -> partial[vibench.Reduction]:
+def reduce() -> partial[vibench.Reduction]:
+    problem = vibench.create("problem", PROBLEM["name"], PROBLEM["options"])
     dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
-    stops = vibench.Stop(tolerance=1e-2), vibench.Stop(tolerance=1e-1)
-    return partial(vibench.Reduction, problem, dual, primal, *stops, tolerance=0.5)
+    stops = {"modes": vibench.Stop(tolerance=1e-2), "generators": vibench.Stop(tolerance=1e-1)}
+    return partial(vibench.Reduction, problem, dual, primal=primal, **stops, tolerance=0.5)
 
 
 @pytest.fixture(scope="module")
 def snapshots(reduce: partial[vibench.Reduction]) -> vibench.Snapshots:
-    found: vibench.Snapshots = reduce().snapshots
-    return found
+    return reduce().snapshots
 
 
 @pytest.mark.parametrize("assembly", ["full", "certified"])
 @pytest.mark.parametrize("primal", ["online-supremizers", "offline-pga"])
 def test_a_reduction_answers_as_the_run_of_the_same_study(
-    small_run: vibench.Run, problem: vibench.Problem, snapshots: vibench.Snapshots, primal: str, assembly: str
+    small_run: vibench.Run, reduce: partial[vibench.Reduction], snapshots: vibench.Snapshots, primal: str, assembly: str
 ) -> None:
     rows = with_ways(small_run.cells).set_index(["problem", "primal", "assembly"])
     row = rows.loc[(PROBLEM["name"], primal, assembly)]
-    reduction = vibench.Reduction(
-        problem,
-        vibench.create("dual strategy", "mcpg"),
-        vibench.create("primal strategy", primal),
-        vibench.Stop(tolerance=1e-2),
-        vibench.Stop(tolerance=1e-1),
-        tolerance=0.5 if primal == "offline-pga" else None,
-        assembly="full" if assembly == "full" else "reduced",
-        bounds=assembly == "certified",
-        interpolation=SMALL.interpolation,
-        accuracy=SMALL.accuracy[0],
-    ).given(snapshots=snapshots)
+    certified = assembly == "certified"
+    reduction = reduce(
+        primal=vibench.create("primal strategy", primal), tolerance=0.5 if primal == "offline-pga" else None,
+        assembly="reduced" if certified else "full", bounds=certified,
+        interpolation=SMALL.interpolation, accuracy=SMALL.accuracy[0],
+    ).given(snapshots=snapshots)  # fmt: skip
     assert (reduction.pod.basis.shape[1], reduction.cone.size) == (row["N"], row["R"])
     assert reduction.enrichment.kind == row["enrichment_kind"]
     theirs = small_run.model(row["cell"])
-    for mu in problem.validation_set(3, 1):
+    for mu in reduction.problem.validation_set(3, 1):
         one, other = reduction.model.solve(mu), theirs.solve(mu)
         assert one.status == other.status == "ok"
         assert np.allclose(one.u, other.u, rtol=0.0, atol=1e-8 * np.abs(other.u).max())
@@ -114,31 +103,26 @@ def test_training_sets_of_sampling_strategies(reduce: partial[vibench.Reduction]
     drawn = vibench.Reduction(reduce().problem, reduce().dual, None, *[vibench.Stop(size=2)] * 2, training=Few())
     assert np.array_equal(drawn.snapshots.mu, drawn.parameters)
     assert len(drawn.parameters) == 2**drawn.problem.parameters.dim
-    adaptive = vibench.Reduction(
-        reduce().problem, reduce().dual, None, vibench.Stop(size=2), vibench.Stop(size=2), training=Centre()
-    )
+    adaptive = replace(drawn, training=Centre())
     assert len(adaptive.parameters) == 2
     assert adaptive.snapshots.u.shape == (adaptive.problem.V.dim, 2)
     assert len(adaptive.decomposed) == len(adaptive.problem.training_set())
 
 
 def test_what_is_asked_for_wrongly_is_one_line(reduce: partial[vibench.Reduction]) -> None:
-    problem, dual, primal = reduce().problem, reduce().dual, reduce().primal
-    stops = vibench.Stop(size=2), vibench.Stop(size=2)
-    with pytest.raises(vibench.RequestError, match=r"problem is the class \w+, expected an instance of a sub"):
-        vibench.Reduction(type(problem), dual, primal, *stops)  # type: ignore[arg-type]
-    with pytest.raises(vibench.RequestError, match="dual is 'mcpg', expected an instance of a subclass of Du"):
-        vibench.Reduction(problem, "mcpg", primal, *stops)  # type: ignore[arg-type]
-    with pytest.raises(vibench.RequestError, match=r"modes is 0\.001, expected a Stop"):
-        vibench.Reduction(problem, dual, primal, 1e-3, stops[1])  # type: ignore[arg-type]
-    with pytest.raises(vibench.RequestError, match="OfflinePGA needs a tolerance"):
-        vibench.Reduction(problem, dual, primal, *stops)
-    with pytest.raises(vibench.RequestError, match="without a primal strategy there is no tolerance"):
-        vibench.Reduction(problem, dual, None, *stops, tolerance=0.5)
-    with pytest.raises(vibench.RequestError, match="assembly is 'fulll', expected 'full' or 'reduced'"):
-        vibench.Reduction(problem, dual, None, *stops, assembly="fulll")  # type: ignore[arg-type]
+    right = reduce()
+    for wrong, line in (
+        ({"problem": type(right.problem)}, r"problem is the class \w+, expected an instance of a sub"),
+        ({"dual": "mcpg"}, "dual is 'mcpg', expected an instance of a subclass of Du"),
+        ({"modes": 1e-3}, r"modes is 0\.001, expected a Stop"),
+        ({"tolerance": None}, "OfflinePGA needs a tolerance"),
+        ({"primal": None}, "without a primal strategy there is no tolerance"),
+        ({"assembly": "fulll"}, "assembly is 'fulll', expected 'full' or 'reduced'"),
+    ):
+        with pytest.raises(vibench.RequestError, match=line):
+            replace(right, **wrong)
     with pytest.raises(UnsupportedError, match="needs reduced assembly, and the model is assembled in full"):
-        _ = vibench.Reduction(problem, dual, None, *stops, training=Few()).certificate
+        _ = replace(right, primal=None, tolerance=None, training=Few()).certificate
 
 
 def test_certificates_hold_where_supremizers_use_few_of_the_coordinates_of_their_space() -> None:

@@ -35,20 +35,16 @@ def test_a_pack_names_linear_outputs(tmp_path: Path) -> None:
     assert values == [3.0 * SIZE, SIZE * (SIZE - 1.0) + 3.0 * SIZE]
 
 
-@pytest.mark.parametrize(
-    ("outputs", "words"),
-    [
+def test_a_mistake_is_named(tmp_path: Path) -> None:
+    for outputs, words in (
         ([{"name": "s"}], "outputs.0: give coefficients of 'u', of 'lam', or of both"),
         ([FORCE, FORCE], "outputs: two of them have the same name: force, force"),
         ([{"name": "s", "u": "outputs.npz:short"}], "outputs.0.u: 11; expected 12"),
         ([{"name": "s", "lam": "outputs.npz:no"}], "outputs.0.lam"),
         ([{"name": "s", "function": "u.max()"}], "no key is called 'function'"),
-    ],
-)
-def test_a_mistake_is_named(outputs: list[dict[str, Any]], words: str, tmp_path: Path) -> None:
-    with pytest.raises(RequestError) as refused:
-        read_model_pack(write(tmp_path / "cable", outputs))
-    assert words in str(refused.value)
+    ):
+        with pytest.raises(RequestError, match=words):
+            read_model_pack(write(tmp_path / f"cable {words}", outputs))
 
 
 def test_the_linear_outputs_of_a_problem_are_written(tmp_path: Path) -> None:

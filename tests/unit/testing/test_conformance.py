@@ -53,9 +53,8 @@ def test_a_built_in_plugin_passes_every_check(word: str, name: str, tmp_path: Pa
     assert [str(finding) for finding in findings if finding.verdict is not Verdict.PASSED] == list(map(str, skipped))
     # The constraint of the sample problem is not smooth enough in mu for polynomials.
     assert [finding.check for finding in skipped[:1]] == (["build"] if name == "compiled" else [])
-    assert all(
-        "does not support the problem: the model cannot be exported to C" in each.message for each in skipped[:1]
-    )
+    unsupported = "does not support the problem: the model cannot be exported to C"
+    assert all(unsupported in each.message for each in skipped[:1])
 
 
 def sampling_options(name: str, folder: Path) -> dict[str, object]:
@@ -225,9 +224,7 @@ def test_options_reach_the_plugin_of_the_kind_that_is_given(main: Main, tmp_path
     code, out, _ = main("check", "lying_around:Mine")
     assert code == 0
     assert out.startswith("dual strategy 'lying_around:Mine'")
-    register(
-        ("vibench.problems", "twin", "broken_problems:Declared"),
-        ("vibench.dual_strategies", "twin", "broken_strategies:Greedy"),
-    )
+    twins = {"problems": "broken_problems:Declared", "dual_strategies": "broken_strategies:Greedy"}
+    register(*((f"vibench.{group}", "twin", value) for group, value in twins.items()))
     refused(main("check", "twin"), "several plugins are called 'twin'", "problem:twin or dual:twin")
     assert main("check", "dual:twin")[1].startswith("dual strategy 'twin'")

@@ -151,9 +151,8 @@ def test_what_is_right_passes_and_a_seed_that_changes_nothing_is_doubtful() -> N
 def test_the_command_says_its_size_and_seed_and_names_what_hangs(main: Main) -> None:
     code, out, err = main("check", "sampling:latin-hypercube")
     assert (code, err) == (0, ""), out
-    assert out.startswith(
-        "sampling strategy 'latin-hypercube', with size = 16 and seed = 0 (--option size=… for another)\n"
-    )
+    title = "sampling strategy 'latin-hypercube', with size = 16 and seed = 0 (--option size=… for another)\n"
+    assert out.startswith(title)
     assert "passed   parameters: 1 parameter: P = 16; 2 parameters: P = 16; 3 parameters: P = 16\n" in out
     code, out, _ = main("check", "sampling:list", "--option", "points=[[0.5, 1, 5.2], [1, 2, 5.3]]")
     assert code == 0
