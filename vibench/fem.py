@@ -115,13 +115,10 @@ def unilateral(basis: Basis, sense: Sense, *, free: Indices | None = None, lumpe
         vertices = vertices[np.isin(basis.nodal_dofs[0, vertices], free)]
     dofs, points = basis.nodal_dofs[0, vertices], basis.mesh.p[:, vertices]
     sign = 1.0 if sense == "<=" else -1.0
-    if lumped:
-        weights = _positive(lumped_mass(basis), dofs)
-        B = sp.csr_array((sign * weights, (np.arange(len(dofs)), dofs)), shape=(len(dofs), basis.N))
-        return Unilateral(B, _diagonal(weights), vertices, points, sense)
-    rows = mass(basis)[dofs]
-    W = InnerProduct(sp.csr_array(rows[:, dofs]), "X_W")
-    return Unilateral(sp.csr_array(sign * rows), W, vertices, points, sense, partial(_integrals, basis, dofs))
+    W, integrals = _multipliers(basis, dofs, lumped)
+    places, shape = (np.arange(len(dofs)), dofs), (len(dofs), basis.N)
+    rows = sp.csr_array((W.matrix.diagonal(), places), shape=shape) if lumped else mass(basis)[dofs]
+    return Unilateral(sp.csr_array(sign * rows), W, vertices, points, sense, integrals)
 
 
 def normal_constraint(
@@ -168,11 +165,8 @@ def normal_constraint(
     B.eliminate_zeros()
     constrained = np.arange(len(vertices)) if free is None else np.flatnonzero(abs(B[:, free]).sum(axis=1) > 0.0)
     B, vertices = sp.csr_array(B[constrained]), vertices[constrained]
-    dofs, points = scalar.nodal_dofs[0, vertices], basis.mesh.p[:, vertices]
-    if lumped:
-        return Unilateral(B, _diagonal(_positive(lumped_mass(scalar), dofs)), vertices, points, "<=")
-    W = InnerProduct(sp.csr_array(mass(scalar)[dofs][:, dofs]), "X_W")
-    return Unilateral(B, W, vertices, points, "<=", partial(_integrals, scalar, dofs))
+    W, integrals = _multipliers(scalar, scalar.nodal_dofs[0, vertices], lumped)
+    return Unilateral(B, W, vertices, basis.mesh.p[:, vertices], "<=", integrals)
 
 
 def eliminate(vi: VariationalInequality, free: Indices, dirichlet_lift: Array | None = None) -> VariationalInequality:
@@ -210,14 +204,15 @@ def _vertices(basis: Basis) -> Indices:
     return np.unique(table if chosen is None else table[:, chosen]).astype(np.intp)
 
 
-def _positive(integrals: Array, dofs: Indices) -> Array:
-    """The integrals (m,) of chosen functions; refused unless all are positive."""
+def _multipliers(
+    basis: Basis, dofs: Indices, lumped: bool
+) -> tuple[InnerProduct, Callable[[Callable[[Array], Array]], Array] | None]:
+    """The product of chosen functions of a scalar basis, lumped or consistent, and for the latter their integrals."""
+    if not lumped:
+        return InnerProduct(sp.csr_array(mass(basis)[dofs][:, dofs]), "X_W"), partial(_integrals, basis, dofs)
+    integrals = lumped_mass(basis)
     weights = integrals[dofs]
     if np.min(weights, initial=np.inf) <= 1e-14 * np.max(integrals, initial=0.0):
         needed = "multipliers need nonnegative functions: linear or bilinear elements"
         raise NumericalError(f"a basis function has the integral {weights.min():.1e}; {needed}")
-    return weights
-
-
-def _diagonal(weights: Array) -> InnerProduct:
-    return InnerProduct(sp.csr_array(sp.diags_array(weights)), "X_W")
+    return InnerProduct(sp.csr_array(sp.diags_array(weights)), "X_W"), None

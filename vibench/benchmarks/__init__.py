@@ -6,10 +6,9 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from importlib.resources import files
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 from vibench.errors import RequestError, VibenchError
 from vibench.execution.supervisor import manner_of_death
@@ -24,8 +23,7 @@ Resolution = str | int  # a name that a problem knows, or a number of nodes
 Timing = Callable[..., None]  # the fixture `timing`: see `vibench.benchmarks.plugin`
 
 
-@dataclass(frozen=True)
-class TimedProblem:
+class TimedProblem(NamedTuple):
     """A registered problem at a resolution; `None` where it has no such option and is timed as it is."""
 
     problem: str
@@ -35,8 +33,7 @@ class TimedProblem:
         return self.problem if self.resolution is None else f"{self.problem}-{self.resolution}"
 
 
-@dataclass(frozen=True)
-class PrimalChoice:
+class PrimalChoice(NamedTuple):
     """A registered primal strategy and its tolerance, `None` where it takes none."""
 
     name: str
@@ -46,8 +43,7 @@ class PrimalChoice:
         return self.name if self.tolerance is None else f"{self.name}-{self.tolerance:g}"
 
 
-@dataclass(frozen=True)
-class ReducedSpaces:
+class ReducedSpaces(NamedTuple):
     """Where V_N and the reduced cone of a registered dual strategy stop."""
 
     modes: Stop
@@ -55,8 +51,7 @@ class ReducedSpaces:
     dual: str
 
 
-@dataclass(frozen=True)
-class Size:
+class Size(NamedTuple):
     """A reduced program by its prescribed dimensions; the enrichment adds to N."""
 
     N: int
@@ -66,8 +61,7 @@ class Size:
         return f"N{self.N}-R{self.R}"
 
 
-@dataclass(frozen=True)
-class Setting:
+class Setting(NamedTuple):
     """Strategies and tolerances that complete a model of which one part is timed; `seconds` is the limit of a stage."""
 
     problems: tuple[str, ...]
@@ -108,37 +102,28 @@ def resolutions(texts: Sequence[str]) -> list[Resolution]:
     return wanted
 
 
-@dataclass(frozen=True)
-class Plan:
-    """The benchmarks in which one of the chosen plugins takes part; all that are registered where none is chosen.
-
-    Problems that are not chosen are those of the setting, at the resolutions that they know; QP solvers use the first.
-    """
-
-    chosen: Mapping[str, Sequence[str]]
-    resolutions: Sequence[Resolution]
-    setting: Setting
-
-    def parameters(self, axes: Sequence[str]) -> list[tuple[TimedProblem, *tuple[Any, ...]]]:
-        """Problems and choices of a benchmark with these axes."""
-        if self.chosen and not self.chosen.keys() & {"problem", *axes}:
-            return []
-        chosen, primals = self.chosen, self.chosen.get("primal", registered(PluginKind.PRIMAL))
-        choices: dict[str, Iterable[Any]] = {
-            "size": [Size(5, 5), Size(10, 12), Size(20, 30), Size(46, 60), Size(80, 70)],
-            "dual": chosen.get("dual", registered(PluginKind.DUAL)),
-            "primal": [one for name in primals for one in _at_tolerances(name)] if "primal" in axes else [],
-            "formulation": chosen.get("formulation", registered(PluginKind.FORMULATION)),
-            "solver": chosen.get("solver", installed_solvers(registered(PluginKind.SOLVER))),
-            "accuracy": [1e-6, 1e-10],
-        }
-        # Whoever names a plugin waits for it: two problems of a study are enough then.
-        every = self.setting.problems if self.chosen else filter(_takes_no_option, registered(PluginKind.PROBLEM))
-        cases = []
-        for name in self.chosen.get("problem", every):
-            known = [TimedProblem(name, one) for one in self.resolutions if _knows(name, one)]
-            cases += (known or [TimedProblem(name, None)])[: 1 if "size" in axes else None]
-        return list(product(cases, *(choices[axis] for axis in axes)))
+def cases(
+    axes: Sequence[str], chosen: Mapping[str, Sequence[str]], resolutions: Sequence[Resolution], setting: Setting
+) -> list[tuple[TimedProblem, *tuple[Any, ...]]]:
+    """Problems and choices of a benchmark with these axes, if a chosen plugin takes part; all where none is chosen."""
+    if chosen and not chosen.keys() & {"problem", *axes}:
+        return []
+    primals = chosen.get("primal", registered(PluginKind.PRIMAL))
+    choices: dict[str, Iterable[Any]] = {
+        "size": [Size(5, 5), Size(10, 12), Size(20, 30), Size(46, 60), Size(80, 70)],
+        "dual": chosen.get("dual", registered(PluginKind.DUAL)),
+        "primal": [one for name in primals for one in _at_tolerances(name)] if "primal" in axes else [],
+        "formulation": chosen.get("formulation", registered(PluginKind.FORMULATION)),
+        "solver": chosen.get("solver", installed_solvers(registered(PluginKind.SOLVER))),
+        "accuracy": [1e-6, 1e-10],
+    }
+    # Whoever names a plugin waits for it: two problems of a study are enough then, and QP solvers use one resolution.
+    every = setting.problems if chosen else filter(_takes_no_option, registered(PluginKind.PROBLEM))
+    timed = []
+    for name in chosen.get("problem", every):
+        known = [TimedProblem(name, one) for one in resolutions if _knows(name, one)]
+        timed += (known or [TimedProblem(name, None)])[: 1 if "size" in axes else None]
+    return list(product(timed, *(choices[axis] for axis in axes)))
 
 
 def run_pytest(options: Sequence[str]) -> None:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -19,8 +18,7 @@ from vibench.text import parsed_json, unbroken
 AXES = ("problem", "dual", "primal", "formulation", "size", "solver", "accuracy")
 
 
-@dataclass(frozen=True)
-class Measured:
+class Measured(NamedTuple):
     """One benchmark of a file; times are CPU seconds of one call."""
 
     group: str
@@ -36,8 +34,7 @@ class Measured:
     calibration: float  # seconds of fixed work beside it, which say how fast the machine was; NaN where unknown
 
 
-@dataclass(frozen=True)
-class Timed:
+class Timed(NamedTuple):
     """Content of a file: benchmarks by name, how many failed, and machine, libraries, timer and code."""
 
     benchmarks: Mapping[str, Measured]

@@ -20,6 +20,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping
+from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -32,7 +33,7 @@ from pytest_benchmark.stats import Metadata, Stats
 from threadpoolctl import threadpool_limits
 
 from vibench import benchmarks, provenance
-from vibench.benchmarks import Plan, Timing
+from vibench.benchmarks import Timing
 from vibench.benchmarks.stages import StageInputs
 from vibench.errors import VibenchError, in_a_line, message_of
 from vibench.execution.supervisor import manner_of_death
@@ -70,8 +71,9 @@ class Passes:
         self._config, option = config, config.option
         self._seconds: float = option.seconds
         try:
-            chosen, setting = benchmarks.chosen_plugins(option.plugin), benchmarks.setting(option.study)
-            self._plan = Plan(chosen, benchmarks.resolutions(option.resolution or ["coarse"]), setting)
+            chosen, self._setting = benchmarks.chosen_plugins(option.plugin), benchmarks.setting(option.study)
+            resolutions = benchmarks.resolutions(option.resolution or ["coarse"])
+            self._cases = partial(benchmarks.cases, chosen=chosen, resolutions=resolutions, setting=self._setting)
         except VibenchError as error:
             raise pytest.UsageError(str(error)) from None
         self._inputs: dict[Any, StageInputs] = {}
@@ -85,7 +87,7 @@ class Passes:
         if "timing" not in metafunc.fixturenames:
             return
         axes = [name for name in inspect.signature(metafunc.function).parameters if name not in ("timing", "inputs")]
-        several = self._plan.parameters(axes)
+        several = self._cases(axes)
         values = [(number, *each) for number in range(PASSES) for each in several]
         names = ["-".join(f"{one:.0e}" if isinstance(one, float) else str(one) for one in each) for each in several]
         ids = [f"{name}-pass{number + 1}" for number in range(PASSES) for name in names]
@@ -100,7 +102,7 @@ class Passes:
     @pytest.fixture
     def inputs(self, case: Any) -> StageInputs:
         """The inputs of the stages of a problem, made once for all benchmarks."""
-        return self._inputs.setdefault(case, StageInputs(case, self._plan.setting))
+        return self._inputs.setdefault(case, StageInputs(case, self._setting))
 
     @pytest.fixture
     def timing(self, benchmark: Any, inputs: StageInputs, number: int) -> Timing:
@@ -184,7 +186,7 @@ class Passes:
         if not process:
             self._work(begun, theirs)
         theirs.close()
-        limit, parent = self._plan.setting.seconds, os.getppid()
+        limit, parent = self._setting.seconds, os.getppid()
         try:
             while True:
                 deadline = limit + time.monotonic() - _queued(process)
@@ -231,7 +233,7 @@ class Passes:
                         continue
                     connection.send(number)
                     # If the other process has died, nobody else enforces the limit.
-                    faulthandler.dump_traceback_later(2.0 * self._plan.setting.seconds + 60.0, exit=True)
+                    faulthandler.dump_traceback_later(2.0 * self._setting.seconds + 60.0, exit=True)
                     following = items[number + 1] if number + 1 < len(items) else None
                     for report in runtestprotocol(items[number], log=False, nextitem=following):
                         # A plugin forked: the copy must not speak for this process.

@@ -9,10 +9,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
 from functools import partial, wraps
 from itertools import cycle
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 import pytest
@@ -21,16 +20,10 @@ from vibench.arrays import Array
 from vibench.benchmarks import PrimalChoice, ReducedSpaces, Setting, Size, TimedProblem, Timing
 from vibench.errors import UnsupportedError
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
+from vibench.interfaces import validation
 from vibench.interfaces.formulations import FormulationAnswer, Snapshots
 from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment, Stop
-from vibench.interfaces.validation import (
-    check_cone,
-    check_enrichment,
-    checked_assembly,
-    training_parameters,
-    validation_parameters,
-)
 from vibench.linalg.inner_product import InnerProduct, project_out, singular_values
 from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
 from vibench.model.errors import ReferenceSolutions, errors
@@ -57,8 +50,7 @@ T = TypeVar("T")
 Info = Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class ValidationQuery:
+class ValidationQuery(NamedTuple):
     """A validation parameter (d,), the matrices there, and the high-fidelity solution."""
 
     mu: Array
@@ -103,7 +95,7 @@ class StageInputs:
     @property
     @_once
     def training(self) -> Array:
-        return training_parameters(self.problem)
+        return validation.training_parameters(self.problem)
 
     @property
     @_once
@@ -124,10 +116,10 @@ class StageInputs:
     @_once
     def queries(self) -> list[ValidationQuery]:
         problem, snapshots = self.problem, self.snapshots
-        mus = validation_parameters(problem, 8, seed=2022)
+        mus = validation.validation_parameters(problem, 8, seed=2022)
         scales = float(problem.V.norm(snapshots.u).max()), float(problem.W.norm(snapshots.lam).max())
         exact = [ReferenceSolutions(s.u[:, None], s.lam[:, None], *scales) for s in solve_all(problem, mus)]
-        return [ValidationQuery(mu, checked_assembly(problem, mu), one) for mu, one in zip(mus, exact, strict=True)]
+        return list(map(ValidationQuery, mus, [validation.checked_assembly(problem, mu) for mu in mus], exact))
 
     @_once
     def reduction(self, spaces: ReducedSpaces, primal: PrimalChoice | None = None) -> Reduction:
@@ -203,7 +195,7 @@ def test_cone(timing: Timing, inputs: StageInputs, dual: str) -> None:
     strategy = find(PluginKind.DUAL, dual).create({})
 
     def judge(cone: Cone) -> Info:
-        rays = check_cone(cone, W).rays
+        rays = validation.check_cone(cone, W).rays
         largest = max((project_on_cone(rays, theta, W).distance for theta in lam.T), default=0.0)
         error = largest / (float(W.norm(lam).max(initial=0.0)) or 1.0)
         return {"R": cone.size, "fallbacks": len(cone.fallbacks), "accuracy": {"projection_error": error}}
@@ -217,7 +209,7 @@ def test_enrichment(timing: Timing, inputs: StageInputs, primal: PrimalChoice) -
     offline = reduction.offline
 
     def judge(enrichment: Enrichment) -> Info:
-        check_enrichment(enrichment, offline.problem.V, offline.basis)
+        validation.check_enrichment(enrichment, offline.problem.V, offline.basis)
         model = reduction.given(enrichment=enrichment).projection
         # σ costs a full assembly and an orthonormalisation at every parameter.
         some = np.unique(np.linspace(0, len(offline.training) - 1, 9).round().astype(int))
@@ -230,7 +222,7 @@ def test_enrichment(timing: Timing, inputs: StageInputs, primal: PrimalChoice) -
 
 def _sigma(model: ReducedModel, mu: Array) -> float:
     """Largest sine between a supremizer at mu (d,) and the enriched space."""
-    V, vi = model.problem.V, checked_assembly(model.problem, mu)
+    V, vi = model.problem.V, validation.checked_assembly(model.problem, mu)
     wanted = V.whiten(V.orthonormalise(supremizers(V, vi.B, model.span)))
     return float(singular_values(project_out(V.whiten(model.primal_basis(vi)), wanted)).max(initial=0.0))
 
@@ -344,12 +336,9 @@ def errors_of(inputs: StageInputs, query: ValidationQuery, u: Array, lam: Array)
     """Relative errors of u and λ, scaled ones where the high-fidelity u or λ is zero."""
     energy = assemblies(inputs.problem).energy_at(query.mu)
     (error,) = errors(inputs.problem, [query.vi], [energy], query.exact, u[:, None], lam[:, None])
-    figures: dict[str, float] = {}
-    for name in ("error_u", "error_lambda"):
-        relative = getattr(error, name)
-        scaled = f"{name}_scaled"
-        figures |= {scaled: getattr(error, scaled)} if relative is None else {name: relative}
-    return figures
+    pairs = (("error_u", "error_u_scaled"), ("error_lambda", "error_lambda_scaled"))
+    names = [scaled if getattr(error, relative) is None else relative for relative, scaled in pairs]
+    return {name: getattr(error, name) for name in names}
 
 
 def test_solver(timing: Timing, inputs: StageInputs, size: Size, solver: str, accuracy: float) -> None:

@@ -35,14 +35,9 @@ class _Running:
             self.first = self.first if self.first[0] else self.last
 
     @property
-    def has_pace(self) -> bool:
-        """True if two fractions are known: the first one includes the set-up."""
-        return self.last != self.first
-
-    @property
     def seconds(self) -> float:
-        """Seconds of all of it, without the set-up where there is a pace; needs a fraction."""
-        (fraction, seconds), (before, setup) = self.last, self.first if self.has_pace else (0.0, 0.0)
+        """Seconds of all of it, without the set-up, which the first fraction includes, if there is another one."""
+        (fraction, seconds), (before, setup) = self.last, self.first if self.last != self.first else (0.0, 0.0)
         return (seconds - setup) / (fraction - before)
 
 
@@ -78,7 +73,7 @@ class TimeLeft:
         self._running = {stage.key: began[stage.key] for stage, _ in done}
         for stage, fraction in done:
             self._running[stage.key].note(fraction, now)
-        return max((now - one.began for one in self._running.values() if one.has_pace), default=0.0)
+        return max((now - one.began for one in self._running.values() if one.last != one.first), default=0.0)
 
     def done(self, stage: Stage, wall: float) -> None:
         """Count a finished stage."""

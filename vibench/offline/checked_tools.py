@@ -31,8 +31,7 @@ from vibench.text import brief
 P = ParamSpec("P")
 T = TypeVar("T")
 
-Shape = tuple[str, ...]
-"""What an array has along its axes; what has one name has one size in a call."""
+Shape = tuple[str, ...]  # names of the axes of an array: what has one name has one size in a call
 
 
 def checked(**expected: Shape | type) -> Callable[[Callable[P, T]], Callable[P, T]]:

@@ -53,9 +53,6 @@ if TYPE_CHECKING:
 Parameters = Sequence[float] | Array | Mapping[str, float]
 """A parameter mu: its components in the order of `ParameterBox.names`, or by these names."""
 
-BLOCK = 256
-"""Programs that `Model.solve_all` assembles at once."""
-
 ACCURACY = 1e-7
 """Accuracy of formulations without an axis of accuracies."""
 
@@ -395,7 +392,7 @@ class Model:
 
         Its columns are the parameters by name, status, reason and the worst residual; of a model with bounds these
         and the verdict; `output:NAME` and with bounds `bound:NAME` of every quantity of interest; and CPU seconds.
-        Reduced assembly evaluates the sums of terms of up to `BLOCK` programs at once, and each row has an equal part
+        Reduced assembly evaluates the sums of terms of up to 256 programs at once, and each row has an equal part
         of the seconds; programs are solved one after the other.
 
         Raises a `RequestError` as `solve`, or if the array has another shape.
@@ -410,9 +407,9 @@ class Model:
         if not self.solves_programs:
             return pd.DataFrame([self._answered(at, settings).columns() for at in points])
         rows = []
-        for start in range(0, len(points), BLOCK):
-            # Blocks bound the memory of the programs that are assembled together.
-            block = points[start : start + BLOCK]
+        # Blocks bound the memory of the programs that are assembled together.
+        for start in range(0, len(points), size := 256):
+            block = points[start : start + size]
             if isinstance(self.reduced, HyperReducedModel):
                 together, spent = timed(partial(self.reduced.assemble_all, np.array(block)))
                 assembled = ((reduced, spent.cpu / len(block)) for reduced in together)

@@ -12,6 +12,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import NumericalError, RequestError, UnsupportedError, message_of
 from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces import validation
 from vibench.interfaces.formulations import Formulation, Snapshots, axes_of
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import (
@@ -26,26 +27,14 @@ from vibench.interfaces.strategies import (
     Stop,
     no_free,
 )
-from vibench.interfaces.validation import (
-    ReferenceAssembly,
-    check_cone,
-    check_enrichment,
-    checked_assembly,
-    training_parameters,
-)
 from vibench.linalg.inner_product import check_symmetric
+from vibench.model import hyperreduced
 from vibench.model.affine import INTERPOLATION_RTOL, AffineMember, affine_decomposition
 from vibench.model.certificates.base import CertificateBase, certificate_base
 from vibench.model.certificates.bounds import OnlineCertificate, prepare
 from vibench.model.certificates.greedy import GreedyTrainer
 from vibench.model.galerkin import ReducedModel
-from vibench.model.hyperreduced import (
-    AnyReducedModel,
-    HyperReducedModel,
-    ReducedOperators,
-    hyper_reduce,
-    reason_for_full_assembly,
-)
+from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel, ReducedOperators
 from vibench.offline.models import Model, check_built
 from vibench.plugins import registry
 from vibench.plugins.kinds import PluginKind
@@ -177,9 +166,9 @@ class Reduction:
     def snapshots(self) -> Snapshots:
         """High-fidelity solutions at the training parameters; an adaptive sampling strategy chooses these itself."""
         if not isinstance(self.training, AdaptiveSampling):
-            mus = training_parameters(self.problem, self.training)
+            mus = validation.training_parameters(self.problem, self.training)
             return high_fidelity_sweep(self.problem, mus, skip=self.on_failure == "skip")
-        trainer = GreedyTrainer(self.problem, ReferenceAssembly(self.problem))
+        trainer = GreedyTrainer(self.problem, validation.ReferenceAssembly(self.problem))
         self.training.train(self.problem.parameters, trainer)
         mus, solutions = np.array([s.mu for s in trainer.solved]), [s.solution for s in trainer.solved]
         return Snapshots(mus, np.column_stack([s.u for s in solutions]), np.column_stack([s.lam for s in solutions]))
@@ -189,7 +178,7 @@ class Reduction:
         """The training parameters (P×d): those of the snapshots, where these are known, or it depends on solutions."""
         if "snapshots" in self.__dict__ or isinstance(self.training, AdaptiveSampling) or self.on_failure == "skip":
             return self.snapshots.mu
-        return training_parameters(self.problem, self.training)
+        return validation.training_parameters(self.problem, self.training)
 
     @cached_property
     def pod(self) -> POD:
@@ -204,7 +193,7 @@ class Reduction:
         W = self.problem.W
         if self.dual is None or self.generators is None:
             return Cone(np.zeros((W.dim, 0)), np.ones(1), no_free(0))
-        return check_cone(self.dual.reduce(self.snapshots.lam, W, self.generators), W)
+        return validation.check_cone(self.dual.reduce(self.snapshots.lam, W, self.generators), W)
 
     @cached_property
     def multipliers(self) -> ConeBasis:
@@ -221,7 +210,8 @@ class Reduction:
         """The vectors that the primal strategy adds to V_N."""
         if self.primal is None:
             return Enrichment(Kind.NONE)
-        return check_enrichment(self.primal.build(self.offline, self.tolerance), self.problem.V, self.pod.basis)
+        built = self.primal.build(self.offline, self.tolerance)
+        return validation.check_enrichment(built, self.problem.V, self.pod.basis)
 
     @cached_property
     def projection(self) -> ReducedModel:
@@ -236,13 +226,14 @@ class Reduction:
     @cached_property
     def decomposed(self) -> Array:
         """Parameters (P×d) of the decomposition: the problem's own where training is adaptive, with few parameters."""
-        return training_parameters(self.problem) if isinstance(self.training, AdaptiveSampling) else self.parameters
+        is_adaptive = isinstance(self.training, AdaptiveSampling)
+        return validation.training_parameters(self.problem) if is_adaptive else self.parameters
 
     @cached_property
     def operators(self) -> ReducedOperators | str:
         """The members projected on the reduced spaces, or why queries are assembled in full."""
-        why = reason_for_full_assembly(self.projection, self.members)
-        return why or hyper_reduce(self.projection, self.members)
+        why = hyperreduced.reason_for_full_assembly(self.projection, self.members)
+        return why or hyperreduced.hyper_reduce(self.projection, self.members)
 
     @cached_property
     def assembled(self) -> AnyReducedModel:
@@ -298,7 +289,7 @@ class Reduction:
         # Projections are symmetrised, and would hide it.
         mus = self.parameters
         for mu in mus[:1] if "A" in self.problem.constant else mus[[0, len(mus) // 2, -1]]:
-            check_symmetric(checked_assembly(self.problem, mu).A, f"A at mu = {mu.tolist()}")
+            check_symmetric(validation.checked_assembly(self.problem, mu).A, f"A at mu = {mu.tolist()}")
 
     @cached_property
     def certificate(self) -> OnlineCertificate:

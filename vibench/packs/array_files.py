@@ -140,21 +140,20 @@ class ArrayFiles:
     def _npz(self, path: Path, inner: str) -> Any:
         with zipfile.ZipFile(path) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            parts = [name for name in members if name.startswith(f"{inner}/")] if inner else list(members)
-            if inner and inner not in members and not parts:
+            prefix = f"{inner}/" if inner else ""
+            parts = [inner] if inner in members else [name for name in members if name.startswith(prefix)]
+            if inner and not parts:
                 raise unknown_name(f"array in '{path.name}'", inner, sorted(members)[:20])
             # A file of `scipy.sparse.save_npz` is one matrix of several arrays.
             if not inner and len(members) > 1 and "data" not in members:
                 raise RequestError(f"'{path.name}' has several arrays: name one, as in '{path.name}:{parts[0]}'")
-            single = inner if inner in members else parts[0] if len(parts) == 1 else None
-            names = [single] if single is not None else parts
 
             def read(name: str) -> Any:
                 with archive.open(members[name]) as file:
                     return self._array(file, members[name].file_size)
 
-            arrays = {name.removeprefix(f"{inner}/" if inner else ""): read(name) for name in names}
-        return arrays if single is None else next(iter(arrays.values()))
+            arrays = {name.removeprefix(prefix): read(name) for name in parts}
+        return next(iter(arrays.values())) if len(parts) == 1 else arrays
 
     def _array(self, file: IO[bytes], size: int) -> Array:
         """A .npy file of so many bytes; sizes are checked before it is read, and Python objects are refused."""

@@ -147,10 +147,8 @@ class ModelPack:
 
     Attributes
     ----------
-    manifest
-        The manifest.
-    box
-        Parameters, bounds and units.
+    manifest, box
+        The manifest; parameters, bounds and units.
     training, validation
         Training parameters (P×d); validation parameters (Q×d), or `None` for random ones in the box.
     V, W
@@ -161,14 +159,10 @@ class ModelPack:
         Unknowns (k,) that B touches at some parameter.
     integrals
         Integrals (m,) of the multiplier functions, `None` for X_W applied to ones.
-    reference
-        Reference solutions, or `None`.
-    mesh
-        Data of pictures, or `None`.
-    outputs
-        Quantities of interest.
-    residual
-        Largest KKT residual of the reference solutions; `None` without, or without operators or u.
+    reference, residual
+        Reference solutions, or `None`, and their largest KKT residual, `None` without, or without operators or u.
+    mesh, outputs
+        Data of pictures, or `None`; quantities of interest.
     """
 
     manifest: Manifest

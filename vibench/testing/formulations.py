@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 from unittest import SkipTest
 
 import numpy as np
@@ -34,8 +34,7 @@ from vibench.testing.checks import Check, Note
 from vibench.testing.sample_problem import sample_reduction
 
 
-@dataclass(frozen=True)
-class Answered:
+class Answered(NamedTuple):
     """The answer of a query with the solver that it was given, and its pair u (n,), λ (m,)."""
 
     answer: FormulationAnswer
@@ -103,7 +102,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
     def stored(self, result: Answered) -> Answered:
         """A result with the coefficients of the answer as a run stores them."""
         coefficients = loads(dumps({"x": result.answer.x, "alpha": result.answer.alpha}))
-        return replace(result, answer=replace(result.answer, **coefficients))
+        return result._replace(answer=replace(result.answer, **coefficients))
 
     def axes(self) -> Iterator[str]:
         """`uses`, `multiplier` and `takes_start` are declared as they should be."""
@@ -167,7 +166,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
         for name, result in self.results.items():
             fresh = self._of(self.plugin, offline, self.model_of(self.plugin).built).online
             kept = FormulationAnswer(result.answer.x, result.answer.alpha)
-            again = replace(result, pair=fresh.reconstruct(self.arguments[name].copy(), kept))
+            again = result._replace(pair=fresh.reconstruct(self.arguments[name].copy(), kept))
             for array, what in differences(self.arrays(again), self.arrays(result), 0.0):
                 yield f"{name}: reconstructed from x and alpha by another model, {array} differs: {what}"
 
