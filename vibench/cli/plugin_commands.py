@@ -51,12 +51,14 @@ def list_plugins(
     known = {kind.plural: kind for kind in PluginKind}
     if what is None:
         for kind in PluginKind:
-            print_rows(_solvers_by_version() if kind is PluginKind.SOLVER else _read_rows(kind), headings, kind.plural)
+            print_rows(
+                _solver_rows(load=False) if kind is PluginKind.SOLVER else _read_rows(kind), headings, kind.plural
+            )
         echo("", "what the options of one kind are, and whether its plugins can be loaded:")
         echo(f"  vibench list KIND, such as {PluginKind.PROBLEM.plural}")
     elif what in known:
         # The list of QP solvers also has those that are no plugins.
-        rows = _solver_rows() if known[what] is PluginKind.SOLVER else _loaded_rows(known[what], sizes)
+        rows = _solver_rows(load=True) if known[what] is PluginKind.SOLVER else _loaded_rows(known[what], sizes)
         print_rows(rows, headings, what)
     else:
         raise unknown_name("list", what, known)
@@ -82,13 +84,20 @@ def check_plugin(
     """
     from functools import partial
 
+    from vibench.plugins.registry import find_named, registered
+    from vibench.qp.solve import installed_solvers
     from vibench.testing import Examination, Verdict
     from vibench.testing.solvers import of_qpsolvers
 
-    checked = _find(plugin)
+    prefix, colon, name = plugin.partition(":")
+    if colon and prefix not in CHECKED:
+        checked = _find_object(prefix, name)
+    else:
+        checked = find_named(plugin, CHECKED, installed_solvers(registered(PluginKind.SOLVER)))
+    # A plugin that cannot be loaded has no title.
+    loaded = checked.load() if checked.entries else partial(of_qpsolvers, solver=checked.name)
     options, remark = _chosen_options(checked, dict(map(key_value, option or [])))
     echo(f"{checked}{remark}")
-    loaded = checked.load() if checked.entries else partial(of_qpsolvers, solver=checked.name)
     create = partial(loaded, **options) if options else loaded
     counts = Counter[Verdict]()
     limit = {} if seconds is None else {"seconds": seconds}
@@ -194,43 +203,23 @@ def _parameters(problem: type) -> Iterator[str]:
             yield f"mu_{k}: {name} from {low:g} to {high:g}" + f" {unit}" * (unit != "1")
 
 
-def _solvers_by_version() -> list[Row]:
-    """QP solvers and their versions, without loading them."""
-    from vibench import provenance
-    from vibench.qp.settings import SETTINGS
-
-    rows = list(_read_rows(PluginKind.SOLVER))
-    for name in SETTINGS:
-        version, package = provenance.solver_version(name), provenance.solver_distribution(name)
-        rows.append((name, version, "" if version else f"not installed: `pip install {package}`", ""))
-    return sorted(rows)
-
-
-def _solver_rows() -> Iterator[Row]:
-    """QP solvers, their versions, and whether they can be loaded."""
+def _solver_rows(load: bool) -> Iterator[Row]:
+    """QP solvers and their versions, and if asked to `load` them, whether they can be."""
     from vibench import provenance
     from vibench.plugins.registry import find, registered
     from vibench.qp.settings import SETTINGS
     from vibench.qp.solve import installed_solvers
 
-    installed = installed_solvers(registered(PluginKind.SOLVER))
-    for name in sorted({*SETTINGS, *registered(PluginKind.SOLVER)}):
-        state = find(PluginKind.SOLVER, name).conflict or ("installed" if name in installed else "not installed")
-        yield name, provenance.solver_version(name), state, ""
-
-
-def _find(text: str) -> RegisteredPlugin:
-    """The plugin that NAME, KIND:NAME or MODULE:NAME refers to, loaded; a `RequestError` for none or several."""
-    from vibench.plugins.registry import find_named, registered
-    from vibench.qp.solve import installed_solvers
-
-    prefix, colon, rest = text.partition(":")
-    if colon and prefix not in CHECKED:
-        return _find_object(prefix, rest)
-    plugin = find_named(text, CHECKED, installed_solvers(registered(PluginKind.SOLVER)))
-    if plugin.entries:
-        plugin.load()
-    return plugin
+    plugins = {row[0]: row for row in _read_rows(PluginKind.SOLVER)}
+    loaded = installed_solvers(registered(PluginKind.SOLVER)) if load else ()
+    for name in sorted({*SETTINGS, *plugins}):
+        version, package = provenance.solver_version(name), provenance.solver_distribution(name)
+        if load:
+            state = find(PluginKind.SOLVER, name).conflict or ("installed" if name in loaded else "not installed")
+            yield name, version, state, ""
+        else:
+            missing = "" if version else f"not installed: `pip install {package}`"
+            yield plugins.get(name, (name, version, missing, ""))
 
 
 def _find_object(module: str, name: str) -> RegisteredPlugin:

@@ -212,12 +212,8 @@ def readable(frame: pd.DataFrame, runs: int) -> pd.DataFrame:
     return shown.rename(columns={"farthest_ratio": "farthest ratio"})
 
 
-class FigureFormat(StrEnum):
-    """Formats of figures; typer takes no list of literals."""
-
-    PNG = "png"
-    SVG = "svg"
-    PDF = "pdf"
+# Typer takes no list of literals.
+FigureFormat = StrEnum("FigureFormat", ["png", "svg", "pdf"])
 
 
 def write_report(

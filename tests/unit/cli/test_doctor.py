@@ -136,50 +136,49 @@ def test_the_error_of_a_plugin_is_no_markup(main: Main, register: Register, monk
     assert r"ImportError: [/b] [red]:warning: \u001b[2J\ud800" in " ".join(out.split())
 
 
-class TestDisk:
-    def test_places_without_room_locks_or_permission_are_noticed(
-        self, main: Main, trials: dict[str, Trial], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-    ) -> None:
-        Path("taken").touch()
-        code, out, _ = main("doctor", "--out", "taken/below")
-        assert code == 1
-        assert out.splitlines()[-1] == "broken: runs"
-        assert "taken/below: cannot be used: Not a directory" in out
-        monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
-        Store(default_folder()).put("pod-1", "x" * 2**20, NO_TIME, ())
-        found = by_subject(list(doctor.check_disk(tmp_path)))
-        assert found["stored"].text.startswith("1 artefacts, 1.0 MiB")
-        assert "VIBENCH_CACHE" in found["artefact folder"].text
-        assert str(tmp_path / "cache" / "artefacts") in found["artefacts"].text
-        monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=2**28))
-        found = by_subject(list(doctor.check_disk(tmp_path / "new")))["runs"]
-        assert found == Diagnosis("runs", f"{tmp_path / 'new'}: 0.2 GiB free", Health.NOTE)
-        monkeypatch.setattr(doctor, "locked", Mock(side_effect=RequestError("cannot be locked: No locks available")))
-        found = by_subject(list(doctor.check_disk(tmp_path)))["runs"]
-        assert found.health is Health.BROKEN
-        assert "No locks available" in found.text
+def test_places_without_room_locks_or_permission_are_noticed(
+    main: Main, trials: dict[str, Trial], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    Path("taken").touch()
+    code, out, _ = main("doctor", "--out", "taken/below")
+    assert code == 1
+    assert out.splitlines()[-1] == "broken: runs"
+    assert "taken/below: cannot be used: Not a directory" in out
+    monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
+    Store(default_folder()).put("pod-1", "x" * 2**20, NO_TIME, ())
+    found = by_subject(list(doctor.check_disk(tmp_path)))
+    assert found["stored"].text.startswith("1 artefacts, 1.0 MiB")
+    assert "VIBENCH_CACHE" in found["artefact folder"].text
+    assert str(tmp_path / "cache" / "artefacts") in found["artefacts"].text
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=2**28))
+    found = by_subject(list(doctor.check_disk(tmp_path / "new")))["runs"]
+    assert found == Diagnosis("runs", f"{tmp_path / 'new'}: 0.2 GiB free", Health.NOTE)
+    monkeypatch.setattr(doctor, "locked", Mock(side_effect=RequestError("cannot be locked: No locks available")))
+    found = by_subject(list(doctor.check_disk(tmp_path)))["runs"]
+    assert found.health is Health.BROKEN
+    assert "No locks available" in found.text
 
 
-class TestTimings:
-    def test_load_and_an_unsteady_calculation_are_doubts(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(doctor, "Stopwatch", lambda: SimpleNamespace(seconds=lambda: Seconds(1.0, 1.0)))
-        monkeypatch.setattr("os.cpu_count", lambda: 2)
-        for others, slowdown, doubts in (
-            (0.0, 1.0, []), (3.0, 1.0, ["other load"]), (0.0, 1.4, ["slowdown"]),
-            (3.0, 2.0, ["other load", "slowdown"]),
-        ):  # fmt: skip
-            monkeypatch.setattr(doctor, "_busy_seconds", iter([100.0, 101.0 + others]).__next__)
-            monkeypatch.setattr(doctor.Calibration, "slowdown", lambda _, slowdown=slowdown: slowdown)
-            found = by_subject(list(doctor.check_timings()))
-            assert [subject for subject in found if found[subject].health is Health.NOTE][:-1] == doubts
-            assert f"{others:.1f} of 2 cores" in found["other load"].text
-            assert ("can be trusted" in found["verdict"].text) is not bool(doubts)
+def test_load_and_an_unsteady_calculation_are_doubts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "Stopwatch", lambda: SimpleNamespace(seconds=lambda: Seconds(1.0, 1.0)))
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    for others, slowdown, doubts in (
+        (0.0, 1.0, []), (3.0, 1.0, ["other load"]), (0.0, 1.4, ["slowdown"]),
+        (3.0, 2.0, ["other load", "slowdown"]),
+    ):  # fmt: skip
+        monkeypatch.setattr(doctor, "_busy_seconds", iter([100.0, 101.0 + others]).__next__)
+        monkeypatch.setattr(doctor.Calibration, "slowdown", lambda _, slowdown=slowdown: slowdown)
+        found = by_subject(list(doctor.check_timings()))
+        assert [subject for subject in found if found[subject].health is Health.NOTE][:-1] == doubts
+        assert f"{others:.1f} of 2 cores" in found["other load"].text
+        assert ("can be trusted" in found["verdict"].text) is not bool(doubts)
 
-    def test_the_machine_that_works_is_seen_to_work(self) -> None:
-        before = doctor._busy_seconds()
-        if before == 0.0:
-            pytest.skip("the system does not tell")
-        watch = Stopwatch()
-        while watch.seconds().cpu < 0.1:
-            pass
-        assert doctor._busy_seconds() - before >= 0.05
+
+def test_the_machine_that_works_is_seen_to_work() -> None:
+    before = doctor._busy_seconds()
+    if before == 0.0:
+        pytest.skip("the system does not tell")
+    watch = Stopwatch()
+    while watch.seconds().cpu < 0.1:
+        pass
+    assert doctor._busy_seconds() - before >= 0.05

@@ -134,60 +134,57 @@ def test_a_width_that_is_none_is_no_width(monkeypatch: pytest.MonkeyPatch) -> No
         assert new_console().width == 10_000
 
 
-class TestShow:
-    """Rows and columns that are asked for."""
+def test_columns_and_rows_are_those_asked_for_and_numbers_are_numbers(main: Main, quick_run: Path) -> None:
+    run, cells = str(quick_run), read_table(results_file(str(quick_run)), "cells")
+    _, out, _ = main("show", run, "--columns", "solver,online [ms],online_s", "--format", "csv")
+    assert out.splitlines()[0] == "solver,online_s"  # by name or heading
+    _, out, _ = main("show", run, "--table", "cells", "--columns", "solver,online_s", "--limit", "3")
+    assert out.splitlines()[1].split() == ["solver", "online_s"]
+    assert len(out.splitlines()) == 1 + 1 + 1 + 3
+    asked = ("--where", "solver = 'piqp' and N > 0", "--sort", "-error_u_mean", "--limit", "5")
+    _, out, _ = main("show", run, "--table", "cells", *asked, "--format", "csv")
+    best = cells[cells["solver"] == "piqp"].nlargest(5, "error_u_mean")
+    assert list(pd.read_csv(io.StringIO(out))["cell"]) == list(best["cell"])
+    _, out, _ = main("show", run, "--columns", "cell,solver", "--limit", "3")
+    for line in out.splitlines()[3:]:  # keys that replay takes
+        assert cells["cell"].str.startswith(line.split()[0]).sum() == 1
+    for table in show.VIEWS:
+        _, out, _ = main("show", str(quick_run), "--table", table, "--format", "json", "--limit", "20")
+        found = pd.read_json(io.StringIO(out))
+        source = read_table(results_file(str(quick_run)), show.VIEWS[table].source)
+        for name in found.columns.intersection(source.columns):
+            if source[name].dtype.kind in "if" and found[name].notna().any():
+                assert found[name].dtype.kind in "if", (table, name)
 
-    def test_columns_and_rows_are_those_asked_for_and_numbers_are_numbers(self, main: Main, quick_run: Path) -> None:
-        run, cells = str(quick_run), read_table(results_file(str(quick_run)), "cells")
-        _, out, _ = main("show", run, "--columns", "solver,online [ms],online_s", "--format", "csv")
-        assert out.splitlines()[0] == "solver,online_s"  # by name or heading
-        _, out, _ = main("show", run, "--table", "cells", "--columns", "solver,online_s", "--limit", "3")
-        assert out.splitlines()[1].split() == ["solver", "online_s"]
-        assert len(out.splitlines()) == 1 + 1 + 1 + 3
-        asked = ("--where", "solver = 'piqp' and N > 0", "--sort", "-error_u_mean", "--limit", "5")
-        _, out, _ = main("show", run, "--table", "cells", *asked, "--format", "csv")
-        best = cells[cells["solver"] == "piqp"].nlargest(5, "error_u_mean")
-        assert list(pd.read_csv(io.StringIO(out))["cell"]) == list(best["cell"])
-        _, out, _ = main("show", run, "--columns", "cell,solver", "--limit", "3")
-        for line in out.splitlines()[3:]:  # keys that replay takes
-            assert cells["cell"].str.startswith(line.split()[0]).sum() == 1
-        for table in show.VIEWS:
-            _, out, _ = main("show", str(quick_run), "--table", table, "--format", "json", "--limit", "20")
-            found = pd.read_json(io.StringIO(out))
-            source = read_table(results_file(str(quick_run)), show.VIEWS[table].source)
-            for name in found.columns.intersection(source.columns):
-                if source[name].dtype.kind in "if" and found[name].notna().any():
-                    assert found[name].dtype.kind in "if", (table, name)
 
-    def test_a_cell_has_all_its_columns(self, main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setenv("COLUMNS", "200")
-        row = read_table(results_file(str(quick_run)), "cells").iloc[3]
-        code, out, _ = main("show", str(quick_run), row["cell"][:6])
-        body, empty = out.split("\nempty: ")
-        assert code == 0
-        assert out.splitlines()[0] == f"cell {row['cell']} of {quick_run.name}"
-        (line,) = (line for line in body.splitlines() if line.startswith("online_s "))
-        assert line.split(None, 3)[1:3] == [f"{row['online_s']:.3g}", "s"]
-        assert line.split(None, 3)[3].startswith("One query with assembly")
-        named = {line.split()[0] for line in body.splitlines()[3:] if not line.startswith(" ")}
-        assert named | {name.strip() for name in empty.split(",")} == set(STORED["cells"])
-        _, out, _ = main("show", str(quick_run), row["cell"], "--table", "queries", "--format", "csv")
-        assert set(pd.read_csv(io.StringIO(out))["cell"]) == {row["cell"]}
-        # a cell is not ignored where a condition has none of its rows
-        no_rows = f"{quick_run.name}: summary: no rows\n"
-        assert main("show", str(quick_run), row["cell"], "--where", "N > 1000")[:2] == (0, no_rows)
+def test_a_cell_has_all_its_columns(main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    row = read_table(results_file(str(quick_run)), "cells").iloc[3]
+    code, out, _ = main("show", str(quick_run), row["cell"][:6])
+    body, empty = out.split("\nempty: ")
+    assert code == 0
+    assert out.splitlines()[0] == f"cell {row['cell']} of {quick_run.name}"
+    (line,) = (line for line in body.splitlines() if line.startswith("online_s "))
+    assert line.split(None, 3)[1:3] == [f"{row['online_s']:.3g}", "s"]
+    assert line.split(None, 3)[3].startswith("One query with assembly")
+    named = {line.split()[0] for line in body.splitlines()[3:] if not line.startswith(" ")}
+    assert named | {name.strip() for name in empty.split(",")} == set(STORED["cells"])
+    _, out, _ = main("show", str(quick_run), row["cell"], "--table", "queries", "--format", "csv")
+    assert set(pd.read_csv(io.StringIO(out))["cell"]) == {row["cell"]}
+    # a cell is not ignored where a condition has none of its rows
+    no_rows = f"{quick_run.name}: summary: no rows\n"
+    assert main("show", str(quick_run), row["cell"], "--where", "N > 1000")[:2] == (0, no_rows)
 
-    def test_what_cannot_be_shown_is_refused(self, main: Main, quick_run: Path) -> None:
-        cell = read_table(results_file(str(quick_run)), "cells")["cell"][0]
-        of_rows = (
-            "--where selects rows of cells, of which the table is made; 'error_below' is a column of the table alone"
-        )
-        without = "the table benefits has no rows of one cell; expected summary, best, cells, queries"
-        for asked, *words in (
-            (["x"], "0 cells of ", "begin with 'x', expected one"),
-            (["--table", "best", "--where", "error_below < 0.1"], f"{of_rows}, for --columns and --sort"),
-            ([cell, "--table", "benefits"], without),
-            (["--columns", "solvr"], "did you mean 'solver'"),
-            (["--sort", "solvr"], "did you mean 'solver'"),
-        ):
-            refused(main("show", str(quick_run), *asked), *words)
+
+def test_what_cannot_be_shown_is_refused(main: Main, quick_run: Path) -> None:
+    cell = read_table(results_file(str(quick_run)), "cells")["cell"][0]
+    of_rows = "--where selects rows of cells, of which the table is made; 'error_below' is a column of the table alone"
+    without = "the table benefits has no rows of one cell; expected summary, best, cells, queries"
+    for asked, *words in (
+        (["x"], "0 cells of ", "begin with 'x', expected one"),
+        (["--table", "best", "--where", "error_below < 0.1"], f"{of_rows}, for --columns and --sort"),
+        ([cell, "--table", "benefits"], without),
+        (["--columns", "solvr"], "did you mean 'solver'"),
+        (["--sort", "solvr"], "did you mean 'solver'"),
+    ):
+        refused(main("show", str(quick_run), *asked), *words)

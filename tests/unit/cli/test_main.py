@@ -69,37 +69,37 @@ def test_a_wrong_request_is_refused_in_one_line(main: Main, quick_run: Path, tmp
         refused(main("run", path), path, *words)
 
 
-class TestOutputFolder:
-    def test_taken_places_and_other_folders_are_refused_and_kept(self, main: Main) -> None:
-        Path("taken").touch()
-        refused(main("run", "--out", "taken"), "'taken'", "is a file")
-        refused(main("run", "--out", "taken/below"), "taken/below", "cannot be written")
-        refused(main("run", "--out", "a" * 300), "output folder")
-        if Path("/proc").is_dir():  # a folder nobody can write to
-            refused(main("run", "--out", "/proc/vibench"), "/proc/vibench", "cannot be written")
-        Path("runs").mkdir()
-        Path("runs/quick").touch()  # the folder of the study
-        refused(main("run"), "runs/quick", "is a file")
-        for content in (None, "hello", "SQLite format 3\0 and then nothing"):
-            folder = Path(f"full{len(content or '')}")
-            folder.mkdir()
-            (folder / "notes.txt").write_text("precious")
-            if content:
-                (folder / FILE).write_text(content)
-            for fresh in ([], ["--fresh"]) if content is None else ([],):
-                refused(main("run", "--out", folder.name, *fresh), folder.name, FILE if content else "not empty")
-            assert (folder / "notes.txt").read_text() == "precious"
-            assert content is None or (folder / FILE).read_text() == content
+def test_taken_places_and_other_folders_are_refused_and_kept(main: Main) -> None:
+    Path("taken").touch()
+    refused(main("run", "--out", "taken"), "'taken'", "is a file")
+    refused(main("run", "--out", "taken/below"), "taken/below", "cannot be written")
+    refused(main("run", "--out", "a" * 300), "output folder")
+    if Path("/proc").is_dir():  # a folder nobody can write to
+        refused(main("run", "--out", "/proc/vibench"), "/proc/vibench", "cannot be written")
+    Path("runs").mkdir()
+    Path("runs/quick").touch()  # the folder of the study
+    refused(main("run"), "runs/quick", "is a file")
+    for content in (None, "hello", "SQLite format 3\0 and then nothing"):
+        folder = Path(f"full{len(content or '')}")
+        folder.mkdir()
+        (folder / "notes.txt").write_text("precious")
+        if content:
+            (folder / FILE).write_text(content)
+        for fresh in ([], ["--fresh"]) if content is None else ([],):
+            refused(main("run", "--out", folder.name, *fresh), folder.name, FILE if content else "not empty")
+        assert (folder / "notes.txt").read_text() == "precious"
+        assert content is None or (folder / FILE).read_text() == content
 
-    def test_results_of_another_study_are_refused_and_kept(self, main: Main, quick_run: Path, tmp_path: Path) -> None:
-        shutil.copytree(quick_run, "other")
-        for fresh in ([], ["--fresh"]):
-            refused(main("run", write_study(tmp_path), "--out", "other", *fresh), "other", "study", "quick", "sample")
-            assert len(read_table(Path("other", FILE), "cells")) == len(expand(read_study("quick")))
-        text = Path(find(kinds.PluginKind.STUDY, "quick").load()).read_text(encoding="utf-8")
-        path = tmp_path / "seeded.toml"
-        path.write_text(text.replace("seed = 2022", "seed = 2023"), encoding="utf-8")
-        refused(main("run", str(path), "--out", "other"), "seed 2022 instead of 2023")
+
+def test_results_of_another_study_are_refused_and_kept(main: Main, quick_run: Path, tmp_path: Path) -> None:
+    shutil.copytree(quick_run, "other")
+    for fresh in ([], ["--fresh"]):
+        refused(main("run", write_study(tmp_path), "--out", "other", *fresh), "other", "study", "quick", "sample")
+        assert len(read_table(Path("other", FILE), "cells")) == len(expand(read_study("quick")))
+    text = Path(find(kinds.PluginKind.STUDY, "quick").load()).read_text(encoding="utf-8")
+    path = tmp_path / "seeded.toml"
+    path.write_text(text.replace("seed = 2022", "seed = 2023"), encoding="utf-8")
+    refused(main("run", str(path), "--out", "other"), "seed 2022 instead of 2023")
 
 
 @pytest.mark.usefixtures("_nothing_starts")

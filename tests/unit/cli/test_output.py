@@ -32,15 +32,8 @@ def test_every_line_and_every_table_is_printable(one: str, other: str, text: str
 
 
 def test_markup_is_text_and_lines_of_cells_stay_apart() -> None:
-    for text in (
-        "[/b]",
-        "[red]membrane[/red]",
-        ":warning:",
-        "[link=file:///]a[/link]",
-        "[bold",
-        r"\[x]",
-        "`a` *b* <c>",
-    ):
+    markup = ("[/b]", "[red]membrane[/red]", ":warning:", "[link=file:///]a[/link]", "[bold", r"\[x]", "`a` *b* <c>")
+    for text in markup:
         assert printed(lambda: echo(text)) == [text, ""]  # noqa: B023
         assert printed(lambda: print_line(new_console(), text)) == [text, ""]  # noqa: B023
         assert printed(lambda: new_console().print(text)) == [text, ""]  # noqa: B023

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from running import DECIDED, Changed, Main, refused
+from running import DECIDED, Changed, Main
 
 from vibench.cli.result_commands import compare_runs
 from vibench.errors import RequestError
 from vibench.provenance import PROTOCOL
-from vibench.report.comparison import compare
+from vibench.report.comparison import Comparison, compare
 from vibench.report.differences import ChangeKind, agreement, run_names
 from vibench.results.sqlite import FILE
 
@@ -26,12 +26,6 @@ STEADY = (
 DECISIVE = (*DECIDED, *STEADY)
 
 ONE = "solver = 'piqp' AND problem = 'hertz' AND dual = 'mcpg' AND primal = 'offline-pga'"
-
-
-def test_a_run_does_not_differ_from_itself(quick_run: Path) -> None:
-    found = compare([quick_run / FILE, quick_run / FILE], 1.0)
-    assert found.changes.empty
-    assert found.regressions == 0
 
 
 @pytest.fixture
@@ -85,15 +79,12 @@ def test_errors_are_compared_on_the_queries_that_are_ok_in_both_runs(changed: Ch
     assert of_errors == {"queries_ok", "error_u_mean", "error_u_max"}
 
 
-def test_changes_within_the_limit_are_not_told(changed: Changed, steady: Path) -> None:
+def test_changes_within_the_limit_or_what_the_solvers_contributed_are_not_told(
+    changed: Changed, steady: Path, tmp_path: Path
+) -> None:
     after = changed("UPDATE cells SET online_s = 1.2 * online_s, error_u_mean = 1.2 * error_u_mean", *STEADY)
     assert compare([steady, after], 1.25).changes.empty
     assert compare([steady, after], 1.1).regressions == 2 * 36
-
-
-def test_an_error_that_moves_by_no_more_than_the_solvers_contributed_has_not_changed(
-    changed: Changed, tmp_path: Path
-) -> None:
     before = changed("UPDATE cells SET error_u_mean = 1e-6, solver_error_u_max = 2e-6").rename(tmp_path / "a.sqlite")
     for moved, verdict in ((4.9e-6, ChangeKind.WITHIN_ACCURACY), (5.1e-6, ChangeKind.WORSE)):
         after = changed(f"UPDATE cells SET error_u_mean = {moved}, solver_error_u_max = 2e-6")
@@ -129,13 +120,22 @@ def test_a_ratio_of_seconds_has_the_interval_of_resampled_rounds(changed: Change
     assert ((online["ratio_high"] < 2.2) & (online["ratio_high"] > 2.0)).all()
 
 
-def test_errors_and_constants_of_round_off_are_not_compared(changed: Changed, tmp_path: Path) -> None:
-    for one, other in (
-        ("error_u_mean = 1e-14", "error_u_mean = 9e-14"),
-        ("beta_span_min = 9e-17", "beta_span_min = 1e-17"),
-    ):
-        before = changed(f"UPDATE cells SET {one}").rename(tmp_path / "before.sqlite")
-        assert compare([before, changed(f"UPDATE cells SET {other}")], 1.25).changes.empty
+def test_what_is_equal_round_off_new_or_there_again_is_no_regression(
+    changed: Changed, quick_run: Path, tmp_path: Path
+) -> None:
+    """Nor are columns without any value an obstacle."""
+    empty = ("UPDATE thresholds SET primal_tol_b = NULL, dual_tol = NULL", "UPDATE cells SET primal_tol = NULL")
+    for before, after, changes in (
+        ((), (), 0), (empty, (), None), ((), empty, None),
+        (["UPDATE cells SET error_u_mean = 1e-14"], ["UPDATE cells SET error_u_mean = 9e-14"], 0),
+        (["UPDATE cells SET beta_span_min = 9e-17"], ["UPDATE cells SET beta_span_min = 1e-17"], 0),
+        ([f"UPDATE cells SET beta_span_min = NULL, beta_cone_lower_min = NULL WHERE {ONE}"], (), 2),
+        ([f"DELETE FROM cells WHERE {ONE}"], (), 1),
+    ):  # fmt: skip
+        found = compare([changed(*before).rename(tmp_path / "before.sqlite"), changed(*after)], 1.0)
+        assert changes is None or (len(found.changes), found.regressions) == (changes, 0), before
+    (row,) = found.changes.to_dict("records")
+    assert (row["after"], row["verdict"]) == ("new", ChangeKind.CHANGED.value)
 
 
 def test_times_of_another_machine_or_version_of_the_benchmark_are_left_out(changed: Changed, quick_run: Path) -> None:
@@ -152,55 +152,25 @@ NUMBERS = ("benefit_threshold", "threshold_low", "threshold_high")
 LATER = ", ".join(f"{name} = 30 * {name}" for name in NUMBERS)
 
 
-@pytest.fixture
-def decided(changed: Changed, tmp_path: Path) -> Path:
-    """A run whose break-evens against the high-fidelity model are decided."""
-    return changed(*DECISIVE).rename(tmp_path / "decided.sqlite")
+def test_a_break_even_is_worse_where_its_own_side_got_slower(changed: Changed, tmp_path: Path) -> None:
+    """Not where it stays within the interval of the other run, or its competitor got quicker."""
+    before = changed(*DECISIVE).rename(tmp_path / "decided.sqlite")
 
+    def after(*statements: str, limit: float = 1.25) -> Comparison:
+        return compare([before, changed(*DECISIVE, *(f"UPDATE thresholds SET {one}" for one in statements))], limit)
 
-def test_a_threshold_within_the_interval_of_the_other_is_no_change(changed: Changed, decided: Path) -> None:
     moved = "benefit_threshold = threshold_high, threshold_high = 3 * threshold_high, offline_b_s = 3 * offline_b_s"
-    after = changed(*DECISIVE, f"UPDATE thresholds SET {moved} WHERE primal_a = 'high-fidelity'")
-    assert compare([decided, after], 1.0 + 1e-9).changes.empty
-
-
-def test_a_threshold_is_worse_where_its_own_side_got_slower(changed: Changed, decided: Path) -> None:
-    later = f"{LATER}, offline_b_s = 3 * offline_b_s"
+    assert after(f"{moved} WHERE primal_a = 'high-fidelity'", limit=1.0 + 1e-9).changes.empty
     never = "benefit_threshold = NULL, threshold_low = NULL, threshold_high = NULL, meaning = 'never'"
-    after = changed(
-        *DECISIVE,
-        f"UPDATE thresholds SET {later} {THRESHOLD} AND primal_b = 'decorrelated'",
-        f"UPDATE thresholds SET {never}, online_b_s = 9 * online_b_s {THRESHOLD} AND primal_b = 'offline-pga'",
+    found = after(
+        f"{LATER}, offline_b_s = 3 * offline_b_s {THRESHOLD} AND primal_b = 'decorrelated'",
+        f"{never}, online_b_s = 9 * online_b_s {THRESHOLD} AND primal_b = 'offline-pga'",
     )
-    found = compare([decided, after], 1.25)
     assert set(found.changes["primal"]) == {"decorrelated", "offline-pga"}
     assert set(found.changes["what"]) == {"break-even against high-fidelity"}
     assert found.regressions == 2
-
-
-def test_a_competitor_that_got_quicker_is_no_regression(changed: Changed, decided: Path) -> None:
-    later = f"{LATER}, online_a_s = online_a_s / 3"
-    found = compare([decided, changed(*DECISIVE, f"UPDATE thresholds SET {later} {THRESHOLD}")], 1.25)
-    assert len(found.changes) == 3
-    assert found.regressions == 0
-
-
-def test_what_was_missing_and_is_there_is_no_regression(changed: Changed, quick_run: Path) -> None:
-    before = changed(f"UPDATE cells SET beta_span_min = NULL, beta_cone_lower_min = NULL WHERE {ONE}")
-    assert compare([before, quick_run / FILE], 1.25).regressions == 0
-
-
-def test_columns_without_any_value_are_no_obstacle(changed: Changed, quick_run: Path) -> None:
-    emptied = changed(
-        "UPDATE thresholds SET primal_tol_b = NULL, dual_tol = NULL", "UPDATE cells SET primal_tol = NULL"
-    )
-    compare([quick_run / FILE, emptied], 1.25)
-
-
-def test_a_new_cell_is_no_regression(changed: Changed, quick_run: Path) -> None:
-    found = compare([changed(f"DELETE FROM cells WHERE {ONE}"), quick_run / FILE], 1.25)
-    (row,) = found.changes.to_dict("records")
-    assert (row["after"], row["verdict"]) == ("new", ChangeKind.CHANGED.value)
+    quicker = after(f"{LATER}, online_a_s = online_a_s / 3 {THRESHOLD}")
+    assert (len(quicker.changes), quicker.regressions) == (3, 0)
 
 
 def test_the_command_ends_with_one_where_something_got_worse(
@@ -215,8 +185,12 @@ def test_the_command_ends_with_one_where_something_got_worse(
     assert "0 for the worse" in capsys.readouterr().out
     compare_runs([str(quick_run), str(quick_run)], strict=True, form="csv")
     assert capsys.readouterr().out.startswith("run,against,problem,formulation,dual,primal,asked")
-    with pytest.raises(RequestError, match="no results in 'nowhere'"):
-        compare_runs([str(quick_run), "nowhere"])
+    for runs, said in (
+        ([str(quick_run), "nowhere"], "no results in 'nowhere'"),
+        ([str(after)], "expected two or more"),
+    ):
+        with pytest.raises(RequestError, match=said):
+            compare_runs(runs)
 
 
 @pytest.fixture
@@ -278,15 +252,6 @@ def test_comparing_two_of_many_gives_what_comparing_these_two_gives(three: list[
         pd.testing.assert_frame_equal(alone, of_it.reset_index(drop=True))
 
 
-def test_the_changes_are_the_end_of_a_comparison(three: list[Path], main: Main) -> None:
-    pair = (str(three[0]), str(three[2]))
-    code, listed, _ = main("compare", *pair, "--table", "changes", "--strict", "--format", "csv")
-    assert code == 1
-    assert main("compare", *pair, "--format", "csv") == (0, listed, "")
-    code, shown, _ = main("compare", *pair, "--table", "changes", "--strict")
-    assert main("compare", *pair)[1].endswith(shown)
-
-
 @pytest.mark.parametrize("width", [80, 120, 200])
 def test_a_comparison_fits_the_terminal(
     width: int, three: list[Path], main: Main, monkeypatch: pytest.MonkeyPatch
@@ -309,36 +274,33 @@ def test_what_a_narrow_comparison_is_about_is_shown(
     _, shown, _ = main("compare", *[str(quick_run)] * 3, "--column", "online_s")
     below = shown.split("─\n")[1].split("not shown")[0].splitlines()
     assert all(re.search(r"( [0-9][0-9.e-]*){3}$", re.sub(" +", " ", line)) for line in below)
-    for command in (["compare", "--table", "changes"], ["compare"]):
-        _, shown, _ = main(command[0], str(quick_run), str(other), *command[1:])
-        assert re.search(r"before +after", shown)
-        assert re.search(r"present +gone", shown)
-        assert re.search(r"ok +error", shown)
+    for asked in (("--table", "changes"), ()):
+        _, shown, _ = main("compare", str(quick_run), str(other), *asked)
+        assert all(re.search(words, shown) for words in (r"before +after", r"present +gone", r"ok +error"))
     _, shown, _ = main("compare", str(quick_run), str(other), "--table", "cells")
     assert re.search(r"yes +no|quick yes, .* no", shown)
 
 
 def test_every_table_of_a_comparison_has_every_format(three: list[Path], main: Main) -> None:
     paths = list(map(str, three))
+    pair, asked = paths[::2], ("--table", "changes", "--strict")
+    code, listed, _ = main("compare", *pair, *asked, "--format", "csv")
+    assert code == 1
+    assert main("compare", *pair, "--format", "csv") == (0, listed, "")
+    assert main("compare", *pair)[1].endswith(main("compare", *pair, *asked)[1])
     for table, rows in (("changes", 38), ("runs", 3), ("cells", 12)):
         code, text, _ = main("compare", *paths, "--table", table, "--format", "json")
         assert code == 0
         assert len(json.loads(text)) == rows
         assert main("compare", *paths, "--table", table, "--format", "markdown")[1].startswith("|")
-    (found,) = (
-        row
-        for row in json.loads(main("compare", *paths, "--table", "columns", "--format", "json")[1])
-        if (row["what"], row["run"], row["against"]) == ("error_u_mean", "later", "steady")
-    )
+    columns = json.loads(main("compare", *paths, "--table", "columns", "--format", "json")[1])
+    about = ("error_u_mean", "later", "steady")
+    (found,) = (row for row in columns if (row["what"], row["run"], row["against"]) == about)
     assert (found["cells"], found["equal"], found["worse"], found["ratio"]) == (24, 23, 1, 1.0)
     assert found["farthest_ratio"] == pytest.approx(4.0)
     code, text, _ = main("compare", *paths, "--column", "N", "--format", "csv")
     assert code == 0
     assert text.splitlines()[0].endswith(",cell,steady,server,later")
-
-
-def test_one_run_is_nothing_to_compare(quick_run: Path, main: Main) -> None:
-    refused(main("compare", str(quick_run)), "expected two or more")
 
 
 def test_runs_of_folders_with_the_same_name_are_told_apart(tmp_path: Path) -> None:

@@ -130,13 +130,10 @@ def test_every_failure_has_its_reason_and_nothing_is_markup(changed: Changed) ->
     assert "no picture of wire: no &lt;mesh&gt;" in page
 
 
-@pytest.mark.parametrize(
-    "label", ["</script><script>alert(1)</script>", "<img src=x onerror=alert(1)>", '" onclick="x']
-)
-def test_a_label_is_no_markup_wherever_it_stands(label: str, changed: Changed) -> None:
+def test_a_label_is_no_markup_wherever_it_stands(changed: Changed) -> None:
     """In tables, attributes, findings and facts, those that come from JSON included."""
     plain = elements(html.page(changed(), figures=False))
-    label += "\x1b[31m\n\ud800"
+    label = '</script><script>alert(1)</script><img src=x onerror=alert(1)>" onclick="x\x1b[31m\n\ud800'
     known = json.dumps({"name": label, "seed": label})
     axes = [
         f"UPDATE {table} SET {axis} = '{brief(label)}'"

@@ -14,7 +14,7 @@ from running import Main, Shared, execute, refused, rows
 from samples import toml
 
 from vibench.report import identifying
-from vibench.report.citation import Citation, requirements
+from vibench.report.citation import Citation
 from vibench.report.site import publish
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
@@ -118,13 +118,3 @@ def test_runs_of_one_name_do_not_tell_their_folders(made: Path, main: Main, tmp_
     assert (code, err) == (0, "")
     assert sorted(path.name for path in (tmp_path / "s" / "runs").iterdir()) == ["run", "run-2"]
     assert b"secret" not in (tmp_path / "s" / "index.html").read_bytes()
-
-
-def test_requirements_hold_nothing_that_a_stranger_invents() -> None:
-    text = requirements(
-        {"evil-package": "6.6.6", "numpy": "2.0.0", "osqp": "1.0", "python": "3.12", "protocol": "1"}, "code"
-    )
-    assert "evil" not in text
-    assert "numpy==2.0.0\n" in text
-    assert "osqp==1.0\n" in text
-    assert "# left out: 1 that" in text

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import starmap
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -134,15 +134,6 @@ def _tightest(steps: pd.DataFrame) -> pd.DataFrame:
     return at_best_tolerance(steps, grown.groupby(["primal", "primal_tol"])["step"].max())
 
 
-class _Panel(NamedTuple):
-    """Content of one panel over the span and of the one below it over the cone."""
-
-    title: str
-    strategies: list[tuple[str, Series, pd.DataFrame]]
-    reference: pd.DataFrame
-    order: pd.Series  # queries along the abscissa
-
-
 def inf_sup(data: ProblemTables) -> Pages:
     """Inf-sup constants β of every primal strategy and of the high-fidelity pair over the validation set."""
     # Without the other columns: a run may have thousands of pairs, each with a copy of its rows.
@@ -150,21 +141,21 @@ def inf_sup(data: ProblemTables) -> Pages:
     needed += [name for name in data.queries if name.startswith("beta_")]
     constants = one_solver(data.queries[needed], ["pair"])
     shown, axis = loosest(constants), data.parameter
-    for panels, part in data.pages(_panels(data, shown), 6):
+    for panels, part in data.pages(list(_panels(data, shown)), 6):
         sheet, over, below = style.two_rows(len(panels), f"{data.problem}, {data.duals[0]}: inf-sup constants")
-        looks = Looks(key for panel in panels for _, key, _ in panel.strategies)
+        looks = Looks(key for _, strategies, _, _ in panels for _, key, _ in strategies)
         zeros: list[list[str]] = []
-        for panel, span, cone in zip(panels, over, below, strict=True):
-            reference, both = panel.reference.set_index("query").reindex(panel.order), (span, cone)
+        for (title, strategies, first, order), span, cone in zip(panels, over, below, strict=True):
+            reference, both = first.set_index("query").reindex(order), (span, cone)
             # Without a single parameter the abscissae are places in the order.
             x = reference["mu_1"].to_numpy(float) if axis else np.arange(1, len(reference) + 1)
             _draw_constants(both, x, reference, "beta_hf_", style.HIGH_FIDELITY_LOOK, "high-fidelity")
             drawn = {
-                name: _draw_constants(both, x, rows.set_index("query").reindex(panel.order), "beta_", looks[key], name)
-                for name, key, rows in panel.strategies
+                name: _draw_constants(both, x, rows.set_index("query").reindex(order), "beta_", looks[key], name)
+                for name, key, rows in strategies
             }
             zeros.append([name for name, zero in drawn.items() if zero])
-            span.set_title(panel.title)
+            span.set_title(title)
             for axes, generated in ((span, "span"), (cone, "cone")):
                 axes.set(ylabel=f"β over {generated}", xlabel=axis or "validation parameters, sorted", yscale="log")
                 if not axis:
@@ -183,9 +174,12 @@ def loosest(constants: pd.DataFrame) -> pd.DataFrame:
     return constants.loc[~fixed | constants.index.isin(at_best_tolerance(compared, score).index)]
 
 
-def _panels(data: ProblemTables, shown: pd.DataFrame) -> list[_Panel]:
-    """A panel for each pair, and several where there are more strategies than a panel takes."""
-    panels, by_pair = [], dict(iter(shown.groupby("pair", sort=False)))
+def _panels(data: ProblemTables, shown: pd.DataFrame) -> Iterator[tuple[str, list[Any], pd.DataFrame, pd.Series]]:
+    """Title, strategies, rows of the first of these and order of the queries of each panel.
+
+    A pair has a panel, and several where there are more strategies than a panel takes.
+    """
+    by_pair = dict(iter(shown.groupby("pair", sort=False)))
     for pair, sizes in data.queries[["pair", "N", "R"]].groupby("pair", sort=False):
         # Without contact, as without generators, a pair has no constants.
         if pair not in by_pair:
@@ -197,8 +191,7 @@ def _panels(data: ProblemTables, shown: pd.DataFrame) -> list[_Panel]:
         order = first.sort_values("mu_1" if data.parameter else "beta_span", kind="stable")["query"]
         strategies = list(by_strategy(rows))
         groups = titled_parts(dimensions(sizes), strategies, beside_reference=True)
-        panels += [_Panel(title, group, strategies[0][2], order) for title, group in groups]
-    return panels
+        yield from ((title, group, strategies[0][2], order) for title, group in groups)
 
 
 def _draw_constants(
