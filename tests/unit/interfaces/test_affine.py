@@ -78,7 +78,6 @@ def test_declared_sums_are_members_and_terms_of_the_decomposition() -> None:
     assert np.allclose(vi.f, -(4.0 + math.sin(1.3)) / 13)
     assert np.allclose(vi.g, 0.2 / 13)
     assert problem.constant == {"B"}
-    assert problem.contact_dofs is not None
     assert problem.contact_dofs.tolist() == [2, 3, 4, 5, 6]
     assert np.array_equal(problem.constraint(mu)[0].toarray(), vi.B.toarray())
     assert np.allclose(problem.affine["A"].coefficients(mu), [1.3, 1.69, 0.5])

@@ -1,7 +1,5 @@
 """Members of any unambiguous type are sparse matrices and vectors of float64 afterwards; others are named."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, ClassVar
 

@@ -14,7 +14,6 @@ from vibench.linalg.inner_product import (
     orthonormal_range,
     project_out,
     singular_values,
-    svd,
 )
 
 seeds = st.integers(0, 10_000)
@@ -74,15 +73,6 @@ def test_what_is_no_inner_product_is_refused_at_once_or_later() -> None:
         InnerProduct(sp.csc_array(np.ones((2, 3))))
     with pytest.raises(NumericalError, match="not positive definite"):
         InnerProduct(indefinite)
-
-
-@given(seeds, st.integers(1, 8), st.integers(1, 8))
-def test_svd_reproduces_the_matrix(seed: int, rows: int, columns: int) -> None:
-    a = np.random.default_rng(seed).standard_normal((rows, columns))
-    u, s, vt = svd(a)
-    assert np.allclose(u * s @ vt, a, atol=1e-13)
-    assert np.all(np.diff(s) <= 0.0)
-    assert np.allclose(s, singular_values(a), atol=1e-13)
 
 
 @given(seeds, st.integers(1, 5))

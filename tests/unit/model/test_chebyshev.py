@@ -1,7 +1,5 @@
 """Polynomials on a box: exact where the arrays are polynomials, and honest about their error where they are not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 from fractions import Fraction
 from unittest import mock
@@ -176,7 +174,6 @@ def test_corrected_pairs_are_feasible_and_nothing_but_the_residual_is_left_of_th
 ) -> None:
     vi, _, _, u_N, lam_N = given
     before, pair = bounds(vi, u_N, lam_N), corrected_pair(vi, energy(vi), u_N, lam_N)
-    assert pair is not None
     v, nu = pair.u, pair.lam
     after = bounds(vi, v, nu)
     assert np.min(nu) >= 0.0
@@ -209,7 +206,6 @@ def test_the_multiplier_of_a_correction_is_the_high_fidelity_one_where_there_is_
     A = vi.A.toarray()
     without = np.linalg.solve(A, vi.f - vi.B.T @ lam_N)
     corrected = find_correction(vi, energy(vi), without, lam_N)
-    assert corrected is not None
     assert corrected.nu.min(initial=0.0) >= 0.0
     size = np.abs(vi.f).max() + np.abs(A).max() * np.abs(u).max() + np.abs(vi.B.T @ lam_N).max()
     np.testing.assert_allclose(A @ corrected.w, vi.B.T @ (corrected.nu - lam_N), rtol=0.0, atol=1e-9 * size)
@@ -221,7 +217,6 @@ def test_the_terms_are_those_of_a_correction_that_is_feasible_in_exact_arithmeti
     vi, _, _, u_N, lam_N = given
     corrected, norm = find_correction(vi, energy(vi), u_N, lam_N), energy(vi)
     scale = norm.norm(u_N) + norm.dual_norm(vi.f) + norm.dual_norm(vi.B.T @ lam_N)
-    assert corrected is not None
     w = corrected.w
     for row, g in zip(vi.B.toarray(), vi.g, strict=True):
         slack = sum(Fraction(b) * (Fraction(x) - Fraction(v)) for b, x, v in zip(row, w, u_N, strict=True))

@@ -1,7 +1,5 @@
 """Rows that are dependent, nearly so, equalities, or in any units, against solutions of 100 digits."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -60,7 +58,6 @@ def test_solutions_are_right_and_bounds_exist_and_hold(kind: str, seed: int) -> 
         share * np.max(exact_lam * lengths) / lengths * rng.uniform(0.0, 1.0, len(lam)) * (rng.random(len(lam)) < 0.3)
     )
     pair = corrected_pair(vi, norm, u_N, lam_N)
-    assert pair is not None
     for v, nu in ((u_N, lam_N), (pair.u, pair.lam)):
         found = bound_errors_at(InnerProduct(vi.A), vi, norm, Constant(1.0, True), Constant(0.0, True), v, nu)
         assert found.note == BoundNote.NOT_UNIQUE

@@ -1,7 +1,5 @@
 """Queries without arrays of mesh size give the programs of queries in full."""
 
-from __future__ import annotations
-
 import pickle
 import sys
 import tracemalloc

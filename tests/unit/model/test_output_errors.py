@@ -1,7 +1,5 @@
 """Errors of quantities of interest: by hand on a few numbers, zeros apart, and one line for what is wrong."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -107,10 +105,8 @@ def model(small_run: vibench.Run) -> vibench.Model:
 def test_the_bound_of_an_output_of_lambda_is_at_most_that_in_w_and_far_below_where_it_is_smooth(
     model: vibench.Model,
 ) -> None:
-    assert model.certificate is not None
     problem, base = model.problem, model.certificate.base
     force = Output("force", "N", lam=problem.W.apply(np.ones(problem.W.dim)))
-    assert force.lam is not None
     in_W = float(np.linalg.norm(problem.W.whiten_functional(force.lam))) / base.inf_sup.value
     of_u, of_lam = output_weights(problem, base, force)
     assert of_u == 0.0
@@ -118,9 +114,7 @@ def test_the_bound_of_an_output_of_lambda_is_at_most_that_in_w_and_far_below_whe
 
 
 def test_there_is_no_bound_without_those_of_u_and_lambda(model: vibench.Model) -> None:
-    assert model.certificate is not None
     base, bound = model.certificate.base, model.solve(model.parameters.lower).bound
-    assert bound is not None
     assert output_error_bound((2.0, 0.0), base, bound) == pytest.approx(2.0 * bound.u_energy / bound.coercivity**0.5)
     assert output_error_bound((2.0, 1.0), base, replace(bound, inf_sup=0.0, lam=np.inf)) == np.inf
     assert output_error_bound((2.0, 0.0), base, replace(bound, inf_sup=0.0, lam=np.inf)) < np.inf
