@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.sparse as sp
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import Varying, space
 
@@ -212,6 +212,7 @@ def test_intervals_where_many_generators_count_or_the_program_is_not_exact() -> 
 
 
 @given(seeds, st.integers(2, 7))
+@settings(max_examples=30)
 def test_certificates_hold_whatever_the_iterations_reached(seed: int, count: int) -> None:
     C, G = random_pair(seed, count, count, 0.2)
     M, exact = C.T @ C, minimum_by_faces(C.T @ C, G) ** 2
