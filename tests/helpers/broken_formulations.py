@@ -11,13 +11,17 @@ import numpy as np
 from formulations import Program, ProgramModel
 
 import vibench
-from vibench import Array, FormulationAnswer, FormulationModel, Multiplier, OfflinePhase, Outcome, QuerySettings
+from vibench import Array, FormulationAnswer, FormulationModel, OfflinePhase, Outcome, QuerySettings
+
+
+def _variant(name: str, **members: Any) -> type[Program]:
+    return type(name, (Program,), {"__module__": __name__, **members})
 
 
 def _wrong(name: str, **members: Any) -> type[Program]:
     """The mixed formulation with a model that has other members."""
     kind = type(f"{name}Model", (ProgramModel,), members)
-    return type(name, (Program,), {"__module__": __name__, "model": lambda self, offline, built: kind(offline)})
+    return _variant(name, model=lambda self, offline, built: kind(offline))
 
 
 def _answering(name: str, change: Callable[[FormulationAnswer, Array], Any]) -> type[Program]:
@@ -27,33 +31,6 @@ def _answering(name: str, change: Callable[[FormulationAnswer, Array], Any]) -> 
 def _rebuilding(name: str, change: Callable[[Array, Array], Any]) -> type[Program]:
     """The mixed formulation that makes another pair of its answer."""
     return _wrong(name, reconstruct=lambda self, mu, answer: change(*ProgramModel.reconstruct(self, mu, answer)))
-
-
-class AxisThatIsNone(Program):
-    uses: ClassVar[tuple[str, ...]] = ("pod", "cones")
-
-
-class EnrichesNothing(Program):
-    uses: ClassVar[tuple[str, ...]] = ("pod", "primal")
-
-
-class MultiplierInWords(Program):
-    multiplier: ClassVar[Multiplier] = "somehow"  # type: ignore[assignment]
-
-
-class BuildsAList(Program):
-    def build(self, offline: OfflinePhase) -> Mapping[str, Any]:
-        return [offline.snapshots.u]  # type: ignore[return-value]
-
-
-class BuildsAFunction(Program):
-    def build(self, offline: OfflinePhase) -> Mapping[str, Any]:
-        return {"tangent": lambda mu: mu}
-
-
-class MakesADictionary(Program):
-    def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:
-        return {"basis": offline.pod.basis}  # type: ignore[return-value]
 
 
 def _without_dimension(self: Any, offline: OfflinePhase) -> None:
@@ -76,6 +53,13 @@ def _same_solver(self: Any, mu: Array, settings: QuerySettings) -> FormulationAn
     return FormulationAnswer(found.x, found.alpha)
 
 
+AxisThatIsNone = _variant("AxisThatIsNone", uses=("pod", "cones"))
+EnrichesNothing = _variant("EnrichesNothing", uses=("pod", "primal"))
+SolverOfItsOwnAccord = _variant("SolverOfItsOwnAccord", uses=("pod", "dual", "primal", "accuracy", "assembly"))
+MultiplierInWords = _variant("MultiplierInWords", multiplier="somehow")
+BuildsAList = _variant("BuildsAList", build=lambda self, offline: [offline.snapshots.u])
+BuildsAFunction = _variant("BuildsAFunction", build=lambda self, offline: {"tangent": lambda mu: mu})
+MakesADictionary = _variant("MakesADictionary", model=lambda self, offline, built: {"basis": offline.pod.basis})
 WithoutDimension = _wrong("WithoutDimension", __init__=_without_dimension)
 MoreThanDeclared = _wrong("MoreThanDeclared", __init__=_more_than_declared)
 # It says that it has a solver, and always calls the same one.
@@ -118,10 +102,6 @@ class _ScaledModel(ProgramModel):
     def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
         u, lam = super().reconstruct(mu, answer)
         return self.scale * u, lam
-
-
-class SolverOfItsOwnAccord(Program):
-    uses: ClassVar[tuple[str, ...]] = ("pod", "dual", "primal", "accuracy", "assembly")
 
 
 class Unpicklable(Program):

@@ -126,6 +126,19 @@ LoadsWrong = _variant("LoadsWrong", Declared, contact_loads=lambda self, eta: De
 LoadsReachFarther = _variant(
     "LoadsReachFarther", Declared, contact_loads=lambda self, eta: replace(Declared.contact_loads(self, eta), reach=1)
 )
+NoInequality = _variant(
+    "NoInequality", assemble=lambda self, mu: tuple(getattr(Wire.assemble(self, mu), name) for name in "AfBg")
+)
+# On the contact alone the bound is another one.
+PartlyWrong = _variant(
+    "PartlyWrong", Declared, contact=lambda self, mu: Contact(-self.mass, Declared.contact(self, mu).g * (1.0 + 1e-6))
+)
+PaintsNothing = _variant(
+    "PaintsNothing", Declared,
+    picture=lambda self, mu, u, lam: replace(
+        Declared.picture(self, mu, u, lam), triangles=np.array([[0], [1], [len(u)]]), values=u[:-1]
+    ),
+)  # fmt: skip
 NoContact = _variant("NoContact", Declared, contact=lambda self, mu: None)
 # B touches an unknown that is not declared.
 Overlooked = _variant("Overlooked", Declared, contact_dofs=property(lambda self: np.arange(1, self.V.dim)))
@@ -148,12 +161,6 @@ class IndefiniteDualNorm(Wire):
 NoSpace = _built("NoSpace", V=lambda wire: wire.stiffness)
 NoConstraint = _built("NoConstraint", W=lambda wire: InnerProduct(sp.csr_array((0, 0))))
 Unpicklable = _built("Unpicklable", load=lambda wire: lambda force: -force)
-
-
-class NoInequality(Wire):
-    def assemble(self, mu: Array) -> Any:
-        vi = super().assemble(mu)
-        return vi.A, vi.f, vi.B, vi.g
 
 
 class Raises(Wire):
@@ -192,14 +199,6 @@ class OneBuffer(Wire):
         return replace(super().assemble(mu), f=self._load)
 
 
-class PartlyWrong(Declared):
-    """On the contact alone the bound is another one."""
-
-    def contact(self, mu: Array) -> Contact:
-        found = super().contact(mu)
-        return Contact(found.B, found.g * (1.0 + 1e-6))
-
-
 class ContactChangesTheParameter(Declared):
     def contact(self, mu: Array) -> Contact:
         mu += 1.0
@@ -221,12 +220,6 @@ class SamplesWrong(Declared):
 
 class Worse(Outside, Unpicklable):
     """Wrong in two ways."""
-
-
-class PaintsNothing(Declared):
-    def picture(self, mu: Array, u: Array, lam: Array) -> Picture:
-        found = super().picture(mu, u, lam)
-        return replace(found, triangles=np.array([[0], [1], [len(u)]]), values=u[:-1])
 
 
 class InsideOut(Declared):

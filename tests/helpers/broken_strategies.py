@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -103,41 +103,32 @@ class Supremizing(PrimalStrategy):
         return V.orthonormalise(np.hstack([np.zeros((V.dim, 0)), *found]), offline.basis)
 
 
-class NotOrthogonal(Supremizing):
-    """Orthonormal in the Euclidean sense."""
-
-    def vectors(self, offline: Offline, count: int) -> Array:
-        return np.linalg.qr(super().vectors(offline, count))[0]
+def _supremizing(name: str, **members: Any) -> type[Supremizing]:
+    return type(name, (Supremizing,), {"__module__": __name__, **members})
 
 
-class AsksForATolerance(Supremizing):
-    """Forgets to say that it takes one."""
-
-    takes_tolerance: ClassVar[bool] = False
-
-
-class NeedsNone(Supremizing):
-    """Takes a tolerance, and is content without."""
-
-    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
-        return super().build(offline, tolerance or 0.5)
+def _drawn_vectors(self: Supremizing, offline: Offline, count: int) -> Array:
+    V = offline.problem.V
+    return V.orthonormalise(np.random.default_rng().standard_normal((V.dim, count)), offline.basis)
 
 
-class Fewer(Supremizing):
-    def count(self, tolerance: float) -> int:
-        return round(5.0 * tolerance)
+def _of_one_kind_above(self: Supremizing, offline: Offline, tolerance: float) -> Enrichment:
+    return Enrichment(Kind.NONE) if tolerance > 0.8 else Supremizing.build(self, offline, tolerance)
 
 
-class KindOfTwo(Supremizing):
-    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
-        assert tolerance is not None
-        return Enrichment(Kind.NONE) if tolerance > 0.8 else super().build(offline, tolerance)
-
-
-class DrawsVectors(Supremizing):
-    def vectors(self, offline: Offline, count: int) -> Array:
-        V = offline.problem.V
-        return V.orthonormalise(np.random.default_rng().standard_normal((V.dim, count)), offline.basis)
+# Orthonormal in the Euclidean sense.
+NotOrthogonal = _supremizing(
+    "NotOrthogonal", vectors=lambda self, offline, count: np.linalg.qr(Supremizing.vectors(self, offline, count))[0]
+)
+# Forgets to say that it takes one.
+AsksForATolerance = _supremizing("AsksForATolerance", takes_tolerance=False)
+# Takes a tolerance, and is content without.
+NeedsNone = _supremizing(
+    "NeedsNone", build=lambda self, offline, tolerance: Supremizing.build(self, offline, tolerance or 0.5)
+)
+Fewer = _supremizing("Fewer", count=lambda self, tolerance: round(5.0 * tolerance))
+KindOfTwo = _supremizing("KindOfTwo", build=_of_one_kind_above)
+DrawsVectors = _supremizing("DrawsVectors", vectors=_drawn_vectors)
 
 
 class ChangesTheBasis(Supremizing):

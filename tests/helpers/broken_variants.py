@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
-from broken_problems import built, changed
+from broken_problems import built, changed, variant
 from other_problems import Block, Put, Torsion, nodal
 
 import vibench
@@ -109,7 +109,7 @@ class AllElements(ByElements):
         return super().element_sampler(np.arange(self.V.dim + 1))
 
 
-_changed, _built = (partial(make, __name__) for make in (changed, built))
+_changed, _built, _variant = (partial(make, __name__) for make in (changed, built, variant))
 
 # The reaction has the wrong sign, which matters where the rate is large and the volatility small.
 IndefiniteSomewhere = _changed(
@@ -134,6 +134,11 @@ IgnoresTheParameter = _changed("IgnoresTheParameter", "f", lambda f, mu, bar: 6.
 EuclideanNorm = _built("EuclideanNorm", Cube, V=lambda cube: InnerProduct(sp.eye_array(cube.V.dim, format="csc")))
 # X_W is that of all nodes, and not of those of the top.
 DualNormOfAllNodes = _built("DualNormOfAllNodes", Cube, W=lambda cube: InnerProduct(sp.eye_array(27, format="csc")))
+
+
+ConstantStiffness = _variant("ConstantStiffness", Option, constant=frozenset({"A"}))
+# Ends the process where a picture is asked for.
+PaintsTheEnd = _variant("PaintsTheEnd", Bar, picture=lambda *_: os._exit(5))
 
 
 class SkewStiffness(Option):
@@ -169,10 +174,6 @@ class RepeatedConstraint(Cube):
         rows = np.arange(self.W.dim)
         rows[-1] = 0
         return replace(vi, B=vi.B[rows], g=vi.g[rows])
-
-
-class ConstantStiffness(Option):
-    constant: ClassVar[frozenset[str]] = frozenset({"A"})
 
 
 class NamesOfNodes(Bar):
@@ -225,13 +226,6 @@ class ShiftsTheParameter(Bar):
     def assemble(self, mu: Array) -> VariationalInequality:
         mu -= 1.0
         return super().assemble(mu + 1.0)
-
-
-class PaintsTheEnd(Bar):
-    """Ends the process where a picture is asked for."""
-
-    def picture(self, mu: Array, u: Array, lam: Array) -> None:
-        os._exit(5)
 
 
 class UnknownAnnotation(Bar):

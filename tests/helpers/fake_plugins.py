@@ -187,37 +187,24 @@ def careful(program: VariationalInequality, accuracy: float) -> QPSolution:
     return solve_qp(program, "piqp", accuracy)
 
 
-def raises(program: VariationalInequality, accuracy: float) -> QPSolution:
-    raise RuntimeError("the solver\ngave in")
+def _answering(answer: Callable[[VariationalInequality], Any]) -> Callable[[VariationalInequality, float], Any]:
+    return lambda program, accuracy: answer(program)
 
 
-def nothing(program: VariationalInequality, accuracy: float) -> QPSolution:
-    return None  # type: ignore[return-value]
-
-
-def gives_up(program: VariationalInequality, accuracy: float) -> QPSolution:
-    return QPSolution(None, None, "gave up")
-
-
-def not_a_number(program: VariationalInequality, accuracy: float) -> QPSolution:
-    return QPSolution(np.full(len(program.f), np.nan), np.zeros(len(program.g)), "solved")
-
-
-def wrong(program: VariationalInequality, accuracy: float) -> QPSolution:
-    return QPSolution(np.zeros(len(program.f)), np.zeros(len(program.g)), "solved")
-
-
-def wrong_length(program: VariationalInequality, accuracy: float) -> QPSolution:
-    return QPSolution(np.zeros(len(program.f) + 1), np.zeros(len(program.g)), "solved")
+raises = _answering(lambda _: throw(RuntimeError("the solver\ngave in")))
+leaves = _answering(lambda _: sys.exit(3))
+dies = _answering(lambda _: os._exit(7))
+nothing = _answering(lambda _: None)
+gives_up = _answering(lambda _: QPSolution(None, None, "gave up"))
+not_a_number = _answering(lambda vi: QPSolution(np.full(len(vi.f), np.nan), np.zeros(len(vi.g)), "solved"))
+wrong = _answering(lambda vi: QPSolution(np.zeros(len(vi.f)), np.zeros(len(vi.g)), "solved"))
+wrong_length = _answering(lambda vi: QPSolution(np.zeros(len(vi.f) + 1), np.zeros(len(vi.g)), "solved"))
+hungry = _answering(lambda _: QPSolution(np.ones(2**36), np.ones(3), "solved"))
 
 
 def numpy_count(program: VariationalInequality, accuracy: float) -> QPSolution:
     found = solve_qp(program, "piqp", accuracy)
     return QPSolution(found.x, found.alpha, found.solver_status, np.int64(3))
-
-
-def dies(program: VariationalInequality, accuracy: float) -> QPSolution:
-    os._exit(7)
 
 
 def hangs(program: VariationalInequality, accuracy: float) -> QPSolution:
@@ -248,15 +235,7 @@ def dies_once(program: VariationalInequality, accuracy: float) -> QPSolution:
     return careful(program, accuracy)
 
 
-def hungry(program: VariationalInequality, accuracy: float) -> QPSolution:
-    return QPSolution(np.ones(2**36), np.ones(3), "solved")
-
-
 def chatty(program: VariationalInequality, accuracy: float) -> QPSolution:
     print("solving")
     os.write(2, b"solving past Python\n")
     return careful(program, accuracy)
-
-
-def leaves(program: VariationalInequality, accuracy: float) -> QPSolution:
-    sys.exit(3)

@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,27 +22,20 @@ from vibench.stages.base import PROGRESS, Failed, Items, ItemwiseStage, Result, 
 from vibench.timing import Seconds
 
 
+def interrupt() -> None:
+    raise KeyboardInterrupt
+
+
+MISBEHAVIOUR: Mapping[str, Callable[[], object]] = {
+    "sleep": lambda: time.sleep(3600),
+    "hang": lambda: ctypes.PyDLL(None).sleep(3600),  # in native code that keeps every other thread waiting
+    "exit": lambda: os._exit(5), "segfault": fake_plugins.segfault, "interrupt": interrupt, "fork": os.fork,
+    "hunger": lambda: np.ones(2**36), "third": lambda: PROGRESS.get()(1.0 / 3.0), "moment": lambda: time.sleep(0.05),
+}  # fmt: skip
+
+
 def misbehave(how: str) -> None:
-    if how == "sleep":
-        time.sleep(3600)
-    elif how == "hang":  # in native code that keeps every other thread of the process waiting
-        ctypes.PyDLL(None).sleep(3600)
-    elif how == "exit":
-        os._exit(5)
-    elif how == "segfault":
-        fake_plugins.segfault()
-    elif how == "interrupt":
-        raise KeyboardInterrupt
-    elif how == "fork":
-        os.fork()
-    elif how == "hunger":
-        np.ones(2**36)
-    elif how == "third":
-        PROGRESS.get()(1.0 / 3.0)
-    elif how == "moment":
-        time.sleep(0.05)
-    else:
-        start(*how.split())
+    MISBEHAVIOUR.get(how, lambda: start(*how.split()))()
 
 
 def meet(diary: Path) -> None:

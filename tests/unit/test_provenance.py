@@ -123,22 +123,22 @@ def test_versions_name_the_commit_of_a_checkout_and_whether_it_was_changed(tmp_p
         command = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b", *arguments]
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
-    assert provenance.commit(tmp_path) == ""
+    def found() -> str:
+        provenance.commit.cache_clear()
+        return provenance.commit(tmp_path)
+
+    assert found() == ""
     git("init", "-q")
     (tmp_path / "a.py").write_text("a = 1\n")
     (tmp_path / "page.md").write_text("1\n")
     git("add", "a.py", "page.md")
     git("commit", "-q", "-m", "a")
     commit = git("rev-parse", "HEAD")[:10]
-    provenance.commit.cache_clear()
-    assert provenance.commit(tmp_path) == commit
+    assert found() == commit
     (tmp_path / "page.md").write_text("2\n")
-    provenance.commit.cache_clear()
-    assert provenance.commit(tmp_path) == commit
+    assert found() == commit
     (tmp_path / "a.py").write_text("a = 2\n")
-    provenance.commit.cache_clear()
-    assert provenance.commit(tmp_path) == commit + "+"
+    assert found() == commit + "+"
     shutil.rmtree(tmp_path / ".git")
     (tmp_path / ".git").write_text("no repository")
-    provenance.commit.cache_clear()
-    assert provenance.commit(tmp_path) == ""
+    assert found() == ""

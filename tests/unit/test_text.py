@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from odd_plugins import UnreadableError
 
 from vibench.benchmarks.comparison import read_benchmarks
 from vibench.errors import RequestError, in_a_line
@@ -59,11 +60,6 @@ def test_long_texts_and_messages_of_exceptions_are_cut_to_one_line() -> None:
     assert line.startswith(r"RuntimeError: the wire snapped \u001b[2J\ud800xxx")
     assert line.endswith("… (50000036 characters)")
     assert len(line) <= LONGEST
-
-
-class UnreadableError(Exception):
-    def __str__(self) -> str:
-        raise ValueError("not to be read")
 
 
 @given(st.floats(1e-15, 1.0), st.floats(1.0 + 1e-12, 100.0))

@@ -59,22 +59,16 @@ def test_repeats_are_timed_until_they_have_taken_enough(clocks: Callable[..., No
     with pytest.raises(ZeroDivisionError):
         median_seconds(lambda: 1 // 0)
     clocks((0.25, 0.75))
-    work = Work()
-    assert timed(work) == (1, Seconds(0.25, 0.75))
-    assert work.count == 1
-    clocks((0.125, 1.25))
-    work = Work()
-    assert median_seconds(work) == (1, Seconds(0.125, 1.25))
-    assert work.count == 1
-    clocks((0.9, 0.9), (0.5, 0.5), (0.25, 0.25), (0.25, 0.25))
-    work = Work()
-    assert median_seconds(work) == (1, Seconds(0.25, 0.25))
-    assert work.count == 1 + 3
+    assert timed(Work()) == (1, Seconds(0.25, 0.75))
     sixteenths = ((1, 1), (8, 12), (2, 4), (4, 8), (6, 2), (1, 10))
-    clocks(*((cpu / 256, wall / 256) for cpu, wall in sixteenths))
-    work = Work()
-    assert median_seconds(work) == (1, Seconds(4 / 256, 8 / 256))
-    assert work.count == 1 + REPEATS
+    for durations, seconds, count in (
+        ([(0.125, 1.25)], Seconds(0.125, 1.25), 1),
+        ([(0.9, 0.9), (0.5, 0.5), (0.25, 0.25), (0.25, 0.25)], Seconds(0.25, 0.25), 1 + 3),
+        ([(cpu / 256, wall / 256) for cpu, wall in sixteenths], Seconds(4 / 256, 8 / 256), 1 + REPEATS),
+    ):
+        clocks(*durations)
+        work = Work()
+        assert (*median_seconds(work), work.count) == (1, seconds, count)
     clocks(*[(0.1, 0.1)] * (1 + REPEATS))
     done: list[int] = []
     result, seconds = median_seconds(lambda number: done.append(number) or -number, itertools.count(7))
