@@ -38,15 +38,6 @@ def test_sizes(resolution: str | int, nodes: int) -> None:
     assert isinstance(problem, Problem)
 
 
-def test_what_is_declared_constant_is() -> None:
-    problem = Radial("coarse")
-    first, second = (problem.assemble(mu) for mu in MUS[:2])
-    assert abs(first.A - second.A).max() == 0.0
-    assert abs(first.B - second.B).max() == 0.0
-    assert np.array_equal(first.f, second.f)
-    assert not np.allclose(first.g, second.g)
-
-
 def test_the_errors_are_zero_for_the_exact_solution_and_known_for_nothing() -> None:
     problem, mu = Radial(2000), MUS[2]
     exact = problem.exact(mu)
