@@ -20,12 +20,6 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 IMPORTED = ("", "problems", "strategies", "tests", "tests/helpers")
-AT_ONCE = 2
-"""Copies that are tested side by side."""
-
-PLACES = "tests/faults/test_mutations.py"
-"""Says whether the faults fit the sources, and so fails on every copy with a fault."""
-
 PATIENCE = 600
 """Seconds after which tests that do not end count as failed."""
 
@@ -85,7 +79,9 @@ def caught(fault: Fault) -> str | None:
     with tempfile.TemporaryDirectory() as folder:
         root = copy_of_sources(folder)
         (root / fault.file).write_text(changed(root, fault), encoding="utf-8")
-        return first_failure(root, fault.tests) or first_failure(root, ["tests", f"--ignore={PLACES}"])
+        # That file says whether the faults fit the sources, and so fails on every copy with a fault.
+        others = ["tests", "--ignore=tests/faults/test_mutations.py"]
+        return first_failure(root, fault.tests) or first_failure(root, others)
 
 
 def main(names: Sequence[str]) -> int:
@@ -99,7 +95,7 @@ def main(names: Sequence[str]) -> int:
     if broken:
         raise SystemExit(f"{broken} fails without any fault")
     survivors = 0
-    with ThreadPoolExecutor(AT_ONCE) as pool:
+    with ThreadPoolExecutor(2) as pool:
         for fault, test in zip(chosen, pool.map(caught, chosen), strict=True):
             survivors += test is None
             print(f"{fault.name:40s} {test or 'SURVIVED'}", flush=True)

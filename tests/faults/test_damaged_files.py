@@ -28,8 +28,7 @@ STUDY = {
     "problem": [{"name": "radial-obstacle", "options": {"resolution": 200}}],
     "tolerances": [{"pod": [1e-1], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}], "timing_rounds": 2,
 }  # fmt: skip
-HEAD = 8192
-"""Bytes at the beginning of a results file that say what the others are: header and schema."""
+
 
 Damage = Callable[[bytes], bytes]
 
@@ -54,7 +53,7 @@ def results(made: Path, tmp_path: Path) -> Path:
 
 
 def flips(seed: int, count: int, first: int = 0) -> Iterator[Damage]:
-    """Damages of one bit each, every third among the first bytes."""
+    """Damages of one bit each, every third among the first bytes, such as the header and the schema of a file."""
     rng = random.Random(seed)
 
     def flip(content: bytes, at: float, bit: int, end: int) -> bytes:
@@ -95,7 +94,7 @@ def refusal(path: Path) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("damages", [flips(1, 210, HEAD), truncations(2, 60)], ids=["flips", "truncations"])
+@pytest.mark.parametrize("damages", [flips(1, 210, 8192), truncations(2, 60)], ids=["flips", "truncations"])
 def test_damage_of_a_results_file_is_found_or_harmless(damages: Iterator[Damage], made: Path, results: Path) -> None:
     """As the file itself says it is: its digests are those that were written with it."""
     content, original = results.read_bytes(), everything(results)

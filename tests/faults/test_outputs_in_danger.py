@@ -18,11 +18,6 @@ from vibench.library.runs import Run
 from vibench.report import site as folder
 from vibench.results.sqlite import FILE
 
-KILLS = 2
-COARSE = {"name": "radial-obstacle", "options": {"resolution": "coarse"}}
-NOBODY = 65534
-"""A user who owns nothing, for tests that root runs: root may read and write everything."""
-
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
@@ -36,7 +31,7 @@ def test_a_site_killed_while_written_is_whole_or_not_there(run: Path, vibench: V
     assert vibench(tmp_path, *arguments).returncode == 0
     seconds, whole = time.monotonic() - start, sorted(path.name for path in site.rglob("*"))
     shutil.rmtree(site)
-    for kill in range(KILLS):
+    for kill in range(2):
         with forked(arguments, tmp_path, tmp_path) as process:
             time.sleep(rng.random() * seconds)
             process.kill()
@@ -101,7 +96,7 @@ def of_another_user(path: Path) -> Iterator[None]:
     user = os.geteuid()
     path.chmod(0o000)
     if user == 0:
-        os.seteuid(NOBODY)
+        os.seteuid(65534)
     try:
         yield
     finally:
@@ -127,7 +122,8 @@ def test_a_folder_of_another_user_is_named(
 def test_a_clock_that_jumps_changes_no_run(main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     jumps, undisturbed = random.Random(1), time.time
     monkeypatch.setattr(time, "time", lambda: undisturbed() + jumps.choice([-1e6, 0.0, 1e6]))
-    write_study(tmp_path, wire_study(problem=[COARSE], solvers=["piqp"]))
+    coarse = {"name": "radial-obstacle", "options": {"resolution": "coarse"}}
+    write_study(tmp_path, wire_study(problem=[coarse], solvers=["piqp"]))
     code, _, err = main("run", f"{tmp_path}/study.toml", "--out", f"{tmp_path}/out", "--jobs", "1", "--no-figures")
     assert (code, err) == (0, "")
     assert {row["status"] for row in rows(tmp_path / "out")} == {"ok"}

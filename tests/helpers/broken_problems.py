@@ -66,14 +66,10 @@ def built(module: str, name: str, base: Any = Wire, **members: Callable[[Any], A
 _variant, _changed, _built = (partial(make, __name__) for make in (variant, changed, built))
 
 
-def _infinite(B: sp.csr_array) -> sp.csr_array:
-    return sp.csr_array((np.where(np.arange(12) == 5, np.inf, B.data), B.indices, B.indptr))
-
-
 Asymmetric = _changed("Asymmetric", "A", lambda A, mu, _: A + sp.csr_array(([1e-3 * mu[0]], ([2], [3])), shape=A.shape))
 Indefinite = _changed("Indefinite", "A", lambda A, mu, wire: A - 4.0 * (mu[0] - 4.0) * Wire().mass / 0.9)
 NotFinite = _changed("NotFinite", "f", lambda f, mu, wire: np.where(np.arange(len(f)) == 7, np.nan, f), above=5.0)
-InfiniteMatrix = _changed("InfiniteMatrix", "B", lambda B, mu, wire: _infinite(B))
+InfiniteMatrix = _changed("InfiniteMatrix", "B", lambda B, mu, wire: B + sp.csr_array(([np.inf], ([5], [5])), B.shape))
 WrongShape = _changed("WrongShape", "B", lambda B, mu, wire: B[:, :-1])
 Integers = _changed("Integers", "g", lambda g, mu, wire: np.zeros(len(g), dtype=int))
 Column = _changed("Column", "f", lambda f, mu, wire: f[:, None])

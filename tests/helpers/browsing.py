@@ -18,7 +18,6 @@ FORMULA = "=decorrelated"
 REQUIRED = "VIBENCH_NEEDS_BROWSER"
 """Where this is set, a missing browser is a failure."""
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 PATIENCE = 120.0
 """Seconds until what a test waits for is missing: it comes at once, but for a machine that does other work, too."""
@@ -46,7 +45,10 @@ def program(package: str, *names: str) -> str:
 @contextmanager
 def chromium(downloads: Path) -> Iterator[webdriver.Chrome]:
     """A browser that saves what it downloads in a folder; skips, or fails, where there is none."""
-    found, driver = program("chromium", *BROWSERS), program("chromium-driver", "chromedriver")
+    found, driver = (
+        program("chromium", "chromium", "chromium-browser", "google-chrome"),
+        program("chromium-driver", "chromedriver"),
+    )
     options = webdriver.ChromeOptions()
     options.binary_location = found
     for option in OPTIONS:

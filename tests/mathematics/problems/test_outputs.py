@@ -3,16 +3,12 @@
 import numpy as np
 import pytest
 
-from vibench import Array, HighFidelitySolver, Output, Problem, create
-
-
-def output(problem: Problem, name: str) -> Output:
-    (found,) = (one for one in problem.outputs if one.name == name)
-    return found
+from vibench import Array, HighFidelitySolver, Problem, create
 
 
 def value(problem: Problem, name: str, mu: Array, u: Array, lam: Array) -> float:
-    return float(output(problem, name).values(mu[None], u[:, None], lam[:, None])[0])
+    (output,) = (one for one in problem.outputs if one.name == name)
+    return float(output.values(mu[None], u[:, None], lam[:, None])[0])
 
 
 @pytest.mark.parametrize("options", [{}, {"approach": "parameter"}])
