@@ -82,7 +82,6 @@ def compared(problem: Problem, mus: Array) -> Iterator[tuple[str, float, float, 
         bounds = [*online, *((*of, bound_errors_at(problem.V, vi, energy, *constants, *of[1:])) for of in at_mesh)]
         sizes = energy.norm(exact.u), energy.dual_norm(vi.B.T @ exact.lam)
         for which, u, lam, bound in bounds:
-            assert bound is not None
             force = energy.dual_norm(vi.B.T @ (exact.lam - lam))
             yield f"{which}: u", bound.u_energy, energy.norm(exact.u - u), sizes[0]
             yield f"{which}: λ", bound.lambda_natural, force, sizes[1]

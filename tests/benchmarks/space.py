@@ -82,7 +82,6 @@ def unseen(resolution: str, count: str = "1000") -> int:
         on, size = energy.contact_form(vi), energy.norm(exact.u)
         for name, model in models.items():
             found = model.solve(mu)
-            assert found.bound is not None
             errors = energy.norm(exact.u - found.u), on.force_representer(exact.lam - found.lam).norm
             bounds = found.bound.u_energy, found.bound.lambda_natural
             violations[name] += any(is_violated(e, b, size) for e, b in zip(errors, bounds, strict=True))

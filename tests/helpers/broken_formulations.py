@@ -95,7 +95,6 @@ class _ScaledModel(ProgramModel):
 
     def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
         answer = super().solve(mu, settings)
-        assert answer.x is not None
         self.scale = float(np.linalg.norm(answer.x))
         return replace(answer, x=answer.x / self.scale)
 
@@ -138,13 +137,11 @@ class MisbehavingModel(ProgramModel):
         if self.how == "raises":
             raise ArithmeticError("no pivot")
         if self.how == "nan":
-            assert answer.x is not None
             return replace(answer, x=np.full_like(answer.x, np.nan))
         return answer
 
     def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
         u, lam = super().reconstruct(mu, answer)
-        assert lam is not None
         if mu[0] < self.middle or self.how not in ("size", "pulls"):
             return u, lam
         return (u[:-1], lam) if self.how == "size" else (u, lam - 1.0)

@@ -266,7 +266,6 @@ def overwrites(program: VariationalInequality, accuracy: float) -> QPSolution:
 
 def draws(program: VariationalInequality, accuracy: float) -> QPSolution:
     found = exact(program, accuracy)
-    assert found.x is not None
     return replace(found, x=found.x + 1e-5 * np.random.default_rng().random(len(found.x)))
 
 

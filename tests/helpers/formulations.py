@@ -36,8 +36,6 @@ class ProgramModel(FormulationModel):
         return FormulationAnswer(found.x, found.alpha, iterations=found.iterations)
 
     def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
-        assert answer.x is not None
-        assert answer.alpha is not None
         u = self.assembled.assemble(mu).reconstruct(answer.x[:, None])[:, 0]
         return np.asarray(u), np.asarray(self.assembled.generators @ answer.alpha)
 
@@ -66,7 +64,6 @@ class NearestModel(FormulationModel):
         return FormulationAnswer(np.array([float(nearest)]), uncertainty=0.5)
 
     def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
-        assert answer.x is not None
         return self.u[:, int(answer.x[0])].copy(), None
 
 

@@ -121,7 +121,6 @@ def run_wire(
 
 
 def read_until(process: subprocess.Popen[str], words: str) -> None:
-    assert process.stdout is not None
     printed = ""
     while words not in printed:
         line = process.stdout.readline()

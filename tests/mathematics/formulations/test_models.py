@@ -18,7 +18,7 @@ from vibench_problems.obstacle import Obstacle
 from vibench_strategies.cpg import CPG
 from vibench_strategies.dictionary import Dictionary
 from vibench_strategies.formulations.hyper_reduced import HyperReduced
-from vibench_strategies.formulations.local import Local, LocalModel
+from vibench_strategies.formulations.local import Local
 from vibench_strategies.formulations.penalty import Penalty
 from vibench_strategies.formulations.proximal import Proximal
 from vibench_strategies.formulations.regression import Regression
@@ -62,7 +62,6 @@ def test_other_ways_to_solve_the_reduced_program_give_the_mixed_answer(formulati
     assert other.status == "ok"
     assert np.allclose(other.u, mixed.u, atol=1e-8 * np.abs(mixed.u).max())
     assert np.allclose(other.lam, mixed.lam, atol=1e-6 * mixed.lam.max())
-    assert other.iterations is not None
     assert 0 < other.iterations < 100
 
 
@@ -87,7 +86,6 @@ def test_one_cluster_is_the_mixed_model_and_several_have_smaller_spaces(by: str)
     assert np.allclose(one.u, mixed.u, atol=1e-9)
     assert np.allclose(one.lam, mixed.lam, atol=1e-6 * mixed.lam.max())
     several = STRING.with_formulation(Local(clusters=3, by=by)).model
-    assert isinstance(several.online, LocalModel)
     assert several.online.dimension < STRING.pod.basis.shape[1] + STRING.cone.size
     owners, steps = several.built["owners"], several.built["steps"]
     assert set(owners) == set(range(len(steps)))
@@ -107,7 +105,6 @@ def test_one_cluster_is_the_mixed_model_and_several_have_smaller_spaces(by: str)
 
 def test_clusters_of_parameters_are_chosen_by_the_nearest_centroid() -> None:
     model = STRING.with_formulation(Local(clusters=3)).model.online
-    assert isinstance(model, LocalModel)
     owners = np.array([model.phase(mu) for mu in STRING.snapshots.mu])
     places = STRING.problem.parameters.to_unit(STRING.snapshots.mu)
     # k-means has ended: each centroid is the mean of those that it is nearest to
@@ -165,7 +162,6 @@ def test_regression_interpolates_the_snapshots_and_its_uncertainty_has_the_size_
     assert_interpolates(processes)
     for mu in problem.validation_set(12, 0):
         found, exact = processes.solve(mu), vibench.solve_high_fidelity(problem.assemble(mu))
-        assert found.uncertainty is not None
         ratios.append(V.norm(found.u - exact.u) / found.uncertainty)
         assert V.norm(found.u - exact.u) <= found.error_bounds.u  # the proved bound knows nothing of the regression
     assert 0.1 < np.median(ratios) < 10.0

@@ -38,7 +38,6 @@ class Distance(Trainer):
 
 def trained(**options: object) -> tuple[AdaptiveSampling, Distance]:
     strategy, trainer = create("sampling strategy", "greedy", options), Distance()
-    assert isinstance(strategy, AdaptiveSampling)
     strategy.train(BOX, trainer)
     return strategy, trainer
 
@@ -148,7 +147,6 @@ def test_what_ends_the_training_is_random() -> None:
     random = [place for place in dict.fromkeys(places) if places.count(place) == 1][-60:]
     assert len(random) == 60
     strategy = create("sampling strategy", "greedy", {"candidates": 2000, "tolerance": 0.35})
-    assert isinstance(strategy, AdaptiveSampling)
     all_of_them = strategy.parameters(BOX)
     mean = np.linalg.norm(all_of_them[:, None] - np.array(trainer.solved), axis=2).min(axis=1)
     asked = np.linalg.norm(np.array(random)[:, None] - np.array(trainer.solved), axis=2).min(axis=1)
@@ -184,7 +182,6 @@ def test_the_solutions_of_the_training_are_the_snapshots(store: SampleStore) -> 
 def test_history_and_seconds_are_recorded(store: SampleStore) -> None:
     (stage,) = solution_stages(PROBLEM, GREEDY)
     artefact = store.get(stage.key)
-    assert artefact is not None
     histories = {history.quantity: history for history in artefact.histories}
     assert set(histories) == {"bound", "bounds evaluated", "scale", "centre_x", "centre_y"}
     assert {history.stage for history in histories.values()} == {"selection"}
