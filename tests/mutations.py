@@ -50,7 +50,6 @@ def changed(root: Path, fault: Fault) -> str:
 
 
 def first_failure(root: Path, tests: Sequence[str]) -> str | None:
-    """The first test that fails on a tree, or `None`."""
     paths = os.pathsep.join(str(root / folder) for folder in IMPORTED)
     command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "--tb=no", "-rfE", *tests]
     environment = {**os.environ, "PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"}
@@ -69,13 +68,11 @@ def first_failure(root: Path, tests: Sequence[str]) -> str | None:
 
 
 def copy_of_sources(folder: str) -> Path:
-    """A copy of the tree without what it does not need."""
     ignored = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", ".*_cache", ".hypothesis")
     return Path(shutil.copytree(ROOT, Path(folder) / "copy", ignore=ignored))
 
 
 def caught(fault: Fault) -> str | None:
-    """The test that notices a fault, or `None`."""
     with tempfile.TemporaryDirectory() as folder:
         root = copy_of_sources(folder)
         (root / fault.file).write_text(changed(root, fault), encoding="utf-8")

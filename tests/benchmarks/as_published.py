@@ -47,8 +47,6 @@ COMPILED = "query offline, compiled"
 
 
 class Pair(NamedTuple):
-    """The same of both sides."""
-
     published: Any
     ours: Any
 
@@ -58,7 +56,6 @@ Seconds = dict[str, Pair]
 
 
 def measure_stages(sides: Pair, repeats: int) -> Seconds:
-    """Every stage on both sides in turn."""
     seconds: Seconds = defaultdict(lambda: Pair([], []))
     for name in STAGES:
         for _ in range(repeats):
@@ -122,7 +119,6 @@ def _tell(name: str, seconds: Pair) -> None:
 
 
 def sizes(sides: Pair) -> Figures:
-    """Dimensions, and σ over the training set as `published` computes it."""
     added = [side.space.shape[1] - side.basis.shape[1] for side in sides]
     return {
         "N": Pair(*(side.basis.shape[1] for side in sides)),
@@ -188,7 +184,6 @@ def time_table(seconds: Seconds, paper: Sequence[float]) -> pd.DataFrame:
 
 
 def ratio_table(seconds: Seconds) -> pd.DataFrame:
-    """Ratios of medians that answer what a user would ask."""
     published_, ours = ({name: statistics.median(pair[side]) for name, pair in seconds.items()} for side in range(2))
     reduced, with_reduction = ours["query offline, reduced"], ours[TOTAL_NAME] + ours["reduction"]
     rows = [

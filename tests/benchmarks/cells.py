@@ -46,7 +46,6 @@ def study_of(cells: int) -> vibench.Study:
 
 
 def run(cells: int, folder: Path) -> None:
-    """Run a study in this process and note what that took."""
     start = time.process_time()
     with ProgressDisplay() as progress:
         run_study(study_of(cells), folder, progress, Options(jobs=2))

@@ -105,7 +105,6 @@ class Tally:
 
     @property
     def corrected(self) -> str:
-        """How much more accurate corrected pairs are."""
         return "".join(
             f"\n    corrected {which}, {name}: {len(divided)} queries, error of λ in W divided by "
             f"{np.median(divided):.2f} (median), smaller in {100.0 * np.mean(divided > 1.0):.1f} %"

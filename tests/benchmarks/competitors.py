@@ -40,7 +40,6 @@ SLOWER = 1.2
 
 
 def plain_hyper_reduced(offline: Reduction, solve_qp: SolveQP, built: Mapping[str, Any]) -> plain.Query:
-    """The plain query in the spaces and on the domain of ours."""
     chi, (rows, weights) = offline.cone.generators, built["rows"]
     tested = np.zeros_like(chi)
     tested[rows] = weights[:, None] * chi[rows]

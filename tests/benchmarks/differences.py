@@ -24,7 +24,6 @@ OF_THE_RUN = {
 
 
 def differences(one: pd.DataFrame, other: pd.DataFrame, table: str) -> Iterator[str]:
-    """Lines on the columns of joined rows that differ."""
     for name in one.columns.intersection(other.columns):
         column = STORED[table].get(name)
         if name in OF_THE_RUN or (column is not None and column.unit in ("s", "ms")):
@@ -42,7 +41,6 @@ def differences(one: pd.DataFrame, other: pd.DataFrame, table: str) -> Iterator[
 
 
 def main(one: Path, other: Path) -> None:
-    """Compare the cells and the queries of two runs."""
     runs = vibench.open_run(one), vibench.open_run(other)
     for table, keys in (("cells", ["cell"]), ("queries", ["cell", "query"])):
         frames = [run.table(table).set_index(keys).sort_index() for run in runs]

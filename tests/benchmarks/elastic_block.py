@@ -58,7 +58,6 @@ class Block(AffineProblem):
 
 
 def measure(problem: Problem, count: int) -> None:
-    """Print one line per parameter, and the medians."""
     box, ratios = problem.parameters, []
     mus = box.lower + np.random.default_rng(2022).random((count + 1, len(box.lower))) * (box.upper - box.lower)
     solver, kept = HighFidelitySolver(problem), Assemblies(problem)
@@ -79,7 +78,6 @@ def _solved(solver: HighFidelitySolver, problem: Problem, mu: Array) -> ActiveSe
 
 
 def _approximation(solution: ActiveSetSolution) -> tuple[Array, Array]:
-    """A pair that is not the solution."""
     return 0.99 * solution.u, 1.02 * solution.lam
 
 

@@ -43,7 +43,6 @@ SEED = 2031
 
 
 def name(problem: Problem) -> str:
-    """The kind of the problem, its unknowns and its rows."""
     return f"{type(problem).__name__:14} {problem.V.dim:5} {problem.W.dim:5}"
 
 

@@ -18,7 +18,6 @@ COLUMNS = "lines", "modules", "statements", "constants", "own", "docstrings", "o
 
 
 def is_number(node: ast.expr | None) -> bool:
-    """Whether an expression is made of numeric literals."""
     if node is None:
         return False
     parts = list(ast.walk(node))
@@ -28,7 +27,6 @@ def is_number(node: ast.expr | None) -> bool:
 
 
 def assigned(node: ast.stmt) -> Iterator[tuple[str, ast.expr | None]]:
-    """Names that a statement assigns to, with the value."""
     targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
     for target in chain.from_iterable(t.elts if isinstance(t, ast.Tuple) else [t] for t in targets):
         if isinstance(target, ast.Name):
@@ -36,7 +34,6 @@ def assigned(node: ast.stmt) -> Iterator[tuple[str, ast.expr | None]]:
 
 
 def constants(tree: ast.Module) -> Iterator[str]:
-    """Names of all constants of a module."""
     for name, value in chain.from_iterable(map(assigned, tree.body)):
         if (name.isupper() and len(name) > 1) or is_number(value):
             yield name
@@ -59,7 +56,6 @@ def numbers_of(call: ast.expr | None) -> set[str]:
 
 
 def measured(path: Path) -> Counter[str]:
-    """The counts of one module."""
     text = path.read_text(encoding="utf-8")
     tree = ast.parse(text)
     nodes = list(ast.walk(tree))
@@ -73,7 +69,6 @@ def measured(path: Path) -> Counter[str]:
 
 
 def main(folder: str, *options: str) -> None:
-    """Print the counts of every package of a folder and their sum."""
     packages: dict[str, Counter[str]] = {}
     for path in sorted(Path(folder).rglob("*.py")):
         package = packages.setdefault(path.relative_to(folder).parts[0].removesuffix(path.name) or ".", Counter())

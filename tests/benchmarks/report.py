@@ -34,7 +34,6 @@ return [entry.loadEventEnd / 1e3, document.querySelectorAll('[data-table="summar
 
 
 def command(*arguments: str) -> tuple[float, float]:
-    """Wall seconds of a vibench command, and CPU seconds of its processes."""
     start = time.perf_counter()
     used = seconds_of(*arguments)
     return time.perf_counter() - start, used

@@ -73,8 +73,6 @@ class Side:
 
 
 class Published(Side):
-    """As published."""
-
     def snapshots(self) -> None:
         self.u, self.lam = published.snapshots(self.problem, self.problem.training_set())
 
@@ -110,8 +108,6 @@ class Published(Side):
 
 
 class Ours(Side):
-    """vibench's own."""
-
     compiled: CompiledProgram
     not_compiled = ""
 

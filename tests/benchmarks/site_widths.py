@@ -36,14 +36,12 @@ return [...(wide ? ["the page"] : []), ...named];
 
 
 def main(site: str) -> None:
-    """Print what does not fit."""
     lines = list(faults(Path(site).resolve()))
     print("\n".join(lines) or f"{site}: every page fits {' and '.join(map(str, WIDTHS))} pixels")
     sys.exit(bool(lines))
 
 
 def faults(site: Path) -> Iterator[str]:
-    """A line for every page and width with something that does not fit."""
     pages = sorted(page for page in site.rglob("*.html") if page.name != "404.html")
     if not pages:
         sys.exit(f"{site}: no pages")

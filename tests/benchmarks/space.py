@@ -50,7 +50,6 @@ def reductions(resolution: str) -> dict[str, vibench.Reduction]:
 
 
 def timed_query(reduction: vibench.Reduction, mu: np.ndarray) -> tuple[float, float]:
-    """CPU milliseconds of a reduced query, and of its certificate."""
     times = [time.process_time_ns()]
     reduced = reduction.assembled.assemble(mu)
     answer = solve_qp(reduced.program, SOLVER, ACCURACY, factor=reduced.factor)
@@ -62,7 +61,6 @@ def timed_query(reduction: vibench.Reduction, mu: np.ndarray) -> tuple[float, fl
 
 
 def unseen(resolution: str, count: str = "1000") -> int:
-    """Compare bounds with errors; returns the number of violations."""
     problem = vibench.create("problem", "hertz3d", {"resolution": resolution, "factorisation": "pardiso"})
     dual, solved = vibench.create("dual strategy", "mcpg"), high_fidelity_sweep(problem, problem.training_set())
     models: dict[str, vibench.Model] = {}

@@ -103,7 +103,6 @@ def drawn(path: Path) -> str:
 
 @pytest.fixture(scope="module")
 def own(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
-    """The elements of a report on plain text."""
     return elements(page(recorded(tmp_path_factory.mktemp("plain"), "plain", 3)))
 
 

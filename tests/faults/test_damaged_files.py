@@ -35,7 +35,6 @@ Damage = Callable[[bytes], bytes]
 
 @pytest.fixture(scope="module")
 def made(vibench: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a run of a small study, and its artefacts."""
     folder = tmp_path_factory.mktemp("made")
     write_study(folder, STUDY)
     with pytest.MonkeyPatch.context() as patch:

@@ -70,7 +70,6 @@ class Run:
 
 
 def bad(name: str, plugin: str) -> dict[str, Any]:
-    """The plugin that is broken in the way its label ends with."""
     return {"name": plugin, "label": name, "options": {"how": name.rpartition("-")[2]}}
 
 

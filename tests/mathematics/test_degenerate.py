@@ -69,7 +69,6 @@ def store(tmp_path_factory) -> SampleStore:
 
 @pytest.fixture
 def rows(register, store):
-    """Function that runs one cell of a case and returns its rows."""
     problems = (("vibench.problems", case.__name__, f"{__name__}:{case.__name__}") for case in CASES)
     register(*problems, *STRATEGIES)
 

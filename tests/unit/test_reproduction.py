@@ -27,7 +27,6 @@ LINES = ("N", "R", *TIMES, "online time, on [s]", "online time, off [s]", "onlin
 
 @pytest.fixture(scope="module")
 def reproduction() -> Iterator[ModuleType]:
-    """The script that writes the page."""
     scripts = str(ROOT / "results" / "scripts")
     sys.path.insert(0, scripts)
     yield importlib.import_module("reproduction")

@@ -52,7 +52,6 @@ def test_the_folder_is_light_every_file_is_on_a_page_and_every_link_resolves() -
 
 @pytest.fixture(autouse=True)
 def scripts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The scripts of the pages can be imported."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
 
 

@@ -12,8 +12,6 @@ from vibench_problems.mortar import Pairing
 
 @dataclass(frozen=True)
 class Sides:
-    """The two sides of a coupling, apart."""
-
     slave: sp.csr_array
     master: sp.csr_array
     gap: np.ndarray
