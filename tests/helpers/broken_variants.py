@@ -20,24 +20,27 @@ import vibench
 from vibench import Array, Contact, Indices, InnerProduct, Problem, QPSolution, Sampler, VariationalInequality
 
 
-class Bar(Problem):
-    """A small bar under torsion, assembled by its author."""
+class Own(Problem):
+    """A problem whose author assembles what others declare."""
 
-    parameters = Torsion.parameters
+    def __init__(self, declared: Problem) -> None:
+        self._declared, self.parameters, self.V, self.W = declared, declared.parameters, declared.V, declared.W
+
+    def training_set(self) -> Array:
+        return self._declared.training_set()
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        return self._declared.assemble(mu)
+
+
+class Bar(Own):
+    """A small bar under torsion."""
+
     constant: ClassVar[frozenset[str]] = frozenset({"A", "B", "g"})
 
     def __init__(self) -> None:
-        bar = Torsion(cells=6)
-        vi = bar.assemble(np.ones(1))
-        self.V, self.W = bar.V, bar.W
-        self._stiffness, self._weights, self._distance = vi.A, vi.f, vi.g / vi.f
-
-    def training_set(self) -> Array:
-        return self.parameters.grid(15)
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        weights = self._weights
-        return VariationalInequality(self._stiffness, mu[0] * weights, nodal(weights), weights * self._distance)
+        super().__init__(Torsion(cells=6))
+        self._weights = self._declared.assemble(np.ones(1)).f
 
 
 class Option(Put):
@@ -47,30 +50,17 @@ class Option(Put):
         super().__init__(cells=24)
 
 
-class Cube(Problem):
-    """A coarse block, assembled by its author."""
+class Cube(Own):
+    """A coarse block."""
 
     constant: ClassVar[frozenset[str]] = frozenset({"A", "f", "B"})
     entrywise: ClassVar[frozenset[str]] = frozenset({"g"})
 
     def __init__(self) -> None:
-        self._block = Block(cells=2)
-        self.parameters, self.V, self.W = self._block.parameters, self._block.V, self._block.W
-        vi = self._block.assemble(self.parameters.lower)
-        self._stiffness, self._coupling = vi.A, vi.B
-
-    def training_set(self) -> Array:
-        return self._block.training_set()
-
-    def bound(self, mu: Array) -> Array:
-        return self._block.assemble(mu).g
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        return VariationalInequality(self._stiffness, np.zeros(self.V.dim), self._coupling, self.bound(mu))
+        super().__init__(Block(cells=2))
 
     def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
-        rows = wanted["g"][0]
-        return lambda mu: {"g": self.bound(mu)[rows]}
+        return lambda mu: {"g": self._declared.assemble(mu).g[wanted["g"][0]]}
 
 
 class ByElements(Option):
@@ -182,10 +172,12 @@ class NamesOfNodes(Bar):
     def __init__(self) -> None:
         super().__init__()
         names = {f"node {k}" for k in range(self.V.dim)}
-        order = [int(name.split()[1]) for name in names]
-        self._stiffness = self._stiffness[order][:, order]
-        self._distance = self._distance[order]
+        self._order = order = [int(name.split()[1]) for name in names]
         self.V = InnerProduct(self.V.matrix[order][:, order])
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi, order = super().assemble(mu), self._order
+        return replace(vi, A=vi.A[order][:, order], g=vi.g[order])
 
 
 class NotANumberInACorner(Option):
@@ -203,10 +195,11 @@ class OtherContact(Cube):
 
     @property
     def contact_dofs(self) -> Indices:
-        return np.unique(self._coupling.indices)
+        return np.unique(self._declared.assemble(self.parameters.lower).B.indices)
 
     def contact(self, mu: Array) -> Contact:
-        return Contact(sp.csr_array(self._coupling[:, self.contact_dofs])[::-1], self.bound(mu))
+        vi = self._declared.assemble(mu)
+        return Contact(sp.csr_array(vi.B[:, self.contact_dofs])[::-1], vi.g)
 
 
 class DependsOnTheCallBefore(Option):

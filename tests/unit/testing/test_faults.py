@@ -181,7 +181,7 @@ def test_a_fault_is_found_by_its_check(module: str, name: str) -> None:
 def test_every_broken_plugin_is_tried() -> None:
     sound = {
         "Declared", "variant", "changed", "built", "Greedy", "LastErrorAlone", "Supremizing", "Worse", "one_vector",
-        "Bar", "ByElements", "Option", "Cube", "exact", "Misbehaves", "MisbehavingModel",
+        "Own", "Bar", "ByElements", "Option", "Cube", "exact", "Misbehaves", "MisbehavingModel",
     }  # fmt: skip
     elsewhere = {"PaintsTheEnd": "test_processes.py", "UnknownAnnotation": "test_conformance.py"}
     for name, file in elsewhere.items():
