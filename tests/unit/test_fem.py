@@ -4,7 +4,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-import skfem
 from skfem import Basis, ElementHex1, ElementTriP1, ElementTriP2, ElementVector, FacetBasis, MeshHex, MeshTri
 from skfem.models.elasticity import linear_elasticity
 from skfem.models.poisson import laplace, unit_load
@@ -153,8 +152,8 @@ def test_lifted_problems_pass_the_checks_and_keep_their_constants() -> None:
     assert np.allclose(problem.assemble(np.ones(3)).f, (ones - stiffness @ lift)[problem.free])
 
 
-def test_contact_of_a_block_is_that_of_scikit_fem_alone() -> None:
-    """Pressed uniformly by a rigid plane, free to slide, a cube of ν = 0 is compressed uniformly."""
+def test_contact_of_a_block_is_uniform_compression() -> None:
+    """Of a cube of ν = 0, pressed by a rigid plane and free to slide."""
     mesh = MeshHex.init_tensor(*[np.linspace(0.0, 1.0, 3)] * 3)
     basis = Basis(mesh, ElementVector(ElementHex1()))
     fixed = np.concatenate([basis.nodal_dofs[k, mesh.p[k] == 0.0] for k in range(3)])
@@ -176,9 +175,7 @@ def test_contact_of_a_block_is_that_of_scikit_fem_alone() -> None:
 
     solution = HighFidelitySolver(Cube()).solve(np.array([0.1]))
     assert np.allclose(solution.lam, 0.1)  # pressure E·ε
-    prescribed = np.zeros(basis.N)
-    prescribed[basis.nodal_dofs[2, mesh.p[2] == 1.0]] = -0.1
-    D = np.concatenate([fixed, basis.nodal_dofs[2, mesh.p[2] == 1.0]])
-    alone = skfem.solve(*skfem.condense(stiffness, x=prescribed, D=D))
-    assert np.allclose(solution.u, alone[free], atol=1e-13)
+    exact = np.zeros(basis.N)
+    exact[basis.nodal_dofs[2]] = -0.1 * mesh.p[2]
+    assert np.allclose(solution.u, exact[free], atol=1e-13)
     assert np.allclose(fem.eliminate(full, free).B.toarray(), Cube().assemble(np.array([0.1])).B.toarray())

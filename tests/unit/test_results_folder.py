@@ -178,11 +178,13 @@ def test_other_machines_are_compared_row_by_row(tmp_path: Path) -> None:
     rows["gain"] /= 2.0
     cells.to_csv(there / "cells.csv", index=False)
     rows.to_csv(there / "thresholds.csv", index=False)
-    importlib.import_module("machines").main(str(tmp_path), str(tmp_path / "machines"))
-    lines = (tmp_path / "machines" / "README.md").read_text(encoding="utf-8").splitlines()
-    verdicts, apart = (
-        [part.strip() for part in line.split("|")[1:-1]] for line in lines if line.startswith("| benefit")
-    )
+
+    def lines() -> list[list[str]]:
+        importlib.import_module("machines").main(str(tmp_path), str(tmp_path / "machines"))
+        page = (tmp_path / "machines" / "README.md").read_text(encoding="utf-8").splitlines()
+        return [[part.strip() for part in line.split("|")[1:-1]] for line in page if line.startswith("| benefit")]
+
+    verdicts, apart = lines()
     assert verdicts[:3] == ["benefit", "other", str(len(rows))]
     assert verdicts[4] == "1"  # the one that is contradicted
     assert verdicts[6:] == ["2.00 (2.00–2.00)"] * 2
@@ -190,9 +192,7 @@ def test_other_machines_are_compared_row_by_row(tmp_path: Path) -> None:
     # seconds of the high-fidelity model are not those of an earlier protocol
     cells["versions"] = cells["versions"].str.replace(r'"protocol": "\d+"', '"protocol": "0"', regex=True)
     cells.to_csv(there / "cells.csv", index=False)
-    importlib.import_module("machines").main(str(tmp_path), str(tmp_path / "machines"))
-    lines = (tmp_path / "machines" / "README.md").read_text(encoding="utf-8").splitlines()
-    verdicts = next([part.strip() for part in line.split("|")[1:-1]] for line in lines if line.startswith("| benefit"))
+    verdicts, *_ = lines()
     assert verdicts[2] == str(int((rows["primal_a"] != "high-fidelity").sum()))
     assert verdicts[4] == "0"
     assert verdicts[6:] == ["–", "2.00 (2.00–2.00)"]
