@@ -48,6 +48,33 @@ class Beam(AffineProblem):
         return self.parameters.grid(5, 4, 3)
 
 
+class Floating(AffineProblem):
+    """A string with free ends on springs so weak that the stiffness is nearly singular, above a floor near one end.
+
+    Where A varies its tension does, too.
+    """
+
+    parameters = ParameterBox(
+        ("load", "bias", "tension"), np.array([1.0, -1.0, 0.5]), np.array([2.0, 1.0, 2.0]), ("1", "1", "1")
+    )
+
+    def __init__(self, springs: float, varying: bool, nodes: int = 14, contact: int = 5) -> None:
+        off, rng = -np.ones(nodes - 1), np.random.default_rng(0)
+        diagonal = np.where((np.arange(nodes) == 0) | (np.arange(nodes) == nodes - 1), 1.0, 2.0)
+        string = sp.csr_array(sp.diags_array([diagonal, off, off], offsets=[0, 1, -1]))
+        spring = sp.csr_array(springs * sp.eye_array(nodes))
+        B = sp.csr_array((-np.ones(contact), (np.arange(contact), np.arange(contact))), shape=(contact, nodes))
+        self.V, self.W = (InnerProduct(sp.eye_array(size, format="csc")) for size in (nodes, contact))
+        loads = ((string + spring) @ rng.standard_normal((nodes, 2))).T
+        self.declare(
+            A=[("tension", string), (1.0, spring)] if varying else string + spring,
+            f=[("load", loads[0]), ("bias", loads[1])], B=B, g=np.full(contact, 0.1),
+        )  # fmt: skip
+
+    def training_set(self) -> Array:
+        return self.parameters.grid(4, 4, 2)
+
+
 class Truss(AffineProblem):
     """A truss with two chords on two hinges, over unilateral springs under every lower node: they push and do not pull.
 

@@ -266,9 +266,9 @@ def _certificate_thetas(certificate: OnlineCertificate, samples: Mapping[str, Ar
 
 
 def _stiffness_coefficients(certificate: OnlineCertificate) -> Array | None:
-    """The matrix that makes θ of rotated terms of A, then those of `TermRanges`, from the θ of a query, if A varies."""
-    rotation, spectral = certificate.base.rotation, certificate.base.spectral
-    if rotation is None or spectral is None or spectral.ranges is None:
+    """The matrix that makes θ of rotated terms of A from those of a query, if A varies, then the latter of a sum."""
+    rotation = certificate.base.rotation
+    if rotation is None or not certificate.base.term_errors.any():
         return rotation
     return np.vstack([rotation, np.eye(rotation.shape[1])])
 
@@ -295,6 +295,7 @@ def _certificate_arrays(
         "responses": responses, "sizes": corrections.sizes, "directions": corrections.directions,
         "terms": np.array(corrections.terms), "kept": residual.kept, "factor": residual.factor,
         "inverse_scale": residual.inverse_scale, "remainder": np.array(residual.remainder), "norms": residual.norms,
+        "round_off": np.array(residual.round_off), "margins": np.array([certificate.margin, corrections.error]),
     }  # fmt: skip
     if unknowns is not None:
         loads = np.zeros((base.X.dim, len(corrections.rows)))
@@ -324,10 +325,12 @@ def _certificate_arrays(
             "axes": grid.axes, "lower": grid.lower, "upper": grid.upper, "counts": grid.counts, "places": grid.places,
             "turn": spectral.turn, "term_norms": spectral.norms, "spectral_error": np.array(spectral.error + stiffness),
         }  # fmt: skip
+        if base.term_errors.any():
+            found["term_errors"] = base.term_errors
         if (ranges := spectral.ranges) is not None:
             widest = np.maximum(-ranges.lower, ranges.upper) / np.abs(ranges.reference)
             found["ranges"] = np.column_stack([ranges.reference, ranges.lower, ranges.upper])
-            found["range_errors"] = np.array([ranges.round_off, error["theta_A"] * np.linalg.norm(widest)])
+            found["range_errors"] = np.array([ranges.error, error["theta_A"] * np.linalg.norm(widest)])
     return {f"certificate_{name}": array for name, array in found.items()}
 
 

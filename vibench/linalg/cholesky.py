@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from functools import cached_property
+from math import sqrt
 from typing import Any
 
 import numpy as np
@@ -165,6 +166,24 @@ class PartialCholesky(FactoredElimination):
         P is the matrix whose factors are exactly the computed L_ii, L_ci and D, with the computed S as its complement.
         """
         return round_off_of_factors(self._lu, self._split, self._corner, weights)
+
+    def backward_errors(self, squares: Array) -> tuple[float, float]:
+        inverse, count = 1.0 / np.sqrt(squares[self.order]), len(self.order)
+        eliminated, columns = float(np.max(inverse * self.round_off(inverse), initial=0.0)), abs(self._columns)
+        # k_i terms in column i of F, the entries of row i of L. Loads of the last unknowns are summed before their
+        # solution: twice the terms.
+        terms = np.bincount(columns.indices, minlength=count) + 8.0
+        terms[self._split :] += count - self._split
+        weights, trailing, squares = terms * inverse, np.abs(self.trailing_factor), self._root**2
+        # With M = (k_i |F_ji| / S_i) the norm of M is at most the root of the largest entry of MᵀM x over x, for x > 0.
+        x = np.ones(count)
+        for _ in range(8):
+            scaled = weights * x
+            product = columns @ (squares * (columns.T @ scaled))
+            product[self._split :] += trailing.T @ (trailing @ scaled[self._split :])
+            largest, x = float(np.max(weights * product / x, initial=0.0)), weights * product
+            x = np.maximum(x / np.max(x, initial=1e-300), 1e-3)
+        return eliminated, 2.2 * UNIT_ROUND_OFF * sqrt(largest)
 
     def eliminate(self, right: Array) -> tuple[Array, Array]:
         solved = np.ascontiguousarray(right[self.order], dtype=float)

@@ -205,6 +205,14 @@ class FactoredElimination(Elimination):
     def solve_factor_transposed(self, right: Array) -> Array:
         """The solution F⁻ᵀ r for r (n,) or (n, k); a load on the last unknowns has nonzeros only there."""
 
+    @abstractmethod
+    def backward_errors(self, squares: Array) -> tuple[float, float]:
+        """Bounds δ and τ of round-off in units of S² = diag(X), `squares` (n,) (Higham 2002, §8.1 and 10.1).
+
+        X differs by a matrix between ±δS² from one whose exact factors are the computed ones of the eliminated unknowns
+        and whose exact Schur complement is the computed one. Of y = F⁻ᵀt as it is computed, |S⁻¹(t − Fᵀy)| ≤ τ|y|.
+        """
+
 
 def checked(matrix: SparseMatrix, name: str) -> SparseMatrix:
     """Return the matrix (CSC); raises a `NumericalError` if an entry is not finite, or a diagonal one not positive."""

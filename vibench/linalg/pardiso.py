@@ -6,6 +6,7 @@ import os
 import weakref
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, files
+from math import sqrt
 
 import numpy as np
 import scipy.linalg
@@ -14,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
+from vibench.linalg import UNIT_ROUND_OFF
 from vibench.linalg.definite import BlockDiagonal, Factor, FactoredElimination, checked, dense_cholesky
 
 
@@ -114,6 +116,13 @@ class PardisoElimination(_Factorised, FactoredElimination):
         u = np.empty_like(ordered)
         u[self._order] = self._call(333, ordered)
         return u
+
+    def backward_errors(self, squares: Array) -> tuple[float, float]:  # noqa: ARG002
+        count, last = len(self._order), len(self._order) - self._split
+        entries = (self._entries if self._entries > 0 else 0.5 * count * (count + 1.0)) + last**2
+        # the sum over columns of γ_{t+1} of t entries (Rump 2006); no column has more terms than there are unknowns
+        terms = sqrt((count + 8.0) * (entries + 8.0 * count))
+        return 1.01 * UNIT_ROUND_OFF * (entries + 2.0 * count), 2.2 * UNIT_ROUND_OFF * terms
 
     @cached_property
     def trailing_factor(self) -> Array:

@@ -17,7 +17,7 @@ may be as large as small bounds: there v is that of extended precision, and p ma
 
 from __future__ import annotations
 
-from math import sqrt
+from math import inf, sqrt
 
 import numpy as np
 import scipy.sparse as sp
@@ -25,7 +25,9 @@ import scipy.sparse as sp
 from vibench.arrays import Array
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg import EPS, UNIT_ROUND_OFF
+from vibench.linalg.inner_product import InnerProduct
 from vibench.qp.verification import extended
+from vibench.stability.coercivity import share_of_diagonal
 
 
 class ProvedNorms:
@@ -73,3 +75,14 @@ class ProvedNorms:
         size = np.abs(vi.f) + self._magnitude @ (np.abs(u) + np.abs(p).astype(float)) + abs(vi.B).T @ lam
         lost = 1.01 * (self._of_residual * size + EPS * np.abs(q))
         return q, float(np.linalg.norm(self._weights * (np.abs(q) + lost))) * (1.0 + 16.0 * EPS * sqrt(len(q)))
+
+
+def dual_norm(X: InnerProduct, functional: Array, error: Array | float = 0.0) -> float:
+    """Upper bound of the norm in X⁻¹ of all functionals (n,) that differ from one by at most an error (n,)."""
+    share, none = share_of_diagonal(X), np.zeros(0)
+    if not share.proved:
+        return inf
+    floor, p = share.value * X.matrix.diagonal(), extended(X.riesz(functional))
+    load = VariationalInequality(X.matrix, functional, sp.csr_array((0, X.dim)), none)
+    norms, beside = ProvedNorms(load, floor, precise=True), float(np.linalg.norm(error / np.sqrt(floor)))
+    return float(norms.energies(p[:, None])[0][0]) + norms.missed(np.zeros(X.dim), p, none)[1] + beside

@@ -124,7 +124,7 @@ def _of_certificate(
     # These arrays exist only where A depends on the parameter; C needs them always.
     spectral = (
         "axes", "anchors", "lower", "upper", "counts", "places", "turn", "term_norms", "spectral_error", "ranges",
-        "range_errors",
+        "range_errors", "term_errors",
     )  # fmt: skip
     own: dict[str, Array] = {f"certificate_{name}": np.zeros(1) for name in spectral}
     own |= {name: array for name, array in arrays.items() if name.startswith("certificate_")}
@@ -134,11 +134,12 @@ def _of_certificate(
     # Doubles on the stack of the certificate, for its documentation in the header.
     numbers = loads * (loads + 1) // 2 + 8 * rows + 20 * loads + norms + kept
     sizes = {name: polynomial.terms.shape[1] for name, polynomial in thetas.items()}
-    ranges = len(arrays.get("certificate_ranges", ()))
+    declared = len(arrays.get("certificate_term_errors", ()))
     return sizes | {
         "rows": rows, "loads": loads, "directions": directions, "kept": kept, "residual_terms": norms,
         "spectral": int("certificate_anchors" in arrays), "stack": round(8e-3 * numbers) + 1,
-        "ranges": ranges, "stiffness_terms": sizes["theta_A"] - ranges, "leading": len(own["certificate_turn"]),
+        "ranges": len(arrays.get("certificate_ranges", ())), "leading": len(own["certificate_turn"]),
+        "declared": declared, "stiffness_terms": sizes["theta_A"] - declared,
         "axes": len(arrays.get("certificate_axes", ())), "places": np.shape(own["certificate_places"])[-1],
         "thetas": "\n".join(_member(key, polynomial) for key, polynomial in thetas.items()),
         "arrays": "\n".join(map(_array, own, own.values())),

@@ -12,6 +12,15 @@ them, which is verified at the parameter. β₀² is the smallest eigenvalue of 
 
 for any z and S = B₀ X⁻¹B₀ᵀ, since β₀ ‖ε‖_W ≤ ‖B₀ᵀε‖_{X⁻¹}; θ = 1 where B₀ is B on some bodies. z = S⁻¹m makes c small
 even if β₀ is, which the modes of ε on single elements decide.
+
+**Round-off.** With S² = diag(X) and a proved σ, X ≽ σS², a difference between ±δS² is one between ±(δ/σ)X. So the
+Schur complement Ŝ of a factorisation is that of X up to η = δ/σ (`FactoredElimination.backward_errors`), and for the
+computed C the symmetric Ŝ^½CŜ^½ − I has at most the norm ν of any matrix similar to ŜC − I, hence
+
+    (1 − μ) C ≼ EᵀX⁻¹E ≼ (1 + μ) C,    μ = (ν + η)/(1 − 2ν − 2η).
+
+A declared sum A(µ) = Σ_q θ_q A_q differs from that of rotated terms, and from what is assembled, by matrices between
+±Σ_q |θ_q| e_q X.
 """
 
 from __future__ import annotations
@@ -33,9 +42,10 @@ from vibench.errors import UnsupportedError
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.validation import checked_assembly
-from vibench.linalg.definite import dense_inverse
+from vibench.linalg import EPS, UNIT_ROUND_OFF
+from vibench.linalg.definite import BlockDiagonal
+from vibench.linalg.factorisations import implementation
 from vibench.linalg.inner_product import InnerProduct
-from vibench.linalg.schur_complement import EliminationPattern, StaticCondensation
 from vibench.model.affine import AffineMember, Evaluation, coefficients, evaluated_members
 from vibench.model.bound_terms import BoundNote
 from vibench.model.certificates.prepared_correction import constant_unknowns
@@ -48,7 +58,9 @@ from vibench.model.certificates.spectral import (
     spectral_bounds,
 )
 from vibench.model.galerkin import contact_at
-from vibench.stability.coercivity import MARGINS, energy_inf_sup, largest_quotient
+from vibench.model.proved_norms import dual_norm
+from vibench.qp.verification import extended
+from vibench.stability.coercivity import MARGINS, Constant, energy_inf_sup, largest_quotient, share_of_diagonal
 
 
 class Guarantee(StrEnum):
@@ -147,6 +159,12 @@ class CertificateBase:
         The terms of g (m×Q) where B is a multiple of one matrix and g an exact sum; `None` elsewhere.
     inf_sup
         Lower bounds of β_A(µ).
+    share
+        σ.
+    compliance_error
+        μ.
+    term_errors
+        e_q (Q,) of the coefficients of A that a query evaluates; zero where A is no declared sum.
     """
 
     X: InnerProduct
@@ -160,11 +178,14 @@ class CertificateBase:
     constraint: SparseMatrix
     bound_terms: Array | None
     inf_sup: OnlineInfSup
+    share: Constant
+    compliance_error: float
+    term_errors: Array
 
     @property
     def guarantee(self) -> Guarantee:
         """Worth of the bounds of all models."""
-        proved = self.spectral is None or self.spectral.proved
+        proved = self.share.proved and (self.spectral is None or self.spectral.proved)
         return Guarantee.CERTIFIED if proved and self.is_exact else Guarantee.VERIFIED
 
     @cached_property
@@ -179,9 +200,13 @@ class CertificateBase:
             theta["A"] = self.rotation @ theta["A"]
         return theta
 
-    def spectrum(self, mu: Array, theta: Array, samples: Mapping[str, Array]) -> tuple[float, float]:
-        """The bounds α(µ) and γ(µ) at mu (d,) with the rotated θ of A (Q,), and the coefficients that led to these."""
-        return (1.0, 1.0) if self.spectral is None else self.spectral.evaluate(mu, theta, samples.get("A"))
+    def spectrum(self, mu: Array, theta: Array, samples: Mapping[str, Array]) -> tuple[float, float, float]:
+        """The bounds α(µ) and γ(µ), and that of Ã(µ)'s error, from the rotated θ of A (Q,) and what led to these."""
+        if self.spectral is None:
+            return 1.0, 1.0, self.stiffness_error
+        lower, upper = self.spectral.evaluate(mu, theta, samples.get("A"))
+        rounded = float(np.abs(samples.get("A", self.one)) @ self.term_errors)
+        return lower - rounded, upper + rounded, self.stiffness_error + rounded
 
 
 def unsupported(problem: Problem, members: Mapping[str, AffineMember]) -> str:
@@ -237,23 +262,66 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
     X = InnerProduct(at_centre, "A", problem.factorisation)
     terms, rotation, spectral, leading = list(A.terms), None, None, len(A.terms)
     evaluate = coefficients(problem, *evaluated_members({"A": A, "f": f}))
+    share, term_errors = share_of_diagonal(X), np.zeros(len(A.terms))
+
+    def declared(mu: Array) -> Array:
+        return evaluate(mu).get("A", np.ones(1))
+
+    def missed(mu: Array) -> float:
+        return left_out + float(np.abs(declared(mu)) @ term_errors)
+
     if not constant:
-        samples = np.column_stack([evaluate(mu).get("A", np.ones(1)) for mu in training])
+        samples = np.column_stack([declared(mu) for mu in training])
         rotation, terms = T, _ = rotated(A.terms, samples)
         leading = len(terms) if is_exact(problem, "A", A) else leading_terms(T @ samples)
+        if A.way is Evaluation.AFFINE:
+            term_errors = _term_errors(A.terms, T, terms, X) / share.value
     load, stiffness, left_out = _interpolation_errors(problem, X, members, evaluate, rotation, terms, leading)
     if not constant:
-        ranges = TermRanges.of(A.terms, evaluate(centre)["A"], X) if A.way is Evaluation.AFFINE else None
-        spectral = spectral_bounds(
-            problem, X, terms[:leading], lambda mu: T @ evaluate(mu).get("A", np.ones(1)), left_out, ranges
-        )
-    pattern = EliminationPattern.of(X.matrix, dofs, X.factorisation)
-    condensed = StaticCondensation(X.matrix, pattern, X.factorisation)
+        ranges = TermRanges.of(A.terms, declared(centre), X, missed(centre)) if A.way is Evaluation.AFFINE else None
+        spectral = spectral_bounds(problem, X, terms[:leading], lambda mu: T @ declared(mu), missed, ranges)
+    factor = implementation(X.factorisation).eliminate_with_factor(X.matrix, dofs, "A")
     # Eᵀ X⁻¹ E is the inverse of a Schur complement: no solution of mesh size for each contact unknown
-    C = dense_inverse(condensed.dense_schur, "A")
+    schur, squares = factor.schur_blocks(), X.matrix.diagonal()
+    C = schur.inverse("A").toarray()
+    error = _compliance_error(schur, C, np.sqrt(squares[dofs]), factor.backward_errors(squares)[0] / share.value)
     constraint, bound, inf_sup = _constant_constraint(problem, members, X, C, training)
     exact = all(is_exact(problem, name, members[name]) for name in "Af")
-    return CertificateBase(X, C, tuple(terms), rotation, spectral, load, stiffness, exact, constraint, bound, inf_sup)
+    return CertificateBase(
+        X, C, tuple(terms), rotation, spectral, load, stiffness, exact, constraint, bound, inf_sup, share, error,
+        term_errors,
+    )  # fmt: skip
+
+
+def _compliance_error(schur: BlockDiagonal, compliance: Array, scale: Array, eta: float) -> float:
+    """The bound μ of C (k×k) from the computed Schur complement, S (k,) on the contact unknowns, and η."""
+    distance = 0.0
+    for unknowns, block in schur.blocks:
+        own, of_C = scale[unknowns], compliance[np.ix_(unknowns, unknowns)]
+        left = (block @ of_C - np.eye(len(own))) / own[:, None] * own
+        sums = float(np.max((np.abs(block) @ (1.0 / own)) / own))
+        rounded = 1.01 * EPS * (len(own) + 4.0) * sums * float(np.linalg.norm(own[:, None] * of_C * own))
+        distance = max(distance, float(np.linalg.norm(left)) + rounded)
+    distance += eta
+    return distance / (1.0 - 2.0 * distance) if distance < 0.25 else inf
+
+
+def _term_errors(
+    declared: Sequence[SparseMatrix], rotation: Array, terms: Sequence[SparseMatrix], X: InnerProduct
+) -> Array:
+    """Bounds (Q,) of the largest row sums of S⁻¹|A_q − Σ_p T_pq A'_p|S⁻¹, and of round-off in sums of the terms."""
+    unit = 1.0 / np.sqrt(X.matrix.diagonal())
+
+    def row_sums(matrix: SparseMatrix) -> float:
+        return float(np.max((abs(sp.csr_array(matrix)) @ unit) * unit, initial=0.0))
+
+    turned, of_terms = [extended(sp.csr_array(term)) for term in terms], np.array([row_sums(term) for term in terms])
+    errors, unit_of_sums = [], 1.01 * UNIT_ROUND_OFF * (len(declared) + 3.0)
+    for term, weights in zip(declared, rotation.T, strict=True):
+        missed = extended(sp.csr_array(term)) - sum(t * one for t, one in zip(extended(weights), turned, strict=True))
+        sums = row_sums(term) + float(np.abs(weights) @ of_terms)
+        errors.append(row_sums(missed.astype(float)) + unit_of_sums * sums)
+    return np.array(errors)
 
 
 def _constant_constraint(
@@ -332,15 +400,20 @@ def output_weights(problem: Problem, base: CertificateBase, output: Output) -> t
     """The weights ‖l‖_{X⁻¹} and c of a linear output; c is infinite where no β₀ is proved."""
     of_u, of_lam = output_coefficients(problem, output)
     beta, B = base.inf_sup.value, base.inf_sup.constraint
-    in_u = float(np.linalg.norm(base.X.whiten_functional(of_u)))
+    in_u = dual_norm(base.X, of_u)
     if not of_lam.any():
         return in_u, 0.0
     if not beta > 0.0:
         return in_u, inf
-    S = np.asarray(B @ np.asarray(B @ base.compliance).T)
-    S, bounds = 0.5 * (S + S.T), [float(np.linalg.norm(problem.W.whiten_functional(of_lam))) / beta]
+    C, S = base.compliance, np.asarray(B @ np.asarray(B @ base.compliance).T)
+    S, bounds = 0.5 * (S + S.T), [dual_norm(problem.W, of_lam) / beta]
     with suppress(np.linalg.LinAlgError):  # rows that are dependent up to round-off
         z = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), of_lam)
-        rest = float(np.linalg.norm(problem.W.whiten_functional(of_lam - S @ z)))
-        bounds.append(float(np.sqrt(max(0.0, z @ S @ z))) + rest / beta)
+        load, root = np.asarray(B.T @ z), np.sqrt(np.diag(C))
+        values, reach = C @ load, float(root @ (abs(B).T @ np.abs(z)))
+        # the round-off in sums over rows and columns of B₀ and over C, and what C misses
+        unit = 1.01 * EPS * (len(z) + 2.0 * len(load) + 8.0)
+        size = sqrt((max(0.0, float(load @ values)) + unit * reach**2) * (1.0 + base.compliance_error))
+        rest = dual_norm(problem.W, of_lam - B @ values, unit * (reach * (abs(B) @ root) + np.abs(of_lam)))
+        bounds.append(size * (1.0 + 2.0 * base.compliance_error) + rest / beta)
     return in_u, min(bounds)

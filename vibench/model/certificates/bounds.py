@@ -18,8 +18,10 @@ The best correction w for c X in place of A comes with ν ≥ 0, c X w = Bᵀ(ν
 has the residual r − (c X − A) w and violates nothing, so that both of its errors are at most the root of
 ‖r − (c X − A) w‖²_{A⁻¹} + 2 νᵀ(B w − s). The norm is at most ρ/√α + ½ (γ − α)/√α ‖w‖_X for c = ½ (α + γ).
 
-Round-off is bounded where it decides whether w is feasible, and in the coordinates of the residual: it may be all that
-is left of Δ² + 2 rᵀw, in which these are multiplied with those of X w.
+**Round-off** is bounded in all terms, however large the condition number of X: in ρ (`residual`), in w and its norm
+by the μ of C (`contact_correction`), in κ, and in A(µ) and its spectrum (`base`). With FᵀF between (1 ± η) X, the
+distortion of U and the computed directions, rᵀw differs from the product of coordinates by at most m ρ ω, and ρ is at
+most (1 + m) times what they give (`OnlineCertificate.margin`).
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.errors import UnsupportedError
 from vibench.interfaces.problem import Contact, Problem
-from vibench.linalg import EPS
+from vibench.linalg import EPS, UNIT_ROUND_OFF
 from vibench.linalg.factorisations import implementation
 from vibench.model.affine import AffineMember
 from vibench.model.bound_terms import BoundNote, BoundTerms, CorrectionMode, in_dual_set
@@ -125,7 +127,7 @@ class _Query:
         self.problem, self.mu, self.x, self.lam, self.y = problem, mu, x, lam, evaluated.in_space(x)
         self.A, self.samples, self._contact = reduced.program.A, evaluated.samples, evaluated.contact
         self.theta = base.coefficients(self.samples)
-        self.lower, self.upper = base.spectrum(mu, self.theta["A"], self.samples)
+        self.lower, self.upper, self.error = base.spectrum(mu, self.theta["A"], self.samples)
 
     @property
     def contact(self) -> Contact:
@@ -156,6 +158,8 @@ class OnlineCertificate:
         χ (m×R).
     forces
         B₀ᵀχ (k×R) where B is assembled on the contact; `None` where it is exactly the sum of its terms.
+    margin
+        m, relative: see `vibench.model.certificates.bounds`.
     prepared
         Corrections that take no factorisation at the parameter, where there are any.
     """
@@ -167,6 +171,7 @@ class OnlineCertificate:
     contact_basis: Array
     generators: Array
     forces: Array | None
+    margin: float
     prepared: PreparedCorrections | None = None
 
     @cached_property
@@ -225,14 +230,14 @@ class OnlineCertificate:
             return OnlineBound.none(BoundNote.NOT_IN_CONE)
         if not base.is_exact and query.problem.parameters.outside(query.mu).any():
             return OnlineBound.none(BoundNote.OUTSIDE)
-        if not lower > base.stiffness_error:
+        if not lower > query.error:
             return OnlineBound.none(BoundNote.NOT_COERCIVE)
         quick, note = None, ""
         if self.prepared is not None:
             quick = self.prepared.correction(*self._constraint(query), query.y, lam, upper)
             note = BoundNote.NOT_PREPARED
         if quick is not None:
-            (along, norm, kappa), eta, note = quick, 0.0, ""
+            (along, norm, kappa, eta), note = quick, ""
         else:
             best = find_contact_correction(self.compliance, query.contact, *self._on_contact(query), lam, upper)
             if best is None:
@@ -245,11 +250,18 @@ class OnlineCertificate:
         coordinates, beside, missing = self.residual.parts(z)
         square_of_u = float(query.x @ (query.A @ query.x))
         # ‖u_N‖_X from ‖u_N‖ in the interpolated stiffness, whose coercivity is at least α less its error
-        u_norm = sqrt(max(0.0, square_of_u) / (lower - base.stiffness_error))
-        lacking = base.load_error + base.stiffness_error * u_norm
-        rho = sqrt(float(coordinates @ coordinates) + beside**2) + missing + lacking
+        u_norm = sqrt(max(0.0, square_of_u) / (lower - query.error))
+        lacking = base.load_error + query.error * u_norm
+        if contact is not None:
+            # the round-off in what B₀ᵀλ_N lacks, from all |B_ij| λ_i √C_jj; |B| as a matrix would show
+            # in the seconds of a query
+            rows, unit = sp.csr_array(contact.B), 2.0 * EPS * (len(lam) + len(alpha))
+            sizes = np.abs(rows.data) * self.compliance.root.take(rows.indices)
+            lacking += unit * float(sizes @ np.repeat(lam, np.diff(rows.indptr)))
+        rho = (sqrt(float(coordinates @ coordinates) + beside**2) + missing) * (1.0 + self.margin) + lacking
+        kappa *= 1.0 + self.margin
         # an upper bound of rᵀw: what r has besides its coordinates may act along w, and w' is within η of w
-        work = float(along @ coordinates) + (beside + missing + lacking) * norm + rho * eta
+        work = float(along @ coordinates) + (beside + missing + lacking) * norm + rho * (eta + self.margin * norm)
         terms = BoundTerms.from_work(rho / sqrt(lower), norm * sqrt(upper), kappa, work)
         of_u, of_lam = terms.primal, terms.dual
         if self.prepared is None and base.spectral is not None:
@@ -260,10 +272,11 @@ class OnlineCertificate:
                 (*self._on_contact(query), lam),
                 (coordinates, beside + missing + lacking),
                 (lower, upper),
+                self.margin,
             )
             of_u, of_lam = min(of_u, others[0]), min(of_lam, others[1])
         # a lower bound of ‖u‖_A, from that of ‖u_N‖_A and the triangle inequality
-        least = sqrt(max(0.0, square_of_u - base.stiffness_error * u_norm**2)) - of_u
+        least = sqrt(max(0.0, square_of_u - query.error * u_norm**2)) - of_u
         relative = of_u / least if least > 0.0 else inf
         beta, which = base.inf_sup.lower_bound(float(query.theta["B"][0]), lambda: query.contact.B, upper)
         in_W = of_lam / beta if beta > 0.0 else inf
@@ -287,7 +300,7 @@ class OnlineCertificate:
         """The corrected pair of a solution whose bounds are known."""
         lower, upper, lam, contact = query.lower, query.upper, query.lam, query.contact
         middle = 0.5 * (lower + upper)
-        pair, eta = None, 0.0
+        pair = None
         # prepared corrections of some bodies alone are not the best ones, and no ν belongs to them
         if self.prepared is not None and self.base.bound_terms is not None:
             B, g, g_size = self._constraint(query)
@@ -296,8 +309,8 @@ class OnlineCertificate:
             best = find_contact_correction(self.compliance, contact, *self._on_contact(query), lam, middle)
             if best is None or best.nu is None:
                 return None
-            pair, eta = (best.nu, best.norm, best.gap), best.eta
-        nu, norm, gap = pair
+            pair = best.nu, best.norm, best.gap, best.eta + best.away
+        nu, norm, gap, eta = pair
         rho = bound.rho + (0.5 * (upper - lower) * norm + middle * eta) / sqrt(lower)
         both = sqrt(rho**2 + 2.0 * gap) + eta * sqrt(upper)
         # over the lower bound of ‖u‖ that the first bounds gave
@@ -311,7 +324,7 @@ class OnlineCertificate:
     def corrected(self, u: Array, correction: OnlineCorrection, unknowns: Indices) -> Array:
         """The corrected solution v = u_N − w (n,) from u_N (n,) and the contact unknowns (k,).
 
-        Costs one solve with X, by arrays of mesh size.
+        Costs one solve with X, by arrays of mesh size, whose round-off is not in the bounds of v.
         """
         load = np.zeros(self.base.X.dim)
         load[unknowns] = correction.load
@@ -329,27 +342,42 @@ def prepare(
     X, dofs, scaled = base.X.matrix, contact_unknowns(problem), base.bound_terms is not None
     factor = implementation(base.X.factorisation).eliminate_with_factor(X, dofs, "A")
     forces = None if is_exact(problem, "B", B) else np.asarray(base.constraint.T @ chi)
+    squares = X.diagonal()
+    eliminated, of_solution = np.array(factor.backward_errors(squares)) / [base.share.value, sqrt(base.share.value)]
 
-    def block(functionals: Array) -> ColumnBlock:
-        return ColumnBlock(factor.solve_factor_transposed(np.asarray(functionals)))
+    def block(matrix: SparseMatrix, vectors: Array, terms: int) -> ColumnBlock:
+        """The products with a sparse matrix, which enter sums of so many terms."""
+        values = factor.solve_factor_transposed(np.asarray(matrix @ vectors))
+        unit = 1.01 * EPS * (np.max(np.diff(sp.csr_array(matrix).indptr)) + terms + 4.0) / sqrt(base.share.value)
+        rounded = unit * (abs(matrix) @ np.abs(vectors)) / np.sqrt(squares)[:, None]
+        return ColumnBlock(values, np.linalg.norm(rounded, axis=0) + of_solution * np.linalg.norm(values, axis=0))
 
-    blocks: list[ResidualTerms] = [block(np.column_stack(members["f"].terms))]
-    if base.spectral is None:
-        blocks.append(ColumnBlock(factor.apply_factor(Phi)))  # A is X
-    else:
-        blocks += [block(term @ Phi) for term in base.terms]
-    on_contact = ContactFunctionals(factor.trailing_factor, len(X.indptr) - 1)
+    loads = np.column_stack(members["f"].terms)
+    blocks: list[ResidualTerms] = [block(sp.eye_array(len(loads), format="csr"), loads, loads.shape[1])]
+    blocks += [block(term, Phi, 0) for term in ([X] if base.spectral is None else base.terms)]
+    on_contact = ContactFunctionals(factor.trailing_factor, len(squares), of_solution)
     if forces is None:
-        blocks += [block(B_q.T @ chi) for B_q in B.terms]
+        blocks += [block(B_q.T, chi, len(B.terms) + chi.shape[1]) for B_q in B.terms]
     else:
-        blocks += [on_contact, ColumnBlock(on_contact.combined(forces))]
-    compliance = ContactCompliance(base.compliance, _near(problem, chi, training))
+        values = on_contact.combined(forces)
+        blocks += [on_contact, ColumnBlock(values, of_solution * np.linalg.norm(values, axis=0))]
+    compliance = ContactCompliance(base.compliance, _near(problem, chi, training), base.compliance_error)
     contact_basis = np.ascontiguousarray(Phi[dofs])
     z, typical, held = _sampled(model, base, compliance, contact_basis, forces, training)
     residual, U = residual_basis(blocks, z, typical, len(dofs))
     directions = scipy.linalg.solve_triangular(factor.trailing_factor, U)
-    corrections = prepare_corrections(base.constraint, scaled, base.compliance, held, contact_basis, directions)
-    return OnlineCertificate(base, residual, directions, compliance, contact_basis, chi, forces, corrections)
+    corrections = prepare_corrections(base.constraint, scaled, compliance, held, contact_basis, directions)
+    trailing, scale = np.abs(factor.trailing_factor), np.sqrt(squares[dofs])
+    # of the dense factor γ_{k+1}|F|ᵀ|F|, whose largest row sum in units of S is at least its norm
+    dense = (len(dofs) + 2.0) * UNIT_ROUND_OFF * float(np.max(trailing.T @ (trailing @ (1.0 / scale)) / scale))
+    eta = 1.01 * eliminated + 1.02 * dense / base.share.value
+    # what triangular solutions miss of U in the norm of F⁻ᵀE c, and the round-off in products of c with the directions:
+    # Σ |c_i| √C_ii is at most the root below times ‖w‖
+    solved = float(np.linalg.norm(trailing @ np.abs(directions)))
+    spread = sqrt(len(dofs) * float(np.diag(base.compliance) @ np.sum(trailing**2, axis=0)))
+    rounded = EPS * (sum(directions.shape) + 16.0) * (solved + spread)
+    margin = 1.01 * (2.0 * eta + residual.distortion + base.compliance_error + rounded) if eta < 0.5 else inf
+    return OnlineCertificate(base, residual, directions, compliance, contact_basis, chi, forces, margin, corrections)
 
 
 def _near(problem: Problem, chi: Array, training: Array) -> Indices:

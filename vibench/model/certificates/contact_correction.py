@@ -6,7 +6,8 @@ with γ c = Bᵀ(ν − λ), multipliers ν ≥ 0 and complementarity. Let S = B
 λ_i > 0 in which releasing λ_i alone violates the constraint, λ_i S_ii > −s_i, and those that other w violate; on the
 other rows, J, ν = 0. Then ν = λ + S_II⁻¹(s + v + S_IJ λ_J) on I, with v ≥ 0 and ν ≥ 0. Few rows leave v = 0, so that
 one factorisation of S_II serves all steps. Optimality of w is not verified, feasibility is. Rows far from the contact
-are skipped if |B w| ≤ Σ_j |B_ij| √C_jj ‖w‖, the inequality of Cauchy and Schwarz, suffices.
+are skipped if |B w| ≤ Σ_j |B_ij| √C_jj ‖w‖, the inequality of Cauchy and Schwarz, suffices. The computed C decides
+on no row: w has the values C c, and is within μ ‖w‖ of X⁻¹ E c, with the μ of `vibench.model.certificates.base`.
 
 **Complementarity.** ν = ν₀ + M v ≥ 0, v ≥ 0, νᵀv = 0, with M symmetric positive definite, has one solution. The
 primal-dual active set method (Hintermüller, Ito and Kunisch, 2002) takes few steps, but it may cycle where M is no
@@ -111,9 +112,15 @@ def descent(M: Array, fixed: Array) -> Array:
 
 
 def tied_correction(
-    C: Array, contact: Contact, excess: Array, round_off: Array, size: Array, lam: Array, gamma: float
-) -> tuple[Array, float, float, Array, float, float] | None:
-    """Values c (k,), ‖w'‖, κ, ν (m,), νᵀ(B w' − s) and η; `None` without equalities, or if no w was found.
+    compliance: ContactCompliance,
+    contact: Contact,
+    excess: Array,
+    round_off: Array,
+    size: Array,
+    lam: Array,
+    gamma: float,
+) -> tuple[Array, float, float, Array, float, float, float] | None:
+    """The attributes of a `ContactCorrection` besides its unknowns; `None` without equalities, or if no w was found.
 
     `excess` is s (m,), with bounds of its round-off and of its terms.
     """
@@ -122,7 +129,12 @@ def tied_correction(
     rows = rows_that_matter(B, contact.g, 1e-12 * size, lam)
     if not rows.equal.any():
         return None
-    L, kept, lengths = np.linalg.cholesky(C), rows.kept, row_norms(B)[rows.kept]
+    L, kept, lengths = np.linalg.cholesky(compliance.matrix), rows.kept, row_norms(B)[rows.kept]
+    # what C misses of the energy of values of w, and the factor and solutions with it of C
+    condition = float(np.linalg.norm(abs(scipy.linalg.solve_triangular(L, np.eye(len(L)), lower=True)) @ abs(L)))
+    loss = compliance.error + 4.0 * EPS * (len(L) + 4.0) * condition**2
+    if not loss <= 0.1:  # η is twice what it would be without
+        return None
     whitened = np.asarray((B @ L).T)
     equalities = Equalities.from_rows(whitened[:, rows.equalities], lambda y: np.asarray(L @ y), B)
     K, load = -whitened[:, kept] / lengths / np.sqrt(gamma), -(whitened @ lam) / np.sqrt(gamma)
@@ -139,15 +151,19 @@ def tied_correction(
         eta = equalities.distance((np.abs(slack) + rounded)[rows.equalities])
         # ν belongs to the w before the step: its distance counts twice.
         eta += equalities.distance(np.abs(missed))
-        reach = equalities.reach * eta
-        lacking = np.where(rows.implied, 0.0, rounded + reach - slack)
+        moved = equalities.reach * eta
+        lacking = np.where(rows.implied, 0.0, rounded + moved - slack)
         if np.all(lacking <= 0.0):  # NaN is not
             y = scipy.linalg.solve_triangular(L, w, lower=True)
             nu = rows.multipliers(np.where(rows.equal, forces, np.maximum(forces, 0.0)) / lengths, len(lam))
             # slack may be infinite on absent rows, where multipliers are zero
-            kappa, gap = (dual_gap(one, np.where(one > 0.0, slack, 0.0)) + float(one @ reach) for one in (lam, nu))
+            most = slack + rounded
+            kappa, gap = (dual_gap(one, np.where(one > 0.0, most, 0.0)) + float(one @ moved) for one in (lam, nu))
             c = scipy.linalg.solve_triangular(L, y, lower=True, trans="T")
-            return c, float(np.linalg.norm(y)) + eta, kappa, nu, gap, eta
+            norm = float(np.linalg.norm(y)) * (1.0 + loss)
+            # also the round-off in the forces of ν − λ
+            away = loss * norm + EPS * (len(L) + len(lam) + 8.0) * float(abs(B) @ compliance.root @ (lam + nu)) / gamma
+            return c, norm + eta, kappa, nu, gap, eta, away
         margin = 10.0 * np.maximum(margin, np.where(rows.equal, 0.0, np.nan_to_num(lacking[kept], posinf=0.0)))
     return None
 
@@ -169,6 +185,8 @@ class ContactCorrection:
         ν is `None` for a w that holds dependent rows as equalities, with forces that pull: no such ν is known.
     eta
         Where there are equalities, another w' satisfies B w' ≥ s, with ‖w' − w‖ at most this; the others are of w'.
+    away
+        Bound of the distance of w from the one that belongs to ν, by round-off.
     """
 
     unknowns: Indices
@@ -178,17 +196,20 @@ class ContactCorrection:
     nu: Array | None
     gap: float
     eta: float
+    away: float
 
 
 @dataclass(frozen=True)
 class ContactCompliance:
     """The compliance C (k×k) on all contact unknowns, and on those that corrections usually involve.
 
-    These are `near`: positions (l,), rising, of the unknowns that rows near the support of the generators touch.
+    `near` are positions (l,), rising, of the unknowns that rows near the support of the generators touch. `error` is
+    the μ of C (`vibench.model.certificates.base`).
     """
 
     matrix: Array
     near: Indices
+    error: float = 0.0
 
     @cached_property
     def root(self) -> Array:
@@ -239,10 +260,11 @@ def find_contact_correction(
         near[np.repeat(np.arange(len(lam)), np.diff(B.indptr))[~inside]] = False
         if not near[lam > 0.0].all():
             continue
-        best = _Program(C, restricted, near, excess, round_off, reach, terms, lam, gamma).best()
+        root = compliance.root[unknowns]
+        best = _Program(C, restricted, near, excess, round_off, reach, terms, lam, gamma, root, compliance.error).best()
         if best is not None:
             return ContactCorrection(unknowns, *best)
-    tied = tied_correction(compliance.matrix, contact, excess, round_off, total, lam, gamma)
+    tied = tied_correction(compliance, contact, excess, round_off, total, lam, gamma)
     return None if tied is None else ContactCorrection(np.arange(len(compliance.matrix)), *tied)
 
 
@@ -259,24 +281,30 @@ class _Program:
     terms: Array
     lam: Array
     gamma: float
+    root: Array
+    error: float
 
-    def best(self) -> tuple[Array, float, float, Array | None, float, float] | None:
+    def best(self) -> tuple[Array, float, float, Array | None, float, float, float] | None:
         """The attributes of a `ContactCorrection` besides its unknowns, in their order."""
         B, margin = self.B, first_margin(self.round_off)
         size = sp.csr_array((np.abs(B.data), B.indices, B.indptr), B.shape)
+        unit = 1.01 * EPS * (len(self.root) + len(self.lam) + 8.0)
         for _ in range(4):
             for load, values, norm, nu in self._minimisers(self.excess + margin):
                 slack = self.B @ values - self.excess
-                lacking = self.terms * (size @ np.abs(values)) + self.round_off - slack
+                # with the round-off in C c
+                uncertain = unit * float(self.root @ np.abs(load))
+                rounded = self.terms * (size @ np.abs(values)) + self.round_off + self.reach * uncertain
                 # 1e-10 more than the round-off in ‖w‖ and in the bound of |B w|
                 far = self.reach * norm * (1.0 + 1e-10) + self.excess + self.round_off
-                lacking = np.where(self.near, lacking, far)
+                lacking = np.where(self.near, rounded - slack, far)
                 if np.all(lacking <= 0.0):  # NaN is not
-                    pushing = np.maximum(nu, 0.0)
+                    pushing, most = np.maximum(nu, 0.0), slack + rounded
                     # A force pulls if ν is negative beyond the round-off in ν − λ + λ.
                     pulls = np.any(nu < -8.0 * EPS * self.lam)
-                    gap = dual_gap(pushing, slack)
-                    return load, norm, dual_gap(self.lam, slack), None if pulls else pushing, gap, 0.0
+                    away = self.error * norm + unit * float(self.reach @ (pushing + self.lam)) / self.gamma
+                    kappa, gap = dual_gap(self.lam, most), dual_gap(pushing, most)
+                    return load, norm, kappa, None if pulls else pushing, gap, 0.0, away
                 if np.any(lacking[~self.near] > 0.0):
                     return None
                 margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking, nan=0.0, posinf=0.0))
@@ -294,7 +322,9 @@ class _Program:
             values = self.compliance @ load
             violated = self.near & ~chosen & (excess - self.B @ values > self.round_off)
             if not violated.any():
-                yield load, values, float(np.sqrt(max(0.0, float(load @ values)))), self.lam + difference
+                rounded = 2.02 * EPS * (len(load) + 4.0) * float(self.root @ np.abs(load)) ** 2
+                square = (max(0.0, float(load @ values)) + rounded) * (1.0 + self.error)
+                yield load, values, float(np.sqrt(square)), self.lam + difference
                 return
             chosen |= violated
 
@@ -350,12 +380,13 @@ def defect_corrected_bounds(
     solution: tuple[Array, Array, Array],
     residual: tuple[Array, float],
     spectrum: tuple[float, float],
+    margin: float,
 ) -> tuple[float, float]:
     """Bounds of ‖u − u_N‖_A and of ‖Bᵀ(λ − λ_N)‖_{A⁻¹}; infinite where no correction was found.
 
     `directions` are the coordinates (k×K) of the contact unknowns, as functionals, in the basis of residuals;
     `solution` is u_N (k,) on the contact unknowns, a bound (k,) of its round-off, and λ_N ≥ 0 (m,); `residual` its
-    coordinates (K,) and the norm of what they lack; `spectrum` α > 0 and γ.
+    coordinates (K,) and the norm of what they lack; `spectrum` α > 0 and γ; `margin` that of the certificate.
     """
     (on_contact, uncertain, lam), (coordinates, outside), (lower, upper) = solution, residual, spectrum
     middle = 0.5 * (lower + upper)
@@ -368,9 +399,10 @@ def defect_corrected_bounds(
     # the coordinates of X w, whose rest is orthogonal to z
     along = found.load @ directions[found.unknowns]
     beside = max(0.0, found.norm**2 - float(along @ along))
-    round_off = terms * EPS * (float(np.linalg.norm(moved)) + found.norm)
+    round_off = (terms * EPS + margin) * (float(np.linalg.norm(moved)) + found.norm)
     distance = float(np.linalg.norm(moved - along)) + round_off
-    distance = sqrt(distance**2 + beside + terms * EPS * found.norm**2)
-    left = (outside + 0.5 * (upper - lower) * distance + middle * (found.eta + round_off)) / sqrt(lower)
-    delta = sqrt(left**2 + 2.0 * found.gap) + found.eta * sqrt(upper)
+    distance = sqrt(distance**2 + beside + (terms * EPS + 2.0 * margin) * found.norm**2)
+    eta = found.eta + found.away
+    left = (outside + 0.5 * (upper - lower) * distance + middle * (eta + round_off)) / sqrt(lower)
+    delta = sqrt(left**2 + 2.0 * found.gap) + eta * sqrt(upper)
     return sqrt(upper) * distance + delta, middle * found.norm / sqrt(lower) + delta

@@ -12,7 +12,7 @@ v = 0 where λ > 0 costs nothing, as there, and its systems have the size of the
 Where B(µ) is θ(µ) B₀ everywhere, w is the best one, but for λ beyond J, in rows that do not touch. Where it is so on
 some bodies alone, w is the best of those that deform no other body: of two equal ones in contact the correction of one
 has √2 times the norm of that of both. In either case it must satisfy B w ≥ s in all rows, with the B of the parameter
-and bounds of round-off; C is taken as it is stored, and |C_ij| ≤ √C_ii √C_jj. Otherwise there is no prepared one.
+and bounds of round-off. Otherwise there is no prepared one.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.linalg import EPS
 from vibench.linalg.definite import connected_blocks
 from vibench.model.bound_terms import dual_gap, first_margin
-from vibench.model.certificates.contact_correction import complementary
+from vibench.model.certificates.contact_correction import ContactCompliance, complementary
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,8 @@ class PreparedCorrections:
         Coordinates (j×K) of the rows J of B₀ as functionals, in the basis of residuals.
     terms
         Bound of the number of round-off errors, of size `EPS`, in an entry of s and of B w; but for those of B.
+    error
+        The μ of C (`vibench.model.certificates.base`).
     """
 
     moved: Indices
@@ -70,39 +72,43 @@ class PreparedCorrections:
     sizes: Array
     directions: Array
     terms: int
+    error: float
 
     def correction(
         self, B: float | SparseMatrix, g: Array, g_size: Array, y: Array, lam: Array, gamma: float
-    ) -> tuple[Array, float, float] | None:
-        """Coordinates (K,) of X w in the basis of residuals, ‖w‖, and κ; `None` if no w was found.
+    ) -> tuple[Array, float, float, float] | None:
+        """Coordinates (K,) of X w in the basis of residuals, ‖w‖, κ, and the round-off in the coordinates, as a norm.
 
         `B` is θ where B(µ) is θ(µ) B₀ everywhere, else B (m×k); `g_size` is a bound (m,) of the terms that g (m,) is
-        the sum of; `y` are coordinates (d,) of u_N.
+        the sum of; `y` are coordinates (d,) of u_N. `None` if no w was found.
         """
         found = self._feasible(B, g, g_size, y, lam, gamma)
         if found is None:
             return None
-        _, a, norm, slack = found
-        return a @ self.directions, norm, dual_gap(lam, slack)
+        _, a, norm, most = found
+        rounded = 2.0 * self.terms * EPS * float(self.reach @ np.abs(a))
+        return a @ self.directions, norm, dual_gap(lam, most), rounded
 
     def multiplier(
         self, theta: float, g: Array, g_size: Array, y: Array, lam: Array, gamma: float
-    ) -> tuple[Array, float, float] | None:
+    ) -> tuple[Array, float, float, float] | None:
         """The multiplier ν ≥ 0 (m,) with γ X w = Bᵀ(ν − λ), ‖w‖, and νᵀ(B w − s), where B(µ) is θ B₀ everywhere.
 
-        Elsewhere w is the best of those that deform some bodies alone, and there is no such ν.
+        Also a bound of the distance of w from the one that belongs to ν. Elsewhere w is the best of those that deform
+        some bodies alone, and there is no such ν.
         """
         found = self._feasible(theta, g, g_size, y, lam, gamma)
         if found is None:
             return None
-        (nu, _, norm, slack), on_all = found, lam.copy()
+        (nu, _, norm, most), on_all = found, lam.copy()
         on_all[self.rows] = np.maximum(nu, 0.0)
-        return on_all, norm, dual_gap(on_all, slack)
+        away = 8.0 * EPS * abs(theta) * float(self.reach @ (on_all + lam).take(self.rows)) / gamma
+        return on_all, norm, dual_gap(on_all, most), away + self.error * norm
 
     def _feasible(
         self, B: float | SparseMatrix, g: Array, g_size: Array, y: Array, lam: Array, gamma: float
     ) -> tuple[Array, Array, float, Array] | None:
-        """The ν on the rows J, a with c = B₀ᵀ a, ‖w‖ and B w − s (m,) of a w that is feasible."""
+        """The ν on the rows J, a with c = B₀ᵀ a, and bounds of ‖w‖ and B w − s (m,) of a w that is feasible."""
         B = B if isinstance(B, (float, sp.csr_array)) else sp.csr_array(B)
         theta, terms = (B, self.terms) if isinstance(B, float) else (1.0, self.terms + int(np.diff(B.indptr).max()))
         # B vanishes, and no load on its rows lifts anything.
@@ -119,11 +125,13 @@ class PreparedCorrections:
             a = (theta / gamma) * (nu - here)  # c = B₀ᵀ a
             values = np.zeros(len(self.basis))
             values[self.moved] = self.responses @ a
-            slack = _times(B, values) - excess
-            lacking = round_off + (unit * float(self.reach @ np.abs(a))) * size[:, 1] - slack
+            slack, reach = _times(B, values) - excess, float(self.reach @ np.abs(a))
+            rounded = round_off + (unit * reach) * size[:, 1]
+            lacking = rounded - slack
             if lacking.max() <= 0.0:  # NaN is not
                 square = float(a @ (values.take(self.rows) if isinstance(B, float) else self.compliance @ a))
-                return nu, a, max(0.0, square) ** 0.5, slack
+                norm = ((max(0.0, square) + 2.0 * unit * reach**2) * (1.0 + self.error)) ** 0.5
+                return nu, a, norm, slack + rounded
             # Larger margins on J do not help if only rows beyond J are violated.
             if lacking[self.rows].max() <= 0.0:
                 return None
@@ -151,7 +159,7 @@ def constant_unknowns(compliance: Array, constraints: list[SparseMatrix]) -> Mas
 
 
 def prepare_corrections(
-    B: SparseMatrix, scaled: bool, compliance: Array, rows: Mask, basis: Array, directions: Array
+    B: SparseMatrix, scaled: bool, compliance: ContactCompliance, rows: Mask, basis: Array, directions: Array
 ) -> PreparedCorrections | None:
     """Prepare corrections by loads that are multiples of some rows of B₀; `None` where these are dependent, or none.
 
@@ -160,8 +168,8 @@ def prepare_corrections(
     `directions` (k×K).
     """
     J, B = np.flatnonzero(rows), sp.csr_array(B)
-    chosen, root = B[J], np.sqrt(np.diag(compliance))
-    responses = np.asarray((chosen @ compliance).T)
+    chosen, root = B[J], compliance.root
+    responses = np.asarray((chosen @ compliance.matrix).T)
     S = np.asarray(chosen @ responses)
     S = 0.5 * (S + S.T)
     # rows are dependent beyond a condition number of 1e9: M would have lost more digits than margins cover
@@ -176,6 +184,5 @@ def prepare_corrections(
     terms = max(basis.shape[1], len(J)) + 2 * int(np.diff(B.indptr).max()) + 8
     reach, along = abs(chosen) @ root, np.asarray(chosen @ directions)
     symmetric = 0.5 * (inverse + inverse.T)
-    return PreparedCorrections(
-        moved, J, symmetric, S, reach, basis, np.ascontiguousarray(responses[moved]), sizes, along, terms
-    )
+    few = np.ascontiguousarray(responses[moved])
+    return PreparedCorrections(moved, J, symmetric, S, reach, basis, few, sizes, along, terms, compliance.error)

@@ -11,6 +11,13 @@ P = I − UUᵀ,
     ‖P R z‖ ≤ ‖P R D‖ ‖D⁻¹z‖,      and    Σ_j |z_j| ‖F⁻ᵀt_j‖    over the terms that are left out.
 
 Sharpness alone depends on d: samples of z give it, and how much is left out is a share of the norms that they have.
+
+**Round-off.** A computed y_j ≈ F⁻ᵀt_j has ‖t_j − Fᵀy_j‖_{X⁻¹} ≤ ε_j, whatever the condition number of X is. With
+FᵀF ≼ (1 + η) X,
+
+    ‖Σ_j z_j t_j‖_{X⁻¹} ≤ √(1 + η) |Σ_j z_j y_j| + Σ_j |z_j| ε_j,    Σ_j |z_j| ε_j ≤ |Dε| ‖D⁻¹z‖ for the terms kept.
+
+What U and UᵀR miss of R is computed from them, as R D − U UᵀR D, so that no more is assumed of the decompositions.
 """
 
 from __future__ import annotations
@@ -19,6 +26,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from math import isqrt, sqrt
 from typing import Protocol
 
 import numpy as np
@@ -38,6 +46,10 @@ class ResidualTerms(Protocol):
     def norms(self) -> Array:
         """Their norms (p,)."""
 
+    @property
+    def errors(self) -> Array:
+        """Their ε_j (p,)."""
+
     def columns(self, chosen: Indices) -> Array:
         """The chosen ones (n×c)."""
 
@@ -47,9 +59,10 @@ class ResidualTerms(Protocol):
 
 @dataclass(frozen=True)
 class ColumnBlock:
-    """A block that is stored as an array (n×p)."""
+    """A block that is stored as an array (n×p), with its ε_j (p,)."""
 
     values: Array
+    errors: Array
 
     @property
     def norms(self) -> Array:
@@ -66,16 +79,23 @@ class ColumnBlock:
 class ContactFunctionals:
     """The functionals that act on one contact unknown each, in coordinates that have these unknowns at the end.
 
-    There X = FᵀF with F upper triangular, and `trailing` is its last block (k×k); n is the dimension of the space.
+    There X = FᵀF with F upper triangular, and `trailing` is its last block (k×k); n is the dimension of the space. ε_j
+    is `error` times the norm.
     """
 
     trailing: Array
     dim: int
+    error: float
 
     @cached_property
     def norms(self) -> Array:
-        inverse = scipy.linalg.solve_triangular(self.trailing, np.eye(len(self.trailing)), check_finite=False)
-        return np.asarray(np.linalg.norm(inverse, axis=1))
+        identity = np.eye(len(self.trailing))
+        columns = scipy.linalg.solve_triangular(self.trailing, identity, trans="T", check_finite=False)
+        return np.asarray(np.linalg.norm(columns, axis=0))
+
+    @property
+    def errors(self) -> Array:
+        return self.error * self.norms
 
     def columns(self, chosen: Indices) -> Array:
         return self.combined(np.eye(len(self.trailing))[:, chosen])
@@ -101,31 +121,38 @@ class ResidualBasis:
     inverse_scale
         1/d (p,).
     remainder
-        Bound of ‖P R D‖, and of the round-off in coordinates for ‖D⁻¹z‖ = 1.
+        Bound of ‖P R D‖.
+    round_off
+        Bound of the round-off in coordinates and of the ε_j, for ‖D⁻¹z‖ = 1.
     norms
-        Norms (Z,) of the terms that are left out; zero for those that are kept.
+        Norms (Z,) of the terms that are left out, with their ε_j; zero for those that are kept.
+    distortion
+        Bound of ‖UᵀU − I‖, and of the same of the transformation that left few rows.
     """
 
     kept: Indices
     factor: Array
     inverse_scale: Array
     remainder: float
+    round_off: float
     norms: Array
+    distortion: float
 
     def parts(self, z: Array) -> tuple[Array, float, float]:
         """The residual with coefficients z (Z,): its coordinates (K,) in U, and bounds of what is left out of them.
 
-        These are of the part that is orthogonal to U with the round-off, and of the terms that are left out.
+        These are of the part that is orthogonal to U, and of the terms that are left out with all round-off.
         """
         represented = z.take(self.kept)
         scaled = self.inverse_scale * represented
-        beside = self.remainder * float(scaled @ scaled) ** 0.5
-        return self.factor @ represented, beside, float(self.norms @ np.abs(z))
+        size = float(scaled @ scaled) ** 0.5
+        missing = float(self.norms @ np.abs(z)) + self.round_off * size
+        return self.factor @ represented, self.remainder * size, missing
 
     def norm(self, z: Array) -> float:
         """Upper bound of the dual norm of the residual."""
         coordinates, beside, missing = self.parts(z)
-        return float(np.hypot(np.linalg.norm(coordinates), beside)) + missing
+        return float(np.hypot(np.linalg.norm(coordinates), beside)) * (1.0 + self.distortion) + missing
 
 
 def residual_basis(
@@ -150,44 +177,70 @@ def residual_basis(
     keep[order[np.cumsum(mean[order]) <= fraction * typical]] = False
     # contributions below 1e-12 of the largest one are round-off of the others
     kept = np.flatnonzero(keep & (largest > 1e-12 * largest.max(initial=0.0)))
-    pairs = zip(blocks, ranges, strict=True)
+    pairs, errors = zip(blocks, ranges, strict=True), np.concatenate([block.errors for block in blocks])
     R = np.hstack([block.columns(kept[(kept >= a) & (kept < b)] - a) for block, (a, b) in pairs])
+    scale, rotated, lost = scale[kept], 0.0, 0.0
     if last is not None:
-        R = _with_fewer_rows(R, last)
-    inverse = 1.0 / scale[kept]
+        R, rotated, lost = _with_fewer_rows(R, last, scale)
+    inverse = 1.0 / scale
     reach = float(np.linalg.norm(inverse[:, None] * samples[kept], axis=0).mean())
     # directions left out are orthogonal to the others: 40 % of the typical norm adds 8 % in quadrature
-    U, remainder = _directions(R, scale[kept], 0.4 * typical / max(reach, np.finfo(float).tiny))
-    norms[kept], factor = 0.0, U.T @ R
-    # the round-off in sums of p terms, of the product UᵀR and of that with z, see Higham 2002, §3.1
-    round_off = 1.01 * EPS * (len(kept) + 8.0) * float(np.linalg.norm(factor * scale[kept]))
-    basis = ResidualBasis(kept, factor, inverse, remainder + round_off, norms)
+    U, few = _directions(R, scale, 0.4 * typical / max(reach, np.finfo(float).tiny))
+    factor, (rows, count) = U.T @ R, U.shape
+    left = R * scale - U @ (factor * scale)
+    # the round-off in sums of so many terms, see Higham 2002, §3.1 and 3.5
+    unit, lengths = 1.01 * EPS, [float(np.linalg.norm(part * scale)) for part in (R, factor)]
+    rounded = unit * (count + 4.0) * (lengths[0] + sqrt(count) * lengths[1])
+    remainder = length = float(np.linalg.norm(left))
+    if few:  # more is left than round-off: the spectral norm, with more than the round-off in it
+        small = left.T if left.shape[1] < rows else left
+        remainder = min(remainder, sqrt(float(np.linalg.norm(small @ small.T, 2)) * (1.0 + 1e-7)))
+    across = float(np.linalg.norm(U.T @ left)) + unit * (rows + 4.0) * sqrt(count) * length + rounded
+    round_off = lost + across + unit * (len(kept) + 8.0) * lengths[1]
+    round_off += float(np.linalg.norm(scale * (errors[kept] + 4.0 * EPS * norms[kept])))
+    norms += errors + 4.0 * EPS * norms
+    norms[kept] = 0.0
+    distortion = rotated + _distortion(U)
+    basis = ResidualBasis(kept, factor, inverse, remainder + rounded, round_off, norms, distortion)
     return basis, U if last is None else U[len(U) - last :]
 
 
-def _with_fewer_rows(R: Array, last: int) -> Array:
-    """The matrix R (n×p) after an orthogonal transformation that leaves few of all rows but the last ones."""
+def _distortion(Q: Array) -> float:
+    """Bound of ‖QᵀQ − I‖ (n×k); sums of √n sums of √n terms have less round-off than sums of n terms."""
+    parts = np.array_split(Q, isqrt(len(Q)) + 1)
+    rounded = 1.01 * EPS * (len(parts) + len(parts[0]) + 4.0) * Q.shape[1]
+    return float(np.linalg.norm(sum(part.T @ part for part in parts) - np.eye(Q.shape[1])) + rounded)
+
+
+def _with_fewer_rows(R: Array, last: int, scale: Array) -> tuple[Array, float, float]:
+    """R (n×p) after an orthogonal transformation that leaves few of all rows but the last ones.
+
+    Also its distortion, and a bound of what it loses of the norm of R D z, D = diag(`scale`), for |z| = 1.
+    """
     first, last_rows = R[: len(R) - last], R[len(R) - last :]
     entering = np.flatnonzero(first.any(axis=0))
-    if 2 * len(entering) >= len(first):
-        return R
-    few = np.zeros((len(entering), R.shape[1]))
-    few[:, entering] = np.linalg.qr(first[:, entering], mode="r")
-    return np.vstack([few, last_rows])
+    count = len(entering)
+    if 2 * count >= len(first):
+        return R, 0.0, 0.0
+    few = np.zeros((count, R.shape[1]))
+    Q, few[:, entering] = np.linalg.qr(first[:, entering])
+    lost = float(np.linalg.norm((first[:, entering] - Q @ few[:, entering]) * scale[entering]))
+    lost += 1.01 * EPS * (count + 4.0) * sqrt(count) * float(np.linalg.norm(few * scale))
+    return np.vstack([few, last_rows]), _distortion(Q), lost
 
 
-def _directions(R: Array, scale: Array, allowed: float) -> tuple[Array, float]:
-    """Orthonormal basis (n×K) of S = R D (n×p), D = diag(`scale`), up to a remainder, and a bound of its norm.
+def _directions(R: Array, scale: Array, allowed: float) -> tuple[Array, bool]:
+    """Orthonormal basis (n×K) of S = R D (n×p), D = diag(`scale`), up to a remainder of at most `allowed`.
 
-    It is at most `allowed`. If 800 principal directions are not enough, or save few of the columns, the basis is of all
-    columns, and nothing remains.
+    If 800 principal directions are not enough, or save few of the columns, the basis is of all columns. Also whether it
+    is of fewer.
     """
     count, rest = R.shape[1], 0.0
     # A decomposition of so many terms would cost more than a randomised one, with 100 directions to spare.
     if count > 1000:
         randomised = _random_range(R, scale, allowed, limit=900, block=100)
         if randomised is None:
-            return np.linalg.qr(R * scale)[0], 0.0
+            return np.linalg.qr(R * scale)[0], False
         Q, small, rest = randomised
     else:
         Q, small = np.linalg.qr(R * scale)
@@ -198,8 +251,8 @@ def _directions(R: Array, scale: Array, allowed: float) -> tuple[Array, float]:
     remainders = np.hypot(np.append(sigma, 0.0), rest)
     enough = int(np.argmax(remainders <= allowed))
     if remainders[enough] <= allowed and enough <= min(800, 0.7 * count):
-        return Q @ left[:, :enough], float(remainders[enough])
-    return (Q if count <= 1000 else np.linalg.qr(R * scale)[0]), 0.0
+        return Q @ left[:, :enough], True
+    return (Q if count <= 1000 else np.linalg.qr(R * scale)[0]), False
 
 
 def _random_range(

@@ -53,15 +53,23 @@ class TermRanges:
         θ(µ̄) (Q,), none of them zero.
     lower, upper
         l_q and h_q (Q,).
+    error
+        Bound of the difference between X and the sum, and of the round-off in sums, for the largest |t_q| = 1.
     """
 
     reference: Array
     lower: Array
     upper: Array
+    error: float
 
     @classmethod
-    def of(cls, terms: Sequence[SparseMatrix], reference: Array, X: InnerProduct) -> TermRanges | None:
-        """Prove the ranges of terms A_q (n×n) whose sum with θ(µ̄) (Q,) is X; `None` where one is not proved."""
+    def of(
+        cls, terms: Sequence[SparseMatrix], reference: Array, X: InnerProduct, error: float = 0.0
+    ) -> TermRanges | None:
+        """Prove the ranges of terms A_q (n×n); `None` where one is not proved.
+
+        Their sum with θ(µ̄) (Q,) is X but for an error relative to it.
+        """
         if not np.all(reference != 0.0):
             return None
         ranges = [_range(theta * sp.csr_array(term), X) for theta, term in zip(reference, terms, strict=True)]
@@ -69,7 +77,8 @@ class TermRanges:
         if len(found) < len(ranges):
             return None
         lower, upper = np.array(found).T
-        return cls(reference, lower, upper)
+        rounded = (len(reference) + 4.0) * EPS * (1.0 + 2.0 * float(np.sum(upper - lower)))
+        return cls(reference, lower, upper, error + rounded)
 
     def evaluate(self, theta: Array) -> tuple[float, float]:
         """The bounds α(µ) and γ(µ) with θ(µ) (Q,)."""
@@ -77,15 +86,9 @@ class TermRanges:
         # a column for every τ
         above = t[:, None] - t
         low, high = above * self.lower[:, None], above * self.upper[:, None]
-        # the round-off in these sums
-        room = self.round_off * float(np.abs(t).max())
+        room = self.error * float(np.abs(t).max())
         lower, upper = t + np.minimum(low, high).sum(axis=0), t + np.maximum(low, high).sum(axis=0)
         return float(lower.max()) - room, float(upper.min()) + room
-
-    @cached_property
-    def round_off(self) -> float:
-        """Round-off in the sums of `evaluate`, relative to the largest t_q."""
-        return (len(self.reference) + 4.0) * EPS * (1.0 + 2.0 * float(np.sum(self.upper - self.lower)))
 
 
 def _range(term: SparseMatrix, X: InnerProduct) -> tuple[float, float] | None:
@@ -278,14 +281,15 @@ def spectral_bounds(
     X: InnerProduct,
     terms: list[SparseMatrix],
     theta: Callable[[Array], Array],
-    error: float,
+    missed: Callable[[Array], float],
     ranges: TermRanges | None = None,
 ) -> SpectralBounds:
-    """Bounds from the first terms A_q (n×n) of A, coefficients θ (Q,) of all as a function of mu, and η of these."""
+    """Bounds from the first terms A_q (n×n) of A, coefficients θ (Q,) of all as a function of mu, and ‖D(µ)‖."""
     box, leading = problem.parameters, np.eye(len(terms), len(theta(problem.parameters.lower)))
     grid = AnchorGrid.of(box, lambda mu: leading @ theta(mu), np.array([largest_quotient(term, X) for term in terms]))
     points = grid.points(box)
     constants = [coercivity_and_continuity(checked_assembly(problem, mu).A, X) for mu in points]
+    error = max(missed(mu) for mu in points)
     alpha, gamma = (np.array([constant.value for constant in one]) for one in zip(*constants, strict=True))
     coefficients, proved = (
         np.column_stack([theta(mu) for mu in points]),

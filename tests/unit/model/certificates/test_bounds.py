@@ -235,8 +235,8 @@ def test_what_equalities_may_miss_enters_where_the_derivation_says(
     def missing_more(*given: Any) -> Any:
         found = of_ties(*given)
         assert found is not None
-        assert found[-1] < 1e-9
-        return (*found[:-1], eta)
+        assert found[-2] < 1e-9
+        return (*found[:-2], eta, found[-1])
 
     monkeypatch.setattr(contact_correction, "tied_correction", missing_more)
     bound, other = certificate.certify(problem, mu, reduced, x, alpha)
@@ -339,8 +339,8 @@ def test_where_no_prepared_correction_is_feasible_the_best_one_is_computed_and_i
     monkeypatch.setattr(bounds_module, "defect_corrected_bounds", lambda *_: (np.inf, np.inf))  # if none are prepared
     problem, model, certificate = prepared("affine", constraint="scaled")
     term, rows = problem.affine["B"].terms[0][:, CONTACT], np.arange(M) < 2
-    base, at_contact = certificate.base, (certificate.contact_basis, certificate.contact_directions)
-    few = replace(certificate, prepared=prepare_corrections(term, True, base.compliance, rows, *at_contact))
+    at_contact = certificate.contact_basis, certificate.contact_directions
+    few = replace(certificate, prepared=prepare_corrections(term, True, certificate.compliance, rows, *at_contact))
     without = replace(certificate, prepared=None)
     assert few.prepared is not None
     for mu in BOX.sample(20, 6):
@@ -373,7 +373,9 @@ def test_small_residuals_keep_their_digits(constraint: str) -> None:
         if certificate.forces is not None:
             of_lam = force[CONTACT]
         z = np.concatenate([np.ones(1), -x, -of_lam])
-        whitened = [ColumnBlock(certificate.base.X.whiten_functional(block)) for block in blocks]
+        whitened = [
+            ColumnBlock(certificate.base.X.whiten_functional(block), np.zeros(block.shape[1])) for block in blocks
+        ]
         basis, _ = residual_basis(whitened, z[:, None], 0.0)
         exact_norm = size * float(np.sqrt(away @ np.linalg.solve(A, away)))
         assert basis.norm(z) == pytest.approx(exact_norm, rel=1e-5)

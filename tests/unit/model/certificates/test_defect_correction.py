@@ -47,7 +47,7 @@ class Pair:
         solution = self.u_N[CONTACT], np.zeros(len(CONTACT)), self.lam_N
         shown = coordinates[:kept], float(np.linalg.norm(coordinates[kept:]))
         contact = Contact(sp.csr_array(B[:, CONTACT]), g)
-        return defect_corrected_bounds(compliance, directions[:, :kept], contact, solution, shown, self.spectrum)
+        return defect_corrected_bounds(compliance, directions[:, :kept], contact, solution, shown, self.spectrum, 0.0)
 
 
 SIZES = st.sampled_from([0.0, 1e-3, 1.0])

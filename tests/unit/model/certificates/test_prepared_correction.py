@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from numerics import exact, spd
 
 from vibench.interfaces.problem import VariationalInequality
+from vibench.model.certificates.contact_correction import ContactCompliance
 from vibench.model.certificates.prepared_correction import PreparedCorrections, constant_unknowns, prepare_corrections
 
 K, M, D = 9, 6, 3
@@ -27,7 +28,7 @@ def prepared(
     B: np.ndarray, C: np.ndarray, basis: np.ndarray, scaled: bool, rows: np.ndarray = ALL
 ) -> PreparedCorrections | None:
     """The directions are the functionals themselves."""
-    return prepare_corrections(sp.csr_array(B), scaled, C, rows, basis, np.eye(K))
+    return prepare_corrections(sp.csr_array(B), scaled, ContactCompliance(C, np.arange(K)), rows, basis, np.eye(K))
 
 
 @given(
@@ -51,7 +52,7 @@ def test_corrections_are_feasible_also_in_exact_arithmetic_and_the_best_ones(
     assert corrections is not None
     found = corrections.correction(factor if scaled else sp.csr_array(B), g, np.abs(g), y, lam, gamma)
     assert found is not None
-    load, norm, kappa = found
+    load, norm, kappa, _ = found
     w, u = fractions(C) @ fractions(load), fractions(basis) @ fractions(y)
     slack = fractions(B) @ (w - u) + fractions(g)
     unit = Fraction(1e-14 * float((np.abs(B) @ np.abs(C) @ np.abs(load)).max()))  # `load` itself is rounded
@@ -78,8 +79,9 @@ def test_where_rows_are_independent_there_is_always_a_correction(condition: floa
     for seed in seeds:
         rng = np.random.default_rng(seed)
         C, B = np.linalg.inv(spd(size, rng, condition)), rng.standard_normal((rows, size))
+        of_C = ContactCompliance(0.5 * (C + C.T), np.arange(size))
         everything = prepare_corrections(
-            sp.csr_array(B), True, 0.5 * (C + C.T), np.ones(rows, bool), rng.standard_normal((size, D)), np.eye(size)
+            sp.csr_array(B), True, of_C, np.ones(rows, bool), rng.standard_normal((size, D)), np.eye(size)
         )
         assert everything is not None
         y, lam = rng.standard_normal(D), np.maximum(rng.standard_normal(rows), 0.0) * rng.choice([0.0, 1.0])
@@ -122,7 +124,7 @@ def test_rows_without_pressure_are_not_held_where_they_are() -> None:
     g[2] = -1.0
     found = corrections.correction(1.0, g, np.abs(g), np.zeros(D), np.eye(M)[2], 1.0)
     assert found is not None
-    load, _, kappa = found
+    load, _, kappa, _ = found
     assert load == pytest.approx(np.eye(K)[2] * load[2])
     assert (C @ load)[2] == pytest.approx(-1.0)
     assert kappa == pytest.approx(0.0, abs=1e-12)

@@ -13,7 +13,14 @@ X = space(40, 5)
 rng = np.random.default_rng(1)
 DECAY = np.exp(-0.25 * np.arange(60))
 BLOCKS = [rng.standard_normal((40, 50)), rng.standard_normal((40, 10)), np.zeros((40, 2))]
-WHITENED = [ColumnBlock(X.whiten_functional(block)) for block in BLOCKS]
+
+
+def block_of(values: np.ndarray) -> ColumnBlock:
+    """Columns that are what they stand for."""
+    return ColumnBlock(values, np.zeros(values.shape[1]))
+
+
+WHITENED = [block_of(X.whiten_functional(block)) for block in BLOCKS]
 SAMPLES = np.append(DECAY, [1.0, 0.0])[:, None] * rng.standard_normal((62, 30))
 
 
@@ -43,7 +50,7 @@ def test_small_residuals_of_large_terms_keep_their_digits() -> None:
     """Two terms that cancel to 1e-9: the square root of a sum of products would see 1e-8 of noise."""
     term = rng.standard_normal((40, 1))
     blocks = [term, term * (1.0 + 1e-9)]
-    basis, _ = residual_basis([ColumnBlock(X.whiten_functional(block)) for block in blocks], np.ones((2, 3)), 0.0)
+    basis, _ = residual_basis([block_of(X.whiten_functional(block)) for block in blocks], np.ones((2, 3)), 0.0)
     difference = np.array([1.0, -1.0])
     assert basis.norm(difference) == pytest.approx(1e-9 * float(np.linalg.norm(X.whiten_functional(term))), rel=1e-5)
 
@@ -57,7 +64,7 @@ def test_few_directions_are_enough_for_many_terms() -> None:
     """More than 1,000 terms, of which a randomised method finds the directions."""
     terms = X.whiten_functional(rng.standard_normal((40, 40)) * 0.5 ** np.arange(40) @ rng.standard_normal((40, 1100)))
     samples = rng.standard_normal((1100, 30))
-    found, U = residual_basis([ColumnBlock(terms)], samples, 1.0)
+    found, U = residual_basis([block_of(terms)], samples, 1.0)
     assert len(found.factor) < 40 < len(found.kept)
     assert found.remainder > 0.0
     np.testing.assert_allclose(U.T @ U, np.eye(U.shape[1]), atol=1e-12)
@@ -83,8 +90,8 @@ def test_rows_that_few_terms_enter_are_made_fewer() -> None:
     few[:33, :4] = rng.standard_normal((33, 4))
     few[33:] = rng.standard_normal((7, 12))
     samples = rng.standard_normal((12, 20))
-    whole, U = residual_basis([ColumnBlock(few)], samples, 0.0)
-    reduced, tail = residual_basis([ColumnBlock(few)], samples, 0.0, last)
+    whole, U = residual_basis([block_of(few)], samples, 0.0)
+    reduced, tail = residual_basis([block_of(few)], samples, 0.0, last)
     assert tail.shape[0] == last
     functional = rng.standard_normal(last)
     for z in rng.standard_normal((5, 12)):

@@ -41,7 +41,7 @@ class Curved(Problem):
 
 
 T, ROTATED = rotated(tuple(TERMS), np.column_stack([theta(mu) for mu in Curved().training_set()]))
-BOUNDS = spectral_bounds(Curved(), X, ROTATED, lambda mu: T @ theta(mu), 0.0)
+BOUNDS = spectral_bounds(Curved(), X, ROTATED, lambda mu: T @ theta(mu), lambda _: 0.0)
 
 
 def extremes(mu: np.ndarray) -> tuple[float, float]:
@@ -71,7 +71,7 @@ def test_bounds_are_sharp_between_anchors() -> None:
 def test_errors_of_the_terms_widen_the_bounds() -> None:
     mu = np.array([1.1, 0.3])
     narrow = BOUNDS.evaluate(mu, T @ theta(mu))
-    wide = spectral_bounds(Curved(), X, ROTATED, lambda mu: T @ theta(mu), 0.01).evaluate(mu, T @ theta(mu))
+    wide = spectral_bounds(Curved(), X, ROTATED, lambda mu: T @ theta(mu), lambda _: 0.01).evaluate(mu, T @ theta(mu))
     assert wide == pytest.approx((narrow[0] - 0.02, narrow[1] + 0.02))
 
 
@@ -162,7 +162,7 @@ def test_terms_that_are_left_out_are_bounded_by_what_they_are() -> None:
     """The last of three terms, with its largest norm in the place of an error that was measured."""
     points = Curved.parameters.sample(50, 2)
     last = [abs((T @ theta(mu))[2]) * operator_norm(ROTATED[2], X).value for mu in points]
-    found = spectral_bounds(Curved(), X, ROTATED[:2], lambda mu: T @ theta(mu), 1.5 * max(last))
+    found = spectral_bounds(Curved(), X, ROTATED[:2], lambda mu: T @ theta(mu), lambda _: 1.5 * max(last))
     assert found.turn.shape == (2, 3)
     assert not found.turn[:, 2].any()
     for mu in points:
