@@ -5,9 +5,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from copy import deepcopy
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import replace
 from functools import partial
 from types import FrameType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,8 +24,7 @@ from vibench.testing.checks import SECONDS, Check, ConformanceError, Doubt, Note
 from vibench.timing import timed
 
 
-@dataclass(frozen=True, eq=False)
-class KnownProgram:
+class KnownProgram(NamedTuple):
     """A dense program with its solution x (n,) and multipliers α (m,); `None` where these are not unique."""
 
     program: VariationalInequality
@@ -72,16 +72,11 @@ def known_programs() -> dict[str, KnownProgram]:
     }  # fmt: skip
 
 
-@dataclass(eq=False)
 class SolverCase:
     """A QP solver, which is the function that is registered under `vibench.qp_solvers`, and the programs it solves."""
 
-    create: QPSolver
-    _: KW_ONLY
-    seconds: float = SECONDS
-
-    def __post_init__(self) -> None:
-        self.programs = known_programs()
+    def __init__(self, create: QPSolver, *, seconds: float = SECONDS) -> None:
+        self.create, self.seconds, self.programs = create, seconds, known_programs()
         # The program with some active constraints, scaled as it is when a solver gets it.
         self.typical = _scaled(self.programs["some constraints are active"].program)
 
