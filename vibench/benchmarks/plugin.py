@@ -184,6 +184,8 @@ class Passes:
         ours, theirs = Pipe(duplex=False)
         process, reason, status = os.fork(), "", 0
         if not process:
+            # With its own copy of this end open, a send would wait for ever if the other process has died.
+            ours.close()
             self._work(begun, theirs)
         theirs.close()
         limit, parent = self._setting.seconds, os.getppid()
