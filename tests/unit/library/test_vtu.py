@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ NEIGHBOURS = [(1, 3, 4), (2, 0, 5), (3, 1, 6), (0, 2, 7), (7, 5, 0), (4, 6, 1), 
 SMALL = {"hertz3d": {"resolution": 1350}, "hertz": {"resolution": 300}, "obstacle": {"resolution": 200}}
 
 
+@cache
 def model_of(name: str) -> vibench.Model:
     """A model of few snapshots, whose errors are large."""
     problem = create("problem", name, SMALL[name])

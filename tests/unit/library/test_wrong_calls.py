@@ -55,11 +55,9 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calls:
     bases, coordinates = {"problem": "membrane", "dual": "wide"}, {"x": np.zeros(2), "alpha": np.zeros(2)}
     return {
         "open_run": (vibench.open_run, {"path": "run", "at": {}}),
-        "run": (
-            vibench.run,
-            {"study": vibench.Study(**STUDY), "out": "o", "jobs": 1, "fresh": False, "retry": False}
-            | {"executor": "local", "scheduler": None, "observer": None, "progress": False, "repeats": 1},
-        ),
+        "run": (vibench.run, {
+            "study": vibench.Study(**STUDY), "out": "o", "jobs": 1, "fresh": False, "retry": False, "executor": "local",
+            "scheduler": None, "observer": None, "progress": False, "repeats": 1}),
         "read_study": (vibench.read_study, {"request": "quick", "overrides": {}}),
         "create": (vibench.create, {"kind": "problem", "name": "radial-obstacle", "options": {}}),
         "Run.table": (run.table, {"name": "cells"}),
@@ -69,21 +67,17 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calls:
         "Run.write_figures": (run.write_figures, {"folder": "f", "formats": ()}),
         "Run.report": (run.report, {"path": "r.html", "figures": False}),
         "Run.model": (run.model, {"cell": "0"}),
-        "export_model": (
-            vibench.export_model,
-            {"model": model, "file": "m.npz", "tolerance": 1e-8, "evaluations": 64, "bases": True, "c": False},
-        ),
+        "export_model": (vibench.export_model, {
+            "model": model, "file": "m.npz", "tolerance": 1e-8, "evaluations": 64, "bases": True, "c": False}),
         "Model.high_fidelity": (model.high_fidelity, {"mu": mu}),
         "Model.reconstruct": (model.reconstruct, {"mu": mu, **coordinates}),
         "break_even": (vibench.break_even, {"offline_a": 1.0, "online_a": 0.1, "offline_b": 2.0, "online_b": 0.05}),
         "read_model_pack": (vibench.packs.read_model_pack, {"path": "cable"}),
         "pack_digest": (vibench.packs.pack_digest, {"path": "cable"}),
-        "Reduction": (
-            vibench.Reduction,
-            {"problem": pack, "dual": reduction.dual, "primal": None, "modes": Stop(size=2), "generators": Stop(size=2)}
-            | {"tolerance": None, "training": None, "assembly": "full", "interpolation": 1e-9, "solver": "piqp"}
-            | {"accuracy": 1e-9, "formulation": reduction.formulation, "bounds": False, "on_failure": "stop"},
-        ),
+        "Reduction": (vibench.Reduction, {
+            "problem": pack, "dual": reduction.dual, "primal": None, "modes": Stop(size=2), "generators": Stop(size=2),
+            "tolerance": None, "training": None, "assembly": "full", "interpolation": 1e-9, "solver": "piqp",
+            "accuracy": 1e-9, "formulation": reduction.formulation, "bounds": False, "on_failure": "stop"}),
         "Study": (vibench.Study, STUDY),
         "Stop": (Stop, {"tolerance": 0.1, "size": None}),
         "Stop of a size": (Stop, {"tolerance": None, "size": 3}),
@@ -92,23 +86,15 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calls:
         "project_on_cone": (vibench.project_on_cone, {"generators": np.eye(3, 2), "theta": np.ones(3), "W": few}),
         "supremizers": (vibench.supremizers, {"V": space, "B": sp.eye_array(3, 5), "eta": np.ones((3, 1))}),
         "solve_high_fidelity": (vibench.solve_high_fidelity, {"vi": vi, "stiffness": None, "start": None}),
-        "solve_qp": (
-            vibench.solve_qp,
-            {"program": vi, "solver": "piqp", "accuracy": 1e-8, "extra": None, "factor": None, "start": None},
-        ),
+        "solve_qp": (vibench.solve_qp, {
+            "program": vi, "solver": "piqp", "accuracy": 1e-8, "extra": None, "factor": None, "start": None}),
         "InnerProduct": (vibench.InnerProduct, {"matrix": sp.eye_array(5), "name": "X", "factorisation": "superlu"}),
-        **{
-            f"InnerProduct.{name}": (getattr(space, name), {argument: np.ones(5)})
-            for argument, names in (
-                ("u", "apply norm whiten"),
-                ("functional", "riesz whiten_functional"),
-                ("y", "unwhiten"),
-            )
-            for name in names.split()
-        },
+        **{f"InnerProduct.{name}": (getattr(space, name), {argument: np.ones(5)}) for name, argument in (
+            ("apply", "u"), ("norm", "u"), ("whiten", "u"), ("riesz", "functional"),
+            ("whiten_functional", "functional"), ("unwhiten", "y"))},
         "InnerProduct.gram": (space.gram, {"u": np.eye(5), "v": np.eye(5)}),
         "InnerProduct.orthonormalise": (space.orthonormalise, {"u": np.eye(5), "against": None}),
-    }
+    }  # fmt: skip
 
 
 def test_every_wrong_argument_is_refused_in_a_line(calls: Calls, monkeypatch: pytest.MonkeyPatch) -> None:

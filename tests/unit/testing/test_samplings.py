@@ -2,7 +2,9 @@
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from itertools import repeat
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,21 +24,24 @@ class Uniform(Sampling):
         return box.sample(self.size, self.seed)
 
 
-def variant(name: str, points: Callable[[Uniform, ParameterBox], Array]) -> type[Uniform]:
-    """A strategy of this module with other points."""
-    return type(name, (Uniform,), {"parameters": points, "__module__": __name__, "__doc__": name})
+def variant(name: str, base: type[Sampling] = Uniform, **methods: Callable[..., Any]) -> type[Sampling]:
+    """A strategy of this module with other methods."""
+    return type(name, (base,), {**methods, "__module__": __name__, "__doc__": name})
 
 
 def entropy() -> int:
     return int(np.random.default_rng().integers(2**32))
 
 
-Transposed = variant("Transposed", lambda self, box: box.sample(self.size, self.seed).T)
-Outside = variant("Outside", lambda self, box: box.sample(self.size, self.seed) + (box.upper - box.lower))
-Twice = variant("Twice", lambda self, box: box.sample((self.size + 1) // 2, self.seed).repeat(2, axis=0)[: self.size])
-PerAxis = variant("PerAxis", lambda self, box: box.grid(*[self.size] * box.dim))  # takes its size for that of an axis
-Unseeded = variant("Unseeded", lambda self, box: box.sample(self.size, entropy()))
-Deaf = variant("Deaf", lambda self, box: box.sample(self.size, 1))
+Transposed = variant("Transposed", parameters=lambda self, box: box.sample(self.size, self.seed).T)
+Outside = variant("Outside", parameters=lambda self, box: box.sample(self.size, self.seed) + (box.upper - box.lower))
+Twice = variant(
+    "Twice", parameters=lambda self, box: box.sample((self.size + 1) // 2, self.seed).repeat(2, axis=0)[: self.size]
+)
+# Takes its size for that of an axis.
+PerAxis = variant("PerAxis", parameters=lambda self, box: box.grid(*[self.size] * box.dim))
+Unseeded = variant("Unseeded", parameters=lambda self, box: box.sample(self.size, entropy()))
+Deaf = variant("Deaf", parameters=lambda self, box: box.sample(self.size, 1))
 
 
 class OfHashes(Uniform):
@@ -89,26 +94,10 @@ class Farthest(AdaptiveSampling):
                 trainer.solve(mu, trainer.bound(mu))
 
 
-class Idle(Farthest):
-    def train(self, box: ParameterBox, trainer: Trainer) -> None:
-        pass
-
-
-class Endless(Farthest):
-    def train(self, box: ParameterBox, trainer: Trainer) -> None:
-        while True:
-            trainer.solve(box.lower)
-
-
-class Beyond(Farthest):
-    def train(self, box: ParameterBox, trainer: Trainer) -> None:
-        trainer.solve(2.0 * box.upper)
-
-
-class Wanders(Farthest):
-    def train(self, box: ParameterBox, trainer: Trainer) -> None:
-        trainer.solve(box.sample(1, entropy())[0])
-
+Idle = variant("Idle", Farthest, train=lambda self, box, trainer: None)
+Endless = variant("Endless", Farthest, train=lambda self, box, trainer: [*map(trainer.solve, repeat(box.lower))])
+Beyond = variant("Beyond", Farthest, train=lambda self, box, trainer: trainer.solve(2.0 * box.upper))
+Wanders = variant("Wanders", Farthest, train=lambda self, box, trainer: trainer.solve(box.sample(1, entropy())[0]))
 
 WRONG: Mapping[type[Sampling], tuple[str, str]] = {
     Transposed: ("parameters", "1 parameter: parameters of shape (1, 5); expected (P, 1), a row for each, with P > 0"),
