@@ -86,6 +86,8 @@ class Run:
     def break_even(self, error: str = "solution", within: float | None = None) -> pd.DataFrame:
         """The thresholds with the errors of both models, `error_a` and `error_b`; 0 of the high-fidelity model.
 
+        Raises a `RequestError` if there is no such measure, or the largest error is not positive.
+
         Parameters
         ----------
         error
@@ -93,11 +95,6 @@ class Run:
             for a quantity of interest.
         within
             Largest error that both models may have; by default all rows are kept.
-
-        Raises
-        ------
-        RequestError
-            If there is no such measure, or the largest error is not positive.
         """
         rows = ranking.with_errors(self.thresholds, *cells_with_errors(self.path, error))
         return rows if within is None else ranking.within(rows, within).reset_index(drop=True)
@@ -105,6 +102,8 @@ class Run:
     @requested
     def best(self, queries: float | None = None, error: float | None = None, measure: str = "solution") -> pd.DataFrame:
         """The best model of every problem: at every level of error that is reached, or within one.
+
+        Raises a `RequestError` for a number that is not positive, an error without `queries`, or no such measure.
 
         Parameters
         ----------
@@ -116,11 +115,6 @@ class Run:
             Largest error that is allowed; needs `queries`. By default there is a row for every power of ten.
         measure
             Measure of the error, as in `break_even`.
-
-        Raises
-        ------
-        RequestError
-            If a number is not positive, there is an error without a number of queries, or no such measure.
         """
         # An empty measure is the default of the table, whose heading then needs no name.
         of_solution = "" if measure == "solution" else measure
@@ -140,19 +134,10 @@ class Run:
 
     @requested
     def figure(self, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
-        """One figure of the run, to be shown or saved.
+        """One figure of the run, to be shown or saved; the kind is "inf-sup", "errors", "total-cost", ….
 
-        Parameters
-        ----------
-        kind
-            Kind of the figure: "inf-sup", "errors", "total-cost", …; the documentation shows them all.
-        problem, dual
-            Label of a problem and, for figures of a cone, of a dual strategy; not needed where the run has one.
-
-        Raises
-        ------
-        RequestError
-            If there is no such figure, or the run has no data for it.
+        `problem` and, for figures of a cone, `dual` are labels, not needed where the run has one. Raises a
+        `RequestError` if there is no such figure, or the run has no data for it.
         """
         from vibench.report.figures import draw  # noqa: PLC0415  loads matplotlib
 
@@ -195,17 +180,9 @@ class Run:
 
     @requested
     def model(self, cell: str) -> Model:
-        """The model of a cell, ready for queries; stages whose artefacts are missing are run again.
+        """The model of a cell, named by the beginning of its key; stages whose artefacts are missing are run again.
 
-        Parameters
-        ----------
-        cell
-            Key of the cell, or its beginning.
-
-        Raises
-        ------
-        RequestError
-            If there is no such cell, it failed before it had a model, or other code computed it.
+        Raises a `RequestError` if there is no such cell, it failed before it had a model, or other code computed it.
         """
         return recorded_cell(str(self.path), cell, self._at).model
 
@@ -214,17 +191,8 @@ class Run:
 def open_run(path: Path | str, *, at: Mapping[str, str] = {}) -> Run:
     """A finished run: its folder, its results file, or the name of a study that was run in this folder.
 
-    Parameters
-    ----------
-    path
-        Where it is.
-    at
-        Where files and folders of its study, such as packs, are now, by the name that its tables have of them.
-
-    Raises
-    ------
-    RequestError
-        If there is no results file, or it has another schema.
+    `at` says where files and folders of its study, such as packs, are now, by the names that its tables have of them.
+    Raises a `RequestError` if there is no results file, or it has another schema.
     """
     return Run(results_file(str(path)), {name: str(Path(place).absolute()) for name, place in at.items()})
 

@@ -124,18 +124,15 @@ class Assemblies:
         if self._contact is None or self._contact[0] is not stiffness:
             squares = self.at(mu).A.diagonal()
             schur, round_off = stiffness.schur_with_round_off(squares)
-            lost = round_off / share if (share := self._share_at(mu)) > 0.0 else np.inf
+            # A ≽ σ diag(A), proved by α where that is.
+            V, alpha = self._problem.V, self.coercivity_at(mu)
+            share, smallest = share_of_diagonal(V), float(np.min(V.matrix.diagonal() / squares))
+            sigma = alpha.value * share.value * smallest if alpha.proved and share.proved else 0.0
+            lost = round_off / sigma if sigma > 0.0 else np.inf
             inverse = stiffness.inverse if stiffness.dense and "A" in self._problem.constant else None
             found = ContactInfSup(schur, squares[stiffness.retained], lost, inverse=inverse)
             self._contact = stiffness, found
         return self._contact[1]
-
-    def _share_at(self, mu: Array) -> float:
-        """A σ with A ≽ σ diag(A) at mu (d,), proved by α; 0 where α is not."""
-        alpha, V = self.coercivity_at(mu), self._problem.V
-        share = share_of_diagonal(V)
-        smallest = float(np.min(V.matrix.diagonal() / self.at(mu).A.diagonal()))
-        return alpha.value * share.value * smallest if alpha.proved and share.proved else 0.0
 
     def _own_bytes(self, energy: EnergyNorm) -> int:
         """Memory of what is of one parameter alone."""

@@ -23,17 +23,9 @@ from vibench.qp.verification import kkt_residuals
 
 @requested
 def read_model_pack(path: str | Path) -> ModelPack:
-    """Read a model pack and check it.
+    """Read a model pack, a folder, and check it.
 
-    Parameters
-    ----------
-    path
-        Its folder.
-
-    Raises
-    ------
-    RequestError
-        Naming what is wrong in the manifest or with an array, what was probably meant, and what would be right.
+    A `RequestError` names what is wrong in the manifest or with an array, what was probably meant, and what is right.
     """
     with naming(path) as folder:
         pack = PackReader(folder, read_manifest(folder)).pack()
@@ -112,21 +104,17 @@ def _check_operators(pack: ModelPack, X_V: Any) -> None:
 
 def _check_dirichlet(A: Any, X_V: Any) -> None:
     # Penalties of Dirichlet unknowns are ten orders of magnitude above the median of the diagonal.
-    penalty, diagonal = 1e10, A.diagonal()
-    if diagonal.max(initial=0.0) > penalty * max(float(np.median(diagonal)), 0.0) > 0.0:
-        k = np.flatnonzero(diagonal > penalty * np.median(diagonal))
-        raise RequestError(
-            f"operators.A has diagonal entries of {diagonal.max():.0e} at {len(k)} unknowns, the first is {k[0]}: a "
-            "penalty for Dirichlet conditions was left in; remove these unknowns, or name the free ones in spaces.free"
-        )
+    diagonal, advice = A.diagonal(), "remove these unknowns, or name the free ones in spaces.free"
+    middle = float(np.median(diagonal)) if len(diagonal) else 0.0
+    if middle > 0.0 and len(k := np.flatnonzero(diagonal > 1e10 * middle)):
+        what = f"diagonal entries of {diagonal.max():.0e} at {len(k)} unknowns, the first is {k[0]}"
+        raise RequestError(f"operators.A has {what}: a penalty for Dirichlet conditions was left in; {advice}")
     # A Dirichlet row keeps its diagonal entry alone, while X_V was assembled without conditions.
     coupled_V, coupled_A = (_couplings(matrix) > 0 for matrix in (X_V, A))
     alone = np.flatnonzero(coupled_V & ~coupled_A)
     if len(alone) and np.any(coupled_A):
-        raise RequestError(
-            f"operators.A couples {len(alone)} unknowns with no other, the first is {alone[0]}, and X_V does: rows of "
-            "Dirichlet unknowns were left in; remove these unknowns, or name the free ones in spaces.free"
-        )
+        what = f"{len(alone)} unknowns with no other, the first is {alone[0]}, and X_V does"
+        raise RequestError(f"operators.A couples {what}: rows of Dirichlet unknowns were left in; {advice}")
 
 
 def _couplings(matrix: Any) -> Array:
@@ -140,10 +128,8 @@ def _of_signs(lam: Array) -> RequestError:
     if lam.max() <= 1e-8 * np.abs(lam).max():
         return RequestError("solutions.lam is negative: λ has the other sign, it is −λ that is nonnegative")
     i, k = np.unravel_index(lam.argmin(), lam.shape)
-    return RequestError(
-        f"solutions.lam has both signs, {lam[i, k]:.1e} at entry {i} of column {k}: λ needs coefficients that are "
-        "nonnegative, in a basis in which W⁺ is the cone of nonnegative coefficients"
-    )
+    needed = "λ needs coefficients that are nonnegative, in a basis in which W⁺ is the cone of nonnegative coefficients"
+    return RequestError(f"solutions.lam has both signs, {lam[i, k]:.1e} at entry {i} of column {k}: {needed}")
 
 
 @dataclass(frozen=True)
