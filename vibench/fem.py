@@ -36,7 +36,12 @@ def lumped_mass(basis: Basis) -> Array:
 def h1_gram(basis: Basis, free: Indices | None = None, length: float = 1.0) -> SparseMatrix:
     """Gram matrix of ‖v‖² = ∫ |v|² + ℓ² ∫ |∇v|² for a scalar or vector basis (paper, equation (44)).
 
-    `free` are the unknowns (n,) that are kept, by default all; `length` is ℓ, in the unit of length of the mesh.
+    Parameters
+    ----------
+    basis, free
+        The basis, with N functions, and the unknowns (n,) that are kept; by default all.
+    length
+        ℓ, in the unit of length of the mesh.
     """
     form = BilinearForm(lambda u, v, _: (ddot if _is_vector(basis) else dot)(grad(u), grad(v)))
     gram = sp.csr_array(mass(basis) + length**2 * sp.csr_array(form.assemble(basis)))

@@ -191,8 +191,14 @@ class Run:
 def open_run(path: Path | str, *, at: Mapping[str, str] = {}) -> Run:
     """A finished run: its folder, its results file, or the name of a study that was run in this folder.
 
-    `at` says where files and folders of its study, such as packs, are now, by the names that its tables have of them.
     Raises a `RequestError` if there is no results file, or it has another schema.
+
+    Parameters
+    ----------
+    path
+        Where it is.
+    at
+        Where files and folders of its study, such as packs, are now, by the name that its tables have of them.
     """
     return Run(results_file(str(path)), {name: str(Path(place).absolute()) for name, place in at.items()})
 

@@ -21,10 +21,17 @@ from vibench.offline.models import Model, Parameters
 def export_vtu(model: Model, mu: Parameters, file: Path | str) -> Path:
     """Write u and λ of a reduced model and of the high-fidelity problem at one parameter, and their differences.
 
-    The `file`, whose name ends in .vtu, is one of VTK's unstructured grids, which ParaView and meshio read, on the mesh
-    of the high-fidelity solution; fields of cells are NaN in cells that do not have them. Raises a `RequestError` if
-    meshio is not installed, the problem has neither `mesh_fields` nor a picture, or has wrong ones, the parameter is
-    outside the box, a solution fails, or the file exists or cannot be written.
+    The file is one of VTK's unstructured grids, which ParaView and meshio read, on the mesh of the high-fidelity
+    solution; fields of cells are NaN in cells that do not have them. Raises a `RequestError` if meshio is not
+    installed, the problem has neither `mesh_fields` nor a picture, or has wrong ones, the parameter is outside the box,
+    a solution fails, or the file exists or cannot be written.
+
+    Parameters
+    ----------
+    model, mu
+        The reduced model, and the parameter (d,).
+    file
+        Its name ends in .vtu.
     """
     file = Path(file)
     if file.suffix != ".vtu":

@@ -23,9 +23,14 @@ from vibench.qp.verification import kkt_residuals
 
 @requested
 def read_model_pack(path: str | Path) -> ModelPack:
-    """Read a model pack, a folder, and check it.
+    """Read a model pack and check it.
 
     A `RequestError` names what is wrong in the manifest or with an array, what was probably meant, and what is right.
+
+    Parameters
+    ----------
+    path
+        Its folder.
     """
     with naming(path) as folder:
         pack = PackReader(folder, read_manifest(folder)).pack()

@@ -252,10 +252,14 @@ def find_named(text: str, kinds: Mapping[str, PluginKind], solvers: Sequence[str
 
 @requested
 def create(kind: str, name: str, options: Mapping[str, Any] | None = None) -> Any:
-    """Instance of a registered plugin, whose options are keyword arguments of its constructor and are checked.
+    """Instance of a registered plugin; a `RequestError` if there is none, or it does not take these options.
 
-    The kind is "problem", "dual strategy", "primal strategy", "formulation" or "sampling strategy". Raises a
-    `RequestError` if there is no such plugin, or it does not take these options.
+    Parameters
+    ----------
+    kind
+        "problem", "dual strategy", "primal strategy", "formulation" or "sampling strategy".
+    name, options
+        Name under which the plugin is registered, and keyword arguments of its constructor.
     """
     if kind not in [*PluginKind]:
         raise unknown_name("kind of plugins", kind, PluginKind)
