@@ -32,7 +32,13 @@ from vibench.packs.pack import Listing, ModelPack, PackMember, PackMesh, PackSol
 
 @requested
 def pack_digest(path: str | Path) -> str:
-    """Digest of the manifest and of the files it names; a `RequestError` if that is invalid, or a file is missing."""
+    """Digest of the manifest and of the files it names; a `RequestError` if that is invalid, or a file is missing.
+
+    Parameters
+    ----------
+    path
+        Folder of the pack.
+    """
     content = hashlib.sha256()
     with naming(path) as folder:
         manifest = read_manifest(folder)
