@@ -219,29 +219,24 @@ def test_only_figures_of_vibench_are_removed(tmp_path: Path) -> None:
     figures.remove(tmp_path / "nowhere")
 
 
-def test_who_may_read_a_file_is_decided_by_the_mask(tmp_path: Path) -> None:
+def test_a_file_is_written_whole_for_those_of_the_mask_and_over_no_pipe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As /dev/null would be replaced, for an administrator."""
+    target = tmp_path / "table.csv"
     for mask, mode in ((0o022, 0o644), (0o027, 0o640), (0o077, 0o600)):
         before = os.umask(mask)
         try:
-            write_atomically(tmp_path / "report.html", b"")
+            write_atomically(target, b"before")
         finally:
             os.umask(before)
-        assert (tmp_path / "report.html").stat().st_mode & 0o777 == mode
-
-
-def test_a_pipe_or_a_device_is_not_replaced_by_a_file(tmp_path: Path) -> None:
-    """As /dev/null would be, for an administrator."""
+        assert target.stat().st_mode & 0o777 == mode
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(OSError, match="it is no regular file"):
         write_atomically(tmp_path / "pipe", b"")
     assert (tmp_path / "pipe").is_fifo()
-
-
-def test_what_cannot_be_written_whole_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    target = tmp_path / "table.csv"
-    target.write_text("before")
     monkeypatch.setattr(Path, "replace", lambda self, other: (_ for _ in ()).throw(OSError(28, "No space left")))
     with pytest.raises(OSError, match="No space left"):
         write_atomically(target, b"after")
-    assert [path.name for path in tmp_path.iterdir()] == ["table.csv"]
+    assert {path.name for path in tmp_path.iterdir()} == {"table.csv", "pipe"}
     assert target.read_text() == "before"
