@@ -73,9 +73,8 @@ def test_folders_called_like_a_library_are_not_taken_for_it(
     (tmp_path / "piqp").mkdir()
     (tmp_path / "piqp" / "__init__.py").write_text("raise OSError('not the solver')")
     write_study(tmp_path, wire_study(solvers=["piqp", "daqp", "careful"]))
-    with started(
-        [command, "run", "study.toml", "--jobs", "1", "--no-figures"], tmp_path, Path(f"{plugins_folder}:")
-    ) as process:
+    run = [command, "run", "study.toml", "--jobs", "1", "--no-figures"]
+    with started(run, tmp_path, Path(f"{plugins_folder}:")) as process:
         _, errors = process.communicate(timeout=PATIENCE)
     assert (process.returncode, errors) == (0, "")
     found = {solver: row["status"] for solver, row in by_solver(tmp_path / "runs" / "wire").items()}

@@ -223,19 +223,14 @@ def test_a_talkative_job_can_be_stopped(watcher: Supervisor, tmp_path: Path) -> 
         watcher.run(job, lambda _: watcher.stop())
 
 
-def test_what_is_not_of_an_item_costs_the_cell(run: Run) -> None:
+def test_what_is_not_of_an_item_costs_the_cell_or_the_whole_stage(run: Run) -> None:
     statuses = {"sleep": Status.TIMEOUT, "exit": Status.CRASHED, "interrupt": Status.ERROR}
-    for where, (how, status) in itertools.product(("at_begin", "at_end"), statuses.items()):
-        found = run(InItems(("fine",), **{where: how}), cell=0.5 if how == "sleep" else 20.0)
-        assert isinstance(found, Failed)
-        assert found.status is status
-
-
-def test_a_whole_stage_that_hangs_or_dies_is_said_so(run: Run) -> None:
-    for how, status in (("sleep", Status.TIMEOUT), ("hang", Status.TIMEOUT), ("segfault", Status.CRASHED)):
-        found = run(Whole(how), cell=0.5 if status is Status.TIMEOUT else 30.0)
-        assert isinstance(found, Failed)
-        assert found.status is status
+    for how, status in (*statuses.items(), ("hang", Status.TIMEOUT), ("segfault", Status.CRASHED)):
+        items = (InItems(("fine",), at_begin=how), InItems(("fine",), at_end=how)) if how in statuses else ()
+        for stage in (*items, Whole(how)):
+            found = run(stage, cell=0.5 if status is Status.TIMEOUT else 30.0)
+            assert isinstance(found, Failed)
+            assert found.status is status
         assert isinstance(run(Whole("fine")), Done)  # the next one has a new process
 
 

@@ -35,12 +35,9 @@ def as_published(problem: str, sizes: str, loose: float, tight: float) -> list[s
         statements.append(f"UPDATE {table} SET {sizes} WHERE problem = '{problem}'{stage}")
         statements.append(f"UPDATE {table} SET primal_tol = {loose} WHERE problem = '{problem}' AND {FIXED}")
     for table in ("queries", "histories"):
-        statements += [
-            f"CREATE TABLE again AS SELECT * FROM {table} WHERE problem = '{problem}' AND {FIXED}",
-            f"UPDATE again SET primal_tol = {tight}",
-            f"INSERT INTO {table} SELECT * FROM again",
-            "DROP TABLE again",
-        ]
+        mine = f"SELECT * FROM {table} WHERE problem = '{problem}' AND {FIXED}"
+        statements += [f"CREATE TABLE again AS {mine}", f"UPDATE again SET primal_tol = {tight}"]
+        statements += [f"INSERT INTO {table} SELECT * FROM again", "DROP TABLE again"]
     return statements
 
 
@@ -80,23 +77,22 @@ def test_every_figure_from_3_to_15_has_a_twin(changed: Changed) -> None:
         assert figure.compared.startswith(("Agrees: ", "Differs: ", "Cannot be compared: ")), name
 
 
-def test_a_run_without_the_pairs_of_the_paper_has_fewer(quick_run: Path) -> None:
-    for problem, missing in (
-        ("obstacle", {"figure-7", "figure-8"}),
-        ("hertz", {"figure-13", "figure-14", "figure-15"}),
-    ):
+def test_a_run_without_the_pairs_of_the_paper_has_fewer_and_no_page(quick_run: Path) -> None:
+    without = {"obstacle": {"figure-7", "figure-8"}, "hertz": {"figure-13", "figure-14", "figure-15"}}
+    for problem, missing in without.items():
         found = twins(quick_run / "results.sqlite", problem)
         assert {name for name in missing if found[name]() is None} == missing
+    obstacle, hertz = (tables_of(quick_run / "results.sqlite", name) for name in ("obstacle", "hertz"))
+    with pytest.raises(ValueError, match=r"the run of obstacle has no models for \(19, 50\), \(51, 70\), \(89, 50\)"):
+        sections(obstacle, hertz, hertz, {})
 
 
 @pytest.mark.parametrize(
     ("problem", "options"), [("obstacle", '{"bulge": true}'), ("hertz", '{"approach": "parameter"}')]
 )
 def test_a_problem_with_another_parameter_is_not_the_paper_s(problem: str, options: str, changed: Changed) -> None:
-    path = changed(
-        *(f"UPDATE {table} SET problem_options = '{options}' WHERE problem = '{problem}'" for table in TABLES)
-    )
-    assert twins(path, problem) == {}
+    update = f"SET problem_options = '{options}' WHERE problem = '{problem}'"
+    assert twins(changed(*(f"UPDATE {table} {update}" for table in TABLES)), problem) == {}
 
 
 def test_projection_errors_stand_beside_the_published_sizes(quick_run: Path) -> None:
@@ -161,8 +157,8 @@ def test_constants_of_the_third_pair_are_over_the_only_parameter(changed: Change
     path = changed(*HERTZ)
     figure = twins(path, "hertz")["figure-13"]()
     queries = read_table(path, "queries")
-    mine = queries[(queries["problem"] == "hertz") & (queries["dual"] == "mcpg") & (queries["primal_tol"] == 0.4)]
-    mine = mine[mine["solver"] == "piqp"].sort_values("mu_1")
+    mine = queries.query("problem == 'hertz' and dual == 'mcpg' and primal_tol == 0.4 and solver == 'piqp'")
+    mine = mine.sort_values("mu_1")
     expected = mine[["mu_1", "beta_plain_span"]].to_numpy(float)
     np.testing.assert_allclose(line_called(figure.axes[0], "β_dec over the span"), expected)
     (panel, *_) = twins(path, "hertz")["figure-15"]().axes
@@ -174,9 +170,7 @@ def test_the_greedy_algorithm_is_that_of_the_histories(changed: Changed) -> None
     figure = twins(path, "hertz")["figure-14"]()
     sigma, least, _ = figure.axes
     histories = read_table(path, "histories")
-    mine = histories[
-        (histories["problem"] == "hertz") & (histories["dual"] == "mcpg") & (histories["primal_tol"] == 0.3)
-    ]
+    mine = histories.query("problem == 'hertz' and dual == 'mcpg' and primal_tol == 0.3")
     for panel, quantity in ((sigma, "sigma"), (least, "beta_span_min")):
         steps = mine[mine["quantity"] == quantity].sort_values("step")[["step", "value"]].to_numpy(float)
         shown = line_called(panel, "offline-pga, δ = 0.3")
@@ -208,12 +202,6 @@ def test_five_pressures_lie_in_one_panel_with_hertz_s_theory(quick_run: Path) ->
         exact = theory(problem, np.array([radius]), found.u)
         x, pressure = np.asarray(ellipse.get_xydata(), float).T
         np.testing.assert_allclose((x / exact.half_width) ** 2 + (pressure / exact.peak) ** 2, 1.0, rtol=1e-12)
-
-
-def test_a_run_without_the_pairs_of_the_paper_makes_no_page(quick_run: Path) -> None:
-    obstacle, hertz = (tables_of(quick_run / "results.sqlite", name) for name in ("obstacle", "hertz"))
-    with pytest.raises(ValueError, match=r"the run of obstacle has no models for \(19, 50\), \(51, 70\), \(89, 50\)"):
-        sections(obstacle, hertz, hertz, {})
 
 
 def test_claims_are_sorted_by_their_verdicts() -> None:

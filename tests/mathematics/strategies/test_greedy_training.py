@@ -31,9 +31,13 @@ class Distance(Trainer):
         self.reasons.append(bound)
 
     def bound(self, mu: Array) -> float:
-        found = float(np.linalg.norm(np.array(self.solved) - mu, axis=1).min())
-        self.asked.append((mu, found))
-        return found
+        self.asked.append((mu, float(apart(mu[None], self.solved)[0])))
+        return self.asked[-1][1]
+
+
+def apart(mus: Array, solved: list[Array]) -> Array:
+    """Distances of parameters (P×d) from the nearest of some."""
+    return np.linalg.norm(np.asarray(mus)[:, None] - np.array(solved), axis=2).min(axis=1)
 
 
 def trained(**options: object) -> tuple[AdaptiveSampling, Distance]:
@@ -46,8 +50,7 @@ def test_all_candidates_meet_the_tolerance_where_all_are_checked() -> None:
     strategy, trainer = trained(candidates=400, tolerance=0.2, checked=400)
     candidates = strategy.parameters(BOX)
     assert {tuple(mu) for mu in trainer.solved} <= {tuple(mu) for mu in candidates}
-    apart = np.linalg.norm(candidates[:, None] - np.array(trainer.solved), axis=2).min(axis=1)
-    assert apart.max() <= 0.2
+    assert apart(candidates, trainer.solved).max() <= 0.2
     assert trainer.solved[0].tolist() == [1.0, 0.5]  # the middle of the box
     assert {(x, y) for x in (0.0, 2.0) for y in (0.0, 1.0)} <= {tuple(mu) for mu in candidates}
     assert {(x, y) for x in 0.5 * np.arange(5) for y in 0.25 * np.arange(5)} <= {tuple(mu) for mu in candidates}
@@ -61,13 +64,12 @@ def test_estimates_rank_and_bounds_decide() -> None:
 
     class Optimist(Distance):
         def estimate(self, mu: Array) -> float:
-            return float(np.linalg.norm(np.array(self.solved) - mu, axis=1).min()) / 3.0
+            return float(apart(mu[None], self.solved)[0]) / 3.0
 
     strategy, trainer = create("sampling strategy", "greedy", {"candidates": 200, "tolerance": 0.2}), Optimist()
     strategy.train(BOX, trainer)
     candidates = strategy.parameters(BOX)
-    apart = np.linalg.norm(candidates[:, None] - np.array(trainer.solved), axis=2).min(axis=1)
-    assert apart.max() <= 0.2
+    assert apart(candidates, trainer.solved).max() <= 0.2
     assert set(trainer.reasons[1:]) <= {bound for _, bound in trainer.asked}
 
 
@@ -78,8 +80,7 @@ def test_reasons_are_above_the_tolerance_and_nearly_the_worst_of_the_pool() -> N
     assert reasons.min() > 0.25
     candidates = create("sampling strategy", "greedy", {"candidates": 300, "tolerance": 0.5}).parameters(BOX)
     for k, reason in enumerate(reasons, 1):
-        worst = np.linalg.norm(candidates[:, None] - np.array(trainer.solved[:k]), axis=2).min(axis=1).max()
-        assert reason >= 0.8 * worst - 1e-12
+        assert reason >= 0.8 * apart(candidates, trainer.solved[:k]).max() - 1e-12
 
 
 def test_it_ends_after_so_many_candidates_in_a_row_or_solutions() -> None:
@@ -147,9 +148,7 @@ def test_what_ends_the_training_is_random() -> None:
     random = [place for place in dict.fromkeys(places) if places.count(place) == 1][-60:]
     assert len(random) == 60
     strategy = create("sampling strategy", "greedy", {"candidates": 2000, "tolerance": 0.35})
-    all_of_them = strategy.parameters(BOX)
-    mean = np.linalg.norm(all_of_them[:, None] - np.array(trainer.solved), axis=2).min(axis=1)
-    asked = np.linalg.norm(np.array(random)[:, None] - np.array(trainer.solved), axis=2).min(axis=1)
+    mean, asked = (apart(mus, trainer.solved) for mus in (strategy.parameters(BOX), random))
     assert abs(asked.mean() - mean.mean()) < 4.0 * mean.std() / np.sqrt(60)
 
 
