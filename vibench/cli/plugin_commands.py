@@ -317,7 +317,7 @@ def _timed(plugins: list[str], out: Path | None, resolutions: list[str], study: 
 
     from vibench import benchmarks
     from vibench.benchmarks.comparison import read_benchmarks
-    from vibench.files import write_atomically
+    from vibench.files import write_atomically, writing
 
     if find_spec("pytest_benchmark") is None:
         raise VibenchError("`vibench bench` needs pytest-benchmark: pip install 'vibench[bench]'")
@@ -333,10 +333,8 @@ def _timed(plugins: list[str], out: Path | None, resolutions: list[str], study: 
         if not file.exists():  # everything was left out
             file.write_text('{"machine_info": {}, "benchmarks": []}')
         if out is not None:
-            try:
+            with writing(out):
                 write_atomically(out, file.read_bytes())
-            except OSError as error:
-                raise RequestError(f"'{out}' cannot be written: {error.strerror}") from None
         return read_benchmarks(file)
 
 

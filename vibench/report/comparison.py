@@ -13,18 +13,8 @@ import numpy as np
 import pandas as pd
 
 from vibench.errors import RequestError, unknown_name
-from vibench.report.differences import (
-    AXES,
-    ERRORS,
-    Agreement,
-    ChangeKind,
-    ComparedRun,
-    Difference,
-    agreement,
-    compared_runs,
-    number_differences,
-    timing_differences,
-)
+from vibench.report import differences
+from vibench.report.differences import AXES, ChangeKind, ComparedRun, Difference
 from vibench.results import formats
 from vibench.results.break_even import FEWEST_ROUNDS
 from vibench.results.schema import STORED
@@ -74,18 +64,18 @@ class Comparison:
             by_what = defaultdict[str, list[Difference]](list)
             for one in found:
                 by_what[one.what].append(one)
-            for what, differences in by_what.items():
-                counts = {verdict.value: sum(d.verdict == verdict for d in differences) for verdict in ChangeKind}
-                ratios = [d.ratio for d in differences if np.isfinite(d.ratio) and d.ratio > 0.0]
+            for what, moves in by_what.items():
+                counts = {verdict.value: sum(d.verdict == verdict for d in moves) for verdict in ChangeKind}
+                ratios = [d.ratio for d in moves if np.isfinite(d.ratio) and d.ratio > 0.0]
                 low, high = median_interval(ratios) if len(ratios) >= FEWEST_ROUNDS else (float("nan"), float("nan"))
                 middle = float(np.median(ratios)) if ratios else float("nan")
                 farthest = max(ratios, key=lambda ratio: abs(np.log(ratio)), default=float("nan"))
                 numbers = {"ratio": middle, "ratio_low": low, "ratio_high": high, "farthest_ratio": farthest}
-                about = {"what": what, "run": run, "against": against, "cells": len(differences)}
+                about = {"what": what, "run": run, "against": against, "cells": len(moves)}
                 rows.append(about | counts | numbers)
         # The order in which columns are compared; break-even is last.
         order = ["cell", "queries_ok", "status", "N", "R", "rank", "enrichment", "beta_span_min", "beta_cone_lower_min"]
-        order += [*ERRORS, "error_u_zero_max", "error_lambda_zero_max", "offline_s", "online_s"]
+        order += [*differences.ERRORS, "error_u_zero_max", "error_lambda_zero_max", "offline_s", "online_s"]
         places = {what: place for place, what in enumerate(order)}
         by = {"kind": "stable", "ignore_index": True, "key": lambda whats: whats.map(places).fillna(len(order))}
         return pd.DataFrame(rows).sort_values("what", **by)
@@ -148,23 +138,23 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
     """
     if len(paths) < 2:
         raise RequestError(f"{len(paths)} run is given, expected two or more to compare")
-    runs = compared_runs(paths)
+    runs = differences.compared_runs(paths)
     first, *others = runs
     by_pair = defaultdict[tuple[str, str], list[Difference]](list)
     notes: list[str] = []
     for k, run in enumerate(others, start=1):
         of_run = f"{run.name}: " if len(others) > 1 else ""
         shared = [key for key in first.cells if key in run.cells]
-        differences = by_pair[run.name, first.name]
+        found = by_pair[run.name, first.name]
         gone = [first.cells[key] for key in first.cells if key not in run.cells]
         new = [run.cells[key] for key in run.cells if key not in first.cells]
-        differences += [Difference(cell, "cell", "present", "gone", ChangeKind.WORSE) for cell in gone]
-        differences += [Difference(cell, "cell", "", "new", ChangeKind.CHANGED) for cell in new]
+        found += [Difference(cell, "cell", "present", "gone", ChangeKind.WORSE) for cell in gone]
+        found += [Difference(cell, "cell", "", "new", ChangeKind.CHANGED) for cell in new]
         means = _on_common_queries(first, run, shared)
         for key in shared:
             # Means over different queries are no comparison.
             one, two = first.cells[key] | means[0].get(key, {}), run.cells[key] | means[1].get(key, {})
-            differences += number_differences(one, two, limit)
+            found += differences.number_differences(one, two, limit)
         notes.append(f"{of_run}{len(shared)} cells are in both runs")
         if means[0]:
             notes.append(f"{of_run}errors of {len(means[0])} of them are compared on the queries that are ok in both")
@@ -174,7 +164,7 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
             same = run.measured_beside(earlier, unless=runs[: runs.index(earlier)])
             compared += len(same)
             if same:
-                by_pair[run.name, earlier.name] += timing_differences(earlier, run, same, limit)
+                by_pair[run.name, earlier.name] += differences.timing_differences(earlier, run, same, limit)
         if compared < len([key for key in run.cells if any(key in earlier.cells for earlier in runs[:k])]):
             notes.append(f"{of_run}times and break-even of different machines or protocols are not compared")
     notes += _agreements(runs)
@@ -183,14 +173,14 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
 
 def _agreements(runs: Sequence[ComparedRun]) -> list[str]:
     """A line on how often intervals of break-evens overlap, over all pairs of runs of one machine."""
-    found = list[Agreement]()
+    found = list[differences.Agreement]()
     for k, run in enumerate(runs):
         for earlier in runs[:k]:
             if same := run.measured_beside(earlier, unless=()):
-                found.append(agreement(earlier.thresholds_of(same), run.thresholds_of(same)))
+                found.append(differences.agreement(earlier.thresholds_of(same), run.thresholds_of(same)))
     if not found:
         return []
-    total = Agreement(*map(sum, zip(*found, strict=True)))
+    total = differences.Agreement(*map(sum, zip(*found, strict=True)))
     return [
         f"intervals of break-evens overlap in {total.overlapping} of {total.both} pairs",
         f"{total.opposite} of {total.decided} break-evens that two runs decide contradict each other",
@@ -208,7 +198,7 @@ def _on_common_queries(one: ComparedRun, two: ComparedRun, shared: Sequence[str]
     both_means: list[Means] = []
     for run in (one, two):
         common = run.ok_queries[run.ok_queries.index.isin(both)].groupby("cell")
-        means = {column: common[name].agg(how).reindex(keys) for column, (name, how) in ERRORS.items()}
+        means = {column: common[name].agg(how).reindex(keys) for column, (name, how) in differences.ERRORS.items()}
         both_means.append({key: {column: float(values[key]) for column, values in means.items()} for key in keys})
     return both_means[0], both_means[1]
 

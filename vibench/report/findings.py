@@ -16,18 +16,8 @@ from vibench.interfaces.strategies import Kind
 from vibench.model.bound_terms import CorrectionMode
 from vibench.model.errors import UNMEASURABLE
 from vibench.qp.status import Status
-from vibench.report.figures.data import (
-    Comparable,
-    ProblemTables,
-    best_solver,
-    by_dimensions,
-    common_programs,
-    label,
-    label_of,
-    on_common_queries,
-    problem_tables,
-    whole,
-)
+from vibench.report.figures import data as tables
+from vibench.report.figures.data import Comparable, ProblemTables, label, label_of, whole
 from vibench.results import consistency, formats
 from vibench.results.consistency import agreement_sentence
 from vibench.results.paired_timing import PairedTiming
@@ -60,7 +50,7 @@ def findings(path: Path) -> dict[str, list[str]]:
     """Sentences on completeness, stability, errors, costs and solvers by subject, "" for the whole run."""
     by_subject = defaultdict[str, list[str]](list)
     read = {name: read_table(path, name) for name in TABLES}
-    for one in all_findings(read, problem_tables(path, read)):
+    for one in all_findings(read, tables.problem_tables(path, read)):
         by_subject[one.subject].append(one.text)
     return dict(by_subject)
 
@@ -74,8 +64,8 @@ def all_findings(
         yield Finding("", text, weight)
     for name, data in by_problem:
         about = [(name, Weight.ANSWER, _answer(data, paired))]
-        for title, cells in by_dimensions(best_solver(data.cells)):
-            compared = on_common_queries(cells, data.queries)
+        for title, cells in tables.by_dimensions(tables.best_solver(data.cells)):
+            compared = tables.on_common_queries(cells, data.queries)
             about.append((f"{name}, {title}", Weight.COMPARISON, _stability(cells, compared)))
             about.append((f"{name}, {title}", Weight.COMPARISON, _costs(cells, data.thresholds)))
         about.append((f"{name}, corrections", Weight.COMPARISON, _corrections(data)))
@@ -331,7 +321,7 @@ def _solvers(data: ProblemTables) -> Iterator[str]:
     """Programs solved by each solver at each accuracy; median time and mean errors on the common ones."""
     several, by = data.cells["accuracy"].nunique() > 1, ["solver", "accuracy"]
     solved = data.queries[data.queries["status"] == Status.OK].groupby(by).size()
-    shared = dict(iter(common_programs(data.queries).groupby(by)))
+    shared = dict(iter(tables.common_programs(data.queries).groupby(by)))
     common, errors = max(map(len, shared.values()), default=0), list[str]()
     for way, cells in data.cells.groupby(by, sort=False):
         solver = "{} at {:g}".format(*way) if several else way[0]

@@ -15,7 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from vibench.errors import RequestError
-from vibench.files import write_atomically
+from vibench.files import write_atomically, writing
 from vibench.qp.status import Status
 from vibench.report import findings, plots
 from vibench.report.differences import ComparedRun
@@ -26,7 +26,7 @@ from vibench.results import formats, pictures, ranking, show
 from vibench.results.paired_timing import PairedTiming
 from vibench.results.ranking import LARGEST_BAND, Criterion, Winner, leaderboard
 from vibench.results.read import in_order, read_table
-from vibench.results.schema import STORED, TABLES, Column
+from vibench.results.schema import STORED, TABLES
 from vibench.results.selection import short_keys
 from vibench.stability.infsup import VANISHES
 from vibench.text import printable
@@ -64,6 +64,7 @@ class TableGrid:
 def grid_of_cells(cells: pd.DataFrame, caption: str) -> TableGrid:
     """The table of all cells, in the order of the rows."""
     columns = STORED["cells"]
+    headings = {name: column.heading or name for name, column in columns.items()}
     # Columns that matter most come first; those of `offered` are not shown at first.
     first = (
         "cell", *show.AXES, "status", "queries_ok", "error_lambda_mean", "error_u_mean", "online_s", "offline_s",
@@ -78,19 +79,16 @@ def grid_of_cells(cells: pd.DataFrame, caption: str) -> TableGrid:
     says_nothing = [name for name in names if columns[name].heading and not formats.says_something(cells, name)]
     length = short_keys(cells["cell"])
     frame = formats.under_headings(cells.assign(cell=cells["cell"].str[:length]), names, columns)
-    hidden = [_heading(columns, name) for name in (*says_nothing, *offered) if name in names]
-    axes = tuple(_heading(columns, name) for name in (*show.AXES, "status"))
-    disturbed, left_out = _disturbed(cells["cell"], cells), (*hidden, *_constant(frame))
-    return TableGrid("summary", "All cells", caption, frame, axes, left_out, disturbed)
+    hidden = [headings[name] for name in (*says_nothing, *offered) if name in names] + _constant(frame)
+    axes, disturbed = tuple(headings[name] for name in (*show.AXES, "status")), _disturbed(cells["cell"], cells)
+    return TableGrid("summary", "All cells", caption, frame, axes, tuple(hidden), disturbed)
 
 
 def grid_of_thresholds(name: str, title: str, caption: str, rows: pd.DataFrame, cells: pd.DataFrame) -> TableGrid:
     """A table of break-even points; a row is disturbed if one of its cells is."""
-    ordered = in_order(rows)
-    frame = formats.break_even_table(rows)
-    first = _heading(STORED["thresholds"], "primal_b")
+    ordered, frame, names = in_order(rows), formats.break_even_table(rows), STORED["thresholds"]
+    first, *results = (names[name].heading or name for name in ("primal_b", "benefit_threshold", "threshold_high"))
     frame = frame[[first, *frame.columns.drop(first)]]
-    results = {_heading(STORED["thresholds"], name) for name in ("benefit_threshold", "threshold_high")}
     texts = [heading for heading in frame.columns if not pd.api.types.is_numeric_dtype(frame[heading])]
     axes = tuple(heading for heading in texts if heading not in results)
     disturbed = {*_disturbed(ordered["cell_a"], cells), *_disturbed(ordered["cell_b"], cells)}
@@ -104,10 +102,6 @@ def grid_of(name: str, title: str, caption: str, frame: pd.DataFrame, axes: Sequ
     shown = frame.dropna(axis=1, how="all")
     shown = shown.assign(cell=shown["cell"].str[:keys]) if "cell" in shown else shown
     return TableGrid(name, title, caption, shown, tuple(one for one in axes if one in shown), tuple(_constant(shown)))
-
-
-def _heading(table: dict[str, Column] | Any, name: str) -> str:
-    return table[name].heading or name
 
 
 def _constant(frame: pd.DataFrame) -> list[str]:
@@ -158,10 +152,8 @@ def write(path: Path, target: Path, *, figures: bool = True) -> Path:
     # `os.path`, since `Path.resolve` raises for links in a circle.
     if os.path.realpath(target) == os.path.realpath(path):
         raise RequestError(f"'{target}' is the results file itself; choose another file for the report")
-    try:
+    with writing(target):
         write_atomically(target, page(path, figures=figures).encode("utf-8"))
-    except OSError as error:
-        raise RequestError(f"'{target}' cannot be written: {error.strerror}") from None
     return target
 
 

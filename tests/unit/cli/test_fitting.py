@@ -40,6 +40,7 @@ def test_every_table_of_a_run_fits(table: str, main: Main, quick_run: Path, monk
         monkeypatch.setenv("COLUMNS", str(width))
         code, out, _ = main("show", str(quick_run), "--table", table, "--limit", "60")
         assert code == 0
+        assert out.startswith(f"{quick_run.name}: {table}")
         assert max(map(cell_len, out.splitlines())) <= width
         assert "…" not in out
         shown = out.split("\n", 1)[1].split("not shown")[0].replace(",", " ")

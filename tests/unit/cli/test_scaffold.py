@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -35,9 +34,6 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {kind: scaffold.write_package(CHECKED[kind], name, parent) for kind, name in NAMES.items()}
 
 
-Run = Callable[..., "subprocess.CompletedProcess[str]"]
-
-
 @pytest.fixture(scope="module")
 def site(written: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the new packages are installed, and not their sources but their wheels."""
@@ -48,21 +44,11 @@ def site(written: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> 
     return folder
 
 
-@pytest.fixture(scope="module")
-def installed(site: Path) -> Run:
-    """Function that runs Python where the new packages are installed."""
-
-    def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
-        environment = os.environ | {"PYTHONPATH": str(site)}
-        command = [sys.executable, *arguments]
-        return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-
-    return run
-
-
-def test_the_tests_of_new_packages_are_green(written: dict[str, Path], installed: Run, tmp_path: Path) -> None:
-    tests = [str(folder / "tests") for folder in written.values()]
-    done = installed("-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error", *tests, folder=tmp_path)
+def test_the_tests_of_new_packages_are_green(written: dict[str, Path], site: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error"]
+    command += [str(folder / "tests") for folder in written.values()]
+    environment = os.environ | {"PYTHONPATH": str(site)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
     checks = sum(len(case_of(kind).checks) for kind in NAMES)
     assert f"{checks + len(NAMES)} passed" in done.stdout  # every package has one more test

@@ -92,11 +92,8 @@ def shown_rows(browser: Chrome, table: str = "summary") -> list[dict[str, str]]:
 
 def choose(browser: Chrome, axis: str, value: str) -> None:
     """Choose a value in the list of an axis, as a user does."""
-    (label,) = [
-        one
-        for one in browser.find_elements(By.CSS_SELECTOR, '[data-table="summary"] .tools label')
-        if one.text.split("\n")[0].split(" all")[0].strip() == axis
-    ]
+    labels = browser.find_elements(By.CSS_SELECTOR, '[data-table="summary"] .tools label')
+    (label,) = [one for one in labels if one.text.split("\n")[0].split(" all")[0].strip() == axis]
     label.find_element(By.XPATH, f".//option[normalize-space(.)='{value}']").click()
 
 
@@ -128,7 +125,8 @@ def test_nothing_is_cut_or_wrapped_inside_a_number(
     awaited(browser, lambda b: b.execute_script("return [...document.images].every(image => image.naturalWidth > 100)"))
 
 
-def test_columns_that_matter_are_seen_at_once(browser: Chrome, made: Path) -> None:
+def test_columns_that_matter_and_flags_are_seen_at_once(browser: Chrome, made: Path, cells: pd.DataFrame) -> None:
+    """Rows of a disturbed machine are flagged."""
     look(browser, made)
     seen = browser.execute_script(
         """
@@ -148,6 +146,10 @@ def test_columns_that_matter_are_seen_at_once(browser: Chrome, made: Path) -> No
         """
     found = browser.execute_script(sides)
     assert {tuple(one) for one in found} == {("left", "left"), ("right", "right")}
+    flagged = [row["cell"].split()[0] for row in shown_rows(browser) if "⚑" in row["cell"]]
+    expected = cells["cell"][cells["disturbed"] == 1]
+    assert len(flagged) == len(expected) == 2
+    assert all(key.startswith(short) for key, short in zip(expected, flagged, strict=True))
 
 
 def test_the_switch_changes_the_theme_and_back(browser: Chrome, made: Path) -> None:
@@ -222,14 +224,6 @@ def test_the_csv_is_what_is_shown(browser: Chrome, made: Path, downloads: Path, 
     )
 
 
-def test_rows_of_a_disturbed_machine_are_flagged(browser: Chrome, made: Path, cells: pd.DataFrame) -> None:
-    look(browser, made)
-    flagged = [row["cell"].split()[0] for row in shown_rows(browser) if "⚑" in row["cell"]]
-    expected = cells["cell"][cells["disturbed"] == 1]
-    assert len(flagged) == len(expected) == 2
-    assert all(key.startswith(short) for key, short in zip(expected, flagged, strict=True))
-
-
 def move(browser: Chrome, *places: tuple[float, float]) -> None:
     """Move the pointer from place to place."""
     actions = ActionChains(browser)
@@ -257,9 +251,7 @@ def hover(browser: Chrome, name: str, series: int) -> dict[str, Any]:
 
 def show_plot(browser: Chrome, name: str) -> None:
     browser.execute_script("document.getElementById(arguments[0]).scrollIntoView()", name)
-    ready = (
-        "return [...Bokeh.index.roots].some(view => view.el.closest('#' + arguments[0]) && view.frame.x_range.start)"
-    )
+    ready = "return [...Bokeh.index.roots].some(v => v.el.closest('#' + arguments[0]) && v.frame.x_range.start)"
     awaited(browser, lambda b: b.execute_script(ready, name))
 
 
@@ -277,9 +269,8 @@ def test_hover_tells_the_cell_and_the_legend_hides_it(browser: Chrome, made: Pat
     assert row["problem"] in model
     assert formats.cell_text(row["error_u_mean"]) == found["error"]
 
-    (button,) = [
-        one for one in browser.find_elements(By.CSS_SELECTOR, f"#{name} .legend button") if one.text == row["primal"]
-    ]
+    buttons = browser.find_elements(By.CSS_SELECTOR, f"#{name} .legend button")
+    (button,) = [one for one in buttons if one.text == row["primal"]]
     button.click()
     assert button.get_attribute("aria-pressed") == "false"
     left = browser.execute_script(POINT, name, 0)

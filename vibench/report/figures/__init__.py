@@ -32,6 +32,7 @@ KINDS: dict[str, tuple[DrawPages, bool]] = {
 # A figure to be drawn: name of its first file, function that draws its pages, and their data.
 FigureTask = tuple[str, DrawPages, ProblemTables]
 Made = TypeVar("Made")
+Progress = Callable[[str, int, int], None]
 
 
 def drawings(path: Path) -> Iterator[FigureTask]:
@@ -100,9 +101,8 @@ def read_captions(folder: Path) -> dict[str, str]:
 
 
 def draw_all(
-    path: Path, folder: Path, formats: tuple[str, ...],
-    progress: Callable[[str, int, int], None] = lambda *_: None,
-) -> tuple[list[Path], list[str]]:  # fmt: skip
+    path: Path, folder: Path, formats: tuple[str, ...], progress: Progress = lambda *_: None
+) -> tuple[list[Path], list[str]]:
     """Draw every figure that a results file has data for, in every format.
 
     Returns the files written to the folder, and a line for every figure that could not be drawn. Beside them is
@@ -125,9 +125,8 @@ def draw_all(
 
 
 def render(
-    tasks: Sequence[FigureTask], finish: Callable[[str, Figure], Made],
-    progress: Callable[[str, int, int], None] = lambda *_: None,
-) -> tuple[list[Made], list[str]]:  # fmt: skip
+    tasks: Sequence[FigureTask], finish: Callable[[str, Figure], Made], progress: Progress = lambda *_: None
+) -> tuple[list[Made], list[str]]:
     """Draw figures; returns the results of `finish(name, page)` of all their pages, and a line for each that fails."""
     rendered: list[Made] = []
     failures: list[str] = []

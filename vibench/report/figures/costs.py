@@ -9,19 +9,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from vibench.qp.status import Status
-from vibench.report.figures.data import (
-    ProblemTables,
-    best_solver,
-    by_dimensions,
-    label,
-    of_solvers,
-    on_common_queries,
-    parts,
-    program_columns,
-    series,
-    titled_parts,
-    whole,
-)
+from vibench.report.figures import data as tables
+from vibench.report.figures.data import ProblemTables, label, parts, series, titled_parts, whole
 from vibench.report.figures.style import HIGH_FIDELITY_LOOK, Layout, Looks, Pages, Series, Sheet, plot, scatter
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
 
@@ -31,8 +20,8 @@ def work_precision(data: ProblemTables) -> Pages:
 
     Dual strategies, assemblies and corrections have a row of panels each.
     """
-    cells = best_solver(data.cells)
-    compared = on_common_queries(cells, data.queries)
+    cells = tables.best_solver(data.cells)
+    compared = tables.on_common_queries(cells, data.queries)
     cells = compared.cells[compared.cells[["error_u_mean", "error_lambda_mean"]].notna().any(axis=1)]
     over, seconds = compared.over or f" over all {compared.asked} queries", 1e3 * cells["online_s"]
     rows_of = "dual strategy" + " and way of a query" * (cells["way"].nunique() > 1)
@@ -89,9 +78,9 @@ def _front(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def total_cost(data: ProblemTables) -> Pages:
     """Offline and online seconds against the number of queries; triangles mark where two models break even."""
-    cells, queries = best_solver(data.cells), np.geomspace(1.0, 1e6, 61)
+    cells, queries = tables.best_solver(data.cells), np.geomspace(1.0, 1e6, 61)
     panels = []
-    for title, mine in by_dimensions(cells):
+    for title, mine in tables.by_dimensions(cells):
         # The cells with the most vectors of every strategy and way: a line per tolerance would hide the crossings.
         added = mine.assign(added=mine["enrichment"].fillna(0))
         most = added.sort_values(["added", "primal_tol"], ascending=[False, True], kind="stable")
@@ -140,7 +129,7 @@ def solvers(data: ProblemTables) -> Pages:
 
     Failures count as infinite times, so that a curve ends at the fraction its solver solved. One solver has no profile.
     """
-    queries = of_solvers(data.queries)
+    queries = tables.of_solvers(data.queries)
     if not queries["solve_s"].notna().any():
         return
     names = [str(name) for name in queries["solver"].unique()]
@@ -181,7 +170,7 @@ def _accuracy(panel: Axes, queries: pd.DataFrame, names: list[str], looks: Looks
 
 def _profile(panel: Axes, queries: pd.DataFrame, names: list[str], looks: Looks) -> None:
     solved = queries["solve_s"].where(queries["status"] == Status.OK, np.inf).fillna(np.inf)
-    by = [*program_columns(), "accuracy", "solver"]
+    by = [*tables.program_columns(), "accuracy", "solver"]
     instances = queries.assign(time=solved).groupby(by, dropna=False)["time"].min().unstack()
     # Where nobody solved a program all ratios are infinite.
     fastest = instances.min(axis=1).replace(np.inf, 1.0)
