@@ -123,7 +123,7 @@ def help_on(
 
     known = commands
     lines = [f"`vibench {word}` is now `vibench {shlex.join(new)}`"] if (new := renamed([word])) else []
-    for names, line in chain(_keys(), _columns(), _tables_and_plugins(), glossary()):
+    for names, line in explained_words():
         known += names
         lines += [line] * (word.casefold() in map(str.casefold, names))
     if not lines:
@@ -136,8 +136,12 @@ def help_on(
 Explained = Iterator[tuple[Collection[str], str]]
 
 
+def explained_words() -> Explained:
+    """Keys of study files, columns, tables, plugins, and terms of the glossary."""
+    return chain(_keys(), _columns(), _tables_and_plugins(), glossary())
+
+
 def _keys() -> Explained:
-    """Keys of study files."""
     from vibench.plugins.options import keys, places
     from vibench.study.spec import Study
 

@@ -74,11 +74,9 @@ def test_new_plugins_pass_their_checks_and_give_rows_as_they_are(vibench: Vibenc
 def test_new_packages_register_their_plugin_and_keep_to_ruff(written: dict[str, Path]) -> None:
     for kind, folder in written.items():
         project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
-        assert (folder.name, project["name"]) == (f"vibench-{NAMES[kind]}",) * 2
-        ((group, entries),) = project["entry-points"].items()
-        assert group == CHECKED[kind].entry_points
-        ((name, value),) = entries.items()
-        assert name == NAMES[kind]
+        assert list(project["entry-points"]) == [CHECKED[kind].entry_points]
+        ((name, value),) = project["entry-points"][CHECKED[kind].entry_points].items()
+        assert folder.name == project["name"] == f"vibench-{name}" == f"vibench-{NAMES[kind]}"
         module, cls = value.split(":")
         source = scaffold.module_file(folder, CHECKED[kind], name)
         assert source == folder / "src" / f"{module.replace('.', '/')}.py"
