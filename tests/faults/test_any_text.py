@@ -26,7 +26,7 @@ from vibench.qp.verification import QPSolution
 from vibench.report import html
 from vibench.report.figures import problem_tables, work_precision
 from vibench.report.figures.style import styled, write_figure
-from vibench.results import formats, pictures
+from vibench.results import formats
 from vibench.results.database import ResultsDatabase
 from vibench.results.read import in_order, read_table
 from vibench.results.schema import STORED, TABLES
@@ -74,7 +74,7 @@ def recorded(folder: Path, text: str, count: Any) -> Path:
         database.write_histories([[sample("histories", **said)]])
         for table in ("thresholds", "disagreements"):
             database.replace(table, [sample(table, **said)])
-        database.replace("pictures", [sample("pictures", **said) | pictures.failure_rows(text)[0] | {"data": None}])
+        database.replace("pictures", [sample("pictures", **said) | {"reason": text} | {"data": None}])
     return folder / FILE
 
 

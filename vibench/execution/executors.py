@@ -115,16 +115,9 @@ class Dask(Executor):
         if scheduler is None:
             with interrupts.held():
                 self._cluster = LocalCluster(
-                    n_workers=slots,
-                    threads_per_worker=1,
-                    processes=True,
-                    host="127.0.0.1",
-                    protocol="tls",
-                    security=own,
-                    dashboard_address="127.0.0.1:0",
-                    memory_limit=0,
-                    silence_logs="CRITICAL",
-                )
+                    n_workers=slots, threads_per_worker=1, processes=True, host="127.0.0.1", protocol="tls",
+                    security=own, dashboard_address="127.0.0.1:0", memory_limit=0, silence_logs="CRITICAL",
+                )  # fmt: skip
         try:
             self._client = Client(self._cluster or scheduler, timeout="10s", set_as_default=False)
         except (OSError, ValueError) as error:

@@ -61,9 +61,6 @@ class IsolatedCall(ItemwiseStage, Items):
                 return NotImportableError(in_a_line(error))
             return function(*arguments)
 
-    def failed(self, number: int, failed: Failed) -> Failed:  # noqa: ARG002
-        return failed
-
     def collect(self, items: Sequence[Any]) -> Any:
         return items[0]
 

@@ -18,12 +18,14 @@ from vibench.model.certificates.base import Guarantee
 from vibench.plugins.plugin import Plugin
 from vibench.qp.status import Status
 from vibench.results.database import ResultsDatabase
+from vibench.results.pictures import picture_rows
 from vibench.results.schema import KEYS
 from vibench.results.show import exported_files
 from vibench.results.sqlite import DAMAGED, FILE, DamagedResultsError, read_meta, set_aside, study_of
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Row, Stage, value_of
 from vibench.stages.cell_queries import CellRows
+from vibench.stages.pictures import PictureStage
 from vibench.stages.timing_rounds import TimedRound, seconds_of_cell, seconds_of_queries
 from vibench.study.cells import NO_SUCH_AXIS, Axes, Cell, digest
 from vibench.study.parameter_sets import ParameterSet
@@ -90,10 +92,6 @@ def ended_by_smaller_limits(database: ResultsDatabase, limits: Limits) -> set[st
     return ended
 
 
-def keep_limits(database: ResultsDatabase, study: str, limits: Limits) -> None:
-    database.keep(f"limits of {study}", limits.model_dump_json())
-
-
 @dataclass(frozen=True)
 class ResultWriter:
     """Writes the results of the stages of a study, where plugins go by their `labels`."""
@@ -111,14 +109,10 @@ class ResultWriter:
         keys = cell_columns(cell)
         row = {"cell": cell.key, **keys, "machine": provenance.machine(), **rows.cell}
         row |= {
-            "seed": cell.validation.seed,
-            **_set_columns(cell.validation),
-            "study_hash": self.study_hash,
-            "code": cell.code,
-            "threads": int(ONE_THREAD["OMP_NUM_THREADS"]),
+            "seed": cell.validation.seed, **_set_columns(cell.validation), "study_hash": self.study_hash,
+            "code": cell.code, "threads": int(ONE_THREAD["OMP_NUM_THREADS"]), "definition": cell.definition,
             "versions": json.dumps(provenance.versions(cell.solver), sort_keys=True),
-            "definition": cell.definition,
-        }
+        }  # fmt: skip
         queries = [{"cell": cell.key, **keys, "query": k, **query} for k, query in enumerate(rows.queries)]
         solutions = [{"cell": cell.key, **solution} for solution in rows.solutions]
         outputs = [{"cell": cell.key, **keys, **output} for output in rows.outputs]
@@ -145,18 +139,13 @@ class ResultWriter:
             rows.append([named | {"step": history.first_step + k, "value": v} for k, v in enumerate(history.values)])
         if rows:
             self.database.write_histories(rows, partial=stage.partial)
-        # Artefacts are large: read them only if rows are made of them.
-        if type(stage).rows is not Stage.rows:
-            self._tables(stage, stage.rows(value_of(store, stage)))
+        if isinstance(stage, PictureStage):
+            self.pictures(stage, picture_rows(value_of(store, stage)))
 
-    def failure(self, stage: Stage, reason: str) -> None:
-        """Write the rows of a stage that failed, except for those of the cells that need it."""
-        self._tables(stage, stage.failure_rows(reason))
-
-    def _tables(self, stage: Stage, tables: Mapping[str, Sequence[Row]]) -> None:
+    def pictures(self, stage: PictureStage, rows: Iterable[Row]) -> None:
+        """Write the pictures of a problem, or the reason why there are none."""
         keys = axis_columns(stage.axes, self.labels)
-        for table, rows in tables.items():
-            self.database.replace(table, [keys | row for row in rows], **keys)
+        self.database.replace("pictures", [keys | {"number": k} | row for k, row in enumerate(rows)], **keys)
 
 
 def refute(database: ResultsDatabase) -> None:

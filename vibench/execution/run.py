@@ -13,16 +13,7 @@ from vibench import interrupts, provenance
 from vibench.errors import ExecutorError, RequestError, StorageError, VibenchError, in_a_line
 from vibench.execution.executors import Dask, Executor, Local
 from vibench.execution.graph import Graph
-from vibench.execution.recording import (
-    LOG,
-    ResultWriter,
-    claimed,
-    clear,
-    ended_by_smaller_limits,
-    keep_limits,
-    labels_of,
-    refute,
-)
+from vibench.execution.recording import LOG, ResultWriter, claimed, clear, ended_by_smaller_limits, labels_of, refute
 from vibench.execution.supervisor import Job
 from vibench.execution.timing_plan import OfflinePlan, TimingPlan
 from vibench.linalg.factorisations import DEFAULT, implementation
@@ -151,7 +142,7 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
             kept = {key: code for key, (_, code) in finished.items() if key not in repeated}
             todo = [cell for cell in cells if kept.get(cell.key) != cell.code]
             writer = ResultWriter(study, database, labels_of(cells))
-            keep_limits(database, writer.study_hash, study.limits)
+            database.keep(f"limits of {writer.study_hash}", study.limits.model_dump_json())
             run = _Run(study, folder, store, writer, observer, options)
             interrupted = run.execute(cells, todo)
             refute(database)
@@ -278,7 +269,8 @@ class _Run:
         if isinstance(outcome, Failed):
             # The last stage of a cell has no name that a user knows.
             reason = outcome.reason if stage.key in self.cells else f"in {stage.label}: {outcome.reason}"
-            self.writer.failure(stage, outcome.reason)
+            if isinstance(stage, PictureStage):
+                self.writer.pictures(stage, [{"reason": outcome.reason}])
             self._timed(stage, outcome)
             for goal in self.graph.lost(stage):
                 for cell in self.cells.get(goal.key, ()):

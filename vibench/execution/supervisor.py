@@ -114,7 +114,6 @@ class CurrentItem:
         return state >> 32, state % 2**32 >> 1 if state else None, bool(state & 1)
 
 
-@dataclass(frozen=True)
 class Begun:
     """The worker has received its job."""
 
@@ -134,7 +133,6 @@ class ItemDone:
     value: Any
 
 
-@dataclass(frozen=True)
 class BatchDone:
     """The worker has done a batch that does not end its stage."""
 

@@ -40,7 +40,7 @@ from vibench.execution.supervisor import (
 )
 from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
-from vibench.stages.base import FAILED_STAGES, PROGRESS, Done, Failed, Items, ItemwiseStage, Unstored
+from vibench.stages.base import Done, Failed, Items, ItemwiseStage, Unstored
 
 T = TypeVar("T")
 Send = Callable[[Any], None]
@@ -124,21 +124,20 @@ def perform(
         _check_code(job, batch)
         # Artefacts that were read stay in memory: at most 1 GiB, and an eighth of the limit.
         store = _store(job.store, min(2**30, int(0.125 * job.memory_gib * 2**30)))
-        FAILED_STAGES.set(job.lost)
+        store.lost = job.lost
         if isinstance(job.stage, ItemwiseStage):
             if job.stage.key not in _last:
                 _last.clear()
                 _last[job.stage.key] = job.stage.begin(store)
             items = _last[job.stage.key]
             earlier = {number: items.failed(number, failed) for number, failed in progress.lost.items()} | progress.done
-            items.resume(earlier)
             done = earlier | _done(job, items, batch, send, enter)
             if not batch.ends:
                 return BatchDone()
             _last.clear()
             value = items.collect([done[number] for number in range(job.stage.items)])
             return Done((), value, time.perf_counter() - start)
-        PROGRESS.set(lambda fraction: send(FractionDone(fraction)))
+        store.progress = lambda fraction: send(FractionDone(fraction))
         result = job.stage.run(store)
         store.put(job.stage.key, result.value, result.seconds, result.histories)
         return Done(result.histories, None, time.perf_counter() - start, result.seconds)

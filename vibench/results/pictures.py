@@ -22,21 +22,16 @@ def members(arrays: bool) -> list[str]:
 
 
 def picture_rows(drawn: Iterable[tuple[str, Picture]]) -> list[dict[str, Any]]:
-    """Rows of the pictures table, one for every title and picture, without the columns that identify the problem."""
+    """Rows of the pictures table, one for every title and picture, without the columns that identify them."""
     rows = list[dict[str, Any]]()
     # Single precision, which is enough to draw.
     precision = {name: np.int32 if name == "triangles" else np.float32 for name in members(arrays=True)}
-    for k, (title, one) in enumerate(drawn):
+    for title, one in drawn:
         stream = io.BytesIO()
         np.savez_compressed(stream, **{name: getattr(one, name).astype(kind) for name, kind in precision.items()})
         names = json.dumps([getattr(one, text) for text in members(arrays=False)])
-        rows.append({"number": k, "title": title, "names": names, "data": stream.getvalue()})
+        rows.append({"title": title, "names": names, "data": stream.getvalue()})
     return rows
-
-
-def failure_rows(reason: str) -> list[dict[str, Any]]:
-    """The row of the pictures table that holds the reason why a problem has no picture."""
-    return [{"number": 0, "reason": reason}]
 
 
 @dataclass(frozen=True)
@@ -52,15 +47,12 @@ class Shown:
 def read(path: Path) -> Iterator[Shown]:
     names, rows = read_rows(path, "pictures")
     for row in (dict(zip(names, values, strict=True)) for values in rows):
-        picture = None if row["data"] is None else _unpacked(row["data"], row["names"])
-        yield Shown((row["problem"], row["problem_options"]), row["title"] or "", picture, row["reason"] or "")
-
-
-def _unpacked(data: bytes, names: str) -> Picture:
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        values: dict[str, Any] = {
-            name: arrays[name].astype(np.intp if name == "triangles" else float) for name in members(arrays=True)
-        }
-    # A file of an earlier version has no unit of length.
-    values |= zip(members(arrays=False), (printable(str(text)) for text in json.loads(names)), strict=False)
-    return Picture(**values)
+        key, title, reason = (row["problem"], row["problem_options"]), row["title"] or "", row["reason"] or ""
+        if row["data"] is None:
+            yield Shown(key, title, None, reason)
+            continue
+        with np.load(io.BytesIO(row["data"]), allow_pickle=False) as stored:
+            kinds = {name: np.intp if name == "triangles" else float for name in members(arrays=True)}
+            parts: dict[str, Any] = {name: stored[name].astype(kind) for name, kind in kinds.items()}
+        texts = (printable(str(text)) for text in json.loads(row["names"]))
+        yield Shown(key, title, Picture(**parts | dict(zip(members(arrays=False), texts, strict=True))), reason)

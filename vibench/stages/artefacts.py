@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,12 +76,16 @@ def default_folder() -> Path:
 class Store:
     """The artefacts in a folder, with a cache of those used last."""
 
-    # `cached_bytes` limits the files of cached artefacts, 256 MiB by default; a larger artefact is read at each use.
+    # `cached_bytes` limits the files of cached artefacts, 256 MiB by default; a larger artefact is read at each use. Of
+    # the running stage it knows the dispensable inputs that were `lost`, by key, and the callback for its `progress`,
+    # the fraction of it that is done.
 
     def __init__(self, folder: Path, cached_bytes: int | None = None) -> None:
         self.folder = folder
         size = 2**28 if cached_bytes is None else cached_bytes
         self._recent: LRUCache[str, tuple[Artefact, int]] = LRUCache(size, getsizeof=lambda one: one[1])
+        self.lost: Mapping[str, Any] = {}
+        self.progress: Callable[[float], None] = lambda _: None
 
     @property
     def lock(self) -> Path:
@@ -169,13 +173,9 @@ def usable_store() -> Store:
         store.folder.mkdir(0o700, parents=True, exist_ok=True)
         # Whoever may write could plant false numbers. A folder that is named on purpose may be shared by a group.
         if store.folder.stat().st_mode & (0o002 if os.environ.get("VIBENCH_CACHE") else 0o022):
-            raise RequestError(
-                f"others may write into the folder for artefacts, '{store.folder}': run `chmod go-w` on it, "
-                f"or set VIBENCH_CACHE to another one"
-            )
+            others = f"others may write into the folder for artefacts, '{store.folder}'"
+            raise RequestError(f"{others}: run `chmod go-w` on it, or set VIBENCH_CACHE to another one")
     except OSError as error:
-        raise RequestError(
-            f"the folder for artefacts, '{store.folder}', cannot be made: {error.strerror}; "
-            f"set VIBENCH_CACHE to another one"
-        ) from None
+        failed = f"the folder for artefacts, '{store.folder}', cannot be made: {error.strerror}"
+        raise RequestError(f"{failed}; set VIBENCH_CACHE to another one") from None
     return store

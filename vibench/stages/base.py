@@ -6,11 +6,9 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from contextvars import ContextVar
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, ClassVar
 
 from vibench.errors import NumericalError
@@ -25,10 +23,6 @@ from vibench.timing import NO_TIME, Seconds
 
 Row = dict[str, Any]
 """A row of a results table: column → value."""
-
-
-PROGRESS: ContextVar[Callable[[float], None]] = ContextVar("PROGRESS", default=lambda _: None)
-"""Progress callback of the running stage (fraction done), for the estimate of the time left."""
 
 
 @lru_cache(maxsize=4)
@@ -76,10 +70,6 @@ class Failed:
     reason: str
 
 
-FAILED_STAGES: ContextVar[Mapping[str, Failed]] = ContextVar("FAILED_STAGES", default=MappingProxyType({}))
-"""Dispensable stages that failed, by their keys, for a stage that needs them."""
-
-
 @dataclass(frozen=True)
 class Unstored:
     """A stage whose artefact could not be written, and the reason; writing others is not tried."""
@@ -90,14 +80,14 @@ class Unstored:
 class Stage(ABC):
     """One stage of a computation; subclasses are frozen dataclasses of what determines the result."""
 
-    # The runner, the result writer and the progress display treat all stages alike: a stage declares its label, the
-    # axes of the study it depends on and the rows that are recorded of it.
+    # The runner and the progress display treat all stages alike: a stage declares its label and the axes of the study
+    # it depends on.
 
     label: ClassVar[str]  # name of the result in a word or two, for messages and for the names of artefacts
     stored: ClassVar[bool] = True  # whether the value is kept as an artefact, under `key`
     # Whether several stages hold parts of one result; progress is then shown part by part.
     partial: ClassVar[bool] = False
-    # Whether stages that need it run even if it failed, and find the reason in `FAILED_STAGES`; these are not `stored`.
+    # Whether stages that need it run even if it failed, and find the reason in `Store.lost`; these are not `stored`.
     dispensable: ClassVar[bool] = False
 
     @cached_property
@@ -181,14 +171,6 @@ class Stage(ABC):
     def run(self, store: Store) -> Result:
         """Compute the value; the artefacts of the inputs are in the store."""
 
-    def rows(self, value: Any) -> Mapping[str, Sequence[Row]]:  # noqa: ARG002
-        """Rows of results tables made from the value, by table; the columns that name the axes are added to them."""
-        return {}
-
-    def failure_rows(self, reason: str) -> Mapping[str, Sequence[Row]]:  # noqa: ARG002
-        """Rows recorded in place of `rows` if the stage failed, in addition to those of the cells that need it."""
-        return {}
-
 
 def _described(value: Any) -> Any:
     """A field of a stage in JSON: the key of a stage, the compared fields of another object."""
@@ -210,16 +192,13 @@ TimeLimit = Callable[[], AbstractContextManager[None]]
 class Items(ABC):
     """The items of a stage in progress, which can be done in any order and by several processes."""
 
-    def resume(self, done: Mapping[int, Any]) -> None:  # noqa: B027
-        """Register the values of items that another process did or lost; by default nothing."""
-
     @abstractmethod
     def run_item(self, number: int, time_limit: TimeLimit) -> Any:
         """Do one item; operations that have a limit of their own run `with time_limit():`."""
 
-    @abstractmethod
-    def failed(self, number: int, failed: Failed) -> Any:
-        """The substitute for an item that exceeded its limit or whose process died."""
+    def failed(self, number: int, failed: Failed) -> Any:  # noqa: ARG002
+        """The substitute for an item that exceeded its limit or whose process died: by default the failure itself."""
+        return failed
 
     @abstractmethod
     def collect(self, items: Sequence[Any]) -> Any:

@@ -25,7 +25,7 @@ from vibench.stability.infsup import (
     nodal_cone,
 )
 from vibench.stages.artefacts import Store
-from vibench.stages.base import FAILED_STAGES, PROGRESS, Failed, Result, Stage, build_problem, value_of
+from vibench.stages.base import Failed, Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage
 from vibench.stages.serialisation import storable
@@ -65,7 +65,7 @@ class EnergyConstants(Stage):
         # The constants of one parameter take about as long as six high-fidelity solutions.
         return 6.0 * chunk_size(self.parameters.count, self.chunk)
 
-    def run(self, store: Store) -> Result:  # noqa: ARG002
+    def run(self, store: Store) -> Result:
         problem, constants = build_problem(self.problem), []
         matrices, (_, mus) = assemblies(problem), chunk_of(self.parameters.of(problem), self.chunk)
         # All constants of one parameter together, as long as its factorisation is there.
@@ -73,7 +73,7 @@ class EnergyConstants(Stage):
             with at_parameter(mu):
                 found = matrices.coercivity_at(mu), matrices.continuity_at(mu), matrices.energy_inf_sup_at(mu)
             constants.append(found)
-            PROGRESS.get()(len(constants) / len(mus))
+            store.progress(len(constants) / len(mus))
         return Result(constants)
 
 
@@ -98,7 +98,7 @@ class ReferenceConstants:
         inf_sup: list[InfSup] = value_of(store, ReferenceInfSup(self.constraints))
         constants: list[Stability | Failed] = []
         for chunk, (first, end) in zip(self.energy, pairwise(chunk_edges(len(inf_sup))), strict=True):
-            if (failed := FAILED_STAGES.get().get(chunk.key)) is not None:
+            if (failed := store.lost.get(chunk.key)) is not None:
                 constants += [replace(failed, reason=f"in {chunk.label}: {failed.reason}")] * (end - first)
             else:
                 pairs = zip(inf_sup[first:end], value_of(store, chunk), strict=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,9 +12,9 @@ from vibench.errors import NumericalError
 from vibench.interfaces.outputs import Picture
 from vibench.interfaces.parameters import ParameterBox
 from vibench.plugins.plugin import Plugin
-from vibench.results.pictures import failure_rows, members, picture_rows
+from vibench.results.pictures import members
 from vibench.stages.artefacts import Store
-from vibench.stages.base import Result, Row, Stage, build_problem
+from vibench.stages.base import Result, Stage, build_problem
 from vibench.stages.serialisation import storable
 from vibench.stages.snapshots import gather, solution_stages
 from vibench.study.cells import Axes
@@ -54,12 +53,6 @@ class PictureStage(Stage):
             if picture is not None:
                 pictures.append((_title(box, solutions.mu[k]), _checked(picture)))
         return Result(tuple(pictures))
-
-    def rows(self, value: tuple[tuple[str, Picture], ...]) -> Mapping[str, Sequence[Row]]:
-        return {"pictures": picture_rows(value)}
-
-    def failure_rows(self, reason: str) -> Mapping[str, Sequence[Row]]:
-        return {"pictures": failure_rows(reason)}
 
 
 def _title(box: ParameterBox, mu: Array) -> str:

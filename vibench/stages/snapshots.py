@@ -25,7 +25,7 @@ from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.qp.scaling import nearby
 from vibench.stages.artefacts import History, Store
-from vibench.stages.base import PROGRESS, Result, Stage, build_problem, faults_of, value_of
+from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.stages.serialisation import storable
 from vibench.study.cells import Axes
 from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_of, chunk_size
@@ -138,11 +138,11 @@ class SnapshotStage(Stage):
         # The training set names the histories of its own parts only.
         return Axes(self.problem, training=self.parameters if self.parameters.role == "training" else None)
 
-    def run(self, store: Store) -> Result:  # noqa: ARG002
+    def run(self, store: Store) -> Result:
         with faults_of(self.problem):
-            return self._sweep(build_problem(self.problem))
+            return self._sweep(build_problem(self.problem), store)
 
-    def _sweep(self, problem: Problem) -> Result:
+    def _sweep(self, problem: Problem, store: Store) -> Result:
         first, mus = chunk_of(self.parameters.of(problem), self.chunk)
         kept = _set_up(problem)
         work = _Work(problem, kept.solver or HighFidelitySolver(problem), ReferenceAssembly(problem), mus, mus.copy())
@@ -163,7 +163,7 @@ class SnapshotStage(Stage):
                 solutions.append(solution)
                 seconds.append(taken)
                 solved[k] = True
-            PROGRESS.get()((k + 1) / len(mus))
+            store.progress((k + 1) / len(mus))
         mus = mus[solved]
         u, lam = np.zeros((problem.V.dim, len(mus))), np.zeros((problem.W.dim, len(mus)))
         for k, solution in enumerate(solutions):

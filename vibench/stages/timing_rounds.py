@@ -25,12 +25,7 @@ from vibench.results.paired_timing import beside, blocks_of, mean_seconds, paces
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Failed, Items, ItemwiseStage, Result, Row, Stage, TimeLimit, build_problem
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.marginal_solutions import (
-    MarginalSolution,
-    MarginalSolutions,
-    SolutionsBeside,
-    parts_alike,
-)
+from vibench.stages.marginal_solutions import MarginalSolution, MarginalSolutions, SolutionsBeside, parts_alike
 from vibench.stages.query import ModelQuery, Queries
 from vibench.stages.snapshots import TimedSnapshots, gather
 from vibench.timing import DISTURBED, NO_TIME, Seconds, calibration, timed
@@ -183,13 +178,9 @@ class _Rounds(Items):
         return [*mine[shift:], *mine[:shift]]
 
     def _time_queries(
-        self,
-        time_limit: TimeLimit,
-        alternated: Iterable[tuple[int, MarginalSolution | None]],
-        at: int,
-        cell: int,
+        self, time_limit: TimeLimit, alternated: Iterable[tuple[int, MarginalSolution | None]], at: int, cell: int,
         warm_up: int,
-    ) -> tuple[dict[int, Seconds], dict[int, Seconds], dict[int, Seconds]]:
+    ) -> tuple[dict[int, Seconds], dict[int, Seconds], dict[int, Seconds]]:  # fmt: skip
         """Seconds of assembly, solution and certificate of queries; `warm_up` is part of the seeds."""
         # Every repetition is perturbed, so that a caching solver or problem cannot be timed on a cache hit.
         stage, seed = self._stage.cells[cell], (at, cell, warm_up)
@@ -242,9 +233,6 @@ class _Rounds(Items):
             self._models[key] = stage.queries(self._store)
         return self._models[key]
 
-    def failed(self, number: int, failed: Failed) -> Failed:  # noqa: ARG002
-        return failed
-
     def collect(self, items: Sequence[TimedRound | Failed]) -> tuple[TimedCell, ...]:
         rounds: list[dict[int, TimedRound]] = [{} for _ in self._stage.cells]
         failures: list[list[Failed]] = [[] for _ in rounds]
@@ -259,12 +247,9 @@ class _Rounds(Items):
 
 
 def _assembly(
-    model: AnyReducedModel,
-    near: Array,
-    solution: MarginalSolution | None,
-    further: Callable[[], MarginalSolution],
+    model: AnyReducedModel, near: Array, solution: MarginalSolution | None, further: Callable[[], MarginalSolution],
     done: Mapping[int, Seconds],
-) -> Seconds | None:
+) -> Seconds | None:  # fmt: skip
     """Seconds of the assembly of a query, `None` where it is not timed."""
     if isinstance(model, HyperReducedModel):
         return timed(partial(model.assemble, near))[1]

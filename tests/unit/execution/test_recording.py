@@ -10,7 +10,7 @@ import pytest
 from samples import cell_row
 
 from vibench.errors import RequestError
-from vibench.execution.recording import LOG, REPORT, claimed, clear, ended_by_smaller_limits, keep_limits, refute
+from vibench.execution.recording import LOG, REPORT, claimed, clear, ended_by_smaller_limits, refute
 from vibench.execution.supervisor import OUT_OF_MEMORY
 from vibench.results.database import ResultsDatabase
 from vibench.results.sqlite import FILE
@@ -85,7 +85,7 @@ def database(tmp_path: Path) -> Iterator[ResultsDatabase]:
         found.write_cell({"cell": cell, "study_hash": study, "status": status, "reason": reason}, [])
     queries: list[dict[str, Any]] = [{"cell": "both", "query": k, "status": s} for k, s in enumerate(("timeout", "ok"))]
     found.write_cell({"cell": "both", "study_hash": "before", "status": "crashed"}, queries)
-    keep_limits(found, "before", BEFORE)
+    found.keep("limits of before", BEFORE.model_dump_json())
     yield found
     found.close()
 
@@ -101,7 +101,7 @@ def test_cells_ended_by_a_limit_of_their_row_are_run_wire_where_it_is_larger(dat
     ):
         assert ended_by_smaller_limits(database, BEFORE.model_copy(update=changed)) == again
     larger = BEFORE.model_copy(update={"cell_seconds": 700.0})
-    keep_limits(database, "after", larger)
+    database.keep("limits of after", larger.model_dump_json())
     database.write_cell({"cell": "slow", "study_hash": "after", "status": "timeout"}, [])
     assert ended_by_smaller_limits(database, larger) == {"both"}
     assert ended_by_smaller_limits(database, BEFORE) == set()

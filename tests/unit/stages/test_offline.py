@@ -23,7 +23,7 @@ from vibench.reduction.nested import Milestone
 from vibench.stability.coercivity import Stability
 from vibench.stages import snapshots
 from vibench.stages.assessment import summarise
-from vibench.stages.base import FAILED_STAGES, Failed, value_of
+from vibench.stages.base import Failed, value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import NestedEnrichment, SingleEnrichment
 from vibench.stages.infsup_constants import ReferenceConstants
@@ -98,7 +98,7 @@ def test_chunks_make_up_the_whole_sweep_in_order_with_its_diagnostics(
     assert min(steps.values()) >= 1.0
     monkeypatch.setattr(problem, "diagnostics", lambda mu: {})
     monkeypatch.setattr(snapshots, "build_problem", lambda plugin: problem)
-    assert SnapshotStage(PROBLEM, ParameterSet("validation", 2, 0), 0).run(None).histories == ()
+    assert SnapshotStage(PROBLEM, ParameterSet("validation", 2, 0), 0).run(store).histories == ()
 
 
 def test_histories_and_models_are_those_of_the_offline_stages(store: SampleStore) -> None:
@@ -277,7 +277,9 @@ def test_every_query_has_proved_bounds_of_the_errors_in_the_same_norms(store: Sa
         assert rows.cell[f"effectivity_{name}_median"] == median
 
 
-def test_slow_queries_missing_artefacts_and_failed_constants_are_named(tmp_path: Path, store: SampleStore) -> None:
+def test_slow_queries_missing_artefacts_and_failed_constants_are_named(
+    tmp_path: Path, store: SampleStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
     stage = PODStage(PROBLEM, Stop(size=2))
     with pytest.raises(NumericalError, match=stage.key):
         value_of(SampleStore(tmp_path), stage)
@@ -288,11 +290,8 @@ def test_slow_queries_missing_artefacts_and_failed_constants_are_named(tmp_path:
     assert "the limit is 1e-09 s" in rows.queries[0]["reason"]
     stage = cell("offline-pga", 0.5)
     first, *_ = stage.reference.energy
-    token = FAILED_STAGES.set({first.key: Failed(Status.TIMEOUT, "too long")})
-    try:
-        rows = stage.run(store).value.queries
-    finally:
-        FAILED_STAGES.reset(token)
+    monkeypatch.setattr(store, "lost", {first.key: Failed(Status.TIMEOUT, "too long")})
+    rows = stage.run(store).value.queries
     lost = chunk_of(np.arange(9.0)[:, None], 0)[1].size
     assert [row["status"] for row in rows] == ["timeout"] * lost + ["ok"] * (9 - lost)
     assert {row["reason"] for row in rows[:lost]} == {"in high-fidelity constants: too long"}
