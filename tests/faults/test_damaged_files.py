@@ -19,8 +19,7 @@ from vibench.results.database import ResultsDatabase
 from vibench.results.read import results_file
 from vibench.results.schema import STORED
 from vibench.results.sqlite import FILE, read_meta, read_rows, study_of
-from vibench.stages.artefacts import Store
-from vibench.stages.serialisation import dumps
+from vibench.stages.artefacts import Store, dumps
 
 STUDY = {
     "name": "small", "seed": 3, "validation": 2, "solvers": ["piqp", "osqp"], "dual": ["mcpg"],

@@ -1,25 +1,235 @@
-"""Artefacts: results of stages, each a file under the hash of its inputs, shared by all runs."""
+"""Artefacts: results of stages, each a file under the hash of its inputs, shared by all runs.
+
+Values are arrays and JSON in the safetensors format, from which nothing but data can be read.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
+import math
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
+from enum import Enum
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import numpy as np
 import platformdirs
+import safetensors
+import safetensors.numpy
+import scipy.sparse as sp
 from cachetools import LRUCache
 
-from vibench.errors import RequestError, StorageError
+from vibench.arrays import SparseMatrix
+from vibench.errors import NumericalError, RequestError, StorageError, VibenchError
 from vibench.files import PART, TEMPORARY, locked, write_atomically
 from vibench.provenance import machine
-from vibench.stages.serialisation import DamagedArtefactError, dumps, loads, storable
 from vibench.text import one_line
 from vibench.timing import Seconds
+
+SPARSE = {
+    "csr": ("data", "indices", "indptr"), "csc": ("data", "indices", "indptr"), "bsr": ("data", "indices", "indptr"),
+    "coo": ("row", "col", "data"), "dia": ("data", "offsets"),
+}  # fmt: skip
+"""The arrays of a sparse matrix, by its format; matrices of other formats are stored as `coo`."""
+
+_classes: dict[str, type] = {}
+
+ClassT = TypeVar("ClassT", bound=type)
+
+
+class DamagedArtefactError(VibenchError):
+    """Bytes that `dumps` did not write."""
+
+
+def storable(kind: ClassT) -> ClassT:
+    """Add a class to the closed list of those whose objects may be stored; may be used as a decorator."""
+    # A dataclass is stored by its fields, an enumeration by the name of the member, any other class by the value of
+    # `__getstate__` without cached properties. A module that defines a stage lists the classes of its value.
+    # Files name classes without their modules.
+    if _classes.setdefault(kind.__name__, kind) is not kind:
+        raise TypeError(f"two storable classes are called {kind.__name__}")
+    return kind
+
+
+def dumps(value: Any) -> bytes:
+    """A value as bytes: `None`, booleans, numbers, texts, tuples, lists, dictionaries, arrays, `storable` objects."""
+    writer = _Writer()
+    text = json.dumps(writer.described(value), allow_nan=False, separators=(",", ":"))
+    # One tensor holds the JSON text; the others are the arrays it refers to, by their numbers.
+    return safetensors.numpy.save(writer.arrays | {"structure": np.frombuffer(text.encode("ascii"), np.uint8)})
+
+
+def loads(content: bytes) -> Any:
+    """The value that `dumps` wrote, dense arrays read-only; a `DamagedArtefactError` for any other content."""
+    try:
+        arrays = safetensors.numpy.load(content)
+        text = arrays.pop("structure").tobytes().decode("ascii")
+        structure = json.loads(text, object_pairs_hook=_no_duplicates, parse_constant=_refuse)
+        return _Reader(arrays).value(structure)
+    except (
+        safetensors.SafetensorError,
+        LookupError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        RecursionError,
+        MemoryError,
+        # Factorisations are computed again, which may fail.
+        VibenchError,
+    ) as error:
+        raise DamagedArtefactError(one_line(str(error))) from None
+
+
+class _Writer:
+    """Describes a value in JSON; arrays are stored apart, and one that occurs twice is stored once."""
+
+    def __init__(self) -> None:
+        self.arrays: dict[str, np.ndarray[Any, Any]] = {}
+        self._numbers: dict[int, str] = {}
+        # Keep described objects alive: identities of collected ones are reused.
+        self._alive: list[Any] = []
+
+    def described(self, value: Any) -> Any:
+        """JSON of a value: itself, or an object with the kind of the value as its only key."""
+        if value is None or type(value) in (bool, int, str):
+            return value
+        if type(value) is float:
+            # JSON knows no infinity and no NaN.
+            return value if math.isfinite(value) else {"float": repr(value)}
+        if sp.issparse(value):
+            return self._sparse(value)
+        if isinstance(value, Mapping):
+            return {"dict": [[self.described(key), self.described(part)] for key, part in value.items()]}
+        if type(value) in (tuple, list):
+            return {type(value).__name__: [self.described(part) for part in value]}
+        return self._array(value) if type(value) is np.ndarray or isinstance(value, np.generic) else self._object(value)
+
+    def _array(self, value: Any) -> Any:
+        """An array, or a number of NumPy."""
+        # Booleans, signed and unsigned integers and floats of at most 8 bytes: safetensors has no other type.
+        if value.dtype.kind not in "biuf" or value.dtype.itemsize > 8:
+            raise NumericalError(f"an array of the type {value.dtype} cannot be stored")
+        columnwise = value.flags.f_contiguous and not value.flags.c_contiguous
+        kind = "scalar" if isinstance(value, np.generic) else "columnwise" if columnwise else "array"
+        if id(value) not in self._numbers:
+            number = self._numbers[id(value)] = str(len(self.arrays))
+            self._alive.append(value)
+            self.arrays[number] = value.T if columnwise else np.asarray(value, order="C")
+        return {kind: self._numbers[id(value)]}
+
+    def _sparse(self, value: SparseMatrix) -> Any:
+        kind = value.format if value.format in SPARSE else "coo"
+        stored = value.asformat(kind)
+        self._alive.append(stored)
+        parts = [self.described(np.asarray(getattr(stored, name))) for name in SPARSE[kind]]
+        return {"sparse": [value.format, kind, isinstance(value, sp.sparray), list(value.shape), parts]}
+
+    def _object(self, value: Any) -> Any:
+        kind, name = type(value), type(value).__name__
+        if _classes.get(name) is not kind:
+            raise NumericalError(f"a value of the type {kind.__module__}.{kind.__qualname__} cannot be stored")
+        if isinstance(value, Enum):
+            return {"member": [name, value.name]}
+        if is_dataclass(value):
+            state = {field.name: getattr(value, field.name) for field in fields(value)}
+        else:
+            cached = {key for key in value.__getstate__() if isinstance(getattr(kind, key, None), cached_property)}
+            state = {key: part for key, part in value.__getstate__().items() if key not in cached}
+        return {"object": [name, {key: self.described(part) for key, part in state.items()}]}
+
+
+class _Reader:
+    """Makes a value from its description and its arrays."""
+
+    def __init__(self, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
+        self._arrays, self._views = arrays, dict[str, np.ndarray[Any, Any]]()
+        self._kinds: dict[str, Callable[[Any], Any]] = {
+            "float": lambda text: {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}[text],
+            "tuple": lambda parts: tuple(map(self.value, parts)), "list": lambda parts: list(map(self.value, parts)),
+            "dict": lambda parts: {self.value(key): self.value(part) for key, part in parts}, "array": self._read_only,
+            "columnwise": lambda number: self._read_only(number).T, "scalar": lambda number: self._arrays[number][()],
+            "sparse": lambda parts: self._sparse(*parts), "member": lambda parts: _class(parts[0], Enum)[parts[1]],
+            "object": lambda parts: self._object(*parts),
+        }  # fmt: skip
+
+    def value(self, described: Any) -> Any:
+        """The value of a description."""
+        if not isinstance(described, dict):
+            if isinstance(described, list):
+                raise TypeError("a list without its kind")
+            return described
+        ((kind, content),) = described.items()
+        return self._kinds[kind](content)
+
+    def _read_only(self, number: str) -> np.ndarray[Any, Any]:
+        """A view of an array, the same one wherever it occurs."""
+        # A process keeps values for several stages: a plugin that wrote into them would change the results of others.
+        if number not in self._views:
+            self._views[number] = self._arrays[number].view()
+            self._views[number].flags.writeable = False
+        return self._views[number]
+
+    def _part(self, described: tuple[str, str]) -> np.ndarray[Any, Any]:
+        kind, number = described
+        if kind not in ("array", "columnwise"):
+            raise TypeError("a sparse matrix without arrays")
+        # Writable: SciPy sorts indices in place.
+        return self._arrays[number].T if kind == "columnwise" else self._arrays[number]
+
+    def _sparse(self, wanted: str, kind: str, array: bool, shape: list[int], parts: list[Any]) -> SparseMatrix:
+        arrays = [self._part(*part.items()) for part in parts]
+        if kind not in SPARSE or wanted not in {*SPARSE, "lil", "dok"} or len(arrays) != len(SPARSE[kind]):
+            raise ValueError("no format of a sparse matrix")
+        make = getattr(sp, f"{kind}_{'array' if array else 'matrix'}")
+        given = (arrays[2], (arrays[0], arrays[1])) if kind == "coo" else tuple(arrays)
+        matrix = make(given, shape=tuple(shape))
+        if kind in ("csr", "csc", "bsr"):
+            if not arrays[1].dtype.kind == arrays[2].dtype.kind == "i":
+                raise ValueError("indices that are no integers")
+            # Compiled loops trust the indices.
+            matrix.check_format(full_check=True)
+            # The constructor may have converted them.
+            matrix.indices, matrix.indptr = arrays[1], arrays[2]
+        return matrix if wanted == kind else matrix.asformat(wanted)
+
+    def _object(self, name: str, described: dict[str, Any]) -> Any:
+        kind = make = _class(name, object)
+        state = {key: self.value(part) for key, part in described.items()}
+        if is_dataclass(kind):
+            if state.keys() != {field.name for field in fields(kind)}:
+                raise TypeError(f"other fields than those of {name}")
+            return make(**state)
+        made = object.__new__(kind)
+        set_state = getattr(made, "__setstate__", made.__dict__.update)
+        set_state(state)
+        return made
+
+
+def _class(name: str, base: type) -> Any:
+    """The class of a name, from the closed list."""
+    named = _classes[name]
+    if issubclass(named, Enum) is not (base is Enum):
+        raise TypeError(f"{name} is another kind of class")
+    return named
+
+
+def _no_duplicates(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    pairs = list(pairs)
+    unique = dict(pairs)
+    # The reader must not depend on which of two entries JSON keeps.
+    if len(unique) != len(pairs):
+        raise ValueError("a name that occurs twice")
+    return unique
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is not JSON")
 
 
 @storable

@@ -15,11 +15,10 @@ from vibench.model.galerkin import ReducedModel, leading_part, project
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline.assemblies import assemblies
 from vibench.qp.exact import ExactSolution, exact_solution
-from vibench.stages.artefacts import Store
+from vibench.stages.artefacts import Store, storable
 from vibench.stages.base import Result, Stage, value_of
 from vibench.stages.enrichment import GrowthStage
 from vibench.stages.formulation import FormulationStage
-from vibench.stages.serialisation import storable
 from vibench.study.parameter_sets import ParameterSet
 
 for _kind in (VariationalInequality, ExactSolution):

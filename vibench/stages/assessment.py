@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -11,20 +11,12 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Kind
+from vibench.model import errors as measured
 from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineBound
 from vibench.model.error_bounds import ErrorBounds, error_bounds
-from vibench.model.errors import (
-    UNMEASURABLE,
-    Errors,
-    ReferenceSolutions,
-    energy_norms,
-    errors,
-    high_fidelity_residuals,
-    of_stiffness,
-    output_errors,
-)
+from vibench.model.errors import UNMEASURABLE, ReferenceSolutions
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
 from vibench.model.hyperreduced import AnyReducedModel
@@ -33,42 +25,33 @@ from vibench.offline.solution import Answer, Corrector
 from vibench.qp.exact import ExactSolution
 from vibench.qp.scaling import ratio
 from vibench.qp.status import Status
+from vibench.results.schema import STORED
 from vibench.stability.coercivity import Stability
 from vibench.stages.base import Row
 
 
 def pair_columns(
-    problem: Problem,
-    mus: Array,
-    vis: Sequence[VariationalInequality],
-    u: Array,
-    lam: Array,
-    reference: ReferenceSolutions,
-    constants: Sequence[Stability],
-) -> list[Row]:
+    problem: Problem, mus: Array, vis: Sequence[VariationalInequality], u: Array, lam: Array,
+    reference: ReferenceSolutions, constants: Sequence[Stability],
+) -> list[Row]:  # fmt: skip
     """Columns of answers u (n×P), λ (m×P) at parameters (P×d): errors, their bounds, residuals and outputs."""
     energies = [assemblies(problem).energy_at(mu) for mu in mus]
-    forces = of_stiffness(energies, u)
+    forces = measured.of_stiffness(energies, u)
     residuals = [vi.f - force - vi.B.T @ of_lam for vi, force, of_lam in zip(vis, forces.T, lam.T, strict=True)]
     bounds = error_bounds(problem.V, vis, energies, constants, u, lam, reference.lam > 0.0, residuals)
-    measured = zip(
-        errors(problem, vis, energies, reference, u, lam),
-        bounds,
-        hsw_bounds(problem, vis, constants, u, lam, residuals),
-        strict=True,
-    )
-    rows = [_columns(*one) for one in measured]
-    sizes = energy_norms(u, forces)
-    pairs = zip(rows, bounds, sizes.tolist(), vis, energies, u.T, lam.T, strict=True)
-    for row, bound, size, vi, energy, of_u, of_lam in pairs:
-        hf = high_fidelity_residuals(vi, energy, of_u, of_lam, bound.rho, size)
-        row |= {"hf_primal_residual": hf.primal, "hf_dual_residual": hf.dual, "hf_gap": hf.gap}
-    for row, of_query in zip(rows, output_errors(problem.outputs, mus, (u, lam), reference), strict=True):
-        row["outputs"] = of_query
+    hsw = hsw_bounds(problem, vis, constants, u, lam, residuals)
+    errors = measured.errors(problem, vis, energies, reference, u, lam)
+    rows = [_columns(*one) for one in zip(errors, bounds, hsw, strict=True)]
+    outputs = measured.output_errors(problem.outputs, mus, (u, lam), reference)
+    sizes = measured.energy_norms(u, forces).tolist()
+    pairs = zip(rows, bounds, outputs, sizes, vis, energies, u.T, lam.T, strict=True)
+    for row, bound, of_query, size, vi, energy, of_u, of_lam in pairs:
+        hf = measured.high_fidelity_residuals(vi, energy, of_u, of_lam, bound.rho, size)
+        row |= {"hf_primal_residual": hf.primal, "hf_dual_residual": hf.dual, "hf_gap": hf.gap, "outputs": of_query}
     return rows
 
 
-def _columns(error: Errors, bounds: ErrorBounds, hsw: HSWBounds | None) -> Row:
+def _columns(error: measured.Errors, bounds: ErrorBounds, hsw: HSWBounds | None) -> Row:
     row: Row = asdict(error) | {"bound_note": bounds.note}
     # Errors below round-off have no effectivity. Those of zero solutions are relative to the largest training solution.
     of_u = (error.error_u_scaled if error.error_u is None else error.error_u) > UNMEASURABLE
@@ -138,22 +121,17 @@ def is_violated(error: Array | float, bound: Array | float, size: Array | float)
 
 
 def error_columns(
-    corrector: Corrector,
-    mus: Array,
-    solutions: Sequence[tuple[Array, Array]],
-    reference: ReferenceSolutions,
-    constants: Sequence[Stability],
-    exact: Sequence[ExactSolution | None],
+    corrector: Corrector, mus: Array, solutions: Sequence[tuple[Array, Array]], reference: ReferenceSolutions,
+    constants: Sequence[Stability], exact: Sequence[ExactSolution | None],
     projected: Sequence[ExactSolution | None] = (),
-) -> list[Row]:
+) -> list[Row]:  # fmt: skip
     """Errors of answers to solutions (x, α), one per parameter of `mus` (P×d), their error bounds and effectivities."""
     # `exact` are the same programs solved to round-off: the difference is the error of the solver. `projected` are the
     # programs assembled in full, solved to round-off, where those of the queries are not: the difference from `exact`
     # is the error of reduced assembly. A `corrector` with a certificate adds bounds at online cost.
     if not solutions:
         return []
-    model = corrector.model
-    problem = model.problem
+    model, problem = corrector.model, corrector.model.problem
     vis = [assemblies(problem).at(mu) for mu in mus]
     u, lam = _reconstructed(model, mus, vis, solutions)
     queries = zip(mus, solutions, u.T, lam.T, strict=True)
@@ -197,18 +175,11 @@ def _reconstructed(
 
 
 def _contribution(
-    source: str,
-    corrector: Corrector,
-    mu: Array,
-    corrected: bool,
-    norms: tuple[float, float],
-    row: Row,
-    one: ExactSolution,
-    other: ExactSolution,
-) -> Row:
+    source: str, corrector: Corrector, mu: Array, corrected: bool, norms: tuple[float, float], row: Row,
+    one: ExactSolution, other: ExactSolution,
+) -> Row:  # fmt: skip
     """Contribution of a source of error, the difference of two solutions of a query, relative to `norms` of u and λ."""
-    parts: Row = {}
-    problem = corrector.model.problem
+    parts, problem = dict[str, float](), corrector.model.problem
     if corrected:
         pairs = [_corrected(corrector, mu, solution) for solution in (one, other)]
         if not all(pair.is_corrected for pair in pairs):
@@ -251,25 +222,19 @@ def summarise(rows: Sequence[Row]) -> Row:
     def column(name: str, among: Sequence[Row] = fine) -> Array:
         return np.array([row[name] for row in among if row.get(name) is not None], dtype=float)
 
-    def mean(name: str) -> float | None:
-        return float(column(name).mean()) if column(name).size else None
-
-    def median(name: str) -> float | None:
-        return float(np.median(column(name))) if column(name).size else None
-
-    def largest(name: str, among: Sequence[Row] = fine) -> float | None:
+    def over(statistic: Callable[[Array], Any], name: str, among: Sequence[Row] = fine) -> float | None:
         values = column(name, among)
-        return float(values.max()) if values.size else None
+        return float(statistic(values)) if values.size else None
 
-    def smallest(name: str) -> float | None:
-        return min((row[name] for row in rows if row.get(name) is not None), default=None)
+    def largest(*names: str) -> float | None:
+        return max((value for name in names if (value := over(np.max, name)) is not None), default=None)
 
     def fraction(source: str, name: str) -> float | None:
         # A quotient of means: that of single queries is noise where their errors are near round-off.
-        measured = [row for row in fine if row.get(f"{source}_error_{name}") is not None]
-        whole = sum(row[f"error_{name}"] for row in measured)
-        measurable = whole > UNMEASURABLE * len(measured)
-        return float(sum(row[f"{source}_error_{name}"] for row in measured) / whole) if measurable else None
+        known = [row for row in fine if row.get(f"{source}_error_{name}") is not None]
+        whole = sum(row[f"error_{name}"] for row in known)
+        measurable = whole > UNMEASURABLE * len(known)
+        return float(sum(row[f"{source}_error_{name}"] for row in known) / whole) if measurable else None
 
     def contributions(source: str) -> Row:
         shares = [part for name in ("u", "lambda") if (part := fraction(source, name)) is not None]
@@ -281,39 +246,26 @@ def summarise(rows: Sequence[Row]) -> Row:
         # largest error on the scale of the training set has a column of its own.
         zero = [row for row in fine if row.get(f"zero_{name}")]
         return {
-            f"error_{name}_mean": mean(f"error_{name}"),
-            f"error_{name}_max": largest(f"error_{name}"),
-            f"queries_zero_{name}": len(zero),
-            f"error_{name}_zero_max": largest(f"error_{name}_scaled", zero),
-        }
+            f"error_{name}_mean": over(np.mean, f"error_{name}"), f"error_{name}_max": largest(f"error_{name}"),
+            f"queries_zero_{name}": len(zero), f"error_{name}_zero_max": over(np.max, f"error_{name}_scaled", zero),
+        }  # fmt: skip
 
-    bounds = (
-        "u_energy", "u", "lambda_natural", "lambda", "online_u_energy", "online_lambda_natural", "online_lambda",
-        "hsw_u", "hsw_lambda",
-    )  # fmt: skip
     violated = column("bound_online_violated")
-    residuals = [largest(name) for name in ("primal_residual", "dual_residual", "gap")]
-    hf_residuals = [largest(name) for name in ("hf_primal_residual", "hf_dual_residual", "hf_gap")]
+    medians = [name for name in STORED["cells"] if name.startswith("effectivity_")]
+    smallest = ("beta_span", "beta_cone_lower", "beta_cone_upper")
     return {
         "status": worst.value,
         "reason": f"{len(reasons)} of {len(rows)} queries, first {reasons[0]}" if reasons else "",
-        "queries": len(rows),
-        "queries_ok": len(fine),
-        **errors("u"),
-        **errors("lambda"),
-        **{f"effectivity_{name}_median": median(f"effectivity_{name}") for name in bounds},
-        "corrected_share": mean("corrected"),
-        "reference_bound_max": largest("reference_bound", rows),
+        "queries": len(rows), "queries_ok": len(fine),
+        **errors("u"), **errors("lambda"), **contributions("solver"), **contributions("assembly"),
+        **{name: over(np.median, name.removesuffix("_median")) for name in medians},
+        "corrected_share": over(np.mean, "corrected"),
+        "reference_bound_max": over(np.max, "reference_bound", rows),
         # Zero violations are a result only of a cell with bounds.
         "bound_online_violations": int(violated.sum()) if violated.size else None,
-        **contributions("solver"),
-        **contributions("assembly"),
-        "assembly_error_max": largest("assembly_error"),
-        "violation_max": largest("violation"),
-        "hf_residual_max": max((r for r in hf_residuals if r is not None), default=None),
-        "error_u_predicted_mean": mean("error_u_predicted"),
-        "residual_max": max((r for r in residuals if r is not None), default=None),
-        "beta_span_min": smallest("beta_span"),
-        "beta_cone_lower_min": smallest("beta_cone_lower"),
-        "beta_cone_upper_min": smallest("beta_cone_upper"),
-    }
+        "assembly_error_max": largest("assembly_error"), "violation_max": largest("violation"),
+        "hf_residual_max": largest("hf_primal_residual", "hf_dual_residual", "hf_gap"),
+        "residual_max": largest("primal_residual", "dual_residual", "gap"),
+        "error_u_predicted_mean": over(np.mean, "error_u_predicted"),
+        **{f"{name}_min": over(np.min, name, rows) for name in smallest},
+    }  # fmt: skip

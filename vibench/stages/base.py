@@ -28,9 +28,7 @@ Row = dict[str, Any]
 @lru_cache(maxsize=4)
 def build_problem(plugin: Plugin) -> Problem:
     """The problem of a stage; one instance per process."""
-    problem = plugin.create()
-    # `RegisteredPlugin.load` refuses anything else.
-    assert isinstance(problem, Problem)
+    problem: Problem = plugin.create()
     return problem
 
 
@@ -107,7 +105,7 @@ class Stage(ABC):
         # Of its own layer only the modules count that it imports from: an edit of one stage keeps most other artefacts.
         imported = {str(getattr(one, "__module__", "")) for one in vars(sys.modules[cls.__module__]).values()}
         # These modules only pass values on.
-        carriers = {__name__, "vibench.stages.artefacts", "vibench.stages.serialisation"}
+        carriers = {__name__, "vibench.stages.artefacts"}
         own = {name for name in imported if name.startswith("vibench.stages.")} - carriers
         sources = [source_hash(Path(str(sys.modules[name].__file__))) for name in sorted({cls.__module__, *own})]
         return " ".join([*sources, numerical_code(below="stages")])

@@ -27,7 +27,7 @@ from vibench.provenance import machine
 from vibench.qp.exact import ExactSolution
 from vibench.qp.status import Status
 from vibench.results.consistency import vectors
-from vibench.stability.coercivity import Stability
+from vibench.stability.coercivity import Constant, Stability
 from vibench.stability.infsup import InfSup, stability_ratio
 from vibench.stages.artefacts import Artefact, Store
 from vibench.stages.assembly import AssemblyStage, ExactSolutions, ReducedPrograms
@@ -194,9 +194,8 @@ class _Queries(Items):
     def __init__(self, stage: CellQueries, store: Store) -> None:
         self._stage, self._store, self._queries = stage, store, stage.queries(store)
         self._problem, self._model = build_problem(stage.problem), self._queries.model
-        self._training, self._reference, self._compared = _solutions(
-            store, stage.problem, stage.training, stage.validation
-        )
+        solved = _solutions(store, stage.problem, stage.training, stage.validation)
+        self._training, self._reference, self._compared = solved
         self._zeros = zeros(self._problem, self._compared)
         self._stability = stage.reference.gather(store)
         self._certificate = None if stage.certificate is None else stage.certificate.certificate(store)
@@ -225,11 +224,8 @@ class _Queries(Items):
         rows = [row | refutation(row) for row in rows]
         sizes, fallbacks = self._sizes(rows)
         own = summarise(rows) | self._common(fallbacks) | sizes | self._offline()
-        outputs = summarise_outputs(
-            self._problem.outputs,
-            self._compared.scale_outputs,
-            [row["outputs"] for row in rows if row["status"] == Status.OK],
-        )
+        fine = [row["outputs"] for row in rows if row["status"] == Status.OK]
+        outputs = summarise_outputs(self._problem.outputs, self._compared.scale_outputs, fine)
         written = [row | {"outputs": json.dumps(values) if (values := row.get("outputs")) else None} for row in rows]
         box = self._problem.parameters
         named = tuple(zip(map(str, box.names), map(str, box.units), strict=True))
@@ -281,13 +277,10 @@ class _Queries(Items):
         row |= {"hf_s": reference.seconds[number].cpu, "reference_bound": bound if math.isfinite(bound) else None}
         row |= {"zero_u": int(zero_u[number]), "zero_lambda": int(zero_lam[number])}
         if isinstance(constants, Stability):
-            row |= _inf_sup_columns("beta_hf_", constants.inf_sup) | {
-                "coercivity": constants.coercivity.value,
-                "coercivity_proved": int(constants.coercivity.proved),
-                "continuity": constants.continuity.value,
-                "continuity_proved": int(constants.continuity.proved),
-                "beta_energy": constants.energy_inf_sup.value,
-            }
+            row |= _inf_sup_columns("beta_hf_", constants.inf_sup) | {"beta_energy": constants.energy_inf_sup.value}
+            for name in ("coercivity", "continuity"):
+                one: Constant = getattr(constants, name)
+                row |= {name: one.value, f"{name}_proved": int(one.proved)}
         for prefix, of_pair in zip(("beta_", "beta_full_", "beta_plain_"), self._constants, strict=False):
             row |= _inf_sup_columns(prefix, of_pair[number])
         if self._constants:
@@ -407,22 +400,11 @@ def _solutions(
 ) -> tuple[TimedSnapshots, TimedSnapshots, ReferenceSolutions]:
     """Training and validation solutions, and the latter with the largest values of the former."""
     trained, reference, problem = gather(store, training), gather(store, validation), build_problem(plugin)
-    return (
-        trained,
-        reference,
-        ReferenceSolutions(
-            reference.u,
-            reference.lam,
-            float(np.max(problem.V.norm(trained.u), initial=0.0)),
-            float(np.max(problem.W.norm(trained.lam), initial=0.0)),
-            output_scales(problem.outputs, trained.mu, trained.u, trained.lam),
-        ),
-    )
+    norms = problem.V.norm(trained.u), problem.W.norm(trained.lam)
+    of_u, of_lam = (float(np.max(one, initial=0.0)) for one in norms)
+    scales = output_scales(problem.outputs, trained.mu, trained.u, trained.lam)
+    return trained, reference, ReferenceSolutions(reference.u, reference.lam, of_u, of_lam, scales)
 
 
 def _inf_sup_columns(prefix: str, constants: InfSup) -> Row:
-    return {
-        f"{prefix}span": constants.span,
-        f"{prefix}cone_lower": constants.cone_lower,
-        f"{prefix}cone_upper": constants.cone_upper,
-    }
+    return {f"{prefix}{name}": getattr(constants, name) for name in ("span", "cone_lower", "cone_upper")}

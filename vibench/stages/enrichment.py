@@ -19,10 +19,9 @@ from vibench.plugins.plugin import Plugin
 from vibench.reduction.nested import Grown, Milestone, grow_through
 from vibench.reduction.supremizers import ConstraintClasses, projected_supremizers
 from vibench.stability.infsup import ProjectedSupremizers
-from vibench.stages.artefacts import History, Store
+from vibench.stages.artefacts import History, Store, storable
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.stages.offline import ConeStage, PODStage, ReducedCone, TrainingConstants
-from vibench.stages.serialisation import storable
 from vibench.stages.snapshots import parameters_in
 from vibench.study.cells import Axes, Cell
 from vibench.timing import Seconds, timed

@@ -28,11 +28,10 @@ from vibench.offline.reduction import Reduction
 from vibench.plugins.plugin import Plugin
 from vibench.reduction.pod import POD
 from vibench.reduction.supremizers import ContactCoordinates, LoadCoordinates, SpannedCoordinates
-from vibench.stages.artefacts import Store
+from vibench.stages.artefacts import Store, storable
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.offline import ConeStage, PODStage, ReducedCone
-from vibench.stages.serialisation import storable
 from vibench.stages.snapshots import gather, parameters_in, solution_stages
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.timing import timed
@@ -179,7 +178,7 @@ class FormulationStage(Stage):
 
     def run(self, store: Store) -> Result:
         """Build the formulation, timed; raises an `UnsupportedError` if the problem lacks what it needs."""
-        offline, formulation = self.offline(store), self.create()
+        offline, formulation = self.offline(store), self.formulation.create()
         # Read snapshots and members before the clock begins.
         offline.snapshots  # noqa: B018
         if self.decomposition is not None:
@@ -195,12 +194,6 @@ class FormulationStage(Stage):
             built, seconds = timed(work)
         operators = offline.__dict__.get("operators") if self.reduction is None else None
         return Result(BuiltFormulation(dict(built), operators), seconds)
-
-    def create(self) -> Formulation:
-        formulation = self.formulation.create()
-        # `RegisteredPlugin.load` refuses anything else.
-        assert isinstance(formulation, Formulation)
-        return formulation
 
     def offline(self, store: Store, accuracy: float = ACCURACY) -> Reduction:
         pod, cone, enrichment = self.pod, self.cone, self.enrichment
@@ -236,7 +229,7 @@ class FormulationStage(Stage):
             built = dict(stored.built)
             if stored.operators is not None:
                 offline = offline.given(operators=stored.operators)
-        return Model(self.create(), offline, built, solver, accuracy)
+        return Model(self.formulation.create(), offline, built, solver, accuracy)
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,10 @@ from vibench.stability.infsup import (
     inf_sup,
     nodal_cone,
 )
-from vibench.stages.artefacts import Store
+from vibench.stages.artefacts import Store, storable
 from vibench.stages.base import Failed, Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage
-from vibench.stages.serialisation import storable
 from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_edges, chunk_of, chunk_size
 
 for _kind in (ConstraintClasses, Stability, Constant, InfSup):

@@ -11,9 +11,8 @@ from vibench.reduction.cones import orthogonality
 from vibench.reduction.pod import POD, pod
 from vibench.reduction.supremizers import ConstraintClasses, constraint_classes, isometric_supremizers
 from vibench.stability.infsup import ConeBasis, beta_span, cone_basis
-from vibench.stages.artefacts import History, Store
+from vibench.stages.artefacts import History, Store, storable
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
-from vibench.stages.serialisation import storable
 from vibench.stages.snapshots import gather, parameters_in, solution_stages
 from vibench.study.cells import Axes
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet

@@ -13,9 +13,8 @@ from vibench.interfaces.outputs import Picture
 from vibench.interfaces.parameters import ParameterBox
 from vibench.plugins.plugin import Plugin
 from vibench.results.pictures import members
-from vibench.stages.artefacts import Store
+from vibench.stages.artefacts import Store, storable
 from vibench.stages.base import Result, Stage, build_problem
-from vibench.stages.serialisation import storable
 from vibench.stages.snapshots import gather, solution_stages
 from vibench.study.cells import Axes
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
@@ -66,16 +65,14 @@ def _checked(picture: Picture) -> Picture:
     mistyped += [name for name in members(arrays=False) if not isinstance(getattr(picture, name), str)]
     if mistyped:
         raise NumericalError(f"the problem's picture has {' and '.join(mistyped)} of the wrong type")
-    count, places = picture.points.shape[-1], picture.positions.shape[-1]
-    corners = picture.triangles
+    points, corners, positions = picture.points, picture.triangles, picture.positions
+    count = points.shape[-1]
     mesh = corners.shape[0] == 3 and bool(np.all((corners >= 0) & (corners < count)))
     fits = {
-        "points": picture.points.ndim == 2 and len(picture.points) in (1, 2),
-        "triangles": len(picture.points) == 1 or mesh,
-        "values": picture.values.shape == (count,),
-        "positions": picture.positions.ndim == 2 and len(picture.positions) in (1, 2),
-        "multiplier": picture.multiplier.shape == (places,),
-    }
+        "points": points.ndim == 2 and len(points) in (1, 2), "triangles": len(points) == 1 or mesh,
+        "values": picture.values.shape == (count,), "positions": positions.ndim == 2 and len(positions) in (1, 2),
+        "multiplier": picture.multiplier.shape == positions.shape[-1:],
+    }  # fmt: skip
     wrong = [name for name, right in fits.items() if not right]
     if wrong:
         raise NumericalError(f"the problem's picture has {' and '.join(wrong)} of the wrong shape")

@@ -172,13 +172,9 @@ class Queries:
     # `programs` are the programs at these, of a formulation that has any.
 
     def __init__(
-        self,
-        store: Store,
-        built: FormulationStage,
-        validation: ParameterSet,
-        assembly: AssemblyStage | None,
+        self, store: Store, built: FormulationStage, validation: ParameterSet, assembly: AssemblyStage | None,
         accuracy: float | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.model, self._validation = built.model(store, accuracy=accuracy), validation
         self.mus = validation.of(self.model.problem)
         self.programs: ReducedPrograms | None = None if assembly is None else value_of(store, assembly)

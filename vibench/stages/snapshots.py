@@ -24,9 +24,8 @@ from vibench.offline.reduction import check_skipped
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.qp.scaling import nearby
-from vibench.stages.artefacts import History, Store
+from vibench.stages.artefacts import History, Store, storable
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
-from vibench.stages.serialisation import storable
 from vibench.study.cells import Axes
 from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_of, chunk_size
 from vibench.timing import NO_TIME, SLOW, Seconds, median_of, timed
@@ -243,9 +242,7 @@ class SnapshotStage(Stage):
         for mu in mus:
             for quantity, value in problem.diagnostics(mu).items():
                 by_quantity.setdefault(quantity, []).append(float(value))
-        return tuple(
-            History.of(self.parameters.role, quantity, values, first) for quantity, values in by_quantity.items()
-        )
+        return tuple(History.of(self.parameters.role, name, values, first) for name, values in by_quantity.items())
 
 
 @dataclass(frozen=True)
@@ -280,15 +277,10 @@ class AdaptiveTraining(Stage):
         u, lam = (np.column_stack([getattr(one.solution, name) for one in solved]) for name in ("u", "lam"))
         fallbacks, setups = tuple(one.fallback for one in solved), (trainer.setup,)
         swept = TimedSnapshots(mus, u, lam, seconds, setups, fallbacks, reference.fingerprint, trainer.selecting)
-        histories = (
-            History.of("selection", "bound", [one.bound for one in solved]),
-            History.of("selection", "bounds evaluated", [one.evaluated for one in solved]),
-            *(
-                History.of("selection", name, column)
-                for name, column in zip(problem.parameters.names, mus.T, strict=True)
-            ),
-        )
-        return Result(swept, sum(seconds, trainer.selecting), histories)
+        quantities = {"bound": [one.bound for one in solved], "bounds evaluated": [one.evaluated for one in solved]}
+        columns = [*quantities.items(), *zip(problem.parameters.names, mus.T, strict=True)]
+        histories = (History.of("selection", name, column) for name, column in columns)
+        return Result(swept, sum(seconds, trainer.selecting), tuple(histories))
 
 
 def solution_stages(problem: Plugin, parameters: ParameterSet) -> tuple[Stage, ...]:

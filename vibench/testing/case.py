@@ -19,7 +19,7 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError, in_a_line
 from vibench.execution.isolated import NotImportableError
 from vibench.plugins.options import Option, options_of
-from vibench.stages.serialisation import dumps, loads
+from vibench.stages.artefacts import dumps, loads
 from vibench.testing.checks import SECONDS, Check, ConformanceError, Doubt, Note, call_in_other_process, kind_of
 from vibench.timing import timed
 

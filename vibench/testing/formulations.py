@@ -28,7 +28,7 @@ from vibench.offline.assemblies import assemblies
 from vibench.offline.models import ACCURACY, CellSolver, Model, check_built
 from vibench.offline.reduction import Reduction
 from vibench.qp.status import Status
-from vibench.stages.serialisation import dumps, loads
+from vibench.stages.artefacts import dumps, loads
 from vibench.testing.case import Arrays, Case, at, difference, differences, largest_entry, unmutated
 from vibench.testing.checks import Check, Note
 from vibench.testing.sample_problem import sample_reduction

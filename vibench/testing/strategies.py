@@ -33,8 +33,8 @@ from vibench.interfaces.validation import check_cone, check_enrichment
 from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction.cones import project_on_cone
 from vibench.reduction.nested import NestedStrategy, grow_through
+from vibench.stages.artefacts import dumps, loads
 from vibench.stages.enrichment import BuiltEnrichment
-from vibench.stages.serialisation import dumps, loads
 from vibench.testing.case import Arrays, Case, array_fault, at, difference, unmutated
 from vibench.testing.checks import Check, ConformanceError, Doubt, Note, raised
 from vibench.testing.sample_problem import arrays_of, copy_of, sample_offline, sample_snapshots

@@ -13,7 +13,7 @@ from vibench import Enrichment, Formulation, Kind, Offline, PrimalStrategy, Redu
 from vibench.offline.models import Model
 from vibench.offline.reduction import high_fidelity_sweep
 from vibench.stages import formulation as _  # noqa: F401  lists the classes that formulations may store
-from vibench.stages.serialisation import dumps, loads
+from vibench.stages.artefacts import dumps, loads
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies.cpg import CPG
 from vibench_strategies.dictionary import Dictionary

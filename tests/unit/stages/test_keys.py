@@ -101,7 +101,7 @@ def traced(stage: Stage, store: Store) -> tuple[Result, set[str]]:
 
 
 CARRIERS = (
-    "stages.artefacts", "stages.serialisation", "stages.base", "plugins", "study", "errors", "text", "provenance",
+    "stages.artefacts", "stages.base", "plugins", "study", "errors", "text", "provenance",
     "files",
 )  # fmt: skip
 """Packages and modules that only hand over what determines numbers."""

@@ -22,7 +22,7 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction.supremizers import ContactCoordinates
 from vibench.stages import assembly  # noqa: F401  lists what operators consist of
-from vibench.stages.serialisation import DamagedArtefactError, dumps, loads, storable
+from vibench.stages.artefacts import DamagedArtefactError, dumps, loads, storable
 from vibench.timing import Seconds
 
 
