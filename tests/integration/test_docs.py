@@ -34,9 +34,8 @@ from vibench.plugins import registry
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import registered
 from vibench.results import formats, schema
-from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
 from vibench.study.matrix import expand, read_study
-from vibench.study.spec import Limits, Study, ToleranceTable
+from vibench.study.spec import Entry, Limits, ProblemEntry, SamplingEntry, Study, ToleranceTable
 from vibench.testing import check
 
 ROOT = Path(__file__).parents[2]

@@ -101,9 +101,8 @@ class Dask(Executor):
             # Anybody who can connect to a scheduler can run code on its workers: keep out other users of this machine.
             own = Security.temporary() if scheduler is None else None
         except ImportError:
-            raise RequestError(
-                "the executor 'dask' needs dask.distributed and cryptography: install vibench with its extra 'cluster'"
-            ) from None
+            needs = "the executor 'dask' needs dask.distributed and cryptography"
+            raise RequestError(f"{needs}: install vibench with its extra 'cluster'") from None
         credentials = Security().get_connection_args("client")
         if scheduler is not None and is_authenticated(scheduler) and credentials["ssl_context"] is None:
             raise RequestError(f"the scheduler '{scheduler}' asks for credentials: set distributed.comm.tls of dask")
@@ -194,10 +193,8 @@ def _allow_open_files(workers: int) -> None:
     if soft == resource.RLIM_INFINITY or soft >= needed:
         return
     if hard != resource.RLIM_INFINITY and hard < needed:
-        raise RequestError(
-            f"the executor 'dask' needs {needed} open files, the limit is {hard}: raise it (`ulimit -n {needed}`), "
-            "ask for fewer --jobs, or use the executor 'local'"
-        )
+        remedy = f"raise it (`ulimit -n {needed}`), ask for fewer --jobs, or use the executor 'local'"
+        raise RequestError(f"the executor 'dask' needs {needed} open files, the limit is {hard}: {remedy}")
     resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
 
 

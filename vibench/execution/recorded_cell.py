@@ -53,20 +53,15 @@ class RecordedCell:
         Raises a `RequestError` if other code computed the row, so that its model cannot be reproduced.
         """
         if self.cell.code != self.row["code"]:
-            raise RequestError(
-                f"cell {self.row['cell']} was computed by other code, with another version of its solver, or from "
-                "files that were changed since; run its study again"
-            )
+            others = "by other code, with another version of its solver, or from files that were changed since"
+            raise RequestError(f"cell {self.row['cell']} was computed {others}; run its study again")
         store, queries = usable_store(), cell_queries(self.cell, query_seconds=1e6)
         certificate, built = queries.certificate, queries.built
         needed = () if certificate is None else (certificate.base, certificate)
         _provide((*built.model_inputs, *needed), store)
-        return replace(
-            built.model(store, queries.solver, queries.accuracy),
-            certificate=None if certificate is None else certificate.certificate(store),
-            row=self.row,
-            correction=queries.correction,
-        )
+        certified = None if certificate is None else certificate.certificate(store)
+        model = built.model(store, queries.solver, queries.accuracy)
+        return replace(model, certificate=certified, row=self.row, correction=queries.correction)
 
     @cached_property
     def parameters(self) -> Array:
@@ -119,11 +114,8 @@ def recorded_cells(run: str, places: Mapping[str, str] = {}) -> list[RecordedCel
 
 
 def _has_program(definition: str) -> bool:
-    """Whether the formulation of a recorded cell has programs; before all formulations were plugins it did if none."""
-    recorded = json.loads(definition).get("formulation")
-    if recorded is None:
-        return True
-    plugin = Plugin(**recorded).registered
+    """Whether the formulation of a recorded cell has programs."""
+    plugin = Plugin(**json.loads(definition)["formulation"]).registered
     return bool(plugin.entries and not plugin.conflict and plugin.load().has_program)
 
 

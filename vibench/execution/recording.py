@@ -118,9 +118,7 @@ class ResultWriter:
         outputs = [{"cell": cell.key, **keys, **output} for output in rows.outputs]
         return self.database.write_cell(row, queries, solutions, outputs, rows.parameters)
 
-    def seconds(
-        self, cell: Cell, rows: Sequence[Row], rounds: Sequence[TimedRound], machines: Set[str], lost: str
-    ) -> None:
+    def seconds(self, cell: Cell, rows: list[Row], rounds: Sequence[TimedRound], machines: Set[str], lost: str) -> None:
         """Write the seconds of a cell that has its rows; more may follow until it has the column `timing_rounds`."""
         row = self.database.cell(cell.key)
         # Cells are timed only when they have their rows.

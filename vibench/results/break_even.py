@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ from vibench.errors import requested
 from vibench.interfaces.strategies import Kind
 from vibench.plugins.registry import default_formulation
 from vibench.results.paired_timing import CONDITIONS, DRAWS, PairedTiming
-from vibench.results.schema import KEYS, STORED
+from vibench.results.schema import KEYS, STORED, Row
 from vibench.study.cells import NO_SUCH_AXIS
 
 # Probability left out on each side of a 95 % interval.
@@ -90,23 +90,19 @@ class BreakEvenComparison(NamedTuple):
     `online` are the seconds of a query of both in the blocks that they share, `gain` the 95 % interval of a over b.
     """
 
-    a: Mapping[str, Any] | None
-    b: Mapping[str, Any]
+    a: Row | None
+    b: Row
     result: BreakEven
     online: tuple[float, float]
     gain: tuple[float, float] | None
 
 
-def break_even_rows(
-    cells: Iterable[Mapping[str, Any]], timings: Iterable[Mapping[str, Any]]
-) -> Iterator[dict[str, Any]]:
+def break_even_rows(cells: Iterable[Row], timings: Iterable[Row]) -> Iterator[dict[str, Any]]:
     """Rows of the thresholds table from rows of the tables of cells and timings; see `compared`."""
     return (_row(one) for one in compared(cells, PairedTiming(timings)))
 
 
-def compared(
-    cells: Iterable[Mapping[str, Any]], paired: PairedTiming, tail: float = TAIL
-) -> Iterator[BreakEvenComparison]:
+def compared(cells: Iterable[Row], paired: PairedTiming, tail: float = TAIL) -> Iterator[BreakEvenComparison]:
     """Break-even of the models that are compared, undecided where more than `tail` of the draws deny it.
 
     It is "as fast" where it would be undecided, but the seconds of both queries differ by a factor of less than 1.25,
@@ -120,9 +116,9 @@ def compared(
     """
     timed, usual = [cell for cell in cells if cell["online_s"] is not None], default_formulation()
     default = [cell for cell in timed if cell["formulation"] == usual]
-    indices: dict[tuple[str, ...], dict[tuple[Any, ...], list[Mapping[str, Any]]]] = {}
+    indices: dict[tuple[str, ...], dict[tuple[Any, ...], list[Row]]] = {}
 
-    def equal_to(cell: Mapping[str, Any], columns: tuple[str, ...], among: list[Mapping[str, Any]]) -> Iterable[Any]:
+    def equal_to(cell: Row, columns: tuple[str, ...], among: list[Row]) -> Iterable[Any]:
         # Cells are indexed by their values in the columns: comparing every cell with all others would be quadratic.
         if (index := indices.get(columns)) is None:
             index = indices[columns] = {}
@@ -151,7 +147,7 @@ def _is_blank(value: object) -> bool:
     return value in (None, NO_SUCH_AXIS, "{}")
 
 
-def _axes(cell: Mapping[str, Any]) -> tuple[str, ...]:
+def _axes(cell: Row) -> tuple[str, ...]:
     """The columns in which the mixed programs agree with a cell of another formulation that replaces them."""
     # A formulation may lack these axes; what it lacks may be anything in the mixed program.
     axes = (
@@ -162,7 +158,7 @@ def _axes(cell: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(name for name in (*_shared_axes(), *axes[1]) if name not in lacking)
 
 
-def _compared(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+def _compared(a: Row, b: Row) -> bool:
     """Whether b replaces a: fixed enrichment a per-parameter one, or a certified query the same without certificate."""
     if a["bounds"] == b["bounds"]:
         return bool(a["enrichment_kind"] == Kind.PER_PARAMETER and b["enrichment_kind"] == Kind.FIXED)
@@ -170,9 +166,7 @@ def _compared(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     return a["assembly"] == "reduced" and not a["bounds"] and same
 
 
-def _comparison(
-    paired: PairedTiming, a: Mapping[str, Any] | None, b: Mapping[str, Any], tail: float
-) -> BreakEvenComparison:
+def _comparison(paired: PairedTiming, a: Row | None, b: Row, tail: float) -> BreakEvenComparison:
     """Break-even of b against a with its interval; common offline phases, or the set-up, do not differ."""
     key, offline_a = (None, b["hf_setup_s"]) if a is None else (a["cell"], a["offline_s"])
     ratio, level = paired.ratio(key, b["cell"]), paired.level(key, b["cell"])
@@ -226,7 +220,7 @@ def _rounds_missing(paired: PairedTiming, a: str | None, b: str, margin: float) 
     return max(1, math.ceil(min(needed, 1e6) - done))
 
 
-def shared_offline(a: Mapping[str, Any], b: Mapping[str, Any]) -> float:
+def shared_offline(a: Row, b: Row) -> float:
     """Offline seconds of the phases that two cells have in common."""
     # Equal seconds were measured once for both cells, since their stage is the same.
     phases = ("snapshots", "pod", "cone", "enrichment", "assembly")
@@ -238,7 +232,7 @@ def offline_factor(deviation: float) -> float:
     return math.exp(1.96 * deviation)
 
 
-def offline_draws(cell: Mapping[str, Any], shared: float, rng: np.random.Generator) -> Array:
+def offline_draws(cell: Row, shared: float, rng: np.random.Generator) -> Array:
     """Offline seconds (`DRAWS`,) of a cell that other runs might measure; those that are `shared` do not vary."""
     low, high = cell["offline_low_s"], cell["offline_high_s"]
     # The deviation from its 95 % interval, see `offline_factor`.

@@ -12,7 +12,7 @@ Solvers agree where ok solutions of the same program are no further apart than t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.interfaces.strategies import Kind
 from vibench.qp.verification import Slack, allowed
-from vibench.results.schema import KEYS, STORED
+from vibench.results.schema import KEYS, STORED, Row
 from vibench.stability.infsup import ABSOLUTE, RELATIVE
 from vibench.study.cells import NO_SUCH_AXIS
 
@@ -98,7 +98,7 @@ def solution_row(x: Array, alpha: Array | None, left_open: Slack | None) -> dict
     }
 
 
-def vectors(row: Mapping[str, Any]) -> tuple[Array, Any]:
+def vectors(row: Row) -> tuple[Array, Any]:
     """The two vectors, x and α, of a row of the solutions table; α is `None` where λ has no coefficients."""
     return np.frombuffer(row["x"], "<f8"), None if row["alpha"] is None else np.frombuffer(row["alpha"], "<f8")
 
@@ -113,15 +113,13 @@ class Recorded:
     slack: Slack
 
 
-def disagreement_rows(
-    cells: Iterable[Mapping[str, Any]], fine_solutions: Callable[[str], Iterable[Mapping[str, Any]]]
-) -> Iterator[dict[str, Any]]:
+def disagreement_rows(cells: Iterable[Row], fine_solutions: Callable[[str], Iterable[Row]]) -> Iterator[dict[str, Any]]:
     """Rows of the disagreements table from rows of the cells table.
 
     `fine_solutions` gives rows of the solutions table, those of the ok queries of a cell, by its key: it is asked for
     one reduced model after the other, since all solutions of a run may be more than memory holds.
     """
-    programs: dict[tuple[str, float], list[Mapping[str, Any]]] = {}
+    programs: dict[tuple[str, float], list[Row]] = {}
     for cell in cells:
         if cell["model"] and cell["solver"] != NO_SUCH_AXIS:
             programs.setdefault((cell["model"], cell["accuracy"]), []).append(cell)

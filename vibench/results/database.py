@@ -20,7 +20,7 @@ import numpy as np
 
 from vibench.errors import RequestError, StorageError, VibenchError
 from vibench.qp.status import Status
-from vibench.results.schema import KEYS, STORED, VERSION, Column, SqlType, column_of
+from vibench.results.schema import KEYS, STORED, VERSION, Column, Row, SqlType, column_of
 from vibench.results.sqlite import (
     DAMAGED,
     FILE,
@@ -40,7 +40,7 @@ class UnstorableError(VibenchError):
     """A value that its column cannot hold; the message names the column and says why."""
 
 
-def storable(table: str, row: Mapping[str, Any]) -> dict[str, Any]:
+def storable(table: str, row: Row) -> dict[str, Any]:
     """The row of a table as the results file holds it.
 
     Raises an `UnstorableError` for the first value that it cannot hold.
@@ -199,8 +199,7 @@ class ResultsDatabase:
         return self._db.execute(f"{own} UNION ALL {queries}")
 
     def write_cell(
-        self, cell: Mapping[str, Any], queries: Sequence[Mapping[str, Any]],
-        solutions: Sequence[Mapping[str, Any]] = (), outputs: Sequence[Mapping[str, Any]] = (),
+        self, cell: Row, queries: Sequence[Row], solutions: Sequence[Row] = (), outputs: Sequence[Row] = (),
         parameters: Sequence[tuple[str, str]] = (),
     ) -> dict[str, Any]:  # fmt: skip
         """Write a cell, its queries, solutions and outputs in one transaction; its earlier rows are replaced.
@@ -239,7 +238,7 @@ class ResultsDatabase:
         entries = self._db.execute("SELECT key, value FROM meta").fetchall()
         return {key.removeprefix(beginning): value for key, value in entries if key.startswith(beginning)}
 
-    def _write_cell(self, cell: Mapping[str, Any], **others: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    def _write_cell(self, cell: Row, **others: Sequence[Row]) -> dict[str, Any]:
         with self._writing():
             # A column for every parameter mu_1, mu_2, … of the queries.
             there = {row[1] for row in self._db.execute("PRAGMA table_info(queries)")}
@@ -252,10 +251,7 @@ class ResultsDatabase:
                 self._digests.count(table, "cell = ?", (cell["cell"],))
         return storable("cells", cell)
 
-    def write_seconds(
-        self, cell: str, own: Mapping[str, Any], queries: Mapping[int, Mapping[str, Any]],
-        rounds: Sequence[Mapping[str, Any]],
-    ) -> None:  # fmt: skip
+    def write_seconds(self, cell: str, own: Row, queries: Mapping[int, Row], rounds: Sequence[Row]) -> None:
         """Write the seconds of a cell that has its rows, in one transaction; earlier ones are replaced.
 
         `own` are columns of the cell, `queries` those of its queries by their number, `rounds` rows of timings.
@@ -271,14 +267,14 @@ class ResultsDatabase:
                 self._digests.count(table, "cell = ?", (cell,))
             self._replace("timings", {"cell": cell}, rounds)
 
-    def write_columns(self, cell: str, columns: Mapping[str, Any], table: str = "cells") -> None:
+    def write_columns(self, cell: str, columns: Row, table: str = "cells") -> None:
         """Write some columns of a cell that has its row, or of all its rows of another table."""
         with self._writing():
             self._digests.count(table, "cell = ?", (cell,), remove=True)
             self._update(table, columns, cell=cell)
             self._digests.count(table, "cell = ?", (cell,))
 
-    def _update(self, table: str, columns: Mapping[str, Any], **keys: Any) -> None:
+    def _update(self, table: str, columns: Row, **keys: Any) -> None:
         changes = ", ".join(f'"{name}" = ?' for name in columns)
         same = " AND ".join(f'"{name}" IS ?' for name in keys)
         values = (*storable(table, columns).values(), *storable(table, keys).values())
@@ -293,7 +289,7 @@ class ResultsDatabase:
         """The row of a cell, if it has one."""
         return next(self._selected("SELECT * FROM cells WHERE cell = ?", key), None)
 
-    def write_histories(self, histories: Sequence[Sequence[Mapping[str, Any]]], *, partial: bool = False) -> None:
+    def write_histories(self, histories: Sequence[Sequence[Row]], *, partial: bool = False) -> None:
         """Write histories, each given as its rows; earlier histories of the same name are replaced.
 
         With `partial`, earlier steps outside the range of the new ones are kept: several writers share a history.
@@ -304,14 +300,12 @@ class ResultsDatabase:
                 within = f" AND step BETWEEN {min(steps)} AND {max(steps)}" if partial else ""
                 self._replace("histories", {name: rows[0].get(name) for name in _history_axes()}, rows, within)
 
-    def replace(self, table: str, rows: Iterable[Mapping[str, Any]], **keys: Any) -> None:
+    def replace(self, table: str, rows: Iterable[Row], **keys: Any) -> None:
         """Replace all rows of a table, or those with these values in the columns `keys`."""
         with self._writing():
             self._replace(table, keys, rows)
 
-    def _replace(
-        self, table: str, keys: Mapping[str, Any], rows: Iterable[Mapping[str, Any]], within: str = ""
-    ) -> None:
+    def _replace(self, table: str, keys: Row, rows: Iterable[Row], within: str = "") -> None:
         same = " AND ".join(["TRUE", *(f'"{name}" IS ?' for name in keys)]) + within
         values = tuple(storable(table, keys).values())
         if keys:
@@ -349,10 +343,8 @@ class ResultsDatabase:
                     there = False
                 # SQLite would go on writing into a file that nobody finds any more.
                 if not there:
-                    raise StorageError(
-                        f"'{self._path}' was removed or replaced during the run; the same command runs its cells "
-                        "again, with the artefacts that are stored"
-                    )
+                    remedy = "the same command runs its cells again, with the artefacts that are stored"
+                    raise StorageError(f"'{self._path}' was removed or replaced during the run; {remedy}")
         except sqlite3.DatabaseError as error:
             code = code_of(error)
             # A full, lost or read-only disk, or a file locked or damaged by another program; the rest is a bug.
@@ -364,7 +356,7 @@ class ResultsDatabase:
             waited = " by another program for 60 s" if code == sqlite3.SQLITE_BUSY else ""
             raise StorageError(f"results cannot be written: {error}{waited}") from None
 
-    def _insert(self, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
+    def _insert(self, table: str, rows: Iterable[Row]) -> None:
         for row in rows:
             self._db.execute(_insertion(table, tuple(row)), tuple(storable(table, row).values()))
 

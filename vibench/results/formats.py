@@ -18,7 +18,7 @@ from vibench.plugins.registry import default_formulation
 from vibench.qp.status import Status
 from vibench.results.break_even import Meaning
 from vibench.results.read import in_order
-from vibench.results.schema import STORED, Column, SqlType, shown_columns
+from vibench.results.schema import STORED, Column, Row, SqlType, shown_columns
 from vibench.study.cells import NO_SUCH_AXIS
 from vibench.text import printable_lines, unbroken
 
@@ -119,7 +119,7 @@ def cell_text(value: Any) -> str:
     return str(value)
 
 
-def asked(row: Mapping[str, Any] | pd.Series, axis: str) -> str:
+def asked(row: Row | pd.Series, axis: str) -> str:
     """The tolerance of `axis`, "pod" or "dual", or the dimension where the study prescribes one."""
     tolerance, count = row[f"{axis}_tol"], row[f"{axis}_size"]
     if pd.notna(count):
@@ -127,13 +127,13 @@ def asked(row: Mapping[str, Any] | pd.Series, axis: str) -> str:
     return NO_SUCH_AXIS if pd.isna(tolerance) else f"{tolerance:g}"
 
 
-def solver_text(row: Mapping[str, Any] | pd.Series) -> str:
+def solver_text(row: Row | pd.Series) -> str:
     """QP solver and accuracy, as far as the formulation of a cell has them; "" without either."""
     solver = "" if row["solver"] == NO_SUCH_AXIS else str(row["solver"])
     return " ".join(filter(None, [solver, "" if pd.isna(row["accuracy"]) else f"{row['accuracy']:g}"]))
 
 
-def name_of_cell(row: Mapping[str, Any] | pd.Series) -> str:
+def name_of_cell(row: Row | pd.Series) -> str:
     """A cell by all its axes, as `Cell` prints itself."""
     tolerance = "" if pd.isna(row["primal_tol"]) else f" {row['primal_tol']:g}"
     sizes = ", ".join(text for axis in ("pod", "dual") if (text := asked(row, axis)) != NO_SUCH_AXIS)
@@ -213,9 +213,8 @@ def under_headings(frame: pd.DataFrame, names: Sequence[str], table: Mapping[str
     shown = {}
     for name in names:
         column = headed.get(name)
-        shown[name if column is None else column.heading] = (
-            frame[name] if column is None else _shown(frame, name, column)
-        )
+        heading, values = (name, frame[name]) if column is None else (column.heading, _shown(frame, name, column))
+        shown[heading] = values
     return pd.DataFrame(shown, index=frame.index)
 
 

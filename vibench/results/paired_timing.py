@@ -16,14 +16,15 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import digamma, polygamma, stdtrit
 
 from vibench.arrays import Array
+from vibench.results.schema import Row
 
 # Standard deviation of the logarithm of a ratio between cold runs beyond the scatter of their blocks, measured in runs
 # under different loads (docs/measurement.md).
@@ -143,7 +144,7 @@ class Block(NamedTuple):
     ratio: float
 
 
-def blocks_of(rounds: Iterable[Mapping[str, Any]]) -> dict[str, Block]:
+def blocks_of(rounds: Iterable[Row]) -> dict[str, Block]:
     """The blocks of a cell by their names, from its rows of the timings table."""
     by_block: dict[str, list[tuple[float, float]]] = {}
     for row in rounds:
@@ -168,20 +169,20 @@ def mean_seconds(blocks: Iterable[Block]) -> tuple[float, float | None]:
 class PairedTiming:
     """Seconds of the cells of a run, from rows of its timings table."""
 
-    def __init__(self, timings: Iterable[Mapping[str, Any]] = ()) -> None:
+    def __init__(self, timings: Iterable[Row] = ()) -> None:
         self._blocks: dict[str, dict[str, Block]] = {}
         self._rounds: dict[str, Counter[str]] = {}
         self._ratios, self._levels = CommonVariance(), CommonVariance()
         # Every group has a first block; the others are the independent ones that a common variance rests on.
         self._names: set[str] = set()
         self._first: set[str] = set()
-        by_cell: dict[str, list[Mapping[str, Any]]] = {}
+        by_cell: dict[str, list[Row]] = {}
         for row in timings:
             by_cell.setdefault(row["cell"], []).append(row)
         for cell, rounds in by_cell.items():
             self.add(cell, rounds)
 
-    def add(self, cell: str, rounds: Sequence[Mapping[str, Any]]) -> None:
+    def add(self, cell: str, rounds: Sequence[Row]) -> None:
         """Add all rounds of a cell, rows of the timings table, in place of earlier ones."""
         blocks = self._blocks[cell] = blocks_of(rounds)
         self._rounds[cell] = Counter(row["block"] for row in rounds)

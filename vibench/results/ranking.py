@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Literal, NamedTuple
@@ -17,15 +17,13 @@ from vibench.model.bound_terms import CorrectionMode
 from vibench.qp.status import Status
 from vibench.results.break_even import HIGH_FIDELITY, TAIL, offline_draws, shared_offline
 from vibench.results.paired_timing import DRAWS, MeanEstimate, PairedTiming
-from vibench.results.schema import STORED, Column, integer, real
+from vibench.results.schema import STORED, Column, Row, integer, real
 from vibench.stability.infsup import VANISHES
 
 
 def columns_of_measures() -> dict[str, tuple[str, ...]]:
     """Measures of the error of the solution, each with the columns of the cells table whose maximum it is."""
-    return {
-        "solution": ("error_u_mean", "error_lambda_mean"), "u": ("error_u_mean",), "lambda": ("error_lambda_mean",),
-    }  # fmt: skip
+    return {"solution": ("error_u_mean", "error_lambda_mean"), "u": ("error_u_mean",), "lambda": ("error_lambda_mean",)}
 
 
 def measures(outputs: pd.DataFrame) -> list[str]:
@@ -45,9 +43,7 @@ def fastest_columns() -> dict[str, Column]:
     """Columns of the table of the fastest queries: those of the cells, the accuracy and the ties."""
     return {
         **STORED["cells"],
-        "error_below": real(
-            "1", "Power of ten that the mean errors, of u and λ unless told, do not exceed.", "error ≤", 1
-        ),
+        "error_below": real("1", "Power of ten that mean errors, of u and λ unless told, do not exceed.", "error ≤", 1),
         "ties": integer("Other models whose query may be as fast: the interval of the ratio contains 1.", "ties", 24),
     }  # fmt: skip
 
@@ -189,21 +185,19 @@ def _digits(errors: pd.Series) -> pd.Series:
     return np.ceil(np.log10(errors.clip(lower=np.finfo(float).tiny)) - 1e-12)
 
 
-def bands(
-    cells: pd.DataFrame, errors: pd.Series, columns: Collection[str]
-) -> Iterator[tuple[float, pd.DataFrame, dict[str, Any]]]:
+def bands(cells: pd.DataFrame, errors: pd.Series, names: Collection[str]) -> Iterator[tuple[float, pd.DataFrame, Row]]:
     """The bands of accuracy that the cells of one problem reach, from the largest error to the smallest.
 
-    Yields the power of ten that the errors in the band do not exceed, its cells, and by each of the columns of which it
-    has a value the index of the smallest one, of equal ones the first. A band in which the same cells have these as in
-    the next smaller one is left out.
+    Yields the power of ten that the errors in the band do not exceed, its cells, and by each of the named columns of
+    which it has a value the index of the smallest one, of equal ones the first. A band in which the same cells have
+    these as in the next smaller one is left out.
     """
     digits = _digits(errors)
-    smaller: dict[str, Any] | None = None
-    reached = list[tuple[float, pd.DataFrame, dict[str, Any]]]()
+    smaller: Row | None = None
+    reached = list[tuple[float, pd.DataFrame, Row]]()
     for digit in sorted(set(digits)):
         mine = cells[digits <= digit]
-        smallest = {name: _compared(mine, name).idxmin() for name in columns if mine[name].notna().any()}
+        smallest = {name: _compared(mine, name).idxmin() for name in names if mine[name].notna().any()}
         keys = {name: mine.at[index, "cell"] for name, index in smallest.items()}
         if keys != smaller:
             reached.append((10.0**digit, mine, smallest))
@@ -250,7 +244,7 @@ class Winner:
 
     criterion: Criterion
     value: float
-    cell: Mapping[str, Any]
+    cell: Row
     ties: tuple[str, ...] = ()
 
 
@@ -319,9 +313,7 @@ def _standings(problem: str, options: str, cells: pd.DataFrame, paired: PairedTi
     return Standings(problem, options, reached, len(cells), unstable=int(unstable(rows).sum()), **counts)
 
 
-def _winners(
-    cells: pd.DataFrame, rows: pd.DataFrame, smallest: Mapping[str, Any], paired: PairedTiming | None
-) -> Iterator[Winner]:
+def _winners(cells: pd.DataFrame, rows: pd.DataFrame, smallest: Row, paired: PairedTiming | None) -> Iterator[Winner]:
     for criterion in Criterion:
         column = criterion.column
         if column in smallest and criterion is Criterion.QUERY:
@@ -344,8 +336,10 @@ def _as_good(criterion: Criterion, first: pd.Series, other: pd.Series) -> bool:
     return bool(other[column] - first[column] <= allowed)
 
 
-def model_row(cell: Mapping[str, Any], setup: float, solution: float) -> dict[str, Any]:
-    """A row of the cells table for the high-fidelity model of a cell, which has no errors."""
+def high_fidelity_row(cell: Row, cells: pd.DataFrame) -> dict[str, Any]:
+    """A row of the cells table, like that of a cell, for the high-fidelity model of some cells; it has no errors."""
+    setup = float(np.median(cells["hf_setup_s"].astype(float)))
+    solution = float(np.exp(np.mean(np.log(cells["hf_s"].astype(float)))))
     same = ("problem", "problem_options", "machine", "status", "queries", "queries_ok", "accuracy", "training")
     row = dict.fromkeys(cell) | {name: cell.get(name) for name in same}
     row |= dict.fromkeys(("cell", "formulation", "dual", "solver", "assembly"), "")
@@ -357,29 +351,19 @@ def model_row(cell: Mapping[str, Any], setup: float, solution: float) -> dict[st
 
 def _fastest(cells: pd.DataFrame, index: Any, paired: PairedTiming | None) -> Winner:
     """The fastest query of some cells, of which that in row `index` is the fastest, and of the high-fidelity model."""
-    first, criterion = cells.loc[index], Criterion.QUERY
-    timed = cells[cells["online_s"].notna()]
-    if first["online_s"] > first["hf_s"]:
-        solution = float(np.exp(np.mean(np.log(timed["hf_s"].astype(float)))))
-        row = model_row(first.to_dict(), float(np.median(timed["hf_setup_s"].astype(float))), solution)
-        ties = [cell for cell in timed["cell"] if paired is not None and _may_be_as_fast(paired, None, cell)]
-        return Winner(criterion, solution, row, tuple(ties))
-    key = first["cell"]
-    others = timed["cell"][timed["cell"] != key]
-    ties = [cell for cell in others if paired is not None and _may_be_as_fast(paired, key, cell)]
-    return Winner(criterion, float(first["online_s"]), first, tuple(ties))
-
-
-def _may_be_as_fast(paired: PairedTiming, first: str | None, other: str) -> bool:
-    """Whether the 95 % interval of the ratio of the seconds of two queries contains 1; where none is known it does."""
-    ratio = paired.ratio(first, other)
-    return ratio is None or ratio.interval(TAIL)[0] <= 0.0
+    first, timed = cells.loc[index], cells[cells["online_s"].notna()]
+    row = high_fidelity_row(first.to_dict(), timed) if first["online_s"] > first["hf_s"] else first
+    others = timed["cell"][timed["cell"] != row["cell"]]
+    ratios = {} if paired is None else {cell: paired.ratio(row["cell"] or None, cell) for cell in others}
+    # Those tie for which the 95 % interval of the ratio contains 1, or none is known.
+    ties = (cell for cell, ratio in ratios.items() if ratio is None or ratio.interval(TAIL)[0] <= 0.0)
+    return Winner(Criterion.QUERY, float(row["online_s"]), row, tuple(ties))
 
 
 class Candidate(NamedTuple):
     """A model that competes: its row of the cells table, and its total costs."""
 
-    row: Mapping[str, Any]
+    row: Row
     offline: float
     online: float
     offline_draws: Array
@@ -451,9 +435,8 @@ def candidates(cells: pd.DataFrame, paired: PairedTiming) -> Iterator[Candidate]
     the ratios to them may be in other runs, whose machine may be faster or slower as a whole.
     """
     rng, rows = np.random.default_rng(0), [dict(row) for row in cells.to_dict("records")]
-    solution = float(np.exp(np.mean(np.log([row["hf_s"] for row in rows]))))
-    setup = float(np.median([row["hf_setup_s"] for row in rows]))
-    row = model_row(rows[0], setup, solution)
+    row = high_fidelity_row(rows[0], cells)
+    setup, solution = row["offline_s"], row["online_s"]
     yield Candidate(row, setup, solution, np.full(DRAWS, setup), np.full(DRAWS, solution))
     for row in rows:
         ratio = paired.ratio(None, row["cell"]) or MeanEstimate(math.log(row["online_s"] / row["hf_s"]), 0.0, 1.0)

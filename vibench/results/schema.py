@@ -8,7 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
+
+Row: TypeAlias = Mapping[str, Any]
+"""A row of a table: column → value."""
 
 # Increase it with every change of the schema: a results file of another version is refused.
 VERSION = 21

@@ -36,7 +36,8 @@ def matching(
     Raises a `RequestError` if it is no such expression, or names a column that the table does not have.
     """
     query = f'SELECT ({expression}) IS TRUE FROM "{table}" NOT INDEXED WHERE {of_cells(cells)} ORDER BY rowid'
-    with _opened(path, table, expression, frame, added) as db:
+    named = any(re.search(rf"(?i)\b{name}\b", _text_free(expression)) for name in added)
+    with _copied(table, frame, added) if named else open_read_only(path) as db:
         found = _answers(db, table, expression, (query, cells), frame.columns, made)
     return np.array([matches for (matches,) in found], dtype=bool)
 
@@ -106,14 +107,8 @@ def _text_free(expression: str) -> str:
 
 
 @contextlib.contextmanager
-def _opened(
-    path: Path, table: str, expression: str, frame: pd.DataFrame, added: Mapping[str, Column]
-) -> Iterator[sqlite3.Connection]:
-    """Context with the results file, or with a table in memory for an expression that names an added column."""
-    if not any(re.search(rf"(?i)\b{name}\b", _text_free(expression)) for name in added):
-        with open_read_only(path) as db:
-            yield db
-        return
+def _copied(table: str, frame: pd.DataFrame, added: Mapping[str, Column]) -> Iterator[sqlite3.Connection]:
+    """Context with a table in memory, which has the columns that are added to it."""
     columns = {**STORED[table], **added}
     kinds = ", ".join(f'"{name}" {(columns.get(name) or column_of(table, name)).kind}' for name in frame.columns)
     values = frame.astype(object).where(frame.notna(), None)

@@ -69,17 +69,10 @@ def _views() -> dict[str, View]:
         "beta_cone_lower", "beta_span", "primal_residual", "dual_residual", "gap", "iterations", "reason",
     )  # fmt: skip
     of_outputs = (
-        "problem", "training", "formulation", "dual", "primal", "primal_tol", "solver", "assembly", "bounds",
-        "correction", "output", "unit", "error_mean", "error_max", "error_scaled_mean", "scale", "queries_ok",
-        "queries_zero", "pod_tol", "dual_tol", "accuracy", "cell",
+        *AXES, "output", "unit", "error_mean", "error_max", "error_scaled_mean", "scale", "queries_ok", "queries_zero",
+        "cell",
     )  # fmt: skip
-    of_disagreements = (
-        "solver_a", "solver_b", "problem", "dual", "primal", "primal_tol", "pod_tol", "dual_tol", "accuracy",
-        "assembly", "bounds", "difference_max", "flagged", "queries", "allowed_worst", "query_flagged",
-    )  # fmt: skip
-    of_histories = (
-        "stage", "quantity", "step", "value", "problem", "dual", "primal", "primal_tol", "pod_tol", "dual_tol",
-    )  # fmt: skip
+    compared = ("difference_max", "flagged", "queries", "allowed_worst", "query_flagged")
     of_timings = (*AXES, "cell", "round", "total_s", "assemble_s", "solve_s", "queries", "slowdown")
     cells, thresholds = STORED["cells"], STORED["thresholds"]
     of_best = ("problem", "error_below", *of_cells[:14], "ties", *of_cells[14:])
@@ -89,11 +82,11 @@ def _views() -> dict[str, View]:
         "benefits": View("thresholds", (*of_break_even, *(n for n in thresholds if thresholds[n].heading)), thresholds),
         "cells": View("cells", (*of_cells, "reason")),
         "queries": View("queries", of_queries),
-        "histories": View("histories", of_histories),
+        "histories": View("histories", ("stage", "quantity", "step", "value", *AXES)),
         "timings": View("timings", of_timings),
         "thresholds": View("thresholds", of_break_even),
         "outputs": View("outputs", of_outputs),
-        "disagreements": View("disagreements", of_disagreements),
+        "disagreements": View("disagreements", ("solver_a", "solver_b", *AXES, *compared)),
     }
 
 
@@ -258,24 +251,22 @@ def _parameters(path: Path, rows: pd.DataFrame) -> dict[str, str]:
     return {name: heading for name, heading in joined.items() if taken.count(heading) == 1}
 
 
-def _cells_needed(
-    path: Path, view: View, cell: str, where: str, sort: Sequence[str], limit: int | None
-) -> Sequence[str]:
+def _cells_needed(path: Path, view: View, cell: str, where: str, sort: Sequence[str], limit: int | None) -> list[str]:
     """Cells of all rows of a large table that are asked for, where they are few; none where all rows are read."""
     named = [key.removeprefix("-") for key in sort]
     # These have many rows of each cell, and their cells are distinguished by columns of the table of cells.
     if view.source not in ("queries", "timings", "outputs"):
-        return ()
+        return []
     if cell:
-        return (_key_of(path, cell),)
+        return [_key_of(path, cell)]
     if not limit or not set(STORED[view.source]).issuperset(named):  # a parameter, or no column at all
-        return ()
+        return []
     falls = ("DESC" if key.startswith("-") else "ASC" for key in sort)
     first = [f'"{name}" IS NULL, "{name}" {way}' for name, way in zip(named, falls, strict=True)]
     order = [*first, *terms_in_order(STORED[view.source])]
     cells = selection.cells_of_first(path, view.source, where, order, limit)
     # Reading rows by their cells pays only for few of them.
-    return cells if len(cells) <= 100 else ()
+    return cells if len(cells) <= 100 else []
 
 
 def _key_of(path: Path, cell: str) -> str:

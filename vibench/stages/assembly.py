@@ -80,7 +80,7 @@ class AssemblyStage(Stage):
         is_own = self.nested is not None and reduced is model.offline.assembled
         larger = value_of(store, self.nested) if self.nested is not None and is_own else None
         if isinstance(reduced, HyperReducedModel):
-            return Result(_hyper_reduced(reduced, mus, larger))
+            return Result(_reduced(reduced, mus, larger))
         if larger is None:
             programs = _projections(reduced, mus)
         else:
@@ -100,9 +100,7 @@ class AssemblyStage(Stage):
         }
 
 
-def _hyper_reduced(
-    model: HyperReducedModel, mus: Array, larger: Sequence[VariationalInequality] | None
-) -> ReducedPrograms:
+def _reduced(model: HyperReducedModel, mus: Array, larger: Sequence[VariationalInequality] | None) -> ReducedPrograms:
     """The hyper-reduced programs, compared with Galerkin projections: the leading parts of `larger` ones if known."""
     matrices = assemblies(model.problem)
     programs, errors, projected, factor = [], [], [], None

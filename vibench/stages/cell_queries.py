@@ -307,32 +307,28 @@ class _Queries(Items):
             "certificate": (Guarantee.NONE if self._certificate is None else self._certificate.base.guarantee).value,
         }  # fmt: skip
         if self._queries.programs is not None and self._stage.assembly is not None:
-            row |= self._program_sizes(self._stage.assembly, self._queries.programs, rows, fallbacks)
+            row |= self._stage.assembly.columns(self._store)
+            row |= self._program_sizes(self._queries.programs, rows, fallbacks)
         return row, fallbacks
 
-    def _program_sizes(
-        self, assembly: AssemblyStage, programs: ReducedPrograms, rows: Sequence[Row], fallbacks: list[str]
-    ) -> Row:
+    def _program_sizes(self, programs: ReducedPrograms, rows: Sequence[Row], fallbacks: list[str]) -> Row:
         """Columns of a model with programs; adds the fallbacks of these."""
-        built, offline, online = assembly.built, self._model.offline, self._model.online
+        built, offline, online = self._stage.built, self._model.offline, self._model.online
         if built.reduction is not None and isinstance(why := offline.operators, str):
             fallbacks.append(f"assembled in full: {why}")
         tolerance, error = built.interpolation, max(programs.errors)
         if tolerance is not None and is_missed(tolerance, error):
-            fallbacks.append(
-                f"reduced assembly differs from the Galerkin projection by up to {error:.1e} at validation parameters: "
-                f"the interpolation tolerance {tolerance:g} holds at training parameters only"
-            )
-        row: Row = {"correction_cost": self._corrector.cost} | assembly.columns(self._store)
+            differs = f"reduced assembly differs from the Galerkin projection by up to {error:.1e}"
+            holds = f"the interpolation tolerance {tolerance:g} holds at training parameters only"
+            fallbacks.append(f"{differs} at validation parameters: {holds}")
+        row: Row = {"correction_cost": self._corrector.cost}
         if built.cone is not None:
             cone: ReducedCone = value_of(self._store, built.cone)
             prepared = cone.prepared
             # The singular values on both sides of the threshold should differ by a clear factor.
             if prepared.rank_gap < 10.0:
-                fallbacks.append(
-                    f"the rank {prepared.rank} is in doubt: its last singular value is {prepared.rank_gap:.2g} times "
-                    "what is below"
-                )
+                last = f"its last singular value is {prepared.rank_gap:.2g} times what is below"
+                fallbacks.append(f"the rank {prepared.rank} is in doubt: {last}")
             if online.generators == cone.cone.rays.shape[1]:
                 # A free generator counts once, with two coefficients.
                 row["R"] = cone.cone.size

@@ -187,24 +187,22 @@ class Queries:
         """A parameter (d,) next to that of a query, which depends on the seed, for timed repetitions."""
         return nearby(self.model.problem.parameters, self.mus[number], self._validation.seed, number, *seed)
 
-    def query(
-        self, number: int, solver: str | None, accuracy: float | None, warm_start: bool
-    ) -> ProgramQuery | ModelQuery:
+    def query(self, k: int, solver: str | None, accuracy: float | None, warm_start: bool) -> ProgramQuery | ModelQuery:
         """One query of a solver; for a warm start with the one before it on the path of `query_before`."""
         # The query before is solved again, so that a start does not depend on what the process solved before.
-        before = self._before[number] if warm_start else None
+        before = self._before[k] if warm_start else None
         if self.programs is None or solver is None:
             model = self.model.solving(solver)
-            program = None if self.programs is None else self.programs.programs[number]
+            program = None if self.programs is None else self.programs.programs[k]
             start = None if before is None else (before, self.mus[before])
-            return ModelQuery(model, self.mus[number], partial(self.near, number), program, start)
+            return ModelQuery(model, self.mus[k], partial(self.near, k), program, start)
         # Formulations with programs for a QP solver have this axis.
         assert accuracy is not None
         programs = self.programs.programs
         # Coordinates of two queries are not comparable if the primal basis changes with the parameter.
         may_start = takes_start(solver) and self.model.reduced.kind is not Kind.PER_PARAMETER
         begun = (before, programs[before]) if before is not None and may_start else None
-        return ProgramQuery(programs[number], self.programs.factor, solver, accuracy, begun)
+        return ProgramQuery(programs[k], self.programs.factor, solver, accuracy, begun)
 
 
 def query_before(validation: ParameterSet, problem: Problem) -> list[int | None]:

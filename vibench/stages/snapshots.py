@@ -191,13 +191,11 @@ class SnapshotStage(Stage):
             for mu in problem.parameters.sample(missing, self.parameters.seed + 1):
                 reference.refuse_false_declarations(mu, checked_assembly(problem, mu))
 
-    def _solved(
-        self, work: _Work, number: int, mu: Array
-    ) -> tuple[VariationalInequality, HighFidelitySolution, Seconds]:
+    def _solved(self, work: _Work, k: int, mu: Array) -> tuple[VariationalInequality, HighFidelitySolution, Seconds]:
         """The inequality at mu (d,), its verified solution, and the seconds of that without the verification."""
         # The first one without repetitions: its seconds from a known start are measured in the end.
-        runs = self._runs if number else 1
-        repeated = itertools.chain([mu], self._near(work.problem, mu, number))
+        runs = self._runs if k else 1
+        repeated = itertools.chain([mu], self._near(work.problem, mu, k))
         (vi, unverified), taken = self._measure(work.solve, repeated, runs)
         # Repetitions at other parameters may have written into the arrays.
         if runs > 1:
@@ -312,10 +310,9 @@ def gather(store: Store, chunks: tuple[Stage, ...]) -> TimedSnapshots:
         check_skipped(skipped, sum(len(part.mu) for part in parts))
         here = fingerprint_here(problem)
         for deviation in (text for part in parts for text in part.fingerprint.deviations(here)):
-            raise NumericalError(
-                f"two assemblies at one parameter are not the same, as in another process: {deviation}; look for "
-                "unseeded random numbers, the order of sets, and what is kept between calls"
-            )
+            unequal = f"two assemblies at one parameter are not the same, as in another process: {deviation}"
+            look_for = "unseeded random numbers, the order of sets, and what is kept between calls"
+            raise NumericalError(f"{unequal}; look for {look_for}")
     return TimedSnapshots(
         np.concatenate([part.mu for part in parts]), np.hstack([part.u for part in parts]),
         np.hstack([part.lam for part in parts]), tuple(seconds for part in parts for seconds in part.seconds),

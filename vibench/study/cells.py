@@ -16,7 +16,7 @@ from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import default_formulation, find
 from vibench.provenance import numerical_code
-from vibench.study.parameter_sets import OWN, OWN_TRAINING, ParameterSet
+from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 
 
 def digest(content: Any) -> str:
@@ -76,9 +76,8 @@ class Cell:
     def key(self) -> str:
         """Hash of everything that determines the numbers of the cell except for the code."""
         content = self._content()
-        del content["labels"], content["nested_tolerances"], content["set_labels"]
         # Labels and places change no number, and the code is compared by itself.
-        del content["formulation_label"]
+        del content["labels"], content["nested_tolerances"], content["set_labels"], content["formulation_label"]
         for name in ("dual", "primal", "training", "validation_sampling"):
             if content[name] is None:
                 del content[name]
@@ -115,28 +114,18 @@ class Cell:
         known = {name for one in plugins.values() if places for name in one.paths.values()}
         for name in places.keys() - known:
             raise unknown_name("file or folder of the cell", name, known)
-        # In older files `mixed` and `compiled` were no plugins.
-        if content.get("formulation") is None:
-            name = "compiled" if content["assembly"] == "compiled" else default_formulation()
-            plugins["formulation"] = Plugin.of(find(PluginKind.FORMULATION, name), {}, {})
-            content["formulation_label"] = name
-        if content["assembly"] in ("certified", "compiled"):  # these were assemblies
-            content["bounds"], content["assembly"] = content["assembly"] == "certified", "reduced"
         # The problem first: its error is the one to mend.
         for name in sorted(plugins, key=lambda name: name != "problem"):
             content[name] = _installed(plugins[name].moved(places))
         for axis in ("pod", "cone"):
             content[axis] = None if content[axis] is None else Stop(**content[axis])
         for name in ("labels", "nested_tolerances"):
-            content[name] = tuple(content.get(name, ()))
-        trained, validated = content.pop("set_labels", (OWN, OWN))
+            content[name] = tuple(content[name])
+        trained, validated = content.pop("set_labels")
         skips = content.pop("training_skips", False)
-        content["training"] = ParameterSet("training", 0, 0, content.get("training"), trained, skips)
-        count, seed = content["validation"], content.pop("seed")
-        # Older definitions do not have all of them.
-        sampling = content.pop("validation_sampling", None)
-        content["validation"] = ParameterSet("validation", count, seed, sampling, validated)
-        return cls(**content)
+        content["training"] = ParameterSet("training", 0, 0, content["training"], trained, skips)
+        count, seed, sampling = (content.pop(name) for name in ("validation", "seed", "validation_sampling"))
+        return cls(**content | {"validation": ParameterSet("validation", count, seed, sampling, validated)})
 
     @property
     def axes(self) -> Axes:
@@ -166,10 +155,10 @@ class Cell:
         formulation = "" if self.formulation_label == default_formulation() else self.formulation_label
         cone, enriched = "" if self.dual is None else dual, "" if self.primal is None else f"{primal}{tolerance}"
         solver = " ".join(filter(None, [self.solver, accuracy]))
-        chosen = [problem, formulation, cone, enriched, ", ".join(stops), solver]
-        way = "" if self.assembly == "full" else f" · {self.assembly}{' with bounds' * self.bounds}"
-        way += "" if self.correction == CorrectionMode.NONE else f" · corrected: {self.correction}"
-        return " · ".join(filter(None, chosen)) + way
+        way = "" if self.assembly == "full" else f"{self.assembly}{' with bounds' * self.bounds}"
+        corrected = "" if self.correction == CorrectionMode.NONE else f"corrected: {self.correction}"
+        parts = (problem, formulation, cone, enriched, ", ".join(stops), solver, way, corrected)
+        return " · ".join(filter(None, parts))
 
 
 def _installed(plugin: Plugin) -> Plugin:

@@ -20,9 +20,8 @@ from vibench.plugins.plugin import GivenPlugin, Plugin
 from vibench.plugins.registry import find, registered
 from vibench.reduction.nested import NestedStrategy
 from vibench.study.cells import NO_SUCH_AXIS, Cell
-from vibench.study.entries import Entry, FormulationEntry, ProblemEntry, SamplingEntry
 from vibench.study.parameter_sets import OWN, ParameterSet
-from vibench.study.spec import Study, ToleranceTable
+from vibench.study.spec import Entry, FormulationEntry, ProblemEntry, SamplingEntry, Study, ToleranceTable
 
 
 def find_study(request: str) -> Path:
@@ -76,13 +75,10 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
     content = _replace_axes(content, given)
     # Paths in the options of problems and sampling strategies are relative to the folder of the file.
     problems = _tables(content.get("problem"))
-    samplings = [table.get(key) for table in [content, *problems] for key in ("training", "validation")]
-    for kind, entries in (
-        (PluginKind.PROBLEM, problems),
-        *((PluginKind.SAMPLING, _tables(some)) for some in samplings),
-    ):
-        for entry in entries:
-            _anchor_options(kind, entry, path.absolute().parent)
+    sets = [_tables(table.get(key)) for table in [content, *problems] for key in ("training", "validation")]
+    samplings = [(PluginKind.SAMPLING, entry) for entries in sets for entry in entries]
+    for kind, entry in (*((PluginKind.PROBLEM, entry) for entry in problems), *samplings):
+        _anchor_options(kind, entry, path.absolute().parent)
     try:
         return Study.model_validate(content)
     except RequestError as error:
@@ -167,10 +163,9 @@ def expand(study: Study) -> list[Cell]:
                 )  # fmt: skip
                 # Files are known by their names: two of one name would be one cell.
                 if (same := cells.setdefault(cell.key, cell)) is not cell and same.code != cell.code:
-                    raise RequestError(
-                        f"study '{study.name}': two cells are called '{cell}', but have files of one name in different "
-                        "folders: rename one of them, or put the folders beside the study"
-                    )
+                    what = f"two cells are called '{cell}', but have files of one name in different folders"
+                    remedy = "rename one of them, or put the folders beside the study"
+                    raise RequestError(f"study '{study.name}': {what}: {remedy}")
     if not cells:
         raise RequestError(f"study '{study.name}': the matrix is empty")
     return list(cells.values())
@@ -252,14 +247,14 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
 def _plugin_entry(plugin: Plugin, label: str, **keys: Any) -> Any:
     given = plugin.registered
     name = given.given if isinstance(given, GivenPlugin) else plugin.name
-    entries: dict[PluginKind, type[Entry]]
-    entries = {
-        PluginKind.PROBLEM: ProblemEntry,
-        PluginKind.SAMPLING: SamplingEntry,
-        PluginKind.FORMULATION: FormulationEntry,
-    }
+    own = (
+        (PluginKind.PROBLEM, ProblemEntry),
+        (PluginKind.SAMPLING, SamplingEntry),
+        (PluginKind.FORMULATION, FormulationEntry),
+    )
+    entry = next((entry for kind, entry in own if kind is plugin.kind), Entry)
     content = {"name": name, "label": label, "options": json.loads(plugin.options)} | keys
-    return entries.get(plugin.kind, Entry).model_validate(content).at(json.loads(plugin.places))
+    return entry.model_validate(content).at(json.loads(plugin.places))
 
 
 def _entry_of_set(parameters: ParameterSet) -> Any:

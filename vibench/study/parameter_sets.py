@@ -108,29 +108,22 @@ def check_sets(problem: Plugin, training: ParameterSet, validation: ParameterSet
     """Raise a `RequestError` if a problem has no such sets, or all validation parameters are training parameters."""
     # Errors there would say nothing of other parameters, and two strategies with one seed draw the same points. Only
     # the problem itself may choose equal sets.
+    choosing = "chooses training parameters by what solutions know"
     if validation.is_adaptive and validation.sampling is not None:
-        raise RequestError(
-            f"sampling strategy '{validation.sampling.name}' chooses training parameters by what solutions know; it "
-            "makes no validation set"
-        )
+        raise RequestError(f"sampling strategy '{validation.sampling.name}' {choosing}; it makes no validation set")
     if training.is_adaptive and training.skips and training.sampling is not None:
-        raise RequestError(
-            f"sampling strategy '{training.sampling.name}' chooses parameters by what solutions know; it has none to "
-            'skip: leave out on_failure = "skip"'
-        )
+        remedy = 'it has none to skip: leave out on_failure = "skip"'
+        raise RequestError(f"sampling strategy '{training.sampling.name}' {choosing}; {remedy}")
     mus = parameters_of(problem, validation)
     if training.sampling is None and validation.sampling is None:
         return
     # Every row is one value, equal only if all bits are.
-    trained, validated = (
-        np.ascontiguousarray(rows, float).view(f"V{8 * mus.shape[1]}").ravel()
-        for rows in (parameters_of(problem, training), mus)
-    )
+    both = (np.ascontiguousarray(rows, float) for rows in (parameters_of(problem, training), mus))
+    trained, validated = (rows.view(f"V{8 * mus.shape[1]}").ravel() for rows in both)
     if np.isin(validated, trained).all():
-        raise RequestError(
-            f"all validation parameters of problem '{problem.name}' are training parameters, so that errors would say "
-            "nothing of others: give one of the two sets another seed, or other parameters"
-        )
+        what = f"all validation parameters of problem '{problem.name}' are training parameters"
+        remedy = "give one of the two sets another seed, or other parameters"
+        raise RequestError(f"{what}, so that errors would say nothing of others: {remedy}")
 
 
 def chunk_edges(count: int) -> list[int]:

@@ -1,57 +1,195 @@
-"""The schema of study files."""
+"""The schema of study files: plugins with their options, parameter sets, tolerances, and the settings of a study."""
 
 from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Sequence
-from typing import Annotated, Any, Literal, TypeAlias, TypeVar
+from collections.abc import Mapping, Sequence
+from datetime import date, time
+from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import (
     AfterValidator,
-    AllowInfNan,
     BaseModel,
     BeforeValidator,
+    ConfigDict,
     Discriminator,
     Field,
     ModelWrapValidatorHandler,
+    PrivateAttr,
     Tag,
     ValidationError,
     model_validator,
 )
 
 from vibench.errors import RequestError, fault_line, unknown_name
+from vibench.interfaces.formulations import Formulation, axes_of
 from vibench.interfaces.strategies import Stop
 from vibench.linalg.factorisations import DEFAULT
 from vibench.plugins.kinds import PluginKind
-from vibench.plugins.plugin import Plugin
-from vibench.plugins.registry import default_formulation, find, registered
+from vibench.plugins.plugin import GivenPlugin, Plugin, give
+from vibench.plugins.registry import RegisteredPlugin, default_formulation, find, registered
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
-from vibench.study.entries import (
-    Entry,
-    FormulationEntry,
-    Name,
-    ProblemEntry,
-    SamplingEntry,
-    Size,
-    Training,
-    Validation,
-    as_list,
-)
 from vibench.study.parameter_sets import OWN, ParameterSet, check_sets, is_available
 
-Tolerance: TypeAlias = Annotated[float, Gt(0.0), Lt(1.0), AllowInfNan(False)]
-Seconds: TypeAlias = Annotated[float, Gt(0.0), Le(1e7), AllowInfNan(False)]
-Gibibytes: TypeAlias = Annotated[float, Gt(0.0), Lt(1e6), AllowInfNan(False)]
+Size: TypeAlias = Annotated[int, Ge(1), Le(100_000)]
+Name: TypeAlias = Annotated[str, MinLen(1)]
+
+
+def as_list(value: Any) -> Any:
+    """A list, or a single value as a list of one."""
+    return value if isinstance(value, list) else [value]
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether a value may occur in a study file, or is an entry already; others are classes or objects."""
+    return value is None or isinstance(value, str | int | float | list | dict | date | time | BaseModel)
+
+
+class _Model(BaseModel):
+    # Unknown keys, infinities and NaN are refused, and no type is converted.
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+class Entry(_Model):
+    """One entry of an axis of plugins; in Python a class or an object may replace the name or the whole entry."""
+
+    name: Name = Field(description="Name the plugin is registered under.")
+    label: str = Field(default="", description="Label in tables; its name by default.")
+    options: dict[str, Any] = Field(default={}, description="Keyword arguments of its constructor.")
+
+    _given: Any = PrivateAttr(None)
+    _places: Mapping[str, str] = PrivateAttr({})
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _from_python(cls, value: Any, build: ModelWrapValidatorHandler[Self]) -> Self:
+        given = value.get("name") if isinstance(value, dict) else value
+        if _is_plain(given):
+            return build(value)
+        # The name of the class is that of the entry, and its label in tables.
+        name = (given if isinstance(given, type) else type(given)).__name__
+        entry = build((value if isinstance(value, dict) else {}) | {"name": name})
+        entry._given = given
+        return entry
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: Any) -> Any:
+        return {"name": value} if isinstance(value, str) else value
+
+    @property
+    def is_registered(self) -> bool:
+        """Whether it names a plugin, and does not hold a class or an object."""
+        return self._given is None
+
+    def registered(self, kind: PluginKind) -> RegisteredPlugin:
+        """The registry entry of its name, or its class or object in the state of the first call."""
+        if self.is_registered:
+            return find(kind, self.name)
+        if not isinstance(self._given, GivenPlugin):
+            # Take its state now: later calls must return the same plugin.
+            self._given = give(kind, self.title, self._given)
+        return self._given
+
+    def plugin(self, kind: PluginKind) -> Plugin:
+        return Plugin.of(self.registered(kind), self.options, self._places)
+
+    def at(self, places: Mapping[str, str]) -> Self:
+        """The entry with files and folders at these places, by option."""
+        self._places = places
+        return self
+
+    @property
+    def title(self) -> str:
+        return self.label or self.name
+
+
+class FormulationEntry(Entry):
+    """One entry of the axis of formulations."""
+
+    @model_validator(mode="after")
+    def _no_label_of_another(self) -> FormulationEntry:
+        if self.label and self.label == default_formulation() != self.name:
+            raise ValueError(f"'{self.label}' is the formulation of studies that name none, and no label of another")
+        return self
+
+    @property
+    def kind(self) -> type[Formulation]:
+        """The class; a formulation that has all axes where several packages use its name: its cells cannot be run."""
+        plugin = self.registered(PluginKind.FORMULATION)
+        kind: type[Formulation] = Formulation if plugin.conflict else plugin.load()
+        return kind
+
+    @property
+    def uses(self) -> tuple[str, ...]:
+        """The axes of a study that it has. Raises a `RequestError` if it declares axes that there are not."""
+        return axes_of(self.kind, str(self.registered(PluginKind.FORMULATION)))
+
+
+class SamplingEntry(Entry):
+    """A parameter set: `own`, that of the problem itself, or a sampling strategy; other keys are its options."""
+
+    on_failure: Literal["stop", "skip"] = Field(
+        default="stop",
+        description="Of a training set: `skip` leaves out parameters without a solution, a tenth at most.",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: Any) -> Any:
+        if not isinstance(value, dict):
+            return {"name": value} if isinstance(value, str) else value
+        own = {key: part for key, part in value.items() if key in cls.model_fields}
+        short = {key: part for key, part in value.items() if key not in cls.model_fields}
+        given = own.get("options", {})
+        return own | {"options": given | short} if isinstance(given, dict) else own
+
+    @model_validator(mode="after")
+    def _no_options_of_own(self) -> SamplingEntry:
+        if self.name == OWN and self.options:
+            raise ValueError(f"the problem's own set has no options (found {', '.join(map(repr, self.options))})")
+        if self.label == OWN != self.name:
+            raise ValueError(f"'{OWN}' is the problem's own set and no label of another")
+        return self
+
+
+def _number_or_table(value: Any) -> str:
+    return "<number>" if _is_plain(value) and not isinstance(value, dict | str | SamplingEntry) else "<table>"
+
+
+def _drawn(entry: SamplingEntry) -> SamplingEntry:
+    if entry.name == OWN:
+        raise ValueError("give the number of parameters in the problem's own set, or a sampling strategy")
+    if entry.on_failure == "skip":
+        raise ValueError("on_failure is for training sets: every query has a row")
+    return entry
+
+
+Training: TypeAlias = Annotated[list[SamplingEntry], MinLen(1), BeforeValidator(as_list)]
+Validation: TypeAlias = Annotated[
+    Annotated[Size, Tag("<number>")] | Annotated[SamplingEntry, AfterValidator(_drawn), Tag("<table>")],
+    Discriminator(_number_or_table),
+]
+
+
+class ProblemEntry(Entry):
+    """One entry of the axis of problems."""
+
+    training: Training | None = Field(default=None, description="Training sets of this problem, not those of all.")
+    validation: Validation | None = Field(default=None, description="Validation set of this problem, likewise.")
+
+
+Tolerance: TypeAlias = Annotated[float, Gt(0.0), Lt(1.0)]
+Seconds: TypeAlias = Annotated[float, Gt(0.0), Le(1e7)]
+Gibibytes: TypeAlias = Annotated[float, Gt(0.0), Lt(1e6)]
 Rounds: TypeAlias = Annotated[int, Ge(1), Lt(1000)]
 Tolerances: TypeAlias = Annotated[list[Tolerance], MinLen(1)]
 Sizes: TypeAlias = Annotated[list[Size], MinLen(1)]
 Names: TypeAlias = Annotated[list[Name], MinLen(1)]
-
-
-Accuracy: TypeAlias = Annotated[float, Ge(1e-14), Le(1e-2), AllowInfNan(False)]
+Accuracy: TypeAlias = Annotated[float, Ge(1e-14), Le(1e-2)]
 Bounds: TypeAlias = Annotated[list[bool], MinLen(1), BeforeValidator(as_list)]
 Accuracies: TypeAlias = Annotated[list[Accuracy], MinLen(1), BeforeValidator(as_list)]
 
@@ -82,22 +220,16 @@ def _file_name(value: str) -> str:
 FileName: TypeAlias = Annotated[Name, AfterValidator(_file_name)]
 
 
-class _Model(BaseModel):
-    model_config = Entry.model_config
-
-
 class ToleranceTable(_Model):
     """A grid of tolerances: the Cartesian product of its lists."""
 
-    pod: Annotated[Tolerances | None, Field(description="Tolerances δ_POD of the POD.")] = None
-    N: Annotated[Sizes | None, Field(description="Dimensions of V_N, in place of `pod`.")] = None
-    dual: Annotated[
-        PerStrategy[Tolerances] | None, Field(description="Tolerances δ_dual of the cones: for all, or by strategy.")
-    ] = None
-    R: Annotated[
-        PerStrategy[Sizes] | None, Field(description="Numbers of generators, in place of `dual`: likewise.")
-    ] = None
-    primal: Annotated[dict[str, Tolerances], Field(description="Tolerances δ of the primal strategies, by name.")] = {}
+    pod: Tolerances | None = Field(default=None, description="Tolerances δ_POD of the POD.")
+    N: Sizes | None = Field(default=None, description="Dimensions of V_N, in place of `pod`.")
+    dual: PerStrategy[Tolerances] | None = Field(
+        default=None, description="Tolerances δ_dual of the cones: for all, or by strategy."
+    )
+    R: PerStrategy[Sizes] | None = Field(default=None, description="Numbers of generators, in place of `dual`.")
+    primal: dict[str, Tolerances] = Field(default={}, description="Tolerances δ of the primal strategies, by name.")
 
     @model_validator(mode="after")
     def _one_of_each(self) -> ToleranceTable:
@@ -137,12 +269,12 @@ def _meant_for(values: Any, entry: Entry, key: str) -> list[Any]:
 class Limits(_Model):
     """Limits of a query and of a stage; all queries of a cell are one stage."""
 
-    query_seconds: Annotated[Seconds, Field(description="Wall seconds of one solution of a query.")] = 20.0
-    cell_seconds: Annotated[Seconds, Field(description="Wall seconds of a stage.")] = 600.0
-    memory_gib: Annotated[
-        Gibibytes,
-        Field(description="Address space of a worker process in GiB; kept artefacts take an eighth, at most 1 GiB."),
-    ] = 8.0
+    query_seconds: Seconds = Field(default=20.0, description="Wall seconds of one solution of a query.")
+    cell_seconds: Seconds = Field(default=600.0, description="Wall seconds of a stage.")
+    memory_gib: Gibibytes = Field(
+        default=8.0,
+        description="Address space of a worker process in GiB; kept artefacts take an eighth, at most 1 GiB.",
+    )
 
 
 class Study(_Model):
@@ -154,65 +286,54 @@ class Study(_Model):
         If a setting is wrong, or names a plugin, or an option of one, that there is not; it says what would be right.
     """
 
-    name: Annotated[FileName, Field(description="Name of the study; its results are in the folder `runs/<name>`.")]
-    seed: Annotated[int, Ge(0), Lt(2**63), Field(description="Seed of the validation set.")] = 0
-    validation: Annotated[
-        Validation,
-        Field(description="Validation set, the queries of every cell: a number for the problem's own, or a sampling."),
-    ]
-    training: Annotated[Training, Field(description="Training sets: an axis; `own` is that of the problem itself.")] = [
-        SamplingEntry(name=OWN)
-    ]
-    accuracy: Annotated[
-        Accuracies, Field(description="Relative accuracy prescribed to QP solvers, or a list of accuracies: an axis.")
-    ] = [1e-7]
-    formulation: Annotated[
-        list[FormulationEntry],
-        MinLen(1),
-        Field(
-            description="Formulations; `mixed` is the program of V_N and the cone. None has axes that it does not use.",
-            default_factory=lambda: [FormulationEntry(name=default_formulation())],
-        ),
-    ]
-    solvers: Annotated[
-        Solvers, Field(description="QP solvers; `available` for all installed ones. Required by `mixed`.")
-    ] = []
-    dual: Annotated[list[Entry], MinLen(1), Field(description="Dual strategies. Required by `mixed`.")] = []
-    primal: Annotated[list[Entry], MinLen(1), Field(description="Primal strategies. Required by `mixed`.")] = []
-    assembly: Annotated[list[Literal["full", "reduced"]], MinLen(1), Field(description="Assembly of queries.")] = [
-        "full"
-    ]
-    bounds: Annotated[Bounds, Field(description="Error bounds of queries, with reduced assembly: an axis.")] = [False]
-    correction: Annotated[
-        list[Literal["none", "feasible", "auto"]],
-        MinLen(1),
-        Field(description="Whether solutions are corrected; `auto` for those whose violation dominates the bound."),
-    ] = ["none"]
-    interpolation: Annotated[Tolerance, Field(description="Tolerance of interpolation in reduced assembly.")] = 1e-6
-    warm_start: Annotated[
-        bool,
-        Field(
-            description="Whether QP solvers start from a solution at another parameter if they can: the one before it "
-            "in an ordered validation set, else a neighbour."
-        ),
-    ] = False
-    timing_rounds: Annotated[
-        Rounds,
-        Field(description="Maximal number of timing rounds of a cell; with fewer than six, break-even is undecided."),
-    ] = 18
-    timing_rounds_min: Annotated[
-        Rounds,
-        Field(description="Minimal number of timing rounds, after which a cell with decided comparisons ends."),
-    ] = 6
-    factorisation: Annotated[
-        Literal["superlu", "pardiso", "cholmod", "available"],
-        Field(description="Factorisation of high-fidelity matrices; a problem may have an option of the same name."),
-    ] = "superlu"
-    problem: Annotated[list[ProblemEntry], MinLen(1), Field(description="Problems.")]
-    tolerances: Annotated[
-        list[ToleranceTable], MinLen(1), Field(description="Grids of tolerances; cells are their union.")
-    ]
-    limits: Annotated[Limits, Field(description="Limits of a query and of a stage.")] = Limits()
+    name: FileName = Field(description="Name of the study; its results are in the folder `runs/<name>`.")
+    seed: Annotated[int, Ge(0), Lt(2**63)] = Field(default=0, description="Seed of the validation set.")
+    validation: Validation = Field(
+        description="Validation set, the queries of every cell: a number for the problem's own, or a sampling."
+    )
+    training: Training = Field(
+        default=[SamplingEntry(name=OWN)], description="Training sets: an axis; `own` is that of the problem itself."
+    )
+    accuracy: Accuracies = Field(
+        default=[1e-7], description="Relative accuracy prescribed to QP solvers, or a list of accuracies: an axis."
+    )
+    formulation: Annotated[list[FormulationEntry], MinLen(1)] = Field(
+        default_factory=lambda: [FormulationEntry(name=default_formulation())],
+        description="Formulations; `mixed` is the program of V_N and the cone. None has axes that it does not use.",
+    )
+    solvers: Solvers = Field(default=[], description="QP solvers; `available` for all installed. Required by `mixed`.")
+    dual: Annotated[list[Entry], MinLen(1)] = Field(default=[], description="Dual strategies. Required by `mixed`.")
+    primal: Annotated[list[Entry], MinLen(1)] = Field(default=[], description="Primal strategies. Required by `mixed`.")
+    assembly: Annotated[list[Literal["full", "reduced"]], MinLen(1)] = Field(
+        default=["full"], description="Assembly of queries."
+    )
+    bounds: Bounds = Field(default=[False], description="Error bounds of queries, with reduced assembly: an axis.")
+    correction: Annotated[list[Literal["none", "feasible", "auto"]], MinLen(1)] = Field(
+        default=["none"],
+        description="Whether solutions are corrected; `auto` for those whose violation dominates the bound.",
+    )
+    interpolation: Tolerance = Field(default=1e-6, description="Tolerance of interpolation in reduced assembly.")
+    warm_start: bool = Field(
+        default=False,
+        description="Whether QP solvers start from a solution at another parameter if they can: the one before it in "
+        "an ordered validation set, else a neighbour.",
+    )
+    timing_rounds: Rounds = Field(
+        default=18,
+        description="Maximal number of timing rounds of a cell; with fewer than six, break-even is undecided.",
+    )
+    timing_rounds_min: Rounds = Field(
+        default=6, description="Minimal number of timing rounds, after which a cell with decided comparisons ends."
+    )
+    factorisation: Literal["superlu", "pardiso", "cholmod", "available"] = Field(
+        default="superlu",
+        description="Factorisation of high-fidelity matrices; a problem may have an option of the same name.",
+    )
+    problem: Annotated[list[ProblemEntry], MinLen(1)] = Field(description="Problems.")
+    tolerances: Annotated[list[ToleranceTable], MinLen(1)] = Field(
+        description="Grids of tolerances; cells are their union."
+    )
+    limits: Limits = Field(default=Limits(), description="Limits of a query and of a stage.")
 
     @model_validator(mode="wrap")
     @classmethod
@@ -232,10 +353,8 @@ class Study(_Model):
 
     def training_sets(self, problem: ProblemEntry) -> list[ParameterSet]:
         entries = problem.training or self.training
-        return [
-            ParameterSet("training", 0, 0, _sampling(entry), entry.title, entry.on_failure == "skip")
-            for entry in entries
-        ]
+        skips = [(entry, entry.on_failure == "skip") for entry in entries]
+        return [ParameterSet("training", 0, 0, _sampling(entry), entry.title, skip) for entry, skip in skips]
 
     def validation_set(self, problem: ProblemEntry) -> ParameterSet:
         """The validation set of a problem; that of a sampling strategy has no size yet."""
@@ -273,12 +392,11 @@ def _sampling(entry: SamplingEntry) -> Plugin | None:
 
 def _check_names(study: Study) -> None:
     """Check names and options of plugins, and that exactly the strategies that take a tolerance have one."""
-    axes: dict[PluginKind, Sequence[Entry]] = {
-        PluginKind.PROBLEM: study.problem,
-        PluginKind.DUAL: study.dual,
-        PluginKind.PRIMAL: study.primal,
-    }
-    for kind, axis in (*axes.items(), (PluginKind.FORMULATION, study.formulation)):
+    axes: Sequence[tuple[PluginKind, Sequence[Entry]]] = [
+        (PluginKind.PROBLEM, study.problem), (PluginKind.DUAL, study.dual), (PluginKind.PRIMAL, study.primal),
+        (PluginKind.FORMULATION, study.formulation),
+    ]  # fmt: skip
+    for kind, axis in axes:
         for entry in axis:
             entry.registered(kind).check_options(entry.options)
         _check_given(kind, axis)
@@ -325,7 +443,7 @@ def _check_sets(study: Study, entry: ProblemEntry) -> None:
     for sampling in samplings:
         sampling.registered(PluginKind.SAMPLING).check_options(sampling.options)
     # Without files and samplings nothing can be wrong with them, and building a problem takes seconds.
-    if not samplings and not entry.registered(PluginKind.PROBLEM).data_digest({**entry.options, **entry.places}):
+    if not samplings and not entry.registered(PluginKind.PROBLEM).data_digest({**entry.options, **entry._places}):
         return
     problem, validation = entry.plugin(PluginKind.PROBLEM), study.validation_set(entry)
     training = study.training_sets(entry)
@@ -336,10 +454,9 @@ def _check_sets(study: Study, entry: ProblemEntry) -> None:
 
 def _check_tolerances(study: Study, table: ToleranceTable) -> None:
     given = (
-        (PluginKind.DUAL, study.dual, table.dual),
-        (PluginKind.DUAL, study.dual, table.R),
+        (PluginKind.DUAL, study.dual, table.dual), (PluginKind.DUAL, study.dual, table.R),
         (PluginKind.PRIMAL, study.primal, table.primal),
-    )
+    )  # fmt: skip
     for kind, axis, tolerances in given:
         # A tolerance may name a plugin that an option of the command line has removed from the axis.
         names = {name for entry in axis for name in (entry.name, entry.title)}

@@ -25,9 +25,8 @@ from vibench.results.ranking import added_columns
 from vibench.results.read import read_table
 from vibench.results.schema import STORED, TABLES
 from vibench.results.sqlite import FILE
-from vibench.study.entries import ProblemEntry
 from vibench.study.matrix import expand, read_study
-from vibench.study.spec import Study
+from vibench.study.spec import ProblemEntry, Study
 from vibench.text import printable
 
 
