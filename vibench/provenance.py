@@ -70,10 +70,7 @@ def cores() -> int:
 
 
 def versions(solver: str | None) -> dict[str, str]:
-    """Versions of the benchmark protocol, of Python, the numerical libraries, vibench and a solver, if any.
-
-    In a checkout the version of vibench includes the commit: "0.1.0 at 1a2b3c4d5e".
-    """
+    """Versions of the protocol, Python, the numerical libraries, a solver, and vibench: "0.1.0 at 1a2b3c4d5e"."""
     numerical = {name: distribution_version(name) for name in ("numpy", "scipy", "scikit-fem", "qpsolvers", "vibench")}
     numerical["vibench"] += f" at {commit()}" if commit() else ""
     own = {"protocol": PROTOCOL, "python": platform.python_version(), **numerical}

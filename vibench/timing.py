@@ -50,10 +50,7 @@ NO_TIME = Seconds(0.0, 0.0)
 
 
 class Stopwatch:
-    """Seconds since its creation, of all threads of the process and of the children that have ended.
-
-    A child that outlives the work does not count; the wall seconds then exceed the CPU seconds.
-    """
+    """CPU seconds of all threads and of the children that have ended, and wall seconds, since its creation."""
 
     def __init__(self) -> None:
         self._children, self._wall, self._cpu = _children_seconds(), perf_counter(), process_time()

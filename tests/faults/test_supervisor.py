@@ -185,7 +185,7 @@ def test_a_plugin_or_a_vibench_that_was_not_planned_with_is_refused(
 
 
 def test_a_suspended_run_is_not_late(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    state = supervisor._JobState(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0), lambda _: None)
+    state = supervisor._JobState(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0))
     state.update(Begun())
     now = time.monotonic()
     monkeypatch.setattr(supervisor.time, "monotonic", lambda: now + 3600.0)
@@ -195,7 +195,7 @@ def test_a_suspended_run_is_not_late(monkeypatch: pytest.MonkeyPatch, tmp_path: 
 
 def test_limits_begin_when_the_work_begins(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """None of the time counts in which a process starts and imports: here three times what the work may take."""
-    state = supervisor._JobState(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0), lambda _: None)
+    state = supervisor._JobState(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0))
     seconds = itertools.count(time.monotonic())
     monkeypatch.setattr(supervisor.time, "monotonic", lambda: next(seconds))
     for _ in range(90):
@@ -213,7 +213,7 @@ def test_a_process_never_begun_is_given_up(
     watcher: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervisor._JobState, "start_seconds", 0.1)
-    found = watcher.run(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0), lambda _: None)
+    found = watcher.run(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0))
     assert found == Failed(Status.CRASHED, "no worker process began within 0.1 s")
 
 
@@ -242,7 +242,7 @@ def test_a_process_that_forks_answers_once(run: Run) -> None:
 
 def test_what_cannot_be_stored_is_not_the_fault_of_the_stage(watcher: Supervisor, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    found = watcher.run(Job(str(tmp_path / "file"), Whole("fine"), 1.0, 30.0, 8.0), lambda _: None)
+    found = watcher.run(Job(str(tmp_path / "file"), Whole("fine"), 1.0, 30.0, 8.0))
     assert isinstance(found, Unstored)
     assert "cannot be written" in found.reason
 

@@ -164,10 +164,7 @@ class Dask(Executor):
 
 
 def _greet(scheduler: str, seconds: float) -> None:
-    """Shake hands with a scheduler, since a client would wait for ever for an answer, and trust any size it receives.
-
-    Raises a `RequestError` if none answers within some seconds.
-    """
+    """Shake hands with a scheduler: a client would wait for ever for an answer, and trust any size it receives."""
     from distributed.comm.core import connect  # noqa: PLC0415
     from distributed.security import Security  # noqa: PLC0415
 

@@ -48,10 +48,7 @@ class RecordedCell:
 
     @cached_property
     def model(self) -> Model:
-        """The model, with its bounds; stages whose artefacts are missing are run again.
-
-        Raises a `RequestError` if other code computed the row, so that its model cannot be reproduced.
-        """
+        """The model, with its bounds; raises a `RequestError` if other code computed the row."""
         if self.cell.code != self.row["code"]:
             others = "by other code, with another version of its solver, or from files that were changed since"
             raise RequestError(f"cell {self.row['cell']} was computed {others}; run its study again")
@@ -78,10 +75,7 @@ class RecordedCell:
 
 
 def _provide(stages: Iterable[Stage], store: Store) -> None:
-    """Run the stages whose artefacts are missing, and the inputs they need; in a supervised process, as in a run.
-
-    Raises a `RequestError` if one of them fails.
-    """
+    """Run stages without artefacts, and their inputs, in a supervised process; a `RequestError` if one fails."""
     graph = Graph()
     for stage in stages:
         graph.add_goal(stage, lambda needed: store.get(needed.key) is not None)
@@ -105,10 +99,7 @@ def _rows(run: str) -> tuple[Path, list[dict[str, Any]]]:
 
 
 def recorded_cells(run: str, places: Mapping[str, str] = {}) -> list[RecordedCell]:
-    """All cells of a run that have a model with quadratic programs.
-
-    Raises a `RequestError` if there is no such run.
-    """
+    """All cells with quadratic programs of a run; a `RequestError` if there is no such run."""
     path, rows = _rows(run)
     return [RecordedCell(path, row, places) for row in rows if row["model"] and _has_program(row["definition"])]
 
@@ -120,10 +111,7 @@ def _has_program(definition: str) -> bool:
 
 
 def recorded_cell(run: str, cell: str, places: Mapping[str, str] = {}) -> RecordedCell:
-    """One cell of a run, by its key or a unique prefix of it.
-
-    Raises a `RequestError` if the prefix fits no cell or several, or the cell failed before it had a reduced model.
-    """
+    """One cell with a reduced model, by a unique prefix of its key; a `RequestError` if there is none or several."""
     recorded = _matching(run, cell, places)
     if not recorded.row["model"]:
         raise RequestError(f"cell {recorded.row['cell']} has no reduced model: {recorded.row['reason']}")

@@ -38,10 +38,7 @@ LOG, REPORT = "workers.log", "report.html"
 
 @contextlib.contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """Lock a run folder, which is created if it does not exist.
-
-    Raises a `RequestError` if it is no run folder, cannot be written, or is locked by another run.
-    """
+    """Lock a run folder; a `RequestError` if it is none, cannot be written, or is locked by another run."""
     try:
         if folder.exists() and not folder.is_dir():
             raise RequestError(f"output folder '{folder}' is a file")
@@ -78,10 +75,7 @@ def clear(folder: Path, study: str, note: Callable[[str], None]) -> None:
 
 
 def ended_by_smaller_limits(database: ResultsDatabase, limits: Limits) -> set[str]:
-    """Keys of the cells that ended, or had a query that ended, at a limit that is larger now.
-
-    Rows name their study by its hash; limits of an unknown hash count as unchanged.
-    """
+    """Keys of the cells that ended, or had a query that ended, at a limit of their study that is larger now."""
     known = {study: json.loads(text) for study, text in database.kept("limits of ").items()}
     ended = set()
     for cell, study, status, reason in database.ends():

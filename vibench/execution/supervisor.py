@@ -19,7 +19,7 @@ import tempfile
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
 from multiprocessing.connection import Connection
@@ -42,10 +42,7 @@ def code_here() -> str:
 
 @dataclass(frozen=True)
 class Job:
-    """A stage to be run: the folder of artefacts, the limits of a query and of the stage, and the code expected.
-
-    `lost` are dispensable stages that failed, by key.
-    """
+    """A stage to be run, the folder of artefacts, the limits, `lost` dispensable stages, and the code expected."""
 
     store: str
     stage: Stage
@@ -168,8 +165,8 @@ class _JobState:
     # Seconds beyond the limit of a query, for the work before and after the solver.
     grace = 2.0
 
-    def __init__(self, job: Job, observe: Callable[[Any], None]) -> None:
-        self.job, self.progress, self._observe = job, Progress(), observe
+    def __init__(self, job: Job) -> None:
+        self.job, self.progress = job, Progress()
         self.seconds = self.fraction = 0.0
         self._begin(Batch(frozenset(), (), ends=False), None)
 
@@ -222,7 +219,6 @@ class _JobState:
                 self.fraction = message.fraction
             case ItemDone():
                 self.progress.done[message.number] = message.value
-                self._observe(message.value)
             case OutOfMemory():
                 raise _WorkerLostError(message.failed)
             case Done() | Failed() | Unstored() | BatchDone():
@@ -249,17 +245,14 @@ class Supervisor:
         self._state: _JobState | None = None
         self._stop = threading.Event()
 
-    def run(self, job: Job, observe: Callable[[Any], None] = lambda _: None) -> Done | Failed | Unstored:
-        """Run a stage until it ends or exceeds its limits; `observe` is called with the value of every item done.
-
-        Raises a `StoppedError` if `stop` is called meanwhile.
-        """
+    def run(self, job: Job) -> Done | Failed | Unstored:
+        """Run a stage until it ends or exceeds its limits; raises a `StoppedError` if `stop` is called meanwhile."""
         # A session is timed in cold processes: caches of earlier ones must not make it faster.
         if job.stage.session > self._session:
             self._kill()
             self._session = job.stage.session
         try:
-            return self._run(job, observe)
+            return self._run(job)
         except BaseException:
             self._kill()
             raise
@@ -279,8 +272,8 @@ class Supervisor:
         self.stop()
         self._kill()
 
-    def _run(self, job: Job, observe: Callable[[Any], None]) -> Done | Failed | Unstored:
-        state, limit, retried = _JobState(job, observe), job.cell_seconds, False
+    def _run(self, job: Job) -> Done | Failed | Unstored:
+        state, limit, retried = _JobState(job), job.cell_seconds, False
         self._state = state
         done, lost = state.progress.done, state.progress.lost
         # Idle processes hold memory, each with the imports of its packages: keep the last four.
@@ -340,7 +333,11 @@ class Supervisor:
         """The worker process of some packages, started if there is none."""
         if packages not in self._workers:
             (ours, theirs), mark = socket.socketpair(), secrets.token_hex(8)
-            environment = _environment({**os.environ, **self._environment}) | {MARK: mark}
+            # With these (bytes) glibc keeps up to 1 GiB of freed memory: it does not map large arrays page by page again.
+            memory = {"MMAP_THRESHOLD": "33554432", "TRIM_THRESHOLD": "1073741824", "TOP_PAD": "67108864"}
+            environment = {**os.environ, **self._environment, **ONE_THREAD, MARK: mark}
+            environment |= {f"MALLOC_{name}_": size for name, size in memory.items()}
+            environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
             with theirs, tempfile.TemporaryFile() as shared:
                 shared.truncate(8)
                 socket.send_fds(ours, [b"+"], [shared.fileno()])
@@ -386,14 +383,6 @@ def _cause_of_death(process: subprocess.Popen[bytes]) -> str:
 def manner_of_death(code: int) -> str:
     names = {number.value: number.name for number in signal.Signals}
     return f"exit code {code}" if code >= 0 else f"signal {names.get(-code, -code)}"
-
-
-def _environment(parent: Mapping[str, str]) -> dict[str, str]:
-    """Environment with one thread for numerical libraries, freed memory kept, and the import path of this process."""
-    # With these (bytes) glibc keeps up to 1 GiB of freed memory: large arrays are not mapped page by page every time.
-    memory = {"MMAP_THRESHOLD": "33554432", "TRIM_THRESHOLD": "1073741824", "TOP_PAD": "67108864"}
-    kept_memory = {f"MALLOC_{name}_": size for name, size in memory.items()}
-    return {**parent, **ONE_THREAD, **kept_memory, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
 
 def kill_marked(mark: str) -> None:

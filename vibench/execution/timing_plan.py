@@ -126,10 +126,7 @@ class TimingPlan:
         self._session = 0
 
     def start(self, todo: Iterable[Cell]) -> list[TimingRounds]:
-        """Register the cells that will get new rows.
-
-        Returns the stages of the groups that wait for none of them, and have cells without seconds.
-        """
+        """Register the cells that will get new rows; returns stages of groups that wait for none but lack seconds."""
         waiting = set(todo)
         for cell in self._goals:
             self._groups.setdefault(_group(cell), []).append(cell)

@@ -41,10 +41,7 @@ class UnstorableError(VibenchError):
 
 
 def storable(table: str, row: Row) -> dict[str, Any]:
-    """The row of a table as the results file holds it.
-
-    Raises an `UnstorableError` for the first value that it cannot hold.
-    """
+    """The row of a table as the results file holds it; an `UnstorableError` for the first value that it cannot hold."""
     values: dict[str, Any] = {}
     for name, value in row.items():
         column, kind = column_of(table, name), type(value)
@@ -149,10 +146,7 @@ class ResultsDatabase:
         self._digests.count("meta")
 
     def _remove_damaged(self, path: Path) -> tuple[str, ...]:
-        """Remove cells whose rows are not those that were written, and tables derived from them; returns their keys.
-
-        Raises a `RequestError` if other tables are damaged, or the file itself is.
-        """
+        """Remove cells whose rows have changed, and return their keys; a `RequestError` for damage elsewhere."""
         sound = self._is_sound()
         if not sound:
             # An index holds nothing that its table does not.

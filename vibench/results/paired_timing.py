@@ -156,10 +156,7 @@ def blocks_of(rounds: Iterable[Row]) -> dict[str, Block]:
 
 
 def mean_seconds(blocks: Iterable[Block]) -> tuple[float, float | None]:
-    """Seconds of a query and of a high-fidelity solution, `None` if unknown: geometric means over blocks.
-
-    Only blocks with both count, if there are any.
-    """
+    """Seconds of a query and of a high-fidelity solution (or `None`), over the blocks with both, else over all."""
     every = np.array(list(blocks))
     paired = every[np.isfinite(every[:, 1])]
     online, ratio = np.exp((paired if len(paired) else every).mean(axis=0))
@@ -192,10 +189,7 @@ class PairedTiming:
         self._levels.add(cell, [b.online for b in blocks.values()])
 
     def rounds(self, a: str | None, b: str) -> int:
-        """Number of rounds of b in the blocks that it shares with a, or with the high-fidelity model without a.
-
-        Where they share none, they are compared by that model.
-        """
+        """Number of rounds of b in the blocks shared with a; in all where it shares none, or without a."""
         mine = self._blocks.get(b, {})
         return sum(self._rounds[b][name] for name in mine.keys() & self._blocks.get(a or b, {}) or mine)
 
@@ -235,10 +229,7 @@ class PairedTiming:
         return self._estimate(self._levels, values)
 
     def draws(self, a: str | None, b: str, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Seconds (`DRAWS`,) of a query of a, and their quotients b over a, that other runs might measure.
-
-        They are NaN where they were not measured in two blocks.
-        """
+        """Seconds (`DRAWS`,) of a query of a, and quotients b over a, in other runs; NaN without two blocks of both."""
         level, ratio = self.level(a, b), self.ratio_within(a, b)
         if level is None or ratio is None:
             return np.full(DRAWS, np.nan), np.full(DRAWS, np.nan)

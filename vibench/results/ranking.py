@@ -100,10 +100,7 @@ def with_errors(thresholds: pd.DataFrame, cells: pd.DataFrame, errors: pd.Series
 
 
 def within(thresholds: pd.DataFrame, largest: float) -> pd.DataFrame:
-    """The break-even points of models that both have errors of at most `largest`.
-
-    Raises a `RequestError` if it is no positive number.
-    """
+    """Break-even points of models with errors of at most `largest`; a `RequestError` if this is not positive."""
     if not largest > 0.0:
         raise RequestError(f"the largest error is {largest:g}, expected a positive number")
     return thresholds[(thresholds["error_a"] <= largest) & (thresholds["error_b"] <= largest)]

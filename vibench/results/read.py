@@ -43,10 +43,7 @@ def read_table(path: Path, table: str, cells: Sequence[str] = ()) -> pd.DataFram
 
 
 def read_in_parts(path: Path, table: str) -> Iterator[pd.DataFrame]:
-    """One table as `read_table` gives it, some thousand rows at a time, since it may be larger than memory.
-
-    Raises a `RequestError` as `read_table`; of damage after the last part.
-    """
+    """One table as `read_table` gives it, some thousand rows at a time; errors of damage come after the last part."""
     return (_framed(path, table, part) for part in read_parts(path, table))
 
 
@@ -87,10 +84,7 @@ def _expected(column: Column, name: str) -> tuple[Callable[[object], bool], str]
 
 
 def cells_with_errors(path: Path, measure: str = "solution") -> tuple[pd.DataFrame, pd.Series]:
-    """The recorded cells of a results file, and the error of each by a measure.
-
-    Raises a `RequestError` if there is no such measure, or the file cannot be read.
-    """
+    """The recorded cells of a results file, and the error of each by a measure; a `RequestError` if it is unknown."""
     cells = read_table(path, "cells")
     return cells, ranking.errors_of(cells, read_table(path, "outputs"), measure)
 

@@ -130,10 +130,7 @@ def parts(text: str) -> list[str]:
 
 
 def sorted_by(frame: pd.DataFrame, keys: Sequence[str], what: str) -> pd.DataFrame:
-    """Rows sorted by columns, each named with a "-" before it for the largest first; missing values are last.
-
-    Raises a `RequestError` if there is no such column; `what` names the table in the message.
-    """
+    """Rows sorted by columns of the table `what`; a "-" before a name for the largest first; missing values last."""
     names = [key.removeprefix("-") for key in keys]
     for name in names:
         if name not in frame:

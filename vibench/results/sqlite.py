@@ -164,10 +164,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
 
 
 def refuse_pipes(path: Path) -> None:
-    """Refuse a pipe or a device, of which there may be no end, as a database and among what SQLite opens beside it.
-
-    Raises a `RequestError` that names what is no regular file.
-    """
+    """Refuse a pipe or a device, which may have no end, as a database and among the files beside it."""
     for beside in (f"{path}{end}" for end in ("", "-wal", "-shm", "-journal")):
         if os.path.exists(beside) and not os.path.isfile(beside):  # noqa: PTH110, PTH113
             raise RequestError(f"'{beside}' is no regular file; remove it")
@@ -287,10 +284,7 @@ def read_parts(path: Path, table: str, cells: Sequence[str] = (), order: Sequenc
 
 
 def study_of(path: Path, meta: Mapping[str, str]) -> dict[str, Any]:
-    """The settings of the study that a results file belongs to, from its meta table.
-
-    Raises a `RequestError` if the meta table does not hold them.
-    """
+    """The settings of the study of a results file, from its meta table; a `RequestError` if it does not hold them."""
     study = json_object(meta.get("study"))
     if study is None:
         raise RequestError(f"'{path}' does not say which study it belongs to; use --out")

@@ -1,7 +1,4 @@
-"""Seconds of queries, alternated with high-fidelity solutions round by round, and of offline stages timed again.
-
-See docs/measurement.md for the design of the rounds.
-"""
+"""Seconds of queries, timed in rounds as docs/measurement.md says, and of offline stages that are timed again."""
 
 from __future__ import annotations
 
