@@ -333,7 +333,7 @@ class Supervisor:
         """The worker process of some packages, started if there is none."""
         if packages not in self._workers:
             (ours, theirs), mark = socket.socketpair(), secrets.token_hex(8)
-            # With these (bytes) glibc keeps up to 1 GiB of freed memory: it does not map large arrays page by page again.
+            # With these (bytes) glibc keeps up to 1 GiB of freed memory: large arrays are not mapped anew page by page.
             memory = {"MMAP_THRESHOLD": "33554432", "TRIM_THRESHOLD": "1073741824", "TOP_PAD": "67108864"}
             environment = {**os.environ, **self._environment, **ONE_THREAD, MARK: mark}
             environment |= {f"MALLOC_{name}_": size for name, size in memory.items()}
