@@ -8,20 +8,11 @@ from collections.abc import Iterable, Mapping
 from vibench.execution.recording import ResultWriter
 from vibench.results.break_even import FEWEST_ROUNDS, Meaning, compared
 from vibench.results.paired_timing import PairedTiming
+from vibench.stages import timing_rounds
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Failed, Row, Stage
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.timing_rounds import (
-    QUERY_SUBSETS,
-    OfflineRepeat,
-    TimedCell,
-    TimedRound,
-    TimingRounds,
-    block_rows,
-    offline_columns,
-    scatter,
-    sources,
-)
+from vibench.stages.timing_rounds import OfflineRepeat, TimedCell, TimedRound, TimingRounds
 from vibench.study.cells import Cell
 from vibench.timing import Seconds
 
@@ -50,7 +41,7 @@ class OfflinePlan:
         """The repeats to run for some cells that have their rows, the cheapest first."""
         mine = dict(cells)
         self._cells |= mine
-        stages = {stage.key: stage for goal in mine.values() for stage in sources(goal)}
+        stages = {stage.key: stage for goal in mine.values() for stage in timing_rounds.sources(goal)}
         self._sources |= stages.keys() & self._costs.keys()
         # Begin with the cheapest: the same budget then repeats most stages.
         known = sorted((key for key in stages if key in self._costs), key=self._costs.__getitem__)
@@ -73,11 +64,11 @@ class OfflinePlan:
         stages = {one.key: one for some in phases for one in some}
         runs = {key: self._runs(stage) for key, stage in stages.items()}
         known = {key: some for key, some in runs.items() if some}
-        deviation = scatter(known.values())
+        deviation = timing_rounds.scatter(known.values())
         for cell, goal in self._cells.items():
             row = self._writer.database.cell(cell.key)
             if row is not None and all(one.key in known for some in goal.offline_stages.values() for one in some):
-                columns = offline_columns(goal, row["hf_setup_s"], known, deviation)
+                columns = timing_rounds.offline_columns(goal, row["hf_setup_s"], known, deviation)
                 self._writer.database.write_columns(cell.key, columns)
 
     def _runs(self, stage: Stage) -> list[Seconds]:
@@ -170,7 +161,7 @@ class TimingPlan:
         group = self._planned.pop(stage.key)
         if isinstance(outcome, Failed):
             outcome = (TimedCell({}, "", (outcome,) * stage.rounds),) * len(stage.cells)
-        for goal, rows, timed in zip(stage.cells, block_rows(stage, outcome), outcome, strict=True):
+        for goal, rows, timed in zip(stage.cells, timing_rounds.block_rows(stage, outcome), outcome, strict=True):
             group.rows[goal.key] += rows
             group.rounds[goal.key] += timed.rounds.values()
             group.machines[goal.key] |= {timed.machine} if timed.rounds else set()
@@ -217,7 +208,7 @@ class TimingPlan:
 
 def block_sizes(rounds: int) -> list[int]:
     """Numbers of rounds of the blocks of `rounds`: a pass over all queries, or less where rounds are few."""
-    blocks = 1 if rounds < FEWEST_ROUNDS else max(2, rounds // QUERY_SUBSETS)
+    blocks = 1 if rounds < FEWEST_ROUNDS else max(2, rounds // timing_rounds.QUERY_SUBSETS)
     return [rounds // blocks + (k < rounds % blocks) for k in range(blocks)]
 
 

@@ -23,21 +23,8 @@ from threadpoolctl import threadpool_limits
 
 from vibench import interrupts
 from vibench.errors import NumericalError, StorageError, UnsupportedError, VibenchError, in_a_line, message_of
-from vibench.execution.supervisor import (
-    MARK,
-    OUT_OF_MEMORY,
-    Batch,
-    BatchDone,
-    Begun,
-    CurrentItem,
-    FractionDone,
-    ItemDone,
-    Job,
-    OutOfMemory,
-    Progress,
-    code_here,
-    kill_marked,
-)
+from vibench.execution import supervisor
+from vibench.execution.supervisor import Batch, Job, Progress
 from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, Items, ItemwiseStage, Unstored
@@ -59,7 +46,7 @@ def main() -> None:
     # Children of plugins must not hold the socket open.
     ours.set_inheritable(False)
     _, (shared,), *_ = socket.recv_fds(ours, 1, 1)
-    current = CurrentItem(shared)
+    current = supervisor.CurrentItem(shared)
     os.close(shared)
     connection = Connection(ours.detach())
     # The output of plugins must not look like output of vibench, and must not be lost with a buffer in a crash.
@@ -94,10 +81,10 @@ def main() -> None:
             job, progress, batch = connection.recv()
         except EOFError:
             return
-        send(Begun())
+        send(supervisor.Begun())
         # The allocator keeps freed memory: replace a large process before the next job, which it might fail.
         if not first and not _last and _address_space() > 0.5 * job.memory_gib * 2**30:
-            send(OutOfMemory(None))
+            send(supervisor.OutOfMemory(None))
             return
         first = False
         # The supervisor enforces the limits; this one is for a supervisor that has died.
@@ -110,17 +97,17 @@ def _end_with(parent: int) -> None:
     """Kill this process and the children of plugins once the parent has died, which enforced their limits."""
     while os.getppid() == parent:
         time.sleep(1.0)
-    kill_marked(os.environ[MARK])
+    supervisor.kill_marked(os.environ[supervisor.MARK])
     os.killpg(0, signal.SIGKILL)
 
 
 def perform(
     job: Job, progress: Progress, batch: Batch, send: Send, enter: Enter
-) -> Done | BatchDone | Failed | Unstored | OutOfMemory:
+) -> Done | supervisor.BatchDone | Failed | Unstored | supervisor.OutOfMemory:
     """Run a batch of a stage; an exception of a plugin fails the stage and not the run."""
     start = time.perf_counter()
 
-    def work() -> Done | BatchDone:
+    def work() -> Done | supervisor.BatchDone:
         _check_code(job, batch)
         # Artefacts that were read stay in memory: at most 1 GiB, and an eighth of the limit.
         store = _store(job.store, min(2**30, int(0.125 * job.memory_gib * 2**30)))
@@ -133,11 +120,11 @@ def perform(
             earlier = {number: items.failed(number, failed) for number, failed in progress.lost.items()} | progress.done
             done = earlier | _done(job, items, batch, send, enter)
             if not batch.ends:
-                return BatchDone()
+                return supervisor.BatchDone()
             _last.clear()
             value = items.collect([done[number] for number in range(job.stage.items)])
             return Done((), value, time.perf_counter() - start)
-        store.progress = lambda fraction: send(FractionDone(fraction))
+        store.progress = lambda fraction: send(supervisor.FractionDone(fraction))
         result = job.stage.run(store)
         store.put(job.stage.key, result.value, result.seconds, result.histories)
         return Done(result.histories, None, time.perf_counter() - start, result.seconds)
@@ -151,7 +138,7 @@ def perform(
             return Failed(Status.ERROR, f"{error}; a plugin limits or closes the files of its process")
         return Unstored(str(error))
     except _NoMemoryError:
-        return OutOfMemory(Failed(Status.ERROR, f"{OUT_OF_MEMORY} = {job.memory_gib:g}"))
+        return supervisor.OutOfMemory(Failed(Status.ERROR, f"{supervisor.OUT_OF_MEMORY} = {job.memory_gib:g}"))
 
 
 def _check_code(job: Job, batch: Batch) -> None:
@@ -161,7 +148,7 @@ def _check_code(job: Job, batch: Batch) -> None:
     # Check every plugin once: stages reach the same ones through many of their inputs.
     used = dict.fromkeys(plugin for one in {one.key: one for one in stages}.values() for plugin in one.plugins)
     changed = [f"the {plugin}" for plugin in used if plugin.as_installed() != plugin]
-    if job.code != code_here():
+    if job.code != supervisor.code_here():
         changed.insert(0, "vibench or one of the libraries")
     if changed:
         raise NumericalError(f"{changed[0]} was changed since the run began; run the study again")
@@ -186,7 +173,7 @@ def _done(job: Job, items: Items, batch: Batch, send: Send, enter: Enter) -> dic
         enter(number, False)
         value = _guarded(job.memory_gib, partial(items.run_item, number, time_limit))
         done[number] = items.failed(number, value) if isinstance(value, Failed) else value
-        send(ItemDone(number, done[number]))
+        send(supervisor.ItemDone(number, done[number]))
     return done
 
 

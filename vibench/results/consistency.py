@@ -42,11 +42,6 @@ class Violation:
         return f"{self.invariant} is violated in {self.rows} rows, by up to {self.worst:.1e}"
 
 
-def violations(queries: pd.DataFrame, kinds: pd.Series) -> list[Violation]:
-    """Violated invariants in rows of the queries table; `kinds` is the kind of enrichment of each cell, by cell."""
-    return list(_violations(queries, kinds))
-
-
 def added_up(parts: Iterable[Violation]) -> list[Violation]:
     """Violations of several parts of a table, each invariant once."""
     found: dict[str, Violation] = {}
@@ -57,12 +52,14 @@ def added_up(parts: Iterable[Violation]) -> list[Violation]:
     return list(found.values())
 
 
-def _violations(rows: pd.DataFrame, kinds: pd.Series) -> Iterator[Violation]:
+def violations(rows: pd.DataFrame, kinds: pd.Series) -> list[Violation]:
+    """Violated invariants in rows of the queries table; `kinds` is the kind of enrichment of each cell, by cell."""
+    found = list[Violation]()
     for name in (name for name in STORED["queries"] if name.startswith("effectivity_")):
         # A bound that is the error itself in exact arithmetic may be below it by round-off.
         below = rows[name].astype(float) < 1.0 - 1e-10
         if below.any():
-            yield Violation(f"{name} ≥ 1", int(below.sum()), float(1.0 - rows[name].min()))
+            found.append(Violation(f"{name} ≥ 1", int(below.sum()), float(1.0 - rows[name].min())))
     # Formulations without programs have no constants.
     rows = rows[rows["beta_bounds"].notna()]
     queries, kind = rows.filter(regex="^beta_(full_|plain_|hf_)?(span|cone_)").astype(float), rows["cell"].map(kinds)
@@ -70,14 +67,15 @@ def _violations(rows: pd.DataFrame, kinds: pd.Series) -> Iterator[Violation]:
     scale = queries["beta_full_cone_upper"]
     for larger, smaller in (("full_", ""), ("", "plain_"), ("full_", "hf_")):
         inside = signed if smaller == "hf_" else signed | True
-        yield from _at_least(queries, f"beta_{larger}span", f"beta_{smaller}span", scale)
-        yield from _at_least(queries[inside], f"beta_{larger}cone_upper", f"beta_{smaller}cone_lower", scale[inside])
+        found += _at_least(queries, f"beta_{larger}span", f"beta_{smaller}span", scale)
+        found += _at_least(queries[inside], f"beta_{larger}cone_upper", f"beta_{smaller}cone_lower", scale[inside])
     for whose in ("", "full_", "plain_", "hf_"):
-        yield from _at_least(queries, f"beta_{whose}cone_upper", f"beta_{whose}span", scale)
-        yield from _at_least(queries, f"beta_{whose}cone_upper", f"beta_{whose}cone_lower", scale)
+        for smaller in ("span", "cone_lower"):
+            found += _at_least(queries, f"beta_{whose}cone_upper", f"beta_{whose}{smaller}", scale)
     online, of_online = queries[kind == Kind.PER_PARAMETER], scale[kind == Kind.PER_PARAMETER]
     for larger, smaller in (("span", "full_span"), ("cone_upper", "full_cone_lower")):
-        yield from _at_least(online, f"beta_{larger}", f"beta_{smaller}", of_online)
+        found += _at_least(online, f"beta_{larger}", f"beta_{smaller}", of_online)
+    return found
 
 
 def _at_least(rows: pd.DataFrame, larger: str, smaller: str, scale: pd.Series) -> Iterator[Violation]:

@@ -14,23 +14,15 @@ from vibench.model.galerkin import ReducedModel
 from vibench.offline.assemblies import assemblies
 from vibench.plugins.plugin import Plugin
 from vibench.reduction.supremizers import ConstraintClasses
+from vibench.stability import infsup
 from vibench.stability.coercivity import Constant, Stability
-from vibench.stability.infsup import (
-    ConeBasis,
-    InfSup,
-    constants_full,
-    constants_on,
-    expand_classes,
-    inf_sup,
-    nodal_cone,
-)
 from vibench.stages.artefacts import Store, storable
 from vibench.stages.base import Failed, Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage
 from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_edges, chunk_of, chunk_size
 
-for _kind in (ConstraintClasses, Stability, Constant, InfSup):
+for _kind in (ConstraintClasses, Stability, Constant, infsup.InfSup):
     storable(_kind)
 
 
@@ -44,7 +36,7 @@ class ReferenceInfSup(Stage):
 
     def run(self, store: Store) -> Result:
         problem = build_problem(self.constraints.problem)
-        return Result(constants_full(problem.V, value_of(store, self.constraints), nodal_cone(problem.W)))
+        return Result(infsup.constants_full(problem.V, value_of(store, self.constraints), infsup.nodal_cone(problem.W)))
 
 
 @dataclass(frozen=True)
@@ -94,7 +86,7 @@ class ReferenceConstants:
 
     def gather(self, store: Store) -> list[Stability | Failed]:
         """The constants at every parameter, or the failure of the chunk of the parameter."""
-        inf_sup: list[InfSup] = value_of(store, ReferenceInfSup(self.constraints))
+        inf_sup: list[infsup.InfSup] = value_of(store, ReferenceInfSup(self.constraints))
         constants: list[Stability | Failed] = []
         for chunk, (first, end) in zip(self.energy, pairwise(chunk_edges(len(inf_sup))), strict=True):
             if (failed := store.lost.get(chunk.key)) is not None:
@@ -128,23 +120,23 @@ class InfSupConstants(Stage):
 
     def run(self, store: Store) -> Result:
         classes: ConstraintClasses = value_of(store, self.constraints)
-        cone: ConeBasis = value_of(store, self.cone).prepared
+        cone: infsup.ConeBasis = value_of(store, self.cone).prepared
         # No enrichment exceeds the constants of the whole of V, and online supremizers attain them.
         if self.space is None:
-            return Result(constants_full(build_problem(self.cone.problem).V, classes, cone))
+            return Result(infsup.constants_full(build_problem(self.cone.problem).V, classes, cone))
         if isinstance(self.space, PODStage):
-            return Result(constants_on(value_of(store, self.space).basis, classes, cone))
+            return Result(infsup.constants_on(value_of(store, self.space).basis, classes, cone))
         model = self.space.reduction(store).projection
         if model.kind is not Kind.PER_PARAMETER:
-            return Result(constants_on(model.fixed_basis, classes, cone))
+            return Result(infsup.constants_on(model.fixed_basis, classes, cone))
         mus, matrices = self.constraints.parameters.of(model.problem), assemblies(model.problem)
         if model.enrichment.eta is None:
             return Result([_constants_at(model, matrices.at(mu), cone) for mu in mus])
         # Parameters with proportional constraint matrices share one space: compute its constants once.
         at_firsts = (matrices.at(mu) for mu in mus[classes.firsts])
-        return Result(expand_classes(classes, [_constants_at(model, vi, cone) for vi in at_firsts]))
+        return Result(infsup.expand_classes(classes, [_constants_at(model, vi, cone) for vi in at_firsts]))
 
 
-def _constants_at(model: ReducedModel, vi: VariationalInequality, cone: ConeBasis) -> InfSup:
+def _constants_at(model: ReducedModel, vi: VariationalInequality, cone: infsup.ConeBasis) -> infsup.InfSup:
     projected = model.project_supremizers(vi, np.hstack([cone.span, cone.chi]))
-    return inf_sup(projected[:, : cone.rank], projected[:, cone.rank :], cone)
+    return infsup.inf_sup(projected[:, : cone.rank], projected[:, cone.rank :], cone)

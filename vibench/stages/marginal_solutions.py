@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vibench.arrays import Mask
+from vibench.arrays import Array, Mask
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolver, solve_unverified
 from vibench.interfaces.problem import Problem, VariationalInequality
@@ -77,7 +77,7 @@ class SolutionsBeside:
     # `sweep` (P,) are CPU seconds of all solutions, as the sweep over the validation set measured them.
 
     def __init__(self, marginal: MarginalSolutions, sweep: Sequence[float]) -> None:
-        self._marginal, self._sweep = marginal, np.asarray(sweep)
+        self.marginal, self.sweep = marginal, np.asarray(sweep)
         self._long: dict[int, MarginalSolution] = {}
 
     def alternated(
@@ -95,7 +95,7 @@ class SolutionsBeside:
         if sum(one.seconds.cpu for one in done if one.seconds) > 0.05:
             return None
         # Seeds of queries and warm-ups are 0 and 1: no two parameters of a round are the same.
-        one = self._long.get(at) or self._marginal.solve(k, at, cell, 2 + len(done))
+        one = self._long.get(at) or self.marginal.solve(k, at, cell, 2 + len(done))
         # A solution of more than 0.1 s averages over the speed of the machine: it counts for all cells of a round.
         if one.seconds and one.seconds.cpu > 0.1 and at not in self._long:
             self._long = {at: one._replace(vi=one.vi.copy())}
@@ -108,7 +108,7 @@ class SolutionsBeside:
         if not right:
             return None
         # The sweep tells how solutions at the other parameters of the part compare with these.
-        factor = float(self._sweep[list(part)].mean() / self._sweep[[k for k, _ in right]].mean()) / len(right)
+        factor = float(self.sweep[list(part)].mean() / self.sweep[[k for k, _ in right]].mean()) / len(right)
         return Seconds(factor * sum(s.cpu for _, s in right), factor * sum(s.wall for _, s in right))
 
 
@@ -124,8 +124,8 @@ def _starts(problem: Problem, reference: TimedSnapshots) -> Iterator[Mask]:
             yield reference.lam[:, others][:, int(np.argmin(distances))] > 0.0
 
 
-def parts_alike(seconds: Sequence[float], parts: int) -> tuple[tuple[int, ...], ...]:
+def parts_alike(seconds: Array, parts: int) -> tuple[tuple[int, ...], ...]:
     """Numbers of solutions dealt out to parts that take about as long: the slowest first, there and back."""
-    order, turns = np.argsort(-np.asarray(seconds), kind="stable").tolist(), [*range(parts), *reversed(range(parts))]
+    order, turns = np.argsort(-seconds, kind="stable").tolist(), [*range(parts), *reversed(range(parts))]
     dealt = list(zip(order, cycle(turns), strict=False))
     return tuple(tuple(sorted(k for k, turn in dealt if turn == part)) for part in range(parts))

@@ -24,7 +24,7 @@ from vibench.stages.base import Failed, Items, ItemwiseStage, Result, Row, Stage
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.marginal_solutions import MarginalSolution, MarginalSolutions, SolutionsBeside, parts_alike
 from vibench.stages.query import ModelQuery, Queries
-from vibench.stages.snapshots import TimedSnapshots, gather
+from vibench.stages.snapshots import gather
 from vibench.timing import DISTURBED, NO_TIME, Seconds, calibration, timed
 
 QUERY_SUBSETS = 3
@@ -81,7 +81,7 @@ class TimingRounds(ItemwiseStage):
     # `rounds`, `first`: number of rounds, and number of the first one: those of earlier blocks come before.
     rounds: int
     first: int
-    session: int = 0  # blocks of a later session are timed in processes that have timed none of an earlier one
+    session: int  # blocks of a later session are timed in processes that have timed none of an earlier one
 
     @property
     def items(self) -> int:
@@ -128,22 +128,11 @@ class _Rounds(Items):
         self._slowdown: float | None = None
 
     @cached_property
-    def _reference(self) -> TimedSnapshots:
-        return gather(self._store, self._stage.cells[0].validation)
-
-    @cached_property
-    def _parts(self) -> tuple[tuple[int, ...], ...]:
-        """The validation parameters that the rounds of a block take in turn."""
-        return parts_alike([seconds.cpu for seconds in self._reference.seconds], QUERY_SUBSETS)
-
-    @cached_property
-    def _marginal(self) -> MarginalSolutions:
-        one = self._stage.cells[0]
-        return MarginalSolutions(build_problem(one.problem), self._reference, one.validation_set.seed)
-
-    @cached_property
     def _beside(self) -> SolutionsBeside:
-        return SolutionsBeside(self._marginal, [seconds.cpu for seconds in self._reference.seconds])
+        one = self._stage.cells[0]
+        reference = gather(self._store, one.validation)
+        marginal = MarginalSolutions(build_problem(one.problem), reference, one.validation_set.seed)
+        return SolutionsBeside(marginal, [seconds.cpu for seconds in reference.seconds])
 
     def run_item(self, number: int, time_limit: TimeLimit) -> TimedRound:
         within, cell = self._stage.place(number)
@@ -152,13 +141,16 @@ class _Rounds(Items):
         if cell not in self._warm:
             k = self._stage.queries[cell][0]
             # A process that has made no high-fidelity solution makes one, which does the set-up; others assemble.
-            solution = self._marginal.assemble(k, at, cell) if self._warm else self._marginal.solve(k, at, cell, 1)
+            marginal = self._beside.marginal
+            solution = marginal.assemble(k, at, cell) if self._warm else marginal.solve(k, at, cell, 1)
             self._time_queries(time_limit, [(k, solution)], at, cell, 1)
             self._warm.add(cell)
             before = None
         # The calibration after a round counts for the next one, unless a warm-up is between them.
         before = calibration().slowdown() if before is None else before
-        part = self._parts[at % QUERY_SUBSETS] or self._parts[0]
+        # The rounds of a block take parts of the validation parameters in turn.
+        parts = parts_alike(self._beside.sweep, QUERY_SUBSETS)
+        part = parts[at % QUERY_SUBSETS] or parts[0]
         solutions: list[MarginalSolution] = []
         alternated = self._beside.alternated(self._order(cell, at, part), solutions, at, cell)
         assemble, solve, certify = self._time_queries(time_limit, alternated, at, cell, 0)
@@ -194,7 +186,7 @@ class _Rounds(Items):
                 assemble[k] = NO_TIME
             else:
                 # Seeds below 5 are those of queries and of the at most three solutions.
-                further = partial(self._marginal.assemble, k, at, cell, 5 + warm_up)
+                further = partial(self._beside.marginal.assemble, k, at, cell, 5 + warm_up)
                 seconds = _assembly(queries.model.reduced, near, solution, further, assemble)
                 assemble |= {} if seconds is None else {k: seconds}
                 query = query.repeated(stage.validation_set.seed, k, *seed)

@@ -29,15 +29,7 @@ from vibench.stages.marginal_solutions import MarginalSolution, MarginalSolution
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.query import ProgramQuery
 from vibench.stages.snapshots import gather
-from vibench.stages.timing_rounds import (
-    TimedCell,
-    TimedRound,
-    TimingRounds,
-    block_rows,
-    round_columns,
-    seconds_of_cell,
-    seconds_of_queries,
-)
+from vibench.stages.timing_rounds import TimedCell, TimedRound, TimingRounds
 from vibench.study.parameter_sets import ParameterSet
 from vibench.timing import NO_TIME, Seconds
 
@@ -63,10 +55,16 @@ OF_THREE = tuple(
 )  # fmt: skip
 
 
+def block(
+    cells: tuple[CellQueries, ...], queries: tuple[tuple[int, ...], ...], rounds: int, first: int = 0
+) -> TimingRounds:
+    return TimingRounds(cells, queries, rounds, first, session=0)
+
+
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
     store = SampleStore(tmp_path_factory.mktemp("artefacts"))
-    stages = [stage for cells in (CELLS, OF_THREE) for stage in TimingRounds(cells, (EVERY,) * 4, 1, first=0).inputs()]
+    stages = [stage for cells in (CELLS, OF_THREE) for stage in block(cells, (EVERY,) * 4, 1).inputs()]
     for stage in stages:
         if store.get(stage.key) is None:
             carry_out(stage, store)
@@ -78,7 +76,7 @@ def as_rows(*rounds: TimedRound, hf: float | None = 4.0, pace: float = 1.0, per_
     return [
         {"block": str(k // per_block), "round": k, "queries": len(one.solve), "slowdown": one.slowdown}
         | {"hf_s": hf, "pace": pace}
-        | round_columns(one)
+        | timing_rounds.round_columns(one)
         for k, one in enumerate(rounds)
     ]
 
@@ -89,7 +87,7 @@ def steady(seconds: float, queries: tuple[int, ...] = (0, 1), slowdown: float = 
 
 @given(st.integers(1, 9), st.integers(1, 9))
 def test_every_round_has_every_cell_once_before_the_next_one_begins(rounds: int, count: int) -> None:
-    stage = TimingRounds((CELLS[0],) * count, (EVERY,) * count, rounds, first=0)
+    stage = block((CELLS[0],) * count, (EVERY,) * count, rounds)
     places = [stage.place(item) for item in range(stage.items)]
     assert [number for number, _ in places] == sorted(number for number, _ in places)
     assert sorted(places) == [(number, k) for number in range(rounds) for k in range(count)]
@@ -97,22 +95,22 @@ def test_every_round_has_every_cell_once_before_the_next_one_begins(rounds: int,
 
 def test_order_and_limit_of_a_stage_are_those_of_all_its_cells(tmp_path: Path) -> None:
     """Whoever comes after a large model finds its own arrays out of the cache: not always the same one."""
-    stage = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 12, first=0)
+    stage = block((CELLS[0],) * 6, (EVERY,) * 6, 12)
     first = [stage.place(number * 6)[1] for number in range(12)]
     assert len(set(first)) > 3
-    later = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 4, first=8)
+    later = block((CELLS[0],) * 6, (EVERY,) * 6, 4, 8)
     assert [later.place(number * 6)[1] for number in range(4)] == first[8:]
-    assert TimingRounds(CELLS, (EVERY,) * 4, 12, first=0).weight == 4
+    assert block(CELLS, (EVERY,) * 4, 12).weight == 4
     assert CELLS[0].weight == 1
 
 
 def test_a_machine_that_slows_down_halfway_meets_all_alike() -> None:
     """Cell after cell, the second of two equal ones would seem thrice as slow."""
-    stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 12, first=0)
+    stage = block((CELLS[0],) * 2, (EVERY,) * 2, 12)
     spent = [1.0 if item < stage.items / 2 else 3.0 for item in range(stage.items)]
     items = [replace(steady(one), beside=Seconds(2.0 * one, 2.0 * one)) for one in spent]
     timed = timing_rounds._Rounds.collect(_in(stage), items)
-    one, other = map(seconds_of_cell, block_rows(stage, timed))
+    one, other = map(timing_rounds.seconds_of_cell, timing_rounds.block_rows(stage, timed))
     assert one == other
     assert one["online_q1_s"] < one["online_s"] < one["online_q3_s"]
     assert one["online_s"] == pytest.approx(one["hf_s"])
@@ -129,7 +127,7 @@ def test_every_ok_query_alone_is_timed_and_a_long_round_ends_early(
     store: SampleStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fine = (EVERY, (0, 2, 5), EVERY, (3,))
-    timed = TimingRounds(CELLS, fine, 8, first=0).run(store).value
+    timed = block(CELLS, fine, 8).run(store).value
     for one, numbers in zip(timed, fine, strict=True):
         rounds = list(one.rounds.values())
         assert list(one.rounds) == list(range(8))
@@ -137,12 +135,12 @@ def test_every_ok_query_alone_is_timed_and_a_long_round_ends_early(
         assert all(s.cpu > 0.0 for each in rounds for part in (each.assemble, each.solve) for s in part.values())
         assert all(each.beside_cpu > 0.0 for each in rounds)
         assert not one.failures
-        rows = seconds_of_queries(list(one.rounds.values()))
+        rows = timing_rounds.seconds_of_queries(list(one.rounds.values()))
         assert set(rows) == set(numbers)
         assert all(row["total_s"] == row["assemble_s"] + row["solve_s"] for row in rows.values())
     prepare = ProgramQuery.prepare
     monkeypatch.setattr(ProgramQuery, "prepare", lambda *of: lambda: (prepare(*of)()[0], Seconds(0.1, 6.0)))
-    timed = TimingRounds(CELLS[:1], (EVERY,), 4, first=0).run(store).value[0]
+    timed = block(CELLS[:1], (EVERY,), 4).run(store).value[0]
     assert [len(each.solve) for each in timed.rounds.values()] == [1] * 4
 
 
@@ -152,14 +150,14 @@ def test_reduced_assembly_is_timed_at_every_query_and_full_assembly_at_as_many_a
 ) -> None:
     monkeypatch.setattr(timing_rounds, "ASSEMBLY_SECONDS", enough)
     monkeypatch.setattr(timing_rounds, "QUERY_SUBSETS", 1)
-    timed = TimingRounds(CELLS, (EVERY,) * len(CELLS), 2, first=0).run(store).value
+    timed = block(CELLS, (EVERY,) * len(CELLS), 2).run(store).value
     assert [[len(each.assemble) for each in one.rounds.values()] for one in timed[:3]] == [[in_full] * 2] * 3
     assert all(each.assemble.keys() == each.solve.keys() for each in timed[3].rounds.values())
 
 
 def test_high_fidelity_solutions_start_as_in_the_sweep(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
     """From the contact set of the nearest parameter before; the first one of a part from that of the nearest after."""
-    stage = TimingRounds(CELLS, (EVERY,) * len(CELLS), 1, first=0)
+    stage = block(CELLS, (EVERY,) * len(CELLS), 1)
     reference = gather(store, stage.cells[0].validation)
     starts: list[Any] = []
     solve = marginal_solutions.solve_unverified
@@ -218,16 +216,17 @@ def test_long_solutions_serve_all_cells_of_a_round_and_stand_for_a_part() -> Non
 
 
 def test_rounds_begin_at_other_queries_in_later_blocks_and_for_other_cells(store: SampleStore) -> None:
-    work = TimingRounds(CELLS[:2], (EVERY,) * 2, 1, first=0).begin(store)
+    work = block(CELLS[:2], (EVERY,) * 2, 1).begin(store)
     assert isinstance(work, timing_rounds._Rounds)
-    numbers, parts = range(2 * timing_rounds.QUERY_SUBSETS), work._parts
+    numbers = range(2 * timing_rounds.QUERY_SUBSETS)
+    parts = parts_alike(work._beside.sweep, timing_rounds.QUERY_SUBSETS)
     assert {work._order(0, at, parts[at % timing_rounds.QUERY_SUBSETS])[0] for at in numbers} == set(EVERY)
     assert work._order(0, 0, (1, 4, 5)) != work._order(1, 0, (1, 4, 5))
 
 
 @given(st.lists(st.floats(0.1, 10.0), min_size=1, max_size=40))
 def test_parts_of_a_pass_have_all_queries_once_and_take_about_as_long(seconds: list[float]) -> None:
-    parts = parts_alike(seconds, 4)
+    parts = parts_alike(np.array(seconds), 4)
     assert sorted(k for part in parts for k in part) == list(range(len(seconds)))
     sums = [sum(seconds[k] for k in part) for part in parts]
     assert max(sums) - min(sums) <= 2.0 * max(seconds)
@@ -245,31 +244,31 @@ def test_full_matrices_are_those_of_solutions_assembled_once(
     monkeypatch.setattr(ReducedModel, "reduce", lambda model, vi: (reduced.append(vi), reduce(model, vi))[1])
     monkeypatch.setattr(timing_rounds, "QUERY_SUBSETS", 1)
     monkeypatch.setattr(timing_rounds, "ASSEMBLY_SECONDS", np.inf)
-    TimingRounds(CELLS[:3], (EVERY,) * 3, 4, first=0).run(store)
+    block(CELLS[:3], (EVERY,) * 3, 4).run(store)
     assert len(calls) == 3 * (1 + 4 * (VALIDATION + 1))  # a warm-up, then every query and the last solution of a round
     assert len(set(calls)) == len(calls)
     assert len(reduced) == 3 * (1 + 4 * VALIDATION)  # none after the last query
 
 
 def test_lost_rounds_are_told_and_rows_have_the_pace_of_their_block() -> None:
-    stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 3, first=6)
+    stage = block((CELLS[0],) * 2, (EVERY,) * 2, 3, 6)
     items: list[TimedRound | Failed] = [steady(2.0) for _ in range(stage.items)]
     gone = next(item for item in range(stage.items) if stage.place(item) == (1, 0))
     items[gone] = Failed(Status.CRASHED, "the worker died")
     timed = _in(stage).collect(items)
     assert [list(one.rounds) for one in timed] == [[6, 8], [6, 7, 8]]
     assert [one.failures for one in timed] == [(items[gone],), ()]
-    assert [[row["round"] for row in rows] for rows in block_rows(stage, timed)] == [[6, 8], [6, 7, 8]]
-    stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 3, first=0)
+    assert [[row["round"] for row in rows] for rows in timing_rounds.block_rows(stage, timed)] == [[6, 8], [6, 7, 8]]
+    stage = block((CELLS[0],) * 2, (EVERY,) * 2, 3)
     paced = {k: replace(steady(pace), beside=Seconds(4.0 * pace, 4.0 * pace)) for k, pace in enumerate((1.0, 2.0, 1.0))}
     other = {k: replace(steady(3.0 * pace), beside=Seconds(9.0 * pace, 9.0)) for k, pace in enumerate((1.0, 2.0, 1.0))}
-    rows, others = block_rows(stage, [TimedCell(paced, "here"), TimedCell(other, "here")])
+    rows, others = timing_rounds.block_rows(stage, [TimedCell(paced, "here"), TimedCell(other, "here")])
     for own in (rows, others):  # neighbours of both count
         assert [row["hf_s"] for row in own] == pytest.approx([6.0, 12.0, 6.0])
         assert [row["pace"] for row in own] == pytest.approx([1.0, 2.0, 1.0])
     assert len({row["block"] for row in (*rows, *others)}) == 1
-    later = TimingRounds((CELLS[0],), (EVERY,), 2, first=2)
-    ((row,),) = block_rows(later, [TimedCell({2: steady(1.0)}, "here")])
+    later = block((CELLS[0],), (EVERY,), 2, 2)
+    ((row,),) = timing_rounds.block_rows(later, [TimedCell({2: steady(1.0)}, "here")])
     assert row["block"] != rows[0]["block"]
     assert row["hf_s"] is None
 
@@ -280,36 +279,38 @@ def test_certificates_are_a_part_of_queries_and_columns_are_means_medians_and_qu
     assert [(row["certify_s"], row["total_s"], row["total_wall_s"]) for row in rows] == [
         (0.25, 2.25, 4.0), (0.5, 2.5, 4.0), (4.0, 6.0, 4.0),
     ]  # fmt: skip
-    assert seconds_of_cell(rows)["online_certify_s"] == 0.5
-    assert seconds_of_cell(rows)["online_s"] == pytest.approx(2.5)
-    assert seconds_of_queries(rounds)[1]["certify_s"] == 0.5
+    assert timing_rounds.seconds_of_cell(rows)["online_certify_s"] == 0.5
+    assert timing_rounds.seconds_of_cell(rows)["online_s"] == pytest.approx(2.5)
+    assert timing_rounds.seconds_of_queries(rounds)[1]["certify_s"] == 0.5
     rounds = [
         TimedRound({k: Seconds(0.5, 1.0)}, {k: Seconds(spent, spent), k + 4: Seconds(spent, spent)}, slow)
         for k, (spent, slow) in enumerate([(1.0, 1.0), (3.0, 1.2), (2.0, 1.4), (8.0, 3.0)])
     ]
     rows = as_rows(*rounds, per_block=2, pace=2.0)
     assert [row["total_s"] for row in rows] == [1.5, 3.5, 2.5, 8.5]
-    own = seconds_of_cell(rows)
+    own = timing_rounds.seconds_of_cell(rows)
     # the median of two is the geometric mean, and so is the mean over blocks
     assert own["online_s"] == pytest.approx((1.5 * 3.5 * 2.5 * 8.5) ** 0.25 / 2.0)
     assert own["hf_s"] == pytest.approx(2.0)
-    assert "hf_s" not in seconds_of_cell(as_rows(*rounds, hf=None))
+    assert "hf_s" not in timing_rounds.seconds_of_cell(as_rows(*rounds, hf=None))
     assert (own["online_solve_s"], own["online_assemble_s"]) == (2.5, 0.5)
     assert (own["online_q1_s"], own["online_q3_s"]) == tuple(np.quantile([1.5, 3.5, 2.5, 8.5], (0.25, 0.75)))
     assert own["online_wall_s"] == 3.5
     assert own["slowdown"] == pytest.approx(1.3)
-    queries = seconds_of_queries([replace(one, assemble={k: one.assemble[k]}) for k, one in enumerate(rounds)])
+    queries = timing_rounds.seconds_of_queries(
+        [replace(one, assemble={k: one.assemble[k]}) for k, one in enumerate(rounds)]
+    )
     assert queries[2] == {"assemble_s": 0.5, "solve_s": 2.0, "certify_s": None, "total_s": 2.5, "total_wall_s": 3.0}
     assert own["online_certify_s"] is None
-    assert set(seconds_of_cell([])) == set(own) - {"hf_s"}
-    assert set(seconds_of_cell([]).values()) == {None}
+    assert set(timing_rounds.seconds_of_cell([])) == set(own) - {"hf_s"}
+    assert set(timing_rounds.seconds_of_cell([]).values()) == {None}
 
 
 @pytest.mark.parametrize(("wall", "slow", "disturbed"), [(1.0, 1.0, 0), (9.0, 1.0, 0), (1.0, 1.4, 1)])
 def test_a_slow_machine_marks_the_row_and_waiting_for_a_core_does_not(wall: float, slow: float, disturbed: int) -> None:
     """CPU seconds stop while a process waits; what others do to the caches, the calibration shows."""
     once = TimedRound({0: Seconds(1.0, wall)}, {0: Seconds(1.0, wall)}, slow)
-    assert seconds_of_cell(as_rows(*[once] * 3))["disturbed"] == disturbed
+    assert timing_rounds.seconds_of_cell(as_rows(*[once] * 3))["disturbed"] == disturbed
 
 
 class Remembers:
@@ -337,7 +338,7 @@ def test_a_solver_with_memory_meets_no_program_again_and_none_is_assembled_twice
     solver, visited, plain = Remembers(), list[tuple[float, ...]](), HyperReducedModel.assemble
     monkeypatch.setattr(registry, "qp_solver", lambda name: {name: solver})
     monkeypatch.setattr(HyperReducedModel, "assemble", lambda one, mu: (visited.append(tuple(mu)), plain(one, mu))[1])
-    timed = TimingRounds(OF_THREE, (EVERY[:3],) * 4, 12, first=0).run(store).value
+    timed = block(OF_THREE, (EVERY[:3],) * 4, 12).run(store).value
     assert [len(one.rounds) for one in timed] == [12] * 4
     assert solver.solved == 4 * (12 + 1)  # a query in every round, and the warm-up
     assert solver.remembered == 0
@@ -354,7 +355,7 @@ def test_answers_to_similar_programs_are_not_timed(
     # which queries a round begins with depends on measured seconds; units of some let the first answer pass
     monkeypatch.setattr(timing_rounds, "parts_alike", lambda _, parts: (EVERY[:3],) * parts)
     with pytest.raises(NumericalError, match=r"residual .* above 3e-07.*does the solver remember answers"):
-        TimingRounds(OF_THREE[which : which + 1], (EVERY[:3],), 12, first=0).run(store)
+        block(OF_THREE[which : which + 1], (EVERY[:3],), 12).run(store)
     assert solver.remembered == 1
 
 
