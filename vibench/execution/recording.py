@@ -159,13 +159,12 @@ def refute(database: ResultsDatabase) -> None:
 
 
 def cell_columns(cell: Cell) -> dict[str, Any]:
-    without: dict[str, Any] = {}
-    for name, plugin in (("dual", cell.dual), ("primal", cell.primal)):
-        without |= {name: NO_SUCH_AXIS, f"{name}_options": "{}"} if plugin is None else {}
-    how = {"formulation": cell.formulation_label, "formulation_options": cell.formulation.options}
-    solved = {"solver": cell.solver or NO_SUCH_AXIS, "accuracy": cell.accuracy, "assembly": cell.assembly}
-    solved["bounds"] = int(cell.bounds)
-    columns = axis_columns(cell.axes, labels_of([cell])) | without | how | solved | {"correction": cell.correction}
+    without = {"dual": NO_SUCH_AXIS, "dual_options": "{}", "primal": NO_SUCH_AXIS, "primal_options": "{}"}
+    columns = without | axis_columns(cell.axes, labels_of([cell])) | {
+        "formulation": cell.formulation_label, "formulation_options": cell.formulation.options,
+        "solver": cell.solver or NO_SUCH_AXIS, "accuracy": cell.accuracy, "assembly": cell.assembly,
+        "bounds": int(cell.bounds), "correction": cell.correction,
+    }  # fmt: skip
     return {name: columns.get(name) for name in KEYS}
 
 

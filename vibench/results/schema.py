@@ -115,7 +115,7 @@ KEYS: Mapping[str, Column] = {
 
 
 def _keys_without(*names: str) -> dict[str, Column]:
-    return {name: column for name, column in KEYS.items() if name not in names}
+    return {name: column for name, column in KEYS.items() if name.removesuffix("_options") not in names}
 
 
 def _cell() -> Column:
@@ -302,8 +302,7 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "certificate": text("Bounds at online cost: certified, verified (interpolation is measured), refuted or none."),
         "bound_online_u_energy": real("A", "Bound of error_u_energy_absolute at online cost."),
         "bound_online_lambda_natural": real("A", "Bound of error_lambda_natural_absolute at online cost."),
-        "bound_online_lambda": real("W", "Bound of error_lambda_absolute at online cost; empty where "
-            "beta_energy_online_note says why."),
+        "bound_online_lambda": real("W", "Bound of error_lambda_absolute likewise; empty if beta_energy_online is 0."),
         **_effectivities("online_u_energy", "online_lambda_natural", "online_lambda"),
         "bound_online_rho": real("A", "Its bound of ρ."),
         "bound_online_omega": real("A", "Its bound of ω."),
@@ -321,8 +320,7 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "coercivity_proved": integer("1 if a factorisation proves it, 0 if it is a Lanczos estimate."),
         "continuity": real("A/V²", "γ_a, an upper bound of the largest vᵀA(µ)v / ‖v‖²."),
         "continuity_proved": integer("1 if a factorisation proves it, 0 if it is a Lanczos estimate."),
-        "beta_energy": real("b/AW", "β_A, proved lower bound of the inf-sup constant of V in the norm of A(µ) and W "
-            "over the span."),
+        "beta_energy": real("b/AW", "β_A, proved lower bound of β of V, in the norm of A(µ), and W over the span."),
         "outputs": as_json("Quantities of interest as JSON: value, reference, relative error, error over the scale."),
         "violation": real("u", "Largest (B u_N − g)₊, each row divided by the integral of its multiplier function."),
         "complementarity": real("b", "λᵀ(B u_N − g), λ the high-fidelity multiplier."),
@@ -348,8 +346,7 @@ STORED: Mapping[str, Mapping[str, Column]] = {
     "histories": {
         "artefact": text("Hash of the stage it comes from."),
         "stage": text("pod, cone, enrichment or selection; training or validation for diagnostics of the problem."),
-        **_keys_without("formulation", "formulation_options", "solver", "accuracy", "assembly", "bounds",
-            "correction"),
+        **_keys_without("formulation", "solver", "accuracy", "assembly", "bounds", "correction"),
         "quantity": text("Name of the quantity."),
         "step": integer("Step of the algorithm, or number of the parameter."),
         "value": real("1", "The value; inf-sup constants are in the unit of β, diagnostics in their own units."),
@@ -365,14 +362,12 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "total_s": real("s", "Sum of the three."),
         "total_wall_s": real("s", "The same in wall seconds."),
         "block": text("Block of rounds, which cells timed together share; each block is a process of its own."),
-        "hf_s": real("s", "High-fidelity solution, mean over the parameters of the round: that of the block, at the "
-            "pace of the round."),
+        "hf_s": real("s", "High-fidelity solution, mean over the round: that of the block at the pace of the round."),
         "pace": real("1", "Median factor by which timings of this round exceed those of the block's other rounds."),
         "slowdown": real("1", "CPU time of the calibration next to the round, over its lowest tenth in that process."),
     },
     "thresholds": {
-        **_keys_without("formulation", "formulation_options", "primal", "primal_options", "primal_tol", "assembly",
-            "bounds"),
+        **_keys_without("formulation", "primal", "primal_tol", "assembly", "bounds"),
         "cell_a": text("Cell of model a; empty for the high-fidelity model."),
         "cell_b": text("Cell of model b."),
         "formulation_a": text("Formulation of a; mixed for the high-fidelity model, too.", "formulation of a", 10),

@@ -139,11 +139,6 @@ class CellQueries(ItemwiseStage):
         return tuple(InfSupConstants(space, enrichment.cone, self.reference.constraints) for space in spaces)
 
     @property
-    def exact(self) -> tuple[ExactSolutions, ...]:
-        """The stage of the programs solved to round-off, if there are any."""
-        return () if self.assembly is None else (ExactSolutions(self.assembly),)
-
-    @property
     def offline_stages(self) -> Mapping[str, tuple[Stage, ...]]:
         """The stages whose seconds add up to the offline time of the cell, by column."""
         built, certificate = self.built, self.certificate
@@ -163,8 +158,9 @@ class CellQueries(ItemwiseStage):
         return (*self.built.model_inputs, *assembly, *certifying)
 
     def inputs(self) -> tuple[Stage, ...]:
+        exact = () if self.assembly is None else (ExactSolutions(self.assembly),)
         offline = (stage for stages in self.offline_stages.values() for stage in stages)
-        assessment = (*self.exact, *offline, *self.constants, *self.reference.stages, *self.validation)
+        assessment = (*exact, *offline, *self.constants, *self.reference.stages, *self.validation)
         return tuple(dict.fromkeys((*self.model_inputs, *assessment)))
 
     def queries(self, store: Store) -> Queries:
@@ -200,7 +196,9 @@ class _Queries(Items):
         self._stability = stage.reference.gather(store)
         self._certificate = None if stage.certificate is None else stage.certificate.certificate(store)
         self._constants = [value_of(store, one) for one in stage.constants]
-        self._exact: list[ExactSolution | None] = [one for exact in stage.exact for one in value_of(store, exact)]
+        self._exact: Sequence[ExactSolution | None] = ()
+        if stage.assembly is not None:
+            self._exact = value_of(store, ExactSolutions(stage.assembly))
 
     @property
     def _corrector(self) -> Corrector:

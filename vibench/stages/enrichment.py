@@ -138,9 +138,9 @@ class EnrichmentStage(Stage):
     def enrichment(self, store: Store) -> Enrichment:
         """The enrichment, once the stage has been run."""
 
-    def reduction(self, store: Store, interpolation: float | None = None) -> Reduction:
-        """The offline phase up to the enrichment, once the stage has been run; in full assembly without a tolerance."""
-        return _reduction(store, self.pod, self.cone, interpolation).given(enrichment=self.enrichment(store))
+    def reduction(self, store: Store) -> Reduction:
+        """The offline phase up to the enrichment, once the stage has been run."""
+        return _reduction(store, self.pod, self.cone).given(enrichment=self.enrichment(store))
 
 
 @dataclass(frozen=True)
@@ -229,12 +229,11 @@ def _histories(quantities: Mapping[str, Array]) -> tuple[History, ...]:
     return tuple(History.of("enrichment", quantity, values) for quantity, values in quantities.items())
 
 
-def _reduction(store: Store, pod: PODStage, cone: ConeStage, interpolation: float | None = None) -> Reduction:
+def _reduction(store: Store, pod: PODStage, cone: ConeStage) -> Reduction:
     """The offline phase up to V_N and the cone, which are stored."""
     reduced: ReducedCone = value_of(store, cone)
     reduction = Reduction(
         build_problem(pod.problem), cone.dual.create(), None, pod.stop, cone.stop, training=pod.training.strategy(),
-        assembly="full" if interpolation is None else "reduced", interpolation=interpolation or Reduction.interpolation,
         on_failure="skip" if pod.training.skips else "stop",
     )  # fmt: skip
     return reduction.given(pod=value_of(store, pod), cone=reduced.cone, multipliers=reduced.prepared)

@@ -7,10 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.outputs import Picture
-from vibench.interfaces.parameters import ParameterBox
 from vibench.plugins.plugin import Plugin
 from vibench.results.pictures import members
 from vibench.stages.artefacts import Store, storable
@@ -50,13 +48,10 @@ class PictureStage(Stage):
         for k in dict.fromkeys(nearest):
             picture = problem.picture(solutions.mu[k], solutions.u[:, k], solutions.lam[:, k])
             if picture is not None:
-                pictures.append((_title(box, solutions.mu[k]), _checked(picture)))
+                named = zip(box.names, solutions.mu[k], box.units, strict=True)
+                texts = (f"{name} = {mu:.3g}" + f" {unit}" * (unit not in ("", "1")) for name, mu, unit in named)
+                pictures.append((", ".join(texts), _checked(picture)))
         return Result(tuple(pictures))
-
-
-def _title(box: ParameterBox, mu: Array) -> str:
-    named = zip(box.names, mu, box.units, strict=True)
-    return ", ".join(f"{name} = {value:.3g}" + f" {unit}" * (unit not in ("", "1")) for name, value, unit in named)
 
 
 def _checked(picture: Picture) -> Picture:

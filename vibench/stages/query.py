@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -110,15 +110,13 @@ class ModelQuery:
     # `near` returns a parameter next to mu for every seed, `program` is its program, if it has any, and `start` number
     # and parameter of the query whose answer it starts from.
 
+    form: ClassVar[str] = "formulation"
+
     model: Model
     mu: Array
     near: Callable[..., Array]
     program: VariationalInequality | None = None
     start: tuple[int, Array] | None = None
-
-    @property
-    def form(self) -> str:
-        return "formulation"
 
     def in_model(self, x: Array) -> Array:
         return x

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -313,11 +313,8 @@ def gather(store: Store, chunks: tuple[Stage, ...]) -> TimedSnapshots:
             unequal = f"two assemblies at one parameter are not the same, as in another process: {deviation}"
             look_for = "unseeded random numbers, the order of sets, and what is kept between calls"
             raise NumericalError(f"{unequal}; look for {look_for}")
-    return TimedSnapshots(
-        np.concatenate([part.mu for part in parts]), np.hstack([part.u for part in parts]),
-        np.hstack([part.lam for part in parts]), tuple(seconds for part in parts for seconds in part.seconds),
-        tuple(seconds for part in parts for seconds in part.setups),
-        tuple(note for part in parts for note in part.fallbacks), here,
-        sum((part.selecting for part in parts), NO_TIME), tuple(bound for part in parts for bound in part.bounds),
-        skipped=skipped,
-    )  # fmt: skip
+    joined: dict[str, Any] = {name: np.hstack([getattr(part, name) for part in parts]) for name in ("u", "lam")}
+    for name in ("seconds", "setups", "fallbacks", "bounds"):
+        joined[name] = tuple(one for part in parts for one in getattr(part, name))
+    joined |= {"selecting": sum((part.selecting for part in parts), NO_TIME), "skipped": skipped}
+    return TimedSnapshots(np.concatenate([part.mu for part in parts]), **joined, fingerprint=here)
