@@ -219,8 +219,15 @@ def test_a_process_never_begun_is_given_up(
 
 def test_a_talkative_job_can_be_stopped(watcher: Supervisor, tmp_path: Path) -> None:
     job = Job(str(tmp_path), InItems(("moment",) * 2000), 60.0, 600.0, 8.0)
-    with pytest.raises(StoppedError):  # at its first item, long before its limits, which are ten minutes away
-        watcher.run(job, lambda _: watcher.stop())
+
+    def stop_at_the_first_item() -> None:
+        while watcher._state is None or not watcher._state.progress.done:
+            time.sleep(0.01)
+        watcher.stop()
+
+    threading.Thread(target=stop_at_the_first_item, daemon=True).start()
+    with pytest.raises(StoppedError):  # long before its limits, which are ten minutes away
+        watcher.run(job)
 
 
 def test_what_is_not_of_an_item_costs_the_cell_or_the_whole_stage(run: Run) -> None:

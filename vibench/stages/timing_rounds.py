@@ -81,7 +81,7 @@ class TimingRounds(ItemwiseStage):
     # `rounds`, `first`: number of rounds, and number of the first one: those of earlier blocks come before.
     rounds: int
     first: int
-    session: int  # blocks of a later session are timed in processes that have timed none of an earlier one
+    session: int = 0  # blocks of a later session are timed in processes that have timed none of an earlier one
 
     @property
     def items(self) -> int:

@@ -92,13 +92,11 @@ def database(tmp_path: Path) -> Iterator[ResultsDatabase]:
 
 def test_cells_ended_by_a_limit_of_their_row_are_run_wire_where_it_is_larger(database: ResultsDatabase) -> None:
     for changed, again in (
-        ({}, set()),
-        ({"query_seconds": 1.0, "cell_seconds": 1.0, "memory_gib": 1.0}, set()),
-        ({"query_seconds": 21.0}, {"slow", "both"}),
-        ({"cell_seconds": 601.0}, {"slow", "both"}),
+        ({}, set()), ({"query_seconds": 1.0, "cell_seconds": 1.0, "memory_gib": 1.0}, set()),
+        ({"query_seconds": 21.0}, {"slow", "both"}), ({"cell_seconds": 601.0}, {"slow", "both"}),
         ({"memory_gib": 9.0, "query_seconds": 1.0}, {"large"}),
         ({"memory_gib": 9.0, "cell_seconds": 601.0}, {"slow", "both", "large"}),
-    ):
+    ):  # fmt: skip
         assert ended_by_smaller_limits(database, BEFORE.model_copy(update=changed)) == again
     larger = BEFORE.model_copy(update={"cell_seconds": 700.0})
     database.keep("limits of after", larger.model_dump_json())

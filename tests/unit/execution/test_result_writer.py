@@ -74,12 +74,9 @@ def test_histories_of_every_stage_have_names_by_their_dependences(
     cell: Cell, stages: list[Stage], study: Study
 ) -> None:
     for sort, names in (
-        (SnapshotStage, TRAINED),
-        (PODStage, POD),
-        (ConeStage, CONE),
-        (NestedEnrichment, POD | CONE | {"primal", "primal_options", "primal_tol"}),
-        (EnergyConstants, set()),
-    ):
+        (SnapshotStage, TRAINED), (PODStage, POD), (ConeStage, CONE),
+        (NestedEnrichment, POD | CONE | {"primal", "primal_options", "primal_tol"}), (EnergyConstants, set()),
+    ):  # fmt: skip
         columns = axis_columns(first(stages, sort).axes, labels_of([cell]))
         assert set(columns) == names
         assert set(columns) <= set(STORED["histories"])

@@ -1,7 +1,5 @@
 """Benefit thresholds: the paper's, their four meanings, and which cells are compared."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -31,12 +29,9 @@ PAPER = {
 """Tables 1 and 2 of Niakh, Drouet, Ehrlacher and Ern (2022); the online seconds they print are those of one query."""
 
 
-def test_the_thresholds_of_the_paper() -> None:
+def test_the_thresholds_of_the_paper_and_their_meanings() -> None:
     for case, (offline_a, online_a, offline_b, online_b, printed) in PAPER.items():
         assert str(break_even(offline_a, online_a, offline_b, online_b)) == f"from {printed}", case
-
-
-def test_the_meaning_of_a_threshold() -> None:
     for seconds, number, meaning in (
         ((1.0, 0.5, 3.0, 0.25), 8.0, Meaning.FROM), ((3.0, 0.25, 1.0, 0.5), 8.0, Meaning.UNTIL),
         ((1.0, 0.25, 3.0, 0.5), None, Meaning.NEVER), ((3.0, 0.5, 1.0, 0.25), None, Meaning.AT_ONCE),
@@ -94,17 +89,14 @@ def rounds(cells: Iterable[Mapping[str, Any]], count: int = 12) -> list[dict[str
     """Rounds without any noise, in blocks of four."""
     return [
         {
-            "cell": cell["cell"],
-            "round": k,
-            "block": f"block {k // 4}",
-            "total_s": cell["online_s"],
+            "cell": cell["cell"], "round": k, "block": f"block {k // 4}", "total_s": cell["online_s"],
             "hf_s": cell["hf_s"],
         }
         | {"pace": 1.0}
         for cell in cells
         if cell["online_s"] is not None
         for k in range(count)
-    ]
+    ]  # fmt: skip
 
 
 def compared(cells: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -113,9 +105,8 @@ def compared(cells: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def test_a_cell_costs_the_same_however_many_there_are() -> None:
     def run(groups: int) -> Callable[[], object]:
-        cells = [
-            cell(*kinds, pod_tol=0.1 / (k + 1)) for k in range(groups) for kinds in (("a", "fixed"), ("b", "none"))
-        ]
+        both = (("a", "fixed"), ("b", "none"))
+        cells = [cell(*kinds, pod_tol=0.1 / (k + 1)) for k in range(groups) for kinds in both]
         timings = rounds(cells, FEWEST_ROUNDS)
         return lambda: list(break_even_rows(cells, timings))
 
@@ -236,13 +227,10 @@ def test_another_assembly_may_be_compared_but_not_another_machine() -> None:
     assert ("varying", "fixed") not in pairs(compared(cells))
 
 
-def test_cells_without_an_answer_are_left_out() -> None:
+def test_cells_without_an_answer_are_left_out_and_rows_fit_the_table() -> None:
     fixed, unanswered = cell("fixed", "fixed"), [cell("varying", "per-parameter", online_s=None)]
     assert pairs(compared([*unanswered, fixed, cell("fixed", "fixed", online_s=None)])) == [("high-fidelity", "fixed")]
     assert compared([]) == []
-
-
-def test_rows_fit_the_table_and_name_cells() -> None:
     rows = compared(EVERY)
     keys = {one["primal"]: one["cell"] for one in EVERY}
     assert all(row["cell_b"] == keys[row["primal_b"]] for row in rows)
@@ -265,7 +253,7 @@ def noisy(a: float, b: float, noise: float, count: int = 24, **of_b: Any) -> dic
     return the_one(cells, timings)
 
 
-def test_a_difference_within_the_noise_is_undecided() -> None:
+def test_a_difference_within_the_noise_is_undecided_or_offline_seconds_too_close() -> None:
     """Both signs are possible: neither "from" nor "never" would repeat itself in another run."""
     row = noisy(0.100, 0.092, noise=0.4)
     assert (row["meaning"], row["benefit_threshold"], row["threshold_high"]) == ("undecided", None, None)
@@ -274,10 +262,6 @@ def test_a_difference_within_the_noise_is_undecided() -> None:
     for a, b, meaning in ((0.200, 0.100, "from"), (0.100, 0.200, "never")):
         decided = noisy(a, b, noise=0.1)
         assert (decided["meaning"], decided["rounds_missing"]) == (meaning, None)
-
-
-def test_offline_seconds_that_are_too_close_need_no_more_rounds() -> None:
-    """The queries are decided; whether b costs more offline is not."""
     row = noisy(0.200, 0.100, noise=0.01, offline_low_s=4.0, offline_high_s=36.0)
     assert (row["meaning"], row["rounds_missing"]) == ("undecided", None)
 

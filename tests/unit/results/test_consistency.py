@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
@@ -19,9 +17,8 @@ from vibench.results.schema import KEYS
 
 def program(seed: int, n: int = 6, m: int = 4) -> VariationalInequality:
     rng = np.random.default_rng(seed)
-    return VariationalInequality(
-        spd(n, rng), rng.standard_normal(n), rng.standard_normal((m, n)), rng.standard_normal(m) + 0.5
-    )
+    A, f, B = spd(n, rng), rng.standard_normal(n), rng.standard_normal((m, n))
+    return VariationalInequality(A, f, B, rng.standard_normal(m) + 0.5)
 
 
 def random_answer(vi: VariationalInequality, rng: np.random.Generator, size: float) -> tuple[np.ndarray, np.ndarray]:
@@ -90,14 +87,10 @@ def test_only_ok_answers_of_the_same_reduced_model_are_compared() -> None:
     assert (row["dual"], row["queries"], row["flagged"], row["difference_max"]) == ("of m", 1, 0, 0.0)
 
 
-def test_of_one_solver_nothing_is_said() -> None:
+def test_the_audit_in_a_line_which_says_nothing_of_one_solver() -> None:
     assert agreement_sentence(pd.DataFrame(), 1) == ""
-
-
-def test_the_audit_in_a_line() -> None:
     row = {"queries": 5, "difference_max": 1e-4, "solver_a": "x", "solver_b": "y", "flagged": 0}
     assert "no two solvers" in agreement_sentence(pd.DataFrame(), 2)
-    assert "agree in all 5 comparisons: u differs by at most 1.0e-04 (x and y)" in agreement_sentence(
-        pd.DataFrame([row]), 2
-    )
+    agree = "agree in all 5 comparisons: u differs by at most 1.0e-04 (x and y)"
+    assert agree in agreement_sentence(pd.DataFrame([row]), 2)
     assert "more than the accuracy allows in 2 of 5" in agreement_sentence(pd.DataFrame([row | {"flagged": 2}]), 2)

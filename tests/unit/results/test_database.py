@@ -1,7 +1,5 @@
 """The results file: one transaction a cell, and no mixture of studies."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Models compared by the error of a quantity of interest: break-even, the fastest cells and the figure of both."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -38,14 +36,9 @@ def cell(name: str) -> dict[str, Any]:
     row |= {"offline_low_s": offline, "offline_high_s": offline, "assembly": "full", "solver": "piqp", "machine": "m"}
     row |= {"error_u_mean": error_u, "error_lambda_mean": error_lam, "enrichment_kind": kind.value, "primal": name}
     row |= {
-        "primal_tol": None,
-        "beta_span_min": 0.1,
-        "solver_share_mean": 1e-6,
-        "assembly_share_mean": None,
-        "definition": "{}",
-        "bounds": 0,
-        "disturbed": 0,
-    }
+        "primal_tol": None, "beta_span_min": 0.1, "solver_share_mean": 1e-6, "assembly_share_mean": None,
+        "definition": "{}", "bounds": 0, "disturbed": 0,
+    }  # fmt: skip
     return row | {f"{name}_options": "{}" for name in ("problem", "training", "dual", "primal")}
 
 

@@ -4,8 +4,6 @@ The machine is simulated: it is steady, drifts, or is slowed down in bursts by o
 heavy tails, every process has deviations of its own, and so has every run, by what else uses the machine.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Names of parameters: recorded beside the rows, and shown where mu_1 would stand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pandas as pd
@@ -25,18 +23,12 @@ def queries(tmp_path: Path, **asked: object) -> Table:
     return look_up(tmp_path / "run" / FILE, "queries", **asked)
 
 
-def test_tables_for_reading_have_the_names_and_those_for_programs_do_not(
-    journal: ResultsDatabase, tmp_path: Path
-) -> None:
+def test_names_are_shown_to_readers_and_asked_for_by_either_name(journal: ResultsDatabase, tmp_path: Path) -> None:
     write(journal, "disc", *NAMES)
     table = queries(tmp_path)
     assert {"radius [m]", "friction"} <= set(table.readable.columns)
     assert not {"mu_1", "mu_2"} & {*table.readable.columns, *table.priority}
     assert {"mu_1", "mu_2"} <= set(table.exact.columns)
-
-
-def test_columns_and_orders_are_asked_for_by_either_name(journal: ResultsDatabase, tmp_path: Path) -> None:
-    write(journal, "disc", *NAMES)
     asked = queries(tmp_path, columns=["query", "radius"], sort=["-radius"])
     assert list(asked.readable.columns) == ["query", "radius [m]"]
     pd.testing.assert_frame_equal(asked.rows, queries(tmp_path, columns=["query", "mu_1"], sort=["-mu_1"]).rows)
@@ -65,14 +57,12 @@ def test_results_without_names_have_columns_all_the_same(journal: ResultsDatabas
     assert "mu_1" in queries(tmp_path).readable.columns
 
 
-def test_names_are_written_once_and_again_where_they_changed(journal: ResultsDatabase, tmp_path: Path) -> None:
+def test_names_are_written_again_where_they_changed_or_refused_in_a_line(
+    journal: ResultsDatabase, tmp_path: Path
+) -> None:
     for names in (NAMES, NAMES, NAMES[::-1]):
         write(journal, "disc", *names)
         assert parameters_of(tmp_path / "run" / FILE) == {"disc": list(names)}
-
-
-def test_names_that_are_none_are_refused_in_a_line(journal: ResultsDatabase, tmp_path: Path) -> None:
-    write(journal, "disc", *NAMES)
     path = tmp_path / "run" / FILE
     journal._db.execute("UPDATE meta SET value = '[1, 2]' WHERE key LIKE 'parameters of %'")
     journal._digests.forget(name="meta")

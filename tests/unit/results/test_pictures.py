@@ -1,7 +1,5 @@
 """Pictures: of the right solutions, the same when read back, and a reason where there is none."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -32,15 +30,14 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[tuple[str, Picture]
     return tuple(base.value_of(store, made))
 
 
-def test_the_corners_and_the_middle_of_the_parameters_are_shown(drawn: tuple[tuple[str, Picture], ...]) -> None:
+def test_solutions_at_corners_and_middle_of_the_parameters_are_shown(
+    drawn: tuple[tuple[str, Picture], ...],
+) -> None:
     assert [title for title, _ in drawn] == [
         "scale = 0.8, centre_x = -0.05 m, centre_y = -0.05 m",
         "scale = 1, centre_x = 0 m, centre_y = 0 m",
         "scale = 1.2, centre_x = 0.05 m, centre_y = 0.05 m",
     ]
-
-
-def test_what_is_shown_are_the_solutions_there(drawn: tuple[tuple[str, Picture], ...]) -> None:
     middle = drawn[1][1]
     assert middle.values.min() < -0.02  # the membrane hangs
     assert middle.multiplier.max() > 0.0  # and rests on the obstacle
@@ -53,9 +50,8 @@ def test_pictures_read_back_are_those_written(drawn: tuple[tuple[str, Picture], 
         journal.replace("pictures", [KEYS | row for row in pictures.picture_rows(drawn)], **KEYS)
     journal.close()
     found = list(pictures.read(tmp_path / FILE))
-    assert [(one.key, one.title, one.reason) for one in found] == [
-        (("membrane", OBSTACLE.options), title, "") for title, _ in drawn
-    ]
+    keys = [(("membrane", OBSTACLE.options), title, "") for title, _ in drawn]
+    assert [(one.key, one.title, one.reason) for one in found] == keys
     for one, (_, picture) in zip(found, drawn, strict=True):
         assert one.picture is not None
         assert (one.picture.name, one.picture.multiplier_name) == (picture.name, picture.multiplier_name)

@@ -1,7 +1,5 @@
 """What `--where`, `--sort` and short keys select, and what a condition may not do."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import sqlite3
@@ -81,15 +79,12 @@ def test_any_text_selects_rows_or_is_refused(file: Path, text: str) -> None:
         assert len(matching(file, "cells", text, FRAME)) == 4
 
 
-def test_rows_are_sorted_up_and_down_with_missing_values_last() -> None:
+def test_rows_are_sorted_up_and_down_and_names_stand_between_commas() -> None:
     frame = pd.DataFrame({"a": [2.0, None, 1.0, 2.0], "b": [1, 2, 3, 4]})
     assert list(sorted_by(frame, ["a"], "cells")["b"]) == [3, 1, 4, 2]
     assert list(sorted_by(frame, ["-a", "-b"], "cells")["b"]) == [4, 1, 3, 2]
     with pytest.raises(RequestError, match="no column of cells is called 'c'"):
         sorted_by(frame, ["-c"], "cells")
-
-
-def test_names_stand_between_commas() -> None:
     assert parts("a, b,,online [ms]") == ["a", "b", "online [ms]"]
     assert parts("") == []
 

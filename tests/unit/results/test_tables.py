@@ -1,7 +1,5 @@
 """Tables: found, read, put in order, written, and printed for reading."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json
@@ -41,9 +39,8 @@ CELL = cell_row(
 
 
 def cells(*changes: dict[str, Any]) -> pd.DataFrame:
-    return pd.DataFrame(
-        [CELL | {"cell": str(k)} | change for k, change in enumerate(changes)], columns=list(STORED["cells"])
-    )
+    rows = [CELL | {"cell": str(k)} | change for k, change in enumerate(changes)]
+    return pd.DataFrame(rows, columns=list(STORED["cells"]))
 
 
 @pytest.fixture
@@ -56,9 +53,8 @@ def run(tmp_path: Path) -> Path:
     journal.write_cell(CELL | {"cell": "c1"}, query_rows("c1", 4, gap=1.0 / 3.0), outputs=[output])
     journal.write_cell(missing | {name: CELL[name] for name in KEYS} | {"solver": "osqp"}, [])
     journal.write_histories([[{"artefact": "pod-1", "quantity": "error", "step": 0, "value": 1.0}]])
-    journal.write_seconds(
-        "c1", {"timing_rounds": 1}, {0: {"solve_s": 0.5}}, [{"cell": "c1", "round": 0, "total_s": 1.0}]
-    )
+    timed = [{"cell": "c1", "round": 0, "total_s": 1.0}]
+    journal.write_seconds("c1", {"timing_rounds": 1}, {0: {"solve_s": 0.5}}, timed)
     journal.replace("thresholds", break_even_rows(journal.rows("cells"), []))
     journal.replace("disagreements", [{"solver_a": "osqp", "solver_b": "piqp", "queries": 4, "flagged": 0}])
     journal.close()
@@ -97,7 +93,7 @@ def test_tables_are_read_with_all_their_columns_and_nothing_is_changed(run: Path
     assert sorted(path.name for path in run.iterdir()) == names
 
 
-def test_everything_is_exported(run: Path, tmp_path: Path) -> None:
+def test_everything_is_exported_in_order_with_every_digit(run: Path, tmp_path: Path) -> None:
     files = export(run / FILE, tmp_path / "out" / "tables")
     names = [*(f"{table}.csv" for table in TABLES), "summary.md"]
     assert [path.name for path in files] == names
@@ -106,6 +102,15 @@ def test_everything_is_exported(run: Path, tmp_path: Path) -> None:
         path.write_text("old")
     assert export(run / FILE, tmp_path / "out" / "tables") == files
     assert all(path.read_text(encoding="utf-8").strip() not in ("", "old") for path in files)
+    for table in TABLES:
+        with (tmp_path / "out" / "tables" / f"{table}.csv").open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        expected = in_order(read_table(run / FILE, table))
+        assert len(rows) == len(expected)
+        for name in expected:
+            if pd.api.types.is_numeric_dtype(expected[name]):
+                values = [float(row[name] or "nan") for row in rows]
+                np.testing.assert_array_equal(values, expected[name].to_numpy(float))
 
 
 @pytest.mark.parametrize("rows", [1, 3, 4096])
@@ -126,19 +131,6 @@ def test_large_tables_are_read_and_written_in_parts(run: Path, rows: int, monkey
         assert (run / "tables" / f"{table}.csv").read_text() == whole
 
 
-def test_csv_holds_every_digit(run: Path, tmp_path: Path) -> None:
-    export(run / FILE, tmp_path)
-    for table in TABLES:
-        with (tmp_path / f"{table}.csv").open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-        expected = in_order(read_table(run / FILE, table))
-        assert len(rows) == len(expected)
-        for name in expected:
-            if pd.api.types.is_numeric_dtype(expected[name]):
-                values = [float(row[name] or "nan") for row in rows]
-                np.testing.assert_array_equal(values, expected[name].to_numpy(float))
-
-
 def test_rows_are_in_the_order_of_their_keys_loose_tolerances_and_small_sizes_first() -> None:
     frame = cells({"solver": "b"}, {"dual": "a"}, {"problem": "a"}, {"solver": "a"}, {"primal": "z"})
     assert list(in_order(frame)["cell"]) == ["2", "1", "3", "0", "4"]
@@ -156,7 +148,7 @@ def test_the_order_does_not_depend_on_who_was_first(order: list[int]) -> None:
     assert list(in_order(shuffled)["cell"]) == list(in_order(frame)["cell"])
 
 
-def test_the_summary_has_a_line_for_every_cell(run: Path) -> None:
+def test_the_summary_has_a_line_for_every_cell_and_counts_zero_solutions_where_there_are_any(run: Path) -> None:
     frame = summary(read_table(run / FILE, "cells"))
     first, second = frame.to_dict("records")
     assert (first["solver"], first["ok"]) == ("osqp", "0/4")
@@ -167,9 +159,6 @@ def test_the_summary_has_a_line_for_every_cell(run: Path) -> None:
     assert pd.isna(first["N"])
     frame = summary(cells({"pod_tol": None, "pod_size": 9, "dual_tol": None, "dual_size": 4}))
     assert (frame["δ_POD"][0], frame["δ_dual"][0]) == ("N=9", "R=4")
-
-
-def test_the_summary_counts_zero_solutions_where_there_are_any() -> None:
     none = {"queries_zero_u": 0, "error_u_zero_max": None, "queries_zero_lambda": 0, "error_lambda_zero_max": None}
     some = none | {"queries_zero_lambda": 3, "error_lambda_zero_max": 1e-10}
     columns = {"u = 0", "error, u = 0", "λ = 0", "error, λ = 0"}
@@ -198,15 +187,9 @@ def test_the_benefits_say_from_when_on_a_strategy_pays() -> None:
     low, high = map(int, paired["interval"].split("–"))
     assert low < 1 / 0.0015 < high
     assert len(frame) == 3
-
-
-def test_benefits_without_a_number_are_words() -> None:
     slow = CELL | {"hf_s": 0.001, "enrichment_kind": "none"}
     frame = pd.DataFrame(break_even_rows([slow], rounds([slow])), columns=list(STORED["thresholds"]))
     assert list(break_even_table(frame)["break-even"]) == ["never"]
-
-
-def test_tables_of_nothing_are_empty() -> None:
     assert summary(cells()).empty
     assert break_even_table(pd.DataFrame(columns=list(STORED["thresholds"]))).empty
     for columns in (STORED["cells"], STORED["queries"], STORED["histories"]):
@@ -225,27 +208,28 @@ def test_values_are_printed_with_three_digits(value: Any, text: str) -> None:
     assert cell_text(value) == text
 
 
-def test_csv_quotes_what_it_must() -> None:
+def test_csv_quotes_what_it_must_and_leaves_numbers_alone() -> None:
     frame = pd.DataFrame({"name": ["a,b", 'c"d', "e\nf"], "value": [1.0 / 3.0, None, 1e-300]})
     header, *rows = csv.reader(io.StringIO(to_csv(frame)))
     assert header == ["name", "value"]
     assert [(name, float(value or "inf")) for name, value in rows] == [
         ("a,b", 1.0 / 3.0), ('c"d', float("inf")), ("e\nf", 1e-300),
     ]  # fmt: skip
+    values = {"number": [-1.5, float("inf"), -float("inf"), None], "text": ["-1.5", "+2", "-1e-7", "-inf"]}
+    _, *rows = csv.reader(io.StringIO(to_csv(pd.DataFrame(values))))
+    assert [row for row, _ in rows] == ["-1.5", "inf", "-inf", ""]
+    assert [row for _, row in rows] == ["-1.5", "+2", "-1e-7", "-inf"]
 
 
-def test_markdown_has_a_line_per_row() -> None:
+def test_markdown_has_a_line_per_row_whatever_would_end_a_cell() -> None:
     lines = to_markdown(pd.DataFrame({"name": ["a", "007"], "value": [0.123456, None]})).splitlines()
     assert [[word.strip() for word in line.strip("|").split("|")] for line in lines if "--" not in line] == [
         ["name", "value"], ["a", "0.123"], ["007", ""],
     ]  # fmt: skip
-
-
-@pytest.mark.parametrize("text", ["a|b", "a\nb", "a\\|b", "|", "\\"])
-def test_markdown_survives_what_would_end_a_cell(text: str) -> None:
-    lines = to_markdown(pd.DataFrame({"name": [text, "c"], "value": [1, 2]})).splitlines()
-    assert len(lines) == 4
-    assert {len(re.findall(r"(?<!\\)(?:\\\\)*\|", line)) for line in lines} == {3}
+    for text in ("a|b", "a\nb", "a\\|b", "|", "\\"):
+        lines = to_markdown(pd.DataFrame({"name": [text, "c"], "value": [1, 2]})).splitlines()
+        assert len(lines) == 4
+        assert {len(re.findall(r"(?<!\\)(?:\\\\)*\|", line)) for line in lines} == {3}
 
 
 @pytest.mark.parametrize(
@@ -278,13 +262,6 @@ def test_csv_has_no_formulas(text: str) -> None:
     frame = pd.read_csv(io.StringIO(to_csv(pd.DataFrame({"name": [text], text: [f"a {text}"]}))))
     assert list(frame.columns) == ["name", f"'{text}"]
     assert frame.iloc[0].tolist() == [f"'{text}", f"a {text}"]
-
-
-def test_csv_leaves_numbers_alone() -> None:
-    values = {"number": [-1.5, float("inf"), -float("inf"), None], "text": ["-1.5", "+2", "-1e-7", "-inf"]}
-    _, *rows = csv.reader(io.StringIO(to_csv(pd.DataFrame(values))))
-    assert [row for row, _ in rows] == ["-1.5", "inf", "-inf", ""]
-    assert [row for _, row in rows] == ["-1.5", "+2", "-1e-7", "-inf"]
 
 
 @given(st.lists(st.text(st.characters()), max_size=5))
@@ -340,22 +317,18 @@ def test_latex_of_a_run_compiles(view: str, quick_run: Path, tmp_path: Path) -> 
         assert bare.count("{") == bare.count("}")
         assert not set(bare) & set("\\$%#_^~")
     if engine := shutil.which("pdflatex"):
-        (tmp_path / "page.tex").write_text(
-            r"\documentclass{article}\usepackage{booktabs}\begin{document}" + page + r"\end{document}"
-        )
+        head, end = r"\documentclass{article}\usepackage{booktabs}\begin{document}", r"\end{document}"
+        (tmp_path / "page.tex").write_text(f"{head}{page}{end}")
         subprocess.run([engine, "-halt-on-error", "page.tex"], cwd=tmp_path, check=True, stdout=subprocess.DEVNULL)
 
 
-def test_a_real_run_exports_its_whole_matrix(quick_run: Path) -> None:
+def test_a_real_run_exports_its_whole_matrix_and_times_what_its_cells_are_made_of(quick_run: Path) -> None:
     expected = expand(read_study("quick"))
     frame = pd.read_csv(quick_run / "tables" / "cells.csv")
     assert set(frame["cell"]) == {cell.key for cell in expected}
     assert len(pd.read_csv(quick_run / "tables" / "queries.csv")) == frame["queries"].sum()
     written = (quick_run / "tables" / "summary.md").read_text(encoding="utf-8")
     assert len(written.splitlines()) == len(expected) + 2
-
-
-def test_a_real_run_times_what_its_cells_are_made_of(quick_run: Path) -> None:
     frame = read_table(quick_run / FILE, "cells")
     parts = [f"offline_{part}_s" for part in ("snapshots", "pod", "cone", "enrichment", "assembly")]
     np.testing.assert_allclose(frame[parts].sum(axis=1), frame["offline_s"])
@@ -377,12 +350,10 @@ def test_a_real_run_times_what_its_cells_are_made_of(quick_run: Path) -> None:
 @pytest.mark.parametrize(
     ("table", "where", "sort"),
     [
-        ("queries", "", ()),
-        ("queries", "total_s > 0.001 and solver != 'osqp'", ("-primal_tol", "cell")),
-        ("timings", "", ("-total_s",)),
-        ("timings", "total_s > 0.001 and solver != 'osqp'", ("accuracy", "solver")),
+        ("queries", "", ()), ("queries", "total_s > 0.001 and solver != 'osqp'", ("-primal_tol", "cell")),
+        ("timings", "", ("-total_s",)), ("timings", "total_s > 0.001 and solver != 'osqp'", ("accuracy", "solver")),
     ],
-)
+)  # fmt: skip
 def test_the_first_rows_are_those_of_the_whole_table_and_others_are_not_read(
     table: str, where: str, sort: tuple[str, ...], quick_run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

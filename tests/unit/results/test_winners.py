@@ -3,8 +3,6 @@
 The run of the suite is one of the study `quick`; `VIBENCH_RUNS` may name more, as a list of folders like PATH.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -100,18 +100,16 @@ def flip_a_bit(path: Path) -> None:
 @pytest.mark.parametrize(
     "damage",
     [
-        lambda path: path.write_bytes(b""),
-        lambda path: path.write_bytes(path.read_bytes()[:-20]),
+        lambda path: path.write_bytes(b""), lambda path: path.write_bytes(path.read_bytes()[:-20]),
         lambda path: path.write_bytes(b"nonsense"),
         lambda path: path.write_bytes(encoded("other", Store(path.parent).get("key"))),
         lambda path: path.write_bytes(encoded("key", {"value": 1})),
         lambda path: path.write_bytes(encoded("key", Artefact(1, 1.5, (), "here"))),
         lambda path: path.write_bytes(encoded("key", Artefact(1, TIME, (1,), "here"))),
-        lambda path: path.write_bytes(encoded("key", Artefact(1, TIME, (), ["here"]))),
-        flip_a_bit,
+        lambda path: path.write_bytes(encoded("key", Artefact(1, TIME, (), ["here"]))), flip_a_bit,
     ],
     ids=["empty", "cut off", "nonsense", "renamed", "another object", "seconds", "histories", "machine", "one bit"],
-)
+)  # fmt: skip
 def test_a_damaged_artefact_counts_as_missing(damage: Callable[[Path], object], tmp_path: Path) -> None:
     Store(tmp_path).put("key", list(range(100)), TIME, ())
     damage(tmp_path / "key.artefact")

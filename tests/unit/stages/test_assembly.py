@@ -37,24 +37,20 @@ def cell(
     problem: Plugin, primal: str, interpolation: float | None, tolerance: float | None = None, dual: str = "mcpg"
 ) -> CellQueries:
     enrichment = SingleEnrichment(
-        PODStage(problem, Stop(size=6)),
-        ConeStage(problem, Plugin("dual strategy", dual, "{}", "test"), Stop(size=3)),
-        Plugin("primal strategy", primal, "{}", "test"),
-        tolerance,
-    )
+        PODStage(problem, Stop(size=6)), ConeStage(problem, Plugin("dual strategy", dual, "{}", "test"), Stop(size=3)),
+        Plugin("primal strategy", primal, "{}", "test"), tolerance,
+    )  # fmt: skip
     return program_queries(enrichment, interpolation, ParameterSet("validation", QUERIES, 3), "piqp", 1e-8)
 
 
 CELLS = {
     "obstacle": cell(OBSTACLE, "decorrelated", TOLERANCE),
     "obstacle, fixed": cell(OBSTACLE, "offline-pga", TOLERANCE, 0.5),
-    "obstacle, full": cell(OBSTACLE, "decorrelated", None),
-    "obstacle, loose": cell(OBSTACLE, "decorrelated", 1e-2),
-    "radial": cell(RADIAL, "online-supremizers", TOLERANCE),
-    "hertz": cell(HERTZ, "decorrelated", TOLERANCE),
+    "obstacle, full": cell(OBSTACLE, "decorrelated", None), "obstacle, loose": cell(OBSTACLE, "decorrelated", 1e-2),
+    "radial": cell(RADIAL, "online-supremizers", TOLERANCE), "hertz": cell(HERTZ, "decorrelated", TOLERANCE),
     "hertz, per-parameter": cell(HERTZ, "online-supremizers", TOLERANCE),
     "hertz, full": cell(HERTZ, "decorrelated", None),
-}
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -202,11 +198,8 @@ def test_a_problem_that_declares_nothing_is_assembled_in_full_and_the_reason_is_
     stage = wire(TOLERANCE)
     members = value_of(wire_store, AffineDecomposition(WIRE, TOLERANCE))
     assert [members[name].way for name in MEMBERS] == [
-        Evaluation.CONSTANT,
-        Evaluation.FULL,
-        Evaluation.CONSTANT,
-        Evaluation.CONSTANT,
-    ]
+        Evaluation.CONSTANT, Evaluation.FULL, Evaluation.CONSTANT, Evaluation.CONSTANT,
+    ]  # fmt: skip
     rows, full = value_of(wire_store, stage), value_of(wire_store, wire(None))
     assert rows.cell["status"] == "ok"
     assert rows.cell["fallbacks"] == f"assembled in full: {why}"

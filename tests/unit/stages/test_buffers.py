@@ -25,13 +25,9 @@ from vibench.study.parameter_sets import ParameterSet
 
 OBSTACLE = find(PluginKind.PROBLEM, "obstacle").load()
 PROBLEMS: Mapping[str, Callable[[], Problem]] = {
-    "wire": Declared,
-    "wire, buffered": buffered(Declared),
-    "string": Varying,
-    "string, buffered": buffered(Varying),
-    "obstacle": partial(OBSTACLE, 150),
-    "obstacle, buffered": partial(buffered(OBSTACLE), 150),
-}
+    "wire": Declared, "wire, buffered": buffered(Declared), "string": Varying, "string, buffered": buffered(Varying),
+    "obstacle": partial(OBSTACLE, 150), "obstacle, buffered": partial(buffered(OBSTACLE), 150),
+}  # fmt: skip
 
 
 @pytest.fixture(autouse=True)

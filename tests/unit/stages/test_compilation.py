@@ -24,14 +24,9 @@ from vibench.stages.query import ModelQuery
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
 
 STUDY = small_study(
-    "compiled",
-    [{"name": "radial-obstacle", "options": {"resolution": 150}}],
-    assembly=["reduced"],
-    formulation=["mixed", "compiled"],
-    solvers=["piqp", "osqp"],
-    accuracy=1e-7,
-    validation=4,
-)
+    "compiled", [{"name": "radial-obstacle", "options": {"resolution": 150}}], assembly=["reduced"],
+    formulation=["mixed", "compiled"], solvers=["piqp", "osqp"], accuracy=1e-7, validation=4,
+)  # fmt: skip
 
 
 def script(folder: Path, text: str) -> str:

@@ -23,11 +23,9 @@ EVERY = pytest.mark.parametrize("problem", list(PROBLEMS))
 def cell(problem: str, primal: str) -> CellQueries:
     plugin = PROBLEMS[problem]
     enrichment = SingleEnrichment(
-        PODStage(plugin, Stop(size=4)),
-        ConeStage(plugin, Plugin("dual strategy", "mcpg", "{}", "test"), Stop(size=6)),
-        Plugin("primal strategy", primal, "{}", "test"),
-        PRIMALS[primal],
-    )
+        PODStage(plugin, Stop(size=4)), ConeStage(plugin, Plugin("dual strategy", "mcpg", "{}", "test"), Stop(size=6)),
+        Plugin("primal strategy", primal, "{}", "test"), PRIMALS[primal],
+    )  # fmt: skip
     return program_queries(enrichment, None, ParameterSet("validation", COUNT, 3), "piqp", 1e-8)
 
 

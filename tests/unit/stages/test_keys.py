@@ -52,7 +52,7 @@ def goals(study: Study) -> list[Stage]:
     """The last stages of a study."""
     cells = expand(study)
     ends = [cell_queries(cell, 20.0) for cell in cells]
-    timing = TimingRounds(tuple(ends[:2]), ((0, 1),) * 2, 1, first=0, session=0)
+    timing = TimingRounds(tuple(ends[:2]), ((0, 1),) * 2, 1, 0)
     return [*ends, PictureStage(cells[0].problem, cells[0].training), timing]
 
 

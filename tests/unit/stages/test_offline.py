@@ -153,10 +153,8 @@ def test_a_cell_of_a_nested_strategy_is_the_cell_built_alone(store: SampleStore,
 
 def test_rows_of_a_cell(store: SampleStore) -> None:
     for primal, tolerance, kind in (
-        ("decorrelated", None, "none"),
-        ("online-supremizers", None, "per-parameter"),
-        ("offline-pga", 0.5, "fixed"),
-    ):
+        ("decorrelated", None, "none"), ("online-supremizers", None, "per-parameter"), ("offline-pga", 0.5, "fixed"),
+    ):  # fmt: skip
         rows = value_of(store, cell(primal, tolerance))
         assert rows.cell["enrichment_kind"] == kind
         assert rows.cell["status"] == "ok"
@@ -322,16 +320,12 @@ def test_means_are_over_the_ok_queries_and_the_worst_status_names_the_cell() -> 
 def test_what_is_zero_is_counted_apart_and_enters_no_mean(drawn: list[tuple[bool, bool, bool, float, float]]) -> None:
     rows = [
         query(
-            "ok" if ok else "inaccurate",
-            None if zero_u else error,
-            error_u_scaled=scaled,
-            error_lambda=None if zero_lam else error,
-            error_lambda_scaled=scaled,
-            zero_u=int(zero_u),
+            "ok" if ok else "inaccurate", None if zero_u else error, error_u_scaled=scaled,
+            error_lambda=None if zero_lam else error, error_lambda_scaled=scaled, zero_u=int(zero_u),
             zero_lambda=int(zero_lam),
         )
         for ok, zero_u, zero_lam, error, scaled in drawn
-    ]
+    ]  # fmt: skip
     found = summarise(rows)
     for name, kind in (("u", 1), ("lambda", 2)):
         errors = [one[3] for one in drawn if one[0] and not one[kind]]

@@ -224,16 +224,10 @@ def test_what_no_class_of_the_list_has_is_named_when_it_is_written() -> None:
     with pytest.raises(TypeError, match="two storable classes are called Sample"):
         storable(type("Sample", (), {}))
     for value, named in (
-        (lambda: 0, "builtins.function"),
-        ({"at": [Stranger(1)]}, "Stranger"),
-        (b"bytes", "builtins.bytes"),
-        ({1}, "builtins.set"),
-        (np.array([None]), "object"),
-        (np.array(["text"]), "<U4"),
-        (1j, "builtins.complex"),
-        (np.array([1j]), "complex128"),
-        (np.ma.masked_array([1.0]), "MaskedArray"),
+        (lambda: 0, "builtins.function"), ({"at": [Stranger(1)]}, "Stranger"), (b"bytes", "builtins.bytes"),
+        ({1}, "builtins.set"), (np.array([None]), "object"), (np.array(["text"]), "<U4"), (1j, "builtins.complex"),
+        (np.array([1j]), "complex128"), (np.ma.masked_array([1.0]), "MaskedArray"),
         (type("Sample", (), {})(), "Sample"),
-    ):
+    ):  # fmt: skip
         with pytest.raises(NumericalError, match=f"{named}.* cannot be stored"):
             dumps(value)

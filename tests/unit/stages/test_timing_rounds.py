@@ -55,16 +55,10 @@ OF_THREE = tuple(
 )  # fmt: skip
 
 
-def block(
-    cells: tuple[CellQueries, ...], queries: tuple[tuple[int, ...], ...], rounds: int, first: int = 0
-) -> TimingRounds:
-    return TimingRounds(cells, queries, rounds, first, session=0)
-
-
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
     store = SampleStore(tmp_path_factory.mktemp("artefacts"))
-    stages = [stage for cells in (CELLS, OF_THREE) for stage in block(cells, (EVERY,) * 4, 1).inputs()]
+    stages = [stage for cells in (CELLS, OF_THREE) for stage in TimingRounds(cells, (EVERY,) * 4, 1, 0).inputs()]
     for stage in stages:
         if store.get(stage.key) is None:
             carry_out(stage, store)
@@ -87,7 +81,7 @@ def steady(seconds: float, queries: tuple[int, ...] = (0, 1), slowdown: float = 
 
 @given(st.integers(1, 9), st.integers(1, 9))
 def test_every_round_has_every_cell_once_before_the_next_one_begins(rounds: int, count: int) -> None:
-    stage = block((CELLS[0],) * count, (EVERY,) * count, rounds)
+    stage = TimingRounds((CELLS[0],) * count, (EVERY,) * count, rounds, 0)
     places = [stage.place(item) for item in range(stage.items)]
     assert [number for number, _ in places] == sorted(number for number, _ in places)
     assert sorted(places) == [(number, k) for number in range(rounds) for k in range(count)]
@@ -95,18 +89,18 @@ def test_every_round_has_every_cell_once_before_the_next_one_begins(rounds: int,
 
 def test_order_and_limit_of_a_stage_are_those_of_all_its_cells(tmp_path: Path) -> None:
     """Whoever comes after a large model finds its own arrays out of the cache: not always the same one."""
-    stage = block((CELLS[0],) * 6, (EVERY,) * 6, 12)
+    stage = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 12, 0)
     first = [stage.place(number * 6)[1] for number in range(12)]
     assert len(set(first)) > 3
-    later = block((CELLS[0],) * 6, (EVERY,) * 6, 4, 8)
+    later = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 4, 8)
     assert [later.place(number * 6)[1] for number in range(4)] == first[8:]
-    assert block(CELLS, (EVERY,) * 4, 12).weight == 4
+    assert TimingRounds(CELLS, (EVERY,) * 4, 12, 0).weight == 4
     assert CELLS[0].weight == 1
 
 
 def test_a_machine_that_slows_down_halfway_meets_all_alike() -> None:
     """Cell after cell, the second of two equal ones would seem thrice as slow."""
-    stage = block((CELLS[0],) * 2, (EVERY,) * 2, 12)
+    stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 12, 0)
     spent = [1.0 if item < stage.items / 2 else 3.0 for item in range(stage.items)]
     items = [replace(steady(one), beside=Seconds(2.0 * one, 2.0 * one)) for one in spent]
     timed = timing_rounds._Rounds.collect(_in(stage), items)
@@ -127,7 +121,7 @@ def test_every_ok_query_alone_is_timed_and_a_long_round_ends_early(
     store: SampleStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fine = (EVERY, (0, 2, 5), EVERY, (3,))
-    timed = block(CELLS, fine, 8).run(store).value
+    timed = TimingRounds(CELLS, fine, 8, 0).run(store).value
     for one, numbers in zip(timed, fine, strict=True):
         rounds = list(one.rounds.values())
         assert list(one.rounds) == list(range(8))
@@ -140,7 +134,7 @@ def test_every_ok_query_alone_is_timed_and_a_long_round_ends_early(
         assert all(row["total_s"] == row["assemble_s"] + row["solve_s"] for row in rows.values())
     prepare = ProgramQuery.prepare
     monkeypatch.setattr(ProgramQuery, "prepare", lambda *of: lambda: (prepare(*of)()[0], Seconds(0.1, 6.0)))
-    timed = block(CELLS[:1], (EVERY,), 4).run(store).value[0]
+    timed = TimingRounds(CELLS[:1], (EVERY,), 4, 0).run(store).value[0]
     assert [len(each.solve) for each in timed.rounds.values()] == [1] * 4
 
 
@@ -150,14 +144,14 @@ def test_reduced_assembly_is_timed_at_every_query_and_full_assembly_at_as_many_a
 ) -> None:
     monkeypatch.setattr(timing_rounds, "ASSEMBLY_SECONDS", enough)
     monkeypatch.setattr(timing_rounds, "QUERY_SUBSETS", 1)
-    timed = block(CELLS, (EVERY,) * len(CELLS), 2).run(store).value
+    timed = TimingRounds(CELLS, (EVERY,) * len(CELLS), 2, 0).run(store).value
     assert [[len(each.assemble) for each in one.rounds.values()] for one in timed[:3]] == [[in_full] * 2] * 3
     assert all(each.assemble.keys() == each.solve.keys() for each in timed[3].rounds.values())
 
 
 def test_high_fidelity_solutions_start_as_in_the_sweep(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
     """From the contact set of the nearest parameter before; the first one of a part from that of the nearest after."""
-    stage = block(CELLS, (EVERY,) * len(CELLS), 1)
+    stage = TimingRounds(CELLS, (EVERY,) * len(CELLS), 1, 0)
     reference = gather(store, stage.cells[0].validation)
     starts: list[Any] = []
     solve = marginal_solutions.solve_unverified
@@ -216,7 +210,7 @@ def test_long_solutions_serve_all_cells_of_a_round_and_stand_for_a_part() -> Non
 
 
 def test_rounds_begin_at_other_queries_in_later_blocks_and_for_other_cells(store: SampleStore) -> None:
-    work = block(CELLS[:2], (EVERY,) * 2, 1).begin(store)
+    work = TimingRounds(CELLS[:2], (EVERY,) * 2, 1, 0).begin(store)
     assert isinstance(work, timing_rounds._Rounds)
     numbers = range(2 * timing_rounds.QUERY_SUBSETS)
     parts = parts_alike(work._beside.sweep, timing_rounds.QUERY_SUBSETS)
@@ -244,14 +238,14 @@ def test_full_matrices_are_those_of_solutions_assembled_once(
     monkeypatch.setattr(ReducedModel, "reduce", lambda model, vi: (reduced.append(vi), reduce(model, vi))[1])
     monkeypatch.setattr(timing_rounds, "QUERY_SUBSETS", 1)
     monkeypatch.setattr(timing_rounds, "ASSEMBLY_SECONDS", np.inf)
-    block(CELLS[:3], (EVERY,) * 3, 4).run(store)
+    TimingRounds(CELLS[:3], (EVERY,) * 3, 4, 0).run(store)
     assert len(calls) == 3 * (1 + 4 * (VALIDATION + 1))  # a warm-up, then every query and the last solution of a round
     assert len(set(calls)) == len(calls)
     assert len(reduced) == 3 * (1 + 4 * VALIDATION)  # none after the last query
 
 
 def test_lost_rounds_are_told_and_rows_have_the_pace_of_their_block() -> None:
-    stage = block((CELLS[0],) * 2, (EVERY,) * 2, 3, 6)
+    stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 3, 6)
     items: list[TimedRound | Failed] = [steady(2.0) for _ in range(stage.items)]
     gone = next(item for item in range(stage.items) if stage.place(item) == (1, 0))
     items[gone] = Failed(Status.CRASHED, "the worker died")
@@ -259,7 +253,7 @@ def test_lost_rounds_are_told_and_rows_have_the_pace_of_their_block() -> None:
     assert [list(one.rounds) for one in timed] == [[6, 8], [6, 7, 8]]
     assert [one.failures for one in timed] == [(items[gone],), ()]
     assert [[row["round"] for row in rows] for rows in timing_rounds.block_rows(stage, timed)] == [[6, 8], [6, 7, 8]]
-    stage = block((CELLS[0],) * 2, (EVERY,) * 2, 3)
+    stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 3, 0)
     paced = {k: replace(steady(pace), beside=Seconds(4.0 * pace, 4.0 * pace)) for k, pace in enumerate((1.0, 2.0, 1.0))}
     other = {k: replace(steady(3.0 * pace), beside=Seconds(9.0 * pace, 9.0)) for k, pace in enumerate((1.0, 2.0, 1.0))}
     rows, others = timing_rounds.block_rows(stage, [TimedCell(paced, "here"), TimedCell(other, "here")])
@@ -267,7 +261,7 @@ def test_lost_rounds_are_told_and_rows_have_the_pace_of_their_block() -> None:
         assert [row["hf_s"] for row in own] == pytest.approx([6.0, 12.0, 6.0])
         assert [row["pace"] for row in own] == pytest.approx([1.0, 2.0, 1.0])
     assert len({row["block"] for row in (*rows, *others)}) == 1
-    later = block((CELLS[0],), (EVERY,), 2, 2)
+    later = TimingRounds((CELLS[0],), (EVERY,), 2, 2)
     ((row,),) = timing_rounds.block_rows(later, [TimedCell({2: steady(1.0)}, "here")])
     assert row["block"] != rows[0]["block"]
     assert row["hf_s"] is None
@@ -338,7 +332,7 @@ def test_a_solver_with_memory_meets_no_program_again_and_none_is_assembled_twice
     solver, visited, plain = Remembers(), list[tuple[float, ...]](), HyperReducedModel.assemble
     monkeypatch.setattr(registry, "qp_solver", lambda name: {name: solver})
     monkeypatch.setattr(HyperReducedModel, "assemble", lambda one, mu: (visited.append(tuple(mu)), plain(one, mu))[1])
-    timed = block(OF_THREE, (EVERY[:3],) * 4, 12).run(store).value
+    timed = TimingRounds(OF_THREE, (EVERY[:3],) * 4, 12, 0).run(store).value
     assert [len(one.rounds) for one in timed] == [12] * 4
     assert solver.solved == 4 * (12 + 1)  # a query in every round, and the warm-up
     assert solver.remembered == 0
@@ -355,7 +349,7 @@ def test_answers_to_similar_programs_are_not_timed(
     # which queries a round begins with depends on measured seconds; units of some let the first answer pass
     monkeypatch.setattr(timing_rounds, "parts_alike", lambda _, parts: (EVERY[:3],) * parts)
     with pytest.raises(NumericalError, match=r"residual .* above 3e-07.*does the solver remember answers"):
-        block(OF_THREE[which : which + 1], (EVERY[:3],), 12).run(store)
+        TimingRounds(OF_THREE[which : which + 1], (EVERY[:3],), 12, 0).run(store)
     assert solver.remembered == 1
 
 

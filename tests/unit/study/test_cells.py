@@ -75,11 +75,9 @@ def test_duplicates_merge(cells_of: Expand) -> None:
     obstacle = [{"name": "obstacle", "options": {"resolution": "coarse"} | options} for options in (
         {}, {"length": 1.0}, {"length": 1.0, "load": -1.0}, {"load": -1, "length": 1.0})]  # fmt: skip
     for axis, entries in (
-        ("solvers", ["piqp", "osqp", "piqp"]),
-        ("dual", ["cpg", "mcpg", "cpg", {"name": "cpg", "label": "the same"}]),
-        ("problem", obstacle),
-        ("tolerances", [*STUDY["tolerances"], *STUDY["tolerances"]]),
-    ):
+        ("solvers", ["piqp", "osqp", "piqp"]), ("dual", ["cpg", "mcpg", "cpg", {"name": "cpg", "label": "the same"}]),
+        ("problem", obstacle), ("tolerances", [*STUDY["tolerances"], *STUDY["tolerances"]]),
+    ):  # fmt: skip
         assert [cell.key for cell in cells_of(changed(STUDY, axis, to=entries))] == keys, axis
 
 
@@ -152,28 +150,19 @@ OTHER: Mapping[str, Mapping[str, Any]] = {
     "dual": {"dual": replace(SAMPLE.dual, name="other")},
     "dual options": {"dual": replace(SAMPLE.dual, options='{"a": 2}')},
     "primal": {"primal": replace(SAMPLE.primal, name="other")},
-    "primal options": {"primal": replace(SAMPLE.primal, options='{"a": 2}')},
-    "pod": {"pod": Stop(tolerance=1e-4)},
-    "pod size": {"pod": Stop(size=4)},
-    "cone": {"cone": Stop(size=5)},
-    "cone tolerance": {"cone": Stop(tolerance=0.1)},
-    "primal_tol": {"primal_tol": 0.6},
-    "no primal_tol": {"primal_tol": None},
-    "solver": {"solver": "osqp"},
-    "assembly": {"assembly": "reduced"},
-    "bounds": {"bounds": True},
-    "correction": {"correction": "auto"},
-    "interpolation": {"interpolation": 1e-6},
-    "warm start": {"warm_start": True},
+    "primal options": {"primal": replace(SAMPLE.primal, options='{"a": 2}')}, "pod": {"pod": Stop(tolerance=1e-4)},
+    "pod size": {"pod": Stop(size=4)}, "cone": {"cone": Stop(size=5)}, "cone tolerance": {"cone": Stop(tolerance=0.1)},
+    "primal_tol": {"primal_tol": 0.6}, "no primal_tol": {"primal_tol": None}, "solver": {"solver": "osqp"},
+    "assembly": {"assembly": "reduced"}, "bounds": {"bounds": True}, "correction": {"correction": "auto"},
+    "interpolation": {"interpolation": 1e-6}, "warm start": {"warm_start": True},
     "seed": {"validation": ParameterSet("validation", 8, 2)},
-    "validation": {"validation": ParameterSet("validation", 9, 1)},
-    "accuracy": {"accuracy": 1e-8},
+    "validation": {"validation": ParameterSet("validation", 9, 1)}, "accuracy": {"accuracy": 1e-8},
     "training": {"training": ParameterSet("training", 0, 0, SAMPLING)},
     "training options": {"training": ParameterSet("training", 0, 0, replace(SAMPLING, options='{"a": 1}'))},
     "validation sampling": {"validation": ParameterSet("validation", 8, 1, SAMPLING)},
     "formulation": {"formulation": FORMULATION},
     "formulation options": {"formulation": replace(FORMULATION, options='{"a": 1}')},
-}
+}  # fmt: skip
 
 
 def test_keys_depend_on_all_members_that_determine_numbers_and_not_on_labels_or_code() -> None:

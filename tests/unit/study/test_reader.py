@@ -113,9 +113,7 @@ WRONG: Mapping[str, tuple[tuple[str | int, ...], Any, tuple[str, ...]]] = {
     "dual tolerance missing": ((*TABLE, "dual"), REMOVE, ("tolerances.0", "'dual'", "'R'")),
     "dual tolerance and R": ((*TABLE, "R"), [3], ("tolerances.0", "either 'dual'", "'R'")),
     "dual tolerance of one strategy": (
-        (*TABLE, "dual"),
-        {"cpg": [0.0]},
-        ("tolerances.0.dual", "cpg", "greater than 0"),
+        (*TABLE, "dual"), {"cpg": [0.0]}, ("tolerances.0.dual", "cpg", "greater than 0"),
     ),
     "dual tolerance of a stranger": ((*TABLE, "dual"), {"mcgp": [0.1]}, ("dual strategy", "did you mean 'mcpg'")),
     "primal tolerance zero": ((*TABLE, "primal"), {"offline-pga": [0.0]}, ("primal.offline-pga.0", "greater than 0")),
@@ -135,7 +133,7 @@ WRONG: Mapping[str, tuple[tuple[str | int, ...], Any, tuple[str, ...]]] = {
     "key unknown, in angle brackets": (("<list>",), 7, ("'<list>'", "known: ")),
     "key unknown in a table, an angle bracket": ((*TABLE, "<"), [], ("'<'", "known: ")),
     "key unknown in a table": ((*TABLE, "pods"), [1e-3], ("'pods'", "did you mean 'pod'")),
-}
+}  # fmt: skip
 
 
 def test_what_is_wrong_is_said_in_one_line_without_the_key_itself(tmp_path: Path) -> None:
@@ -235,13 +233,11 @@ def test_overrides_replace_tolerances_in_every_table_and_with_their_strategy(tmp
 
 def test_wrong_overrides_are_refused_and_said_to_be_overrides(tmp_path: Path) -> None:
     cases: list[tuple[dict[str, Any], str]] = [
-        ({"pod": [float("nan")]}, "finite"),
-        ({"dual_tol": [0.0]}, "greater than 0"),
-        ({"primal_tol": [-1.0]}, "greater than 0"),
-        ({"solvers": ["oqsp"]}, "did you mean 'osqp'"),
+        ({"pod": [float("nan")]}, "finite"), ({"dual_tol": [0.0]}, "greater than 0"),
+        ({"primal_tol": [-1.0]}, "greater than 0"), ({"solvers": ["oqsp"]}, "did you mean 'osqp'"),
         ({"problem": ["obstcale"]}, "did you mean 'obstacle'"),
         ({"primal": ["decorelated"]}, "did you mean 'decorrelated'"),
-    ]
+    ]  # fmt: skip
     for overrides, words in cases:
         line = refusal(write_study(tmp_path), overrides)
         assert "options of the command line" in line
