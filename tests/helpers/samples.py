@@ -12,13 +12,15 @@ import fake_plugins
 import pandas as pd
 
 import vibench
+from vibench.interfaces.strategies import Stop
 from vibench.plugins.plugin import Plugin
 from vibench.results.schema import STORED
 from vibench.stages.artefacts import Artefact, Store
 from vibench.stages.base import Stage
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.enrichment import EnrichmentStage
+from vibench.stages.enrichment import EnrichmentStage, SingleEnrichment
 from vibench.stages.formulation import FormulationStage
+from vibench.stages.offline import ConeStage, PODStage
 from vibench.study.parameter_sets import ParameterSet
 
 STUDY: Mapping[str, Any] = {
@@ -213,18 +215,25 @@ def with_ways(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def program_queries(
-    enrichment: EnrichmentStage,
-    interpolation: float | None,
-    validation: ParameterSet,
-    solver: str,
-    accuracy: float,
-    warm_start: bool = False,
-    bounds: bool = False,
-) -> CellQueries:
+    enrichment: EnrichmentStage, interpolation: float | None, validation: ParameterSet, solver: str, accuracy: float,
+    warm_start: bool = False, bounds: bool = False,
+) -> CellQueries:  # fmt: skip
     pod, cone = enrichment.pod, enrichment.cone
     mixed = Plugin("formulation", "mixed", "{}", "test")
     built = FormulationStage(pod.problem, mixed, pod.training, pod, cone, enrichment, interpolation)
     return CellQueries(built, validation, solver, accuracy, 20.0, warm_start, bounds)
+
+
+def mixed_cell(
+    problem: Plugin, pod: Stop, dual: str, cone: Stop, primal: str, validation: ParameterSet, *,
+    tolerance: float | None = None, interpolation: float | None = None, solver: str = "piqp", accuracy: float = 1e-8,
+    bounds: bool = False,
+) -> CellQueries:  # fmt: skip
+    """The queries of a cell of the mixed formulation, with strategies by their names."""
+    reduced = ConeStage(problem, Plugin("dual strategy", dual, "{}", "test"), cone)
+    strategy = Plugin("primal strategy", primal, "{}", "test")
+    enrichment = SingleEnrichment(PODStage(problem, pod), reduced, strategy, tolerance)
+    return program_queries(enrichment, interpolation, validation, solver, accuracy, bounds=bounds)
 
 
 def pga_reduction(problem: vibench.Problem, generators: float, **more: Any) -> vibench.Reduction:

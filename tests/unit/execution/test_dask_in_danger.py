@@ -55,9 +55,8 @@ def scheduled(folder: Path, plugins: Path) -> Iterator[tuple[str, subprocess.Pop
 
     with ExitStack() as stack:
         stack.enter_context(log)
-        scheduler = start(
-            "dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)
-        )
+        place = ("--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file))
+        scheduler = start("dask_scheduler", *place, "--no-dashboard")
         until(file.exists)
         yield str(json.loads(file.read_text())["address"]), scheduler, workers
 
@@ -92,9 +91,8 @@ def ended(process: subprocess.Popen[str]) -> list[str]:
     return [line for line in err.splitlines() if "the connection is not authenticated" not in line]
 
 
-def test_a_late_worker_does_what_one_that_dies_leaves(
-    command: str, plugins_folder: Path, waiting: str, tmp_path: Path
-) -> None:
+def test_a_late_worker_does_the_rest(command: str, plugins_folder: Path, waiting: str, tmp_path: Path) -> None:
+    """It replaces one that dies."""
     with scheduled(tmp_path / "cluster", plugins_folder) as (address, _, workers):
         (first,) = workers(1)
         until(lambda: arrived(address) == 1)

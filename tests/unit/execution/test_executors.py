@@ -67,9 +67,8 @@ def forked_dask_workers() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[LocalCluster]:
     """A cluster as somebody might have it, with TCP between its processes."""
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, protocol="tcp", dashboard_address="127.0.0.1:0", silence_logs="CRITICAL"
-    ) as made:
+    options = {"protocol": "tcp", "dashboard_address": "127.0.0.1:0", "silence_logs": "CRITICAL"}
+    with LocalCluster(n_workers=2, threads_per_worker=1, **options) as made:
         yield made
 
 
@@ -200,12 +199,10 @@ def test_wrong_requests_for_dask_are_refused_in_a_line(vibench: Vibench, tmp_pat
     path, there = write_study(tmp_path, wire_study()), "tcp://127.0.0.1:9"
     for options, expected in (
         (("--executor", "dask", "--scheduler", there), f"no dask scheduler answers at '{there}'"),
-        (
-            ("--executor", "dask", "--scheduler", "tls://a:9"),
-            "the scheduler 'tls://a:9' asks for credentials: set distributed.comm.tls of dask",
-        ),
+        (("--executor", "dask", "--scheduler", "tls://a:9"),
+         "the scheduler 'tls://a:9' asks for credentials: set distributed.comm.tls of dask"),
         (("--scheduler", there), f"--scheduler {there} is for --executor dask"),
-    ):
+    ):  # fmt: skip
         done = vibench(tmp_path, "run", path, *options)
         assert done.returncode == 2
         *warnings, line = done.stderr.splitlines()
@@ -288,11 +285,10 @@ def refusal(context: ssl.SSLContext, plain: socket.socket) -> bool:
 
 def test_dask_changes_no_number(vibench: Vibench, tmp_path: Path) -> None:
     study = wire_study(
-        problem=[{"name": "wire", "options": {"nodes": 40}}],
+        problem=[{"name": "wire", "options": {"nodes": 40}}], solvers=["piqp", "osqp", "gives-up"],
         primal=["online-supremizers", "offline-pga"],
-        solvers=["piqp", "osqp", "gives-up"],
         tolerances=[{"pod": [1e-3], "dual": [1e-2], "primal": {"offline-pga": [0.5]}}],
-    )
+    )  # fmt: skip
     path = write_study(tmp_path, study)
     for executor, jobs in (("local", "1"), ("dask", "2")):
         done = vibench(tmp_path, "run", path, "--jobs", jobs, "--executor", executor, "--out", executor, "--fresh")

@@ -27,9 +27,7 @@ def spent(seconds: float) -> Seconds:
     return Seconds(seconds, seconds)
 
 
-def plan_of(
-    seconds: Mapping[str, float], requested: int = 0, store: Any = None
-) -> tuple[OfflinePlan, list[OfflineRepeat]]:
+def plan_of(seconds: Mapping[str, float], requested: int = 0) -> tuple[OfflinePlan, list[OfflineRepeat]]:
     plan = OfflinePlan(None, SimpleNamespace(), requested)  # type: ignore[arg-type]
     for key, cpu in seconds.items():
         plan.note(next(stage for stage in STAGES if stage.key == key), spent(cpu), 1.5 * cpu)

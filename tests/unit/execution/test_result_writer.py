@@ -70,9 +70,7 @@ POD = TRAINED | {"pod_tol", "pod_size"}
 CONE = TRAINED | {"dual", "dual_options", "dual_tol", "dual_size"}
 
 
-def test_histories_of_every_stage_have_names_by_their_dependences(
-    cell: Cell, stages: list[Stage], study: Study
-) -> None:
+def test_histories_of_every_stage_have_names_by_their_axes(cell: Cell, stages: list[Stage], study: Study) -> None:
     for sort, names in (
         (SnapshotStage, TRAINED), (PODStage, POD), (ConeStage, CONE),
         (NestedEnrichment, POD | CONE | {"primal", "primal_options", "primal_tol"}), (EnergyConstants, set()),

@@ -133,11 +133,9 @@ def test_seconds_are_written_once_and_asked_again_for_another_number_of_rounds(w
     assert (again.rounds, again.first) == (4, 0)  # twenty are six blocks of three or four
 
 
-@pytest.mark.parametrize(
-    ("rounds", "sizes"), [(1, [1]), (5, [5]), (6, [3, 3]), (7, [4, 3]), (8, [4, 4]), (10, [4, 3, 3]), (12, [3] * 4)]
-)
-def test_rounds_come_in_passes_and_at_least_two_blocks_where_they_decide(rounds: int, sizes: list[int]) -> None:
-    assert block_sizes(rounds) == sizes
+def test_rounds_come_in_passes_and_at_least_two_blocks_where_they_decide() -> None:
+    sizes = {1: [1], 5: [5], 6: [3, 3], 7: [4, 3], 8: [4, 4], 10: [4, 3, 3], 12: [3] * 4}
+    assert {rounds: block_sizes(rounds) for rounds in sizes} == sizes
 
 
 def test_rounds_end_for_the_cells_whose_comparisons_are_decided(writer: ResultWriter) -> None:

@@ -65,16 +65,6 @@ def test_beyond_the_threshold_the_totals_change_sides(off_a: float, on_a: float,
     assert sign * advantage(0.99 * found.number) < 0.0
 
 
-@given(seconds, seconds, seconds, seconds)
-def test_the_two_ways_exchanged_turn_from_into_until(off_a: float, on_a: float, off_b: float, on_b: float) -> None:
-    assume((off_a, on_a) != (off_b, on_b))
-    one, other = break_even(off_a, on_a, off_b, on_b), break_even(off_b, on_b, off_a, on_a)
-    opposite = {Meaning.FROM: Meaning.UNTIL, Meaning.NEVER: Meaning.AT_ONCE}
-    opposite |= {second: first for first, second in opposite.items()}
-    assert other.meaning is opposite[one.meaning]
-    assert other.number == one.number
-
-
 def cell(primal: str, kind: str, **columns: Any) -> dict[str, Any]:
     times = {"offline_s": 10.0, "online_s": 0.1, "hf_setup_s": 4.0, "hf_s": 2.0}
     times |= {"offline_snapshots_s": 6.0, "offline_pod_s": 1.0, "offline_cone_s": 1.0}
@@ -88,11 +78,8 @@ def cell(primal: str, kind: str, **columns: Any) -> dict[str, Any]:
 def rounds(cells: Iterable[Mapping[str, Any]], count: int = 12) -> list[dict[str, Any]]:
     """Rounds without any noise, in blocks of four."""
     return [
-        {
-            "cell": cell["cell"], "round": k, "block": f"block {k // 4}", "total_s": cell["online_s"],
-            "hf_s": cell["hf_s"],
-        }
-        | {"pace": 1.0}
+        {"cell": cell["cell"], "round": k, "block": f"block {k // 4}", "pace": 1.0}
+        | {"total_s": cell["online_s"], "hf_s": cell["hf_s"]}
         for cell in cells
         if cell["online_s"] is not None
         for k in range(count)

@@ -67,7 +67,7 @@ def test_errors_that_differ_by_what_the_solver_makes_of_them_are_ties() -> None:
     assert (winner.cell["cell"], winner.ties) == ("b", ("a",))
 
 
-def test_what_is_not_ok_or_solved_too_loosely_takes_no_part() -> None:
+def test_what_is_not_ok_or_too_loose_takes_no_part_and_constants_exclude_nobody() -> None:
     (found,) = leaderboard(
         cells_of(
             row_of("failed", 1e-9, 1e-9, status="inaccurate"), row_of("loose", 1e-3, 1e-9, solver_share_mean=0.5),
@@ -78,9 +78,6 @@ def test_what_is_not_ok_or_solved_too_loosely_takes_no_part() -> None:
     assert won(found, Criterion.QUERY) == []
     assert won(found, Criterion.ERROR) == [(1e-4, "untimed")]
     assert (found.incomplete, found.loose, found.interpolated, found.inexact) == (1, 1, 1, 1)
-
-
-def test_constants_that_were_not_computed_exclude_nobody() -> None:
     (found,) = leaderboard(cells_of(row_of("a", 1e-3, 0.1, beta_span_min=None)))
     assert won(found, Criterion.QUERY) == [(1e-3, "a")]
 

@@ -43,9 +43,7 @@ def test_names_of_several_problems_stand_side_by_side(journal: ResultsDatabase, 
 
 
 @pytest.mark.parametrize("name", ["status", "mu_2"])
-def test_a_parameter_called_like_a_column_takes_its_place_from_nobody(
-    journal: ResultsDatabase, tmp_path: Path, name: str
-) -> None:
+def test_a_parameter_called_like_a_column_takes_no_place(journal: ResultsDatabase, tmp_path: Path, name: str) -> None:
     write(journal, "disc", (name, "1"))
     table = queries(tmp_path, columns=[name, "mu_1"])
     assert list(table.exact.columns) == [name, "mu_1"]

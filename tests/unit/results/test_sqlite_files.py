@@ -47,9 +47,7 @@ def test_a_lock_is_waited_for_and_named_if_it_is_never_released(database: Result
 
 
 @pytest.mark.parametrize("replaced", [False, True])
-def test_a_file_that_is_gone_is_noticed_at_the_next_commit(
-    replaced: bool, database: ResultsDatabase, tmp_path: Path
-) -> None:
+def test_a_file_that_is_gone_is_noticed_at_a_commit(replaced: bool, database: ResultsDatabase, tmp_path: Path) -> None:
     (tmp_path / "run").rename(tmp_path / "elsewhere")
     if replaced:
         with contextlib.closing(ResultsDatabase(tmp_path / "run", STUDY)) as other:

@@ -68,9 +68,7 @@ def test_a_run_is_found_by_folder_by_file_and_by_name(run: Path, monkeypatch: py
     assert results_file("sample").resolve() == run / FILE
 
 
-def test_what_is_no_results_file_of_this_schema_is_refused(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_results_file_of_this_schema_is_refused(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(RequestError, match=r"no results in '.*nothing'.*results\.sqlite"):
         results_file(str(tmp_path / "nothing"))
     (tmp_path / FILE).write_text("hello")

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from running import Register
-from samples import SampleStore, carry_out, program_queries
+from samples import SampleStore, carry_out, mixed_cell
 
 from vibench.interfaces.problem import MEMBERS
 from vibench.interfaces.strategies import Stop
@@ -19,9 +19,8 @@ from vibench.results.ranking import too_loose
 from vibench.results.schema import STORED
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.formulation import AffineDecomposition
-from vibench.stages.offline import ConeStage, PODStage
+from vibench.stages.offline import PODStage
 from vibench.study.parameter_sets import ParameterSet
 
 OBSTACLE = Plugin("problem", "obstacle", '{"resolution": 200}', "test")
@@ -33,14 +32,9 @@ TOLERANCE = 1e-6
 QUERIES = 3
 
 
-def cell(
-    problem: Plugin, primal: str, interpolation: float | None, tolerance: float | None = None, dual: str = "mcpg"
-) -> CellQueries:
-    enrichment = SingleEnrichment(
-        PODStage(problem, Stop(size=6)), ConeStage(problem, Plugin("dual strategy", dual, "{}", "test"), Stop(size=3)),
-        Plugin("primal strategy", primal, "{}", "test"), tolerance,
-    )  # fmt: skip
-    return program_queries(enrichment, interpolation, ParameterSet("validation", QUERIES, 3), "piqp", 1e-8)
+def cell(problem: Plugin, primal: str, interpolation: float | None, tolerance: float | None = None) -> CellQueries:
+    kinds, validation = (Stop(size=6), "mcpg", Stop(size=3), primal), ParameterSet("validation", QUERIES, 3)
+    return mixed_cell(problem, *kinds, validation, tolerance=tolerance, interpolation=interpolation)
 
 
 CELLS = {

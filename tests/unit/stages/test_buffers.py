@@ -9,7 +9,7 @@ from broken_problems import Declared
 from buffered import buffered
 from numerics import Varying
 from running import without_seconds
-from samples import SampleStore, carry_out, program_queries
+from samples import SampleStore, carry_out, mixed_cell
 
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import Stop
@@ -18,8 +18,6 @@ from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find
 from vibench.stages.base import Row, value_of
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.enrichment import SingleEnrichment
-from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.pictures import PictureStage
 from vibench.study.parameter_sets import ParameterSet
 
@@ -36,15 +34,13 @@ def _registered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Plugin, "create", lambda one: PROBLEMS[one.name]() if one.kind == "problem" else create(one))
 
 
-def plugin(kind: str, name: str) -> Plugin:
-    return Plugin(kind, name, "{}", "of this module")
+def problem(name: str) -> Plugin:
+    return Plugin("problem", name, "{}", "of this module")
 
 
 def cell(name: str, primal: str, interpolation: float | None) -> CellQueries:
-    problem = plugin("problem", name)
-    cone = ConeStage(problem, plugin("dual strategy", "cpg"), Stop(size=2))
-    enrichment = SingleEnrichment(PODStage(problem, Stop(size=2)), cone, plugin("primal strategy", primal), None)
-    return program_queries(enrichment, interpolation, ParameterSet("validation", 4, 1), "piqp", 1e-8)
+    kinds = Stop(size=2), "cpg", Stop(size=2), primal, ParameterSet("validation", 4, 1)
+    return mixed_cell(problem(name), *kinds, interpolation=interpolation)
 
 
 def rows(stage: CellQueries, store: SampleStore) -> list[Row]:
@@ -55,9 +51,9 @@ def rows(stage: CellQueries, store: SampleStore) -> list[Row]:
 
 @pytest.mark.parametrize("primal", ["decorrelated", "online-supremizers"])
 @pytest.mark.parametrize("interpolation", [None, 1e-6], ids=["full", "reduced"])
-@pytest.mark.parametrize("problem", ["wire", "string", "obstacle"])
-def test_reused_arrays_keep_numbers(problem: str, primal: str, interpolation: float | None, store: SampleStore) -> None:
-    plain, other = (rows(cell(name, primal, interpolation), store) for name in (problem, f"{problem}, buffered"))
+@pytest.mark.parametrize("kind", ["wire", "string", "obstacle"])
+def test_reused_arrays_keep_numbers(kind: str, primal: str, interpolation: float | None, store: SampleStore) -> None:
+    plain, other = (rows(cell(name, primal, interpolation), store) for name in (kind, f"{kind}, buffered"))
     assert plain[0]["status"] == "ok"
     for one, same in zip(plain, other, strict=True):
         assert one.keys() == same.keys()
@@ -70,7 +66,7 @@ def test_reused_arrays_keep_numbers(problem: str, primal: str, interpolation: fl
 def test_arrays_that_are_used_again_change_no_picture(store: SampleStore) -> None:
     drawn = []
     for name in ("wire", "wire, buffered"):
-        carry_out(stage := PictureStage(plugin("problem", name)), store)
+        carry_out(stage := PictureStage(problem(name)), store)
         drawn.append(value_of(store, stage))
     for (title, plain), (same, other) in zip(*drawn, strict=True):
         assert title == same

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import SampleStore, carry_out, program_queries
+from samples import SampleStore, carry_out, mixed_cell
 
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import VariationalInequality
@@ -21,8 +21,6 @@ from vibench.stages import cell_queries
 from vibench.stages.assessment import error_columns
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.enrichment import SingleEnrichment
-from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.query import path_before, query_before
 from vibench.study.parameter_sets import ParameterSet
 
@@ -31,11 +29,9 @@ PROBLEM = Plugin("problem", "radial-obstacle", '{"resolution": 200}', "test")
 
 
 def cell(problem: Plugin, solver: str, accuracy: float, dual: str = "cpg", *, bounds: bool = False) -> CellQueries:
-    cone = ConeStage(problem, Plugin("dual strategy", dual, "{}", "test"), Stop(size=3))
-    primal = Plugin("primal strategy", "decorrelated", "{}", "test")
-    enrichment = SingleEnrichment(PODStage(problem, Stop(size=4)), cone, primal, None)
-    validation, interpolation = ParameterSet("validation", 4, 1), 1e-6 if bounds else None
-    return program_queries(enrichment, interpolation, validation, solver, accuracy, bounds=bounds)
+    kinds = Stop(size=4), dual, Stop(size=3), "decorrelated", ParameterSet("validation", 4, 1)
+    interpolation = 1e-6 if bounds else None
+    return mixed_cell(problem, *kinds, interpolation=interpolation, solver=solver, accuracy=accuracy, bounds=bounds)
 
 
 @given(st.integers(0, 10_000), st.integers(1, 12))
@@ -107,9 +103,7 @@ def test_a_query_whose_assessment_fails_costs_itself(tmp_path: Path, monkeypatch
 
 
 @pytest.mark.parametrize("certified", [False, True])
-def test_a_cell_too_large_is_assessed_in_parts(
-    certified: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_large_cell_is_assessed_in_parts(certified: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Factors of as many parameters as fit are held at a time; rows are those of all at once."""
     problem = Plugin("problem", "hertz", '{"resolution": "coarse"}', "test")
     store, stage = SampleStore(tmp_path), cell(problem, "piqp", 1e-8, "mcpg", bounds=certified)

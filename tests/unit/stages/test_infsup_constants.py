@@ -1,14 +1,12 @@
 import numpy as np
 import pytest
-from samples import SampleStore, carry_out, program_queries
+from samples import SampleStore, carry_out, mixed_cell
 
 from vibench.interfaces.strategies import Stop
 from vibench.plugins.plugin import Plugin
 from vibench.stability.infsup import InfSup, inf_sup_full, inf_sup_on
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.enrichment import SingleEnrichment
-from vibench.stages.offline import ConeStage, PODStage
 from vibench.study.parameter_sets import ParameterSet
 
 PROBLEMS = {
@@ -21,12 +19,8 @@ EVERY = pytest.mark.parametrize("problem", list(PROBLEMS))
 
 
 def cell(problem: str, primal: str) -> CellQueries:
-    plugin = PROBLEMS[problem]
-    enrichment = SingleEnrichment(
-        PODStage(plugin, Stop(size=4)), ConeStage(plugin, Plugin("dual strategy", "mcpg", "{}", "test"), Stop(size=6)),
-        Plugin("primal strategy", primal, "{}", "test"), PRIMALS[primal],
-    )  # fmt: skip
-    return program_queries(enrichment, None, ParameterSet("validation", COUNT, 3), "piqp", 1e-8)
+    kinds = Stop(size=4), "mcpg", Stop(size=6), primal, ParameterSet("validation", COUNT, 3)
+    return mixed_cell(PROBLEMS[problem], *kinds, tolerance=PRIMALS[primal])
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import SampleStore, carry_out, program_queries
+from samples import SampleStore, carry_out, mixed_cell
 
 from vibench import timing
 from vibench.arrays import Array
@@ -25,9 +25,9 @@ from vibench.stages import snapshots
 from vibench.stages.assessment import summarise
 from vibench.stages.base import Failed, value_of
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.enrichment import NestedEnrichment, SingleEnrichment
+from vibench.stages.enrichment import NestedEnrichment
 from vibench.stages.infsup_constants import ReferenceConstants
-from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage
+from vibench.stages.offline import ConstraintMatrices, PODStage
 from vibench.stages.snapshots import SnapshotStage, gather, solution_stages
 from vibench.study.parameter_sets import CHUNKS, OWN_TRAINING, ParameterSet, chunk_of
 from vibench.timing import NO_TIME, Seconds
@@ -37,13 +37,8 @@ VALIDATION = ParameterSet("validation", 9, 3)
 
 
 def cell(primal: str, tolerance: float | None, solver: str = "piqp") -> CellQueries:
-    enrichment = SingleEnrichment(
-        PODStage(PROBLEM, Stop(tolerance=1e-2)),
-        ConeStage(PROBLEM, Plugin("dual strategy", "mcpg", "{}", "test"), Stop(tolerance=5e-2)),
-        Plugin("primal strategy", primal, "{}", "test"),
-        tolerance,
-    )
-    return program_queries(enrichment, None, VALIDATION, solver, 1e-8)
+    pod, cone = Stop(tolerance=1e-2), Stop(tolerance=5e-2)
+    return mixed_cell(PROBLEM, pod, "mcpg", cone, primal, VALIDATION, tolerance=tolerance, solver=solver)
 
 
 @pytest.fixture(scope="module")
@@ -162,10 +157,7 @@ def test_rows_of_a_cell(store: SampleStore) -> None:
         parts = ("snapshots", "pod", "cone", "enrichment", "assembly")
         assert rows.cell["offline_s"] == pytest.approx(sum(rows.cell[f"offline_{part}_s"] for part in parts))
         snapshots = sum((store.get(chunk.key).seconds for chunk in solution_stages(PROBLEM, OWN_TRAINING)), NO_TIME)
-        training, validation = (
-            gather(store, solution_stages(PROBLEM, OWN_TRAINING)),
-            gather(store, solution_stages(PROBLEM, VALIDATION)),
-        )
+        training, validation = (gather(store, solution_stages(PROBLEM, one)) for one in (OWN_TRAINING, VALIDATION))
         assert snapshots.cpu == pytest.approx(sum(seconds.cpu for seconds in training.seconds))
         setup = median(seconds.cpu for seconds in (*training.setups, *validation.setups))
         assert rows.cell["offline_snapshots_s"] == pytest.approx(snapshots.cpu + setup)
@@ -239,9 +231,8 @@ def test_the_set_up_and_a_start_without_contact_set_are_no_part_of_the_seconds_o
 def test_the_reference_constants_are_those_of_every_parameter(store: SampleStore) -> None:
     constants = ReferenceConstants(ConstraintMatrices(PROBLEM, VALIDATION)).gather(store)
     mus = PROBLEM.create().validation_set(9, 3)
-    scaled = [
-        c.inf_sup.span / mu[0] ** 2 for c, mu in zip(constants, mus, strict=True) if isinstance(c, Stability)
-    ]  # B = mu_1² times one matrix
+    pairs = zip(constants, mus, strict=True)
+    scaled = [c.inf_sup.span / mu[0] ** 2 for c, mu in pairs if isinstance(c, Stability)]  # B = mu_1² times one matrix
     assert np.allclose(scaled, scaled[0], rtol=1e-9)
     assert scaled[0] > 0.0
     problem = PROBLEM.create()
@@ -314,9 +305,10 @@ def test_means_are_over_the_ok_queries_and_the_worst_status_names_the_cell() -> 
     assert (found["error_u_mean"], found["residual_max"], found["beta_span_min"]) == (None, None, 0.2)
 
 
-@given(
-    st.lists(st.tuples(st.booleans(), st.booleans(), st.booleans(), st.floats(1e-6, 1e6), st.floats(0, 1)), min_size=1)
-)
+QUERIES = st.tuples(st.booleans(), st.booleans(), st.booleans(), st.floats(1e-6, 1e6), st.floats(0, 1))
+
+
+@given(st.lists(QUERIES, min_size=1))
 def test_what_is_zero_is_counted_apart_and_enters_no_mean(drawn: list[tuple[bool, bool, bool, float, float]]) -> None:
     rows = [
         query(

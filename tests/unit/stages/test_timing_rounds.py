@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import SampleStore, carry_out, program_queries
+from samples import SampleStore, carry_out, mixed_cell
 
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
@@ -24,9 +24,7 @@ from vibench.qp.verification import QPSolution
 from vibench.stages import marginal_solutions, timing_rounds
 from vibench.stages.base import Failed
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.marginal_solutions import MarginalSolution, MarginalSolutions, SolutionsBeside, parts_alike
-from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.query import ProgramQuery
 from vibench.stages.snapshots import gather
 from vibench.stages.timing_rounds import TimedCell, TimedRound, TimingRounds
@@ -41,10 +39,8 @@ def cell(
     primal: str = "decorrelated", solver: str = "piqp", interpolation: float | None = None, count: int = VALIDATION,
     accuracy: float = 1e-7,
 ) -> CellQueries:  # fmt: skip
-    cone = ConeStage(PROBLEM, Plugin("dual strategy", "cpg", "{}", "test"), Stop(size=4))
-    strategy = Plugin("primal strategy", primal, "{}", "test")
-    enrichment = SingleEnrichment(PODStage(PROBLEM, Stop(size=4)), cone, strategy, None)
-    return program_queries(enrichment, interpolation, ParameterSet("validation", count, 1), solver, accuracy)
+    kinds = Stop(size=4), "cpg", Stop(size=4), primal, ParameterSet("validation", count, 1)
+    return mixed_cell(PROBLEM, *kinds, interpolation=interpolation, solver=solver, accuracy=accuracy)
 
 
 CELLS = (cell(), cell(solver="osqp"), cell("online-supremizers"), cell(interpolation=1e-6))
@@ -117,9 +113,7 @@ def _in(stage: TimingRounds) -> timing_rounds._Rounds:
     return rounds
 
 
-def test_every_ok_query_alone_is_timed_and_a_long_round_ends_early(
-    store: SampleStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_ok_query_is_timed_and_long_rounds_end_early(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
     fine = (EVERY, (0, 2, 5), EVERY, (3,))
     timed = TimingRounds(CELLS, fine, 8, 0).run(store).value
     for one, numbers in zip(timed, fine, strict=True):
@@ -226,15 +220,12 @@ def test_parts_of_a_pass_have_all_queries_once_and_take_about_as_long(seconds: l
     assert max(sums) - min(sums) <= 2.0 * max(seconds)
 
 
-def test_full_matrices_are_those_of_solutions_assembled_once(
-    store: SampleStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_matrices_are_those_of_solutions(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[float] = []
     reduced: list[Any] = []
     plain, reduce = marginal_solutions.checked_assembly, ReducedModel.reduce
-    monkeypatch.setattr(
-        marginal_solutions, "checked_assembly", lambda problem, mu: (calls.append(float(mu[0])), plain(problem, mu))[1]
-    )
+    noted = lambda problem, mu: (calls.append(float(mu[0])), plain(problem, mu))[1]  # noqa: E731
+    monkeypatch.setattr(marginal_solutions, "checked_assembly", noted)
     monkeypatch.setattr(ReducedModel, "reduce", lambda model, vi: (reduced.append(vi), reduce(model, vi))[1])
     monkeypatch.setattr(timing_rounds, "QUERY_SUBSETS", 1)
     monkeypatch.setattr(timing_rounds, "ASSEMBLY_SECONDS", np.inf)
@@ -291,9 +282,8 @@ def test_certificates_are_a_part_of_queries_and_columns_are_means_medians_and_qu
     assert (own["online_q1_s"], own["online_q3_s"]) == tuple(np.quantile([1.5, 3.5, 2.5, 8.5], (0.25, 0.75)))
     assert own["online_wall_s"] == 3.5
     assert own["slowdown"] == pytest.approx(1.3)
-    queries = timing_rounds.seconds_of_queries(
-        [replace(one, assemble={k: one.assemble[k]}) for k, one in enumerate(rounds)]
-    )
+    apart = [replace(one, assemble={k: one.assemble[k]}) for k, one in enumerate(rounds)]
+    queries = timing_rounds.seconds_of_queries(apart)
     assert queries[2] == {"assemble_s": 0.5, "solve_s": 2.0, "certify_s": None, "total_s": 2.5, "total_wall_s": 3.0}
     assert own["online_certify_s"] is None
     assert set(timing_rounds.seconds_of_cell([])) == set(own) - {"hf_s"}
@@ -341,9 +331,7 @@ def test_a_solver_with_memory_meets_no_program_again_and_none_is_assembled_twice
 
 
 @pytest.mark.parametrize("which", [0, 2])
-def test_answers_to_similar_programs_are_not_timed(
-    which: int, store: SampleStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_answers_to_similar_programs_fail(which: int, store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
     solver = Remembers(digits=1)
     monkeypatch.setattr(registry, "qp_solver", lambda name: {name: solver})
     # which queries a round begins with depends on measured seconds; units of some let the first answer pass

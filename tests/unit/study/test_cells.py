@@ -29,18 +29,14 @@ def cells_of(tmp_path: Path) -> Expand:
     return lambda content: expand(read_study(write_study(tmp_path, content)))
 
 
-def test_the_matrix_is_the_product_of_the_axes_in_their_order_without_repeats(
-    cells_of: Expand,
-) -> None:
+def test_the_matrix_is_the_product_of_the_axes_in_their_order_without_repeats(cells_of: Expand) -> None:
     cells = cells_of(STUDY)
     plain = [cell for cell in cells if cell.primal.name == "decorrelated"]
     assert len(plain) == 2 * 2 * 2  # pod × dual × solvers
     assert len(cells) - len(plain) == 2 * 2 * 2 * 3  # and × primal tolerances
     assert len({cell.key for cell in cells}) == len(cells)
-    few, many = (
-        cells_of(changed(STUDY, "tolerances", 0, "primal", to={"offline-pga": values}))
-        for values in ([0.5], [0.5, 0.4, 0.3, 0.2])
-    )
+    studies = ({"offline-pga": values} for values in ([0.5], [0.5, 0.4, 0.3, 0.2]))
+    few, many = (cells_of(changed(STUDY, "tolerances", 0, "primal", to=given)) for given in studies)
     for cells in (few, many):
         plain = [cell for cell in cells if cell.primal.name == "decorrelated"]
         assert len(plain) == 8
@@ -177,9 +173,8 @@ def test_keys_depend_on_all_members_that_determine_numbers_and_not_on_labels_or_
     assert str(replace(SAMPLE, primal_tol=None)) == "P · D · Q · 0.001, R=4 · piqp 1e-07"
 
 
-def test_code_changes_with_plugins_core_and_solver(
-    monkeypatch: pytest.MonkeyPatch, register: Register, tmp_path: Path
-) -> None:
+def test_code_changes_with_its_parts(monkeypatch: pytest.MonkeyPatch, register: Register, tmp_path: Path) -> None:
+    """Plugins, core and solver."""
     whole = replace(SAMPLE, formulation=FORMULATION)
     for role in ("training", "validation"):
         whole = replace(whole, **{role: replace(getattr(whole, role), sampling=SAMPLING)})

@@ -48,9 +48,8 @@ def test_problems_and_restored_cells_have_sets_of_their_own(tmp_path: Path) -> N
     problems = [{**STUDY["problem"][0], "training": SOBOL, "validation": 5}, {"name": "radial-obstacle"}]
     validation = {"name": "random", "options": {"size": 7, "seed": 4}}
     content = changed(changed(STUDY, "problem", to=problems), "validation", to=validation)
-    found = {
-        (c.problem.name, c.training.label, c.validation.count, c.validation.label) for c in cells_of(content, tmp_path)
-    }
+    cells = cells_of(content, tmp_path)
+    found = {(c.problem.name, c.training.label, c.validation.count, c.validation.label) for c in cells}
     assert found == {("obstacle", "sobol", 5, "own"), ("radial-obstacle", "own", 7, "random")}
     content = changed(changed(STUDY, "training", to=SOBOL), "validation", to={"name": "random", "size": 7, "seed": 4})
     cell = cells_of(content, tmp_path)[0]
@@ -60,9 +59,7 @@ def test_problems_and_restored_cells_have_sets_of_their_own(tmp_path: Path) -> N
     assert (alone.training.label, alone.validation.label) == ("sobol", "random")
 
 
-def test_files_are_beside_the_study_part_of_the_code_regular_and_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_are_beside_the_study_part_of_the_code_and_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir("/")
     (tmp_path / "sets").mkdir()
     file = tmp_path / "sets" / "points.csv"
@@ -117,9 +114,7 @@ BAD: dict[str, tuple[tuple[str, Any], list[str]]] = {
         ["'list' for problem 'obstacle': parameter 1 has 'scale' = 1.3, outside the box [0.8, 1.2]"],
     ),
     "twice": (("training", {"name": "list", "points": [[1, 0, 0], [1, 0, 0]]}), ["parameter 1, [1.0, 0.0, 0.0]"]),
-    "infinite": (
-        ("training", {"name": "list", "points": [[float("inf"), 0, 0]]}), ["option 'points'", "expected list"],
-    ),
+    "infinite": (("training", {"name": "list", "points": [[np.inf, 0, 0]]}), ["option 'points'", "expected list"]),
     "no file": (("training", {"name": "file", "path": "no.csv"}), ["no.csv' cannot be read: No such file"]),
     "a folder": (("training", {"name": "file", "path": "."}), ["cannot be read: Is a directory"]),
     "sort of file": (("training", {"name": "file", "path": "text.txt"}), ["is neither a .csv nor a .npy file"]),

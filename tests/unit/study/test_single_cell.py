@@ -11,7 +11,6 @@ from vibench.results import formats
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
 from vibench.study.matrix import expand, only_cell, read_study, study_of_cell
-from vibench.study.spec import Study
 
 
 @pytest.mark.parametrize("name", ["quick", "benefit", "hertz-quadrature", "paper-hertz"])
@@ -21,17 +20,6 @@ def test_a_study_of_one_cell_has_the_same_cell(name: str) -> None:
     for cell in (*cells[:4], *cells[-4:], *cells[:: max(len(cells) // 8, 1)]):
         (again,) = expand(study_of_cell(cell, name))
         assert (again.key, str(again), again.code) == (cell.key, str(cell), cell.code)
-
-
-def test_a_study_of_one_cell_has_its_parameter_sets() -> None:
-    quick = read_study("quick")
-    drawn = {"name": "random", "label": "drawn", "options": {"size": 20, "seed": 3}}
-    sampled = Study(
-        **quick.model_dump() | {"training": ["own", drawn], "validation": drawn | {"options": {"size": 9, "seed": 5}}}
-    )
-    for cell in expand(sampled):
-        (again,) = expand(study_of_cell(cell, "quick"))
-        assert (again.key, str(again), again.validation.count) == (cell.key, str(cell), 9)
 
 
 def test_a_row_is_made_again_from_its_results_file(quick_run: Path, main: Main) -> None:
