@@ -227,21 +227,12 @@ class Criterion(StrEnum):
 
 @dataclass(frozen=True)
 class Winner:
-    """A cell with the smallest value among the cells of its problem whose mean errors are within a band.
-
-    Attributes
-    ----------
-    criterion, value
-        The quantity that is compared, and its value: seconds, or a relative error.
-    cell
-        The whole row of the cells table. The high-fidelity model has the empty key "".
-    ties
-        Other cells that share the place: the 95 % interval of the difference contains 0, or there is no difference.
-    """
+    """A cell with the smallest value among the cells of its problem whose mean errors are within a band."""
 
     criterion: Criterion
-    value: float
-    cell: Row
+    value: float  # seconds, or a relative error
+    cell: Row  # the whole row of the cells table; the high-fidelity model has the empty key ""
+    # Other cells that share the place: the 95 % interval of the difference contains 0, or there is no difference.
     ties: tuple[str, ...] = ()
 
 
@@ -260,28 +251,15 @@ class Band:
 
 @dataclass(frozen=True)
 class Standings:
-    """The leaderboard of one problem.
-
-    Attributes
-    ----------
-    problem, options
-        Label of the problem, and its options as JSON, as in the table of cells.
-    bands
-        Bands of accuracy, from the largest error to the smallest that is reached.
-    cells
-        Number of all cells.
-    unstable
-        Number of cells that take part although β over the span vanishes at a parameter.
-    incomplete, loose, interpolated, inexact
-        Numbers of cells that take no part, by the reason that `excluded` explains.
-    """
+    """The leaderboard of one problem, with its label and options as in the table of cells."""
 
     problem: str
     options: str
-    bands: tuple[Band, ...]
-    cells: int
+    bands: tuple[Band, ...]  # from the largest error to the smallest that is reached
+    cells: int  # number of all cells
+    unstable: int  # number of cells that take part although β over the span vanishes at a parameter
+    # Numbers of cells that take no part, by the reason that `excluded` explains.
     incomplete: int
-    unstable: int
     loose: int
     interpolated: int
     inexact: int
@@ -378,25 +356,11 @@ def cheapest(
 ) -> pd.DataFrame:  # fmt: skip
     """The model with the smallest total costs for a number of queries, for every problem and level of error.
 
-    Parameters
-    ----------
-    cells
-        Rows of the table of cells, of one machine.
-    paired
-        The rounds of these cells.
-    queries
-        Number of queries.
-    errors
-        Errors of the cells by another measure than the larger mean one of u and λ, in their rows or in more.
-    within
-        The largest error that is allowed; by default every power of ten that is reached has a row.
-    certified
-        Bounds of the mean errors, by cell.
+    The cells are those of one machine, and `paired` has their rounds. `errors` are those of the cells by another
+    measure than the larger mean one of u and λ, in their rows or in more. `within` is the largest error allowed; by
+    default every power of ten that is reached has a row. `certified` are bounds of the mean errors, by cell.
 
-    Raises
-    ------
-    RequestError
-        If the number of queries or the error is not positive.
+    Raises a `RequestError` if the number of queries or the error is not positive.
     """
     for what, value in (("number of queries", queries), ("largest error", within)):
         if value is not None and not 0.0 < value < math.inf:

@@ -6,6 +6,7 @@ import contextlib
 import re
 import sqlite3
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import accumulate
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -67,12 +68,8 @@ def _answers(
     if re.search(r'["`;\[\]\'?@$#:\0]|--|/\*', outside.replace("''", "")):
         raise _wrong(expression, "it may hold columns, numbers, operators and texts in single quotes")
     # An unmatched parenthesis would close the one around the expression.
-    depth = 0
-    for sign in outside:
-        depth += (sign == "(") - (sign == ")")
-        if depth < 0:
-            break
-    if depth:
+    depths = [0, *accumulate((sign == "(") - (sign == ")") for sign in outside)]
+    if min(depths) < 0 or depths[-1]:
         raise _wrong(expression, "its parentheses do not match")
 
     # An authoriser, since the expression may come from anybody: SQLite runs LIKE and GLOB as functions, and all others
@@ -150,9 +147,7 @@ def key_of(cell: str, keys: Iterable[str], run: str) -> str:
 
 def short_keys(keys: Iterable[str]) -> int:
     """Number of characters that distinguish the keys of cells, at least four."""
-    least = 4
     different = set(keys)
-    longest = max(map(len, different), default=least)
-    with contextlib.suppress(StopIteration):
-        return next(n for n in range(least, longest) if len({key[:n] for key in different}) == len(different))
-    return longest
+    longest = max(map(len, different), default=4)
+    enough = (n for n in range(4, longest) if len({key[:n] for key in different}) == len(different))
+    return next(enough, longest)

@@ -30,27 +30,13 @@ AXES = (
 
 @dataclass(frozen=True)
 class View:
-    """A table for reading.
-
-    Attributes
-    ----------
-    source
-        The table of the results file that it is made of.
-    columns
-        Its columns, those that matter most first: on a narrow terminal the last ones are left out.
-    headings
-        Columns with headings and places of their own; `None` where names are headings.
-    rows
-        Function from the rows of the source to its rows, in their order.
-    empty
-        Reason why it may have no rows where the source has some.
-    """
+    """A table for reading, made of the table `source` of the results file."""
 
     source: str
-    columns: tuple[str, ...]
-    headings: Mapping[str, Column] | None = None
-    rows: Callable[[pd.DataFrame], pd.DataFrame] = in_order
-    empty: str = ""
+    columns: tuple[str, ...]  # those that matter most first: on a narrow terminal the last ones are left out
+    headings: Mapping[str, Column] | None = None  # columns with headings of their own; `None` where these are the names
+    rows: Callable[[pd.DataFrame], pd.DataFrame] = in_order  # its rows, in their order, from those of the source
+    empty: str = ""  # reason why it may have no rows where the source has some
 
 
 def _views() -> dict[str, View]:
@@ -96,31 +82,16 @@ VIEWS: Mapping[str, View] = _views()
 
 @dataclass(frozen=True)
 class Table:
-    """Selected rows and columns of a table.
+    """Selected rows and columns of a table."""
 
-    Attributes
-    ----------
-    rows
-        The rows, with the columns of the results file.
-    columns, chosen
-        The columns to show, and whether the user chose them.
-    view
-        The view of the whole table.
-    key_length
-        Number of characters that distinguish the keys of the cells of the run.
-    varying
-        Options that distinguish plugins of one name, by the column of the name and the name.
-    parameters
-        Names of the parameters of the problems by their columns, mu_1, mu_2, …
-    """
-
-    rows: pd.DataFrame
-    columns: tuple[str, ...]
-    view: View
-    chosen: bool
-    key_length: int
+    rows: pd.DataFrame  # with the columns of the results file
+    columns: tuple[str, ...]  # to be shown
+    view: View  # of the whole table
+    chosen: bool  # whether the user chose the columns
+    key_length: int  # number of characters that distinguish the keys of the cells of the run
+    # Options that distinguish plugins of one name, by the column of the name and the name.
     varying: Mapping[tuple[str, str], tuple[str, ...]]
-    parameters: Mapping[str, str] = field(default_factory=dict)
+    parameters: Mapping[str, str] = field(default_factory=dict)  # names of parameters by their columns, mu_1, mu_2, …
 
     @property
     def exact(self) -> pd.DataFrame:

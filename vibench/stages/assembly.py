@@ -109,7 +109,9 @@ def _reduced(model: HyperReducedModel, mus: Array, larger: Sequence[VariationalI
         program, factor = reduced.program, reduced.factor
         full = leading_part(larger[k], len(program.f)) if larger else None
         full = full or project(matrices.at(mu), reduced.basis, model.generators)
-        errors.append(_largest_difference(program, full))
+        pairs = [(getattr(program, name), getattr(full, name)) for name in MEMBERS]
+        relative = (np.linalg.norm(one - exact) / (np.linalg.norm(exact) or 1.0) for one, exact in pairs)
+        errors.append(float(max(relative)))
         projected.append(exact_solution(full))
         programs.append(program)
     return ReducedPrograms(tuple(programs), factor, tuple(errors), tuple(projected))
@@ -127,11 +129,6 @@ def _projections(model: ReducedModel, mus: Array) -> list[VariationalInequality]
         known = {name: getattr(programs[0], name) for name in problem.constant if programs}
         programs.append(project(matrices.at(mu), Z, chi, known))
     return programs
-
-
-def _largest_difference(program: VariationalInequality, exact: VariationalInequality) -> float:
-    pairs = [(getattr(program, name), getattr(exact, name)) for name in MEMBERS]
-    return max(float(np.linalg.norm(one - other)) / (float(np.linalg.norm(other)) or 1.0) for one, other in pairs)
 
 
 @dataclass(frozen=True)

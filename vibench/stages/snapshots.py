@@ -52,19 +52,6 @@ class TimedSnapshots(Snapshots):
     bounds: tuple[float, ...] = ()
 
 
-@dataclass
-class _SetUp:
-    """A solver of a problem whose set-up is done, and the seconds of that; `None` before."""
-
-    solver: HighFidelitySolver | None = None
-    seconds: Seconds | None = None
-
-    def done(self, solver: HighFidelitySolver, seconds: Seconds) -> None:
-        # The first chunk of a process does the set-up; the others have none.
-        if self.seconds is None:
-            self.solver, self.seconds = solver, seconds
-
-
 class _WrongProblemError(NumericalError):
     """A problem is not what it declares, whatever its parameter is."""
 
@@ -103,10 +90,8 @@ class _Work:
             raise NumericalError("assemble changes its argument mu: work on a copy")
 
 
-@lru_cache(maxsize=1)
-def _set_up(problem: Problem) -> _SetUp:  # noqa: ARG001
-    """The set-up that the chunks of a problem in one process share."""
-    return _SetUp()
+# The solver of the last problem of this process whose set-up is done, and the seconds of that: its chunks share both.
+_set_up: dict[Problem, tuple[HighFidelitySolver, Seconds]] = {}
 
 
 @dataclass(frozen=True)
@@ -143,8 +128,8 @@ class SnapshotStage(Stage):
 
     def _sweep(self, problem: Problem, store: Store) -> Result:
         first, mus = chunk_of(self.parameters.of(problem), self.chunk)
-        kept = _set_up(problem)
-        work = _Work(problem, kept.solver or HighFidelitySolver(problem), ReferenceAssembly(problem), mus, mus.copy())
+        solver = _set_up[problem][0] if problem in _set_up else HighFidelitySolver(problem)
+        work = _Work(problem, solver, ReferenceAssembly(problem), mus, mus.copy())
         # No solution may depend on what this process has solved before.
         work.solver.forget()
         solutions, seconds = list[HighFidelitySolution](), list[Seconds]()
@@ -169,11 +154,14 @@ class SnapshotStage(Stage):
             u[:, k], lam[:, k] = solution.u, solution.lam
         if solutions:
             beginning, seconds[0] = seconds[0], self._once_started(work, solutions, mus)
-            kept.done(work.solver, beginning.beyond(seconds[0]))
+            # The first chunk of a process does the set-up; the others have none.
+            if problem not in _set_up:
+                _set_up.clear()
+                _set_up[problem] = solver, beginning.beyond(seconds[0])
         self._probe(problem, work.reference)
         work.reference.refuse_rewritten_constants()
         work.refuse_shifted()
-        setups = () if kept.seconds is None else (kept.seconds,)
+        setups = (_set_up[problem][1],) if problem in _set_up else ()
         fallbacks, bounds = (solution.fallback for solution in solutions), self._bounds(problem, mus, u, lam)
         measured = tuple(seconds), setups, tuple(fallbacks), work.reference.fingerprint
         swept = TimedSnapshots(mus, u, lam, *measured, bounds=tuple(bounds), skipped=tuple(skipped))

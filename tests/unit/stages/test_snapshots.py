@@ -139,7 +139,7 @@ def test_a_high_fidelity_solution_is_repeated_next_to_its_parameter(
     visited, plain = list[tuple[float, ...]](), snapshots.checked_assembly
     monkeypatch.setattr(snapshots, "checked_assembly", lambda one, mu: (visited.append(tuple(mu)), plain(one, mu))[1])
     problem = Plugin("problem", "obstacle", '{"resolution": 150}', "repeats")
-    snapshots._set_up.cache_clear()  # with the set-up, beside which a training solution is repeated
+    snapshots._set_up.clear()  # with the set-up, beside which a training solution is repeated
     found = SnapshotStage(problem, ParameterSet(role, 6, 3), 0).run(Store(tmp_path)).value
     repeated = {mu for mu in visited if visited.count(mu) > 1}
     repeated -= {tuple(problem.create().training_set()[0])}  # where the fingerprint is taken
