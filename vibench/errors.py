@@ -165,7 +165,6 @@ def fault_line(fault: ValidationError, root: type[BaseModel], named: Collection[
 
 
 def _model_at(root: type[BaseModel], place: list[str | int]) -> type[BaseModel]:
-    """The model of the table at a place in a file."""
     model = root
     for key in place:
         if key in model.model_fields:

@@ -104,14 +104,11 @@ def median_interval(values: Sequence[float]) -> tuple[float, float]:
     Its ends are order statistics, for any distribution (Conover 1999, section 3.2). Fewer than six values give their
     range, which has a smaller probability.
     """
+    from scipy.stats import binom  # noqa: PLC0415  slow to import
+
     ordered, n = sorted(values), len(values)
-    # Values left out on each side, and the probability that the median is among or below them: a sum of binomial
-    # coefficients over 2^n, in integers because 2^n overflows a float.
-    outside, below, ways, every = 0, 0.0, 1, 2**n
-    while (below := below + ways / every) <= 0.025:
-        ways = ways * (n - outside) // (outside + 1)
-        outside += 1
-    first = max(outside - 1, 0)
+    # The number of values below the median is binomial.
+    first = max(int(binom.ppf(0.025, n, 0.5)) - 1, 0)
     return ordered[first], ordered[n - 1 - first]
 
 

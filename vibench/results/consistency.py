@@ -1,13 +1,10 @@
 """Consistency of recorded results: inequalities in every row of `queries`, and agreement of QP solvers.
 
 A violated inequality is a bug in the linear algebra of vibench. Inf-sup constants grow with the primal space: V_N ≤
-enriched V_N ≤ V, with equality of the last two for per-parameter enrichments. The constant of V is at least that of the
-high-fidelity pair, and a constant over the cone at least that over the span. Error bounds are at least the errors,
-whatever the formulation. Of intervals over the cone, the upper end of the larger constant is compared with the lower
-end of the smaller. A cone with free generators is not in W⁺, and compared with the high-fidelity pair over the span
-alone. The tolerance for round-off is relative to the constant of V, at most the norm of the form.
-
-Solvers agree where ok solutions of the same program are no further apart than their accuracy allows.
+enriched V_N ≤ V, with equality of the last two for per-parameter enrichments. Of intervals over the cone, the upper end
+of the larger constant is compared with the lower end of the smaller. A cone with free generators is not in W⁺, and
+compared with the high-fidelity pair over the span alone. The tolerance for round-off is relative to the constant of V,
+at most the norm of the form. Solvers agree where ok solutions are no further apart than their accuracy allows.
 """
 
 from __future__ import annotations

@@ -1,15 +1,11 @@
 """Seconds of models that were timed in the same rounds: their ratios, and where those of another run would lie.
 
-A *block* is a pass of rounds over all queries, in a process of its own. In every round the queries of all models
-alternate with high-fidelity solutions, so that these meet the machine as the queries do. Within a block the seconds of
-a model are the median over its rounds, each divided by the pace of the round, which is how much slower everything was
-in it; those of a high-fidelity solution are the mean, over all models, of what was measured beside them. Whatever slows
-down a whole round leaves ratios as they are, and what hits one model in one round is an outlier. Blocks are
-independent, and what differs between processes differs between them. The interval of a ratio is that of a mean over
-blocks: Student's, its variance moderated by those of all models of the run (Smyth 2004, "Linear models and empirical
-Bayes methods for assessing differential expression", section 6), since a model has few blocks of its own.
-What else uses the core and its caches during a run changes ratios, too, in all of its blocks alike: the variance of
-`CONDITIONS` is added to what the blocks show.
+Rounds, their blocks and paces are explained in docs/measurement.md. Whatever slows down a whole round leaves ratios as
+they are, and what hits one model in one round is an outlier. Blocks are independent, as what differs between processes
+differs between them. The interval of a ratio is that of a mean over blocks: Student's, its variance moderated by those
+of all models of the run (Smyth 2004, "Linear models and empirical Bayes methods for assessing differential expression",
+section 6), since a model has few blocks of its own. The variance of `CONDITIONS` is added: what else uses the core and
+its caches changes ratios in all blocks alike.
 """
 
 from __future__ import annotations

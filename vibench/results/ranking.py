@@ -268,10 +268,9 @@ class Standings:
 def leaderboard(cells: pd.DataFrame, paired: PairedTiming | None = None) -> tuple[Standings, ...]:
     """The winners of every problem in every band of accuracy, in the order of the cells.
 
-    The cells are those of one run, or of several that one machine measured, since seconds are compared. The
-    high-fidelity model competes for the fastest query. There are no bands where no cell takes part. Who may be as good
-    shares the place, of seconds of a query where their rounds are given. A band in which the same cells win as in the
-    next smaller one is left out.
+    One machine has measured them all, since seconds are compared. The high-fidelity model competes for the fastest
+    query. There are no bands where no cell takes part. Who may be as good shares the place, of seconds of a query where
+    their rounds are given.
     """
     groups = cells.groupby(["problem", "problem_options"], dropna=False, sort=False)
     return tuple(_standings(str(problem), str(options), mine, paired) for (problem, options), mine in groups)

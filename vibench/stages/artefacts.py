@@ -159,7 +159,6 @@ class _Reader:
         }  # fmt: skip
 
     def value(self, described: Any) -> Any:
-        """The value of a description."""
         if not isinstance(described, dict):
             if isinstance(described, list):
                 raise TypeError("a list without its kind")
@@ -212,7 +211,6 @@ class _Reader:
 
 
 def _class(name: str, base: type) -> Any:
-    """The class of a name, from the closed list."""
     named = _classes[name]
     if issubclass(named, Enum) is not (base is Enum):
         raise TypeError(f"{name} is another kind of class")

@@ -118,7 +118,6 @@ def _reduced(model: HyperReducedModel, mus: Array, larger: Sequence[VariationalI
 
 
 def _projections(model: ReducedModel, mus: Array) -> list[VariationalInequality]:
-    """The Galerkin projections at every parameter."""
     matrices, problem = assemblies(model.problem), model.problem
     if model.kind is Kind.PER_PARAMETER:
         bases = model.primal_bases(map(matrices.at, mus))

@@ -185,8 +185,6 @@ def cell_queries(cell: Cell, query_seconds: float) -> CellQueries:
 
 
 class _Queries(Items):
-    """The queries of a cell in progress."""
-
     def __init__(self, stage: CellQueries, store: Store) -> None:
         self._stage, self._store, self._queries = stage, store, stage.queries(store)
         self._problem, self._model = build_problem(stage.problem), self._queries.model
@@ -250,7 +248,6 @@ class _Queries(Items):
         return [row for part in parts for row in self._assess_in_parts({k: solutions[k] for k in part})]
 
     def _assess(self, solutions: Mapping[int, Row]) -> list[Row]:
-        """Error columns of some queries, by their solutions."""
         numbers, mus, programs = list(solutions), self._queries.mus[list(solutions)], self._queries.programs
         compared = self._compared.restrict(numbers)
         constants = [one for k in numbers if isinstance(one := self._stability[k], Stability)]

@@ -158,7 +158,6 @@ class _Rounds(Items):
         return TimedRound(assemble, solve, max(before, self._slowdown), certify, self._beside.seconds(solutions, part))
 
     def _order(self, cell: int, at: int, part: Sequence[int]) -> Sequence[int]:
-        """The queries of a cell in a round."""
         fine = self._stage.queries[cell]
         mine = [k for k in fine if k in part] or [fine[at % len(fine)]]
         # Solutions at a few parameters are scaled to all by the seconds of the sweep. Start elsewhere in every block

@@ -199,9 +199,8 @@ def _combinations(
 ) -> list[_Offline]:
     """Strategies and tolerances of the offline phase, with `None` on each axis that a formulation does not use."""
     pods = [Stop(tolerance=value) for value in table.pod or []] + [Stop(size=value) for value in table.N or []]
-    chosen = product(
-        pods if "pod" in uses else [None], duals if "dual" in uses else [None], primals if "primal" in uses else [None]
-    )
+    axes: Mapping[str, Sequence[Any]] = {"pod": pods, "dual": duals, "primal": primals}
+    chosen = product(*(entries if axis in uses else [None] for axis, entries in axes.items()))
     return [
         (dual, pod, cone, primal, tolerance)
         for pod, dual, primal in chosen
