@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from vibench.cli.main import app
 from vibench.results.schema import KEYS, STORED, TABLES
-from vibench.results.sqlite import FILE, Digests, read_text
+from vibench.results.sqlite import FILE, Digests, text_reader
 from vibench.testing.checks import CheckResult, Verdict
 
 Vibench = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -99,7 +99,7 @@ def execute(folder: Path, *statements: str) -> None:
 
 
 def seal(db: sqlite3.Connection, tables: Collection[str] = ("meta", *STORED)) -> None:
-    db.text_factory = read_text
+    db.text_factory = text_reader()
     for table in {"meta", *STORED}.intersection(tables):
         Digests(db).forget(name=table)
         Digests(db).count(table)

@@ -198,14 +198,9 @@ def set_aside(path: Path) -> None:
     Path(f"{path}-shm").unlink(missing_ok=True)
 
 
-def read_text(stored: bytes) -> str:
-    """A text of a results file, which others may have written: printable, whatever its bytes are."""
-    return printable(stored.decode("utf-8", errors="replace"))
-
-
 def text_reader() -> Callable[[bytes], str]:
-    """`read_text` for one connection, cached: most rows of a table have the same texts."""
-    return lru_cache(maxsize=1 << 16)(read_text)
+    """Makes texts that others may have written printable, cached: most rows of a table have the same texts."""
+    return lru_cache(maxsize=1 << 16)(lambda stored: printable(stored.decode("utf-8", errors="replace")))
 
 
 def parameters_of(path: Path) -> dict[str, list[tuple[str, str]]]:

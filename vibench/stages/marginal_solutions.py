@@ -1,8 +1,4 @@
-"""High-fidelity solutions timed as the sweep over the validation set makes them: the cost of one more of them.
-
-Other processes change the speed of a machine within tenths of a second. Solutions therefore alternate with the queries
-that they are compared with.
-"""
+"""High-fidelity solutions timed as in the sweep over the validation set, alternated with queries."""
 
 from __future__ import annotations
 

@@ -294,9 +294,7 @@ class Study(_Model):
     training: Training = Field(
         default=[SamplingEntry(name=OWN)], description="Training sets: an axis; `own` is that of the problem itself."
     )
-    accuracy: Accuracies = Field(
-        default=[1e-7], description="Relative accuracy prescribed to QP solvers, or a list of accuracies: an axis."
-    )
+    accuracy: Accuracies = Field(default=[1e-7], description="Relative accuracy prescribed to QP solvers: an axis.")
     formulation: Annotated[list[FormulationEntry], MinLen(1)] = Field(
         default_factory=lambda: [FormulationEntry(name=default_formulation())],
         description="Formulations; `mixed` is the program of V_N and the cone. None has axes that it does not use.",
