@@ -1,21 +1,43 @@
-"""The folder of a run: one run at a time, nothing of others, and which cells a larger limit runs again."""
+"""The folder of a run: one run at a time, nothing of others, which cells run again, and columns that name rows."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from samples import cell_row
+from samples import STUDY as FULL_STUDY
+from samples import cell_row, changed, write_study
 
 from vibench.errors import RequestError
-from vibench.execution.recording import LOG, REPORT, claimed, clear, ended_by_smaller_limits, refute
+from vibench.execution.recording import (
+    LOG,
+    REPORT,
+    axis_columns,
+    cell_columns,
+    claimed,
+    clear,
+    ended_by_smaller_limits,
+    labels_of,
+    refute,
+)
 from vibench.execution.supervisor import OUT_OF_MEMORY
+from vibench.interfaces.strategies import Stop
 from vibench.results.database import ResultsDatabase
+from vibench.results.schema import KEYS, STORED
 from vibench.results.sqlite import FILE
 from vibench.stages.assessment import refutation
-from vibench.study.spec import Limits
+from vibench.stages.base import Stage
+from vibench.stages.cell_queries import cell_queries
+from vibench.stages.enrichment import NestedEnrichment
+from vibench.stages.infsup_constants import EnergyConstants
+from vibench.stages.offline import ConeStage, PODStage
+from vibench.stages.snapshots import SnapshotStage
+from vibench.study.cells import Cell
+from vibench.study.matrix import expand, read_study
+from vibench.study.spec import Limits, Study
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4}
 
@@ -90,14 +112,14 @@ def database(tmp_path: Path) -> Iterator[ResultsDatabase]:
     found.close()
 
 
-def test_cells_ended_by_a_limit_of_their_row_are_run_wire_where_it_is_larger(database: ResultsDatabase) -> None:
-    for changed, again in (
+def test_cells_ended_by_a_limit_of_their_row_are_run_again_where_it_is_larger(database: ResultsDatabase) -> None:
+    for limits, again in (
         ({}, set()), ({"query_seconds": 1.0, "cell_seconds": 1.0, "memory_gib": 1.0}, set()),
         ({"query_seconds": 21.0}, {"slow", "both"}), ({"cell_seconds": 601.0}, {"slow", "both"}),
         ({"memory_gib": 9.0, "query_seconds": 1.0}, {"large"}),
         ({"memory_gib": 9.0, "cell_seconds": 601.0}, {"slow", "both", "large"}),
     ):  # fmt: skip
-        assert ended_by_smaller_limits(database, BEFORE.model_copy(update=changed)) == again
+        assert ended_by_smaller_limits(database, BEFORE.model_copy(update=limits)) == again
     larger = BEFORE.model_copy(update={"cell_seconds": 700.0})
     database.keep("limits of after", larger.model_dump_json())
     database.write_cell({"cell": "slow", "study_hash": "after", "status": "timeout"}, [])
@@ -129,3 +151,70 @@ def test_an_error_above_its_bound_and_the_accuracy_of_the_reference_refutes_it()
     assert refutation(row | {"bound_online_u_energy": np.nan})["status"] == "refuted"
     assert refutation(row | {"status": "failed", "bound_online_lambda_natural": 0.5}) == {}
     assert refutation({"status": "ok"}) == {}
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Study:
+    """A study in which every axis has a label of its own."""
+    content = changed(FULL_STUDY, "problem", 0, "label", to="membrane")
+    content = changed(content, "dual", to=[{"name": "mcpg", "label": "widened"}])
+    content = changed(content, "primal", to=[{"name": "offline-pga", "label": "greedy"}])
+    return read_study(write_study(tmp_path, content))
+
+
+@pytest.fixture
+def cell(study: Study) -> Cell:
+    return expand(study)[0]
+
+
+def stages_of(stage: Stage) -> Iterator[Stage]:
+    yield stage
+    for needed in stage.inputs():
+        yield from stages_of(needed)
+
+
+def first(stages: Sequence[Stage], sort: type) -> Stage:
+    return next(stage for stage in stages if type(stage) is sort)
+
+
+@pytest.fixture
+def stages(cell: Cell, study: Study) -> list[Stage]:
+    return list(stages_of(cell_queries(cell, 20.0)))
+
+
+def test_cells_and_sizes_are_named_by_columns(cell: Cell) -> None:
+    columns = cell_columns(cell)
+    assert tuple(columns) == tuple(KEYS)
+    assert columns == {
+        "problem": "membrane", "problem_options": '{"resolution": "coarse"}', "training": "own",
+        "training_options": "{}", "formulation": "mixed", "formulation_options": "{}", "dual": "widened",
+        "dual_options": "{}", "primal": "greedy", "primal_options": "{}", "pod_tol": 1e-2, "pod_size": None,
+        "dual_tol": 1e-1, "dual_size": None, "primal_tol": 0.5, "solver": "piqp",
+        "accuracy": cell.accuracy, "assembly": "full", "bounds": 0, "correction": "none",
+    }  # fmt: skip
+    columns = cell_columns(replace(cell, pod=Stop(size=5), cone=Stop(size=4)))
+    assert [columns[name] for name in ("pod_tol", "pod_size", "dual_tol", "dual_size")] == [None, 5, None, 4]
+
+
+PROBLEM = {"problem", "problem_options"}
+TRAINED = PROBLEM | {"training", "training_options"}
+POD = TRAINED | {"pod_tol", "pod_size"}
+CONE = TRAINED | {"dual", "dual_options", "dual_tol", "dual_size"}
+
+
+def test_histories_of_every_stage_have_names_by_their_axes(cell: Cell, stages: list[Stage], study: Study) -> None:
+    for sort, names in (
+        (SnapshotStage, TRAINED), (PODStage, POD), (ConeStage, CONE),
+        (NestedEnrichment, POD | CONE | {"primal", "primal_options", "primal_tol"}), (EnergyConstants, set()),
+    ):  # fmt: skip
+        columns = axis_columns(first(stages, sort).axes, labels_of([cell]))
+        assert set(columns) == names
+        assert set(columns) <= set(STORED["histories"])
+        of_cell = cell_columns(cell)
+        assert columns == {name: of_cell[name] for name in names}
+    other = replace(cell, labels=("x", "y", "z"), solver="osqp")
+    assert axis_columns(first(stages, PODStage).axes, labels_of([cell, other]))["problem"] == "membrane"
+    labels = labels_of(expand(study))
+    for one in expand(study):
+        for stage in stages_of(cell_queries(one, 20.0)):
+            assert set(axis_columns(stage.axes, labels)) <= set(STORED["histories"])

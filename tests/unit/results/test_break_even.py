@@ -107,7 +107,7 @@ def pairs(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
 EVERY = [cell("none", "none"), cell("varying", "per-parameter", online_s=0.5), cell("fixed", "fixed", offline_s=30.0)]
 
 
-def test_strategies_are_compared_with_the_high_fidelity_model_and_per_parameter_enrichments_with_fixed_ones() -> None:
+def test_enrichments_are_compared_with_the_high_fidelity_model_and_every_pair_of_their_kinds() -> None:
     rows = [row for row in compared(EVERY) if row["primal_a"] == "high-fidelity"]
     assert [row["primal_b"] for row in rows] == ["none", "varying", "fixed"]
     for row in rows:
@@ -118,9 +118,6 @@ def test_strategies_are_compared_with_the_high_fidelity_model_and_per_parameter_
     assert (row["primal_a"], row["primal_b"]) == ("varying", "fixed")
     assert [row[name] for name in ("offline_a_s", "online_a_s", "offline_b_s", "online_b_s")] == [10.0, 0.5, 30.0, 0.1]
     assert row["benefit_threshold"] == pytest.approx((30.0 - 10.0) / (0.5 - 0.1))
-
-
-def test_every_pair_of_kinds_is_compared() -> None:
     cells = [cell(f"v{k}", "per-parameter") for k in range(2)]
     cells += [cell("f", "fixed", primal_tol=tolerance) for tolerance in (0.5, 0.1, 0.01)]
     rows = [row for row in compared(cells) if row["primal_a"] != "high-fidelity"]
@@ -151,7 +148,7 @@ def of_formulations(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [row for row in rows if row["cell_a"] is not None and row["formulation_a"] != row["formulation_b"]]
 
 
-def test_every_formulation_is_compared_with_the_mixed_program() -> None:
+def test_formulations_are_compared_with_the_mixed_program_and_certified_queries_with_certified_ones() -> None:
     cells = [cell("fixed", "fixed"), of("penalty", offline_s=12.0, online_s=0.05), of("local", online_s=0.2)]
     rows = of_formulations(compared(cells))
     assert [(row["formulation_a"], row["formulation_b"]) for row in rows] == [("mixed", "penalty"), ("mixed", "local")]
@@ -159,6 +156,9 @@ def test_every_formulation_is_compared_with_the_mixed_program() -> None:
     assert rows[0]["benefit_threshold"] == pytest.approx((12.0 - 10.0) / (0.1 - 0.05))
     assert [row["meaning"] for row in rows] == ["from", "never"]
     assert {row["formulation_a"] for row in compared(cells) if row["cell_a"] is None} == {"mixed"}
+    cells = [cell("fixed", "fixed", assembly="reduced", bounds=bounds) for bounds in (0, 1)]
+    rows = of_formulations(compared([*cells, of("penalty", assembly="reduced"), of("local", bounds=1)]))
+    assert [(row["bounds_a"], row["formulation_b"]) for row in rows] == [(0, "penalty"), (1, "local")]
 
 
 NO_CONE: Mapping[str, Any] = {"dual": "–", "dual_options": "{}", "dual_tol": None, "dual_size": None}
@@ -186,12 +186,6 @@ def test_a_formulation_is_compared_over_the_axes_that_it_lacks(axis: str) -> Non
 def test_a_formulation_is_compared_with_nothing_unlike(column: str) -> None:
     cells = [cell("fixed", "fixed"), of("penalty", **{column: "other"})]
     assert not of_formulations(compared(cells))
-
-
-def test_certified_queries_of_a_formulation_are_compared_with_certified_ones() -> None:
-    cells = [cell("fixed", "fixed", assembly="reduced", bounds=bounds) for bounds in (0, 1)]
-    rows = of_formulations(compared([*cells, of("penalty", assembly="reduced"), of("local", bounds=1)]))
-    assert [(row["bounds_a"], row["formulation_b"]) for row in rows] == [(0, "penalty"), (1, "local")]
 
 
 def test_formulations_are_compared_with_the_mixed_program_of_another_group_by_the_high_fidelity_model() -> None:
@@ -262,7 +256,7 @@ def test_the_formula_holds_for_the_printed_columns() -> None:
     assert row["threshold_low"] < row["benefit_threshold"] < row["threshold_high"]
 
 
-def test_what_disturbs_a_round_disturbs_both_models() -> None:
+def test_disturbances_of_rounds_and_differences_between_blocks_are_the_same_for_both_models() -> None:
     """Rounds in which everything takes up to four times as long leave the ratio as exact as it is."""
     cells = [cell("varying", "per-parameter", online_s=0.2), cell("fixed", "fixed", online_s=0.100, offline_s=12.0)]
     timings = rounds(cells)
@@ -272,10 +266,6 @@ def test_what_disturbs_a_round_disturbs_both_models() -> None:
     row = the_one(cells, timings)
     assert row["meaning"] == "from"
     assert (row["gain_low"], row["gain_high"]) == pytest.approx((2.0 / OTHER_RUNS, 2.0 * OTHER_RUNS), rel=1e-3)
-
-
-def test_what_differs_between_blocks_is_the_same_for_both_models() -> None:
-    """Ratios are taken within blocks: a later one may have been timed on a machine that was thrice as slow."""
     cells = [cell("varying", "per-parameter", online_s=0.101), cell("fixed", "fixed", online_s=0.100, offline_s=12.0)]
     timings = rounds(cells)
     for row in timings:
@@ -317,7 +307,9 @@ def test_one_block_decides_nothing(count: int, meaning: str) -> None:
     assert (row["benefit_threshold"] is None) == (meaning == "undecided")
 
 
-def test_offline_seconds_are_as_uncertain_as_their_interval(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_offline_seconds_are_as_uncertain_as_their_interval(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Of those that both share nothing is uncertain."""
     cells = [cell("varying", "per-parameter", online_s=0.2), cell("fixed", "fixed", offline_s=12.0)]
     monkeypatch.setattr(paired_timing, "CONDITIONS", 0.0)
@@ -330,10 +322,6 @@ def test_offline_seconds_are_as_uncertain_as_their_interval(monkeypatch: pytest.
     spread = np.hypot(4.0, 2.0) * np.log(1.2) / 1.96
     ends = (unsteady["threshold_low"], unsteady["threshold_high"])
     assert ends == pytest.approx(((2.0 - 1.96 * spread) / 0.1, (2.0 + 1.96 * spread) / 0.1), rel=0.1)
-
-
-def test_shared_offline_phases_cancel(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(paired_timing, "CONDITIONS", 0.0)
     spread = {"offline_low_s": 7.0, "offline_high_s": 9.0}
     cells = [cell("varying", "per-parameter", online_s=0.2), cell("fixed", "fixed")]
     alone = [{**one, **spread, "offline_s": 8.0} for one in cells]  # nothing but what they share

@@ -135,7 +135,7 @@ def test_the_fastest_cells_are_those_of_the_measure(path: Path, main: Main) -> N
     assert (code, out) == (0, "cell\nb\n")
 
 
-def test_what_is_no_measure_is_refused(path: Path, main: Main) -> None:
+def test_no_measure_is_refused_and_a_pair_without_an_error_has_none(path: Path, main: Main) -> None:
     run = str(path.parent)
     assert measures(pd.DataFrame({"output": ["force"]})) == ["solution", "u", "lambda", "output:force"]
     refused(main("show", run, "--table", "benefits", "--error", "output:contact forse"), "did you mean 'output:contact")
@@ -144,9 +144,6 @@ def test_what_is_no_measure_is_refused(path: Path, main: Main) -> None:
     refused(main("show", run, "--table", "benefits", "--within", "0"), "the largest error is 0, expected a positive")
     with pytest.raises(RequestError, match="expected a positive number"):
         within(pd.DataFrame({"error_a": [], "error_b": []}), float("nan"))
-
-
-def test_a_pair_without_an_error_has_none() -> None:
     thresholds = pd.DataFrame({"cell_a": [None, "a"], "cell_b": ["b", "b"]})
     cells = pd.DataFrame({"cell": ["a", "b"]})
     found = with_errors(thresholds, cells, pd.Series([np.nan, 0.5]))

@@ -48,7 +48,7 @@ def test_the_matrix_is_the_product_of_the_axes_in_their_order_without_repeats(ce
     ]
 
 
-def test_accuracies_and_corrections_are_axes(cells_of: Expand) -> None:
+def test_accuracies_and_corrections_are_axes_and_duplicates_merge(cells_of: Expand) -> None:
     cells = cells_of(changed(STUDY, "accuracy", to=[1e-4, 1e-7, 1e-10]))
     alone = cells_of(changed(STUDY, "accuracy", to=1e-4))
     assert len(cells) == 3 * len(alone)
@@ -63,10 +63,6 @@ def test_accuracies_and_corrections_are_axes(cells_of: Expand) -> None:
     assert all(("correction" in cell.definition) == (cell.correction != "none") for cell in cells)
     assert all(Cell.from_definition(cell.definition) == cell for cell in cells)
     assert len({str(cell) for cell in cells}) == len(cells)
-
-
-def test_duplicates_merge(cells_of: Expand) -> None:
-    """Among them a strategy under two labels, defaults that are written out, and a whole number for a float."""
     keys = [cell.key for cell in cells_of(STUDY)]
     obstacle = [{"name": "obstacle", "options": {"resolution": "coarse"} | options} for options in (
         {}, {"length": 1.0}, {"length": 1.0, "load": -1.0}, {"load": -1, "length": 1.0})]  # fmt: skip

@@ -244,15 +244,11 @@ def test_wrong_overrides_are_refused_and_said_to_be_overrides(tmp_path: Path) ->
         assert words in line
 
 
-SCALARS = (
-    st.none().map(lambda _: REMOVE)
-    | st.booleans()
-    | st.integers(-(10**20), 10**20)
-    | st.floats()
-    | st.text(max_size=8)
-    | st.dates()
-    | st.sampled_from(["cpg", "mcpg", "obstacle", "piqp", "decorrelated", "offline-pga", "available", "full", "coarse"])
-)
+WORDS = ["cpg", "mcpg", "obstacle", "piqp", "decorrelated", "offline-pga", "available", "full", "coarse"]
+SCALARS = st.one_of(
+    st.just(REMOVE), st.booleans(), st.integers(-(10**20), 10**20), st.floats(), st.text(max_size=8), st.dates(),
+    st.sampled_from(WORDS),
+)  # fmt: skip
 KEYS = st.text(max_size=6) | st.sampled_from(["pod", "N", "dual", "R", "primal", "name", "label", "options", "limits"])
 VALUES = st.recursive(
     SCALARS.filter(lambda value: value is not REMOVE),
