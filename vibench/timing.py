@@ -18,9 +18,6 @@ import numpy as np
 
 T = TypeVar("T")
 
-# Upper limit of timed runs after one warm-up; the median counts.
-REPEATS = 5
-
 # Seconds after which runs are not repeated; work that takes longer is timed once.
 SLOW = 1.0
 
@@ -77,7 +74,7 @@ def timed(work: Callable[[], T]) -> tuple[T, Seconds]:
 def median_seconds(
     work: Callable[..., T], arguments: Iterable[Any] | None = None, enough: float = SLOW
 ) -> tuple[T, Seconds]:
-    """Result of the first run of some work, and its seconds: one warm-up, then the median of at most `REPEATS` runs.
+    """Result of the first run of some work, and its seconds: one warm-up, then the median of at most five runs.
 
     No run begins after `enough` wall seconds; the warm-up counts if it takes longer than that. Every run gets the next
     of the `arguments`, if any, whose computation is not timed.
@@ -88,7 +85,7 @@ def median_seconds(
     if first.wall > enough:
         return result, first
     runs: list[Seconds] = []
-    while len(runs) < REPEATS and sum(run.wall for run in runs) < enough:
+    while len(runs) < 5 and sum(run.wall for run in runs) < enough:
         runs.append(timed(partial(work, *next(each)))[1])
     return result, median_of(runs)
 

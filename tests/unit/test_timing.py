@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import binom
 
 from vibench import timing
-from vibench.timing import NO_TIME, ONE_THREAD, REPEATS, Calibration, Seconds, median_interval, median_seconds, timed
+from vibench.timing import NO_TIME, ONE_THREAD, Calibration, Seconds, median_interval, median_seconds, timed
 
 
 @pytest.fixture
@@ -64,16 +64,16 @@ def test_repeats_are_timed_until_they_have_taken_enough(clocks: Callable[..., No
     for durations, seconds, count in (
         ([(0.125, 1.25)], Seconds(0.125, 1.25), 1),
         ([(0.9, 0.9), (0.5, 0.5), (0.25, 0.25), (0.25, 0.25)], Seconds(0.25, 0.25), 1 + 3),
-        ([(cpu / 256, wall / 256) for cpu, wall in sixteenths], Seconds(4 / 256, 8 / 256), 1 + REPEATS),
+        ([(cpu / 256, wall / 256) for cpu, wall in sixteenths], Seconds(4 / 256, 8 / 256), 6),
     ):
         clocks(*durations)
         work = Work()
         assert (*median_seconds(work), work.count) == (1, seconds, count)
-    clocks(*[(0.1, 0.1)] * (1 + REPEATS))
+    clocks(*[(0.1, 0.1)] * 6)
     done: list[int] = []
     result, seconds = median_seconds(lambda number: done.append(number) or -number, itertools.count(7))
     assert result == -7
-    assert done == list(range(7, 7 + 1 + REPEATS))
+    assert done == list(range(7, 13))
     assert seconds.cpu == pytest.approx(0.1)
 
 

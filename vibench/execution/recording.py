@@ -12,7 +12,6 @@ from typing import Any
 
 from vibench import provenance
 from vibench.errors import RequestError
-from vibench.execution.supervisor import OUT_OF_MEMORY
 from vibench.files import locked
 from vibench.model.certificates.base import Guarantee
 from vibench.plugins.plugin import Plugin
@@ -21,7 +20,7 @@ from vibench.results.database import ResultsDatabase
 from vibench.results.pictures import picture_rows
 from vibench.results.schema import KEYS
 from vibench.results.show import exported_files
-from vibench.results.sqlite import DAMAGED, FILE, DamagedResultsError, read_meta, set_aside, study_of
+from vibench.results.sqlite import FILE, DamagedResultsError, damaged, read_meta, set_aside, study_of
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Row, Stage, value_of
 from vibench.stages.cell_queries import CellRows
@@ -42,7 +41,7 @@ def claimed(folder: Path) -> Iterator[None]:
     try:
         if folder.exists() and not folder.is_dir():
             raise RequestError(f"output folder '{folder}' is a file")
-        ours = {".lock", FILE + DAMAGED, f"{FILE}{DAMAGED}-wal"}
+        ours = {".lock", damaged(folder / FILE).name, f"{damaged(folder / FILE).name}-wal"}
         if folder.is_dir() and not (folder / FILE).exists() and {path.name for path in folder.iterdir()} - ours:
             raise RequestError(f"output folder '{folder}' is not empty and holds no {FILE}; choose another with --out")
         folder.mkdir(parents=True, exist_ok=True)
@@ -65,7 +64,7 @@ def clear(folder: Path, study: str, note: Callable[[str], None]) -> None:
         meta = read_meta(path) if path.is_file() else {}
     except DamagedResultsError as error:
         set_aside(path)
-        note(f"{error}; it is kept as '{path}{DAMAGED}'")
+        note(f"{error}; it is kept as '{damaged(path)}'")
         meta = {}
     there = study_of(path, meta).get("name") if meta else study
     if there != study:
@@ -81,7 +80,8 @@ def ended_by_smaller_limits(database: ResultsDatabase, limits: Limits) -> set[st
     for cell, study, status, reason in database.ends():
         raised = {name for name, value in limits.model_dump().items() if value > known.get(study, {}).get(name, value)}
         late = status == Status.TIMEOUT and raised & {"query_seconds", "cell_seconds"}
-        if late or (OUT_OF_MEMORY in reason and "memory_gib" in raised):
+        # Workers name this limit in the reason.
+        if late or ("the limit is memory_gib" in reason and "memory_gib" in raised):
             ended.add(cell)
     return ended
 

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 
 from vibench.execution.recording import ResultWriter
-from vibench.results.break_even import FEWEST_ROUNDS, Meaning, compared
+from vibench.results.break_even import FEWEST_ROUNDS, Meaning, compared, scatter
 from vibench.results.paired_timing import PairedTiming
 from vibench.stages import timing_rounds
 from vibench.stages.artefacts import Store
@@ -64,7 +64,7 @@ class OfflinePlan:
         stages = {one.key: one for some in phases for one in some}
         runs = {key: self._runs(stage) for key, stage in stages.items()}
         known = {key: some for key, some in runs.items() if some}
-        deviation = timing_rounds.scatter(known.values())
+        deviation = scatter(known.values())
         for cell, goal in self._cells.items():
             row = self._writer.database.cell(cell.key)
             if row is not None and all(one.key in known for some in goal.offline_stages.values() for one in some):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, NamedTuple
@@ -17,15 +17,13 @@ from vibench.plugins.registry import default_formulation
 from vibench.results.paired_timing import CONDITIONS, DRAWS, PairedTiming
 from vibench.results.schema import KEYS, STORED, Row
 from vibench.study.cells import NO_SUCH_AXIS
+from vibench.timing import Seconds
 
 # Probability left out on each side of a 95 % interval.
 TAIL = 0.025
 
 # Rounds of two blocks; fewer do not show the scatter between blocks, so that nothing is decided.
 FEWEST_ROUNDS = 6
-
-# Standard deviation of the logarithm of offline seconds measured once, where a run repeats no stage.
-SCATTER = 0.2
 
 # Value of `primal_a` where a is the high-fidelity model.
 HIGH_FIDELITY = "high-fidelity"
@@ -227,6 +225,21 @@ def shared_offline(a: Row, b: Row) -> float:
     return float(sum(a[name] for name in (f"offline_{phase}_s" for phase in phases) if a[name] == b[name]))
 
 
+def scatter(runs: Iterable[Sequence[Seconds]]) -> float:
+    """Standard deviation of the logarithm of offline seconds, from the runs of stages timed more than once."""
+    logarithms = [np.log([one.cpu for one in some]) for some in runs if is_repeated(len(some), some[0].cpu)]
+    # Of stages measured once in different runs.
+    if not logarithms:
+        return 0.2
+    squares = sum(float(np.sum((one - one.mean()) ** 2)) for one in logarithms)
+    return float(np.sqrt(squares / sum(len(one) - 1 for one in logarithms)))
+
+
+def is_repeated(times: int, cpu: float) -> bool:
+    # The scatter of a stage below a millisecond says nothing about that of a whole offline phase.
+    return times > 1 and cpu >= 1e-3
+
+
 def offline_factor(deviation: float) -> float:
     """Factor from offline seconds to the end of their 95 % interval; `deviation` is that of their logarithm."""
     return math.exp(1.96 * deviation)
@@ -236,7 +249,7 @@ def offline_draws(cell: Row, shared: float, rng: np.random.Generator) -> Array:
     """Offline seconds (`DRAWS`,) of a cell that other runs might measure; those that are `shared` do not vary."""
     low, high = cell["offline_low_s"], cell["offline_high_s"]
     # The deviation from its 95 % interval, see `offline_factor`.
-    spread = SCATTER if low is None or math.isnan(low) else math.log(high / low) / (2.0 * 1.96)
+    spread = scatter(()) if low is None or math.isnan(low) else math.log(high / low) / (2.0 * 1.96)
     return np.asarray(shared + (cell["offline_s"] - shared) * np.exp(spread * rng.standard_normal(DRAWS)))
 
 

@@ -22,13 +22,13 @@ from vibench.errors import RequestError, StorageError, VibenchError
 from vibench.qp.status import Status
 from vibench.results.schema import KEYS, STORED, VERSION, Column, Row, SqlType, column_of
 from vibench.results.sqlite import (
-    DAMAGED,
     FILE,
     DamagedResultsError,
     DigestError,
     Digests,
     code_of,
     connect,
+    damaged,
     read_meta,
     study_of,
     text_reader,
@@ -366,7 +366,7 @@ def _refuse_other(path: Path, study: Mapping[str, Any]) -> None:
     try:
         meta = read_meta(path) if path.exists() else {}
     except DamagedResultsError as error:
-        raise RequestError(f"{error}; use another --out, or --fresh, which keeps it as {FILE}{DAMAGED}") from None
+        raise RequestError(f"{error}; use another --out, or --fresh, which keeps it as {damaged(path).name}") from None
     if not meta:  # empty where a run was killed before its first transaction
         return
     if meta.get("schema") != str(VERSION):

@@ -134,8 +134,9 @@ class DamagedResultsError(RequestError):
     """A results file that cannot be read: cut off, overwritten, or from a disk that failed."""
 
 
-# Suffix of a damaged database that is kept.
-DAMAGED = ".damaged"
+def damaged(path: Path) -> Path:
+    """Path of a damaged database that is kept."""
+    return Path(f"{path}.damaged")
 
 
 def code_of(error: sqlite3.Error) -> int:
@@ -194,7 +195,7 @@ def set_aside(path: Path) -> None:
     # The log first: a new database must not find it.
     for end in ("-wal", ""):
         with contextlib.suppress(FileNotFoundError):
-            Path(f"{path}{end}").replace(f"{path}{DAMAGED}{end}")
+            Path(f"{path}{end}").replace(f"{damaged(path)}{end}")
     Path(f"{path}-shm").unlink(missing_ok=True)
 
 

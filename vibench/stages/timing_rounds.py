@@ -17,7 +17,7 @@ from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel
 from vibench.offline.assemblies import Assemblies
 from vibench.offline.solution import corrected_in_full
 from vibench.provenance import machine
-from vibench.results.break_even import SCATTER, offline_factor
+from vibench.results.break_even import is_repeated, offline_factor
 from vibench.results.paired_timing import beside, blocks_of, mean_seconds, paces
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Failed, Items, ItemwiseStage, Result, Row, Stage, TimeLimit, build_problem
@@ -346,15 +346,6 @@ class OfflineRepeat(Stage):
         return None if artefact is None else Seconds(*artefact.value[name])
 
 
-def scatter(runs: Iterable[Sequence[Seconds]]) -> float:
-    """Standard deviation of the logarithm of offline seconds, from the stages that were timed more than once."""
-    logarithms = [np.log([one.cpu for one in some]) for some in runs if _is_repeated(len(some), some[0].cpu)]
-    if not logarithms:
-        return SCATTER
-    squares = sum(float(np.sum((one - one.mean()) ** 2)) for one in logarithms)
-    return float(np.sqrt(squares / sum(len(one) - 1 for one in logarithms)))
-
-
 def offline_columns(cell: CellQueries, setup: float, runs: Mapping[str, Sequence[Seconds]], deviation: float) -> Row:
     """The offline columns of a cell from the `runs` of its stages by key, one `setup`, and the `scatter` of one run."""
     columns: Row = {}
@@ -370,14 +361,9 @@ def offline_columns(cell: CellQueries, setup: float, runs: Mapping[str, Sequence
     # the machine; a sum of stages that deviate independently scatters less.
     often = float(np.average(times, weights=seconds)) if sum(seconds) else 1.0
     factor = offline_factor(deviation / float(np.sqrt(often)))
-    repeats = sum(_is_repeated(count, spent) for count, spent in zip(times, seconds, strict=True))
+    repeats = sum(is_repeated(count, spent) for count, spent in zip(times, seconds, strict=True))
     ends = {"offline_low_s": total / factor, "offline_high_s": total * factor}
     return columns | {"offline_s": total, **ends, "offline_repeats": repeats}
-
-
-def _is_repeated(times: int, cpu: float) -> bool:
-    # The scatter of a stage below a millisecond says nothing about that of a whole offline phase.
-    return times > 1 and cpu >= 1e-3
 
 
 def sources(cell: CellQueries) -> Iterator[Stage]:

@@ -23,7 +23,6 @@ from vibench.execution.recording import (
     labels_of,
     refute,
 )
-from vibench.execution.supervisor import OUT_OF_MEMORY
 from vibench.interfaces.strategies import Stop
 from vibench.results.database import ResultsDatabase
 from vibench.results.schema import KEYS, STORED
@@ -92,7 +91,7 @@ BEFORE = Limits(query_seconds=20.0, cell_seconds=600.0, memory_gib=8.0)
 ENDS: dict[str, tuple[str, str, str]] = {
     "done": ("before", "ok", ""),
     "slow": ("before", "timeout", "in cone: stopped after cell_seconds = 600 s"),
-    "large": ("before", "error", f"in POD: {OUT_OF_MEMORY} = 8"),
+    "large": ("before", "error", "in POD: out of memory: the limit is memory_gib = 8"),
     "wrong": ("before", "error", "ArithmeticError: no pivot"),
     "long ago": ("a study without known limits", "timeout", "stopped after query_seconds = 1 s"),
 }

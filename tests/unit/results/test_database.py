@@ -24,7 +24,7 @@ from vibench.results import database as module
 from vibench.results.database import ResultsDatabase
 from vibench.results.read import read_table, results_file
 from vibench.results.schema import STORED, TABLES, VERSION
-from vibench.results.sqlite import DAMAGED, FILE, DamagedResultsError, open_read_only, read_meta, read_rows, set_aside
+from vibench.results.sqlite import FILE, DamagedResultsError, open_read_only, read_meta, read_rows, set_aside
 from vibench.text import LONGEST
 
 
@@ -374,7 +374,7 @@ def test_a_file_set_aside_takes_its_log_along(database: ResultsDatabase, tmp_pat
     for end in ("", "-wal", "-shm"):
         shutil.copyfile(f"{path}{end}", f"{copy}{end}")
     set_aside(copy)
-    assert {path.name for path in copy.parent.iterdir()} == {f"{FILE}{DAMAGED}", f"{FILE}{DAMAGED}-wal"}
+    assert {path.name for path in copy.parent.iterdir()} == {f"{FILE}.damaged", f"{FILE}.damaged-wal"}
     with claimed(copy.parent), contextlib.closing(ResultsDatabase(copy.parent, STUDY)) as anew:
         assert list(anew.rows("cells")) == []
 
