@@ -85,10 +85,9 @@ class Local(Executor):
 class Dask(Executor):
     """The workers of a dask cluster, one job at a time on each.
 
-    They must have the same vibench installed and see the folder of the artefacts under the same path. Another worker
-    repeats the job of a worker that dies, which is safe because stages are pure functions. Without a `scheduler`, a
-    cluster of `slots` processes on this machine is started, which use TLS with temporary credentials. The credentials
-    for a scheduler tls://… come from the configuration of dask. `store` is the folder of the artefacts.
+    They must have the same vibench installed and see the folder of the artefacts, `store`, under the same path. Another
+    worker repeats the job of a worker that dies. Without a `scheduler`, a cluster of `slots` processes on this machine
+    is started, with temporary credentials for TLS; those for a scheduler tls://… come from the configuration of dask.
 
     Raises a `RequestError` if dask cannot be used, does not answer, or has a worker that cannot run the jobs.
     """

@@ -119,11 +119,7 @@ def recorded_cell(run: str, cell: str, places: Mapping[str, str] = {}) -> Record
 
 
 def recorded_study(run: str, cell: str, places: Mapping[str, str] = {}) -> Study:
-    """The study that makes one row of a run again: it has this cell alone.
-
-    Raises a `RequestError` if the prefix fits no cell or several, or the cell cannot be run here: its plugins or
-    options are others.
-    """
+    """The study of one cell of a run alone; a `RequestError` if its plugins are others here, or the prefix is wrong."""
     recorded = _matching(run, cell, places)
     name = str(study_of(recorded.path, read_meta(recorded.path)).get("name"))
     rounds = recorded.row["timing_rounds"]

@@ -1,8 +1,7 @@
 """Stages in worker processes with hard limits: every job has an outcome, even if its process dies or hangs.
 
-A supervisor runs one job at a time, in a worker process for the packages that the job needs, and talks to it through a
-socket. It follows the reports of the worker, kills it when a limit is exceeded, and starts another one. A stage with
-items loses only the current item.
+A supervisor runs one job at a time, in a worker process for the packages that the job needs. It follows the reports of
+the worker, kills it when a limit is exceeded, and starts another one. A stage with items loses only the current item.
 """
 
 from __future__ import annotations

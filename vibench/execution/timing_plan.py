@@ -99,11 +99,10 @@ class _Group:
 class TimingPlan:
     """The groups of a run: the cells that break-even compares, of one problem, cone and pair of tolerances.
 
-    A group is timed whole, even where only some of its cells are new: seconds of different runs are not comparable. It
-    is timed in blocks of rounds; each block is planned when the previous one has ended. A cell whose comparisons are
-    decided takes no part any more.
+    A group is timed whole, even where only some of its cells are new: seconds of different runs are not comparable.
+    Each block of rounds is planned when the previous one has ended, without the cells whose comparisons are decided.
 
-    `goals` are the last stages of the cells that can be timed here. `rounds` is the upper limit of rounds, `fewest` the
+    `goals` are the last stages of the cells that can be timed here, `rounds` is the upper limit of rounds, `fewest` the
     number of rounds of every cell if the limit allows them.
     """
 

@@ -46,8 +46,7 @@ class BreakEven:
 
     `low` and `high` are the ends of the 95 % interval of n*, where seconds were measured in rounds. Where the queries
     are as fast, within a factor of 1.25, no number is claimed. Where it is undecided, `rounds` is how many more of them
-    would decide it at the present scatter, `None` where none would since it is the offline seconds that do not differ
-    by more than theirs.
+    would decide it at the present scatter, `None` where the offline seconds are too close for any to do so.
     """
 
     number: float | None

@@ -20,19 +20,9 @@ import numpy as np
 
 from vibench.errors import RequestError, StorageError, VibenchError
 from vibench.qp.status import Status
+from vibench.results import sqlite
 from vibench.results.schema import KEYS, STORED, VERSION, Column, Row, SqlType, column_of
-from vibench.results.sqlite import (
-    FILE,
-    DamagedResultsError,
-    DigestError,
-    Digests,
-    code_of,
-    connect,
-    damaged,
-    read_meta,
-    study_of,
-    text_reader,
-)
+from vibench.results.sqlite import FILE, DamagedResultsError, DigestError, Digests, damaged, read_meta, study_of
 from vibench.text import LONGEST, brief, printable
 
 
@@ -107,8 +97,8 @@ class ResultsDatabase:
                 _refuse_other(path, study)
             folder.mkdir(parents=True, exist_ok=True)
             self._path = path.absolute()
-            self._db = connect(self._path, "rwc")
-            self._db.text_factory = text_reader()
+            self._db = sqlite.connect(self._path, "rwc")
+            self._db.text_factory = sqlite.text_reader()
             self._digests = Digests(self._db)
             with contextlib.ExitStack() as opened:
                 opened.callback(self.close)
@@ -340,7 +330,7 @@ class ResultsDatabase:
                     remedy = "the same command runs its cells again, with the artefacts that are stored"
                     raise StorageError(f"'{self._path}' was removed or replaced during the run; {remedy}")
         except sqlite3.DatabaseError as error:
-            code = code_of(error)
+            code = sqlite.code_of(error)
             # A full, lost or read-only disk, or a file locked or damaged by another program; the rest is a bug.
             if code not in (
                 sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN,

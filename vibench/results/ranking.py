@@ -122,10 +122,9 @@ def excluded(cells: pd.DataFrame, errors: pd.Series | None = None) -> pd.DataFra
     """Whether a row of the cells table takes no part, for each reason; a row has the first reason that holds.
 
     A query is not ok (`incomplete`); the QP solver makes too large a share of the error (`loose`), or reduced assembly
-    does (`interpolated`); a mean error is above `LARGEST_BAND`, or none is known (`inexact`). All of this was measured
-    in the queries of the cell. That β over the span vanishes at a parameter is no such defect: λ need not be unique
-    there, but mostly is; such cells are marked (`unstable`). `errors` are those of the cells by another measure than
-    the larger one of u and λ.
+    does (`interpolated`); a mean error is above `LARGEST_BAND`, or none is known (`inexact`). That β over the span
+    vanishes at a parameter is no such defect: λ need not be unique there, but mostly is; such cells are marked
+    (`unstable`). `errors` are those by another measure than the larger one of u and λ.
     """
     reasons = {
         "incomplete": cells["status"] != Status.OK,
@@ -272,19 +271,17 @@ def leaderboard(cells: pd.DataFrame, paired: PairedTiming | None = None) -> tupl
     query. There are no bands where no cell takes part. Who may be as good shares the place, of seconds of a query where
     their rounds are given.
     """
-    groups = cells.groupby(["problem", "problem_options"], dropna=False, sort=False)
-    return tuple(_standings(str(problem), str(options), mine, paired) for (problem, options), mine in groups)
-
-
-def _standings(problem: str, options: str, cells: pd.DataFrame, paired: PairedTiming | None) -> Standings:
-    without, errors = excluded(cells), errors_of_solution(cells)
-    rows = cells.assign(**{Criterion.ERROR.column: errors})[~without.any(axis=1)]
-    reached = tuple(
-        Band(error, len(mine), tuple(_winners(cells, mine, smallest, paired)))
-        for error, mine, smallest in bands(rows, errors[rows.index], [criterion.column for criterion in Criterion])
-    )
-    counts = {str(reason): int(count) for reason, count in without.sum().items()}
-    return Standings(problem, options, reached, len(cells), unstable=int(unstable(rows).sum()), **counts)
+    found, columns = list[Standings](), [criterion.column for criterion in Criterion]
+    for (problem, options), mine in cells.groupby(["problem", "problem_options"], dropna=False, sort=False):
+        without, errors = excluded(mine), errors_of_solution(mine)
+        rows = mine.assign(**{Criterion.ERROR.column: errors})[~without.any(axis=1)]
+        reached = tuple(
+            Band(error, len(within), tuple(_winners(mine, within, smallest, paired)))
+            for error, within, smallest in bands(rows, errors[rows.index], columns)
+        )
+        counts = {str(reason): int(count) for reason, count in without.sum().items()} | {"cells": len(mine)}
+        found.append(Standings(str(problem), str(options), reached, unstable=int(unstable(rows).sum()), **counts))
+    return tuple(found)
 
 
 def _winners(cells: pd.DataFrame, rows: pd.DataFrame, smallest: Row, paired: PairedTiming | None) -> Iterator[Winner]:
@@ -391,8 +388,7 @@ def candidates(cells: pd.DataFrame, paired: PairedTiming) -> Iterator[Candidate]
     """The high-fidelity model and the cells of a problem, with total costs at one speed of the machine.
 
     Cells of different groups are timed at different times: seconds of a query are those of a high-fidelity solution,
-    which is timed in all of them, divided by the gain. These solutions are the unit of all totals: draws are of what
-    the ratios to them may be in other runs, whose machine may be faster or slower as a whole.
+    which is timed in all of them, divided by the gain. Draws are of what the ratios to these may be in other runs.
     """
     rng, rows = np.random.default_rng(0), [dict(row) for row in cells.to_dict("records")]
     row = high_fidelity_row(rows[0], cells)

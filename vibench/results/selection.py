@@ -30,9 +30,8 @@ def matching(
     The expression may use columns, numbers, texts in single quotes and operators. It runs on a connection that cannot
     write, under an authoriser that refuses functions, subqueries and other tables.
 
-    `frame` has the rows and the columns of the table, and those `added` to it, which are in no results file: an
-    expression that names one of these runs on a copy in memory. `made` are columns of what is made of the rows, which
-    they do not have themselves. With `cells`, only the rows of these are judged.
+    `frame` has the rows and the columns of the table, and those `added` to it: an expression that names one of these
+    runs on a copy in memory. `made` are columns of what is made of the rows. With `cells`, only their rows are judged.
 
     Raises a `RequestError` if it is no such expression, or names a column that the table does not have.
     """

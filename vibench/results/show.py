@@ -163,11 +163,9 @@ def look_up(
 
     With an error measure (`ranking`) models are compared by it: `best` has its bands, tables of break-even have the
     errors of both models, of which neither is above `largest`. With a number of `queries`, `best` has the model that is
-    the cheapest in total for so many, at every error or within `largest`. `cell` is the key of a cell, or its
-    beginning, to which the rows belong.
+    the cheapest for so many, at every error or within `largest`. Rows belong to `cell`, the beginning of a key.
 
-    Raises a `RequestError` if there is no such table, cell, column or measure, the table does not depend on one, or the
-    condition is none.
+    Raises a `RequestError` if there is no such table, cell, column, measure or condition, or the table depends on none.
     """
     if name not in VIEWS:
         raise unknown_name("table", name, VIEWS)
