@@ -105,7 +105,6 @@ def recorded_cells(run: str, places: Mapping[str, str] = {}) -> list[RecordedCel
 
 
 def _has_program(definition: str) -> bool:
-    """Whether the formulation of a recorded cell has programs."""
     plugin = Plugin(**json.loads(definition)["formulation"]).registered
     return bool(plugin.entries and not plugin.conflict and plugin.load().has_program)
 

@@ -275,7 +275,6 @@ def round_columns(one: TimedRound) -> Row:
 
 
 def _of_all(average: Callable[[Sequence[float]], float], parts: Iterable[Seconds]) -> Array | None:
-    """Average CPU and wall seconds (2,); `None` of none."""
     every = [(seconds.cpu, seconds.wall) for seconds in parts]
     return np.array([average(column) for column in zip(*every, strict=True)]) if every else None
 

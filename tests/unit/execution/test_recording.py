@@ -12,9 +12,8 @@ from samples import STUDY as FULL_STUDY
 from samples import cell_row, changed, write_study
 
 from vibench.errors import RequestError
+from vibench.execution import recording
 from vibench.execution.recording import (
-    LOG,
-    REPORT,
     axis_columns,
     cell_columns,
     claimed,
@@ -67,13 +66,13 @@ def test_what_is_no_folder_of_one_run_is_refused(tmp_path: Path) -> None:
 
 def test_folders_are_cleared_of_what_their_own_run_writes(tmp_path: Path) -> None:
     ResultsDatabase(tmp_path, STUDY).close()
-    (tmp_path / LOG).touch()
+    (tmp_path / recording.LOG).touch()
     with pytest.raises(RequestError, match="holds results of the study 'sample'"):
         clear(tmp_path, "another", pytest.fail)
-    assert (tmp_path / LOG).exists()
+    assert (tmp_path / recording.LOG).exists()
     ResultsDatabase(tmp_path, STUDY).close()
     (tmp_path / "tables").mkdir()
-    made, kept = (LOG, REPORT, "tables/cells.csv"), ("notes.txt", "tables/notes.txt", FILE)
+    made, kept = (recording.LOG, recording.REPORT, "tables/cells.csv"), ("notes.txt", "tables/notes.txt", FILE)
     for name in (*made, "notes.txt", "tables/notes.txt"):
         (tmp_path / name).touch()
     clear(tmp_path, "sample", pytest.fail)
@@ -81,8 +80,7 @@ def test_folders_are_cleared_of_what_their_own_run_writes(tmp_path: Path) -> Non
     (tmp_path / FILE).write_bytes(b"hello")
     notes: list[str] = []
     clear(tmp_path, "sample", notes.append)
-    assert (tmp_path / f"{FILE}.damaged").read_bytes() == b"hello"
-    assert len(notes) == 1
+    assert ((tmp_path / f"{FILE}.damaged").read_bytes(), len(notes)) == (b"hello", 1)
     assert "it is kept as" in notes[0]
 
 

@@ -298,21 +298,18 @@ def test_the_seconds_of_a_nested_enrichment_are_those_of_its_growth(tmp_path_fac
 def test_medians_count_scatter_is_pooled_and_repeats_narrow_intervals() -> None:
     rng = np.random.default_rng(0)
     runs = [[spent(base * float(np.exp(0.3 * rng.standard_normal()))) for _ in range(3)] for base in [0.1, 1.0] * 300]
-    assert scatter(runs) == pytest.approx(0.3, rel=0.05)
-    assert scatter([[spent(1.0)]]) == 0.2
+    assert (scatter(runs), scatter([[spent(1.0)]])) == (pytest.approx(0.3, rel=0.05), 0.2)
     assert scatter([*runs, [spent(1e-5), spent(1e-3)]]) == scatter(runs)  # too short to say anything
     found = columns({"high-fidelity solutions": [1.0, 2.0, 9.0], "cone": [3.0, 5.0]})
     assert (found["offline_snapshots_s"], found["offline_cone_s"]) == (4 * 2.0 + 0.5, 4.0)
-    assert found["offline_s"] == 12.5
-    assert found["offline_repeats"] == 5
+    assert (found["offline_s"], found["offline_repeats"]) == (12.5, 5)
 
     def width(**runs: list[float]) -> float:
         found = columns({name.replace("_", " "): values for name, values in runs.items()})
         return float(np.log(found["offline_high_s"] / found["offline_low_s"]))
 
     once = width(cone=[1.0])
-    assert once == pytest.approx(2.0 * 1.96 * 0.1)
-    assert width(cone=[1.0] * 4) == pytest.approx(once / 2.0)
+    assert (once, width(cone=[1.0] * 4)) == (pytest.approx(2.0 * 1.96 * 0.1), pytest.approx(once / 2.0))
     assert width(cone=[1.0], POD=[1e-6] * 4) == pytest.approx(once, rel=1e-3)
 
 

@@ -307,15 +307,12 @@ def test_one_block_decides_nothing(count: int, meaning: str) -> None:
     assert (row["benefit_threshold"] is None) == (meaning == "undecided")
 
 
-def test_offline_seconds_are_as_uncertain_as_their_interval(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_offline_seconds_are_as_uncertain_as_their_interval(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of those that both share nothing is uncertain."""
     cells = [cell("varying", "per-parameter", online_s=0.2), cell("fixed", "fixed", offline_s=12.0)]
     monkeypatch.setattr(paired_timing, "CONDITIONS", 0.0)
     steady = the_one(cells, rounds(cells))
-    assert steady["threshold_low"] == pytest.approx(20.0)
-    assert steady["threshold_high"] == pytest.approx(20.0)
+    assert (steady["threshold_low"], steady["threshold_high"]) == (pytest.approx(20.0), pytest.approx(20.0))
     wide = [{**one, "offline_low_s": one["offline_s"] / 1.2, "offline_high_s": one["offline_s"] * 1.2} for one in cells]
     unsteady = the_one(wide, rounds(wide))
     # 8 s are shared; the other 4 s of the one and 2 s of the other deviate independently, with this spread.

@@ -13,15 +13,8 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.qp import verification
 from vibench.qp.solve import solve_qp
 from vibench.qp.verification import Slack, allowed, slack
-from vibench.results.consistency import (
-    Recorded,
-    added_up,
-    agreement_sentence,
-    compare,
-    disagreement_rows,
-    solution_row,
-    violations,
-)
+from vibench.results import consistency
+from vibench.results.consistency import Recorded, compare, disagreement_rows, solution_row, violations
 from vibench.results.schema import KEYS, STORED
 
 
@@ -98,12 +91,14 @@ def test_only_ok_answers_of_the_same_reduced_model_are_compared() -> None:
 
 
 def test_the_audit_in_a_line_which_says_nothing_of_one_solver() -> None:
-    assert agreement_sentence(pd.DataFrame(), 1) == ""
+    assert consistency.agreement_sentence(pd.DataFrame(), 1) == ""
     row = {"queries": 5, "difference_max": 1e-4, "solver_a": "x", "solver_b": "y", "flagged": 0}
-    assert "no two solvers" in agreement_sentence(pd.DataFrame(), 2)
+    assert "no two solvers" in consistency.agreement_sentence(pd.DataFrame(), 2)
     agree = "agree in all 5 comparisons: u differs by at most 1.0e-04 (x and y)"
-    assert agree in agreement_sentence(pd.DataFrame([row]), 2)
-    assert "more than the accuracy allows in 2 of 5" in agreement_sentence(pd.DataFrame([row | {"flagged": 2}]), 2)
+    assert agree in consistency.agreement_sentence(pd.DataFrame([row]), 2)
+    assert "more than the accuracy allows in 2 of 5" in consistency.agreement_sentence(
+        pd.DataFrame([row | {"flagged": 2}]), 2
+    )
 
 
 CONSTANTS = [name for name in STORED["queries"] if name.startswith("beta_") and "energy" not in name]
@@ -166,4 +161,4 @@ def test_a_cone_with_free_generators_is_compared_with_the_high_fidelity_pair_ove
 def test_violations_of_parts_are_those_of_the_whole() -> None:
     parts = [rows(beta_cone_lower=0.11), rows(), rows(beta_cone_lower=0.13, effectivity_u=0.5), rows(beta_span=np.nan)]
     whole = {str(one) for one in violations(pd.concat(parts, ignore_index=True), KINDS)}
-    assert {str(one) for one in added_up(one for part in parts for one in violations(part, KINDS))} == whole
+    assert {str(one) for one in consistency.added_up(one for part in parts for one in violations(part, KINDS))} == whole

@@ -36,9 +36,7 @@ def refusal(action: Callable[[], object]) -> str:
     return line
 
 
-def test_cells_and_their_queries_come_back_as_written_after_a_crash_and_in_the_next_run(
-    journal: ResultsDatabase, tmp_path: Path
-) -> None:
+def test_cells_come_back_as_written_after_a_crash_and_in_the_next_run(journal: ResultsDatabase, tmp_path: Path) -> None:
     """What a copy of the folder holds while the journal is open is what a crash would leave."""
     run, rows = tmp_path / "run", (cell_row("c1"), query_rows("c1", 3))
     assert [row for table in TABLES for row in journal.rows(table)] == []
@@ -150,9 +148,7 @@ def test_a_name_that_looks_like_a_uri_is_a_name(tmp_path: Path, monkeypatch: pyt
     assert len(list(tmp_path.iterdir())) == 5
 
 
-def test_rewritten_cells_and_thresholds_replace_earlier_ones(
-    journal: ResultsDatabase,
-) -> None:
+def test_rewritten_cells_and_thresholds_replace_earlier_ones(journal: ResultsDatabase) -> None:
     journal.write_cell(cell_row("c1", status="error"), query_rows("c1", 4))
     journal.write_cell(cell_row("c2"), query_rows("c2", 2))
     journal.write_cell(cell_row("c1"), query_rows("c1", 1, gap=0.25))

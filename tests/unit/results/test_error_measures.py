@@ -107,9 +107,8 @@ def test_only_models_that_are_accurate_enough_are_compared(path: Path, main: Mai
         chosen = ("--error", measure, "--within", str(largest), "--format", "csv", "--columns", "primal_a,primal_b")
         code, out, err = main("show", str(path.parent), "--table", "benefits", *chosen)
         assert (code, err) == (0, "")
-        assert {tuple(line.split(",")) for line in out.splitlines()[1:]} == {
-            (a or "high-fidelity", b) for a, b in pairs
-        }
+        shown = {(a or "high-fidelity", b) for a, b in pairs}
+        assert {tuple(line.split(",")) for line in out.splitlines()[1:]} == shown
 
 
 def test_the_table_shows_selects_and_sorts_by_these_errors(path: Path, main: Main) -> None:

@@ -11,16 +11,9 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
+from vibench.results import paired_timing
 from vibench.results.break_even import TAIL, compared
-from vibench.results.paired_timing import (
-    CONDITIONS,
-    CommonVariance,
-    MeanEstimate,
-    PairedTiming,
-    beside,
-    blocks_of,
-    paces,
-)
+from vibench.results.paired_timing import CONDITIONS, MeanEstimate, PairedTiming
 
 GROUPS, CELLS, ROUNDS, SECONDS = 3, 6, 3, 0.08
 """Groups, cells of each, rounds of a block, and seconds of a cell's part of a round."""
@@ -62,8 +55,8 @@ def measured(
                     for model, (which, level) in enumerate(((one, truth[group, one]), (CELLS, 0.0))):
                         noise = conditions[group, which] + process[which] + 0.02 * rng.standard_t(2.5)
                         seconds[model, one, k] = np.exp(level + noise) * slow[model]
-            pace = paces(seconds.reshape(-1, ROUNDS))
-            high_fidelity = beside(seconds[1], pace)
+            pace = paired_timing.paces(seconds.reshape(-1, ROUNDS))
+            high_fidelity = paired_timing.beside(seconds[1], pace)
             rows += [
                 {"cell": f"{group}-{one}", "block": f"{group}/{block}", "pace": pace[k]}
                 | {"total_s": seconds[0, one, k], "hf_s": high_fidelity * pace[k]}
@@ -159,9 +152,9 @@ def test_intervals_of_break_even_include_the_noise_of_offline_seconds(kind: str,
 
 def test_a_pace_is_how_much_slower_a_round_is_and_nobody_alone_makes_it() -> None:
     seconds = np.array([[1.0, 2.0, 1.0, 1.0], [3.0, 6.0, 3.0, 3.0], [2.0, 4.0, 2.0, 200.0], [5.0, 10.0, 5.0, 5.0]])
-    assert paces(seconds) == pytest.approx([1.0, 2.0, 1.0, 1.0])
+    assert paired_timing.paces(seconds) == pytest.approx([1.0, 2.0, 1.0, 1.0])
     seconds[1, 2] = np.nan  # a round that was lost
-    assert paces(seconds) == pytest.approx([1.0, 2.0, 1.0, 1.0])
+    assert paired_timing.paces(seconds) == pytest.approx([1.0, 2.0, 1.0, 1.0])
 
 
 def test_a_block_has_the_median_of_its_rounds_at_their_pace_and_that_of_their_ratios() -> None:
@@ -169,7 +162,7 @@ def test_a_block_has_the_median_of_its_rounds_at_their_pace_and_that_of_their_ra
         {"block": "b", "total_s": total * pace, "hf_s": hf * pace if hf else None, "pace": pace}
         for total, hf, pace in ((1.0, 4.0, 1.0), (1.0, 4.0, 3.0), (1.0, None, 1.0), (90.0, 9.0, 1.0))
     ]
-    (block,) = blocks_of(rows).values()
+    (block,) = paired_timing.blocks_of(rows).values()
     assert np.exp(block) == pytest.approx([1.0, 0.25])
     assert np.exp(block.online - block.ratio) == pytest.approx(4.0)
 
@@ -177,8 +170,8 @@ def test_a_block_has_the_median_of_its_rounds_at_their_pace_and_that_of_their_ra
 def test_solutions_of_a_block_count_alike_beside_every_model() -> None:
     pace = np.array([1.0, 2.0, 1.0])
     seconds = np.array([[4.0, 8.0, 4.0], [9.0, 18.0, 900.0], [np.nan] * 3])
-    assert beside(seconds, pace) == pytest.approx(6.0)
-    assert np.isnan(beside(seconds[2:], pace))
+    assert paired_timing.beside(seconds, pace) == pytest.approx(6.0)
+    assert np.isnan(paired_timing.beside(seconds[2:], pace))
 
 
 def test_without_other_models_an_interval_is_students_and_other_runs_differ_by_their_conditions() -> None:
@@ -199,12 +192,11 @@ def test_without_other_models_an_interval_is_students_and_other_runs_differ_by_t
 @pytest.mark.parametrize("degrees", [2.0, 8.0])
 def test_the_distribution_of_variances_is_found_again(degrees: float) -> None:
     """Variances are s₀² d₀ / χ² of d₀ degrees of freedom, as in Smyth's model."""
-    rng, common = np.random.default_rng(3), CommonVariance()
+    rng, common = np.random.default_rng(3), paired_timing.CommonVariance()
     for k, variance in enumerate(0.04 * degrees / rng.chisquare(degrees, 4000)):
         common.add(str(k), list(np.sqrt(variance) * rng.standard_normal(4)))
     typical, found = common.prior(10**6)
-    assert typical == pytest.approx(0.04, rel=0.1)
-    assert found == pytest.approx(degrees, rel=0.25)
+    assert (typical, found) == (pytest.approx(0.04, rel=0.1), pytest.approx(degrees, rel=0.25))
     for k in range(4000):  # what is replaced counts once
         common.add(str(k), [0.0, 0.2])
     assert common.prior(10**6)[0] == pytest.approx(0.02 * np.exp(1.27), rel=1e-2)

@@ -30,9 +30,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[tuple[str, Picture]
     return tuple(base.value_of(store, made))
 
 
-def test_solutions_at_corners_and_middle_of_the_parameters_are_shown(
-    drawn: tuple[tuple[str, Picture], ...],
-) -> None:
+def test_solutions_at_corners_and_middle_of_the_parameters_are_shown(drawn: tuple[tuple[str, Picture], ...]) -> None:
     assert [title for title, _ in drawn] == [
         "scale = 0.8, centre_x = -0.05 m, centre_y = -0.05 m",
         "scale = 1, centre_x = 0 m, centre_y = 0 m",

@@ -62,8 +62,7 @@ def run(tmp_path: Path) -> Path:
 
 
 def test_a_run_is_found_by_folder_by_file_and_by_name(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert results_file(str(run)) == run / FILE
-    assert results_file(str(run / FILE)) == run / FILE
+    assert (results_file(str(run)), results_file(str(run / FILE))) == (run / FILE, run / FILE)
     monkeypatch.chdir(run.parent.parent)
     assert results_file("sample").resolve() == run / FILE
 
@@ -87,8 +86,7 @@ def test_tables_are_read_with_all_their_columns_and_nothing_is_changed(run: Path
         assert len(frame) == {"cells": 2, "queries": 4}.get(table, 1)
     with pytest.raises(RequestError, match="cannot be read: no such table"):
         read_table(run / FILE, "cells; DELETE FROM cells")
-    assert (run / FILE).read_bytes() == before
-    assert sorted(path.name for path in run.iterdir()) == names
+    assert ((run / FILE).read_bytes(), sorted(path.name for path in run.iterdir())) == (before, names)
 
 
 def test_everything_is_exported_in_order_with_every_digit(run: Path, tmp_path: Path) -> None:
@@ -163,8 +161,7 @@ def test_the_summary_has_a_line_for_every_cell_and_counts_zero_solutions_where_t
     assert not columns & set(summary(cells(none)).columns)
     shown = summary(cells(none, some | {"solver": "z"}))
     assert columns & set(shown.columns) == {"λ = 0", "error, λ = 0"}
-    assert list(shown["λ = 0"]) == [0, 3]
-    assert shown["error, λ = 0"][1] == 1e-10
+    assert (list(shown["λ = 0"]), shown["error, λ = 0"][1]) == ([0, 3], 1e-10)
 
 
 def rounds(cells: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -405,8 +402,7 @@ def test_names_of_several_problems_stand_side_by_side(journal: ResultsDatabase, 
 def test_a_parameter_called_like_a_column_takes_no_place(journal: ResultsDatabase, tmp_path: Path, name: str) -> None:
     write(journal, "disc", (name, "1"))
     table = queries(tmp_path, columns=[name, "mu_1"])
-    assert list(table.exact.columns) == [name, "mu_1"]
-    assert list(table.readable.columns) == [name, "mu_1"]
+    assert (list(table.exact.columns), list(table.readable.columns)) == ([name, "mu_1"], [name, "mu_1"])
 
 
 def test_results_without_names_have_columns_all_the_same(journal: ResultsDatabase, tmp_path: Path) -> None:
@@ -414,9 +410,7 @@ def test_results_without_names_have_columns_all_the_same(journal: ResultsDatabas
     assert "mu_1" in queries(tmp_path).readable.columns
 
 
-def test_names_are_written_again_where_they_changed_or_refused_in_a_line(
-    journal: ResultsDatabase, tmp_path: Path
-) -> None:
+def test_names_are_written_where_they_changed_or_refused_in_a_line(journal: ResultsDatabase, tmp_path: Path) -> None:
     for names in (NAMES, NAMES, NAMES[::-1]):
         write(journal, "disc", *names)
         assert parameters_of(tmp_path / "run" / FILE) == {"disc": list(names)}

@@ -86,8 +86,7 @@ def wire(interpolation: float | None, problem: Plugin = WIRE) -> CellQueries:
 def test_rows_of_an_interpolated_problem(store: SampleStore) -> None:
     rows = value_of(store, CELLS["obstacle"])
     members = value_of(store, CELLS["obstacle"].built.reduction.decomposition)
-    assert rows.cell["status"] == "ok"
-    assert rows.cell["interpolation_tol"] == TOLERANCE
+    assert (rows.cell["status"], rows.cell["interpolation_tol"]) == ("ok", TOLERANCE)
     assert {name: rows.cell[f"terms_{name}"] for name in "fBg"} == {"f": 7, "B": 1, "g": 1}
     assert rows.cell["terms_A"] == len(members["A"].rows) > 20
     assert rows.cell["interpolation_error"] == members["A"].error == max(m.error for m in members.values())
@@ -201,6 +200,4 @@ def test_a_problem_that_declares_nothing_is_assembled_in_full_and_the_reason_is_
     assert isinstance(stage.built.model(wire_store).reduced, ReducedModel)
     assert {name for name in rows.cell if name.startswith("terms_")} == {"terms_A", "terms_B", "terms_g"}
     for one, other in zip(rows.queries, full.queries, strict=True):
-        assert one["assembly_error"] == 0.0
-        assert one["form"] == "primal"
-        assert one["error_u"] == other["error_u"]
+        assert (one["assembly_error"], one["form"], one["error_u"]) == (0.0, "primal", other["error_u"])

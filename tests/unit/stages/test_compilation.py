@@ -84,8 +84,7 @@ def test_compilers_are_looked_for_by_name_or_missed_in_a_line(tmp_path: Path, mo
     cells = vibench.run(study, tmp_path / "run", progress=False, jobs=1).cells.set_index("formulation")
     assert cells.loc["compiled", "status"] == "unavailable"
     reason = "in formulation: the environment variable CC names the C compiler 'no-such-compiler', which is not found"
-    assert cells.loc["compiled", "reason"] == reason
-    assert cells.loc["mixed", "status"] == "ok"
+    assert (cells.loc["compiled", "reason"], cells.loc["mixed", "status"]) == (reason, "ok")
     monkeypatch.setenv("CC", f"{shutil.which('cc')} -g")
     assert compiler() == [shutil.which("cc"), "-g"]
     monkeypatch.delenv("CC")
@@ -115,8 +114,7 @@ def test_programs_answer_say_what_they_cannot_and_are_repeated_near_by() -> None
     program, strided = small_model().program(), np.array([[0.3, 9.0], [0.5, 9.0], [1.0, 9.0], [7.0, 9.0]])[:, 0]
     for mu, limit in ((strided[:2], 0.25), (strided[1:3], 0.3), (strided[[3, 1]], 0.25)):  # the last one is outside
         found = program(mu)
-        assert found.solver_status == "solved"
-        assert found.x == pytest.approx([limit, 0.0])
+        assert (found.solver_status, found.x) == ("solved", pytest.approx([limit, 0.0]))
         assert found.alpha == pytest.approx([1.0 - limit, 0.0])
         vi = VariationalInequality(np.eye(2), np.array([1.0, 0.0]), LIMITS, limit * np.array([1.0, 4.0]))
         assert verify(vi, found, 1e-9)[0] is Status.OK

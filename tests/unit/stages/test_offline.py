@@ -101,8 +101,7 @@ def test_histories_and_models_are_those_of_the_offline_stages(store: SampleStore
     cone = {h.quantity: h.values for h in store.get(stage.cone.key).histories}
     added = {h.quantity: h.values for h in store.get(stage.key).histories}
     vectors = value_of(store, stage).vectors.shape[1]
-    assert len(pod["error"]) == 126
-    assert len(cone["e_orth"]) + 1 == len(cone["error"])
+    assert (len(pod["error"]), len(cone["e_orth"]) + 1) == (126, len(cone["error"]))
     assert len(added["sigma"]) == len(added["beta_span_min"]) == vectors + 1
     own, full = np.array(added["beta_span_training"]), np.array(added["beta_full_span_training"])
     assert len(own) == len(full) == 125
@@ -150,8 +149,7 @@ def test_rows_of_a_cell(store: SampleStore) -> None:
         ("decorrelated", None, "none"), ("online-supremizers", None, "per-parameter"), ("offline-pga", 0.5, "fixed"),
     ):  # fmt: skip
         rows = value_of(store, cell(primal, tolerance))
-        assert rows.cell["enrichment_kind"] == kind
-        assert rows.cell["status"] == "ok"
+        assert (rows.cell["enrichment_kind"], rows.cell["status"]) == (kind, "ok")
         assert rows.cell["queries"] == rows.cell["queries_ok"] == len(rows.queries) == 9
         parts = ("snapshots", "pod", "cone", "enrichment", "assembly")
         assert rows.cell["offline_s"] == pytest.approx(sum(rows.cell[f"offline_{part}_s"] for part in parts))
@@ -273,8 +271,7 @@ def test_slow_queries_missing_artefacts_and_failed_constants_are_named(
         value_of(SampleStore(tmp_path), stage)
     impatient = replace(cell("decorrelated", None), query_seconds=1e-9)
     rows = impatient.run(store).value
-    assert rows.cell["status"] == "timeout"
-    assert rows.cell["queries_ok"] == 0
+    assert (rows.cell["status"], rows.cell["queries_ok"]) == ("timeout", 0)
     assert "the limit is 1e-09 s" in rows.queries[0]["reason"]
     stage = cell("offline-pga", 0.5)
     first, *_ = stage.reference.energy

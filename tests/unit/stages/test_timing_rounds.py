@@ -90,8 +90,7 @@ def test_order_and_limit_of_a_stage_are_those_of_all_its_cells(tmp_path: Path) -
     assert len(set(first)) > 3
     later = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 4, 8)
     assert [later.place(number * 6)[1] for number in range(4)] == first[8:]
-    assert TimingRounds(CELLS, (EVERY,) * 4, 12, 0).weight == 4
-    assert CELLS[0].weight == 1
+    assert (TimingRounds(CELLS, (EVERY,) * 4, 12, 0).weight, CELLS[0].weight) == (4, 1)
 
 
 def test_a_machine_that_slows_down_halfway_meets_all_alike() -> None:
@@ -280,8 +279,7 @@ def test_certificates_are_a_part_of_queries_and_columns_are_means_medians_and_qu
     assert "hf_s" not in timing_rounds.seconds_of_cell(as_rows(*rounds, hf=None))
     assert (own["online_solve_s"], own["online_assemble_s"]) == (2.5, 0.5)
     assert (own["online_q1_s"], own["online_q3_s"]) == tuple(np.quantile([1.5, 3.5, 2.5, 8.5], (0.25, 0.75)))
-    assert own["online_wall_s"] == 3.5
-    assert own["slowdown"] == pytest.approx(1.3)
+    assert (own["online_wall_s"], own["slowdown"]) == (3.5, pytest.approx(1.3))
     apart = [replace(one, assemble={k: one.assemble[k]}) for k, one in enumerate(rounds)]
     queries = timing_rounds.seconds_of_queries(apart)
     assert queries[2] == {"assemble_s": 0.5, "solve_s": 2.0, "certify_s": None, "total_s": 2.5, "total_wall_s": 3.0}

@@ -41,8 +41,7 @@ def test_correct_studies_are_read_as_written_by_path_or_name(tmp_path: Path, mon
     study = read_study(write_study(tmp_path, changed(STUDY, "solvers", to="available")))
     assert {"piqp", "proxqp", "osqp"} <= set(study.solver_names())
     path = write_study(tmp_path)
-    assert find_study(path) == Path(path)
-    assert find_study("quick").name == "quick.toml"
+    assert (find_study(path), find_study("quick").name) == (Path(path), "quick.toml")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "quick").mkdir()  # what `vibench run --out quick` leaves
     assert read_study("quick").name == "quick"
@@ -112,9 +111,7 @@ WRONG: Mapping[str, tuple[tuple[str | int, ...], Any, tuple[str, ...]]] = {
     "dual tolerance nan": ((*TABLE, "dual"), [float("nan")], ("tolerances.0.dual", "finite")),
     "dual tolerance missing": ((*TABLE, "dual"), REMOVE, ("tolerances.0", "'dual'", "'R'")),
     "dual tolerance and R": ((*TABLE, "R"), [3], ("tolerances.0", "either 'dual'", "'R'")),
-    "dual tolerance of one strategy": (
-        (*TABLE, "dual"), {"cpg": [0.0]}, ("tolerances.0.dual", "cpg", "greater than 0"),
-    ),
+    "dual tolerance of one": ((*TABLE, "dual"), {"cpg": [0.0]}, ("tolerances.0.dual", "cpg", "greater than 0")),
     "dual tolerance of a stranger": ((*TABLE, "dual"), {"mcgp": [0.1]}, ("dual strategy", "did you mean 'mcpg'")),
     "primal tolerance zero": ((*TABLE, "primal"), {"offline-pga": [0.0]}, ("primal.offline-pga.0", "greater than 0")),
     "primal tolerance of a stranger": ((*TABLE, "primal"), {"offline-gpa": [0.5]}, ("did you mean 'offline-pga'",)),
@@ -196,8 +193,7 @@ def test_overrides_replace_whole_axes_and_keep_entries_with_their_name_or_label(
     study = read_study(write_study(tmp_path), given)
     assert [entry.name for entry in study.dual] == ["mcpg"]
     assert [entry.name for entry in study.primal] == ["online-supremizers"]
-    assert study.solver_names() == ["proxqp"]
-    assert study.correction == ["auto"]
+    assert (study.solver_names(), study.correction) == (["proxqp"], ["auto"])
     study = read_study(write_study(tmp_path), {"problem": ["obstacle"]})
     assert study.problem[0].options == {"resolution": "coarse"}
     entries = [{"name": "obstacle", "label": size, "options": {"resolution": size}} for size in ("coarse", "medium")]
