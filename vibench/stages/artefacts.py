@@ -72,17 +72,11 @@ def loads(content: bytes) -> Any:
         text = arrays.pop("structure").tobytes().decode("ascii")
         structure = json.loads(text, object_pairs_hook=_no_duplicates, parse_constant=_refuse)
         return _Reader(arrays).value(structure)
+    # Factorisations are computed again, which may fail with a `VibenchError`.
     except (
-        safetensors.SafetensorError,
-        LookupError,
-        TypeError,
-        ValueError,
-        AttributeError,
-        RecursionError,
-        MemoryError,
-        # Factorisations are computed again, which may fail.
+        safetensors.SafetensorError, LookupError, TypeError, ValueError, AttributeError, RecursionError, MemoryError,
         VibenchError,
-    ) as error:
+    ) as error:  # fmt: skip
         raise DamagedArtefactError(one_line(str(error))) from None
 
 
