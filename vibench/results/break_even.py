@@ -227,7 +227,7 @@ def shared_offline(a: Row, b: Row) -> float:
 def scatter(runs: Iterable[Sequence[Seconds]]) -> float:
     """Standard deviation of the logarithm of offline seconds, from the runs of stages timed more than once."""
     logarithms = [np.log([one.cpu for one in some]) for some in runs if is_repeated(len(some), some[0].cpu)]
-    # Of stages measured once in different runs.
+    # Typical of the seconds of different runs, where nothing was repeated.
     if not logarithms:
         return 0.2
     squares = sum(float(np.sum((one - one.mean()) ** 2)) for one in logarithms)

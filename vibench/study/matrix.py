@@ -246,12 +246,8 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
 def _plugin_entry(plugin: Plugin, label: str, **keys: Any) -> Any:
     given = plugin.registered
     name = given.given if isinstance(given, GivenPlugin) else plugin.name
-    own = (
-        (PluginKind.PROBLEM, ProblemEntry),
-        (PluginKind.SAMPLING, SamplingEntry),
-        (PluginKind.FORMULATION, FormulationEntry),
-    )
-    entry = next((entry for kind, entry in own if kind is plugin.kind), Entry)
+    kinds = {"problem": ProblemEntry, "sampling strategy": SamplingEntry, "formulation": FormulationEntry}
+    entry: type[Entry] = kinds.get(plugin.kind, Entry)
     content = {"name": name, "label": label, "options": json.loads(plugin.options)} | keys
     return entry.model_validate(content).at(json.loads(plugin.places))
 
