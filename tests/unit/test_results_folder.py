@@ -92,18 +92,6 @@ def test_the_first_page_and_the_documentation_are_made_from_the_tables(monkeypat
     assert named == set(sentences.TOPICS)
 
 
-def test_pages_with_effectivities_say_that_the_bound_of_u_is_of_the_sum_with_lambda() -> None:
-    pages = {*PAGES, ROOT / "README.md", ROOT / "vibench/cli/glossary.md", *(ROOT / "docs").rglob("*.md")}
-    silent = []
-    for page in pages:
-        text = page.read_text(encoding="utf-8")
-        printed = re.search(r"[Ee]ffectivit(y|ies)\b.*\d|[Ee]ffectivit(y|ies)\*\*|bound / error|u, energy", text)
-        bare = re.search("decorrelated|without enrichment|regression", text)
-        if printed and bare and not re.search(r"sum (with λ|of both errors)", text):
-            silent.append(page.name)
-    assert silent == []
-
-
 def test_a_page_made_anew_is_as_light(quick_run: Path, tmp_path: Path) -> None:
     folder = tmp_path / "benefit"
     make = [sys.executable, str(SCRIPTS / "study.py"), str(quick_run), str(folder)]

@@ -1,22 +1,30 @@
+"""The obstacle problem of the paper: its map, forms and single entries, and what its solutions converge to."""
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from matplotlib.tri import LinearTriInterpolator, Triangulation
 from numerics import doubled_areas, fitted_rate
+from other_problems import Put
 from skfem import Basis, ElementTriP1, Functional, MeshTri
 from skfem.helpers import dot, grad
+from skfem.models.poisson import laplace, unit_load
 
 from vibench.highfidelity import active_set
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.validation import checked_assembly
+from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
+from vibench_problems.p1_entries import LoadEntries, StiffnessEntries
 
 CENTRE = np.array([1.0, 0.0, 0.0])
 OFF = np.array([1.1, 0.03, -0.02])
+OBSTACLE, SMALL = Obstacle("coarse"), Obstacle(200)
+seeds = st.integers(0, 10_000)
 
-
-@pytest.fixture(scope="module")
-def coarse() -> Obstacle:
-    return Obstacle("coarse")
+TRIANGLE = np.array([[[0.0, 4.0, 0.0], [0.0, 0.0, 3.0]], [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]])
+"""By weight: a triangle with legs 4 and 3, and what makes the legs longer by 1."""
 
 
 def test_sizes_and_resolutions() -> None:
@@ -28,49 +36,45 @@ def test_sizes_and_resolutions() -> None:
     assert problem.W.dim == pytest.approx(467, rel=0.05)
 
 
-def test_parameters_of_the_paper(coarse: Obstacle) -> None:
-    training = coarse.training_set()
+def test_parameters_of_the_paper() -> None:
+    training = OBSTACLE.training_set()
     assert training.shape == (125, 3)
     assert np.array_equal(np.unique(training[:, 0]), np.linspace(0.8, 1.2, 5))
     assert np.allclose(np.unique(training[:, 1]), [-0.05, -0.025, 0.0, 0.025, 0.05])
-    assert coarse.validation_set(64, 3).shape == (64, 3)
+    assert OBSTACLE.validation_set(64, 3).shape == (64, 3)
 
 
 @pytest.mark.parametrize("mu", [CENTRE, OFF])
-def test_the_map_scales_and_shifts_the_disc_and_fixes_the_boundary(coarse: Obstacle, mu: np.ndarray) -> None:
-    points, reference = coarse.points(mu), coarse.mesh.p
-    disc = coarse.disc_nodes
+def test_the_map_scales_and_shifts_the_disc_and_fixes_the_boundary(mu: np.ndarray) -> None:
+    points, reference = OBSTACLE.points(mu), OBSTACLE.mesh.p
+    disc = OBSTACLE.disc_nodes
     assert np.allclose(points[:, disc], mu[0] * reference[:, disc] + mu[1:, None], atol=1e-14)
     boundary = np.abs(reference).max(axis=0) > 0.5 - 1e-9
     assert np.array_equal(points[:, boundary], reference[:, boundary])
-    turned = doubled_areas(points, coarse.mesh.t) * doubled_areas(reference, coarse.mesh.t)
+    turned = doubled_areas(points, OBSTACLE.mesh.t) * doubled_areas(reference, OBSTACLE.mesh.t)
     assert np.all(turned > 0.0)  # no triangle is turned over
 
 
-def test_forms_against_integrals_on_the_mapped_mesh(coarse: Obstacle) -> None:
-    vi = checked_assembly(coarse, OFF)
-    mesh = MeshTri(coarse.points(OFF), coarse.mesh.t)
+def test_constraints_are_integrals_on_the_mapped_mesh() -> None:
+    vi = checked_assembly(OBSTACLE, OFF)
+    mesh = MeshTri(OBSTACLE.points(OFF), OBSTACLE.mesh.t)
     basis = Basis(mesh, ElementTriP1(), intorder=6)
     rng = np.random.default_rng(0)
-    v = np.zeros(coarse.nodes)
-    v[coarse.free] = rng.standard_normal(len(coarse.free))
-    eta = np.zeros(coarse.nodes)
-    eta[coarse.disc_nodes] = rng.random(len(coarse.disc_nodes))
-    energy = Functional(lambda w: dot(grad(w["z"]), grad(w["z"]))).assemble(basis, z=basis.interpolate(v))
-    assert np.isclose(v[coarse.free] @ (vi.A @ v[coarse.free]), energy, rtol=1e-10)
-    work = Functional(lambda w: -w["z"]).assemble(basis, z=basis.interpolate(v))
-    assert np.isclose(vi.f @ v[coarse.free], work, rtol=1e-10)
-    inside = basis.with_elements(np.arange(len(coarse.mesh.subdomains["disc"])))
+    v = np.zeros(OBSTACLE.nodes)
+    v[OBSTACLE.free] = rng.standard_normal(len(OBSTACLE.free))
+    eta = np.zeros(OBSTACLE.nodes)
+    eta[OBSTACLE.disc_nodes] = rng.random(len(OBSTACLE.disc_nodes))
+    inside = basis.with_elements(OBSTACLE.mesh.subdomains["disc"])
     coupling = Functional(lambda w: -w["z"] * w["eta"]).assemble(
         inside, z=inside.interpolate(v), eta=inside.interpolate(eta)
     )
-    assert np.isclose(eta[coarse.disc_nodes] @ (vi.B @ v[coarse.free]), coupling, rtol=1e-10)
+    assert np.isclose(eta[OBSTACLE.disc_nodes] @ (vi.B @ v[OBSTACLE.free]), coupling, rtol=1e-10)
 
     def psi(w):
         return -1.25 * ((w.x[0] - OFF[1]) ** 2 + (w.x[1] - OFF[2]) ** 2) / OFF[0] ** 2
 
     bound = Functional(lambda w: -psi(w) * w["eta"]).assemble(inside, eta=inside.interpolate(eta))
-    assert np.isclose(eta[coarse.disc_nodes] @ vi.g, bound, rtol=1e-10)
+    assert np.isclose(eta[OBSTACLE.disc_nodes] @ vi.g, bound, rtol=1e-10)
 
 
 def test_the_norm_is_that_of_equation_44() -> None:
@@ -104,9 +108,9 @@ def test_the_membrane_lies_on_the_obstacle_where_the_multiplier_is(mu: np.ndarra
     assert np.isclose(weights @ found.lam[deep] / weights.sum(), 5.0 / mu[0] ** 2 + 1.0, rtol=0.05)  # −Δψ + 1
 
 
-def test_options_change_what_they_name(coarse: Obstacle) -> None:
+def test_options_change_what_they_name() -> None:
     loaded = Obstacle("coarse", load=-2.0, obstacle=-2.5)
-    one, two = coarse.assemble(OFF), loaded.assemble(OFF)
+    one, two = OBSTACLE.assemble(OFF), loaded.assemble(OFF)
     assert np.allclose(two.f, 2.0 * one.f)
     assert np.allclose(two.g, 2.0 * one.g)
     u, v = active_set.solve_high_fidelity(one).u, active_set.solve_high_fidelity(two).u
@@ -151,3 +155,83 @@ def test_snapshots_are_tied_by_symmetry_alone(asymmetric: bool, ties: bool) -> N
     norms = np.sort([float(problem.W.norm(solver.solve(mu).lam)) for mu in mirrored])
     assert (np.diff(norms) < 1e-9 * norms[0]).all() == ties
     assert (np.diff(norms) < 1e-9 * norms[0]).any() == ties
+
+
+@given(seeds, st.sampled_from([0, 1, 20, 1000]))
+def test_entries_of_the_obstacle_are_those_of_what_is_assembled(seed: int, count: int) -> None:
+    """Some entries or nearly all, several of them twice, diagonal ones and those at the boundary among them."""
+    rng, A = np.random.default_rng(seed), SMALL.assemble(SMALL.training_set()[0]).A.tocoo()
+    chosen, diagonal = rng.integers(A.nnz, size=count), np.arange(seed % 7, seed % 7 + 3)
+    rows, columns = (np.append(places[chosen], diagonal) for places in A.coords)
+    of_f = rng.integers(SMALL.V.dim, size=count), np.zeros(count, dtype=np.intp)
+    wanted = {"A": (rows, columns), "f": of_f}
+    sample = SMALL.sampler(wanted)
+    for mu in SMALL.parameters.sample(2, seed):
+        found, vi = sample(mu), SMALL.assemble(mu)
+        assert set(found) == set(wanted)
+        for name, (rows, columns) in wanted.items():
+            member = getattr(vi, name)
+            exact = member[rows] if member.ndim == 1 else member.toarray()[rows, columns]
+            assert np.allclose(found[name], exact, rtol=1e-11, atol=1e-14)
+
+
+@given(seeds)
+def test_forms_of_the_obstacle_are_those_of_a_finite_element_library(seed: int) -> None:
+    mu = OBSTACLE.parameters.sample(1, seed)[0]
+    vi, basis = OBSTACLE.assemble(mu), Basis(MeshTri(OBSTACLE.points(mu), OBSTACLE.mesh.t), ElementTriP1())
+    free = OBSTACLE.free
+    assert abs(vi.A - laplace.assemble(basis)[free][:, free]).max() < 1e-13 * abs(vi.A).max()
+    assert np.allclose(vi.f, -unit_load.assemble(basis)[free], rtol=1e-13, atol=0.0)
+    assert vi.A.has_canonical_format
+
+
+@pytest.mark.parametrize("names", [("A",), ("f",), ("A", "f"), ()])
+def test_only_what_is_wanted_is_evaluated(names: tuple[str, ...]) -> None:
+    places = np.array([3, 5]), np.array([3, 5])
+    sample = OBSTACLE.sampler(dict.fromkeys(names, places))
+    assert sorted(sample(OBSTACLE.parameters.lower)) == sorted(names)
+
+
+def test_options_of_the_obstacle_are_in_the_entries() -> None:
+    mu, places = np.array([1.1, 0.02, -0.03]), (np.arange(6), np.zeros(6, np.intp))
+    one, two = (Obstacle(200, load=load, obstacle=load) for load in (-1.0, -3.0))
+    assert np.allclose(two.sampler({"f": places})(mu)["f"], 3.0 * one.sampler({"f": places})(mu)["f"], rtol=1e-14)
+    assert np.allclose(two.affine["g"].at(mu), 3.0 * one.affine["g"].at(mu), rtol=1e-14)
+
+
+@given(seeds)
+def test_declared_sums_of_the_obstacle_are_what_is_assembled(seed: int) -> None:
+    mu = OBSTACLE.parameters.sample(1, seed)[0]
+    vi = OBSTACLE.assemble(mu)
+    assert abs(OBSTACLE.affine["B"].at(mu) - vi.B).max() <= 1e-15 * abs(vi.B).max()
+    assert np.allclose(OBSTACLE.affine["g"].at(mu), vi.g, rtol=1e-14)
+
+
+@pytest.mark.parametrize("weights", [(1.0, 0.0), (1.0, 0.5), (2.0, -1.0)])
+def test_a_right_triangle_by_hand(weights: tuple[float, float]) -> None:
+    """With legs a along x and b along y: ∇φ of the node at the right angle is −(1/a, 1/b), area ab/2."""
+    triangles, (a, b) = np.array([[0], [1], [2]]), weights @ np.array([[4.0, 3.0], [1.0, 1.0]])
+    exact = 0.5 * np.array([
+        [b / a + a / b, -b / a, -a / b],
+        [-b / a, b / a, 0.0],
+        [-a / b, 0.0, a / b],
+    ])  # fmt: skip
+    rows, columns = np.indices((3, 3)).reshape(2, -1)
+    for order in ([0, 1, 2], [1, 2, 0], [0, 2, 1]):  # the last is clockwise
+        found = StiffnessEntries(TRIANGLE, triangles[order], rows, columns)(np.array(weights))
+        assert np.allclose(found.reshape(3, 3), exact)
+        assert np.allclose(LoadEntries(TRIANGLE, triangles[order], np.arange(3))(np.array(weights)), a * b / 6.0)
+
+
+def test_what_has_no_contact_says_so() -> None:
+    problem, mu = Put(cells=20), np.array([0.3, 0.06])
+    assert not problem.has_contact
+    assert problem.contact(mu) is None
+    (B, g), vi = problem.constraint(mu), problem.assemble(mu)
+    assert abs(B - vi.B).max() == 0.0
+    assert np.array_equal(g, vi.g)
+
+
+def test_entries_of_a_problem_that_only_declares_them_are_refused() -> None:
+    with pytest.raises(NotImplementedError, match=r"Hertz declares \[\] and has no sampler"):
+        Hertz("coarse").sampler({"A": (np.zeros(1, np.intp), np.zeros(1, np.intp))})
