@@ -73,37 +73,32 @@ def test_values_are_completed_with_what_there_is_once(register: Register) -> Non
     assert completed("vibench run quick --problem ") == ["mine"]
 
 
-class TestFiles:
-    @pytest.fixture(autouse=True)
-    def _here(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.chdir(tmp_path)
-
-    def test_studies_runs_and_cells_are_those_there(self) -> None:
-        Path("papers").mkdir()
-        for name in ("paper-mine.toml", "paper-notes.txt", "papers/radial.toml"):
-            Path(name).touch()
-        assert completion.studies("paper-") == ["paper-hertz", "paper-mine.toml", "paper-obstacle"]
-        assert completion.studies("papers/") == ["papers/radial.toml"]
-        assert completion.studies(f"{Path.cwd()}/papers/r") == [f"{Path.cwd()}/papers/radial.toml"]
-        assert completion.studies("nowhere/") == []
-        for name in ("mine", "more", "other", "m\x1b[2J", "m\nrm"):  # a prompt would obey the last two
-            Path("runs", name).mkdir(parents=True)
-            if name != "more":
-                Path("runs", name, FILE).touch()
-        assert completed("vibench show ") == ["mine", "other"]
-        assert completed("vibench replay m") == completed("vibench report m") == ["mine"]
-        assert completed("vibench compare mine o") == ["other"]
-
-    def test_cells_are_those_of_the_run_named_before(self, quick_run: Path) -> None:
-        Path("runs").mkdir()
-        Path("runs/quick").symlink_to(quick_run)
-        keys = sorted(read_table(quick_run / FILE, "cells")["cell"])
-        assert completed("vibench replay quick ") == keys
-        assert completed(f"vibench replay quick {keys[0][:6]}") == [keys[0]]
-        assert completed("vibench replay nothing ") == []
-        Path("runs/broken").mkdir()
-        Path("runs/broken", FILE).write_text("no database")
-        assert completed("vibench replay broken ") == []
+def test_studies_runs_and_cells_are_those_there(
+    quick_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("papers").mkdir()
+    for name in ("paper-mine.toml", "paper-notes.txt", "papers/radial.toml"):
+        Path(name).touch()
+    assert completion.studies("paper-") == ["paper-hertz", "paper-mine.toml", "paper-obstacle"]
+    assert completion.studies("papers/") == ["papers/radial.toml"]
+    assert completion.studies(f"{Path.cwd()}/papers/r") == [f"{Path.cwd()}/papers/radial.toml"]
+    assert completion.studies("nowhere/") == []
+    for name in ("mine", "more", "other", "m\x1b[2J", "m\nrm"):  # a prompt would obey the last two
+        Path("runs", name).mkdir(parents=True)
+        if name != "more":
+            Path("runs", name, FILE).touch()
+    assert completed("vibench show ") == ["mine", "other"]
+    assert completed("vibench replay m") == completed("vibench report m") == ["mine"]
+    assert completed("vibench compare mine o") == ["other"]
+    Path("runs/quick").symlink_to(quick_run)
+    keys = sorted(read_table(quick_run / FILE, "cells")["cell"])
+    assert completed("vibench replay quick ") == keys
+    assert completed(f"vibench replay quick {keys[0][:6]}") == [keys[0]]
+    assert completed("vibench replay nothing ") == []
+    Path("runs/broken").mkdir()
+    Path("runs/broken", FILE).write_text("no database")
+    assert completed("vibench replay broken ") == []
 
 
 def test_the_installed_command_completes_for_bash(command: str, tmp_path: Path) -> None:

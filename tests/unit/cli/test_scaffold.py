@@ -140,31 +140,30 @@ def test_nothing_is_left_of_a_package_that_could_not_be_written(main: Main, monk
     assert list(Path.cwd().iterdir()) == []
 
 
-class TestStart:
-    """`vibench new study` and `vibench new pack`: what they write works as it is."""
+def test_a_new_study_has_cells(main: Main) -> None:
+    code, out, _ = main("new", "study", "my-study")
+    assert (code, out.splitlines()[1]) == (0, "  vibench run my-study.toml --dry-run")
+    code, out, _ = main("run", "my-study.toml", "--dry-run")
+    assert (code, out.splitlines()[-1]) == (0, "12 cells")
 
-    def test_a_new_study_has_cells(self, main: Main) -> None:
-        code, out, _ = main("new", "study", "my-study")
-        assert (code, out.splitlines()[1]) == (0, "  vibench run my-study.toml --dry-run")
-        code, out, _ = main("run", "my-study.toml", "--dry-run")
-        assert (code, out.splitlines()[-1]) == (0, "12 cells")
 
-    def test_the_script_of_a_new_pack_writes_one_that_is_imported(self, main: Main) -> None:
-        _, out, _ = main("new", "pack", "my-model")
-        script, check = (line.split()[1:] for line in out.splitlines()[1:])
-        assert check == ["pack", "my-model"]
-        subprocess.run([sys.executable, "-W", "error", *script], check=True, timeout=300)
-        code, out, _ = main("pack", "my-model")
-        assert (code, out.splitlines()[0]) == (0, "my-model")
-        pack = create("problem", "pack", {"path": "my-model"})
-        assert HighFidelitySolver(pack).solve(np.array([4.0, 0.1])).lam.any()
-        assert [output.name for output in pack.outputs] == ["mean deflection"]
+def test_the_script_of_a_new_pack_writes_one_that_is_imported(main: Main) -> None:
+    _, out, _ = main("new", "pack", "my-model")
+    script, check = (line.split()[1:] for line in out.splitlines()[1:])
+    assert check == ["pack", "my-model"]
+    subprocess.run([sys.executable, "-W", "error", *script], check=True, timeout=300)
+    code, out, _ = main("pack", "my-model")
+    assert (code, out.splitlines()[0]) == (0, "my-model")
+    pack = create("problem", "pack", {"path": "my-model"})
+    assert HighFidelitySolver(pack).solve(np.array([4.0, 0.1])).lam.any()
+    assert [output.name for output in pack.outputs] == ["mean deflection"]
 
-    @pytest.mark.parametrize("what", ["study", "pack"])
-    def test_what_is_there_is_kept(self, what: str, main: Main, tmp_path: Path) -> None:
-        into = ("--out", str(tmp_path / "out"))
+
+def test_what_is_there_is_kept(main: Main, tmp_path: Path) -> None:
+    into = ("--out", str(tmp_path / "out"))
+    for what in ("study", "pack"):
         assert main("new", what, "mine", *into)[0] == 0
         refused(main("new", what, "mine", *into), "exists already")
         refused(main("new", what, "Not a name", *into), "lower case letters", f"'my-{what}'")
-        refused(main("new", "study", "quick", *into), "there is a study 'quick' already")
-        assert len(list((tmp_path / "out").iterdir())) == 1
+    refused(main("new", "study", "quick", *into), "there is a study 'quick' already")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"mine", "mine.toml"}

@@ -245,8 +245,6 @@ def test_bibtex_has_balanced_braces_and_no_empty_field(title: str) -> None:
     fields = re.findall(r"^  (\w+) = \{(.*)\},$", bib, re.MULTILINE)
     assert [name for name, _ in fields] == ["title", "author", "year", "url", "note"]  # there is no DOI
     assert all(value for _, value in fields)
-    with pytest.raises(RequestError, match="is no DOI"):
-        Citation("braces", doi="10.5281/zenodo.{1}")
 
 
 def test_a_citation_is_valid_and_its_texts_are_data(site: Path) -> None:
@@ -263,11 +261,9 @@ def test_a_citation_is_valid_and_its_texts_are_data(site: Path) -> None:
     assert "doi" not in of_yaml(without)
     assert "# doi:" in without
     assert "date-released" not in of_yaml(Citation("a", date="2026").cff())  # it would need a day
-    with pytest.raises(RequestError, match="is no DOI, expected such as"):
-        Citation("a", doi="https://doi.org/10.5281/zenodo.1")
-
-
-def test_what_is_no_date_is_refused() -> None:
+    for text in ("https://doi.org/10.5281/zenodo.1", "10.5281/zenodo.{1}"):
+        with pytest.raises(RequestError, match="is no DOI, expected such as"):
+            Citation("a", doi=text)
     for text in ("26", "2026-02-30", "2026-1-1", "2026-11", "0000", "20261126", "٢٠٢٦", "soon"):
         with pytest.raises(RequestError, match="is no date, expected a year or such as 2026-11-26"):
             Citation("a", date=text)

@@ -52,8 +52,8 @@ def draw_solutions(title: str, shown: Sequence[tuple[str, Picture]]) -> Captione
 def draw_field(axes: Axes, picture: Picture, limits: Limits, *, bar: bool = True) -> None:
     """The solution on its mesh: a filled field in the plane, a graph on a line."""
     if len(picture.points) == 1:
-        _graph(axes, picture.points[0], picture.values, picture.name, limits, COLOURS[0], "default")
-        _ends_of_contact(axes, picture)
+        axes.set(ylabel=picture.name)
+        _graph(axes, picture, picture.points[0], picture.values, limits, COLOURS[0], "default")
         return
     mesh = Triangulation(picture.points[0], picture.points[1], picture.triangles.T)
     filled = axes.tripcolor(mesh, picture.values, shading="gouraud", **_colours(limits))
@@ -64,9 +64,8 @@ def draw_field(axes: Axes, picture: Picture, limits: Limits, *, bar: bool = True
 def draw_multiplier(axes: Axes, picture: Picture, limits: Limits, *, bar: bool = True) -> None:
     """The multiplier: a filled field where its points are nodes of the mesh, else points; on a line a graph."""
     if len(picture.positions) == 1:
-        name = picture.multiplier_name
-        _graph(axes, picture.positions[0], picture.multiplier, name, limits, COLOURS[2], "steps-mid")
-        _ends_of_contact(axes, picture)
+        axes.set(ylabel=picture.multiplier_name)
+        _graph(axes, picture, picture.positions[0], picture.multiplier, limits, COLOURS[2], "steps-mid")
         return
     part = _on_mesh(picture)
     filled: ScalarMappable
@@ -124,21 +123,16 @@ def _contact_boundary(axes: Axes, picture: Picture) -> None:
         axes.tricontour(part, touching, levels=[0.5], colors="#D55E00", linewidths=1.0)
 
 
-def _ends_of_contact(axes: Axes, picture: Picture) -> None:
-    """Lines where intervals of contact end; those that end at the last point of the multiplier have no line there."""
-    if len(picture.positions) != 1:
-        return
-    order = np.argsort(picture.positions[0])
-    x, touching = picture.positions[0][order], picture.multiplier[order] > 0.0
-    for k in np.flatnonzero(touching[1:] != touching[:-1]):
-        axes.axvline(0.5 * (x[k] + x[k + 1]), color="#D55E00", linewidth=1.0, linestyle=(0, (1, 1)))
-
-
-def _graph(axes: Axes, x: Array, values: Array, name: str, limits: Limits, colour: str, drawstyle: str) -> None:
-    order = np.argsort(x)
+def _graph(axes: Axes, picture: Picture, x: Array, values: Array, limits: Limits, colour: str, drawstyle: str) -> None:
+    """A graph with lines where intervals of contact end, but for those that end at the last point of the multiplier."""
+    order, room = np.argsort(x), 0.05 * (limits[1] - limits[0])
     axes.plot(x[order], values[order], color=colour, drawstyle=drawstyle)
-    room = 0.05 * (limits[1] - limits[0])
-    axes.set(xlabel="x", ylabel=name, ylim=(limits[0] - room, limits[1] + room))
+    axes.set(xlabel="x", ylim=(limits[0] - room, limits[1] + room))
+    if len(picture.positions) == 1:
+        order = np.argsort(picture.positions[0])
+        places, touching = picture.positions[0][order], picture.multiplier[order] > 0.0
+        for k in np.flatnonzero(touching[1:] != touching[:-1]):
+            axes.axvline(0.5 * (places[k] + places[k + 1]), color="#D55E00", linewidth=1.0, linestyle=(0, (1, 1)))
 
 
 def _plane(axes: Axes, colours: ScalarMappable, name: str) -> None:
