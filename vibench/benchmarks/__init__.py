@@ -108,22 +108,24 @@ def cases(
     """Problems and choices of a benchmark with these axes, if a chosen plugin takes part; all where none is chosen."""
     if chosen and not chosen.keys() & {"problem", *axes}:
         return []
-    primals = chosen.get("primal", registered(PluginKind.PRIMAL))
-    choices: dict[str, Iterable[Any]] = {
-        "size": [Size(5, 5), Size(10, 12), Size(20, 30), Size(46, 60), Size(80, 70)],
-        "dual": chosen.get("dual", registered(PluginKind.DUAL)),
-        "primal": [one for name in primals for one in _at_tolerances(name)] if "primal" in axes else [],
-        "formulation": chosen.get("formulation", registered(PluginKind.FORMULATION)),
-        "solver": chosen.get("solver", installed_solvers(registered(PluginKind.SOLVER))),
-        "accuracy": [1e-6, 1e-10],
-    }
     # Whoever names a plugin waits for it: two problems of a study are enough then, and QP solvers use one resolution.
     every = setting.problems if chosen else filter(_takes_no_option, registered(PluginKind.PROBLEM))
     timed = []
     for name in chosen.get("problem", every):
         known = [TimedProblem(name, one) for one in resolutions if _knows(name, one)]
         timed += (known or [TimedProblem(name, None)])[: 1 if "size" in axes else None]
-    return list(product(timed, *(choices[axis] for axis in axes)))
+    return list(product(timed, *(_choices(axis, chosen) for axis in axes)))
+
+
+def _choices(axis: str, chosen: Mapping[str, Sequence[str]]) -> Iterable[Any]:
+    """The sizes and accuracies of programs, and the plugins that are chosen, or registered."""
+    if axis == "size":
+        return [Size(5, 5), Size(10, 12), Size(20, 30), Size(46, 60), Size(80, 70)]
+    if axis == "accuracy":
+        return [1e-6, 1e-10]
+    own = registered(CHECKED[axis])
+    names = chosen.get(axis, installed_solvers(own) if axis == "solver" else own)
+    return [one for name in names for one in _at_tolerances(name)] if axis == "primal" else names
 
 
 def run_pytest(options: Sequence[str]) -> None:

@@ -265,7 +265,8 @@ class ArrayFiles:
         return _checked(kind((data[:used], indices, pointers), shape=(rows, columns)))
 
     def _based(self, values: Any, count: int) -> Indices:
-        values, low, high = whole(values, "it"), self._base, self._base + count - 1
+        # Any integer of 63 bits, so that the message below may name the base.
+        values, low, high = whole(values, "it", -(2**62), 2**62), self._base, self._base + count - 1
         if len(values) and (values.min() < low or values.max() > high):
             fault = f"it has indices from {values.min()} to {values.max()}; expected {low} to {high}"
             # Indices that fit the other base were probably written with it.
@@ -294,7 +295,7 @@ class ArrayFiles:
             raise RequestError(f"too big for memory: the arrays of the pack take {needed}, {limit} are allowed")
 
 
-def whole(values: Any, what: str, low: int = -(2**62), high: int = 2**62, count: int | None = None) -> Indices:
+def whole(values: Any, what: str, low: int, high: int, count: int | None = None) -> Indices:
     """Integers of any type as int64; compiled code checks neither types nor ranges of indices."""
     values = np.ravel(values)
     if values.dtype.kind not in "iuf" or np.any(values != np.round(values)):

@@ -23,18 +23,16 @@ from vibench.errors import RequestError, message_of
 from vibench.text import one_line
 from vibench.timing import ONE_THREAD
 
-# Names of meshio for the formats that are read, by the end of a file's name: those whose mesh is in one file. Formats
-# that name other files (XDMF, Abaqus, TetGen, DOLFIN) or are HDF5, which may link to others, are not among them.
-FORMATS = {
-    ".msh": "gmsh", ".vtu": "vtu", ".vtk": "vtk", ".mesh": "medit", ".ply": "ply", ".stl": "stl", ".off": "off",
-    ".obj": "obj",
-}  # fmt: skip
-
 
 def format_of(path: Path) -> str:
-    """The name that meshio has for the format of a file; a `RequestError` if it is not one of `FORMATS`."""
-    if (form := FORMATS.get(path.suffix.lower())) is None:
-        expected = f"expected one whose mesh is in one file: {', '.join(FORMATS)}"
+    """The name that meshio has for the format of a file; a `RequestError` if that is not read."""
+    # Formats that name other files (XDMF, Abaqus, TetGen, DOLFIN) or are HDF5, which may link to others, are missing.
+    formats = {
+        ".msh": "gmsh", ".vtu": "vtu", ".vtk": "vtk", ".mesh": "medit", ".ply": "ply", ".stl": "stl", ".off": "off",
+        ".obj": "obj",
+    }  # fmt: skip
+    if (form := formats.get(path.suffix.lower())) is None:
+        expected = f"expected one whose mesh is in one file: {', '.join(formats)}"
         raise RequestError(f"'{path.name}' has a format that is not read; {expected}")
     return form
 
