@@ -142,13 +142,6 @@ def test_missing_solvers_and_answers_are_named(
             getattr(solution, vector)
 
 
-def test_a_cell_is_named_by_its_beginning(small_run: vibench.Run) -> None:
-    key = str(small_run.cells["cell"].iloc[0])
-    assert small_run.model(key[:12]).row["cell"] == key
-    with pytest.raises(vibench.RequestError, match="0 cells of"):
-        small_run.model("zzz")
-
-
 @pytest.fixture(scope="module")
 def certified(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
     problem = {"name": "hertz", "options": {"resolution": 300}}
