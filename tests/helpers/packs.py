@@ -3,6 +3,7 @@
 import contextlib
 import copy
 from collections.abc import Mapping
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +66,17 @@ def write_manifest(folder: Path, content: Mapping[str, Any]) -> None:
     (folder / "pack.toml").write_text(toml(content), encoding="utf-8")
 
 
-def manifest() -> dict[str, Any]:
-    return copy.deepcopy(dict(MANIFEST))
+def manifest(changes: Mapping[str, Any] = {}) -> dict[str, Any]:
+    """The manifest with other values at some paths, such as "operators.g.affine.0.theta"; `...` removes one."""
+    content = copy.deepcopy(dict(MANIFEST))
+    for path, to in changes.items():
+        *steps, last = (int(step) if step.isdigit() else step for step in path.split("."))
+        place: Any = reduce(lambda place, step: place[step], steps, content)
+        if to is ...:
+            del place[last]
+        else:
+            place[last] = to
+    return content
 
 
 def write_cable(folder: Path) -> Path:

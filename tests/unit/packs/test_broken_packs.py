@@ -25,10 +25,10 @@ from vibench.packs.checks import read_model_pack
 from vibench.study.matrix import read_study
 
 Content = dict[str, Any]
-Mistake = Callable[[Content, Cable, Path], None]
+Mistake = Callable[[Cable, Path], Content]
 
 MISTAKES: dict[str, tuple[str, Mistake]] = {}
-"""By name: what the line says, and a function that changes the manifest, the arrays, or, at the end, the files."""
+"""By name: what the line says, and a function that makes a manifest and changes arrays or, at the end, files."""
 
 
 def changed(
@@ -36,20 +36,12 @@ def changed(
 ) -> None:
     """A mistake in values of the manifest by path, `...` for what is missing, in `more.npz`, and in other arrays."""
 
-    def change(manifest: Content, cable: Cable, folder: Path) -> None:
+    def change(cable: Cable, folder: Path) -> Content:
         computed = {key: compute(cable) for key, compute in arrays.items()}
         if more:
             np.savez(folder / "more.npz", **{key: compute(cable) for key, compute in more.items()})
         vars(cable).update(computed)
-        for path, to in content.items():
-            *steps, last = (int(step) if step.isdigit() else step for step in path.split("."))
-            place: Any = manifest
-            for step in steps:
-                place = place[step]
-            if to is ...:
-                del place[last]
-            else:
-                place[last] = to
+        return manifest(content)
 
     MISTAKES[name] = (line, change)
 
@@ -65,9 +57,9 @@ def in_arrays(name: str, line: str, **arrays: Callable[[Cable], Any]) -> None:
 def in_files(name: str, line: str, change: Callable[[Path], object], A: str = "A.npz") -> None:
     """A mistake made once everything is written; the manifest names the file of A."""
 
-    def plan(content: Content, cable: Cable, folder: Path) -> None:
-        content["operators"]["A"] = A if A != "A.npz" else content["operators"]["A"]
+    def plan(cable: Cable, folder: Path) -> Content:
         AFTER.append(lambda: change(folder))
+        return manifest({"operators.A": A})
 
     MISTAKES[name] = (line, plan)
 
@@ -279,10 +271,10 @@ def broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], P
     monkeypatch.setattr(reader, "memory_limit", lambda: 2**24)
 
     def write(name: str) -> Path:
-        folder, content, cable = tmp_path / "pack", manifest(), Cable()
+        folder, cable = tmp_path / "pack", Cable()
         folder.mkdir()
         AFTER.clear()
-        MISTAKES[name][1](content, cable, folder)
+        content = MISTAKES[name][1](cable, folder)
         write_arrays(folder, cable)
         write_manifest(folder, content)
         for change in AFTER:

@@ -87,11 +87,6 @@ MARKET = {
 }
 
 
-def with_operator(A: str) -> dict[str, Any]:
-    """The manifest with another A."""
-    return {**manifest(), "operators": {**manifest()["operators"], "A": A}}
-
-
 def write(folder: Path, **parts: Any) -> Path:
     """A pack whose A has these arrays."""
     np.savez(write_cable(folder) / "A.npz", **parts)
@@ -116,12 +111,12 @@ def test_index_arrays_of_any_type_are_checked_before_compiled_code_has_them(tmp_
         folders.append(write(tmp_path / f"{prefix}{name}", **changed))
     for name, (text, _) in MARKET.items():
         folders.append(write_cable(tmp_path / name))
-        write_manifest(folders[-1], with_operator("A.mtx"))
+        write_manifest(folders[-1], manifest({"operators.A": "A.mtx"}))
         (folders[-1] / "A.mtx").write_text(text)
     with h5py.File(write_cable(tmp_path / "HDF5") / "A.h5", "w") as file:
         for name, array in (PARTS | {"indptr": JUMP}).items():
             file[f"A/{name}"] = array
-    write_manifest(folders[-1].parent / "HDF5", with_operator("A.h5:A"))
+    write_manifest(folders[-1].parent / "HDF5", manifest({"operators.A": "A.h5:A"}))
     said = read_in_a_process([*folders, tmp_path / "HDF5"])
     read = {name: said[name] for name in said if name.removeprefix("triplets ") in ACCEPTED}
     assert {float(line.removeprefix("read ")) for line in read.values()} == {good}
@@ -140,7 +135,7 @@ def test_a_mesh_whose_triangles_lead_beyond_its_points_is_refused(corner: int, t
     meshio.Mesh(points, {"triangle": np.array([[0, 1, corner]])}).write(folder / "mesh.vtu", binary=False)
     np.savez(folder / "mesh.npz", points=[0, 1], positions=np.zeros(N))
     named = {key: f"mesh.npz:{key}" for key in ("points", "positions")}
-    write_manifest(folder, {**manifest(), "mesh": {"file": "mesh.vtu", **named}})
+    write_manifest(folder, manifest({"mesh": {"file": "mesh.vtu", **named}}))
     with pytest.raises(RequestError, match=r"triangles of 'mesh\.vtu' has values from .* expected 0 to 2"):
         read_model_pack(folder)
 

@@ -26,7 +26,7 @@ VTU = """<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian
 def with_mesh(folder: Path, name: str, secret: str = "") -> Path:
     """A pack with a mesh of this name."""
     table = write_mesh(write_cable(folder), name, secret)
-    write_manifest(folder, {**manifest(), "mesh": table})
+    write_manifest(folder, manifest({"mesh": table}))
     return folder
 
 

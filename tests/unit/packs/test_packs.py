@@ -32,13 +32,15 @@ from vibench.plugins.registry import create
 from vibench.study.matrix import read_study
 
 MU = np.array([5.0, 0.2])
+MASS, GAP = "operators.f.affine.0.array", "operators.g.affine.0.theta"
+LISTED = np.array(manifest()["parameters"]["training"] + manifest()["parameters"]["validation"])
 
 
-def pack_with(folder: Path, content: dict[str, Any], **arrays: Any) -> ModelPack:
+def pack_with(folder: Path, changes: dict[str, Any], **arrays: Any) -> ModelPack:
     """The pack of a changed manifest and further arrays."""
     folder.mkdir()
     write_arrays(folder, Cable())
-    write_manifest(folder, content)
+    write_manifest(folder, manifest(changes))
     if arrays:
         np.savez(folder / "more.npz", **arrays)
     return read_model_pack(folder)
@@ -55,7 +57,7 @@ def assert_cable(pack: ModelPack) -> None:
 def test_an_affine_pack_is_the_problem_anywhere_in_the_box(tmp_path: Path) -> None:
     folder = write_cable(tmp_path / "pack")
     for licence, given in (("unknown", {}), ("CC-BY-4.0", {"license": "CC-BY-4.0"})):
-        write_manifest(folder, manifest() | given)
+        write_manifest(folder, manifest(given))
         assert create("problem", "pack", {"path": str(folder)}).licence == licence
     pack = read_model_pack(folder)
     assert_cable(pack)
@@ -66,41 +68,34 @@ def test_an_affine_pack_is_the_problem_anywhere_in_the_box(tmp_path: Path) -> No
 
 
 def test_triplets_count_from_the_index_base_and_matrix_market_from_one(tmp_path: Path) -> None:
-    content, cable, folder = manifest(), Cable(), write_cable(tmp_path / "pack")
+    cable, folder = Cable(), write_cable(tmp_path / "pack")
     A = sp.coo_array(cable.A)
     np.savez(folder / "more.npz", row=A.coords[0] + 1, col=A.coords[1] + 1, data=A.data, shape=np.array(A.shape))
     with gzip.open(folder / "B.mtx.gz", "wb") as file:
         scipy.io.mmwrite(file, sp.coo_array(cable.B))
-    content |= {"index_base": 1}
-    content["operators"] |= {"A": "more.npz", "B": "B.mtx.gz"}
-    write_manifest(folder, content)
+    write_manifest(folder, manifest({"index_base": 1, "operators.A": "more.npz", "operators.B": "B.mtx.gz"}))
     assert_cable(read_model_pack(folder))
 
 
 def test_hdf5_datasets_groups_and_links(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py")
-    content, folder = manifest(), write_cable(tmp_path / "pack")
-    content["operators"]["A"] = "arrays.h5:A"
-    content["operators"]["f"] = {"affine": [{"theta": "-load", "array": "arrays.h5:/vectors/mass"}]}
+    folder = write_cable(tmp_path / "pack")
     with h5py.File(folder / "arrays.h5", "w") as file:
         for name, value in (group("A", Cable().A) | {"vectors/mass": Cable().mass}).items():
             file[name] = value
         file["soft"] = h5py.SoftLink("/vectors/mass")
         file["elsewhere"] = h5py.ExternalLink("/etc/passwd", "/")
-    write_manifest(folder, content)
+    write_manifest(folder, manifest({"operators.A": "arrays.h5:A", MASS: "arrays.h5:/vectors/mass"}))
     assert_cable(read_model_pack(folder))
     lines = {"soft": "is a link", "elsewhere": "is a link", "nothing": "no dataset", "vectors": "is a group"}
     for name, line in lines.items():
-        content["operators"]["f"]["affine"][0]["array"] = f"arrays.h5:{name}"
-        write_manifest(folder, content)
+        write_manifest(folder, manifest({MASS: f"arrays.h5:{name}"}))
         with pytest.raises(RequestError, match=line):
             read_model_pack(folder)
 
 
 def test_an_infinite_entry_of_g_is_a_row_that_constrains_nothing(tmp_path: Path, main: Main) -> None:
-    content, cable = manifest(), Cable()
-    content["operators"]["g"] = "more.npz:g"
-    g = DEPTH * cable.mass
+    content, g = {"operators.g": "more.npz:g"}, DEPTH * Cable().mass
     g[-1] = np.inf  # the multiplier is zero there
     pack = pack_with(tmp_path / "pack", content, g=g)
     assert pack.at(MU).g[-1] == ABSENT
@@ -115,15 +110,10 @@ def test_an_infinite_entry_of_g_is_a_row_that_constrains_nothing(tmp_path: Path,
 @pytest.mark.parametrize("far", [1e12, 1e16, 1e20, np.inf])
 def test_no_obstacle_on_every_second_row_leaves_the_others_in_force(tmp_path: Path, far: float) -> None:
     """A g of 1e20, as codes write it where there is none, once switched all rows off, and the solution was ok."""
-    content = manifest()
-    del content["solutions"]
-    content["operators"]["g"] = {
-        "affine": [{"theta": "depth", "array": "more.npz:near"}, {"theta": "1", "array": "more.npz:far"}]
-    }
+    terms = [{"theta": "depth", "array": "more.npz:near"}, {"theta": "1", "array": "more.npz:far"}]
     second = np.arange(SIZE) % 2 == 1
-    pack = pack_with(
-        tmp_path / "pack", content, near=np.where(second, 0.0, Cable().mass), far=np.where(second, far, 0.0)
-    )
+    arrays = {"near": np.where(second, 0.0, Cable().mass), "far": np.where(second, far, 0.0)}
+    pack = pack_with(tmp_path / "pack", {"solutions": ..., "operators.g": {"affine": terms}}, **arrays)
     vi = pack.at(MU)
     kept = np.flatnonzero(~second)
     alone = VariationalInequality(vi.A, vi.f, sp.csr_array(vi.B)[kept], vi.g[kept])
@@ -138,9 +128,7 @@ def test_no_obstacle_on_every_second_row_leaves_the_others_in_force(tmp_path: Pa
 @pytest.mark.parametrize("precision", [np.float16, np.float32])
 def test_numbers_may_be_stored_in_few_digits(tmp_path: Path, precision: type) -> None:
     """What is stored is exact: computations with it are not made in its precision."""
-    cable, content = Cable(), manifest()
-    del content["solutions"]
-    content["operators"] |= {name: f"more.npz:{name}" for name in ("A", "B")}
+    cable, content = Cable(), {"solutions": ..., "operators.A": "more.npz:A", "operators.B": "more.npz:B"}
     stored = {name: group(name, getattr(cable, name)) for name in ("A", "B", "X_V", "X_W")}
     mass = cable.mass.astype(precision)
     packs = []
@@ -154,7 +142,7 @@ def test_numbers_may_be_stored_in_few_digits(tmp_path: Path, precision: type) ->
         np.savez(folder / "spaces.npz", **groups["X_V"], **groups["X_W"])
         np.savez(folder / "more.npz", **groups["A"], **groups["B"])
         np.savez(folder / "vectors.npz", mass=mass.astype(dtype))
-        write_manifest(folder, content)
+        write_manifest(folder, manifest(content))
         packs.append(read_model_pack(folder))
     few, many = packs
     for name in MEMBERS:
@@ -166,16 +154,11 @@ def test_numbers_may_be_stored_in_few_digits(tmp_path: Path, precision: type) ->
 
 
 def test_tables_and_arrays_by_parameter_hold_at_listed_parameters_only(tmp_path: Path) -> None:
-    content, cable = manifest(), Cable()
-    listed = content["parameters"]["training"] + content["parameters"]["validation"]
-    content["operators"] |= {
-        "A": {"each": "more.npz:A{}"},
-        "f": {"each": "more.npz:f"},
-        "g": {"affine": [{"table": "more.npz:depths", "array": "vectors.npz:mass"}]},
-    }
+    cable, table = Cable(), {"table": "more.npz:depths", "array": "vectors.npz:mass"}
+    each = {f"operators.{name}": {"each": f"more.npz:{files}"} for name, files in (("A", "A{}"), ("f", "f"))}
     arrays = {key: value for k in range(5) for key, value in group(f"A{k}", cable.A).items()}
-    arrays |= {"f": np.column_stack([-load * cable.mass for load, _ in listed]), "depths": np.array(listed)[:, 1]}
-    pack = pack_with(tmp_path / "pack", content, **arrays)
+    arrays |= {"f": -np.outer(cable.mass, LISTED[:, 0]), "depths": LISTED[:, 1]}
+    pack = pack_with(tmp_path / "pack", each | {"operators.g": {"affine": [table]}}, **arrays)
     assert_cable(pack)
     assert not pack.everywhere
     with pytest.raises(NumericalError, match=r"mu = \[5.5, 0.2\] is not listed"):
@@ -183,7 +166,7 @@ def test_tables_and_arrays_by_parameter_hold_at_listed_parameters_only(tmp_path:
 
 
 def test_rows_of_dirichlet_unknowns_are_removed_where_free_ones_are_named(tmp_path: Path) -> None:
-    content, cable = manifest(), Cable()
+    cable = Cable()
 
     def wide(matrix: Any) -> Any:
         return sp.csr_array(sp.block_diag([[[1.0]], matrix, [[1.0]]]))
@@ -191,10 +174,8 @@ def test_rows_of_dirichlet_unknowns_are_removed_where_free_ones_are_named(tmp_pa
     arrays = group("A", wide(cable.A)) | group("X_V", wide(cable.X_V)) | {"free": np.arange(1, SIZE + 1)}
     arrays |= {"mass": np.pad(cable.mass, 1), "u": np.pad(cable.u, ((1, 1), (0, 0)))}
     arrays |= group("B", sp.hstack([np.zeros((SIZE, 1)), cable.B, np.zeros((SIZE, 1))]))
-    content["spaces"] |= {"X_V": "more.npz:X_V", "free": "more.npz:free"}
-    content["operators"] |= {"A": "more.npz:A", "B": "more.npz:B"}
-    content["operators"]["f"]["affine"][0]["array"] = "more.npz:mass"
-    content["solutions"]["u"] = "more.npz:u"
+    places = "spaces.X_V", "spaces.free", "operators.A", "operators.B", "solutions.u"
+    content = {place: f"more.npz:{place.split('.')[1]}" for place in places} | {MASS: "more.npz:mass"}
     assert_cable(pack_with(tmp_path / "pack", content, **arrays))
 
 
@@ -208,7 +189,7 @@ def test_what_is_computed_from_a_pack_is_not_used_again_after_an_edit(tmp_path: 
     np.savez(folder / "vectors.npz", mass=cable.mass)
     edited = plugin.as_installed()
     assert edited.code != plugin.code
-    write_manifest(folder, manifest() | {"description": "another"})
+    write_manifest(folder, manifest({"description": "another"}))
     assert plugin.as_installed().code not in (edited.code, plugin.code)
     (folder / "vectors.npz").unlink()
     with pytest.raises(RequestError, match=r"operators.f.affine.0: the file 'vectors.npz' does not exist"):
@@ -216,9 +197,7 @@ def test_what_is_computed_from_a_pack_is_not_used_again_after_an_edit(tmp_path: 
 
 
 def test_multipliers_alone_are_enough_for_cones(tmp_path: Path, main: Main) -> None:
-    content = manifest()
-    del content["operators"], content["solutions"]["u"], content["spaces"]["X_V"]
-    pack = pack_with(tmp_path / "pack", content)
+    pack = pack_with(tmp_path / "pack", {"operators": ..., "solutions.u": ..., "spaces.X_V": ...})
     cone, _ = reduce_multipliers(pack, create("dual strategy", "mcpg", {}), 1e-3)
     assert cone.errors[-1] <= 1e-3
     code, out, _ = main("pack", str(tmp_path / "pack"))
@@ -262,21 +241,18 @@ def test_import_solves_once_and_reads_a_byte_order_mark(tmp_path: Path, main: Ma
 def test_import_refuses_a_pack_without_a_solution_and_says_which_rows_constrain_nothing(
     tmp_path: Path, main: Main
 ) -> None:
-    cable, content = Cable(), manifest()
-    del content["solutions"]
+    cable = Cable()
     kept = cable.B
     cable.B = sp.csr_array(sp.vstack([kept[:6], -kept[:6]]))
-    content["operators"]["g"]["affine"][0]["theta"] = "-depth"
     (tmp_path / "pack").mkdir()
     write_arrays(tmp_path / "pack", cable)
-    write_manifest(tmp_path / "pack", content)
+    write_manifest(tmp_path / "pack", manifest({"solutions": ..., GAP: "-depth"}))
     code, out, line = main("pack", str(tmp_path / "pack"))
     assert (code, out) == (2, "")
     assert "there is no solution: at mu = [4.0, 0.2]: no active set solves the high-fidelity problem" in line
     cable.B = sp.csr_array(sp.diags_array(np.arange(SIZE) % 2, dtype=float) @ kept)
     write_arrays(tmp_path / "pack", cable)
-    content["operators"]["g"]["affine"][0]["theta"] = "depth"
-    write_manifest(tmp_path / "pack", content)
+    write_manifest(tmp_path / "pack", manifest({"solutions": ...}))
     code, out, _ = main("pack", str(tmp_path / "pack"))
     assert code == 0
     assert "6 rows of B are zero at every listed parameter, the first is 0" in out
@@ -284,13 +260,11 @@ def test_import_refuses_a_pack_without_a_solution_and_says_which_rows_constrain_
 
 @pytest.mark.parametrize("bump", [0.0, 1e-3])
 def test_import_names_outputs_and_what_is_interpolated_and_misses(tmp_path: Path, main: Main, bump: float) -> None:
-    content, cable = manifest(), Cable()
-    content["operators"] |= {"f": {"each": "more.npz:f"}}
-    content["outputs"] = [{"name": "sag", "unit": "m", "u": "more.npz:sag"}]
-    listed = content["parameters"]["training"] + content["parameters"]["validation"]
-    f = np.column_stack([-load * cable.mass for load, _ in listed])
-    f[0, len(content["parameters"]["training"]) :] *= 1.0 + bump
-    pack_with(tmp_path / "pack", content, f=f, sag=np.ones(len(cable.mass)))
+    outputs = [{"name": "sag", "unit": "m", "u": "more.npz:sag"}]
+    f = -np.outer(Cable().mass, LISTED[:, 0])
+    f[0, 3:] *= 1.0 + bump
+    content = {"operators.f": {"each": "more.npz:f"}, "outputs": outputs}
+    pack_with(tmp_path / "pack", content, f=f, sag=np.ones(SIZE))
     code, out, _ = main("pack", str(tmp_path / "pack"))
     assert "; reduced assembly interpolates f and sums the terms of g\n" in out
     assert "\n  outputs: sag [m]\n" in out
@@ -354,14 +328,14 @@ def test_what_the_example_for_matlab_writes_is_read(tmp_path: Path) -> None:
 
 def test_a_mesh_gives_pictures(tmp_path: Path) -> None:
     meshio = pytest.importorskip("meshio")
-    folder, content = write_cable(tmp_path / "pack"), manifest()
+    folder = write_cable(tmp_path / "pack")
     x = np.linspace(0.0, 1.0, SIZE + 2)
     points = np.concatenate([np.column_stack([x, y + 0.0 * x, 0.0 * x]) for y in (0.0, 1.0)])
     cells = [[k, k + 1, k + SIZE + 2] for k in range(SIZE + 1)]
     meshio.Mesh(points, {"triangle": cells}).write(folder / "mesh.vtu")
     np.savez(folder / "more.npz", points=np.arange(1, SIZE + 1), positions=x[1:-1])
-    content["mesh"] = {"file": "mesh.vtu", "points": "more.npz:points", "positions": "more.npz:positions"}
-    write_manifest(folder, content)
+    table = {"file": "mesh.vtu", "points": "more.npz:points", "positions": "more.npz:positions"}
+    write_manifest(folder, manifest({"mesh": table}))
     problem = create("problem", "pack", {"path": str(folder)})
     cable = Cable()
     picture = problem.picture(MU, cable.u[:, 0], cable.lam[:, 0])
@@ -377,9 +351,8 @@ def test_a_mesh_gives_pictures(tmp_path: Path) -> None:
 @pytest.mark.parametrize("where", ["m/{}/A.npz", "m{}/{}.npz", "A-{}.npz", ""])
 def test_the_digest_has_every_file_of_a_numbered_name(where: str, tmp_path: Path) -> None:
     """A name with brackets that is not numbered is one file."""
-    folder, content = write_cable(tmp_path / "pack"), manifest()
-    content["operators"]["A"] = {"each": where} if where else "A{}.npz"
-    write_manifest(folder, content)
+    folder = write_cable(tmp_path / "pack")
+    write_manifest(folder, manifest({"operators.A": {"each": where} if where else "A{}.npz"}))
     files = [folder / where.replace("{}", str(k)) for k in range(5)] if where else [folder / "A{}.npz"]
     for file in files:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -395,10 +368,7 @@ def test_the_digest_has_every_file_of_a_numbered_name(where: str, tmp_path: Path
 @pytest.mark.parametrize("written", ["\u00b5", "\u03bc"])
 @pytest.mark.parametrize("named", ["\u00b5", "\u03bc"])
 def test_the_micro_sign_and_mu_are_one_name(named: str, written: str, tmp_path: Path) -> None:
-    folder, content = write_cable(tmp_path / "pack"), manifest()
-    content["parameters"]["names"][0] = named
-    content["operators"]["f"]["affine"][0]["theta"] = f"-{written}"
-    write_manifest(folder, content)
-    pack = read_model_pack(folder)
+    content = {"parameters.names.0": named, "operators.f.affine.0.theta": f"-{written}"}
+    pack = pack_with(tmp_path / "pack", content)
     assert pack.box.names == ("\u03bc", "depth")
     assert np.array_equal(pack.at(MU).f, -MU[0] * Cable().mass)

@@ -34,9 +34,7 @@ BUILT_IN = [
 
 def unlisted(folder: Path) -> Path:
     """A pack whose validation parameters are drawn in the box."""
-    content = manifest()
-    del content["parameters"]["validation"]
-    write_manifest(write_cable(folder), content)
+    write_manifest(write_cable(folder), manifest({"parameters.validation": ...}))
     return folder
 
 
