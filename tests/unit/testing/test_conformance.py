@@ -70,8 +70,9 @@ def sampling_options(name: str, folder: Path) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("plugin", "code", "title", "lines", "counts"),
     [
-        ("problem:obstacle", 0, "problem 'obstacle', at resolution coarse (--option resolution=… for another)",
-         [], " passed, 0 failed, 0 skipped"),
+        ("problem:radial-obstacle", 0,
+         "problem 'radial-obstacle', at resolution coarse (--option resolution=… for another)", [],
+         " passed, 0 failed, 0 skipped"),
         ("solver:osqp", 0, "QP solver 'osqp'", [], "10 passed, 0 failed, 0 skipped"),
         ("broken_problems:Jumps", 1, "problem 'broken_problems:Jumps'",
          ["failed   continuity in mu: g jumps at mu = [5.432"], "25 passed, 1 failed, 0 skipped"),
@@ -213,9 +214,9 @@ def test_options_reach_the_plugin_of_the_kind_that_is_given(main: Main, tmp_path
     code, out, _ = main("check", "fake_plugins:BadCone", "--option", "how=negative")
     assert code == 1
     assert "failed   cone: " in out
-    code, out, _ = main("check", "obstacle", "--option", "resolution=200")
-    assert (code, out.splitlines()[0]) == (0, "problem 'obstacle'")
-    assert f"n = {create('problem', 'obstacle', {'resolution': 200}).V.dim}, " in out
+    code, out, _ = main("check", "radial-obstacle", "--option", "resolution=200")
+    assert (code, out.splitlines()[0]) == (0, "problem 'radial-obstacle'")
+    assert f"n = {create('problem', 'radial-obstacle', {'resolution': 200}).V.dim}, " in out
     # a class in the current folder
     source = "from broken_strategies import Greedy\n\nclass Mine(Greedy):\n    '''Mine.'''\n"
     (tmp_path / "here" / "lying_around.py").write_text(source)
