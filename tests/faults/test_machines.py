@@ -27,19 +27,14 @@ def test_more_jobs_than_a_machine_can_bear_are_refused(main: Main, tmp_path: Pat
     assert list(Path.cwd().iterdir()) == []
 
 
-def test_too_few_open_files_are_said_to_be_too_few(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_few_open_files_are_said_to_be_too_few(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
     monkeypatch.setattr("vibench.results.database.sqlite3.connect", unable)
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     monkeypatch.setattr("vibench.results.database.resource.getrlimit", lambda _: (7, limits[1]))
     with pytest.raises(RequestError, match=r"this process may open only 7 files \(`ulimit -n`\)"):
         ResultsDatabase(tmp_path / "out", {})
-
-
-def unable(*_: object, **__: object) -> None:
-    raise sqlite3.OperationalError("unable to open database file")
-
-
-def test_dask_without_open_files_ends_with_a_line(command: str, tmp_path: Path) -> None:
     study = write_study(tmp_path, wire_study(problem=["obstacle"]))
     limited = ["bash", "-c", 'ulimit -n 32; exec "$0" "$@"', command, "run", study, "--executor", "dask", "--jobs", "2"]
     done = subprocess.run(limited, cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -48,6 +43,10 @@ def test_dask_without_open_files_ends_with_a_line(command: str, tmp_path: Path) 
         "vibench: the executor 'dask' needs 96 open files, the limit is 32: raise it (`ulimit -n 96`), "
         "ask for fewer --jobs, or use the executor 'local'\n"
     )
+
+
+def unable(*_: object, **__: object) -> None:
+    raise sqlite3.OperationalError("unable to open database file")
 
 
 def test_a_run_does_not_depend_on_asserts_nor_on_an_encoding_that_has_all_letters(

@@ -118,25 +118,21 @@ def query_rows(cell: str = "c1", count: int = 2, **columns: Any) -> list[dict[st
 FAKES: Mapping[str, Mapping[str, str]] = {
     "vibench.problems": {
         "wire": "Wire", "wire-raises": "Raises", "wire-nan": "NotANumber", "wire-shape": "WrongShape",
-        "wire-indefinite": "Indefinite", "wire-broken": "Broken", "wire-hungry": "Hungry",
-        "wire-sleeps": "Sleeps", "wire-exits": "Exits", "wire-segfaults": "Segfaults",
-        "wire-infeasible": "Infeasible", "wire-crooked": "CrookedSpace", "wire-chatty": "Chatty",
+        "wire-indefinite": "Indefinite", "wire-broken": "Broken", "wire-hungry": "Hungry", "wire-sleeps": "Sleeps",
+        "wire-exits": "Exits", "wire-segfaults": "Segfaults", "wire-infeasible": "Infeasible",
+        "wire-crooked": "CrookedSpace", "wire-chatty": "Chatty",
     },
     "vibench.dual_strategies": {
-        "cone-needs": "NeedyCone", "cone-raises": "RaisingCone", "cone-waits": "WaitingCone",
-        "cone-bad": "BadCone",
+        "cone-needs": "NeedyCone", "cone-raises": "RaisingCone", "cone-waits": "WaitingCone", "cone-bad": "BadCone",
     },
     "vibench.primal_strategies": {
         "enrichment-raises": "RaisingEnrichment", "enrichment-counts": "CountingEnrichment",
         "enrichment-bad": "BadVectors",
     },
-    "vibench.qp_solvers": {
-        "careful": "careful", "raises": "raises", "nothing": "nothing", "gives-up": "gives_up",
-        "nan": "not_a_number", "wrong": "wrong", "wrong-length": "wrong_length", "counts": "numpy_count",
-        "dies": "dies", "leaves": "leaves", "hangs": "hangs", "segfaults": "segfaults",
-        "dies-sometimes": "dies_sometimes", "dies-once": "dies_once", "hungry": "hungry",
-        "chatty": "chatty",
-    },
+    "vibench.qp_solvers": {"nan": "not_a_number", "counts": "numpy_count"} | {name.replace("_", "-"): name for name in (
+        "careful", "raises", "nothing", "gives_up", "wrong", "wrong_length", "dies", "leaves", "hangs", "segfaults",
+        "dies_sometimes", "dies_once", "hungry", "chatty",
+    )},
 }  # fmt: skip
 """What the third-party package registers: group → name → member of `fake_plugins`."""
 

@@ -56,18 +56,15 @@ def test_a_reduction_skips_as_a_study(number: int) -> None:
     assert skipping.model.solve([1.4, 0.3]).status == "ok"
 
 
-def test_no_more_than_a_tenth_is_skipped() -> None:
+def test_no_more_than_a_tenth_is_skipped_and_of_known_training_sets_alone() -> None:
     count = "2 of 15 training parameters have no solution, at most 1 may be skipped"
     with pytest.raises(NumericalError, match=rf"{count}; the first one: at mu = \[1.0, -1.0\]: ValueError"):
         reduction(Tangled(0, 2), "skip").snapshots  # noqa: B018
     with pytest.raises(RequestError, match="on_failure is 'ignore', expected 'stop' or 'skip'"):
         reduction(Declared(), "ignore")
-
-
-def test_only_known_training_sets_skip() -> None:
     with pytest.raises(RequestError, match="on_failure is for training sets"):
         study("own", validation={"name": "sobol", "size": 4, "on_failure": "skip"})
-    with pytest.raises(RequestError, match="'greedy' chooses parameters by what solutions know; it has none to skip"):
+    with pytest.raises(RequestError, match="'greedy' chooses training parameters by what solutions know; it has none to skip"):
         study({"name": "greedy", "candidates": 10, "tolerance": 0.1, "on_failure": "skip"})
 
 

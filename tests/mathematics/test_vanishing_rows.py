@@ -107,14 +107,11 @@ def test_a_zero_row_below_its_bound_is_infeasible_and_named() -> None:
         OnContact(bound=-0.25).contact(mu)
 
 
-def test_round_off_of_a_lift_is_no_bound_below_zero() -> None:
+def test_zero_rows_of_every_storage_and_round_off_of_a_lift_in_their_bounds() -> None:
     B, g = sp.csr_array(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 2.0]])), np.array([-1e-17, 0.3, -0.5])
     assert settled_bounds(B, g).tolist() == [0.0, 0.3, -0.5]
     assert Contact(B, g).g.tolist() == [0.0, 0.3, -0.5]
     assert solve_high_fidelity(VariationalInequality(sp.eye_array(2, format="csr"), np.ones(2), B, g)).lam[0] == 0.0
-
-
-def test_zero_rows_of_every_storage() -> None:
     dense = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]])
     cancelling = sp.csr_array((np.array([1.0, -1.0, 1.0]), np.array([0, 0, 0]), np.array([0, 2, 3, 3])), (3, 2))
     explicit = sp.csr_array((np.array([0.0, 1.0]), np.array([1, 0]), np.array([0, 1, 2, 2])), (3, 2))

@@ -96,23 +96,22 @@ def test_a_row_that_occurs_twice_changes_nothing(solve: Callable[[Whitened], Sol
     assert np.allclose(vi.B.T @ (alpha[:9] + alpha[:8:-1]), vi.B.T @ multipliers, atol=1e-7)
 
 
-def test_a_zero_row_below_zero_is_infeasible() -> None:
+def test_infeasible_and_indefinite_programs_are_named() -> None:
     vi = program(0)
-    for bound in (1.0, -1.0):
-        zero = VariationalInequality(vi.A, vi.f, np.vstack([vi.B, np.zeros(6)]), np.append(vi.g, bound))
-        if bound > 0.0:
-            assert not Whitened.of(zero).kept[-1]
-        else:
-            with pytest.raises(NumericalError, match="infeasible: a row of B is zero"):
-                Whitened.of(zero)
-
-
-def test_matrices_that_are_not_positive_definite_are_named() -> None:
+    above, below = (
+        VariationalInequality(vi.A, vi.f, np.vstack([vi.B, np.zeros(6)]), np.append(vi.g, g)) for g in (1.0, -1.0)
+    )
+    assert not Whitened.of(above).kept[-1]
+    with pytest.raises(NumericalError, match="infeasible: a row of B is zero"):
+        Whitened.of(below)
+    B, g = np.vstack([vi.B, -vi.B[:1]]), np.append(vi.g, -vi.g[0] - 1.0)
+    with pytest.raises(NumericalError, match="no coefficients satisfy all constraints"):
+        WAYS["greedy"](Whitened.of(VariationalInequality(vi.A, vi.f, B, g)))
     indefinite, vi = np.array([[1.0, 2.0], [2.0, 1.0]]), program(0, n=2)
     with pytest.raises(NumericalError, match="a matrix of 2 constraints is not positive definite"):
         positive_solution(indefinite, np.ones(2))
     with pytest.raises(NumericalError, match="the stiffness of the reduced program is not positive definite"):
-        Whitened.of(VariationalInequality(np.array([[1.0, 2.0], [2.0, 1.0]]), vi.f, vi.B, vi.g))
+        Whitened.of(VariationalInequality(indefinite, vi.f, vi.B, vi.g))
 
 
 def test_the_penalty_converges_linearly_in_epsilon_and_from_outside() -> None:
@@ -206,10 +205,3 @@ def test_a_few_chosen_entries_are_certified_by_what_is_left(seed: int) -> None:
         values.append(0.5 * np.sum(few**2))
     assert np.all(np.diff(values) >= -1e-12)
     assert values[-1] <= 0.5 * np.sum(z**2) + 1e-12
-
-
-def test_the_greedy_names_an_infeasible_program() -> None:
-    vi = program(0)
-    B, g = np.vstack([vi.B, -vi.B[:1]]), np.append(vi.g, -vi.g[0] - 1.0)
-    with pytest.raises(NumericalError, match="no coefficients satisfy all constraints"):
-        WAYS["greedy"](Whitened.of(VariationalInequality(vi.A, vi.f, B, g)))

@@ -126,16 +126,11 @@ def test_the_dual_is_hard() -> None:
     assert pod(u, problem.V, Stop(tolerance=1e-2)).basis.shape[1] < 15
 
 
-def test_a_boundary_below_the_mesh_is_refused() -> None:
+def test_a_boundary_below_the_mesh_is_refused_and_pictures_show_prices_over_shares() -> None:
     problem = Put("coarse")
-    assert problem.refuse(CARR, np.zeros(problem.V.dim), np.zeros(problem.W.dim)).startswith(
-        "the option is not exercised"
-    )
+    refused = problem.refuse(CARR, np.zeros(problem.V.dim), np.zeros(problem.W.dim))
+    assert refused.startswith("the option is not exercised")
     assert problem.boundary(np.zeros(problem.W.dim)) == 0.0
-
-
-def test_the_picture_is_the_price_over_the_share() -> None:
-    problem = Put("coarse")
     found = HighFidelitySolver(problem).solve(CARR)
     picture = problem.picture(CARR, found.u, found.lam)
     assert np.allclose(picture.values, problem.exact(CARR).price(picture.points[0]), atol=2e-4)

@@ -1,7 +1,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numerics import fitted_rate
@@ -91,24 +90,16 @@ def test_the_film_pushes_the_shaft_back_and_aside_and_cavitates_where_it_widens(
     assert np.allclose(found.lam[inside], -mu[0] * np.sin(theta[inside]), rtol=0.01)
 
 
-@pytest.fixture(scope="module")
-def at_paper_size() -> Reduction:
+def test_few_modes_and_generators_suffice_and_reduced_assembly_is_exact() -> None:
     stops = Stop(tolerance=1e-3), Stop(tolerance=5e-2)
-    return Reduction(Bearing("paper"), ModifiedCPG(), OfflinePGA(), *stops, tolerance=0.1, assembly="reduced")
-
-
-def test_few_modes_and_generators_suffice(at_paper_size: Reduction) -> None:
-    problem, lam = at_paper_size.problem, at_paper_size.snapshots.lam
+    reduction = Reduction(Bearing("paper"), ModifiedCPG(), OfflinePGA(), *stops, tolerance=0.1, assembly="reduced")
+    problem, lam, errors = reduction.problem, reduction.snapshots.lam, reduction.pod.errors
     assert (problem.V.dim, problem.W.dim, lam.shape[1]) == (2856, 2856, 60)
-    errors = at_paper_size.pod.errors
     assert [int(np.argmax(errors <= tolerance)) for tolerance in (1e-2, 1e-3, 1e-4)] == [7, 16, 30]
     sizes = [ModifiedCPG().reduce(lam, problem.W, Stop(tolerance=tolerance)).size for tolerance in (1e-1, 5e-2, 1e-2)]
     assert sizes == [1, 3, 13]
-
-
-def test_reduced_assembly_is_exact(at_paper_size: Reduction) -> None:
-    steps = {name: getattr(at_paper_size, name) for name in ("snapshots", "pod", "cone", "enrichment")}
-    full, mu = replace(at_paper_size, assembly="full").given(**steps), np.array([0.55, 1.2])
-    one, other = at_paper_size.model.solve(mu), full.model.solve(mu)
+    steps = {name: getattr(reduction, name) for name in ("snapshots", "pod", "cone", "enrichment")}
+    full, mu = replace(reduction, assembly="full").given(**steps), np.array([0.55, 1.2])
+    one, other = reduction.model.solve(mu), full.model.solve(mu)
     assert np.allclose(one.u, other.u, rtol=0.0, atol=1e-9 * np.abs(other.u).max())
     assert np.allclose(one.lam, other.lam, rtol=0.0, atol=1e-7 * np.abs(other.lam).max())

@@ -102,15 +102,12 @@ def test_integrals_over_the_egg_are_known(bulge: float) -> None:
     assert egg.g.sum() / disc.g.sum() == pytest.approx(1.44 * (1.0 + bulge**2 / 1.5), rel=4e-3)
 
 
-def test_constraints_truly_vary_with_the_bulge_alone() -> None:
+def test_constraints_and_supremizers_truly_vary_with_the_bulge_alone() -> None:
     for problem, rank, classes in ((EGG, 3, 5), (ROUND, 1, 1)):
         matrices = [problem.assemble(mu).B for mu in problem.training_set()[::7]]
         stacked = np.stack([matrix.toarray().ravel() for matrix in matrices])
         assert np.linalg.matrix_rank(stacked, rtol=1e-10) == rank
         assert len(constraint_classes(matrices).representatives) == classes
-
-
-def test_supremizers_of_all_parameters_span_more_than_those_of_one() -> None:
     eta = np.eye(EGG.W.dim)[:, :5]
     representers = [supremizers(EGG.V, EGG.assemble(mu).B, eta) for mu in corners()]
     assert np.linalg.matrix_rank(np.hstack(representers), rtol=1e-8) > np.linalg.matrix_rank(representers[0]) == 5

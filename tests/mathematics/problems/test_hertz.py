@@ -84,19 +84,14 @@ def test_a_and_f_are_constant_and_b_truly_varies(coarse: Hertz) -> None:
     assert not np.allclose(one.g, two.g)
 
 
-def test_condensed_and_sparse_solutions_agree(coarse: Hertz) -> None:
+def test_condensed_and_sparse_solutions_agree_and_loads_scale_with_youngs_modulus(coarse: Hertz) -> None:
     mu = np.array([0.93])
     condensed, sparse = HighFidelitySolver(coarse).solve(mu), solve_high_fidelity(coarse.assemble(mu))
     assert np.allclose(condensed.u, sparse.u, atol=1e-12)
     assert np.allclose(condensed.lam, sparse.lam, atol=1e-9)
-
-
-def test_a_load_scales_with_youngs_modulus(coarse: Hertz) -> None:
-    stiff = Hertz("coarse", young=30.0)
-    mu = np.array([1.0])
-    one, two = HighFidelitySolver(coarse).solve(mu), HighFidelitySolver(stiff).solve(mu)
-    assert np.allclose(one.u, two.u, atol=1e-12)
-    assert np.allclose(2.0 * one.lam, two.lam, rtol=1e-8)
+    stiff = HighFidelitySolver(Hertz("coarse", young=30.0)).solve(mu)
+    assert np.allclose(condensed.u, stiff.u, atol=1e-12)
+    assert np.allclose(2.0 * condensed.lam, stiff.lam, rtol=1e-8)
 
 
 def test_contact_beyond_the_zone_and_pairing_beyond_the_disc_are_refused(coarse: Hertz) -> None:
@@ -104,6 +99,14 @@ def test_contact_beyond_the_zone_and_pairing_beyond_the_disc_are_refused(coarse:
         HighFidelitySolver(Hertz("coarse", approach=0.3)).solve(np.array([1.0]))
     with pytest.raises(NumericalError, match="the radius of disc 2 is too small"):
         coarse.assemble(np.array([0.6]))
+    # From where each flat moves by 0.22 m and more: what Benaceur's grid would be if d were that.
+    solver = HighFidelitySolver(LOADED)
+    solver.solve(np.array([1.125, 0.2]))
+    with pytest.raises(NumericalError, match=r"at mu = \[1.125, 0.25\]: the contact reaches the end of the potential"):
+        solver.solve(np.array([1.125, 0.25]))
+    slave, master = polygons(1)
+    with pytest.raises(NumericalError, match=r"the pairing ends at x = .* the radius of disc 2 is too small"):
+        coupling(slave, 0.5 * master, "exact")
 
 
 def test_the_picture_shows_deformed_discs_and_pressures(coarse: Hertz) -> None:
@@ -141,13 +144,16 @@ def test_loads_of_multipliers_are_those_of_the_matrix_at_every_radius(options: d
 LOADED, PAPER = Hertz("coarse", approach="parameter"), Hertz("coarse")
 
 
-def test_the_grid_is_that_of_the_total_approach() -> None:
+def test_the_grid_is_that_of_the_total_approach_and_those_of_one_radius_share_supremizers() -> None:
     training = LOADED.training_set()
     assert training.shape == (192, 2)
     assert np.unique(2.0 * training[:, 1].round(12)) == pytest.approx(0.15 + 0.01 * np.arange(16))
     assert np.unique(training[:, 0].round(12)) == pytest.approx(np.linspace(0.905, 1.125, 12))
     assert LOADED.parameters.names == ("radius", "approach")
     assert LOADED.validation_set(5, 1).shape == (5, 2)
+    classes = constraint_classes([LOADED.assemble(mu).B for mu in training])
+    assert len(classes.representatives) == 12
+    assert np.array_equal(classes.members, np.repeat(np.arange(12), 16))
 
 
 @pytest.mark.parametrize("radius", [0.905, 1.1])
@@ -192,21 +198,6 @@ def test_contact_stays_inside_the_zone_over_the_whole_box(options: dict[str, obj
     found = HighFidelitySolver(problem).solve(problem.parameters.upper)  # the longest contact
     ends = problem.points(problem.parameters.upper)[0][0, problem.slave.zone[2::2]]
     assert 0.35 < ends[np.flatnonzero(found.lam)[-1]] < 0.42
-
-
-def test_contact_beyond_the_zone_is_refused_at_its_parameter() -> None:
-    """From where each flat moves by 0.22 m and more: what Benaceur's grid would be if d were that."""
-    solver = HighFidelitySolver(LOADED)
-    solver.solve(np.array([1.125, 0.2]))
-    with pytest.raises(NumericalError, match=r"at mu = \[1.125, 0.25\]: the contact reaches the end of the potential"):
-        solver.solve(np.array([1.125, 0.25]))
-
-
-def test_parameters_of_one_radius_share_their_supremizers() -> None:
-    training = LOADED.training_set()
-    classes = constraint_classes([LOADED.assemble(mu).B for mu in training])
-    assert len(classes.representatives) == 12
-    assert np.array_equal(classes.members, np.repeat(np.arange(12), 16))
 
 
 def test_members_are_constant_or_left_to_the_contact() -> None:
@@ -279,9 +270,3 @@ def test_matching_nodes_are_exact_with_two_gauss_points() -> None:
     one, two = coupling(slave, master, "exact"), coupling(slave, master, 2)
     assert np.allclose(one.master.toarray(), two.master.toarray())
     assert np.allclose(one.gap, 0.5 * one.slave @ np.ones(9))
-
-
-def test_a_master_that_is_too_short_is_refused() -> None:
-    slave, master = polygons(1)
-    with pytest.raises(NumericalError, match=r"the pairing ends at x = .* the radius of disc 2 is too small"):
-        coupling(slave, 0.5 * master, "exact")

@@ -75,7 +75,7 @@ def test_the_mesh_fills_the_quarter_disc(edges: int, angle: float, growth: float
     assert aspect_ratios(p, t).max() < 2.5
 
 
-def test_the_zone_has_equal_edges_from_the_apex_to_its_end() -> None:
+def test_zone_and_straight_sides_are_exact() -> None:
     disc = quarter_disc(50, 0.6, 1.2)
     zone = disc.mesh.p[:, disc.zone]
     assert zone.shape == (2, 51)
@@ -83,9 +83,6 @@ def test_the_zone_has_equal_edges_from_the_apex_to_its_end() -> None:
     assert zone[:, -1] == pytest.approx([np.sin(0.6), -np.cos(0.6)])
     lengths = np.linalg.norm(np.diff(zone, axis=1), axis=0)
     assert np.allclose(lengths, 2.0 * np.sin(0.006), rtol=1e-12)
-
-
-def test_the_straight_sides_are_named_and_exact() -> None:
     disc = quarter_disc(40, 0.5, 1.3)
     p = disc.mesh.p
     assert np.all(p[0, disc.axis] == 0.0)

@@ -27,16 +27,13 @@ TRIANGLE = np.array([[[0.0, 4.0, 0.0], [0.0, 0.0, 3.0]], [[0.0, 1.0, 0.0], [0.0,
 """By weight: a triangle with legs 4 and 3, and what makes the legs longer by 1."""
 
 
-def test_sizes_and_resolutions() -> None:
+def test_sizes_resolutions_and_parameters() -> None:
     for resolution, nodes in (("coarse", 400), ("medium", 1200), (2500, 2500), ("paper", 3594)):
         problem = Obstacle(resolution)
         assert problem.nodes == pytest.approx(nodes, rel=0.05)
         boundary = np.abs(problem.mesh.p).max(axis=0) > 0.5 - 1e-9
         assert problem.V.dim == problem.nodes - np.count_nonzero(boundary)
     assert problem.W.dim == pytest.approx(467, rel=0.05)
-
-
-def test_parameters_of_the_paper() -> None:
     training = OBSTACLE.training_set()
     assert training.shape == (125, 3)
     assert np.array_equal(np.unique(training[:, 0]), np.linspace(0.8, 1.2, 5))
@@ -108,13 +105,17 @@ def test_the_membrane_lies_on_the_obstacle_where_the_multiplier_is(mu: np.ndarra
     assert np.isclose(weights @ found.lam[deep] / weights.sum(), 5.0 / mu[0] ** 2 + 1.0, rtol=0.05)  # −Δψ + 1
 
 
-def test_options_change_what_they_name() -> None:
+def test_options_change_what_they_name_and_their_entries() -> None:
     loaded = Obstacle("coarse", load=-2.0, obstacle=-2.5)
     one, two = OBSTACLE.assemble(OFF), loaded.assemble(OFF)
     assert np.allclose(two.f, 2.0 * one.f)
     assert np.allclose(two.g, 2.0 * one.g)
     u, v = active_set.solve_high_fidelity(one).u, active_set.solve_high_fidelity(two).u
     assert np.allclose(v, 2.0 * u, atol=1e-12)
+    mu, places = np.array([1.1, 0.02, -0.03]), (np.arange(6), np.zeros(6, np.intp))
+    one, two = (Obstacle(200, load=load, obstacle=load) for load in (-1.0, -3.0))
+    assert np.allclose(two.sampler({"f": places})(mu)["f"], 3.0 * one.sampler({"f": places})(mu)["f"], rtol=1e-14)
+    assert np.allclose(two.affine["g"].at(mu), 3.0 * one.affine["g"].at(mu), rtol=1e-14)
 
 
 def test_displacements_converge_with_order_one_and_multipliers_with_a_half() -> None:
@@ -192,13 +193,6 @@ def test_only_what_is_wanted_is_evaluated(names: tuple[str, ...]) -> None:
     assert sorted(sample(OBSTACLE.parameters.lower)) == sorted(names)
 
 
-def test_options_of_the_obstacle_are_in_the_entries() -> None:
-    mu, places = np.array([1.1, 0.02, -0.03]), (np.arange(6), np.zeros(6, np.intp))
-    one, two = (Obstacle(200, load=load, obstacle=load) for load in (-1.0, -3.0))
-    assert np.allclose(two.sampler({"f": places})(mu)["f"], 3.0 * one.sampler({"f": places})(mu)["f"], rtol=1e-14)
-    assert np.allclose(two.affine["g"].at(mu), 3.0 * one.affine["g"].at(mu), rtol=1e-14)
-
-
 @given(seeds)
 def test_declared_sums_of_the_obstacle_are_what_is_assembled(seed: int) -> None:
     mu = OBSTACLE.parameters.sample(1, seed)[0]
@@ -223,15 +217,12 @@ def test_a_right_triangle_by_hand(weights: tuple[float, float]) -> None:
         assert np.allclose(LoadEntries(TRIANGLE, triangles[order], np.arange(3))(np.array(weights)), a * b / 6.0)
 
 
-def test_what_has_no_contact_says_so() -> None:
+def test_what_has_no_contact_or_no_sampler_says_so() -> None:
     problem, mu = Put(cells=20), np.array([0.3, 0.06])
     assert not problem.has_contact
     assert problem.contact(mu) is None
     (B, g), vi = problem.constraint(mu), problem.assemble(mu)
     assert abs(B - vi.B).max() == 0.0
     assert np.array_equal(g, vi.g)
-
-
-def test_entries_of_a_problem_that_only_declares_them_are_refused() -> None:
     with pytest.raises(NotImplementedError, match=r"Hertz declares \[\] and has no sampler"):
         Hertz("coarse").sampler({"A": (np.zeros(1, np.intp), np.zeros(1, np.intp))})

@@ -298,16 +298,13 @@ def test_generators_of_the_plain_greedy_are_normalised_snapshots_the_largest_fir
     assert cone.fallbacks == ()
 
 
-def test_the_second_generator_of_the_example_that_corrects_remark_4_3() -> None:
+def test_subtraction_in_the_example_that_corrects_remark_4_3_and_where_theta_is_zero() -> None:
     theta = np.array([[1.0, 1.0], [1.0, 2.0], [0.0, 1.0]])
     rest, note = subtract_cone_component(theta[:, 1], theta[:, :1], EUCLID)
     assert np.allclose(rest, [0.0, 1.0, 1.0], atol=1e-10)
     assert note == ""
     cone = ModifiedCPG().reduce(theta[:, ::-1], EUCLID, Stop(size=2))  # the larger snapshot comes first
     assert np.allclose(cone.generators[:, 0], np.array([1.0, 2.0, 1.0]) / np.sqrt(6.0))
-
-
-def test_generators_positive_where_theta_is_zero_take_no_part() -> None:
     theta, wide = np.array([1.0, 1.0, 0.0]), np.ones((3, 1))
     assert np.array_equal(subtract_cone_component(theta, wide, EUCLID)[0], theta)
     rest, _ = subtract_cone_component(theta, np.hstack([wide, [[1.0], [0.0], [0.0]]]), EUCLID)

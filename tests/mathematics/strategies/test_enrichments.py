@@ -141,21 +141,17 @@ def test_pga_adds_vectors_from_the_training_supremizers(varying: Offline) -> Non
     assert enrichment.vectors.shape[1] > varying.span.shape[1]  # B(mu) varies: one parameter's are not enough
 
 
-def test_with_one_supremizer_space_sigma_is_the_sines_of_the_principal_angles(obstacle: Offline) -> None:
+def test_with_one_supremizer_space_sigma_is_sines_and_offline_spaces_tend_to_online_ones(obstacle: Offline) -> None:
     V = obstacle.problem.V
     B = obstacle.problem.assemble(obstacle.training[4]).B
     target = orthonormal_range(V.whiten(supremizers(V, B, obstacle.span)))
     sines = singular_values(project_out(V.whiten(obstacle.basis), target))
-    sigma = OfflinePGA().build(obstacle, 1e-10).history["sigma"]
+    enrichment = OfflinePGA().build(obstacle, 1e-10)
+    sigma, added = enrichment.history["sigma"], enrichment.vectors
     steps = min(len(sigma), len(sines))
     assert np.allclose(sigma[:steps], sines[:steps], atol=1e-9)
     assert len(sigma) - 1 == np.count_nonzero(sines > 1e-10) <= obstacle.span.shape[1]
-
-
-def test_with_a_tiny_tolerance_offline_and_online_spaces_coincide(obstacle: Offline) -> None:
-    V = obstacle.problem.V
     B = obstacle.problem.assemble(obstacle.training[7]).B
-    added = OfflinePGA().build(obstacle, 1e-10).vectors
     online = V.orthonormalise(supremizers(V, B, obstacle.span), obstacle.basis)
     assert added.shape == online.shape
     assert np.allclose(singular_values(V.gram(added, online)), 1.0, atol=1e-9)
@@ -171,11 +167,6 @@ def test_the_tolerance_between_offline_and_online_constants(obstacle: Offline) -
             B = problem.assemble(mu).B
             loss = 1.0 - inf_sup_on(Z, B, cone).span / inf_sup_full(problem.V, B, cone).span
             assert -1e-9 <= loss <= 1.0 - np.sqrt(1.0 - delta**2) + 1e-9
-
-
-def test_pga_without_a_tolerance_is_refused(varying: Offline) -> None:
-    with pytest.raises(ValueError, match="needs a tolerance"):
-        OfflinePGA().build(varying, None)
 
 
 ON_BETA = pytest.mark.parametrize("strategy", [InfSupGreedy(), OfflinePGA(stop="beta")], ids=["inf-sup", "PGA"])
@@ -306,7 +297,7 @@ def test_they_conform_and_add_nothing_without_generators(varying: Offline) -> No
         assert strategy.build(data, 0.5).vectors.shape == (varying.problem.V.dim, 0)
 
 
-def test_the_unreachable_has_a_reason(varying: Offline) -> None:
+def test_the_unreachable_has_a_reason_and_pga_needs_a_tolerance(varying: Offline) -> None:
     for strategy, tolerance, measure in (
         (InfSupGreedy(), 1.5, "β_S/β_on = 1"),
         (OfflinePGA(stop="beta"), 1.5, "σ = "),
@@ -316,6 +307,8 @@ def test_the_unreachable_has_a_reason(varying: Offline) -> None:
         reason = rf"tolerance {tolerance:g} is not reached: with all supremizers added, {measure}"
         with pytest.raises(NumericalError, match=reason):
             strategy.build(varying, tolerance)
+    with pytest.raises(ValueError, match="needs a tolerance"):
+        OfflinePGA().build(varying, None)
 
 
 def test_a_parameter_at_which_no_enrichment_can_be_stable_does_not_hold_up_the_others(varying: Offline) -> None:

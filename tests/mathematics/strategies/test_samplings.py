@@ -56,15 +56,12 @@ def test_a_sobol_sequence_is_balanced_and_its_sizes_are_nested() -> None:
         assert len(np.unique(np.floor(found * shape), axis=0)) == 64
 
 
-def test_a_grid_is_that_of_the_box_and_geometric_on_a_log_scale() -> None:
+def test_a_grid_is_that_of_the_box_or_around_the_middle_and_geometric_on_a_log_scale() -> None:
     assert points("grid", counts=[3, 1, 4]).tobytes() == BOX.grid(3, 1, 4).tobytes()
     assert points("grid", counts=[2]).tobytes() == BOX.grid(2, 2, 2).tobytes()
     found = points("grid", counts=[7, 1, 2], log=["a"])
     np.testing.assert_allclose(found[::2, 0], np.geomspace(1e-3, 1e3, 7), rtol=1e-12)
     assert np.array_equal(found[:, 2], [5.0, 5.5] * 7)
-
-
-def test_a_grid_of_a_share_is_around_the_middle() -> None:
     whole, part = points("grid", counts=[3]), points("grid", counts=[3], share=0.5)
     middle = 0.5 * (BOX.lower + BOX.upper)
     assert np.allclose(part - middle, 0.5 * (whole - middle))
