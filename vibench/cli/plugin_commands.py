@@ -208,10 +208,12 @@ def _solver_rows(load: bool) -> Iterator[Row]:
     from vibench import provenance
     from vibench.plugins.registry import find, registered
     from vibench.qp.settings import SETTINGS
-    from vibench.qp.solve import installed_solvers
 
-    plugins = {row[0]: row for row in _read_rows(PluginKind.SOLVER)}
-    loaded = installed_solvers(registered(PluginKind.SOLVER)) if load else ()
+    plugins, loaded = {row[0]: row for row in _read_rows(PluginKind.SOLVER)}, list[str]()
+    if load:
+        from vibench.qp.solve import installed_solvers
+
+        loaded = list(installed_solvers(registered(PluginKind.SOLVER)))
     for name in sorted({*SETTINGS, *plugins}):
         version, package = provenance.solver_version(name), provenance.solver_distribution(name)
         if load:
