@@ -112,16 +112,10 @@ def test_beyond_the_limit_of_the_cell_the_items_done_are_kept(run: Run) -> None:
     found = values(run(InItems(("fine", "fine", "sleep", "fine")), query=60.0, cell=2.0))
     assert [isinstance(value, Failed) for _, value in found] == [False, False, True, True]
     assert found[3][1] == Failed(Status.TIMEOUT, "stopped after cell_seconds = 2 s")
-
-
-def test_many_quick_items_have_the_limit_of_the_cell_too(run: Run) -> None:
     found = values(run(InItems(("moment",) * 400), cell=2.0))
     lost = [value for _, value in found if isinstance(value, Failed)]
     assert 300 < len(lost) < 400
     assert set(lost) == {Failed(Status.TIMEOUT, "stopped after cell_seconds = 2 s")}
-
-
-def test_a_death_beyond_the_limit_is_not_the_reason_of_items_never_asked(run: Run) -> None:
     found = values(run(InItems(("fine", "sleep", "exit", "fine")), query=600.0, cell=1.0))
     assert {value.status for _, value in found[1:]} == {Status.TIMEOUT}
 

@@ -93,14 +93,13 @@ def test_a_cell_without_row_is_done_again(vibench: Vibench, again: Path, artefac
     assert len(rows(folder, "queries")) == 9
 
 
-def test_other_cells_join_those_of_the_same_study(vibench: Vibench, again: Path) -> None:
+def test_other_cells_join_those_of_the_same_study_and_strict_fails_where_one_is_not_ok(
+    vibench: Vibench, again: Path
+) -> None:
     printed, after = run_wire(vibench, again, "--solver", "osqp", "--pod-tol", "0.1")
     assert "1 cells, 1 to run" in printed
     assert [row["solver"] for row in after] == [*SOLVERS, "osqp"]
     assert len(pd.read_csv(again / "runs" / "wire" / "tables" / "cells.csv")) == 4
-
-
-def test_strict_fails_where_a_cell_is_not_ok(vibench: Vibench, again: Path) -> None:
     for solvers, code in ((["piqp", "gives-up"], 1), (["piqp", "careful", "ecos"], 0)):
         chosen = [option for solver in solvers for option in ("--solver", solver)]
         done = vibench(again, "run", "study.toml", "--strict", "--jobs", "1", *chosen)

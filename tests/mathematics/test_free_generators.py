@@ -1,5 +1,7 @@
 """Generators that may be used with either sign, from the cone to the rows of a run."""
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -8,7 +10,6 @@ from hypothesis import strategies as st
 from numerics import Varying, space
 from samples import SampleStore, carry_out, program_queries
 
-from vibench.arrays import Array
 from vibench.highfidelity import active_set
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment, Kind, Stop
@@ -118,31 +119,24 @@ def test_orthogonality_is_the_distance_from_a_cone_that_has_free_generators() ->
     assert values[1] < orthogonality(-chi * np.sign(W.gram(chi, chi)[0, 1]), W)[1] + 1e-12
 
 
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
-    return SampleStore(tmp_path_factory.mktemp("free"))
-
-
-@pytest.mark.parametrize("interpolation", [None, 1e-8], ids=["full", "reduced"])
-def test_rows_of_a_negative_control_keep_the_invariants(store: SampleStore, interpolation: float | None) -> None:
+def test_rows_of_a_negative_control_keep_the_invariants(tmp_path: Path) -> None:
     def plugin(kind: str, name: str, options: str = "{}") -> Plugin:
         return Plugin(PluginKind(kind), name, options, find(PluginKind(kind), name).code)
 
     problem = plugin("problem", "hertz", '{"resolution": "coarse"}')
     cone = ConeStage(problem, plugin("dual strategy", "pod-dual"), Stop(tolerance=1e-2))
     pod, primal = PODStage(problem, Stop(tolerance=1e-3)), plugin("primal strategy", "infsup-greedy")
-    stage = program_queries(
-        SingleEnrichment(pod, cone, primal, 0.7), interpolation, ParameterSet("validation", 3, 1), "piqp", 1e-7
-    )
-    carry_out(stage, store)
-    found: CellRows = value_of(store, stage)
-    assert (found.cell["status"], found.cell["queries_ok"]) == ("ok", 3)
-    control: Array = value_of(store, cone).cone.generators
-    assert found.cell["R"] == control.shape[1]
-    queries = pd.DataFrame(found.queries).assign(cell="a")
-    assert set(queries["beta_bounds"]) == {"span/span"}
-    assert set(queries["form"]) == {"primal"}  # opposite constraints leave the dual singular
-    # without certified bounds, as λ is not in W⁺
-    bounds = [name for name in STORED["queries"] if name.startswith("effectivity_")]
-    queries = queries.reindex(columns=queries.columns.union(bounds))
-    assert violations(queries, pd.Series({"a": "fixed"})) == []
+    enrichment, store = SingleEnrichment(pod, cone, primal, 0.7), SampleStore(tmp_path)
+    for interpolation in (None, 1e-8):
+        stage = program_queries(enrichment, interpolation, ParameterSet("validation", 3, 1), "piqp", 1e-7)
+        carry_out(stage, store)
+        found: CellRows = value_of(store, stage)
+        assert (found.cell["status"], found.cell["queries_ok"]) == ("ok", 3)
+        assert found.cell["R"] == value_of(store, cone).cone.generators.shape[1]
+        queries = pd.DataFrame(found.queries).assign(cell="a")
+        assert set(queries["beta_bounds"]) == {"span/span"}
+        assert set(queries["form"]) == {"primal"}  # opposite constraints leave the dual singular
+        # without certified bounds, as λ is not in W⁺
+        bounds = [name for name in STORED["queries"] if name.startswith("effectivity_")]
+        queries = queries.reindex(columns=queries.columns.union(bounds))
+        assert violations(queries, pd.Series({"a": "fixed"})) == []

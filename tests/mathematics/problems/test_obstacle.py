@@ -177,13 +177,15 @@ def test_entries_of_the_obstacle_are_those_of_what_is_assembled(seed: int, count
 
 
 @given(seeds)
-def test_forms_of_the_obstacle_are_those_of_a_finite_element_library(seed: int) -> None:
+def test_forms_are_those_of_a_finite_element_library_and_declared_sums_what_is_assembled(seed: int) -> None:
     mu = OBSTACLE.parameters.sample(1, seed)[0]
     vi, basis = OBSTACLE.assemble(mu), Basis(MeshTri(OBSTACLE.points(mu), OBSTACLE.mesh.t), ElementTriP1())
     free = OBSTACLE.free
     assert abs(vi.A - laplace.assemble(basis)[free][:, free]).max() < 1e-13 * abs(vi.A).max()
     assert np.allclose(vi.f, -unit_load.assemble(basis)[free], rtol=1e-13, atol=0.0)
     assert vi.A.has_canonical_format
+    assert abs(OBSTACLE.affine["B"].at(mu) - vi.B).max() <= 1e-15 * abs(vi.B).max()
+    assert np.allclose(OBSTACLE.affine["g"].at(mu), vi.g, rtol=1e-14)
 
 
 @pytest.mark.parametrize("names", [("A",), ("f",), ("A", "f"), ()])
@@ -191,14 +193,6 @@ def test_only_what_is_wanted_is_evaluated(names: tuple[str, ...]) -> None:
     places = np.array([3, 5]), np.array([3, 5])
     sample = OBSTACLE.sampler(dict.fromkeys(names, places))
     assert sorted(sample(OBSTACLE.parameters.lower)) == sorted(names)
-
-
-@given(seeds)
-def test_declared_sums_of_the_obstacle_are_what_is_assembled(seed: int) -> None:
-    mu = OBSTACLE.parameters.sample(1, seed)[0]
-    vi = OBSTACLE.assemble(mu)
-    assert abs(OBSTACLE.affine["B"].at(mu) - vi.B).max() <= 1e-15 * abs(vi.B).max()
-    assert np.allclose(OBSTACLE.affine["g"].at(mu), vi.g, rtol=1e-14)
 
 
 @pytest.mark.parametrize("weights", [(1.0, 0.0), (1.0, 0.5), (2.0, -1.0)])

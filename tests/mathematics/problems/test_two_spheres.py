@@ -48,9 +48,11 @@ def test_integrals_of_hat_functions_are_those_of_quadrature(
         assert found[:, j] == pytest.approx(expected, abs=1e-14)
 
 
-def test_a_grid_that_ends_too_early_is_refused() -> None:
+def test_grids_that_end_too_early_and_contact_beyond_the_zone_are_refused() -> None:
     with pytest.raises(NumericalError, match=r"ends at x = 0\.9 m, but .* reaches x = 1 m"):
         hat_integrals(np.linspace(0.0, 1.0, 4), np.linspace(0.0, 0.9, 3))
+    with pytest.raises(NumericalError, match="reaches the end of the potential contact zone"):
+        spheres(4, 0.2)[1].solve(np.array([1.25, 0.15, 0.3]))
 
 
 def cube(cells: int, edge: float) -> Shape:
@@ -139,7 +141,7 @@ def test_the_energy_of_a_body_scales_with_its_radius() -> None:
         assert abs(1.3 * one - other).max() < 1e-13
 
 
-def test_the_exported_mesh_has_both_bodies_the_right_way_round() -> None:
+def test_outputs_and_pictures_are_those_of_the_pressure_and_meshes_have_both_bodies_the_right_way_round() -> None:
     one, solver = spheres(4, 0.2)
     mu = np.array([1.2, 0.07, 0.3])
     found = solver.solve(mu)
@@ -150,6 +152,14 @@ def test_the_exported_mesh_has_both_bodies_the_right_way_round() -> None:
     assert (fields.points[:, 2].min(), fields.points[:, 2].max()) == (-1.0, pytest.approx(1.2))
     moved = fields.at_points["u [m]"][fields.points[:, 2] == 1.2]
     assert moved[:, 2] == pytest.approx(-0.07)
+    one, solver = spheres(4, 0.2)
+    mu = np.array([1.0, 0.08, 0.3])
+    found = solver.solve(mu)
+    force = next(output for output in one.outputs if output.name == "contact force")
+    assert force.values(mu[None], found.u[:, None], found.lam[:, None]) == pytest.approx(one.force(found.lam))
+    picture = one.picture(mu, found.u, found.lam)
+    assert picture.values.min() == pytest.approx(-0.5 * mu[1], rel=0.05)  # equal spheres share the approach
+    assert picture.positions[:, np.argmax(picture.multiplier)] == pytest.approx(one.middles[:, 0])
 
 
 @pytest.mark.parametrize(("radius", "poisson"), [(1.0, 0.3), (0.8, 0.4), (1.25, 0.2)])
@@ -225,11 +235,6 @@ def test_the_published_case_is_that_of_axisymmetric_elements() -> None:
     assert 50.0 * one.measured(found.lam).a == pytest.approx(10.3, abs=0.2)
 
 
-def test_contact_beyond_the_zone_is_refused() -> None:
-    with pytest.raises(NumericalError, match="reaches the end of the potential contact zone"):
-        spheres(4, 0.2)[1].solve(np.array([1.25, 0.15, 0.3]))
-
-
 def test_the_plugin_has_both_obstacles_and_refuses_options_of_the_other() -> None:
     assert type(create("problem", "hertz3d", {"resolution": 1000, "obstacle": "sphere", "extent": 0.1})) is TwoSpheres
     assert type(Hertz3D(1000, obstacle="paraboloid", distance=8.0)) is Hertz3D
@@ -237,14 +242,3 @@ def test_the_plugin_has_both_obstacles_and_refuses_options_of_the_other() -> Non
         create("problem", "hertz3d", {"obstacle": "sphere", "far": "clamped"})
     with pytest.raises(RequestError, match="obstacle = 'paraboloid' has no option 'extent'"):
         create("problem", "hertz3d", {"extent": 0.1})
-
-
-def test_outputs_and_the_picture_are_those_of_the_pressure() -> None:
-    one, solver = spheres(4, 0.2)
-    mu = np.array([1.0, 0.08, 0.3])
-    found = solver.solve(mu)
-    force = next(output for output in one.outputs if output.name == "contact force")
-    assert force.values(mu[None], found.u[:, None], found.lam[:, None]) == pytest.approx(one.force(found.lam))
-    picture = one.picture(mu, found.u, found.lam)
-    assert picture.values.min() == pytest.approx(-0.5 * mu[1], rel=0.05)  # equal spheres share the approach
-    assert picture.positions[:, np.argmax(picture.multiplier)] == pytest.approx(one.middles[:, 0])

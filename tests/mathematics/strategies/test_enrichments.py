@@ -83,10 +83,6 @@ def drawn(n: int, m: int, count: int, modes: int, generators: int) -> Offline:
     return offline(Varying(n, m, count), count, modes, min(generators, count))
 
 
-def test_decorrelated_adds_nothing(varying: Offline) -> None:
-    assert Decorrelated().build(varying, None).kind is Kind.NONE
-
-
 def test_online_supremizers_reach_the_whole_space_at_every_parameter(varying: Offline) -> None:
     enrichment = pickle.loads(pickle.dumps(OnlineSupremizers().build(varying, None)))
     assert enrichment.kind is Kind.PER_PARAMETER
@@ -295,6 +291,7 @@ def test_they_conform_and_add_nothing_without_generators(varying: Offline) -> No
     data = Offline(varying.problem, varying.basis, Cone(empty, np.zeros(1), no_free(0)), empty, varying.training)
     for strategy in (InfSupGreedy(), OfflinePGA(stop="beta"), OfflinePGA(), PODSupremizers()):
         assert strategy.build(data, 0.5).vectors.shape == (varying.problem.V.dim, 0)
+    assert Decorrelated().build(varying, None).kind is Kind.NONE
 
 
 def test_the_unreachable_has_a_reason_and_pga_needs_a_tolerance(varying: Offline) -> None:
