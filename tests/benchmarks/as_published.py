@@ -27,8 +27,7 @@ import published
 from page import Page
 from sides import CASES, TOTAL, TOTAL_NAME, Ours, Published, Side
 
-from vibench import provenance
-from vibench.arrays import Array
+from vibench import Array, provenance
 from vibench.qp import verification
 from vibench.timing import median_seconds, timed
 

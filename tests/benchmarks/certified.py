@@ -20,14 +20,12 @@ import numpy as np
 import pandas as pd
 
 import vibench
-from vibench import Array
+from vibench import Array, HighFidelitySolution, HighFidelitySolver, Model
 from vibench.execution.recorded_cell import recorded_cells
-from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.model.bound_terms import CorrectionMode
 from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.offline.assemblies import Assemblies
-from vibench.offline.models import Model
 from vibench.offline.solution import Answer, Corrector
 from vibench.plugins.plugin import Plugin
 from vibench.stages.assessment import is_violated

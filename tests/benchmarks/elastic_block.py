@@ -22,9 +22,8 @@ import numpy as np
 from skfem import Basis, ElementHex1, ElementVector, MeshHex
 from skfem.models.elasticity import linear_elasticity
 
-from vibench import AffineProblem, Array, InnerProduct, ParameterBox, Problem, fem
+from vibench import AffineProblem, Array, InnerProduct, ParameterBox, Problem, checked_assembly, fem
 from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolver
-from vibench.interfaces.validation import checked_assembly
 from vibench.model.error_bounds import ErrorBounds, bound_errors_at
 from vibench.offline.assemblies import Assemblies
 from vibench.plugins.plugin import Plugin

@@ -17,9 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vibench import AffineProblem, Array, Problem, create
-from vibench.errors import NumericalError
-from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench import AffineProblem, Array, HighFidelitySolver, NumericalError, Problem, create
 from vibench.model.error_bounds import bound_errors_at, corrected_pair
 from vibench.offline.assemblies import assemblies
 from vibench.stability.coercivity import coercivity_and_continuity, energy_inf_sup

@@ -13,9 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import SuperLU, splu
 
-from vibench.arrays import Array, Mask, SparseMatrix
-from vibench.interfaces.problem import Problem, VariationalInequality
-from vibench.interfaces.strategies import Stop
+from vibench import Array, Mask, Problem, SparseMatrix, Stop, VariationalInequality
 
 TIE = 1e-9
 """Relative values that differ by less count as equal; the smallest index wins."""

@@ -7,13 +7,8 @@ from typing import Any
 import numpy as np
 import published
 
-from vibench.arrays import Array
-from vibench.errors import UnsupportedError
-from vibench.interfaces.problem import Problem
-from vibench.interfaces.strategies import Stop
+from vibench import Array, CompiledModel, CompiledProgram, Problem, Reduction, Stop, UnsupportedError
 from vibench.model.hyperreduced import AnyReducedModel
-from vibench.offline.compiled import CompiledModel, CompiledProgram
-from vibench.offline.reduction import Reduction
 from vibench.qp.solve import solve_qp
 from vibench.qp.verification import kkt_residuals
 from vibench_problems.hertz import Hertz

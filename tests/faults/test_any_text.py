@@ -19,10 +19,9 @@ from odd_plugins import LABEL, ODD
 from outputs import clean, elements
 from samples import cell_row, filled, query_rows
 
+from vibench import QPSolution, VariationalInequality
 from vibench.cli.console import print_frame
-from vibench.interfaces.problem import VariationalInequality
 from vibench.plugins import registry
-from vibench.qp.verification import QPSolution
 from vibench.report import html
 from vibench.report.figures import problem_tables, work_precision
 from vibench.report.figures.style import styled, write_figure

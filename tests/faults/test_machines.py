@@ -13,9 +13,8 @@ import pytest
 from running import PATIENCE, Main, Register, Vibench, by_solver, refused, started
 from samples import wire_study, write_study
 
-from vibench import Enrichment, Kind, Offline, PrimalStrategy
+from vibench import Enrichment, Kind, Offline, PrimalStrategy, RequestError
 from vibench.cli import doctor
-from vibench.errors import RequestError
 from vibench.provenance import cores, solver_version
 from vibench.results.database import ResultsDatabase
 

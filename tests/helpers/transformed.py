@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from vibench import Array, Contact, Indices, InnerProduct, Problem, Sampler, VariationalInequality
-from vibench.interfaces.affine import AffineSum
+from vibench import AffineSum, Array, Contact, Indices, InnerProduct, Problem, Sampler, VariationalInequality
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
 from vibench_problems.pack import Pack

@@ -18,9 +18,8 @@ from outputs import clean
 from running import Main, Register, refused
 from samples import install_fakes
 
-from vibench import benchmarks
+from vibench import RequestError, benchmarks
 from vibench.benchmarks.plugin import PASSES, how_often
-from vibench.errors import RequestError
 
 REGISTERED = """\
 [vibench.problems]

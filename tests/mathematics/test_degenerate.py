@@ -7,10 +7,7 @@ import pytest
 from fake_plugins import Wire
 from samples import SampleStore, carry_out, program_queries
 
-from vibench.arrays import Array
-from vibench.errors import NumericalError
-from vibench.interfaces.problem import VariationalInequality
-from vibench.interfaces.strategies import Stop
+from vibench import Array, NumericalError, Stop, VariationalInequality
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find

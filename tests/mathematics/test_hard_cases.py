@@ -10,8 +10,7 @@ from hard_problems import Beam, DoubleObstacle, Floating, Truss
 from other_problems import Covered, ThermalBlock, Torsion
 from samples import pga_reduction
 
-from vibench import AffineProblem, InnerProduct, create
-from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench import AffineProblem, HighFidelitySolver, InnerProduct, create
 from vibench.linalg.cholesky import PartialCholesky
 from vibench.linalg.definite import BlockDiagonal
 from vibench.model.certificates.base import Guarantee

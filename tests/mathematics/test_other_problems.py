@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from other_problems import Block, Put, Torsion
 
-from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench import HighFidelitySolver, Status
 from vibench.qp.solve import solve_qp
-from vibench.qp.status import Status
 from vibench.qp.verification import verify
 
 

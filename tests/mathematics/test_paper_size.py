@@ -6,8 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.strategies import Cone, DualStrategy, Offline, Stop
+from vibench import Cone, DualStrategy, HighFidelitySolver, Offline, Stop
 from vibench.reduction.cones import orthogonality
 from vibench.reduction.pod import pod
 from vibench.stability.infsup import cone_basis, inf_sup_full, inf_sup_on, nodal_cone

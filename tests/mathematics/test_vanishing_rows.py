@@ -11,13 +11,10 @@ from numerics import spd
 from samples import pga_reduction
 from vanishing import BOX, DOFS, Base, Declared, OnContact, Vanishing, share
 
-from vibench import NumericalError, VariationalInequality
-from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench import Contact, HighFidelitySolver, NumericalError, VariationalInequality, solve_high_fidelity
 from vibench.interfaces.absent_rows import settled_bounds, zero_rows
-from vibench.interfaces.problem import Contact
 from vibench.model.affine import Evaluation, affine_decomposition
 from vibench.offline.assemblies import Assemblies
-from vibench.offline.checked_tools import solve_high_fidelity
 from vibench.qp.solve import installed_solvers, solve_qp
 from vibench.qp.verification import verify
 from vibench.stability.infsup import inf_sup_full, nodal_cone

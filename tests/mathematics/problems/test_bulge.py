@@ -11,8 +11,7 @@ from skfem import Basis, ElementTriP1, LinearForm, MeshTri
 from skfem.helpers import dot
 from skfem.models.poisson import laplace, mass
 
-from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.strategies import Stop
+from vibench import HighFidelitySolver, Stop
 from vibench.model.affine import Evaluation, affine_decomposition
 from vibench.offline.reduction import Reduction, high_fidelity_sweep
 from vibench.reduction.supremizers import constraint_classes, supremizers

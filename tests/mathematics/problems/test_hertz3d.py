@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from skfem import Basis, ElementHex1, ElementVector, FacetBasis
 
-from vibench import HighFidelitySolver, NumericalError
-from vibench.highfidelity.active_set import HighFidelitySolution
+from vibench import HighFidelitySolution, HighFidelitySolver, NumericalError
 from vibench_problems.cube_shells import graded_block
 from vibench_problems.elastic_forms import AXES, dilatation, gradients, products_of_gradients, shearing
 from vibench_problems.elliptic_contact import EllipticContact, elliptic_contact

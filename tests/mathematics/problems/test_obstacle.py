@@ -11,9 +11,8 @@ from skfem import Basis, ElementTriP1, Functional, MeshTri
 from skfem.helpers import dot, grad
 from skfem.models.poisson import laplace, unit_load
 
+from vibench import HighFidelitySolver, checked_assembly
 from vibench.highfidelity import active_set
-from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.validation import checked_assembly
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
 from vibench_problems.p1_entries import LoadEntries, StiffnessEntries

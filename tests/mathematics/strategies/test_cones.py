@@ -9,13 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import space
 
-from vibench.arrays import Array
-from vibench.errors import NumericalError
-from vibench.interfaces.problem import VariationalInequality
+from vibench import Array, InnerProduct, NumericalError, QPSolution, VariationalInequality, check_cone
 from vibench.interfaces.strategies import Cone, DualStrategy, Stop, rays
-from vibench.interfaces.validation import check_cone
-from vibench.linalg.inner_product import InnerProduct
-from vibench.qp.verification import QPSolution
 from vibench.reduction import cone_subtraction, subtract_cone_component
 from vibench.reduction.cones import project_on_cone
 from vibench_strategies import enlarged_cpg

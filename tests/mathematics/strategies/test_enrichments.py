@@ -12,11 +12,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numerics import Varying
 
-from vibench.arrays import Array
-from vibench.errors import NumericalError
-from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.strategies import Cone, Kind, Offline, Stop, no_free
-from vibench.interfaces.validation import check_enrichment
+from vibench import Array, Cone, HighFidelitySolver, Kind, NumericalError, Offline, Stop, check_enrichment, no_free
 from vibench.linalg.inner_product import orthonormal_range, project_out, singular_values
 from vibench.reduction.cones import LazyMaximum
 from vibench.reduction.nested import NestedStrategy, grow_through
