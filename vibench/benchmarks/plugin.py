@@ -19,7 +19,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sized
 from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
@@ -107,10 +107,10 @@ class Passes:
     @pytest.fixture
     def timing(self, benchmark: Any, inputs: StageInputs, number: int) -> Timing:
         """A function that times some work, whose result the first pass judges; if that raises, nothing is timed."""
-        # `fresh` gives a new argument of the work for every round, where it takes one. A round has `together` calls,
-        # where each does something else.
+        # `fresh` gives a new argument of the work for every round, where it takes one. A round has a call for each of
+        # the things that the work does `in_turn`.
 
-        def measure(group: str, work: Work, judge: Judge, fresh: Work | None = None, together: int = 1) -> None:
+        def measure(group: str, work: Work, judge: Judge, fresh: Work | None = None, in_turn: Sized = ()) -> None:
             def once() -> tuple[Any, Any]:
                 given = () if fresh is None else (fresh(),)
                 return timed(lambda: work(*given))
@@ -127,7 +127,7 @@ class Passes:
                     seconds = min(seconds, spent.wall)
                 # Slow work is timed in one pass.
                 benchmark.extra_info["slow"] = spent.cpu >= 3.0 * budget
-            rounds, calls = how_often(seconds, budget / PASSES, together)
+            rounds, calls = how_often(seconds, budget / PASSES, max(1, len(in_turn)))
             benchmark.group = group
             before = calibration().seconds().cpu
             if fresh is None:

@@ -286,7 +286,7 @@ def _check_reduced(inputs: StageInputs, primal: PrimalChoice) -> None:
 
 def _time_assembly(timing: Timing, inputs: StageInputs, group: str, model: AnyReducedModel) -> None:
     mus, judge = _in_turn(inputs), lambda _: _judge_programs(inputs, model)
-    timing(group, lambda: model.assemble(next(mus)), judge, together=len(inputs.queries))
+    timing(group, lambda: model.assemble(next(mus)), judge, in_turn=inputs.queries)
 
 
 def _judge_programs(inputs: StageInputs, model: AnyReducedModel) -> Info:
@@ -313,7 +313,7 @@ def test_query(timing: Timing, inputs: StageInputs, primal: PrimalChoice) -> Non
     def judge(_: QPSolution) -> Info:
         return _judge_answers(inputs, model, lambda answer: answer.residuals)
 
-    timing("query", query, judge, together=len(inputs.queries))
+    timing("query", query, judge, in_turn=inputs.queries)
 
 
 def _judge_answers(inputs: StageInputs, model: Model, residuals: Callable[[Solution], Residuals | None]) -> Info:
@@ -385,7 +385,7 @@ def test_formulated_query(timing: Timing, inputs: StageInputs, formulation: str)
     def judge(_: FormulationAnswer) -> Info:
         return _judge_answers(inputs, model, _high_fidelity_residuals)
 
-    timing("query of a formulation", query, judge, together=len(inputs.queries))
+    timing("query of a formulation", query, judge, in_turn=inputs.queries)
 
 
 def _formulated(inputs: StageInputs, formulation: str) -> Callable[[], Model]:

@@ -23,11 +23,9 @@ from vibench.testing.case import Arrays
 
 
 class MovingSupport(Problem):
-    """A string pressed on a parabolic support that moves and rises with the parameter.
+    """A string pressed on a parabolic support that moves and rises with the parameter."""
 
-    The constraints are on weighted means around points that move with the support, so that B, and with it every
-    supremizer, depends on mu.
-    """
+    # Weighted means around points that move with the support are constrained: B and every supremizer depend on mu.
 
     elementwise: ClassVar[frozenset[str]] = frozenset({"A", "f"})
     parameters = ParameterBox(("position", "height"), np.array([-0.1, 0.0]), np.array([0.1, 0.04]), ("m", "m"))
