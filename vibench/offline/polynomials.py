@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from types import MappingProxyType
 
 import numpy as np
 
@@ -42,7 +41,7 @@ def member_polynomials(
     *,
     fixed: bool,
     beside: Beside | None = None,
-    rotated: Mapping[str, Array] = MappingProxyType({}),
+    rotated: Mapping[str, Array] = {},
     check: Callable[[VariationalInequality], None] | None = None,
 ) -> tuple[AnyReducedModel, dict[str, AffinePolynomial]]:
     """The model whose members are evaluated, see `declared_model`, and polynomials of the members."""

@@ -28,13 +28,11 @@ from vibench.qp.verification import Residuals
 class Answer(NamedTuple):
     """The pair u (n,), λ (m,), whether it is corrected, and a note why it is not although that is asked for."""
 
-    # `bound` has its bounds at online cost, where the model has them; `share` is ω/ρ of the reduced solution.
-
     u: Array
     lam: Array
-    bound: OnlineBound | None = None
+    bound: OnlineBound | None = None  # its bounds at online cost, where the model has them
     is_corrected: bool = False
-    share: float | None = None
+    share: float | None = None  # ω/ρ of the reduced solution
     note: str = ""
 
 

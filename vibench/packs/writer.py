@@ -5,8 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import tempfile
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,6 @@ from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import MEMBERS, Problem
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
 from vibench.packs.manifest import FILE
-
-_save_arrays: Callable[..., None] = partial(np.savez_compressed, allow_pickle=False)
 
 
 def write_pack(
@@ -36,7 +33,7 @@ def write_pack(
     with _new_folder(folder) as part:
         lines = ["format = 1", f"name = {_toml_text(name)}", f"source = {_toml_text(source)}", ""]
         box = problem.parameters
-        _save_arrays(part / "parameters.npz", training=training, validation=listed[len(training) :])
+        _save(part / "parameters.npz", {"training": training, "validation": listed[len(training) :]})
         names, units = (", ".join(map(_toml_text, texts)) for texts in (box.names, box.units))
         lines += ["[parameters]", f"names = [{names}]", f"units = [{units}]"]
         lines += [f"lower = {box.lower.tolist()}", f"upper = {box.upper.tolist()}"]
@@ -46,7 +43,7 @@ def write_pack(
             solver = HighFidelitySolver(problem)
             exact = [solver.solve(mu) for mu in listed]
             u, lam = (np.column_stack([getattr(one, name) for one in exact]) for name in ("u", "lam"))
-            _save_arrays(part / "solutions.npz", u=u, lam=lam)
+            _save(part / "solutions.npz", {"u": u, "lam": lam})
             lines += ["[solutions]", 'u = "solutions.npz:u"', 'lam = "solutions.npz:lam"', ""]
         lines += _output_tables(problem, part)
         explanation = (
@@ -72,16 +69,13 @@ def _new_folder(folder: Path) -> Iterator[Path]:
 
 
 def _space_table(problem: Problem, part: Path) -> list[str]:
-    arrays = _parts("X_V", problem.V.matrix) | _parts("X_W", problem.W.matrix)
-    lines = ["[spaces]", 'X_V = "spaces.npz:X_V"', 'X_W = "spaces.npz:X_W"']
+    arrays: dict[str, Any] = {"X_V": problem.V.matrix, "X_W": problem.W.matrix}
     if problem.contact_dofs is not None:
         arrays["contact"] = problem.contact_dofs
-        lines.append('contact = "spaces.npz:contact"')
     if type(problem).multiplier_integrals is not Problem.multiplier_integrals:
         arrays["integrals"] = problem.multiplier_integrals()
-        lines.append('integrals = "spaces.npz:integrals"')
-    _save_arrays(part / "spaces.npz", **arrays)
-    return [*lines, ""]
+    _save(part / "spaces.npz", arrays)
+    return ["[spaces]", *(f'{name} = "spaces.npz:{name}"' for name in arrays), ""]
 
 
 def _operator_table(problem: Problem, listed: Array, part: Path) -> list[str]:
@@ -92,7 +86,7 @@ def _operator_table(problem: Problem, listed: Array, part: Path) -> list[str]:
         vi = checked_assembly(problem, mu)
         for name in MEMBERS:
             if name not in problem.affine and (k == 0 or name not in problem.constant):
-                arrays[name] |= _parts(str(k), getattr(vi, name))
+                arrays[name][str(k)] = getattr(vi, name)
     entrywise = sorted((problem.entrywise | set(problem.affine)) - problem.constant)
     lines = ["[operators]", f"entrywise = [{', '.join(map(_toml_text, entrywise))}]"]
     for name in MEMBERS:
@@ -101,14 +95,13 @@ def _operator_table(problem: Problem, listed: Array, part: Path) -> list[str]:
             declared = problem.affine[name]
             theta = np.column_stack([declared.coefficients(mu) for mu in listed])
             arrays[name] = {f"theta{q}": values for q, values in enumerate(theta)}
-            for q, term in enumerate(declared.terms):
-                arrays[name] |= _parts(f"term{q}", term)
+            arrays[name] |= {f"term{q}": term for q, term in enumerate(declared.terms)}
             entries = (f'{{ table = "{name}.npz:theta{q}", array = "{name}.npz:term{q}" }}' for q in range(len(theta)))
             line = f"{name}.affine = [{', '.join(entries)}]"
         else:
             constant = name in problem.constant
             line = f'{name} = "{name}.npz:0"' if constant else f'{name}.each = "{name}.npz:{{}}"'
-        _save_arrays(part / f"{name}.npz", **arrays[name])
+        _save(part / f"{name}.npz", arrays[name])
         lines.append(line)
     return [*lines, ""]
 
@@ -125,19 +118,23 @@ def _output_tables(problem: Problem, part: Path) -> list[str]:
                 lines.append(f'{key} = "outputs.npz:{key}{k}"')
         lines.append("")
     if arrays:
-        _save_arrays(part / "outputs.npz", **arrays)
+        _save(part / "outputs.npz", arrays)
     return lines
 
 
-def _parts(name: str, matrix: Any) -> dict[str, Any]:
-    """A dense array, or the arrays of a sparse matrix, its entries in their order."""
-    if isinstance(matrix, np.ndarray):
-        return {name: matrix}
-    kept = matrix if matrix.format in ("csr", "csc") else sp.csr_array(matrix)
-    return {
-        f"{name}/data": kept.data, f"{name}/indices": kept.indices, f"{name}/indptr": kept.indptr,
-        f"{name}/shape": np.array(kept.shape), f"{name}/format": np.array(kept.format, dtype="S3"),
-    }  # fmt: skip
+def _save(file: Path, arrays: Mapping[str, Any]) -> None:
+    """Write dense arrays, and the arrays of sparse matrices, their entries in their order."""
+    parts: dict[str, Any] = {}
+    for name, matrix in arrays.items():
+        if isinstance(matrix, np.ndarray):
+            parts[name] = matrix
+            continue
+        kept = matrix if matrix.format in ("csr", "csc") else sp.csr_array(matrix)
+        parts |= {
+            f"{name}/data": kept.data, f"{name}/indices": kept.indices, f"{name}/indptr": kept.indptr,
+            f"{name}/shape": np.array(kept.shape), f"{name}/format": np.array(kept.format, dtype="S3"),
+        }  # fmt: skip
+    np.savez_compressed(file, allow_pickle=False, **parts)
 
 
 def _toml_text(value: str) -> str:
