@@ -20,6 +20,7 @@ from vibench.linalg.inner_product import InnerProduct
 __all__ = ["Unilateral", "eliminate", "h1_gram", "lumped_mass", "mass", "normal_constraint", "unilateral"]
 
 Sense = Literal["<=", ">="]
+Integrals = Callable[[Callable[[Array], Array]], Array]  # of a function times those of a basis
 
 
 def mass(basis: Basis) -> SparseMatrix:
@@ -74,7 +75,7 @@ class Unilateral:
     nodes: Indices
     points: Array
     sense: Sense
-    _integrals: Callable[[Callable[[Array], Array]], Array] | None = field(repr=False, default=None)
+    _integrals: Integrals | None = field(repr=False, default=None)
 
     def bound(self, values: Callable[[Array], Array] | Array) -> Array:
         """The vector g (m,) of a bound, which is a function of x (dim×…) or has values at `points` (m,).
@@ -202,9 +203,7 @@ def _vertices(basis: Basis) -> Indices:
     return np.unique(table if chosen is None else table[:, chosen]).astype(np.intp)
 
 
-def _multipliers(
-    basis: Basis, dofs: Indices, lumped: bool
-) -> tuple[InnerProduct, Callable[[Callable[[Array], Array]], Array] | None]:
+def _multipliers(basis: Basis, dofs: Indices, lumped: bool) -> tuple[InnerProduct, Integrals | None]:
     """The product of chosen functions of a scalar basis, lumped or consistent, and for the latter their integrals."""
     if not lumped:
         return InnerProduct(sp.csr_array(mass(basis)[dofs][:, dofs]), "X_W"), partial(_integrals, basis, dofs)

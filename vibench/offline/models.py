@@ -53,8 +53,7 @@ if TYPE_CHECKING:
 Parameters = Sequence[float] | Array | Mapping[str, float]
 """A parameter mu: its components in the order of `ParameterBox.names`, or by these names."""
 
-ACCURACY = 1e-7
-"""Accuracy of formulations without an axis of accuracies."""
+ACCURACY = 1e-7  # of formulations without an axis of accuracies
 
 
 class CellSolver:

@@ -16,14 +16,12 @@ from vibench.model.chebyshev import AffinePolynomial, interpolate_on_box
 from vibench.model.galerkin import projections
 from vibench.model.hyperreduced import AnyReducedModel, HyperReducedModel, hyper_reduce
 
-TOLERANCE = 1e-11
-"""Default of the largest relative error of a polynomial; solutions then agree to 1e-9 and better."""
+# Defaults of the largest relative error of a polynomial, with which solutions agree to 1e-9 and better, and of the
+# largest number of points of the interpolation grid.
+TOLERANCE, EVALUATIONS = 1e-11, 4096
 
-EVALUATIONS = 4096
-"""Default of the largest number of points of the interpolation grid."""
-
+# From the θ of the members at a parameter to further arrays that are interpolated.
 Beside = Callable[[Mapping[str, Array]], Mapping[str, Array]]
-"""Function from the θ of the members at a parameter to further arrays that are interpolated."""
 
 
 class InaccurateError(RequestError):

@@ -42,8 +42,7 @@ from vibench.reduction.pod import POD, pod
 from vibench.stability.infsup import ConeBasis, cone_basis
 from vibench.text import brief
 
-Assembly: TypeAlias = Literal["full", "reduced"]
-"""How a model assembles its programs, as in a study."""
+Assembly: TypeAlias = Literal["full", "reduced"]  # of the programs, as in a study
 
 
 def high_fidelity_sweep(problem: Problem, mus: Array, *, skip: bool = False) -> Snapshots:

@@ -35,8 +35,7 @@ if TYPE_CHECKING:
 
 CaseT_contra = TypeVar("CaseT_contra", contravariant=True)
 
-SECONDS = 120.0
-"""Default wall time [s] that the checks of a plugin may take; no call of it may take longer."""
+SECONDS = 120.0  # wall time [s] that the checks of a plugin may take by default; no call of it may take longer
 
 
 class Verdict(StrEnum):
