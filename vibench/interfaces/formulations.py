@@ -61,16 +61,6 @@ class Snapshots:
     skipped: tuple[str, ...] = field(default=(), kw_only=True)
 
 
-class _Basis(Protocol):
-    @property
-    def basis(self) -> Array: ...
-
-
-class _Generators(Protocol):
-    @property
-    def span(self) -> Array: ...
-
-
 class _Steps(Protocol):
     # `dataclasses.replace` makes a phase with other inputs, whose steps are computed again.
     __dataclass_fields__: ClassVar[dict[str, Any]]
@@ -86,11 +76,11 @@ class _Steps(Protocol):
     @property
     def snapshots(self) -> Snapshots: ...
     @property
-    def pod(self) -> _Basis: ...
+    def pod(self) -> Any: ...
     @property
     def cone(self) -> Cone: ...
     @property
-    def multipliers(self) -> _Generators: ...
+    def multipliers(self) -> Any: ...
     @property
     def enrichment(self) -> Enrichment: ...
     @property
