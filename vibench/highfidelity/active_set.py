@@ -269,8 +269,7 @@ def _without_cycling(
         settled = _solution_everywhere(system, guess)
         if settled is not None:
             return settled, "the active set cycled; first guess by piqp"
-    exact = least_distance_solution(vi, SparseCholesky(vi.A, "A"), equal, guess)
-    if exact is None:
+    if (exact := least_distance_solution(vi, SparseCholesky(vi.A, "A"), equal, guess)) is None:
         raise NumericalError("no active set solves the high-fidelity problem; is it feasible?")
     return (*exact, 0), "the active set cycled; solved as a least distance problem"
 
@@ -304,8 +303,7 @@ def _solution_everywhere(
     iterations = 0
     while True:
         system = system.watching(active if equal is None else active | equal)
-        settled = active_set_iterations(system, active, equal)
-        if settled is None:
+        if (settled := active_set_iterations(system, active, equal)) is None:
             return None
         u, lam, iterations = system.recover(settled[0]), settled[1], iterations + settled[2]
         if system.beyond is None:

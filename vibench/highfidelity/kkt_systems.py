@@ -432,8 +432,7 @@ class SaddlePointSolver:
         border[n + removed, len(added) + np.arange(len(removed))] = 1.0
         values = np.concatenate([self._g[added], np.zeros(len(removed))])
         names = [*added.tolist(), *(-1 - removed).tolist()]
-        solved = factorisation.solve(names, border, np.concatenate([self._f, self._g[base]]), values)
-        if solved is None:
+        if (solved := factorisation.solve(names, border, np.concatenate([self._f, self._g[base]]), values)) is None:
             return None
         u, lam = np.empty(n), np.zeros(self._B.shape[0])
         u[self._order] = self._displacement * solved[0][:n]

@@ -120,8 +120,7 @@ def bound_errors_at(
     share = share_of_diagonal(V)
     if not alpha.value * share.value > 0.0:
         return ErrorBounds.none(BoundNote.ROUND_OFF)
-    correction = find_correction(vi, energy, u, lam, pressed)
-    if correction is None:
+    if (correction := find_correction(vi, energy, u, lam, pressed)) is None:
         return ErrorBounds.none(BoundNote.NO_CORRECTION)
     if p is None:
         (p,) = solutions([energy], [residual(vi, u, lam)])
@@ -225,8 +224,7 @@ def reference_bound(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam
     Residuals say less: what is κ in Δ_A is only the square of an error. `vi` and `energy` are of the same parameter.
     Raises a `NumericalError` if it is above `REFERENCE`, and Δ_A above what the round-off of B u − g leaves open.
     """
-    correction = find_correction(vi, energy, u, lam)
-    if correction is None:
+    if (correction := find_correction(vi, energy, u, lam)) is None:
         return inf
     bound, contact = bound_terms(correction, u, lam).primal, correction.contact
     size = contact.contact_energy(lam)
@@ -259,8 +257,7 @@ class CorrectedPair:
 
 def corrected_pair(vi: VariationalInequality, energy: EnergyNorm, u: Array, lam: Array) -> CorrectedPair | None:
     """The pair that the correction of u_N (n,) and λ_N ≥ 0 (m,) leads to; `None` without one."""
-    correction = find_correction(vi, energy, u, lam)
-    if correction is None:
+    if (correction := find_correction(vi, energy, u, lam)) is None:
         return None
     terms = bound_terms(correction, u, lam)
     return CorrectedPair(u - correction.w, np.maximum(correction.nu, 0.0), terms.omega, terms.rho)

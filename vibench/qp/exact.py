@@ -161,8 +161,7 @@ def exact_solution(program: VariationalInequality) -> ExactSolution | None:
         return ExactSolution(np.zeros(0), np.zeros(len(program.g)), unique=True)
     # Reduced constraints are sums of products of absent ones with generators of any unit, and so absent much earlier.
     if (absent := program.g >= 1e-50 * ABSENT).any():
-        present = exact_solution(replace(program, B=program.B[~absent], g=program.g[~absent]))
-        if present is None:
+        if (present := exact_solution(replace(program, B=program.B[~absent], g=program.g[~absent]))) is None:
             return None
         alpha = np.zeros(len(absent))
         alpha[~absent] = present.alpha
@@ -214,8 +213,7 @@ def least_distance_solution(
         rows = np.flatnonzero(chosen)
         scaled = sp.csr_array(sp.diags_array(1.0 / lengths[rows]) @ B[rows])
         K = factor.solve_factor_transposed(scaled.toarray().T)
-        forces = least_distance(K, load, vi.g[rows] / lengths[rows], equal[rows])
-        if forces is None:
+        if (forces := least_distance(K, load, vi.g[rows] / lengths[rows], equal[rows])) is None:
             return None
         lam = np.zeros(len(vi.g))
         lam[rows] = forces / lengths[rows]

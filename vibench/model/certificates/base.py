@@ -74,23 +74,15 @@ class Guarantee(StrEnum):
 
 @dataclass(frozen=True)
 class OnlineInfSup:
-    """Data of lower bounds of β_A(µ) at online cost.
+    """Data of lower bounds of β_A(µ) at online cost."""
 
-    Attributes
-    ----------
-    value
-        β₀; 0 where there is none.
-    constraint
-        B₀ (m×k) on the contact unknowns.
-    bodies
-        Contact unknowns (k,) on which B(µ) must be B₀; `None` where B(µ) = θ(µ) B₀ is declared.
-    note
-        Which bound it is, or why there is none.
-    """
-
+    # β₀; 0 where there is none.
     value: float
+    # B₀ (m×k) on the contact unknowns.
     constraint: SparseMatrix
+    # Contact unknowns (k,) on which B(µ) must be B₀; `None` where B(µ) = θ(µ) B₀ is declared.
     bodies: Mask | None
+    # Which bound it is, or why there is none.
     note: str
 
     def lower_bound(self, theta: float, B: Callable[[], SparseMatrix], gamma: float) -> tuple[float, str]:
@@ -135,51 +127,34 @@ def online_inf_sup(
 
 @dataclass(frozen=True)
 class CertificateBase:
-    """Offline data shared by the certificates of all reduced models of a problem.
+    """Offline data shared by the certificates of all reduced models of a problem."""
 
-    Attributes
-    ----------
-    X
-        The inner product; that of A where it is constant.
-    compliance
-        C (k×k) of the contact unknowns E.
-    terms, rotation
-        Terms of A, and what takes coefficients of its interpolation (Q,) to those of these; `None` for a constant A.
-    spectral
-        Bounds of A against X; `None` where A is X.
-    load_error, stiffness_error
-        Bounds of ‖f − f̃‖ in the dual norm of X and of the operator norm of A − Ã; zero where they are exact.
-    is_exact
-        Whether A and f are declared to be constant or affine sums, so that no bound rests on what was measured at some
-        parameters. An error that was measured to be zero proves nothing about other ones.
-    constraint
-        B₀ (m×k) on the contact unknowns: what B is a multiple of where there are `bound_terms`; elsewhere B on the
-        bodies where that is the same at all training parameters, and zero on the others.
-    bound_terms
-        The terms of g (m×Q) where B is a multiple of one matrix and g an exact sum; `None` elsewhere.
-    inf_sup
-        Lower bounds of β_A(µ).
-    share
-        σ.
-    compliance_error
-        μ.
-    term_errors
-        e_q (Q,) of the coefficients of A that a query evaluates; zero where A is no declared sum.
-    """
-
+    # The inner product; that of A where it is constant.
     X: InnerProduct
+    # C (k×k) of the contact unknowns E.
     compliance: Array
+    # Terms of A, and what takes coefficients of its interpolation (Q,) to those of these; `None` for a constant A.
     terms: tuple[SparseMatrix, ...]
     rotation: Array | None
+    # Bounds of A against X; `None` where A is X.
     spectral: SpectralBounds | None
+    # Bounds of ‖f − f̃‖ in the dual norm of X and of the operator norm of A − Ã; zero where they are exact.
     load_error: float
     stiffness_error: float
+    # Whether A and f are declared to be constant or affine sums, so that no bound rests on what was measured at some
+    # parameters. An error that was measured to be zero proves nothing about other ones.
     is_exact: bool
+    # B₀ (m×k) on the contact unknowns: what B is a multiple of where there are `bound_terms`; elsewhere B on the bodies
+    # where that is the same at all training parameters, and zero on the others.
     constraint: SparseMatrix
+    # The terms of g (m×Q) where B is a multiple of one matrix and g an exact sum; `None` elsewhere.
     bound_terms: Array | None
+    # Lower bounds of β_A(µ).
     inf_sup: OnlineInfSup
+    # σ and μ.
     share: Constant
     compliance_error: float
+    # e_q (Q,) of the coefficients of A that a query evaluates; zero where A is no declared sum.
     term_errors: Array
 
     @property
@@ -247,10 +222,7 @@ def contact_unknowns(problem: Problem) -> Indices:
 def certificate_base(problem: Problem, members: Mapping[str, AffineMember], training: Array) -> CertificateBase:
     """Prepare certificates of reduced models of a problem whose members have been decomposed over `training` (P×d).
 
-    Raises
-    ------
-    UnsupportedError
-        If `unsupported` gives a reason.
+    Raises an `UnsupportedError` if `unsupported` gives a reason.
     """
     if reason := unsupported(problem, members):
         raise UnsupportedError(reason)
@@ -382,13 +354,7 @@ def _interpolation_errors(
 
 
 def output_coefficients(problem: Problem, output: Output) -> tuple[Array, Array]:
-    """Coefficients (n,) of u and (m,) of λ of a linear output.
-
-    Raises
-    ------
-    NumericalError
-        If they have another shape.
-    """
+    """Coefficients (n,) of u and (m,) of λ of a linear output; raises a `NumericalError` for those of another shape."""
     sizes = problem.V.dim, problem.W.dim
     output.values(problem.parameters.lower[None], *(np.zeros((size, 1)) for size in sizes))
     pairs = zip((output.u, output.lam), sizes, strict=True)

@@ -65,36 +65,25 @@ from vibench.qp.solve import solve_qp
 
 @dataclass(frozen=True)
 class OnlineBound:
-    """Bounds of one reduced solution, infinite where there are none.
+    """Bounds of one reduced solution, infinite where there are none."""
 
-    Attributes
-    ----------
-    u_energy, lambda_natural
-        Bounds of ‖u − u_N‖ in the norm of A(µ) and of ‖Bᵀ(λ − λ_N)‖ in that of A(µ)⁻¹.
-    relative
-        Bound of ‖u − u_N‖ / ‖u‖ in the norm of A(µ), or of the larger error of u and λ over what contact does.
-    rho, omega, kappa
-        Upper bounds of the terms ρ/√α, ω√γ and κ.
-    coercivity
-        α.
-    guarantee, note
-        Their worth; and why there are none, that no prepared correction was feasible, or "".
-    lam
-        Bound of ‖λ − λ_N‖ in the norm of W: `lambda_natural` over `inf_sup`.
-    inf_sup, inf_sup_note
-        A lower bound of β_A, and which it is; 0, and why there is none.
-    """
-
+    # Bounds of ‖u − u_N‖ in the norm of A(µ) and of ‖Bᵀ(λ − λ_N)‖ in that of A(µ)⁻¹.
     u_energy: float
     lambda_natural: float
+    # Bound of ‖u − u_N‖ / ‖u‖ in the norm of A(µ), or of the larger error of u and λ over what contact does.
     relative: float
+    # Upper bounds of the terms ρ/√α, ω√γ and κ.
     rho: float
     omega: float
     kappa: float
+    # α.
     coercivity: float
+    # Their worth; and why there are none, that no prepared correction was feasible, or "".
     guarantee: Guarantee
     note: str
+    # Bound of ‖λ − λ_N‖ in the norm of W: `lambda_natural` over `inf_sup`.
     lam: float
+    # A lower bound of β_A, and which it is; 0, and why there is none.
     inf_sup: float
     inf_sup_note: str
 
@@ -140,38 +129,25 @@ class _Query:
 
 @dataclass(frozen=True)
 class OnlineCertificate:
-    """Data that bound the errors of one reduced model at online cost, made by `prepare`.
+    """Data that bound the errors of one reduced model at online cost, made by `prepare`."""
 
-    Attributes
-    ----------
-    base
-        Data shared with other models of the problem.
-    residual
-        The basis of its residuals; their coefficients are those of f, of A for every vector of Φ, and of Bᵀλ_N.
-    contact_directions
-        Coordinates (k×K) in that basis of the functionals that act on one contact unknown each.
-    compliance
-        C, and which contact unknowns matter.
-    contact_basis
-        Rows (k×d) of Φ at the contact unknowns.
-    generators
-        χ (m×R).
-    forces
-        B₀ᵀχ (k×R) where B is assembled on the contact; `None` where it is exactly the sum of its terms.
-    margin
-        m, relative: see `vibench.model.certificates.bounds`.
-    prepared
-        Corrections that take no factorisation at the parameter, where there are any.
-    """
-
+    # Data shared with other models of the problem.
     base: CertificateBase
+    # The basis of its residuals; their coefficients are those of f, of A for every vector of Φ, and of Bᵀλ_N.
     residual: ResidualBasis
+    # Coordinates (k×K) in that basis of the functionals that act on one contact unknown each.
     contact_directions: Array
+    # C, and which contact unknowns matter.
     compliance: ContactCompliance
+    # Rows (k×d) of Φ at the contact unknowns.
     contact_basis: Array
+    # χ (m×R).
     generators: Array
+    # B₀ᵀχ (k×R) where B is assembled on the contact; `None` where it is exactly the sum of its terms.
     forces: Array | None
+    # m, relative: see `vibench.model.certificates.bounds`.
     margin: float
+    # Corrections that take no factorisation at the parameter, where there are any.
     prepared: PreparedCorrections | None = None
 
     @cached_property
@@ -289,8 +265,7 @@ class OnlineCertificate:
 
     def _constraint(self, query: _Query) -> tuple[float | SparseMatrix, Array, Array]:
         """The constraint as prepared corrections take it, and a bound of the terms of g."""
-        terms = self.base.bound_terms
-        if terms is None:
+        if (terms := self.base.bound_terms) is None:
             contact = query.contact
             return contact.B, contact.g, np.abs(contact.g)
         of_g = query.samples.get("g", self.base.one)

@@ -140,8 +140,7 @@ def tied_correction(
     K, load = -whitened[:, kept] / lengths / np.sqrt(gamma), -(whitened @ lam) / np.sqrt(gamma)
     margin = np.where(rows.equal, 0.0, first_margin(round_off)[kept])
     for _ in range(4):
-        forces = least_distance(K, load, -(excess[kept] + margin) / lengths, rows.equal)
-        if forces is None:
+        if (forces := least_distance(K, load, -(excess[kept] + margin) / lengths, rows.equal)) is None:
             return None
         w = L @ (load - K @ forces) / np.sqrt(gamma)
         missed = (B @ w - excess)[rows.equalities]
@@ -170,32 +169,22 @@ def tied_correction(
 
 @dataclass(frozen=True)
 class ContactCorrection:
-    """Correction w = X⁻¹ E c with B w ≥ s.
+    """Correction w = X⁻¹ E c with B w ≥ s."""
 
-    Attributes
-    ----------
-    unknowns, load
-        Positions (l,) of the contact unknowns where c is not zero, and its values there.
-    norm
-        ‖w‖ in X.
-    kappa
-        λᵀ(B w − s) ≥ 0.
-    nu, gap
-        ν ≥ 0 (m,) with γ c = Bᵀ(ν − λ), and νᵀ(B w − s) ≥ 0, which is zero but for round-off where w is the best one.
-        ν is `None` for a w that holds dependent rows as equalities, with forces that pull: no such ν is known.
-    eta
-        Where there are equalities, another w' satisfies B w' ≥ s, with ‖w' − w‖ at most this; the others are of w'.
-    away
-        Bound of the distance of w from the one that belongs to ν, by round-off.
-    """
-
+    # Positions (l,) of the contact unknowns where c is not zero, and its values there.
     unknowns: Indices
     load: Array
+    # ‖w‖ in X.
     norm: float
+    # λᵀ(B w − s) ≥ 0.
     kappa: float
+    # ν ≥ 0 (m,) with γ c = Bᵀ(ν − λ), and νᵀ(B w − s) ≥ 0, which is zero but for round-off where w is the best one. ν
+    # is `None` for a w that holds dependent rows as equalities, with forces that pull: no such ν is known.
     nu: Array | None
     gap: float
+    # Where there are equalities, another w' satisfies B w' ≥ s, with ‖w' − w‖ at most this; the others are of w'.
     eta: float
+    # Bound of the distance of w from the one that belongs to ν, by round-off.
     away: float
 
 

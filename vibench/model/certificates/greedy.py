@@ -145,8 +145,7 @@ class ContactEstimates:
             A, f = self._grown(self._projected.get(key, np.zeros((0, 0))), vi.A, vi.f)
             self._projected[key] = A
         B = chi.T @ np.asarray(rows @ self._at_contact)
-        answer = exact_solution(VariationalInequality(A, f, B, chi.T @ contact.g))
-        if answer is None:
+        if (answer := exact_solution(VariationalInequality(A, f, B, chi.T @ contact.g))) is None:
             return ErrorEstimate(inf, False, None)
         z, lam = answer.x, chi @ np.maximum(answer.alpha, 0.0)
         energy, force, on_contact = float(z @ (A @ z)), np.asarray(rows.T @ lam), self._at_contact @ z
@@ -290,8 +289,7 @@ class IncrementalModel:
             return inf
         u, lam = solved
         energy = EnergyNorm(vi.A, self._solver.condensed(vi))
-        corrected = find_correction(vi, energy, u, lam)
-        if corrected is None:
+        if (corrected := find_correction(vi, energy, u, lam)) is None:
             return inf
         self._state = BoundState(mu, vi, energy.stiffness, corrected.nu > 0.0)
         terms = bound_terms(corrected, u, lam)

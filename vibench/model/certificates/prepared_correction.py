@@ -37,41 +37,28 @@ class PreparedCorrections:
 
     Where B(µ) is θ(µ) B₀ everywhere arrays called (p×·) are multiplied by B₀, or by |B₀| (p = m), and have one row per
     contact unknown (p = k) otherwise.
-
-    Attributes
-    ----------
-    moved
-        Where C B₀ᵀ is not zero: contact unknowns, or rows of B₀ where that is multiplied by it.
-    rows
-        J (j,), rising.
-    inverse, compliance
-        M and S₀ (j×j).
-    reach
-        |B₀| √C_ii (j,) on the rows J.
-    basis
-        Φ at the contact unknowns (p×d).
-    responses
-        Rows `moved` of C B₀ᵀ (p×j): w for unit multiples of the rows J.
-    sizes
-        Norms of the rows of Φ, and √C_ii (p×2).
-    directions
-        Coordinates (j×K) of the rows J of B₀ as functionals, in the basis of residuals.
-    terms
-        Bound of the number of round-off errors, of size `EPS`, in an entry of s and of B w; but for those of B.
-    error
-        The μ of C (`vibench.model.certificates.base`).
     """
 
+    # Where C B₀ᵀ is not zero: contact unknowns, or rows of B₀ where that is multiplied by it.
     moved: Indices
+    # J (j,), rising.
     rows: Indices
+    # M and S₀ (j×j).
     inverse: Array
     compliance: Array
+    # |B₀| √C_ii (j,) on the rows J.
     reach: Array
+    # Φ at the contact unknowns (p×d).
     basis: Array
+    # Rows `moved` of C B₀ᵀ (p×j): w for unit multiples of the rows J.
     responses: Array
+    # Norms of the rows of Φ, and √C_ii (p×2).
     sizes: Array
+    # Coordinates (j×K) of the rows J of B₀ as functionals, in the basis of residuals.
     directions: Array
+    # Bound of the number of round-off errors, of size `EPS`, in an entry of s and of B w; but for those of B.
     terms: int
+    # The μ of C (`vibench.model.certificates.base`).
     error: float
 
     def correction(
@@ -82,8 +69,7 @@ class PreparedCorrections:
         `B` is θ where B(µ) is θ(µ) B₀ everywhere, else B (m×k); `g_size` is a bound (m,) of the terms that g (m,) is
         the sum of; `y` are coordinates (d,) of u_N. `None` if no w was found.
         """
-        found = self._feasible(B, g, g_size, y, lam, gamma)
-        if found is None:
+        if (found := self._feasible(B, g, g_size, y, lam, gamma)) is None:
             return None
         _, a, norm, most = found
         rounded = 2.0 * self.terms * EPS * float(self.reach @ np.abs(a))
@@ -97,8 +83,7 @@ class PreparedCorrections:
         Also a bound of the distance of w from the one that belongs to ν. Elsewhere w is the best of those that deform
         some bodies alone, and there is no such ν.
         """
-        found = self._feasible(theta, g, g_size, y, lam, gamma)
-        if found is None:
+        if (found := self._feasible(theta, g, g_size, y, lam, gamma)) is None:
             return None
         (nu, _, norm, most), on_all = found, lam.copy()
         on_all[self.rows] = np.maximum(nu, 0.0)

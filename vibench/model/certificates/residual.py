@@ -110,32 +110,21 @@ class ContactFunctionals:
 
 @dataclass(frozen=True)
 class ResidualBasis:
-    """An orthonormal basis U of residuals.
+    """An orthonormal basis U of residuals."""
 
-    Attributes
-    ----------
-    kept
-        Positions (p,) in z of the terms that U represents.
-    factor
-        Uᵀ R (K×p).
-    inverse_scale
-        1/d (p,).
-    remainder
-        Bound of ‖P R D‖.
-    round_off
-        Bound of the round-off in coordinates and of the ε_j, for ‖D⁻¹z‖ = 1.
-    norms
-        Norms (Z,) of the terms that are left out, with their ε_j; zero for those that are kept.
-    distortion
-        Bound of ‖UᵀU − I‖, and of the same of the transformation that left few rows.
-    """
-
+    # Positions (p,) in z of the terms that U represents.
     kept: Indices
+    # Uᵀ R (K×p).
     factor: Array
+    # 1/d (p,).
     inverse_scale: Array
+    # Bound of ‖P R D‖.
     remainder: float
+    # Bound of the round-off in coordinates and of the ε_j, for ‖D⁻¹z‖ = 1.
     round_off: float
+    # Norms (Z,) of the terms that are left out, with their ε_j; zero for those that are kept.
     norms: Array
+    # Bound of ‖UᵀU − I‖, and of the same of the transformation that left few rows.
     distortion: float
 
     def parts(self, z: Array) -> tuple[Array, float, float]:
@@ -238,8 +227,7 @@ def _directions(R: Array, scale: Array, allowed: float) -> tuple[Array, bool]:
     count, rest = R.shape[1], 0.0
     # A decomposition of so many terms would cost more than a randomised one, with 100 directions to spare.
     if count > 1000:
-        randomised = _random_range(R, scale, allowed, limit=900, block=100)
-        if randomised is None:
+        if (randomised := _random_range(R, scale, allowed, limit=900, block=100)) is None:
             return np.linalg.qr(R * scale)[0], False
         Q, small, rest = randomised
     else:

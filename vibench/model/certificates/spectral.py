@@ -45,21 +45,14 @@ from vibench.stability.coercivity import coercivity_and_continuity, largest_quot
 
 @dataclass(frozen=True)
 class TermRanges:
-    """Bounds of single terms: l_q X ≼ θ_q(µ̄) A_q ≼ h_q X.
+    """Bounds of single terms: l_q X ≼ θ_q(µ̄) A_q ≼ h_q X."""
 
-    Attributes
-    ----------
-    reference
-        θ(µ̄) (Q,), none of them zero.
-    lower, upper
-        l_q and h_q (Q,).
-    error
-        Bound of the difference between X and the sum, and of the round-off in sums, for the largest |t_q| = 1.
-    """
-
+    # θ(µ̄) (Q,), none of them zero.
     reference: Array
+    # l_q and h_q (Q,).
     lower: Array
     upper: Array
+    # Bound of the difference between X and the sum, and of the round-off in sums, for the largest |t_q| = 1.
     error: float
 
     @classmethod
@@ -112,24 +105,16 @@ def _range(term: SparseMatrix, X: InnerProduct) -> tuple[float, float] | None:
 
 @dataclass(frozen=True)
 class AnchorGrid:
-    """A grid of anchors over some of the parameters; the others are at their centre.
+    """A grid of anchors over some of the parameters; the others are at their centre."""
 
-    Attributes
-    ----------
-    axes
-        Positions (a,) of the parameters.
-    lower, upper
-        Ends (a,) of the grid.
-    counts
-        Numbers of anchors (a,) along each of them, two at least.
-    places
-        Lengths (a×K) of the path of A at equidistant values of each parameter, from 0 to 1.
-    """
-
+    # Positions (a,) of the parameters.
     axes: Indices
+    # Ends (a,) of the grid.
     lower: Array
     upper: Array
+    # Numbers of anchors (a,) along each of them, two at least.
     counts: Indices
+    # Lengths (a×K) of the path of A at equidistant values of each parameter, from 0 to 1.
     places: Array
 
     @classmethod
@@ -213,36 +198,24 @@ def _lacking(paths: Array, places: Array, count: int) -> float:
 
 @dataclass(frozen=True)
 class SpectralBounds:
-    """Offline data of α(µ) and γ(µ).
+    """Offline data of α(µ) and γ(µ)."""
 
-    Attributes
-    ----------
-    grid
-        The anchors.
-    alpha, gamma
-        α_i and γ_i (P,).
-    turn
-        The second rotation (L×Q), of all θ to those of the first L terms.
-    theta
-        The turned θ(µ_i) (L×P).
-    norms
-        s_q (L,) of the turned A_q.
-    error
-        η.
-    proved
-        Whether all of α_i, γ_i and s_q are proved.
-    ranges
-        Ranges of the declared terms; `None` where A is no declared sum.
-    """
-
+    # The anchors.
     grid: AnchorGrid
+    # α_i and γ_i (P,).
     alpha: Array
     gamma: Array
+    # The second rotation (L×Q), of all θ to those of the first L terms.
     turn: Array
+    # The turned θ(µ_i) (L×P).
     theta: Array
+    # s_q (L,) of the turned A_q.
     norms: Array
+    # η.
     error: float
+    # Whether all of α_i, γ_i and s_q are proved.
     proved: bool
+    # Ranges of the declared terms; `None` where A is no declared sum.
     ranges: TermRanges | None = None
 
     def evaluate(self, mu: Array, theta: Array, declared: Array | None = None) -> tuple[float, float]:
