@@ -29,7 +29,7 @@ from vibench.plugins.kinds import PluginKind
 from vibench.results.sqlite import FILE
 
 # The examples of a test are the same ones every time and everywhere; `--hypothesis-profile=explore` draws new ones.
-settings.register_profile("same", deadline=None, derandomize=True, database=None)
+settings.register_profile("same", deadline=None, derandomize=True, database=None, max_examples=50)
 settings.register_profile("explore", deadline=None, print_blob=True)
 settings.load_profile("same")
 

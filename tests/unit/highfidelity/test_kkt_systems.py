@@ -10,15 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import spd
 
-from vibench import create
 from vibench.errors import NumericalError
 from vibench.highfidelity import kkt_systems
 from vibench.highfidelity.active_set import HighFidelitySolver, solve_unverified, verified
 from vibench.highfidelity.kkt_systems import CondensedStiffness, SaddlePointSolver, ZoneStiffness, watched, zone_of
-from vibench.interfaces.problem import Problem
 from vibench.linalg import cholesky
 from vibench.linalg.schur_complement import EliminationPattern, PrincipalSubmatrix
 from vibench.qp import verification
+from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
 
 SETS = st.lists(st.sets(st.integers(0, 5)), min_size=1, max_size=5)
@@ -145,9 +144,8 @@ def test_what_serves_many_loads_multiplies_by_the_inverse(monkeypatch: pytest.Mo
         (stiffness.liftings(B), B @ np.linalg.inv(schur)),
     ):
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
-
-
-def test_few_rows_have_their_liftings_from_a_factor() -> None:
+    # few rows have their liftings from a factor
+    monkeypatch.undo()
     line = sp.diags_array([-np.ones(19), 3.0 * np.ones(20), -np.ones(19)], offsets=[-1, 0, 1], format="csr")
     stiffness, B = CondensedStiffness(line), sp.csr_array(np.eye(9, 20))
     stiffness.serve_many(9)
@@ -155,24 +153,22 @@ def test_few_rows_have_their_liftings_from_a_factor() -> None:
     assert "inverse" not in vars(stiffness)
 
 
-MUS = np.array([[0.7], [1.3], [0.9]])
-
-
 @pytest.fixture(scope="module")
-def hertz() -> Problem:
-    return create("problem", "hertz", {"resolution": 300})
+def hertz() -> Hertz:
+    return Hertz(300)
 
 
 @pytest.mark.parametrize("constant", [True, False], ids=["constant", "varying"])
 @pytest.mark.parametrize("rows", [None, 1, 0], ids=["coarse problem", "one row", "nothing"])
-def test_solutions_do_not_depend_on_the_zone(hertz: Problem, rows: int | None, constant: bool) -> None:
-    expected = [HighFidelitySolver(hertz).solve(mu) for mu in MUS]
+def test_solutions_do_not_depend_on_the_zone(hertz: Hertz, rows: int | None, constant: bool) -> None:
+    mus = np.array([[0.7], [1.3], [0.9]])
+    expected = [HighFidelitySolver(hertz).solve(mu) for mu in mus]
     guess = None if rows is None else lambda factor, vi: np.arange(len(vi.g)) < rows
     with mock.patch.multiple(kkt_systems, MANY_UNKNOWNS=0, coarse_contact=guess or kkt_systems.coarse_contact):
-        with mock.patch.object(type(hertz), "constant", frozenset({"A", "f"} if constant else ())):
+        with mock.patch.object(Hertz, "constant", frozenset({"A", "f"} if constant else ())):
             solver = HighFidelitySolver(hertz)
             zones = []
-            for mu, single in zip(MUS, expected, strict=True):
+            for mu, single in zip(mus, expected, strict=True):
                 found = solver.solve(mu)
                 assert isinstance(solver._stiffness, ZoneStiffness)
                 zones.append(solver._stiffness.zone)
@@ -182,8 +178,9 @@ def test_solutions_do_not_depend_on_the_zone(hertz: Problem, rows: int | None, c
                 np.testing.assert_allclose(found.lam, single.lam, atol=1e-9 * single.lam.max())
                 reached = np.unique(sp.csr_array(hertz.assemble(mu).B)[found.lam > 0.0].indices)
                 assert np.isin(reached, zones[-1]).all()
-        force = hertz.assemble(MUS[-1]).B.T @ found.lam
-        energy = force @ np.linalg.solve(hertz.assemble(MUS[-1]).A.toarray(), force)
+        vi = hertz.assemble(mus[-1])
+        force = vi.B.T @ found.lam
+        energy = force @ np.linalg.solve(vi.A.toarray(), force)
         assert solver._stiffness.dual_norms(force[:, None]) == pytest.approx(np.sqrt(energy), rel=1e-9)
         there = force[hertz.contact_dofs]
         assert solver._stiffness.compliance(there) @ there == pytest.approx(energy, rel=1e-9)

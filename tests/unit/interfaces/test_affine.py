@@ -10,16 +10,8 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vibench import (
-    AffineProblem,
-    AffineSum,
-    Array,
-    HighFidelitySolver,
-    InnerProduct,
-    NumericalError,
-    ParameterBox,
-    RequestError,
-)
+from vibench import AffineProblem, AffineSum, Array, HighFidelitySolver, InnerProduct, ParameterBox
+from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.absent_rows import is_absent
 from vibench.interfaces.affine import CONSTANTS, FUNCTIONS, Expression, Theta
 from vibench.interfaces.validation import checked_assembly
@@ -45,12 +37,8 @@ class Strings(AffineProblem):
         self.V = InnerProduct(sp.csr_array(sp.block_diag([K, K])))
         self.W = InnerProduct(sp.csr_array(sp.diags_array(np.full(contact, h))))
         load = np.full(2 * nodes, -h)
-        self.declare(
-            A=[("tension", first), (squared, second), (0.5, second)],
-            f=[("4 + sin(tension)", load)],
-            B=B,
-            g=[("depth", np.full(contact, h))],
-        )
+        A, g = [("tension", first), (squared, second), (0.5, second)], [("depth", np.full(contact, h))]
+        self.declare(A=A, f=[("4 + sin(tension)", load)], B=B, g=g)
 
     def training_set(self) -> Array:
         return self.parameters.grid(4, 3)
@@ -83,19 +71,13 @@ def test_declared_sums_are_members_and_terms_of_the_decomposition() -> None:
     assert np.allclose(problem.affine["A"].coefficients(mu), [1.3, 1.69, 0.5])
     problem = Strings()
     members = affine_decomposition(problem, problem.training_set(), 1e-6)
-    assert {name: (m.way, len(m.terms), m.error) for name, m in members.items()} == {
-        "A": (Evaluation.AFFINE, 3, 0.0),
-        "f": (Evaluation.AFFINE, 1, 0.0),
-        "B": (Evaluation.CONSTANT, 1, 0.0),
-        "g": (Evaluation.AFFINE, 1, 0.0),
-    }
-    problem.affine = {
-        **problem.affine,
-        "f": AffineSum.of([("tension", problem.affine["f"].terms[0])], ["tension", "d"]),
-    }
-    with pytest.raises(
-        NumericalError, match=r"the affine sum declared for f differs from the assembled f by 3\.1e-01 at mu"
-    ):
+    ways = {"A": (Evaluation.AFFINE, 3), "f": (Evaluation.AFFINE, 1), "B": (Evaluation.CONSTANT, 1)}
+    ways["g"] = Evaluation.AFFINE, 1
+    assert {name: (m.way, len(m.terms)) for name, m in members.items()} == ways
+    assert all(m.error == 0.0 for m in members.values())
+    wrong = AffineSum.of([("tension", problem.affine["f"].terms[0])], ["tension", "d"])
+    problem.affine = {**problem.affine, "f": wrong}
+    with pytest.raises(NumericalError, match=r"sum declared for f differs from the assembled f by 3\.1e-01 at mu"):
         affine_decomposition(problem, problem.training_set(), 1e-6)
     problem.affine = {"A": AffineSum.of([(1.0, sp.csr_array(sp.eye_array(3)))], ())}
     with pytest.raises(NumericalError, match=r"the affine sum of A has shape \(3, 3\), A itself \(24, 24\)"):
@@ -182,8 +164,7 @@ def test_an_infinite_entry_needs_a_coefficient_that_is_a_positive_constant(theta
         AffineSum((INFINITE,), lambda mu: np.ones(1))
 
 
-@pytest.mark.parametrize("theta", [1.0, 1e-9, 3e7, "2 * pi"])
-@pytest.mark.parametrize("other", [-2.0, "tilt", "-1e3 * tilt"])
+@pytest.mark.parametrize(("theta", "other"), [(1.0, -2.0), (1e-9, "tilt"), (3e7, "-1e3 * tilt"), ("2 * pi", -2.0)])
 def test_an_absent_row_is_absent_whatever_is_added_to_it(theta: Theta, other: Theta) -> None:
     problem = declared([(1.0, np.array([1.0, 0.0])), (theta, INFINITE), (other, np.array([0.0, 1e30]))])
     twice = declared([(theta, INFINITE + np.array([1.0, 0.0])), (1.0, INFINITE)])
@@ -198,12 +179,10 @@ def test_an_absent_row_is_absent_whatever_is_added_to_it(theta: Theta, other: Th
 
 def test_infinite_loads_are_refused() -> None:
     problem = declared(np.ones(2))
-    problem.declare(A=2.0 * sp.eye_array(2), f=-INFINITE, B=-sp.eye_array(2), g=np.ones(2))
-    with pytest.raises(NumericalError, match="f has entries"):
-        checked_assembly(problem, np.zeros(1))
-    problem.declare(A=2.0 * sp.eye_array(2), f=INFINITE, B=-sp.eye_array(2), g=np.ones(2))
-    with pytest.raises(NumericalError, match="f has entries"):
-        checked_assembly(problem, np.zeros(1))
+    for f in (-INFINITE, INFINITE):
+        problem.declare(A=2.0 * sp.eye_array(2), f=f, B=-sp.eye_array(2), g=np.ones(2))
+        with pytest.raises(NumericalError, match="f has entries"):
+            checked_assembly(problem, np.zeros(1))
 
 
 NAMES = ("a", "b")
@@ -283,22 +262,13 @@ def test_what_is_not_arithmetic_not_finite_or_no_name_is_refused() -> None:
     for text, message in HOSTILE.items():
         with pytest.raises(RequestError, match=message):
             Expression.parse(text, NAMES)
-    for text in (
-        "1 / (a - 1)",
-        "log(-a)",
-        "9**9**9**9",
-        "(-a)**0.5",
-        "max(a, (-b)**1.5)",
-        "abs((-a)**0.5)",
-        "exp(1000)",
-        "1e308 * 10 * a",
-    ):
+    roots = "(-a)**0.5", "max(a, (-b)**1.5)", "abs((-a)**0.5)"
+    for text in ("1 / (a - 1)", "log(-a)", "9**9**9**9", *roots, "exp(1000)", "1e308 * 10 * a"):
         with pytest.raises(NumericalError, match="at a = 1, b = 2"):
             Expression.parse(text, NAMES)((1.0, 2.0))
     for name in (*CONSTANTS, *FUNCTIONS, "\uff45"):
-        with pytest.raises(
-            RequestError, match=r"is a (constant|function) of expressions; give the parameter another name"
-        ):
+        line = r"is a (constant|function) of expressions; give the parameter another name"
+        with pytest.raises(RequestError, match=line):
             Expression.parse("1", ("a", name))
     assert Expression.parse("2 * \u00b5", ["\u03bc"])([3.0]) == Expression.parse("2 * \u03bc", ["\u00b5"])([3.0]) == 6.0
     with pytest.raises(RequestError, match="two parameters have the same name: \u03bc, \u03bc"):

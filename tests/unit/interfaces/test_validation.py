@@ -1,7 +1,8 @@
 """Members of any unambiguous type are sparse matrices and vectors of float64 afterwards; others are named."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -56,9 +57,8 @@ class Chain(Varying):
         matrix, vector = self.kinds
         A = sp.diags_array([4.0 * np.ones(10), -np.ones(9), -np.ones(9)], offsets=[0, 1, -1])
         B, f = -sp.eye_array(10), -np.round(8.0 * (1.0 + mu[0])) * np.ones(10)
-        return VariationalInequality(
-            matrix(sp.csr_matrix(A)), vector(f), matrix(sp.csr_matrix(B)), vector(3.0 + 0.0 * f)
-        )
+        A, B = matrix(sp.csr_matrix(A)), matrix(sp.csr_matrix(B))
+        return VariationalInequality(A, vector(f), B, vector(3.0 + 0.0 * f))
 
 
 @pytest.mark.parametrize("kind", CONVERTED)
@@ -102,29 +102,21 @@ def test_constraints_on_the_contact_norms_and_declared_terms_are_converted_too(k
 
     class Declared(AffineProblem):
         parameters = ParameterBox(("load",), np.array([1.0]), np.array([2.0]), ("1",))
-        V, W = norm, norm
-
-        def training_set(self) -> Array:
-            return self.parameters.grid(3)
+        V = W = norm
+        training_set = None
 
     problem = Declared()
     problem.declare(A=matrix(4.0 * eye), f=[("load", vector(-np.ones(5)))], B=matrix(-eye), g=vector(np.zeros(5)))
     vi = problem.assemble(MU)
     assert checked_assembly(problem, MU).A is vi.A
-
-
-def test_an_infinite_bound_of_single_precision_is_an_absent_row() -> None:
+    # an infinite bound of single precision is an absent row
     vi = VariationalInequality(None, np.ones(1), None, np.array([np.inf, 1.0], np.float32))
     assert vi.g.tolist() == [1e100, 1.0]
 
 
 def test_what_a_problem_raises_names_the_parameter(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = Chain()
-
-    def tangled(mu: Array) -> VariationalInequality:
-        raise ValueError("mesh tangled")
-
-    monkeypatch.setattr(problem, "assemble", tangled)
+    monkeypatch.setattr(problem, "assemble", Mock(side_effect=ValueError("mesh tangled")))
     with pytest.raises(NumericalError, match=r"^at mu = \[0.5\]: ValueError: mesh tangled$"):
         checked_assembly(problem, MU)
 
@@ -152,9 +144,9 @@ def loads_of(loads: float = 1.0, bounds: float = 1.0) -> Any:
     return contact_loads
 
 
-def sampler_of(wrong: str) -> Any:
+def sampler_of(method: str, wrong: str) -> Any:
     def sampler(self: Any, wanted: Any) -> Any:
-        right = Declared.sampler(self, wanted)
+        right = getattr(super(type(self), self), method)(wanted)
         return lambda mu: {name: (1.01 if name == wrong else 1.0) * one for name, one in right(mu).items()}
 
     return sampler
@@ -166,28 +158,20 @@ def sum_of(name: str, theta: Any) -> dict[str, AffineSum]:
     return {name: AffineSum((at_six,), lambda mu: np.array([theta(mu[0])]))}
 
 
-class Elements(ByElements):
-    wrong: ClassVar[str] = ""
-
-    def element_sampler(self, elements: Any) -> Any:
-        right = super().element_sampler(elements)
-        return lambda mu: {name: (1.01 if name == self.wrong else 1.0) * one for name, one in right(mu).items()}
-
-
 WRONG = {
     "`contact`, g": variant(Declared, contact=contact_of(g=1.2)),
     "`contact`, B": variant(Declared, contact=contact_of(B=1.2)),
     "`contact`, g at some parameters": variant(Declared, contact=contact_of(g=1.2, above=5.0)),
     "`contact_loads`, Bᵀη": variant(Declared, contact_loads=loads_of(loads=0.9)),
     "`contact_loads`, ηᵀg": variant(Declared, contact_loads=loads_of(bounds=0.9)),
-    "`sampler` of A": variant(Declared, sampler=sampler_of("A")),
-    "`sampler` of f": variant(Declared, sampler=sampler_of("f")),
+    "`sampler` of A": variant(Declared, sampler=sampler_of("sampler", "A")),
+    "`sampler` of f": variant(Declared, sampler=sampler_of("sampler", "f")),
     "`affine` of f": variant(Wire, affine=sum_of("f", lambda force: force / 6.0 + 0.1 * (force > 5.0))),
     "`affine` of A": variant(Wire, affine=sum_of("A", lambda force: 1.0 + 1e-6 * force)),
-    "`element_sampler` of A": variant(Elements, wrong="A"),
+    "`element_sampler` of A": variant(ByElements, element_sampler=sampler_of("element_sampler", "A")),
     "`affine` of g": variant(Wire, affine=sum_of("g", lambda force: force / 6.0)),
 }
-RIGHT = [Declared(), variant(Declared, contact_loads=loads_of()), Elements(), Wire(),
+RIGHT = [Declared(), variant(Declared, contact_loads=loads_of()), ByElements(), Wire(),
          variant(Wire, affine=sum_of("f", lambda force: force / 6.0))]  # fmt: skip
 
 

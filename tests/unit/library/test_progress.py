@@ -1,9 +1,7 @@
 """Progress: the time left, durations in words, and what is printed where there is no terminal."""
 
-from __future__ import annotations
-
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -28,7 +26,6 @@ from vibench.study.matrix import expand, read_study
 from vibench.study.parameter_sets import CHUNKS, OWN_TRAINING
 
 PROBLEM = Plugin("problem", "p", "{}", "")  # there is none: nothing is built to estimate seconds
-Make = Callable[..., tuple[ProgressDisplay, io.StringIO]]
 OK = {"status": "ok", "reason": ""}
 PODS: list[Stage] = [PODStage(PROBLEM, Stop(size=k)) for k in range(1, 5)]
 CHUNK: list[Stage] = [SnapshotStage(PROBLEM, OWN_TRAINING, chunk) for chunk in range(CHUNKS)]
@@ -38,6 +35,13 @@ CHUNK: list[Stage] = [SnapshotStage(PROBLEM, OWN_TRAINING, chunk) for chunk in r
 def cells(tmp_path: Path) -> list[Cell]:
     content = changed(changed(STUDY, "primal", to=["decorrelated"]), "problem", 0, "label", to="[red]membrane")
     return expand(read_study(write_study(tmp_path, content)))
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    now = [100.0]
+    monkeypatch.setattr("vibench.library.progress.monotonic", lambda: now[0])
+    return now
 
 
 @pytest.fixture
@@ -56,23 +60,21 @@ def test_stages_of_one_sort_are_taken_to_last_as_long(jobs: int) -> None:
     assert left.seconds() == 0.0  # done twice, after its worker was lost
 
 
-def test_a_stage_that_tells_its_fraction_counts_before_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [100.0]
-    monkeypatch.setattr("vibench.library.progress.monotonic", lambda: now[0])
+def test_a_stage_that_tells_its_fraction_counts_before_its_end(clock: list[float]) -> None:
     left = TimeLeft(CHUNK[:4], 2)
     left.begin(CHUNK[0])
     assert left.fractions_done([(CHUNK[0], 0.0)]) == 0.0
     assert left.seconds() is None
-    now[0] += 10.0
+    clock[0] += 10.0
     assert left.fractions_done([(CHUNK[0], 0.25)]) == 0.0  # its pace may be that of a set-up
     assert left.seconds() == pytest.approx((4 * 40.0 - 10.0) / 2)
     left.done(CHUNK[0], 30.0)
     assert left.seconds() == pytest.approx(3 * 30.0 / 2)
     # the set-up of a long stage is not expected of the others
-    now[0], left = 0.0, TimeLeft(CHUNK[:2], 1)
+    clock[0], left = 0.0, TimeLeft(CHUNK[:2], 1)
     left.begin(CHUNK[0])
     for seconds, fraction in ((30.0, 0.1), (35.0, 0.2), (37.0, 0.2), (40.0, 0.3)):
-        now[0] = seconds
+        clock[0] = seconds
         left.fractions_done([(CHUNK[0], fraction)])
     assert left.seconds() == pytest.approx(0.7 * 50.0 + 50.0)
 
@@ -110,15 +112,14 @@ SOLUTIONS = 27
 """Training solutions of a part; the first one has the set-up."""
 
 
-def test_a_run_in_space_says_in_its_first_minute_how_long_it_will_take(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_in_space_says_in_its_first_minute_how_long_it_will_take(clock: list[float]) -> None:
     """Two workers, looked at every five seconds, with stages that take what they took in a run."""
     cells = [cell for cell in expand(read_study("three-dimensions")) if "medium" in str(cell)]
-    graph, now = Graph(), [0.0]
+    graph, now = Graph(), clock
     running, estimates = dict[str, tuple[Stage, float, float]](), list[tuple[float, float]]()
     for cell in cells:
         graph.add_goal(cell_queries(cell, 20.0), lambda _: False)
-    monkeypatch.setattr("vibench.library.progress.monotonic", lambda: now[0])
-    left = TimeLeft(list(graph.stages.values()), 2)
+    now[0], left = 0.0, TimeLeft(list(graph.stages.values()), 2)
     while graph.waiting or running:
         for stage in graph.begin(2 - len(running)):
             left.begin(stage)
@@ -161,15 +162,10 @@ def test_a_duration_in_words_is_about_the_duration(seconds: float) -> None:
     assert {seconds: duration(seconds) for seconds in said} == said
 
 
-@pytest.fixture
-def report() -> Make:
-    """Function that gives a report and what it prints."""
-
-    def make(*, terminal: bool = False) -> tuple[ProgressDisplay, io.StringIO]:
-        printed = io.StringIO()
-        return ProgressDisplay(Console(file=printed, force_terminal=terminal, width=120)), printed
-
-    return make
+def report(*, terminal: bool = False) -> tuple[ProgressDisplay, io.StringIO]:
+    """A report and what it prints."""
+    printed = io.StringIO()
+    return ProgressDisplay(Console(file=printed, force_terminal=terminal, width=120)), printed
 
 
 def agenda(cells: int, stages: Sequence[Stage], workers: int) -> Agenda:
@@ -177,7 +173,7 @@ def agenda(cells: int, stages: Sequence[Stage], workers: int) -> Agenda:
     return Agenda(cells, sum(isinstance(stage, CellQueries) for stage in stages), 0, stages, workers)
 
 
-def test_the_beginning_says_what_is_to_be_done(report: Make, queries: list[Stage]) -> None:
+def test_the_beginning_says_what_is_to_be_done(queries: list[Stage]) -> None:
     for workers, some, said in ((2, 4, "4 stages on 2 workers"), (1, 4, "4 stages on 1 worker"), (0, 0, "0 stages")):
         for terminal in (False, True):
             made, printed = report(terminal=terminal)
@@ -190,7 +186,7 @@ def test_the_beginning_says_what_is_to_be_done(report: Make, queries: list[Stage
     assert printed.getvalue() == "20 cells, 3 to run, 7 stages on 2 workers\n"
 
 
-def test_the_time_left_is_said_if_it_is_a_second(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
+def test_the_time_left_is_said_if_it_is_a_second(cells: list[Cell], queries: list[Stage]) -> None:
     same = sum(isinstance(stage, CellQueries) for stage in queries) - 1
     for seconds, said in ((20.0, True), (0.02, False)):
         made, printed = report()
@@ -201,20 +197,16 @@ def test_the_time_left_is_said_if_it_is_a_second(report: Make, cells: list[Cell]
         assert ("left" in printed.getvalue()) is said
 
 
-def test_a_long_first_part_says_how_long_the_run_will_take(report: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [100.0]
-    monkeypatch.setattr("vibench.library.progress.monotonic", lambda: now[0])
+def test_a_long_first_part_says_how_long_the_run_will_take(clock: list[float]) -> None:
     made, printed = report()
     made.start(agenda(1, CHUNK, 1))
     made.begin(CHUNK[0])
     for seconds, share in ((10.0, 0.1), (15.0, 0.25), (15.0, 0.4)):
-        now[0] += seconds
+        clock[0] += seconds
         made.fractions_done([(CHUNK[0], share)])
     assert printed.getvalue().count("left") == 1
     assert "high-fidelity solutions: 25% of one part, about 6 min left" in printed.getvalue()
-
-
-def test_high_fidelity_parts_are_reported_four_by_four(report: Make) -> None:
+    # high-fidelity parts are reported four by four
     made, printed = report()
     made.start(agenda(1, CHUNK, 2))
     for stage in (*CHUNK[:-1], PODS[0]):
@@ -224,9 +216,7 @@ def test_high_fidelity_parts_are_reported_four_by_four(report: Make) -> None:
     assert f"high-fidelity solutions: {CHUNKS} of {CHUNKS} parts" in printed.getvalue()
 
 
-def test_every_cell_has_a_line_and_beside_a_bar_what_fell_short(
-    report: Make, cells: list[Cell], queries: list[Stage]
-) -> None:
+def test_every_cell_has_a_line_and_beside_a_bar_what_fell_short(cells: list[Cell], queries: list[Stage]) -> None:
     made, printed = report()
     made.start(agenda(len(cells), queries, 2))
     made.cell(cells[0], OK)
@@ -249,7 +239,7 @@ def test_every_cell_has_a_line_and_beside_a_bar_what_fell_short(
 
 
 @pytest.mark.parametrize("terminal", [False, True])
-def test_a_label_is_no_markup(terminal: bool, report: Make, queries: list[Stage], tmp_path: Path) -> None:
+def test_a_label_is_no_markup(terminal: bool, queries: list[Stage], tmp_path: Path) -> None:
     odd = changed(STUDY, "problem", 0, "label", to="[/b] [red]a :warning:\x1b[2J\n[1/1] ok: b")
     cell = expand(read_study(write_study(tmp_path, odd)))[0]
     made, printed = report(terminal=terminal)
@@ -261,7 +251,7 @@ def test_a_label_is_no_markup(terminal: bool, report: Make, queries: list[Stage]
     assert line.endswith(r"([/i] \u001b[31m:smile:\ud800)")
 
 
-def test_a_stage_is_named_when_it_begins(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
+def test_a_stage_is_named_when_it_begins(queries: list[Stage]) -> None:
     made, printed = report()
     made.start(agenda(1, PODS, 2))
     for stage in (*PODS, queries[0]):
@@ -274,7 +264,7 @@ def test_a_stage_is_named_when_it_begins(report: Make, cells: list[Cell], querie
     assert "POD" in printed.getvalue()
 
 
-def test_a_thousand_cells_are_not_a_thousand_lines(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
+def test_a_thousand_cells_are_not_a_thousand_lines(cells: list[Cell], queries: list[Stage]) -> None:
     made, printed = report()
     made.start(agenda(1000, queries[:1] * 1000, 2))
     for k in range(1000):
@@ -291,11 +281,10 @@ def test_a_thousand_cells_are_not_a_thousand_lines(report: Make, cells: list[Cel
         assert printed.getvalue().splitlines()[1:] == told
 
 
-@pytest.mark.parametrize("terminal", [False, True])
-def test_the_figure_that_is_being_drawn_is_named(terminal: bool) -> None:
-    printed = io.StringIO()
-    with DrawingDisplay(Console(file=printed, force_terminal=terminal, width=80)) as display:
-        display.show("[red]hertz-errors", 2, 25)
-    assert "description" not in printed.getvalue()
-    assert ("[red]hertz-errors" in printed.getvalue()) is terminal
-    assert "figures" in printed.getvalue()
+def test_the_figure_that_is_being_drawn_is_named() -> None:
+    for terminal in (False, True):
+        printed = io.StringIO()
+        with DrawingDisplay(Console(file=printed, force_terminal=terminal, width=80)) as display:
+            display.show("[red]hertz-errors", 2, 25)
+        expected = {"description": False, "[red]hertz-errors": terminal, "figures": True}
+        assert {word: word in printed.getvalue() for word in expected} == expected

@@ -1,12 +1,11 @@
 """Studies and runs from Python."""
 
-from __future__ import annotations
-
 import builtins
 import signal
 from html import escape
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import matplotlib.figure
 import pandas as pd
@@ -31,21 +30,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
     return vibench.run(vibench.Study(**SETTINGS), tmp_path_factory.mktemp("library") / "run", progress=False, jobs=1)
 
 
-class Following(Observer):
-    """Counts what it is told."""
-
-    def __init__(self) -> None:
-        self.agenda: Agenda | None = None
-        self.cells = 0
-
-    def start(self, agenda: Agenda) -> None:
-        self.agenda = agenda
-
-    def cell(self, cell: object, row: object) -> None:
-        self.cells += 1
+def following(**calls: Any) -> Mock:
+    """An observer that counts what it is told."""
+    return Mock(spec=Observer, **calls)
 
 
-def test_a_run_has_its_tables(run: vibench.Run) -> None:
+def test_a_run_has_its_tables(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(run.cells) == 2
     assert set(run.cells["status"]) == {"ok"}
     assert len(run.queries) == 4
@@ -57,9 +47,7 @@ def test_a_run_has_its_tables(run: vibench.Run) -> None:
     assert run.study["name"] in shown
     assert shown.count("<tr") == len(run.summary) + 1
     assert all(f"<th>{escape(heading)}</th>" in shown for heading in run.summary.columns)
-
-
-def test_a_run_is_opened_where_it_is(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # it is opened where it is
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "small").symlink_to(run.path.parent)
@@ -70,9 +58,10 @@ def test_a_run_is_opened_where_it_is(run: vibench.Run, tmp_path: Path, monkeypat
 
 
 def test_a_run_is_continued_and_followed(run: vibench.Run, capsys: pytest.CaptureFixture[str]) -> None:
-    following = Following()
-    vibench.run(vibench.Study(**SETTINGS), run.path.parent, observer=following)
-    assert (following.agenda.to_run, following.cells) == (0, 0)
+    observer = following()
+    vibench.run(vibench.Study(**SETTINGS), run.path.parent, observer=observer)
+    ((agenda,), _) = observer.start.call_args
+    assert (agenda.to_run, observer.cell.call_count) == (0, 0)
     assert not capsys.readouterr().out
     vibench.run(vibench.Study(**SETTINGS), run.path.parent)
     assert "2 cells, 0 to run" in capsys.readouterr().out
@@ -135,16 +124,12 @@ def test_a_wrong_study_or_request_says_so_in_one_line(run: vibench.Run) -> None:
         vibench.run(vibench.Study(**SETTINGS), jobs=-1)
 
 
-def test_ctrl_c_raises_and_the_next_call_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Interrupting(Following):
-        def cell(self, cell: object, row: object) -> None:
-            super().cell(cell, row)
-            raise KeyboardInterrupt
-
+def test_ctrl_c_raises_and_the_next_call_continues(tmp_path: Path) -> None:
+    interrupting = following(**{"cell.side_effect": KeyboardInterrupt})
     handler = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt, match="1 cells have no row yet"):
-        vibench.run(vibench.Study(**SETTINGS), tmp_path, observer=Interrupting(), jobs=1)
+        vibench.run(vibench.Study(**SETTINGS), tmp_path, observer=interrupting, jobs=1)
     assert signal.getsignal(signal.SIGINT) is handler
-    again = Following()
+    again = following()
     assert len(vibench.run(vibench.Study(**SETTINGS), tmp_path, observer=again).cells) == 2
-    assert again.cells == 1
+    assert again.cell.call_count == 1

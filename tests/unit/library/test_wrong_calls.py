@@ -1,7 +1,5 @@
 """Calls of the library with wrong arguments: each is a `RequestError` of one line that names the argument."""
 
-from __future__ import annotations
-
 import inspect
 import re
 import warnings

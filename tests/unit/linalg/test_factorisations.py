@@ -19,9 +19,10 @@ def _installed(request: pytest.FixtureRequest) -> None:
 
 
 Sizes = tuple[int, ...]
+BODIES = pytest.mark.parametrize("sizes", [(15,), (9, 12)], ids=["one body", "two bodies"])
 
 
-def membranes(sizes: tuple[int, ...], weight: float = 1.0) -> sp.csc_array:
+def membranes(sizes: Sizes, weight: float = 1.0) -> sp.csc_array:
     """Stiffnesses of square membranes that do not touch."""
     blocks = []
     for n in sizes:
@@ -36,8 +37,8 @@ def condensed(A: np.ndarray, last: np.ndarray) -> np.ndarray:
 
 
 @EVERY
+@BODIES
 @pytest.mark.parametrize("weight", [1e-9, 2e11])
-@pytest.mark.parametrize("sizes", [(15,), (9, 12)], ids=["one body", "two bodies"])
 def test_solutions_and_schur_complements_are_dense_ones(chosen: Implementation, sizes: Sizes, weight: float) -> None:
     A, rng = membranes(sizes, weight), np.random.default_rng(0)
     n, dense = A.shape[0], A.toarray()
@@ -61,7 +62,7 @@ def test_solutions_and_schur_complements_are_dense_ones(chosen: Implementation, 
 
 
 @EVERY
-@pytest.mark.parametrize("sizes", [(15,), (9, 12)], ids=["one body", "two bodies"])
+@BODIES
 def test_a_factor_with_some_unknowns_last_makes_inner_products_euclidean(chosen: Implementation, sizes: Sizes) -> None:
     A, rng = membranes(sizes), np.random.default_rng(1)
     n, dense = A.shape[0], A.toarray()

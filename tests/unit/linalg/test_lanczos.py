@@ -53,8 +53,7 @@ def test_small_matrices_are_exact_and_what_is_not_definite_has_no_estimate() -> 
 def test_iterations_end_with_the_accuracy_of_the_eigenvalue() -> None:
     """The residual is still about 0.01 where the eigenvalue has an error of 1e-4."""
     spectrum = np.concatenate([[1.0], np.linspace(0.0, 0.8, 399)])
-    counts = list[int]()
-    M = sp.eye_array(400, format="csc")
+    M, counts = sp.eye_array(400, format="csc"), list[int]()
 
     def apply(v: np.ndarray) -> np.ndarray:
         counts[-1] += 1

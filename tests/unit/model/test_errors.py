@@ -1,4 +1,5 @@
 from dataclasses import astuple, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.model.error_bounds import error_bounds
 from vibench.model.errors import UNMEASURABLE, EnergyNorm, ReferenceSolutions, errors
-from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
+from vibench.model.hsw_bounds import hsw_bounds
 from vibench.reduction.supremizers import constraint_classes
 from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity, energy_inf_sup
 from vibench.stability.infsup import (
@@ -28,10 +29,7 @@ from vibench.stability.infsup import (
 PROBLEM = Varying()
 
 
-def bound(
-    problem: Problem, vi: VariationalInequality, known: Stability, u: np.ndarray, lam: np.ndarray
-) -> HSWBounds | None:
-    """The bounds of one solution."""
+def bound(problem: Problem, vi: VariationalInequality, known: Stability, u: np.ndarray, lam: np.ndarray) -> Any:
     (found,) = hsw_bounds(problem, [vi], [known], u[:, None], lam[:, None])
     return found
 
@@ -68,8 +66,8 @@ def test_the_bounds_vanish_with_the_error() -> None:
     assert found.u < 1e-5 * float(PROBLEM.V.norm(exact.u))
     # off the solution along a direction of V with λ kept and no penetration, the bound is residual over coercivity
     known, free = stability(mu), np.zeros_like(exact.lam)
-    u = active_set.solve_high_fidelity(type(vi)(vi.A, vi.f, vi.B, vi.g + 10.0)).u  # no contact
-    found = bound(PROBLEM, type(vi)(vi.A, 2.0 * vi.f, vi.B, vi.g + 10.0), known, u, free)
+    u = active_set.solve_high_fidelity(replace(vi, g=vi.g + 10.0)).u  # no contact
+    found = bound(PROBLEM, replace(vi, f=2.0 * vi.f, g=vi.g + 10.0), known, u, free)
     assert found.u == pytest.approx(float(np.linalg.norm(PROBLEM.V.whiten_functional(vi.f))) / known.coercivity.value)
 
 
@@ -78,23 +76,19 @@ def test_each_constant_enters_where_the_derivation_says() -> None:
     V = W = space(1)
     x = float(V.matrix.toarray()[0, 0])
 
-    class Scalar(Varying):
-        def __init__(self) -> None:
-            self.V, self.W = V, W
-
-    vi = type(PROBLEM.assemble(np.zeros(1)))(
-        sp.csc_array([[2.0]]), np.array([1.0]), sp.csr_array([[1.0]]), np.array([0.0])
-    )
+    scalar = Varying()
+    scalar.V, scalar.W = V, W
+    vi = VariationalInequality(sp.csc_array([[2.0]]), np.ones(1), sp.csr_array([[1.0]]), np.zeros(1))
     alpha, gamma, beta = 2.0 / x, 2.0 / x, 1.0 / x
     u, lam = np.array([0.1]), np.array([0.5])
-    found = bound(Scalar(), vi, by_hand(beta, alpha, gamma), u, lam)
+    found = bound(scalar, vi, by_hand(beta, alpha, gamma), u, lam)
     residual, penetration = abs(1.0 - 2.0 * 0.1 - 0.5) / np.sqrt(x), 0.1 / np.sqrt(x)
     mismatch = 0.1 * 0.5  # ⟨π, λ⟩, and −sᵀλ is negative
     c1 = (residual + penetration * gamma / beta) / (2.0 * alpha)
     expected = c1 + np.sqrt(c1**2 + (penetration * residual / beta + mismatch) / alpha)
     assert found.u == pytest.approx(expected)
     assert found.lam == pytest.approx((residual + gamma * expected) / beta)
-    inside = bound(Scalar(), vi, by_hand(beta, alpha, gamma), -u, lam)
+    inside = bound(scalar, vi, by_hand(beta, alpha, gamma), -u, lam)
     residual, mismatch = abs(1.0 + 2.0 * 0.1 - 0.5) / np.sqrt(x), 0.1 * 0.5  # π = 0, −sᵀλ = 0.05
     c1 = residual / (2.0 * alpha)
     assert inside.u == pytest.approx(c1 + np.sqrt(c1**2 + mismatch / alpha))
@@ -137,7 +131,6 @@ def test_errors_are_those_defined_and_only_zero_is_zero() -> None:
     (nothing,) = errors(problem, [vi], [energy(vi)], reference, exact.u[:, None], exact.lam[:, None])
     assert (nothing.error_u, nothing.error_lambda, nothing.error_u_energy) == (0.0, 0.0, 0.0)
     assert nothing.violation < 1e-10
-    vi = problem.assemble(np.array([0.5]))
     lam = np.column_stack([np.zeros(8), 1e-30 * np.ones(8)])
     reference = ReferenceSolutions(np.zeros((30, 2)), lam, 0.0, 0.0)
     found = errors(problem, [vi, vi], [energy(vi)] * 2, reference, np.zeros((30, 2)), np.zeros((8, 2)))
@@ -182,22 +175,18 @@ def test_errors_and_bounds_of_many_queries_are_those_of_each() -> None:
     for vi in vis:
         ends = coercivity_and_continuity(vi.A, problem.V)
         known.append(Stability(inf_sup_full(problem.V, vi.B, cone), *ends, energy_inf_sup(vi.A, vi.B, problem.W)))
-    energies = [energy(vi) for vi in vis]
-    together = (
-        errors(problem, vis, energies, reference, u, lam),
-        error_bounds(problem.V, vis, energies, known, u, lam),
-        hsw_bounds(problem, vis, known, u, lam),
-    )
-    for k, vi in enumerate(vis):
-        own = [energies[k]], u[:, [k]], lam[:, [k]]
-        alone = (
-            errors(problem, [vi], own[0], reference.restrict([k]), *own[1:])[0],
-            error_bounds(problem.V, [vi], own[0], [known[k]], *own[1:])[0],
-            hsw_bounds(problem, [vi], [known[k]], *own[1:])[0],
-        )
-        for found, expected in zip(together, alone, strict=True):
-            assert getattr(found[k], "note", "") == getattr(expected, "note", "")
-            numbers = [[value for value in astuple(one) if not isinstance(value, str)] for one in (found[k], expected)]
+
+    def of_queries(which: list[int]) -> list[tuple[Any, ...]]:
+        some, stable, energies = ([of[k] for k in which] for of in (vis, known, [energy(vi) for vi in vis]))
+        given = u[:, which], lam[:, which]
+        of_error = errors(problem, some, energies, reference.restrict(which), *given)
+        of_bound = error_bounds(problem.V, some, energies, stable, *given), hsw_bounds(problem, some, stable, *given)
+        return list(zip(of_error, *of_bound, strict=True))
+
+    for k, together in enumerate(of_queries([0, 1, 2])):
+        for found, expected in zip(together, *of_queries([k]), strict=True):
+            assert getattr(found, "note", "") == getattr(expected, "note", "")
+            numbers = [[value for value in astuple(one) if not isinstance(value, str)] for one in (found, expected)]
             assert numbers[0] == pytest.approx(numbers[1], rel=1e-10, abs=1e-12)
 
 

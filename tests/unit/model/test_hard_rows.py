@@ -41,7 +41,7 @@ def hard(kind: str, seed: int) -> VariationalInequality:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(5))
 def test_solutions_are_right_and_bounds_exist_and_hold(kind: str, seed: int) -> None:
     vi, rng = hard(kind, seed), np.random.default_rng(seed)
     solution = solve_high_fidelity(vi)
@@ -54,9 +54,8 @@ def test_solutions_are_right_and_bounds_exist_and_hold(kind: str, seed: int) -> 
     u_N = exact_u + share * np.linalg.norm(exact_u) * rng.standard_normal(len(u))
     lengths = np.linalg.norm(vi.B.toarray(), axis=1)
     lam_N = np.maximum(exact_lam * (1.0 + share * rng.standard_normal(len(lam))), 0.0)
-    lam_N += (
-        share * np.max(exact_lam * lengths) / lengths * rng.uniform(0.0, 1.0, len(lam)) * (rng.random(len(lam)) < 0.3)
-    )
+    spread = share * np.max(exact_lam * lengths) / lengths
+    lam_N += spread * rng.uniform(0.0, 1.0, len(lam)) * (rng.random(len(lam)) < 0.3)
     pair = corrected_pair(vi, norm, u_N, lam_N)
     for v, nu in ((u_N, lam_N), (pair.u, pair.lam)):
         found = bound_errors_at(InnerProduct(vi.A), vi, norm, Constant(1.0, True), Constant(0.0, True), v, nu)

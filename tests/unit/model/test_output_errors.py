@@ -58,9 +58,7 @@ def test_an_output_that_vanishes_on_the_whole_training_set_has_absolute_errors()
     zero = ReferenceSolutions(0.0 * U[:, :1], LAM[:, :1], 1.0, 1.0, (0.0,))
     (row,), *_ = output_errors((TOTAL,), MUS[:1], (U[:, :1], LAM[:, :1]), zero)
     assert (row["error"], row["scaled"]) == (None, 2.0)
-
-
-def test_without_an_ok_query_there_are_no_errors() -> None:
+    # without an ok query there are no errors
     (row,) = summarise_outputs((TOTAL,), (5.0,), [])
     assert (row["error_mean"], row["error_scaled_max"], row["queries_ok"]) == (None, None, 0)
 
@@ -80,17 +78,10 @@ def test_what_is_wrong_is_named(output: Output, words: str) -> None:
         output.values(MUS, U, LAM)
 
 
-def test_a_function_cannot_change_the_solution() -> None:
-    def greedy(mu: np.ndarray, u: np.ndarray, lam: np.ndarray) -> float:
-        u *= 0.0
-        return 1.0
-
+def test_an_output_is_linear_or_a_function_which_cannot_change_the_solution() -> None:
     given = U.copy()
-    Output("greedy", "1", function=greedy).values(MUS, given, LAM)
+    Output("greedy", "1", function=lambda mu, u, lam: np.multiply(u, 0.0, out=u).sum()).values(MUS, given, LAM)
     assert np.array_equal(given, U)
-
-
-def test_an_output_is_linear_or_a_function() -> None:
     for more in ({}, {"u": np.ones(2), "function": lambda *_: 0.0}):
         with pytest.raises(ValueError, match="the output 's' has either coefficients of u and λ, or a function"):
             Output("s", "1", **more)
@@ -102,9 +93,7 @@ def model(small_run: vibench.Run) -> vibench.Model:
     return small_run.model(str(rows.loc[("obstacle", "decorrelated", "certified"), "cell"]))
 
 
-def test_the_bound_of_an_output_of_lambda_is_at_most_that_in_w_and_far_below_where_it_is_smooth(
-    model: vibench.Model,
-) -> None:
+def test_the_bound_of_an_output_of_lambda_is_far_below_that_in_w_where_it_is_smooth(model: vibench.Model) -> None:
     problem, base = model.problem, model.certificate.base
     force = Output("force", "N", lam=problem.W.apply(np.ones(problem.W.dim)))
     in_W = float(np.linalg.norm(problem.W.whiten_functional(force.lam))) / base.inf_sup.value

@@ -24,7 +24,7 @@ from vibench.qp.scaling import (
     stiffness,
     units_of,
     units_of_dual,
-)  # fmt: skip
+)
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution
@@ -103,7 +103,7 @@ def test_sparse_and_zero_data_have_units_too() -> None:
     assert (one.length, one.force) == (pytest.approx(other.length), pytest.approx(other.force))
     assert np.allclose(other.scaled(sparse).B.toarray(), one.scaled(vi).B)
     assert np.allclose(other.scaled(sparse).A.toarray(), one.scaled(vi).A)
-    nothing = VariationalInequality(np.zeros((2, 2)), np.zeros(2), np.zeros((1, 2)), np.zeros(1))
+    nothing = VariationalInequality(*map(np.zeros, ((2, 2), 2, (1, 2), 1)))
     unconstrained = VariationalInequality(np.eye(2), np.zeros(2), np.zeros((0, 2)), np.zeros(0))
     for vi in (nothing, unconstrained):
         units = units_of(vi)
@@ -114,15 +114,21 @@ def test_sparse_and_zero_data_have_units_too() -> None:
     assert all(units_of_dual(dual, loaded).length > 0.0 for loaded in (True, False))
 
 
+def solved(vi: VariationalInequality, solver: str, form: str) -> QPSolution:
+    """The solution of the primal or the dual program, which is ok."""
+    answer = solve_qp(vi, solver, 1e-8, factor=np.linalg.cholesky(vi.A) if form == "dual" else None)
+    status, reason, _ = verification.verify(vi, answer, 1e-8)
+    assert status is Status.OK, reason
+    return answer
+
+
 @pytest.mark.parametrize("solver", SOLVERS_OF_TESTS)
 @pytest.mark.parametrize("form", ["primal", "dual"])
 def test_a_program_without_load_is_solved_to_the_accuracy_asked_for(solver: str, form: str) -> None:
     """An indentation by micrometres into steel as well as by kilometres into foam."""
     for (length, modulus), seed in product([(0, 0), (-2, 0), (-6, 11), (4, -6)], range(10)):
         vi = indentation(seed, length, modulus)
-        answer = solve_qp(vi, solver, 1e-8, factor=np.linalg.cholesky(vi.A) if form == "dual" else None)
-        status, reason, _ = verification.verify(vi, answer, 1e-8)
-        assert status is Status.OK, (seed, reason)
+        answer = solved(vi, solver, form)
         x, alpha = exact(indentation(seed))  # where brute force knows what is zero
         assert np.allclose(answer.x, 10.0**length * x, rtol=0.0, atol=1e-5 * 10.0**length)
         force = 10.0 ** (length + modulus)
@@ -135,10 +141,7 @@ def test_without_load_and_contact_or_nearly_so_a_solution_is_ok(solver: str, for
     """The x and α are zero, or small beside g: residuals relative to them would be those of round-off."""
     for closed, seed in product([0.0, 1e-9, 1e-6, 1e-3], range(10)):
         vi = indentation(seed, closed=closed)
-        vi = replace(vi, g=np.abs(vi.g)) if closed == 0.0 else vi
-        answer = solve_qp(vi, solver, 1e-8, factor=np.linalg.cholesky(vi.A) if form == "dual" else None)
-        status, reason, _ = verification.verify(vi, answer, 1e-8)
-        assert status is Status.OK, (closed, seed, reason)
+        solved(replace(vi, g=np.abs(vi.g)) if closed == 0.0 else vi, solver, form)
 
 
 @pytest.mark.parametrize("form", ["primal", "dual"])
@@ -163,9 +166,8 @@ def test_half_an_answer_is_none() -> None:
 @pytest.mark.parametrize("form", ["primal", "dual"])
 def test_a_start_without_load_is_in_the_same_units(solver: str, form: str) -> None:
     vi = indentation(2, -3, 6)
-    factor = np.linalg.cholesky(vi.A) if form == "dual" else None
-    cold = solve_qp(vi, solver, 1e-8, factor=factor)
-    warm = solve_qp(vi, solver, 1e-8, factor=factor, start=cold)
+    cold = solved(vi, solver, form)
+    warm = solve_qp(vi, solver, 1e-8, factor=np.linalg.cholesky(vi.A) if form == "dual" else None, start=cold)
     assert verification.verify(vi, warm, 1e-8)[0] is Status.OK
     assert warm.iterations <= cold.iterations
 

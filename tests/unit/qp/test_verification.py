@@ -53,6 +53,9 @@ def test_residuals_are_those_defined_and_hide_neither_nan_nor_indefinite_matrice
     assert not kkt_residuals(program(0), np.full(6, np.nan), np.zeros(4)).worst <= 1.0
     with pytest.raises(NumericalError, match="A is not positive definite"):
         kkt_residuals(replace(program(0), A=-np.eye(6)), np.ones(6), np.zeros(4))
+    x, alpha = exact(program(3))
+    status, reason, _ = verify(program(3), QPSolution(x, alpha - 1e-12, "solved"), 1e-6)
+    assert (status, reason) == (Status.FAILED, "the solution has negative multipliers: solved")
 
 
 @given(seeds, st.integers(-9, 9), st.integers(-9, 9), st.booleans())
@@ -185,9 +188,3 @@ def test_a_loaded_tie_hides_no_contact() -> None:
     assert verify(vi, right, 1e-8)[0] is Status.OK
     assert verify(vi, wrong, 1e-3)[0] is Status.INACCURATE
     assert kkt_residuals(vi, right.x, right.alpha).unit == pytest.approx(0.25)
-
-
-def test_negative_multipliers_are_no_solution() -> None:
-    vi, (x, alpha) = program(3), exact(program(3))
-    status, reason, _ = verify(vi, QPSolution(x, alpha - 1e-12, "solved"), 1e-6)
-    assert (status, reason) == (Status.FAILED, "the solution has negative multipliers: solved")

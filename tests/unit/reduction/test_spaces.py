@@ -1,4 +1,5 @@
 from collections.abc import Iterator
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -76,12 +77,12 @@ def test_proportional_matrices_are_recognised_and_others_are_not() -> None:
     other.data[0] *= 1.0 + 1e-9
     assert proportionality(other, B) is None
     assert proportionality(0.0 * B, B) is None
-    classes = constraint_classes([B, other, 3.0 * B, 2.0 * other])
+    matrices = [B, other, 3.0 * B, 2.0 * other]
+    classes = constraint_classes(matrices)
     assert classes.members.tolist() == [0, 1, 0, 1]
     assert np.allclose(classes.factors, [1.0, 1.0, 3.0, 2.0])
-    for k, matrix in enumerate([B, other, 3.0 * B, 2.0 * other]):
-        rebuilt = classes.factors[k] * classes.representatives[classes.members[k]]
-        assert np.allclose(rebuilt.toarray(), matrix.toarray())
+    for matrix, factor, member in zip(matrices, classes.factors, classes.members, strict=True):
+        assert np.allclose((factor * classes.representatives[member]).toarray(), matrix.toarray())
 
 
 @pytest.mark.parametrize("reach", [3, 5, None])
@@ -181,14 +182,6 @@ class Ends(UnitVectors):
         yield next(super().steps(offline))
 
 
-class Fails(UnitVectors):
-    """Fails before there is an enrichment at all."""
-
-    def steps(self, offline: Offline) -> Iterator[Step]:
-        raise NumericalError("no space to begin with")
-        yield
-
-
 @pytest.fixture
 def offline() -> Offline:
     problem = Wire()
@@ -217,8 +210,10 @@ def test_a_tolerance_beyond_reach_costs_no_other_and_failures_are_named(offline:
     with pytest.raises(NumericalError, match=r"tolerance 0\.1 is not reached: the strategy has no further vector"):
         Ends().build(offline, 0.1)
     assert Ends().build(offline, 1.0).vectors.shape[1] == 0
+    failing = UnitVectors()
+    failing.steps = Mock(side_effect=NumericalError("no space to begin with"))  # type: ignore[method-assign]
     with pytest.raises(NumericalError, match=r"^no space to begin with$"):
-        grow_through(Fails(), offline, [1.0])
+        grow_through(failing, offline, [1.0])
     with pytest.raises(ValueError, match="UnitVectors needs a tolerance"):
         UnitVectors().build(offline, None)
 

@@ -133,15 +133,7 @@ def test_steps_are_the_smallest_constants_of_leading_parts(seed: int, first: int
     assert found.first(first + 2).beta_span() == pytest.approx(direct[2], rel=1e-12)
 
 
-def test_without_multipliers_nothing_is_unstable() -> None:
-    none = ProjectedSupremizers([np.zeros((4, 0))], constraint_classes([sp.csr_array(np.ones((2, 3)))]))
-    assert none.over_steps(2).tolist() == [np.inf] * 3
-    assert none.stability_ratios(2, np.array([np.inf])).tolist() == [1.0] * 3
-
-
-HORN = np.array(
-    [[1, -1, 1, 1, -1], [-1, 1, -1, 1, 1], [1, -1, 1, -1, 1], [1, 1, -1, 1, -1], [-1, 1, 1, -1, 1]], dtype=float
-)
+HORN = scipy.linalg.circulant([1.0, -1.0, 1.0, 1.0, -1.0])
 """Horn's matrix: copositive, but no sum of a positive semidefinite and a nonnegative matrix."""
 
 
@@ -224,6 +216,9 @@ def test_certificates_hold_whatever_the_iterations_reached(seed: int, count: int
 
 def test_intervals_of_special_cases_and_rounded_zeros() -> None:
     """Neighbours touch, others do not; the products of the images are all positive."""
+    none = ProjectedSupremizers([np.zeros((4, 0))], constraint_classes([sp.csr_array(np.ones((2, 3)))]))
+    assert none.over_steps(2).tolist() == [np.inf] * 3  # without multipliers nothing is unstable
+    assert none.stability_ratios(2, np.array([np.inf])).tolist() == [1.0] * 3
     G = np.eye(4) + 0.3 * np.diag(np.ones(3), 1) + 0.3 * np.diag(np.ones(3), -1)
     M = np.ones((4, 4)) + np.diag([1.0, 2.0, 3.0, 4.0])
     for noise in (-1e-17, 1e-17):
