@@ -21,9 +21,6 @@ T = TypeVar("T")
 # Seconds after which runs are not repeated; work that takes longer is timed once.
 SLOW = 1.0
 
-# Slowdown of the calibration, relative to a calm machine, above which a row is marked as disturbed.
-DISTURBED = 1.3
-
 # Environment in which numerical libraries start with one thread.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
 
@@ -142,6 +139,11 @@ class Calibration:
         for row in self._matrix:
             total += float(row @ row)
         return total
+
+
+def is_disturbed(slowdown: float) -> bool:
+    """Whether a slowdown of the calibration marks a row as disturbed."""
+    return slowdown > 1.3
 
 
 @cache

@@ -38,7 +38,7 @@ from vibench.qp.status import Status
 from vibench.stages.artefacts import Store, default_folder
 from vibench.study.matrix import read_study
 from vibench.text import new_console
-from vibench.timing import DISTURBED, Calibration, Stopwatch
+from vibench.timing import Calibration, Stopwatch, is_disturbed
 
 
 class Health(StrEnum):
@@ -255,7 +255,7 @@ def check_timings() -> Iterator[Diagnosis]:
     doubts = []
     for subject, text, doubtful in (
         ("other load", f"{others:.1f} of {cores} cores", others > 0.25 * cores),
-        ("slowdown", f"{slowdown:.2f}; rows are marked above {DISTURBED}", slowdown > DISTURBED),
+        ("slowdown", f"{slowdown:.2f} times a calm machine", is_disturbed(slowdown)),
         ("wall over CPU", f"{ratio:.2f}; above 1.5 processes often wait for a core", ratio > 1.5),
     ):
         yield Diagnosis(subject, text, _note_if(doubtful))

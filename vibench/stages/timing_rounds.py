@@ -25,7 +25,7 @@ from vibench.stages.cell_queries import CellQueries
 from vibench.stages.marginal_solutions import MarginalSolution, MarginalSolutions, SolutionsBeside, parts_alike
 from vibench.stages.query import ModelQuery, Queries
 from vibench.stages.snapshots import gather
-from vibench.timing import DISTURBED, NO_TIME, Seconds, calibration, timed
+from vibench.timing import NO_TIME, Seconds, calibration, is_disturbed, timed
 
 QUERY_SUBSETS = 3
 """A round takes a third of the queries of a cell, another one each time: short rounds interleave more closely."""
@@ -304,7 +304,7 @@ def seconds_of_cell(rows: Sequence[Row]) -> Row:
         "online_assemble_s": np.median([row["assemble_s"] for row in rows]),
         "online_solve_s": np.median([row["solve_s"] for row in rows]),
         "online_certify_s": np.median(certified) if certified else None, "slowdown": np.median(slowdown),
-        "disturbed": int(np.median(slowdown) > DISTURBED),
+        "disturbed": int(is_disturbed(float(np.median(slowdown)))),
     } | ({} if high_fidelity is None else {"hf_s": high_fidelity})  # fmt: skip
 
 
