@@ -3,7 +3,7 @@
 import copy
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -186,6 +186,15 @@ def carry_out(stage: Stage, store: SampleStore) -> None:
         store.put(stage.key, result.value, result.seconds, result.histories)
     else:
         store.kept[stage.key] = Artefact(result.value, result.seconds, result.histories, "here")
+
+
+def store_of(folder: Path, stages: Iterable[Stage]) -> SampleStore:
+    """A store with the values of some stages and of all that they need."""
+    store = SampleStore(folder)
+    for stage in stages:
+        if store.get(stage.key) is None:
+            carry_out(stage, store)
+    return store
 
 
 def small_study(name: str, problem: Sequence[Mapping[str, Any]], **axes: Any) -> vibench.Study:

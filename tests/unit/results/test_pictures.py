@@ -101,23 +101,14 @@ def draws(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Draws:
     return draw
 
 
-@pytest.mark.parametrize("wrong", ["points", "values", "positions", "multiplier"])
-def test_an_array_of_the_wrong_shape_is_named(wrong: str, draws: Draws) -> None:
-    with pytest.raises(NumericalError, match=f"picture has .*{wrong}.* of the wrong shape"):
-        draws(wrong=wrong)
-
-
-@pytest.mark.parametrize("kind", [str, complex, object])
-def test_an_array_that_holds_no_real_numbers_is_named(kind: type, draws: Draws) -> None:
-    with pytest.raises(NumericalError, match="picture has values of the wrong type"):
-        draws(kind=kind)
-
-
-@pytest.mark.parametrize("name", [None, 3, b"u"])
-def test_a_name_that_is_no_text_is_named(name: object, draws: Draws) -> None:
-    with pytest.raises(NumericalError, match="picture has name of the wrong type"):
-        draws(name=name)
-
-
-def test_the_name_of_a_field_is_one_printable_line(draws: Draws) -> None:
+def test_arrays_and_names_of_the_wrong_sort_are_named_and_names_are_one_printable_line(draws: Draws) -> None:
     assert {picture.name for _, picture in draws(name="u\n\x1b[2J\ud800")} == {r"u \u001b[2J\ud800"}
+    for wrong in ("points", "values", "positions", "multiplier"):
+        with pytest.raises(NumericalError, match=f"picture has .*{wrong}.* of the wrong shape"):
+            draws(wrong=wrong, name="u [m]")
+    for kind in (str, complex, object):
+        with pytest.raises(NumericalError, match="picture has values of the wrong type"):
+            draws(kind=kind, wrong="")
+    for name in (None, 3, b"u"):
+        with pytest.raises(NumericalError, match="picture has name of the wrong type"):
+            draws(name=name, kind=float)

@@ -61,24 +61,21 @@ def test_whatever_else_is_refused_in_one_line_and_changes_nothing(file: Path) ->
         assert (len(str(caught.value).splitlines()), hashlib.sha256(file.read_bytes()).digest()) == (1, before)
 
 
-def test_a_wrong_column_is_named_with_the_nearest(file: Path) -> None:
+def test_rows_are_sorted_up_and_down_names_stand_between_commas_and_wrong_ones_have_hints(file: Path) -> None:
     with pytest.raises(RequestError, match="no column of cells is called 'beta_spn_min'; did you mean 'beta_span_min'"):
         matching(file, "cells", "beta_spn_min < 1", FRAME)
-
-
-@given(st.text(max_size=30))
-def test_any_text_selects_rows_or_is_refused(file: Path, text: str) -> None:
-    with contextlib.suppress(RequestError):
-        assert len(matching(file, "cells", text, FRAME)) == 4
-
-
-def test_rows_are_sorted_up_and_down_and_names_stand_between_commas() -> None:
     frame = pd.DataFrame({"a": [2.0, None, 1.0, 2.0], "b": [1, 2, 3, 4]})
     assert list(sorted_by(frame, ["a"], "cells")["b"]) == [3, 1, 4, 2]
     assert list(sorted_by(frame, ["-a", "-b"], "cells")["b"]) == [4, 1, 3, 2]
     with pytest.raises(RequestError, match="no column of cells is called 'c'"):
         sorted_by(frame, ["-c"], "cells")
     assert (parts("a, b,,online [ms]"), parts("")) == (["a", "b", "online [ms]"], [])
+
+
+@given(st.text(max_size=30))
+def test_any_text_selects_rows_or_is_refused(file: Path, text: str) -> None:
+    with contextlib.suppress(RequestError):
+        assert len(matching(file, "cells", text, FRAME)) == 4
 
 
 @given(st.sets(st.text("0123456789abcdef", min_size=16, max_size=16), min_size=1, max_size=20))

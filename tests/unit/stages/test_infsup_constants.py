@@ -1,6 +1,8 @@
+import itertools
+
 import numpy as np
 import pytest
-from samples import SampleStore, carry_out, mixed_cell
+from samples import SampleStore, mixed_cell, store_of
 
 from vibench.interfaces.strategies import Stop
 from vibench.plugins.plugin import Plugin
@@ -26,13 +28,8 @@ def cell(problem: str, primal: str) -> CellQueries:
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
     """A store with the constants of every pair of a problem and a primal strategy."""
-    store = SampleStore(tmp_path_factory.mktemp("constants"))
-    for problem in PROBLEMS:
-        for primal in PRIMALS:
-            for stage in cell(problem, primal).constants:
-                if store.get(stage.key) is None:
-                    carry_out(stage, store)
-    return store
+    cells = itertools.starmap(cell, itertools.product(PROBLEMS, PRIMALS))
+    return store_of(tmp_path_factory.mktemp("constants"), (stage for one in cells for stage in one.constants))
 
 
 def constants(store: SampleStore, problem: str, primal: str) -> list[list[InfSup]]:

@@ -8,7 +8,7 @@ import pytest
 import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import SampleStore, carry_out, mixed_cell
+from samples import SampleStore, carry_out, mixed_cell, store_of
 
 from vibench import timing
 from vibench.arrays import Array
@@ -42,10 +42,8 @@ def cell(primal: str, tolerance: float | None, solver: str = "piqp") -> CellQuer
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
-    store = SampleStore(tmp_path_factory.mktemp("stages"))
-    for primal, tolerance in (("decorrelated", None), ("online-supremizers", None), ("offline-pga", 0.5)):
-        carry_out(cell(primal, tolerance), store)
-    return store
+    kinds = (("decorrelated", None), ("online-supremizers", None), ("offline-pga", 0.5))
+    return store_of(tmp_path_factory.mktemp("stages"), (cell(*kind) for kind in kinds))
 
 
 def test_keys_say_what_determines_a_stage_and_nothing_else() -> None:

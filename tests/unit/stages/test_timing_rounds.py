@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import SampleStore, carry_out, mixed_cell
+from samples import SampleStore, mixed_cell, store_of
 
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
@@ -53,12 +53,8 @@ OF_THREE = tuple(
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
-    store = SampleStore(tmp_path_factory.mktemp("artefacts"))
-    stages = [stage for cells in (CELLS, OF_THREE) for stage in TimingRounds(cells, (EVERY,) * 4, 1, 0).inputs()]
-    for stage in stages:
-        if store.get(stage.key) is None:
-            carry_out(stage, store)
-    return store
+    rounds = (TimingRounds(cells, (EVERY,) * 4, 1, 0) for cells in (CELLS, OF_THREE))
+    return store_of(tmp_path_factory.mktemp("artefacts"), (stage for one in rounds for stage in one.inputs()))
 
 
 def as_rows(*rounds: TimedRound, hf: float | None = 4.0, pace: float = 1.0, per_block: int = 4) -> list[dict[str, Any]]:

@@ -44,9 +44,8 @@ def test_the_numbers_are_those_of_the_default(name: str, factorisation: str) -> 
     if not IMPLEMENTATIONS[factorisation].is_installed:
         pytest.skip("not installed")
     options = {"resolution": 300}
-    for own, default in zip(
-        solved(name, options | {"factorisation": factorisation}), solved(name, options), strict=True
-    ):
+    found = solved(name, options | {"factorisation": factorisation})
+    for own, default in zip(found, solved(name, options), strict=True):
         np.testing.assert_allclose(own, default, atol=1e-9 * np.abs(default).max())
 
 
