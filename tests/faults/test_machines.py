@@ -26,9 +26,7 @@ def test_more_jobs_than_a_machine_can_bear_are_refused(main: Main, tmp_path: Pat
     assert list(Path.cwd().iterdir()) == []
 
 
-def test_too_few_open_files_are_said_to_be_too_few(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
-) -> None:
+def test_too_few_open_files_are_said_to_be_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
     monkeypatch.setattr("vibench.results.database.sqlite3.connect", unable)
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     monkeypatch.setattr("vibench.results.database.resource.getrlimit", lambda _: (7, limits[1]))

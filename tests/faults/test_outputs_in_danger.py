@@ -104,7 +104,7 @@ def of_another_user(path: Path) -> Iterator[None]:
         path.chmod(0o755)
 
 
-def test_a_folder_of_another_user_is_named(
+def test_folders_of_other_users_are_named(
     run: Path, main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -219,7 +219,7 @@ def test_only_figures_of_vibench_are_removed(tmp_path: Path) -> None:
     figures.remove(tmp_path / "nowhere")
 
 
-def test_a_file_is_written_whole_for_those_of_the_mask_and_over_no_pipe(
+def test_a_file_is_written_whole_as_the_mask_says_and_over_no_pipe(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As /dev/null would be replaced, for an administrator."""

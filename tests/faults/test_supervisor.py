@@ -58,9 +58,7 @@ def values(found: Done | Failed | Unstored) -> list[tuple[int, Any]]:
     return found.value
 
 
-def test_a_stage_that_goes_well_is_stored_and_reports_its_progress(
-    run: Run, shared: Supervisor, tmp_path: Path
-) -> None:
+def test_a_stage_that_goes_well_is_stored_and_tells_its_progress(run: Run, shared: Supervisor, tmp_path: Path) -> None:
     for how, share in (("third", 1.0 / 3.0), ("fine", 0.0)):
         stage = Whole(how)
         assert isinstance(run(stage), Done)
@@ -163,7 +161,7 @@ def sleepers(seconds: int) -> list[str]:
     return found
 
 
-def test_a_plugin_or_a_vibench_that_was_not_planned_with_is_refused(
+def test_a_plugin_or_vibench_that_was_not_planned_with_is_refused(
     run: Run, watcher: Supervisor, tmp_path: Path
 ) -> None:
     """Its result would be stored under the hash of the other."""
@@ -203,9 +201,7 @@ def test_limits_begin_when_the_work_begins(monkeypatch: pytest.MonkeyPatch, tmp_
 
 
 @pytest.mark.usefixtures("new_workers")
-def test_a_process_never_begun_is_given_up(
-    watcher: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_not_begun_is_given_up(watcher: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervisor._JobState, "start_seconds", 0.1)
     found = watcher.run(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0))
     assert found == Failed(Status.CRASHED, "no worker process began within 0.1 s")

@@ -19,9 +19,7 @@ import published
 
 
 @pytest.mark.parametrize(("problem", "nodes"), [("obstacle", 100), pytest.param("hertz", 700, marks=pytest.mark.long)])
-def test_both_sides_make_one_model(
-    problem: str, nodes: int, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_both_make_one_model(problem: str, nodes: int, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     # the seconds do not matter here
     monkeypatch.setattr(as_published, "median_seconds", lambda work, **_: timed(work))
     monkeypatch.setitem(as_published.CASES, problem, replace(as_published.CASES[problem], queries=16))

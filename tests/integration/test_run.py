@@ -93,7 +93,7 @@ def test_a_cell_without_row_is_done_again(vibench: Vibench, again: Path, artefac
     assert len(rows(folder, "queries")) == 9
 
 
-def test_other_cells_join_those_of_the_same_study_and_strict_fails_where_one_is_not_ok(
+def test_other_cells_join_those_of_the_study_and_strict_fails_where_one_is_not_ok(
     vibench: Vibench, again: Path
 ) -> None:
     printed, after = run_wire(vibench, again, "--solver", "osqp", "--pod-tol", "0.1")
@@ -169,9 +169,7 @@ def test_a_run_of_which_nothing_can_run_here_is_an_error(vibench: Vibench, tmp_p
     assert {row["reason"] for row in rows(tmp_path / "runs" / "wire")} == {reason}
 
 
-def test_edits_beside_numbers_run_nothing(
-    plugins_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_edits_beside_numbers_run_none(plugins_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures, help texts, the report and the tables may change: the run is complete, and its models open."""
     package, edited_core = Path(importlib.util.find_spec("vibench").submodule_search_locations[0]), tmp_path / "core"
     # First on the path the copy takes the place of what is installed; its bytecode would take seconds to make.
@@ -251,9 +249,7 @@ def test_artefacts_are_shared_by_studies_and_seconds_only_on_their_machine(
     assert rows(tmp_path / "here")[0]["machine"] == rows(tmp_path / "again")[0]["machine"]
 
 
-def test_clean_shows_and_frees_artefacts_asked(
-    vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_clean_shows_and_frees_artefacts(vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
     run_wire(vibench, tmp_path, study=wire_study())
     artefacts = tmp_path / "cache" / "artefacts"

@@ -91,9 +91,7 @@ def test_the_hash_changes_with_the_sources_and_with_nothing_else(tmp_path: Path)
     assert len(hashes) == 1  # wherever the sources are
 
 
-def test_the_code_of_the_core_is_its_version_and_a_hash_of_its_sources(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_code_of_the_core_is_its_version_and_a_source_hash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copy = shutil.copytree(Path(str(vibench.__file__)).parent, tmp_path / "vibench")
     monkeypatch.setattr(provenance, "__file__", str(copy / "provenance.py"))
     before = core_code.__wrapped__()  # without its cache

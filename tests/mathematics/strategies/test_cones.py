@@ -338,9 +338,7 @@ def test_entries_that_are_round_off_are_exact_zeros() -> None:
 
 
 @pytest.mark.parametrize("broken", ["nothing", "nan", "infeasible"])
-def test_a_solver_that_fails_leaves_a_feasible_generator_and_a_note(
-    monkeypatch: pytest.MonkeyPatch, broken: str
-) -> None:
+def test_a_solver_that_fails_leaves_feasible_generators_and_notes(monkeypatch: pytest.MonkeyPatch, broken: str) -> None:
     def fails(program: VariationalInequality, solver: str, accuracy: float) -> QPSolution:
         if broken == "nothing":
             return QPSolution(None, None, "failed")
