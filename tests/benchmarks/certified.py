@@ -57,9 +57,7 @@ class Tally:
         own = solution.x, solution.alpha, solution.u, solution.lam
         yield "reduced", Answer(solution.u, solution.lam, bound)
         yield "online", Corrector(self.model.reduced, self.certificate, CorrectionMode.FEASIBLE).answer(mu, *own)
-        if (
-            self.parameters % 10 == 1
-        ):  # timed, and corrected at high-fidelity cost, too: what a query does is done again
+        if self.parameters % 10 == 1:  # also corrected at high-fidelity cost: what a query does is done again
             self.time(mu, solution.x, solution.alpha, solution.solution)
             yield "in full", Corrector(self.model.reduced, None, CorrectionMode.FEASIBLE).answer(mu, *own)
 

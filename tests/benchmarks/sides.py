@@ -108,9 +108,8 @@ class Ours(Side):
 
     def __init__(self, problem: Problem, case: Case, solver: str, accuracy: float) -> None:
         super().__init__(problem, case, solver, accuracy)
-        self.fixed = Reduction(
-            problem, ModifiedCPG(), OfflinePGA(), case.pod, case.cone, tolerance=case.pga, assembly="reduced"
-        )
+        pair, stops = (ModifiedCPG(), OfflinePGA()), (case.pod, case.cone)
+        self.fixed = Reduction(problem, *pair, *stops, tolerance=case.pga, assembly="reduced")
 
     def _again(self, *known: str) -> Reduction:
         """The reduction with these steps alone: a stage that is timed repeatedly is computed every time."""

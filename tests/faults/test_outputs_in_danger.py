@@ -104,9 +104,7 @@ def of_another_user(path: Path) -> Iterator[None]:
         path.chmod(0o755)
 
 
-def test_folders_of_other_users_are_named(
-    run: Path, main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_folders_of_others_are_named(run: Path, main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for line in ("show theirs", "publish --yes theirs theirs/site --no-figures", "report theirs --no-figures"):
         shutil.copytree(run, tmp_path / "theirs")

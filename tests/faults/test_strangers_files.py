@@ -219,9 +219,7 @@ def test_only_figures_of_vibench_are_removed(tmp_path: Path) -> None:
     figures.remove(tmp_path / "nowhere")
 
 
-def test_a_file_is_written_whole_as_the_mask_says_and_over_no_pipe(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_is_written_whole_as_masks_say_and_over_no_pipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As /dev/null would be replaced, for an administrator."""
     target = tmp_path / "table.csv"
     for mask, mode in ((0o022, 0o644), (0o027, 0o640), (0o077, 0o600)):

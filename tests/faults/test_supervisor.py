@@ -161,9 +161,7 @@ def sleepers(seconds: int) -> list[str]:
     return found
 
 
-def test_a_plugin_or_vibench_that_was_not_planned_with_is_refused(
-    run: Run, watcher: Supervisor, tmp_path: Path
-) -> None:
+def test_a_plugin_or_vibench_not_planned_with_is_refused(run: Run, watcher: Supervisor, tmp_path: Path) -> None:
     """Its result would be stored under the hash of the other."""
     known = Plugin("problem", "obstacle", "{}", find(PluginKind.PROBLEM, "obstacle").code)
     assert isinstance(run(OfAPlugin(OfAPlugin(problem=known))), Done)

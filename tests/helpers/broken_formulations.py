@@ -67,15 +67,11 @@ NoProgram = _wrong("NoProgram", solve=_same_solver)
 # It changes the parameter that it is given.
 StepsOn = _answering("StepsOn", _stepped_on)
 AnswersInATuple = _answering("AnswersInATuple", lambda answer, mu: (answer.x, answer.alpha))
-NotANumber = _answering(
-    "NotANumber", lambda answer, mu: replace(answer, x=answer.x * np.where(answer.x == answer.x[2], np.nan, 1.0))
-)
+NotANumber = _answering("NotANumber", lambda one, mu: replace(one, x=one.x * np.where(one.x == one.x[2], np.nan, 1.0)))
 NeverConverges = _answering(
     "NeverConverges", lambda answer, mu: replace(answer, outcome=Outcome.INACCURATE, reason="100 steps were too few")
 )
-SaysNotWhy = _answering(
-    "SaysNotWhy", lambda answer, mu: replace(answer, outcome=Outcome.FAILED if mu[0] > 0.0 else Outcome.OK)
-)
+SaysNotWhy = _answering("SaysNotWhy", lambda one, mu: replace(one, outcome=Outcome.FAILED if mu[0] > 0 else Outcome.OK))
 Rolls = _answering("Rolls", lambda one, mu: replace(one, x=one.x * (1.0 + 1e-9 * np.random.default_rng().random())))
 OfAnotherSize = _rebuilding("OfAnotherSize", lambda u, lam: (u[1:], lam))
 Pulls = _rebuilding("Pulls", lambda u, lam: (u, lam - 1e-12 * lam.max()))

@@ -123,9 +123,7 @@ NotOrthogonal = _supremizing(
 # Forgets to say that it takes one.
 AsksForATolerance = _supremizing("AsksForATolerance", takes_tolerance=False)
 # Takes a tolerance, and is content without.
-NeedsNone = _supremizing(
-    "NeedsNone", build=lambda self, offline, tolerance: Supremizing.build(self, offline, tolerance or 0.5)
-)
+NeedsNone = _supremizing("NeedsNone", build=lambda self, offline, tol: Supremizing.build(self, offline, tol or 0.5))
 Fewer = _supremizing("Fewer", count=lambda self, tolerance: round(5.0 * tolerance))
 KindOfTwo = _supremizing("KindOfTwo", build=_of_one_kind_above)
 DrawsVectors = _supremizing("DrawsVectors", vectors=_drawn_vectors)

@@ -111,9 +111,7 @@ WrongSide = _changed("WrongSide", "B", lambda B, mu, bar: -B, Bar)
 NegativeGap = _changed("NegativeGap", "g", lambda g, mu, bar: -g, Bar)
 # B, declared constant, turns with the place of the apex.
 ConstantConstraint = _changed("ConstantConstraint", "B", lambda B, mu, _: sp.csr_array(B * (1.0 + 0.1 * mu[1])), Cube)
-NoisyLoad = _changed(
-    "NoisyLoad", "f", lambda f, mu, bar: f * (1.0 + 1e-6 * np.random.default_rng().random(len(f))), Bar
-)
+NoisyLoad = _changed("NoisyLoad", "f", lambda f, mu, _: f * (1.0 + 1e-6 * np.random.default_rng().random(len(f))), Bar)
 # The load has an entry for the nodes on the boundary, too.
 LoadOnAllNodes = _changed("LoadOnAllNodes", "f", lambda f, mu, bar: np.full(49, mu[0] / 36.0), Bar)
 # κ is the root of a complex number.

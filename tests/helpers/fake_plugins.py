@@ -154,9 +154,7 @@ def _reducing(name: str, act: Callable[[], Any], **members: Any) -> type[DualStr
 RaisingCone = _reducing("RaisingCone", lambda: throw(LookupError("no generator found")))
 ExitingCone = _reducing("ExitingCone", lambda: os._exit(3))
 InterruptingCone = _reducing("InterruptingCone", lambda: throw(KeyboardInterrupt()))
-NeedyCone = _reducing(
-    "NeedyCone", lambda: throw(ImportError("no-such-distribution")), requires=("no-such-distribution",)
-)
+NeedyCone = _reducing("NeedyCone", lambda: throw(ImportError("no such")), requires=("no-such-distribution",))
 
 
 class WaitingCone(DualStrategy):

@@ -93,9 +93,7 @@ def test_a_cell_without_row_is_done_again(vibench: Vibench, again: Path, artefac
     assert len(rows(folder, "queries")) == 9
 
 
-def test_other_cells_join_those_of_the_study_and_strict_fails_where_one_is_not_ok(
-    vibench: Vibench, again: Path
-) -> None:
+def test_other_cells_join_those_of_a_study_and_strict_fails_where_one_is_not_ok(vibench: Vibench, again: Path) -> None:
     printed, after = run_wire(vibench, again, "--solver", "osqp", "--pod-tol", "0.1")
     assert "1 cells, 1 to run" in printed
     assert [row["solver"] for row in after] == [*SOLVERS, "osqp"]

@@ -27,9 +27,7 @@ from vibench_strategies.online_supremizers import OnlineSupremizers
 
 MU = np.array([0.43])
 
-STRING = Reduction(
-    Varying(count=15), CPG(), OnlineSupremizers(), Stop(tolerance=1e-6), Stop(tolerance=1e-3), accuracy=1e-11
-)
+STRING = Reduction(Varying(count=15), CPG(), OnlineSupremizers(), Stop(1e-6), Stop(1e-3), accuracy=1e-11)
 
 
 class Supplied(PrimalStrategy):

@@ -78,9 +78,7 @@ def test_the_eight_terms_are_the_whole_of_the_conductance() -> None:
 def test_the_film_pushes_the_shaft_back_and_aside_and_cavitates_where_it_widens() -> None:
     problem, mu = Bearing("coarse"), np.array([0.6, 1.0])
     found = HighFidelitySolver(problem).solve(mu)
-    back, aside, share = (
-        float(one.values(mu[None], found.u[:, None], found.lam[:, None])[0]) for one in problem.outputs
-    )
+    back, aside, share = (float(of.values(mu[None], found.u[:, None], found.lam[:, None])[0]) for of in problem.outputs)
     assert back < 0.0 < aside
     assert 0.25 < share < 0.5
     (theta, zeta), widening = problem.mesh.p[:, problem.free], found.lam > 0.0

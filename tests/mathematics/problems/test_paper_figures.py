@@ -88,10 +88,10 @@ def test_a_run_without_the_pairs_of_the_paper_has_fewer_and_no_page(quick_run: P
 
 
 @pytest.mark.parametrize(
-    ("problem", "options"), [("obstacle", '{"bulge": true}'), ("hertz", '{"approach": "parameter"}')]
+    ("problem", "given"), [("obstacle", '{"bulge": true}'), ("hertz", '{"approach": "parameter"}')]
 )
-def test_a_problem_with_another_parameter_is_not_the_paper_s(problem: str, options: str, changed: Changed) -> None:
-    update = f"SET problem_options = '{options}' WHERE problem = '{problem}'"
+def test_a_problem_with_another_parameter_is_not_the_paper_s(problem: str, given: str, changed: Changed) -> None:
+    update = f"SET problem_options = '{given}' WHERE problem = '{problem}'"
     assert twins(changed(*(f"UPDATE {table} {update}" for table in TABLES)), problem) == {}
 
 
