@@ -1,7 +1,5 @@
 """Exported C sources, compiled: they answer as the models do, whatever the constraints are like."""
 
-from __future__ import annotations
-
 import ctypes
 import shutil
 import subprocess
@@ -102,11 +100,11 @@ def test_a_c_source_gives_the_answers_of_the_model(model: vibench.Model, tmp_pat
 Certify = Callable[[np.ndarray, bool], tuple[int, np.ndarray, np.ndarray, np.ndarray]]
 
 
-def certify(model: vibench.Model, file: Path, tolerance: float) -> Certify:
-    """The functions of the C source of a model: the code, u, λ and three bounds at a parameter, corrected or not."""
-    arrays = export_model(model, file, tolerance=tolerance, evaluations=6000, c=True).arrays
-    found, (rows, loads) = library(file.with_suffix(".c")), arrays["certificate_responses"].shape
-    basis = arrays["basis"]
+def certify(model: vibench.Model, file: Path, tolerance: float) -> tuple[Certify, Any, ctypes.CDLL]:
+    """The C source of a model: the code, u, λ and three bounds at a parameter, corrected or not; what it is made of."""
+    whole = export_model(model, file, tolerance=tolerance, evaluations=6000, c=True)
+    arrays, found = whole.arrays, library(file.with_suffix(".c"))
+    (rows, loads), basis = arrays["certificate_responses"].shape, arrays["basis"]
 
     def certified(mu: np.ndarray, corrected: bool) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
         x, alpha, residuals = np.zeros(basis.shape[1]), np.zeros(arrays["generators"].shape[1]), np.zeros(3)
@@ -115,7 +113,7 @@ def certify(model: vibench.Model, file: Path, tolerance: float) -> Certify:
         code = found.model_certify(*pointers(mu, x, alpha), int(corrected), *pointers(lam, shift, bounds))
         return code, basis @ x - arrays["certificate_lift"] @ shift, lam, bounds
 
-    return certified
+    return certified, whole, found
 
 
 def assert_bounded(model: vibench.Model, mu: np.ndarray, u: np.ndarray, lam: np.ndarray, bounds: np.ndarray) -> None:
@@ -132,9 +130,8 @@ def test_errors_of_polynomials_are_in_the_bounds(tmp_path: Path) -> None:
     tolerances = [{"pod": [1e-6], "dual": [1e-4]}]
     study = small_study("tight", problem, assembly=["reduced"], bounds=[True], tolerances=tolerances)
     model = model_of(vibench.run(study, tmp_path / "run", progress=False, jobs=1), "obstacle", "certified")
-    certified = certify(model, tmp_path / "model.npz", tolerance=1e-2)
-    assert model.certificate is not None
-    arrays = exported(model, tolerance=1e-2, c=True).arrays
+    certified, whole, _ = certify(model, tmp_path / "model.npz", tolerance=1e-2)
+    arrays = whole.arrays
     assert arrays["certificate_energy_error"] > 0.0
     assert arrays["certificate_load_error"] > model.certificate.base.load_error
     assert arrays["certificate_stiffness_error"] > model.certificate.base.stiffness_error
@@ -194,30 +191,18 @@ def test_expressions_are_exact_in_c_and_bounds_are_certified(tmp_path: Path) -> 
     strategies = dual, primal, vibench.Stop(tolerance=1e-1), vibench.Stop(tolerance=1e-1)
     model = vibench.Reduction(Expressed(), *strategies, tolerance=0.3, assembly="reduced", bounds=True).model
     assert model.certificate.base.guarantee is Guarantee.CERTIFIED
-    whole = exported(model, tolerance=1e-2, c=True)
+    certified, whole, _ = certify(model, tmp_path / "model.npz", tolerance=1e-2)
     assert set(whole.exact) == {*"AfBg", "theta_A", "theta_f", "theta_B", "theta_g"}
     assert whole.about["certificate"] == "certified"
     assert whole.error > 1e-8
-    certified = certify(model, tmp_path / "model.npz", tolerance=1e-2)
     assert "the bounds are\n * certified" in (tmp_path / "model.h").read_text()
     assert_certified_alike(model, certified, (1e-7, 1e-7, 1e-7), 1e-10, bounded=True)
 
 
 @pytest.mark.parametrize("problem", PROBLEMS)
-def test_a_c_source_has_bounds_and_pair_of_the_model(problem: str, small_run: vibench.Run, tmp_path: Path) -> None:
-    model = model_of(small_run, problem, "certified")
-    certified = certify(model, tmp_path / "model.npz", tolerance=2e-13)
-    assert_certified_alike(model, certified, (1e-9, 1e-9, 2e-9), 1e-9)  # the last one has the error of ‖u‖, too
-    assert certified(model.parameters.upper, corrected=True)[0] == 0
-    code, u, lam, bounds = certified(model.parameters.upper * 1.001, corrected=True)
-    assert code == 4
-    assert np.all(bounds == np.inf)
-    assert np.all(np.isfinite(u))
-    assert lam.min() >= 0.0
-
-
-@pytest.mark.parametrize("problem", PROBLEMS)
-def test_outputs_and_their_bounds(problem: str, small_run: vibench.Run, tmp_path: Path, monkeypatch: Patch) -> None:
+def test_a_c_source_has_bounds_pair_and_outputs_of_the_model(
+    problem: str, small_run: vibench.Run, tmp_path: Path, monkeypatch: Patch
+) -> None:
     model = model_of(small_run, problem, "certified")
     rng, sizes = np.random.default_rng(0), (model.problem.V.dim, model.problem.W.dim)
     outputs = (
@@ -227,12 +212,19 @@ def test_outputs_and_their_bounds(problem: str, small_run: vibench.Run, tmp_path
         Output("both", "1", u=rng.standard_normal(sizes[0]), lam=rng.standard_normal(sizes[1])),
     )
     monkeypatch.setattr(type(model.problem), "outputs", outputs)
-    whole = export_model(model, tmp_path / "model.npz", tolerance=2e-13, evaluations=6000, c=True)
+    certified, whole, found = certify(model, tmp_path / "model.npz", tolerance=2e-13)
+    assert_certified_alike(model, certified, (1e-9, 1e-9, 2e-9), 1e-9)  # the last one has the error of ‖u‖, too
+    assert certified(model.parameters.upper, corrected=True)[0] == 0
+    code, u, lam, bounds = certified(model.parameters.upper * 1.001, corrected=True)
+    assert code == 4
+    assert np.all(bounds == np.inf)
+    assert np.all(np.isfinite(u))
+    assert lam.min() >= 0.0
     data, written = whole.arrays, whole.about["outputs"]
     assert written["left_out"] == ["squared"]
     names = [output["name"] for output in written["linear"]]
     assert names == ["load", "force */", "both"]
-    found, script = library(tmp_path / "model.c"), Exported(tmp_path / "model.npz")
+    script = Exported(tmp_path / "model.npz")
     x, alpha, residuals = np.zeros(data["basis"].shape[1]), np.zeros(data["generators"].shape[1]), np.zeros(3)
     lam, shift = (np.zeros(size) for size in data["certificate_responses"].shape)
     bounds, values, errors, plain = (np.zeros(3) for _ in range(4))
@@ -303,7 +295,7 @@ def test_both_methods_of_the_correction_in_c_find_that_of_vibench(steps: int, tm
         np.ctypeslib.as_array((ctypes.c_double * size**2).in_dll(found, f"certificate_{name}")).reshape(size, size)
         for name in ("inverse", "responses")
     )
-    for seed in range(200):
+    for seed in range(80):
         rng = np.random.default_rng(seed)
         Q = np.linalg.qr(rng.standard_normal((size, size)))[0]
         M, excess = Q @ np.diag(np.geomspace(1.0, 1e3, size)) @ Q.T, rng.standard_normal(size)
@@ -357,16 +349,12 @@ DEPENDENT = {
 
 
 def about(names: list[str], **cell: str) -> dict[str, Any]:
-    return {
-        "parameters": {"names": names, "units": ["1"] * len(names)},
-        "cell": dict.fromkeys(("problem", "dual", "primal", "cell"), "") | cell,
-        "source": {"distribution": "none", "licence": "MIT"},
-        "exported_by": "a test",
-        "accuracy": 1e-9,
-    }
+    of_cell, source = dict.fromkeys(("problem", "dual", "primal", "cell"), "") | cell, ("distribution", "licence")
+    words = {"parameters": {"names": names, "units": ["1"] * len(names)}, "cell": of_cell, "exported_by": "a test"}
+    return words | {"source": dict.fromkeys(source, "MIT"), "accuracy": 1e-9}
 
 
-@pytest.mark.parametrize("scale", [1.0, 1e-6, 1e6])
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
 @pytest.mark.parametrize("case", DEPENDENT)
 def test_any_constraints(case: str, scale: float, tmp_path: Path) -> None:
     """One source solves many programs, degenerate and contradictory ones among them: f and g are the parameters."""
@@ -386,7 +374,7 @@ def test_any_constraints(case: str, scale: float, tmp_path: Path) -> None:
     (tmp_path / "case.c").write_text(c_source.source(members, arrays, words, "case")[0], encoding="utf-8")
     solve = compiled(tmp_path / "case.c", n, count)
     random, codes = np.random.default_rng(2), []
-    for trial in range(300):
+    for trial in range(200):
         mu = random.uniform(-1.0, 1.0, dimension)
         mu[random.random(dimension) < 0.2] = 0.0
         if trial % 2:  # a point satisfies all constraints, many of them as equations
@@ -403,7 +391,7 @@ def test_any_constraints(case: str, scale: float, tmp_path: Path) -> None:
             assert np.linalg.norm(x - exact.x) <= 1e-9 * max(np.linalg.norm(exact.x), np.linalg.norm(mu[:n]) / scale)
             assert np.min(alpha, initial=0.0) >= 0.0
             assert np.allclose(B.T @ alpha, B.T @ exact.alpha, rtol=0.0, atol=1e-8 * (1.0 + scale))
-    assert codes.count(0) > 100
+    assert codes.count(0) > 67
     assert set(codes) <= {0, 2}
 
 

@@ -318,10 +318,7 @@ def test_a_reference_is_verified_by_its_bound_where_residuals_do_not_tell() -> N
     assert kkt_residuals(apart, u, lam).worst <= ACCURACY
     with pytest.raises(NumericalError, match=r"the error bound of the high-fidelity solution is 7\.1e-06 of it"):
         module.reference_bound(apart, energy(vi), u, lam)
-
-
-def test_what_round_off_leaves_open_refuses_no_reference() -> None:
-    """Two bodies far from zero on weak springs: their gap is a difference of positions. All numbers are exact."""
+    # What round-off leaves open refuses no reference: two bodies far from zero on weak springs, in exact numbers.
     far, weak = 2.0**17, 2.0**-40
     A, B = sp.csc_array([[4.0 + weak, -4.0], [-4.0, 4.0 + weak]]), sp.csr_array([[1.0, -1.0]])
     u, lam = np.array([far, far - 0.5]), np.array([1.0])
@@ -329,9 +326,7 @@ def test_what_round_off_leaves_open_refuses_no_reference() -> None:
     assert REFERENCE < module.reference_bound(vi, energy(vi), u, lam) < 1e-3
 
 
-def test_an_active_set_method_that_fails_or_finds_dependent_constraints_is_replaced(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_active_set_method_that_fails_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     """The w of dependent constraints is feasible and may be huge: a multiplier that no row alone would have tells."""
     vi, u, lam = scalar(lam=0.8, u=0.6)
     sharp = bounds_or_note(vi, u, lam, KNOWN)

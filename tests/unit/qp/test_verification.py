@@ -90,7 +90,7 @@ def test_they_bound_the_error_and_vanish_with_it(seed: int) -> None:
     assert found.worst >= 1e-3 * (e @ vi.A @ e) / energy**2
 
 
-def test_small_units_far_gaps_and_missing_loads_hide_no_error() -> None:
+def test_small_units_far_gaps_missing_loads_and_ties_hide_no_error() -> None:
     """An absolute floor of the primal residual called the unconstrained solution ok."""
     vi = program(3)
     small = VariationalInequality(vi.A, 1e-9 * vi.f, vi.B, 1e-9 * vi.g)
@@ -109,9 +109,7 @@ def test_small_units_far_gaps_and_missing_loads_hide_no_error() -> None:
     assert (found.x.tolist(), found.alpha.tolist()) == ([0.0, 0.0], [0.0, 0.0])
     assert kkt_residuals(vi, found.x, found.alpha).worst == 0.0
     assert kkt_residuals(vi, np.array([1e-9, 0.0]), np.zeros(2)).dual == pytest.approx(1.0)  # no other scale is there
-
-
-def test_contradictions_are_certified_beside_a_far_row() -> None:
+    # contradictions are certified beside a far row
     B = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]])
     for far in (1.0, 1e20, np.inf):
         vi = VariationalInequality(np.eye(2), np.zeros(2), B, np.array([-1.0, 0.5, far]))
@@ -119,6 +117,13 @@ def test_contradictions_are_certified_beside_a_far_row() -> None:
         assert np.allclose(B.T @ alpha, 0.0, atol=1e-9)
         assert alpha[:2] @ vi.g[:2] < 0.0
         assert infeasibility_certificate(replace(vi, g=np.array([-1.0, 1.5, far]))) is None
+    # Opposite rows hold x₁ = 1e6; F is that of the contact of x₂ alone, 0.25/√1.
+    B = np.array([[1.0, 0.0], [-2.0, 0.0], [0.0, 1.0]])
+    vi = VariationalInequality(np.eye(2), np.array([0.0, 1.0]), B, np.array([1e6, -2e6, 0.75]))
+    right, wrong = (QPSolution(np.array([1e6, x]), np.array([0.0, 5e5, 1.0 - x]), "") for x in (0.75, 1.0))
+    assert verify(vi, right, 1e-8)[0] is Status.OK
+    assert verify(vi, wrong, 1e-3)[0] is Status.INACCURATE
+    assert kkt_residuals(vi, right.x, right.alpha).unit == pytest.approx(0.25)
 
 
 def with_a_loaded_body(seed: int, fraction: float) -> tuple[VariationalInequality, np.ndarray, float]:
@@ -178,13 +183,3 @@ def test_what_is_ok_is_accurate_relative_to_the_contact(solver: str, accuracy: f
                 E, ok = np.sqrt(accuracy**2 + 2.0 * accuracy * (1.0 + pi)), ok + 1
                 assert natural_error(vi, found.alpha, lam) <= F * E / (1.0 - E), seed
     assert ok >= 0.95 * 2 * count
-
-
-def test_a_loaded_tie_hides_no_contact() -> None:
-    """Opposite rows hold x₁ = 1e6; F is that of the contact of x₂ alone, 0.25/√1."""
-    B = np.array([[1.0, 0.0], [-2.0, 0.0], [0.0, 1.0]])
-    vi = VariationalInequality(np.eye(2), np.array([0.0, 1.0]), B, np.array([1e6, -2e6, 0.75]))
-    right, wrong = (QPSolution(np.array([1e6, x]), np.array([0.0, 5e5, 1.0 - x]), "") for x in (0.75, 1.0))
-    assert verify(vi, right, 1e-8)[0] is Status.OK
-    assert verify(vi, wrong, 1e-3)[0] is Status.INACCURATE
-    assert kkt_residuals(vi, right.x, right.alpha).unit == pytest.approx(0.25)

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import product
 
@@ -38,7 +36,7 @@ def problem(seed: int, size: int, condition: float, ties: bool) -> tuple[np.ndar
 
 
 @given(st.integers(0, 100_000), st.integers(1, 7), st.sampled_from([1.0, 1e2, 1e4]), st.booleans())
-@settings(max_examples=300)
+@settings(max_examples=100)
 @example(0, 1, 1.0, True)
 def test_the_solution_is_that_of_an_enumeration(seed: int, size: int, condition: float, ties: bool) -> None:
     M, fixed, start = problem(seed, size, condition, ties)
@@ -46,10 +44,8 @@ def test_the_solution_is_that_of_an_enumeration(seed: int, size: int, condition:
     assert nu == pytest.approx(expected, abs=1e-9 * condition * (1.0 + np.abs(fixed).max()))
 
 
-@given(
-    st.integers(0, 100_000), st.integers(1, 60), st.sampled_from([1e1, 1e5, 1e9]), st.booleans(), st.booleans()
-)  # fmt: skip
-@settings(max_examples=300)
+@given(st.integers(0, 100_000), st.integers(1, 60), st.sampled_from([1e1, 1e5, 1e9]), st.booleans(), st.booleans())
+@settings(max_examples=100)
 def test_it_ends_with_the_right_signs(seed: int, size: int, condition: float, ties: bool, first: bool) -> None:
     """ν = ν₀ + M v: signs and complementarity, with both methods and condition numbers up to the largest there are."""
     M, fixed, start = problem(seed, size, condition, ties)
@@ -85,7 +81,5 @@ def test_round_off_in_place_of_signs_leaves_the_method_of_descent_at_the_solutio
     unit = 1.0 / np.sqrt(M.diagonal())
     nu = fixed + unit**-1 * descent(M * np.outer(unit, unit), unit * fixed)
     assert np.min(nu) >= -1e-14
-
-
-def test_a_matrix_that_is_singular_has_a_solution_all_the_same() -> None:
+    # a singular matrix has a solution all the same
     assert list(complementary(-np.ones(2), np.ones((2, 2)).__getitem__, np.ones(2, bool))) == [0.0, 0.0]

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -32,9 +30,8 @@ def exact(z: np.ndarray) -> float:
 def test_norms_are_never_below_the_exact_ones(seed: int, unseen: float) -> None:
     """Whatever the coefficients are: those of terms that no sample has, and others much larger than in the samples."""
     own = np.random.default_rng(seed)
-    z = SAMPLES[:, own.integers(30)] * own.standard_normal(62) + unseen * own.standard_normal(62) * (
-        own.random(62) < 0.3
-    )
+    z = SAMPLES[:, own.integers(30)] * own.standard_normal(62)
+    z += unseen * own.standard_normal(62) * (own.random(62) < 0.3)
     for basis in (WHOLE, TRUNCATED):
         assert basis.norm(z) >= exact(z) * (1.0 - 1e-12)
 
@@ -54,8 +51,7 @@ def test_small_residuals_of_large_terms_keep_their_digits() -> None:
     difference = np.array([1.0, -1.0])
     assert basis.norm(difference) == pytest.approx(1e-9 * float(np.linalg.norm(X.whiten_functional(term))), rel=1e-5)
 
-
-def test_what_is_left_out_is_small_beside_what_else_enters_the_bound() -> None:
+    # what is left out is small beside what else enters the bound
     loose, _ = residual_basis(WHITENED, SAMPLES, 100.0)
     assert len(loose.kept) < len(TRUNCATED.kept) <= 60
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.linalg
@@ -53,22 +51,17 @@ def extremes(mu: np.ndarray) -> tuple[float, float]:
 @settings(max_examples=50)
 def test_the_spectrum_is_between_the_bounds_also_outside_the_box(a: float, b: float) -> None:
     mu = np.array([a, b])
-    low, high = BOUNDS.evaluate(mu, T @ theta(mu))
-    smallest, largest = extremes(mu)
-    assert low <= smallest
-    assert high >= largest
+    (low, high), (smallest, largest) = BOUNDS.evaluate(mu, T @ theta(mu)), extremes(mu)
+    assert low <= smallest <= largest <= high
 
 
 def test_bounds_are_sharp_between_anchors() -> None:
     for mu in Curved.parameters.sample(20, 1):
-        low, high = BOUNDS.evaluate(mu, T @ theta(mu))
-        smallest, largest = extremes(mu)
+        (low, high), (smallest, largest) = BOUNDS.evaluate(mu, T @ theta(mu)), extremes(mu)
         assert low >= 0.8 * smallest
         assert high <= 1.2 * largest
     assert BOUNDS.proved
-
-
-def test_errors_of_the_terms_widen_the_bounds() -> None:
+    # errors of the terms widen the bounds
     mu = np.array([1.1, 0.3])
     narrow = BOUNDS.evaluate(mu, T @ theta(mu))
     wide = spectral_bounds(Curved(), X, ROTATED, lambda mu: T @ theta(mu), lambda _: 0.01).evaluate(mu, T @ theta(mu))
@@ -121,9 +114,7 @@ def test_ranges_of_terms_bound_any_sum(seed: int, definite: int, others: int) ->
     random = rng.standard_normal((others, N, N))
     terms = [*(F @ F.T for F in factors), *(M + M.T for M in random), spd(N, rng, 10.0)]
     reference = rng.uniform(0.5, 2.0, len(terms)) * rng.choice([-1.0, 1.0], len(terms))
-    reference[-1] = 1.0 + sum(
-        abs(theta) * np.linalg.norm(term, 2) for theta, term in zip(reference, terms, strict=True)
-    )
+    reference[-1] = 1.0 + sum(abs(t) * np.linalg.norm(term, 2) for t, term in zip(reference, terms, strict=True))
     X = InnerProduct(sp.csc_array(sum(theta * term for theta, term in zip(reference, terms, strict=True))))
     ranges = TermRanges.of([sp.csr_array(term) for term in terms], reference, X)
     assert ranges is not None
@@ -156,20 +147,15 @@ def test_the_norm_of_an_operator_is_not_below_its_largest_eigenvalue_in_modulus(
         assert found.proved
         assert exact <= found.value <= 1.01 * exact
     assert operator_norm(sp.csc_array((N, N)), X).value == 0.0
-
-
-def test_terms_that_are_left_out_are_bounded_by_what_they_are() -> None:
-    """The last of three terms, with its largest norm in the place of an error that was measured."""
+    # the last of three terms is left out, its largest norm takes the place of an error that was measured
     points = Curved.parameters.sample(50, 2)
     last = [abs((T @ theta(mu))[2]) * operator_norm(ROTATED[2], X).value for mu in points]
     found = spectral_bounds(Curved(), X, ROTATED[:2], lambda mu: T @ theta(mu), lambda _: 1.5 * max(last))
     assert found.turn.shape == (2, 3)
     assert not found.turn[:, 2].any()
     for mu in points:
-        low, high = found.evaluate(mu, T @ theta(mu))
-        smallest, largest = extremes(mu)
-        assert low <= smallest
-        assert high >= largest
+        (low, high), (smallest, largest) = found.evaluate(mu, T @ theta(mu)), extremes(mu)
+        assert low <= smallest <= largest <= high
 
 
 def test_leading_terms_have_all_but_a_share_of_the_variation() -> None:
