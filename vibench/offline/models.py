@@ -83,8 +83,7 @@ class CellSolver:
         return verify(*self.last, slackened * self._accuracy)
 
 
-@dataclass(frozen=True)
-class QueryStatus:
+class QueryStatus(NamedTuple):
     """Status of an answer, why it is not ok, and its pair u (n,), λ (m,) unless it is broken or has a program."""
 
     status: Status

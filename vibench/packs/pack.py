@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -24,8 +24,7 @@ from vibench.packs.manifest import Manifest
 from vibench.reduction.cones import project_on_cone
 
 
-@dataclass(frozen=True)
-class Listing:
+class Listing(NamedTuple):
     """The listed parameters (P×d) of a pack, and the widths (d,) of its box."""
 
     parameters: Array
@@ -118,8 +117,7 @@ class PackMember:
         return f"affine, {len(self.arrays)} term{'s' * (len(self.arrays) > 1)}" if self.thetas else "constant"
 
 
-@dataclass(frozen=True)
-class PackSolutions:
+class PackSolutions(NamedTuple):
     """Reference solutions: parameters (P×d), u (n×P) or `None`, λ (m×P), largest accepted relative KKT residual."""
 
     parameters: Array
@@ -128,8 +126,7 @@ class PackSolutions:
     tolerance: float
 
 
-@dataclass(frozen=True)
-class PackMesh:
+class PackMesh(NamedTuple):
     """Data of pictures: points (2×p) and triangles (3×t) of the mesh, points and unknowns (k,) drawn, positions."""
 
     points: Array

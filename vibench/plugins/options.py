@@ -6,7 +6,6 @@ import inspect
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import cache
 from inspect import Parameter
 from pathlib import Path
@@ -17,8 +16,7 @@ from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 from vibench.errors import RequestError, in_a_line, unknown_name
 
 
-@dataclass(frozen=True)
-class Option:
+class Option(NamedTuple):
     """One option of a plugin, an argument of its constructor; `preset` is its default or `Parameter.empty`."""
 
     name: str
