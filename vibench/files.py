@@ -15,8 +15,8 @@ from typing import TextIO
 
 from vibench.errors import RequestError
 
-# Prefix and suffix of the names of temporary files; what is between is random.
-TEMPORARY, PART = "vibench-", ".part"
+# Prefix of the names of temporary files and folders.
+TEMPORARY = "vibench-"
 
 
 def write_atomically(path: Path, content: bytes | Iterable[bytes], *, durable: bool = False) -> None:
@@ -28,7 +28,7 @@ def write_atomically(path: Path, content: bytes | Iterable[bytes], *, durable: b
     # The name of a device, as /dev/null, would be that of an ordinary file from then on.
     if os.path.lexists(path) and stat.S_IFMT(path.lstat().st_mode) not in {stat.S_IFREG, stat.S_IFDIR, stat.S_IFLNK}:
         raise OSError(errno.EINVAL, "it is no regular file")
-    part = path.parent / f"{TEMPORARY}{secrets.token_hex(8)}{PART}"
+    part = path.parent / f"{TEMPORARY}{secrets.token_hex(8)}.part"
     # Permissions follow the user's mask.
     handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
     try:

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 
 from vibench.execution.recording import ResultWriter
-from vibench.results.break_even import FEWEST_ROUNDS, Meaning, compared, scatter
+from vibench.results.break_even import Meaning, compared, scatter
 from vibench.results.paired_timing import PairedTiming
 from vibench.stages import timing_rounds
 from vibench.stages.artefacts import Store
@@ -14,7 +14,7 @@ from vibench.stages.base import Failed, Row, Stage
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.timing_rounds import OfflineRepeat, TimedCell, TimedRound, TimingRounds
 from vibench.study.cells import Cell
-from vibench.timing import Seconds
+from vibench.timing import FEWEST_ROUNDS, Seconds
 
 
 class OfflinePlan:

@@ -16,9 +16,8 @@ from vibench.errors import RequestError, unknown_name
 from vibench.report import differences
 from vibench.report.differences import AXES, ChangeKind, ComparedRun, Difference
 from vibench.results import formats
-from vibench.results.break_even import FEWEST_ROUNDS
 from vibench.results.schema import STORED
-from vibench.timing import median_interval
+from vibench.timing import FEWEST_ROUNDS, median_interval
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,13 @@ import numpy as np
 import pandas as pd
 
 from vibench.qp.status import Status
-from vibench.results.break_even import FEWEST_ROUNDS, TAIL, BreakEven, Meaning
+from vibench.results.break_even import TAIL, BreakEven, Meaning
 from vibench.results.paired_timing import DRAWS
 from vibench.results.read import in_order, read_table
 from vibench.results.schema import STORED
 from vibench.results.sqlite import FILE, read_meta, study_of
 from vibench.stability.infsup import VANISHES
+from vibench.timing import FEWEST_ROUNDS
 
 # Columns that identify cells in a comparison; "asked" has all tolerances, or sizes.
 AXES = ("problem", "formulation", "dual", "primal", "asked", "solver", "accuracy", "assembly", "bounds", "correction")

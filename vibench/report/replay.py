@@ -18,7 +18,7 @@ from vibench.arrays import Array
 from vibench.errors import RequestError
 from vibench.execution.isolated import Trial, solver_trials
 from vibench.execution.recorded_cell import RecordedCell, recorded_cells
-from vibench.files import PART, TEMPORARY, write_atomically, writing
+from vibench.files import TEMPORARY, write_atomically, writing
 from vibench.interfaces.problem import VariationalInequality
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import registered
@@ -118,7 +118,7 @@ def export(run: str, folder: Path, places: Mapping[str, str] = {}, *, sequence: 
         raise RequestError(f"no cell of '{run}' has a reduced program{which}")
     with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=TEMPORARY, suffix=PART) as scratch:
+        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=TEMPORARY) as scratch:
             # An interruption leaves nothing under the name of the folder.
             new = Path(scratch) / folder.name
             new.mkdir()

@@ -18,7 +18,7 @@ import pandas as pd
 from jinja2 import Environment
 
 from vibench.errors import RequestError
-from vibench.files import PART, TEMPORARY, write_atomically
+from vibench.files import TEMPORARY, write_atomically
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import default_formulation, registered
 from vibench.provenance import distribution_version
@@ -55,7 +55,7 @@ def write(site: Path, fill: Callable[[Path], None]) -> None:
     check(site)
     try:
         site.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=site.parent, prefix=TEMPORARY, suffix=PART) as scratch:
+        with tempfile.TemporaryDirectory(dir=site.parent, prefix=TEMPORARY) as scratch:
             new = Path(scratch) / "site"
             new.mkdir()
             fill(new)

@@ -22,9 +22,6 @@ from vibench.timing import Seconds
 # Probability left out on each side of a 95 % interval.
 TAIL = 0.025
 
-# Rounds of two blocks; fewer do not show the scatter between blocks, so that nothing is decided.
-FEWEST_ROUNDS = 6
-
 # Value of `primal_a` where a is the high-fidelity model.
 HIGH_FIDELITY = "high-fidelity"
 

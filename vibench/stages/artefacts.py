@@ -27,7 +27,7 @@ from cachetools import LRUCache
 
 from vibench.arrays import SparseMatrix
 from vibench.errors import NumericalError, RequestError, StorageError, VibenchError
-from vibench.files import PART, TEMPORARY, locked, write_atomically
+from vibench.files import TEMPORARY, locked, write_atomically
 from vibench.provenance import machine
 from vibench.text import one_line
 from vibench.timing import Seconds
@@ -344,10 +344,10 @@ class Store:
         if not self.folder.is_dir():
             return freed
         with locked(self.lock, busy=f"a run uses the artefacts in '{self.folder}'"):
-            for path in [*self.folder.glob("*.artefact"), *self.folder.glob(f"{TEMPORARY}*{PART}")]:
+            for path in [*self.folder.glob("*.artefact"), *self.folder.glob(f"{TEMPORARY}*.part")]:
                 with contextlib.suppress(FileNotFoundError):
                     status = path.lstat()
-                    if path.suffix == PART or older_than is None or status.st_mtime <= newest:
+                    if path.suffix == ".part" or older_than is None or status.st_mtime <= newest:
                         path.unlink()
                         freed += status.st_size
         return freed

@@ -27,12 +27,14 @@ from vibench.errors import RequestError, fault_line, unknown_name
 from vibench.interfaces.formulations import Formulation, axes_of
 from vibench.interfaces.strategies import Stop
 from vibench.linalg.factorisations import DEFAULT
+from vibench.model.affine import INTERPOLATION_RTOL
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import GivenPlugin, Plugin, give
 from vibench.plugins.registry import RegisteredPlugin, default_formulation, find, registered
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.study.parameter_sets import OWN, ParameterSet, check_sets, is_available
+from vibench.timing import FEWEST_ROUNDS
 
 Size: TypeAlias = Annotated[int, Ge(1), Le(100_000)]
 Name: TypeAlias = Annotated[str, MinLen(1)]
@@ -310,7 +312,9 @@ class Study(_Model):
         default=["none"],
         description="Whether solutions are corrected; `auto` for those whose violation dominates the bound.",
     )
-    interpolation: Tolerance = Field(default=1e-6, description="Tolerance of interpolation in reduced assembly.")
+    interpolation: Tolerance = Field(
+        default=INTERPOLATION_RTOL, description="Tolerance of interpolation in reduced assembly."
+    )
     warm_start: bool = Field(
         default=False,
         description="Whether QP solvers start from a solution at another parameter if they can: the one before it in "
@@ -321,7 +325,8 @@ class Study(_Model):
         description="Maximal number of timing rounds of a cell; with fewer than six, break-even is undecided.",
     )
     timing_rounds_min: Rounds = Field(
-        default=6, description="Minimal number of timing rounds, after which a cell with decided comparisons ends."
+        default=FEWEST_ROUNDS,
+        description="Minimal number of timing rounds, after which a cell with decided comparisons ends.",
     )
     factorisation: Literal["superlu", "pardiso", "cholmod", "available"] = Field(
         default="superlu",

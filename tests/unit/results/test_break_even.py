@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from samples import cell_row
 
 from vibench.results import paired_timing
-from vibench.results.break_even import FEWEST_ROUNDS, BreakEven, Meaning, break_even, break_even_rows
+from vibench.results.break_even import BreakEven, Meaning, break_even, break_even_rows
 from vibench.results.schema import STORED
+from vibench.timing import FEWEST_ROUNDS
 
 OTHER_RUNS = float(np.exp(1.96 * paired_timing.CONDITIONS))
 """Half the width of the interval of a ratio that all rounds of a run agree on, as a factor."""
