@@ -1,7 +1,5 @@
 """Exported models answer as the models do, without vibench; what cannot be exported is refused with a line."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
@@ -123,7 +121,7 @@ def with_row(template: vibench.Model, queried: Any) -> vibench.Model:
 
 def assert_exported_alike(model: vibench.Model, file: Path) -> None:
     exported = Exported(file)
-    assert max(largest_errors(model, lambda mu: (exported.solve(mu).u, exported.solve(mu).lam), 100)) <= 1e-9
+    assert max(largest_errors(model, lambda mu: (exported.solve(mu).u, exported.solve(mu).lam), 30)) <= 1e-9
 
 
 @pytest.mark.parametrize("kind", [vibench.Kind.NONE, vibench.Kind.PER_PARAMETER])
@@ -175,7 +173,7 @@ def largest_errors(model: vibench.Model, answers: Any, count: int) -> tuple[floa
 
 
 @pytest.mark.parametrize(
-    "way", ["radial-obstacle reduced 1000", "radial-obstacle full 20", "obstacle reduced 40", "string - 100"]
+    "way", ["radial-obstacle reduced 200", "radial-obstacle full 20", "obstacle reduced 40", "string - 100"]
 )
 def test_an_exported_model_reproduces_random_queries(run: vibench.Run, way: str, tmp_path: Path) -> None:
     problem, assembly, count = way.split()

@@ -113,12 +113,10 @@ class Family(Problem):
         return lambda mu: {"A": np.asarray(self.stiffness(mu).toarray()[wanted["A"]])}
 
 
-Prepared = tuple[Family, HyperReducedModel, OnlineCertificate]
+Prepared = tuple[Any, HyperReducedModel, OnlineCertificate]
 
 
-def certified(
-    problem: Family, basis: np.ndarray, chi: np.ndarray, tolerance: float = 1e-3, eta: Any = None
-) -> Prepared:
+def certified(problem: Problem, basis: Any, chi: Any, tolerance: float = 1e-3, eta: Any = None) -> Prepared:
     """A model of a problem with its certificate."""
     training = problem.training_set()
     members = affine_decomposition(problem, training, tolerance)
@@ -319,9 +317,7 @@ def test_prepared_corrections_are_the_best_ones_or_close_to_them(constraint: str
         assert quick.lambda_natural <= loss * best.lambda_natural * (1.0 + 1e-6)
 
 
-def test_where_no_prepared_correction_is_feasible_the_best_one_is_computed_and_it_is_recorded(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_where_no_prepared_correction_is_feasible_the_best_one_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Corrections of the first two rows alone leave the others violated."""
     monkeypatch.setattr(bounds_module, "defect_corrected_bounds", lambda *_: (np.inf, np.inf))  # if none are prepared
     problem, model, certificate = prepared("affine", constraint="scaled")
@@ -344,8 +340,7 @@ def test_small_residuals_keep_their_digits(constraint: str) -> None:
     problem, model, certificate = prepared("constant", constraint=constraint)
     mu = np.array([1.3, 0.2])
     reduced, vi = model.assemble(mu), problem.assemble(mu)
-    A = vi.A.toarray()
-    rng = np.random.default_rng(2)
+    A, rng = vi.A.toarray(), np.random.default_rng(2)
     x, alpha = rng.standard_normal(4), np.abs(rng.standard_normal(3))
     Z, force = reduced.basis, vi.B.T @ (model.generators @ alpha)
     away = rng.standard_normal(N)
@@ -359,9 +354,8 @@ def test_small_residuals_keep_their_digits(constraint: str) -> None:
         if certificate.forces is not None:
             of_lam = force[CONTACT]
         z = np.concatenate([np.ones(1), -x, -of_lam])
-        whitened = [
-            ColumnBlock(certificate.base.X.whiten_functional(block), np.zeros(block.shape[1])) for block in blocks
-        ]
+        whiten = certificate.base.X.whiten_functional
+        whitened = [ColumnBlock(whiten(block), np.zeros(block.shape[1])) for block in blocks]
         basis, _ = residual_basis(whitened, z[:, None], 0.0)
         exact_norm = size * float(np.sqrt(away @ np.linalg.solve(A, away)))
         assert basis.norm(z) == pytest.approx(exact_norm, rel=1e-5)
@@ -534,15 +528,9 @@ def test_a_query_with_bounds_and_a_correction_evaluates_the_constraint_once(
         problem, model, certificate = prepared("interpolated")
     else:
         problem = create("problem", "hertz", {"resolution": 300})
-        training = problem.parameters.grid(*[2] * problem.parameters.dim)
-        snapshots = high_fidelity_sweep(problem, training)
-        members = affine_decomposition(problem, training, 1e-6)
-        basis = problem.V.orthonormalise(snapshots.u)
+        snapshots = high_fidelity_sweep(problem, problem.parameters.grid(*[2] * problem.parameters.dim))
         chi = snapshots.lam[:, :3] / problem.W.norm(snapshots.lam[:, :3])
-        span = problem.W.orthonormalise(chi)
-        whole = ReducedModel(problem, basis, Enrichment(Kind.NONE), chi, span)
-        model = HyperReducedModel(whole, hyper_reduce(whole, members))
-        certificate = prepare(model, members, certificate_base(problem, members, training), training)
+        problem, model, certificate = certified(problem, snapshots.u, chi, 1e-6)
     mu, evaluated, contact = problem.parameters.sample(1, 3)[0], list[float](), problem.contact
     monkeypatch.setattr(problem, "contact", lambda at: evaluated.append(1.0) or contact(at))
     reduced = model.assemble(mu)
