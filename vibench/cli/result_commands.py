@@ -361,7 +361,6 @@ def _export_model(
     from vibench.library import reduced_model
     from vibench.library.export import export_model
     from vibench.library.runs import open_run
-    from vibench.model.chebyshev import MEASURED
     from vibench.offline.polynomials import TOLERANCE
     from vibench.timing import timed
 
@@ -373,7 +372,7 @@ def _export_model(
         terms = f"{len(member.terms)} term{'s' * (len(member.terms) > 1)}"
         form = f"{terms}, polynomials of degree ({', '.join(map(str, member.degrees))})"
         echo(f"{name}: {form if any(member.degrees) else 'constant'}, relative error {member.error:.1e}")
-    echo(f"relative errors are those at {MEASURED} random parameters and at the corners of the box")
+    echo("relative errors are those at random parameters and at the corners of the box")
     # The script has fewer solvers than vibench.
     if exported.about["solver"] != model.solver:
         echo(f"the cell's solver is {model.solver}, the script solves by {exported.about['solver']}")

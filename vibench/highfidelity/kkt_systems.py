@@ -78,9 +78,6 @@ def coarse_contact(solve: Callable[[Array], Array], vi: VariationalInequality) -
     return np.asarray(forces[group] > 0.0)
 
 
-# A factorisation is bordered and reused for active sets that differ from its own in at most so many constraints.
-MAX_BORDER = 16
-
 # From the active constraints to u (c,) and λ (m,): these are equalities, all other multipliers vanish.
 ActiveSolver = Callable[[Indices], tuple[Array, Array]]
 
@@ -234,7 +231,8 @@ class CondensedStiffness(Inverse):
                 self._last = load, self._blocks @ load
             solve_active = ComplianceSolver(self._blocks, self._last[1], B, vi.g)
         else:
-            solve_active = SaddlePointSolver(condensed.schur, load, B, vi.g, whole)
+            # A larger border takes longer than another factorisation.
+            solve_active = SaddlePointSolver(condensed.schur, load, B, vi.g, 16, whole)
             self._saddle = solve_active if whole else None
         recover = partial(condensed.recover, particular=particular)
         return ActiveSetSystem(B, vi.g, solve_active, recover, condensed.correct_eliminated)
@@ -354,23 +352,25 @@ class ActiveSetSystem:
 class SaddlePointSolver:
     """Solves the sparse KKT systems of successive active sets, with one step of iterative refinement.
 
-    The system of one active set is factorised. Active sets that differ from it in few constraints reuse the factor,
-    bordered by a column per added constraint (its row of B) or removed one (a slack that sets its multiplier to zero).
+    The system of one active set is factorised. Active sets that differ from it in at most `border` constraints reuse
+    the factor, with a column per added constraint (its row of B) or removed one (a slack that sets its multiplier to
+    zero).
 
-    A is sparse SPD (c×c), B sparse (m×c). Where `ordered`, which extracts A in an elimination order, is given, systems
+    A is sparse SPD (c×c), B sparse (m×c). Where `order`, which extracts A in an elimination order, is given, systems
     are factorised in this order, with the multipliers last, without pivoting: of A that is a Cholesky factorisation,
     and what is left for the multipliers is −B_a A⁻¹B_aᵀ, negative definite where the rows are independent. Where it is
     not, as without an order, rows are exchanged.
     """
 
     def __init__(
-        self, A: SparseMatrix, f: Array, B: SparseMatrix, g: Array, ordered: PrincipalSubmatrix | None = None
+        self, A: SparseMatrix, f: Array, B: SparseMatrix, g: Array, border: int, order: PrincipalSubmatrix | None = None
     ) -> None:
-        A, B, self._order = sp.csr_array(A), sp.csr_array(B), slice(None) if ordered is None else ordered.chosen
-        if ordered is not None:
-            A, f = ordered.of(A), f[self._order]
-            B = sp.csr_array((B.data, ordered.places[B.indices], B.indptr), shape=B.shape)
-        self._ordered = ordered is not None
+        self._border = border
+        A, B, self._order = sp.csr_array(A), sp.csr_array(B), slice(None) if order is None else order.chosen
+        if order is not None:
+            A, f = order.of(A), f[self._order]
+            B = sp.csr_array((B.data, order.places[B.indices], B.indptr), shape=B.shape)
+        self._ordered = order is not None
         stiffness = np.abs(A.diagonal())
         # Scale unknowns and rows: displacements and forces of steel in metres differ by 1e11, and are compared.
         self._displacement = 1.0 / np.sqrt(np.where(stiffness > 0.0, stiffness, 1.0))
@@ -388,7 +388,7 @@ class SaddlePointSolver:
         """
         solution, is_active = None, np.zeros(len(self._g), bool)
         is_active[active] = True
-        if self._factorisation is not None and np.count_nonzero(is_active != self._is_factorised) <= MAX_BORDER:
+        if self._factorisation is not None and np.count_nonzero(is_active != self._is_factorised) <= self._border:
             solution = self._solve_bordered(self._factorisation, active, is_active)
         if solution is None:
             # Keep this order: the set must stay that of the last factorisation where this one fails.

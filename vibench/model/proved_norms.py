@@ -77,7 +77,7 @@ class ProvedNorms:
         return q, float(np.linalg.norm(self._weights * (np.abs(q) + lost))) * (1.0 + 16.0 * EPS * sqrt(len(q)))
 
 
-def dual_norm(X: InnerProduct, functional: Array, error: Array | float = 0.0) -> float:
+def dual_norm(X: InnerProduct, functional: Array, error: Array | float) -> float:
     """Upper bound of the norm in X⁻¹ of all functionals (n,) that differ from one by at most an error (n,)."""
     share, none = share_of_diagonal(X), np.zeros(0)
     if not share.proved:

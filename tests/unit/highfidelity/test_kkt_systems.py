@@ -28,24 +28,22 @@ def test_solutions_are_those_of_the_whole(seed: int, sets: list, border: int, yo
     rng = np.random.default_rng(seed)
     A, f = young * spd(8, rng), young * rng.standard_normal(8)
     B, g = rng.standard_normal((6, 8)), rng.standard_normal(6)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kkt_systems, "MAX_BORDER", border)
-        order = PrincipalSubmatrix(rng.permutation(8)) if ordered else None
-        solve = SaddlePointSolver(sp.csc_array(A), f, sp.csr_array(B), g, order)
-        for chosen in sets:
-            active = np.array(sorted(chosen), dtype=np.intp)
-            rows = B[active]
-            whole = np.block([[A / young, rows.T], [rows, np.zeros((len(active),) * 2)]])
-            expected = np.linalg.solve(whole, np.concatenate([f / young, g[active]]))
-            u, lam = solve(active)
-            assert np.allclose(u, expected[:8], atol=1e-8)
-            assert np.allclose(lam[active] / young, expected[8:], atol=1e-8)
-            assert not np.any(np.delete(lam, active))
-            assert solve.is_definite == ordered
-            if ordered:
-                functionals = rng.standard_normal((8, 3))
-                squares = np.sum(functionals * np.linalg.solve(A, functionals), axis=0)
-                assert np.allclose(solve.dual_norms(functionals), np.sqrt(squares), rtol=1e-8)
+    order = PrincipalSubmatrix(rng.permutation(8)) if ordered else None
+    solve = SaddlePointSolver(sp.csc_array(A), f, sp.csr_array(B), g, border, order)
+    for chosen in sets:
+        active = np.array(sorted(chosen), dtype=np.intp)
+        rows = B[active]
+        whole = np.block([[A / young, rows.T], [rows, np.zeros((len(active),) * 2)]])
+        expected = np.linalg.solve(whole, np.concatenate([f / young, g[active]]))
+        u, lam = solve(active)
+        assert np.allclose(u, expected[:8], atol=1e-8)
+        assert np.allclose(lam[active] / young, expected[8:], atol=1e-8)
+        assert not np.any(np.delete(lam, active))
+        assert solve.is_definite == ordered
+        if ordered:
+            functionals = rng.standard_normal((8, 3))
+            squares = np.sum(functionals * np.linalg.solve(A, functionals), axis=0)
+            assert np.allclose(solve.dual_norms(functionals), np.sqrt(squares), rtol=1e-8)
 
 
 def test_sets_that_differ_little_are_not_factorised_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -54,14 +52,14 @@ def test_sets_that_differ_little_are_not_factorised_again(monkeypatch: pytest.Mo
     for young in (1e-12, 1.0, 2e11):
         made.clear()
         A, B = sp.csc_array(young * spd(40, np.random.default_rng(0))), sp.eye_array(40).tocsr()
-        solve = SaddlePointSolver(A, young * np.ones(40), B, np.zeros(40))
-        for active in (np.arange(20), np.arange(3, 22), np.arange(20), np.arange(20 + kkt_systems.MAX_BORDER + 1)):
+        solve = SaddlePointSolver(A, young * np.ones(40), B, np.zeros(40), 16)
+        for active in (np.arange(20), np.arange(3, 22), np.arange(20), np.arange(20 + 16 + 1)):
             solve(active)
         assert made == [(60, 60), (77, 77)]
     made.clear()  # a border that is dependent is left to a factorisation
     rng = np.random.default_rng(1)
     rows = rng.standard_normal((2, 5))
-    solve = SaddlePointSolver(sp.csc_array(spd(5, rng)), np.ones(5), sp.csr_array(rows[[0, 1, 0]]), np.zeros(3))
+    solve = SaddlePointSolver(sp.csc_array(spd(5, rng)), np.ones(5), sp.csr_array(rows[[0, 1, 0]]), np.zeros(3), 16)
     solve(np.array([0, 1]))
     with contextlib.suppress(RuntimeError):  # exactly singular or nearly so
         solve(np.array([0, 1, 2]))
@@ -72,17 +70,17 @@ def test_an_order_serves_definite_systems_alone() -> None:
     """Others have exchanged rows as without it, and nothing is said of A."""
     rng = np.random.default_rng(2)
     A, rows, order = spd(5, rng), rng.standard_normal((2, 5)), PrincipalSubmatrix(np.array([3, 1, 4, 0, 2]))
-    dependent = SaddlePointSolver(sp.csc_array(A), np.ones(5), sp.csr_array(rows[[0, 1, 0]]), np.zeros(3), order)
+    dependent = SaddlePointSolver(sp.csc_array(A), np.ones(5), sp.csr_array(rows[[0, 1, 0]]), np.zeros(3), 16, order)
     with contextlib.suppress(RuntimeError):  # exactly singular or nearly so
         dependent(np.arange(3))
     assert not dependent.is_definite
     indefinite = A - 2.0 * np.linalg.eigvalsh(A)[0] * np.eye(5)
-    solve = SaddlePointSolver(sp.csc_array(indefinite), np.ones(5), sp.csr_array(rows), np.zeros(2), order)
+    solve = SaddlePointSolver(sp.csc_array(indefinite), np.ones(5), sp.csr_array(rows), np.zeros(2), 16, order)
     u, lam = solve(np.arange(1))
     assert not solve.is_definite
     assert np.allclose(indefinite @ u + rows.T @ lam, 1.0)
     A = sp.csc_array(np.array([[1.0, 0.0, 0.0], [0.0, -2.0, 1.0], [0.0, 1.0, 0.0]]))  # without an order
-    u, lam = SaddlePointSolver(A, np.ones(3), sp.csr_array(np.eye(3)), np.zeros(3))(np.array([0]))
+    u, lam = SaddlePointSolver(A, np.ones(3), sp.csr_array(np.eye(3)), np.zeros(3), 16)(np.array([0]))
     assert np.allclose((A @ u + lam)[1:], 1.0)
     assert np.isclose(u[0], 0.0)
 

@@ -366,13 +366,13 @@ def output_weights(problem: Problem, base: CertificateBase, output: Output) -> t
     """The weights ‖l‖_{X⁻¹} and c of a linear output; c is infinite where no β₀ is proved."""
     of_u, of_lam = output_coefficients(problem, output)
     beta, B = base.inf_sup.value, base.inf_sup.constraint
-    in_u = dual_norm(base.X, of_u)
+    in_u = dual_norm(base.X, of_u, 0.0)
     if not of_lam.any():
         return in_u, 0.0
     if not beta > 0.0:
         return in_u, inf
     C, S = base.compliance, np.asarray(B @ np.asarray(B @ base.compliance).T)
-    S, bounds = 0.5 * (S + S.T), [dual_norm(problem.W, of_lam) / beta]
+    S, bounds = 0.5 * (S + S.T), [dual_norm(problem.W, of_lam, 0.0) / beta]
     with suppress(np.linalg.LinAlgError):  # rows that are dependent up to round-off
         z = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), of_lam)
         load, root = np.asarray(B.T @ z), np.sqrt(np.diag(C))

@@ -198,7 +198,7 @@ class ContactCompliance:
 
     matrix: Array
     near: Indices
-    error: float = 0.0
+    error: float
 
     @cached_property
     def root(self) -> Array:

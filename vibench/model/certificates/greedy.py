@@ -89,7 +89,7 @@ class ContactEstimates:
         else:
             condensed = StaticCondensation(vi.A, EliminationPattern.of(vi.A, self._dofs))
             self._solve, compliance = SparseCholesky(vi.A, "A").solve, dense_inverse(condensed.dense_schur, "A")
-        self._compliance = ContactCompliance(compliance, np.zeros(0, np.intp))
+        self._compliance = ContactCompliance(compliance, np.zeros(0, np.intp), 0.0)
         self._near = np.zeros(len(self._dofs), bool)
         load = self._solve(self._f[:, None])[:, 0]
         self._load, self._square_of_load = load[self._dofs], float(self._f @ load)
@@ -121,7 +121,7 @@ class ContactEstimates:
         near = self._near | np.asarray(touches.T @ (touches @ (touches.T @ rows)), bool)
         if np.any(near & ~self._near):
             self._near = near
-            self._compliance = ContactCompliance(self._compliance.matrix, np.flatnonzero(near))
+            self._compliance = ContactCompliance(self._compliance.matrix, np.flatnonzero(near), 0.0)
 
     def _grown(self, projected: Array, A: SparseMatrix, f: Array) -> tuple[Array, Array]:
         """The matrix ΦᵀAΦ (d×d), from that on the first vectors of Φ, and Φᵀf (d,)."""

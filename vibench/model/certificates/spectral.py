@@ -56,9 +56,7 @@ class TermRanges:
     error: float
 
     @classmethod
-    def of(
-        cls, terms: Sequence[SparseMatrix], reference: Array, X: InnerProduct, error: float = 0.0
-    ) -> TermRanges | None:
+    def of(cls, terms: Sequence[SparseMatrix], reference: Array, X: InnerProduct, error: float) -> TermRanges | None:
         """Prove the ranges of terms A_q (n×n); `None` where one is not proved.
 
         Their sum with θ(µ̄) (Q,) is X but for an error relative to it.

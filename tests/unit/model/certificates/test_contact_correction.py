@@ -31,7 +31,7 @@ def programs(draw: st.DrawFn) -> Program:
 
 def corrected(given: Program, near: np.ndarray = EVERY) -> ContactCorrection | None:
     C, contact, u, lam, gamma = given
-    return find_contact_correction(ContactCompliance(C, near), contact, u, np.zeros(K), lam, gamma)
+    return find_contact_correction(ContactCompliance(C, near, 0.0), contact, u, np.zeros(K), lam, gamma)
 
 
 def values(C: np.ndarray, found: ContactCorrection) -> np.ndarray:
@@ -99,7 +99,7 @@ def test_nothing_is_lifted_where_nothing_is_violated_and_a_larger_uncertainty_of
     found = corrected((C, Contact(contact.B, np.ones(2)), u, np.zeros(2), gamma))
     assert (found.norm, found.kappa) == (0.0, 0.0)
     plain, careful = (
-        find_contact_correction(ContactCompliance(C, np.arange(K)), contact, u, np.full(K, size), lam, gamma)
+        find_contact_correction(ContactCompliance(C, np.arange(K), 0.0), contact, u, np.full(K, size), lam, gamma)
         for size in (0.0, 0.1)
     )
     assert np.all((contact.B @ values(C, careful))[:1] >= (contact.B @ values(C, plain))[:1] + 0.2)
@@ -127,7 +127,7 @@ def test_a_multiplier_belongs_to_the_correction_or_is_none() -> None:
         B = np.vstack([B, 1.3 * B[:4], B[:2] + B[2:4]])
         C, contact = factor @ factor.T / 12 + 1e5, Contact(sp.csr_array(B), rng.standard_normal(15))
         u, lam = rng.standard_normal(12), np.where(rng.random(15) < 0.5, 3.0 * rng.random(15), 0.0)
-        found = find_contact_correction(ContactCompliance(C, np.arange(12)), contact, u, np.zeros(12), lam, 1.0)
+        found = find_contact_correction(ContactCompliance(C, np.arange(12), 0.0), contact, u, np.zeros(12), lam, 1.0)
         known.append(found is not None and found.nu is not None)
         if found is not None and found.nu is not None:
             w = C @ (B.T @ (found.nu - lam))

@@ -41,7 +41,7 @@ class Pair:
         rotated = np.linalg.qr(self.rng.standard_normal((N, N)))[0]
         coordinates = rotated.T @ np.linalg.solve(half, f - A @ self.u_N - B.T @ self.lam_N)
         directions = np.linalg.solve(half, np.eye(N)[:, CONTACT]).T @ rotated
-        compliance = ContactCompliance(np.linalg.inv(X)[np.ix_(CONTACT, CONTACT)], np.arange(len(CONTACT)))
+        compliance = ContactCompliance(np.linalg.inv(X)[np.ix_(CONTACT, CONTACT)], np.arange(len(CONTACT)), 0.0)
         solution = self.u_N[CONTACT], np.zeros(len(CONTACT)), self.lam_N
         shown = coordinates[:kept], float(np.linalg.norm(coordinates[kept:]))
         contact = Contact(sp.csr_array(B[:, CONTACT]), g)

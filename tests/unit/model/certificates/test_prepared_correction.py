@@ -25,7 +25,7 @@ def compliance(rng: np.random.Generator, two: bool) -> np.ndarray:
 
 def prepared(B: np.ndarray, C: np.ndarray, basis: np.ndarray = FLAT, scaled: bool = True, rows: Any = None) -> Any:
     """The directions are the functionals themselves."""
-    rows, on = np.ones(len(B), bool) if rows is None else rows, ContactCompliance(C, np.arange(len(C)))
+    rows, on = np.ones(len(B), bool) if rows is None else rows, ContactCompliance(C, np.arange(len(C)), 0.0)
     return prepare_corrections(sp.csr_array(B), scaled, on, rows, basis, np.eye(len(C)))
 
 
