@@ -105,7 +105,11 @@ def recorded_cells(run: str, places: Mapping[str, str] = {}) -> list[RecordedCel
 
 
 def _has_program(definition: str) -> bool:
-    plugin = Plugin(**json.loads(definition)["formulation"]).registered
+    # Before all formulations were plugins, cells without one had programs.
+    recorded = json.loads(definition).get("formulation")
+    if recorded is None:
+        return True
+    plugin = Plugin(**recorded).registered
     return bool(plugin.entries and not plugin.conflict and plugin.load().has_program)
 
 

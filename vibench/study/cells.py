@@ -16,7 +16,7 @@ from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import default_formulation, find
 from vibench.provenance import numerical_code
-from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
+from vibench.study.parameter_sets import OWN, OWN_TRAINING, ParameterSet
 
 
 def digest(content: Any) -> str:
@@ -114,17 +114,24 @@ class Cell:
         known = {name for one in plugins.values() if places for name in one.paths.values()}
         for name in places.keys() - known:
             raise unknown_name("file or folder of the cell", name, known)
+        # In the committed results `mixed` and `compiled` were no plugins, and these were assemblies.
+        if content.get("formulation") is None:
+            name = "compiled" if content["assembly"] == "compiled" else default_formulation()
+            plugins["formulation"] = Plugin.of(find(PluginKind.FORMULATION, name), {}, {})
+            content["formulation_label"] = name
+        if content["assembly"] in ("certified", "compiled"):
+            content["bounds"], content["assembly"] = content["assembly"] == "certified", "reduced"
         # The problem first: its error is the one to mend.
         for name in sorted(plugins, key=lambda name: name != "problem"):
             content[name] = _installed(plugins[name].moved(places))
         for axis in ("pod", "cone"):
             content[axis] = None if content[axis] is None else Stop(**content[axis])
         for name in ("labels", "nested_tolerances"):
-            content[name] = tuple(content[name])
-        trained, validated = content.pop("set_labels")
+            content[name] = tuple(content.get(name, ()))
+        trained, validated = content.pop("set_labels", (OWN, OWN))
         skips = content.pop("training_skips", False)
-        content["training"] = ParameterSet("training", 0, 0, content["training"], trained, skips)
-        count, seed, sampling = (content.pop(name) for name in ("validation", "seed", "validation_sampling"))
+        content["training"] = ParameterSet("training", 0, 0, content.get("training"), trained, skips)
+        count, seed, sampling = (content.pop(name, None) for name in ("validation", "seed", "validation_sampling"))
         return cls(**content | {"validation": ParameterSet("validation", count, seed, sampling, validated)})
 
     @property

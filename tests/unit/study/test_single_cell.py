@@ -1,5 +1,6 @@
 """A study of one cell has that cell: a row can be made again from what is recorded of it."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from vibench.execution.recorded_cell import recorded_study
 from vibench.results import formats
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
+from vibench.study.cells import Cell
 from vibench.study.matrix import expand, only_cell, read_study, study_of_cell
 
 
@@ -22,7 +24,14 @@ def test_a_study_of_one_cell_has_the_same_cell(name: str) -> None:
         assert (again.key, str(again), again.code) == (cell.key, str(cell), cell.code)
 
 
-def test_a_row_is_made_again_from_its_results_file(quick_run: Path, main: Main) -> None:
+def test_a_row_is_made_again_from_its_results_file_or_an_older_definition(quick_run: Path, main: Main) -> None:
+    cell = expand(read_study("quick"))[0]
+    older = json.loads(cell.definition)
+    for name in ("training", "validation_sampling", "set_labels", "formulation", "formulation_label", "bounds"):
+        del older[name]
+    assert Cell.from_definition(json.dumps(older)) == cell
+    certified = Cell.from_definition(json.dumps(older | {"assembly": "certified"}))
+    assert (certified.assembly, certified.bounds) == ("reduced", True)
     row = read_table(quick_run / FILE, "cells").iloc[3]
     study = recorded_study(str(quick_run / FILE), row["cell"][:6])
     assert [cell.key for cell in expand(study)] == [row["cell"]]
