@@ -203,7 +203,7 @@ class _Rounds(Items):
         model = queries.model.reduced
         # Without certificate the correction takes high-fidelity matrices, which a full assembly has made already.
         if stage.certificate is None:
-            factors = self._factors.setdefault(stage.built.key, Assemblies(model.problem, 0))
+            factors = self._factors.setdefault(stage.built.key, Assemblies(model.problem))
             vi, assembly = timed(lambda: checked_assembly(model.problem, near).copy())
             _, seconds = timed(partial(corrected_in_full, model, factors, near, vi, *solution))
             return assembly + seconds if isinstance(model, HyperReducedModel) else seconds
