@@ -72,6 +72,7 @@ def _keys(problem: str, dual: str, primal: str, tolerance: float | None) -> Row:
 
 def _cell(key: str, keys: Row, kind: Kind, rng: np.random.Generator, *, failed: bool) -> Row:
     plugins = {axis: {"name": keys[axis]} for axis in ("problem", "dual", "primal")}
+    plugins["formulation"] = {"kind": "formulation", "name": "mixed", "options": "{}", "code": "test"}
     named = {"cell": key, "machine": "sample", "validation": "own", "versions": "{}", "definition": json.dumps(plugins)}
     row = _row(STORED["cells"], rng) | keys | named | {"status": "ok", "reason": "", "enrichment_kind": kind.value}
     row |= {"queries": QUERIES_PER_CELL, "queries_ok": QUERIES_PER_CELL, "timing_rounds": ROUNDS, "disturbed": 0}
