@@ -18,6 +18,15 @@ The best correction w for c X in place of A comes with ν ≥ 0, c X w = Bᵀ(ν
 has the residual r − (c X − A) w and violates nothing, so that both of its errors are at most the root of
 ‖r − (c X − A) w‖²_{A⁻¹} + 2 νᵀ(B w − s). The norm is at most ρ/√α + ½ (γ − α)/√α ‖w‖_X for c = ½ (α + γ).
 
+**Bounds of u and λ apart.** If one error is much smaller than the other, its bound above is that of the larger one. A
+step of defect correction (docs/mathematics.md, "Bounds at online cost") separates them: û = u_N + z/c − w with
+z = X⁻¹r, c X w = Bᵀ(ν − λ_N) and c = ½ (α + γ) gives
+
+    ‖u − u_N‖_A ≤ √γ ‖û − u_N‖_X + δ,         ‖Bᵀ(λ − λ_N)‖_{A⁻¹} ≤ ‖Bᵀ(ν − λ_N)‖_{X⁻¹}/√α + δ,
+
+δ = ½ (γ − α)/√α ‖û − u_N‖_X. w is the correction of u_N + z/c in place of u_N. Only the part of r in the span of the
+basis of residuals is used; the rest, and what is not known of r, adds its norm to that of the residual.
+
 **Round-off** is bounded in all terms, however large the condition number of X: in ρ (`residual`), in w and its norm
 by the μ of C (`contact_correction`), in κ, and in A(µ) and its spectrum (`base`). With FᵀF between (1 ± η) X, the
 distortion of U and the computed directions, rᵀw differs from the product of coordinates by at most m ρ ω, and ρ is at
@@ -43,21 +52,9 @@ from vibench.linalg.factorisations import implementation
 from vibench.model.affine import AffineMember
 from vibench.model.bound_terms import BoundNote, BoundTerms, CorrectionMode, in_dual_set
 from vibench.model.certificates.base import CertificateBase, Guarantee, contact_unknowns, is_exact
-from vibench.model.certificates.contact_correction import (
-    ContactCompliance,
-    defect_corrected_bounds,
-    find_contact_correction,
-    held_rows,
-)
+from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction
 from vibench.model.certificates.prepared_correction import PreparedCorrections, prepare_corrections
-from vibench.model.certificates.residual import (
-    ColumnBlock,
-    ContactFunctionals,
-    ResidualBasis,
-    ResidualTerms,
-    residual_basis,
-    residual_coefficients,
-)
+from vibench.model.certificates.residual import ColumnBlock, ResidualBasis, residual_basis, residual_coefficients
 from vibench.model.galerkin import ReducedProblem, contact_at
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.qp.solve import solve_qp
@@ -148,7 +145,7 @@ class OnlineCertificate:
     # m, relative: see `vibench.model.certificates.bounds`.
     margin: float
     # Corrections that take no factorisation at the parameter, where there are any.
-    prepared: PreparedCorrections | None = None
+    prepared: PreparedCorrections | None
 
     @cached_property
     def bound_sizes(self) -> Array:
@@ -163,10 +160,6 @@ class OnlineCertificate:
         terms = self.contact_basis.shape[1] + 4.0
         return np.asarray(terms * EPS * np.linalg.norm(self.contact_basis, axis=1))
 
-    def evaluate(self, problem: Problem, mu: Array, reduced: ReducedProblem, x: Array, alpha: Array) -> OnlineBound:
-        """Bounds of a solution x (N',), α (R,) of a reduced program that a `HyperReducedModel` assembled at mu (d,)."""
-        return self._bound(_Query(self.base, problem, mu, reduced, x, self.generators @ alpha), alpha)
-
     def certify(
         self,
         problem: Problem,
@@ -176,7 +169,10 @@ class OnlineCertificate:
         alpha: Array,
         mode: CorrectionMode = CorrectionMode.FEASIBLE,
     ) -> tuple[OnlineBound, OnlineCorrection | None]:
-        """The bounds of `evaluate`, and the corrected pair with its own where the mode asks for it and there is one."""
+        """Bounds of a solution x (N',), α (R,) of a reduced program that a `HyperReducedModel` assembled at mu (d,).
+
+        Also the corrected pair with its own where the mode asks for it and there is one.
+        """
         query = _Query(self.base, problem, mu, reduced, x, self.generators @ alpha)
         bound = self._bound(query, alpha)
         if bound.guarantee is Guarantee.NONE or not mode.applies(bound.omega, bound.rho):
@@ -241,15 +237,7 @@ class OnlineCertificate:
         terms = BoundTerms.from_work(rho / sqrt(lower), norm * sqrt(upper), kappa, work)
         of_u, of_lam = terms.primal, terms.dual
         if self.prepared is None and base.spectral is not None:
-            others = defect_corrected_bounds(
-                self.compliance,
-                self.contact_directions,
-                query.contact,
-                (*self._on_contact(query), lam),
-                (coordinates, beside + missing + lacking),
-                (lower, upper),
-                self.margin,
-            )
+            others = self._defect_corrected(query, coordinates, beside + missing + lacking)
             of_u, of_lam = min(of_u, others[0]), min(of_lam, others[1])
         # a lower bound of ‖u‖_A, from that of ‖u_N‖_A and the triangle inequality
         least = sqrt(max(0.0, square_of_u - query.error * u_norm**2)) - of_u
@@ -258,6 +246,33 @@ class OnlineCertificate:
         in_W = of_lam / beta if beta > 0.0 else inf
         own = terms.rho, terms.omega, kappa, lower
         return OnlineBound(of_u, of_lam, relative, *own, base.guarantee, str(note), in_W, beta, which)
+
+    def _defect_corrected(self, query: _Query, coordinates: Array, outside: float) -> tuple[float, float]:
+        """Bounds of ‖u − u_N‖_A and of ‖Bᵀ(λ − λ_N)‖_{A⁻¹}; infinite where no correction was found.
+
+        The residual has these coordinates (K,), and `outside` is the norm of what they lack.
+        """
+        lower, upper, directions = query.lower, query.upper, self.contact_directions
+        on_contact, uncertain = self._on_contact(query)
+        middle = 0.5 * (lower + upper)
+        moved = coordinates / middle  # z/c
+        shift, terms = directions @ moved, len(moved) + 4.0
+        size_of_shift = np.linalg.norm(directions, axis=1) * np.linalg.norm(moved) + np.abs(shift)
+        uncertain = uncertain + terms * EPS * size_of_shift
+        moved_contact = query.contact, on_contact + shift, uncertain, query.lam, middle
+        found = find_contact_correction(self.compliance, *moved_contact)
+        if found is None or found.nu is None:
+            return inf, inf
+        # the coordinates of X w, whose rest is orthogonal to z
+        along = found.load @ directions[found.unknowns]
+        beside = max(0.0, found.norm**2 - float(along @ along))
+        round_off = (terms * EPS + self.margin) * (float(np.linalg.norm(moved)) + found.norm)
+        distance = float(np.linalg.norm(moved - along)) + round_off
+        distance = sqrt(distance**2 + beside + (terms * EPS + 2.0 * self.margin) * found.norm**2)
+        eta = found.eta + found.away
+        left = (outside + 0.5 * (upper - lower) * distance + middle * (eta + round_off)) / sqrt(lower)
+        delta = sqrt(left**2 + 2.0 * found.gap) + eta * sqrt(upper)
+        return sqrt(upper) * distance + delta, middle * found.norm / sqrt(lower) + delta
 
     def _on_contact(self, query: _Query) -> tuple[Array, Array]:
         """The solution u_N (k,) on the contact unknowns, and a bound of its round-off."""
@@ -325,17 +340,19 @@ def prepare(
         values = factor.solve_factor_transposed(np.asarray(matrix @ vectors))
         unit = 1.01 * EPS * (np.max(np.diff(sp.csr_array(matrix).indptr)) + terms + 4.0) / sqrt(base.share.value)
         rounded = unit * (abs(matrix) @ np.abs(vectors)) / np.sqrt(squares)[:, None]
-        return ColumnBlock(values, np.linalg.norm(rounded, axis=0) + of_solution * np.linalg.norm(values, axis=0))
+        errors = np.linalg.norm(rounded, axis=0) + of_solution * np.linalg.norm(values, axis=0)
+        return ColumnBlock(values, errors, len(squares))
 
     loads = np.column_stack(members["f"].terms)
-    blocks: list[ResidualTerms] = [block(sp.eye_array(len(loads), format="csr"), loads, loads.shape[1])]
+    blocks = [block(sp.eye_array(len(loads), format="csr"), loads, loads.shape[1])]
     blocks += [block(term, Phi, 0) for term in ([X] if base.spectral is None else base.terms)]
-    on_contact = ContactFunctionals(factor.trailing_factor, len(squares), of_solution)
     if forces is None:
         blocks += [block(B_q.T, chi, len(B.terms) + chi.shape[1]) for B_q in B.terms]
     else:
-        values = on_contact.combined(forces)
-        blocks += [on_contact, ColumnBlock(values, of_solution * np.linalg.norm(values, axis=0))]
+        # loads on the contact unknowns, which come last: the others are not touched
+        for loads in (np.eye(len(dofs)), forces):
+            values = scipy.linalg.solve_triangular(factor.trailing_factor, loads, trans="T", check_finite=False)
+            blocks.append(ColumnBlock(values, of_solution * np.linalg.norm(values, axis=0), len(squares)))
     compliance = ContactCompliance(base.compliance, _near(problem, chi, training), base.compliance_error)
     contact_basis = np.ascontiguousarray(Phi[dofs])
     z, typical, held = _sampled(model, base, compliance, contact_basis, forces, training)
@@ -391,7 +408,9 @@ def _sampled(
         lam, y = model.generators @ alpha, evaluated.in_space(answer.x)
         contact, theta = evaluated.contact or contact_at(problem, mu), base.coefficients(evaluated.samples)
         residuals.append(residual_coefficients(theta, y, forces, contact, alpha, lam))
-        held |= held_rows(compliance, contact, rows @ y, lam)
+        # rows that are violated, or in which the best w may hold B w = s for γ = 1
+        excess, reach = contact.B @ (rows @ y) - contact.g, abs(contact.B) @ compliance.root
+        held |= (excess > 0.0) | (lam * reach**2 > np.abs(excess))
         if number % 8 == 0:
             correction = find_contact_correction(compliance, contact, rows @ y, np.zeros(len(rows)), lam, 1.0)
             norms += [] if correction is None else [correction.norm]

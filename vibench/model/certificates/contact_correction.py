@@ -17,23 +17,13 @@ zero: SciPy's own method, which does not bound it, returns wrong solutions in su
 
 **Equalities.** The rows of a row and its opposite are dependent. The program is then solved as a least distance problem
 in y, w_E = L y, with C = L Lᵀ and ‖w‖ = |y|. The w' that holds them is within η of w (`vibench.model.bound_terms`).
-
-**Bounds of u and λ apart.** If one error is much smaller than the other, its bound (ii) is that of the larger one. A
-step of defect correction (docs/mathematics.md, "Bounds at online cost") separates them: û = u_N + z/c − w with
-z = X⁻¹r, c X w = Bᵀ(ν − λ_N) and c = ½ (α + γ) gives
-
-    ‖u − u_N‖_A ≤ √γ ‖û − u_N‖_X + δ,         ‖Bᵀ(λ − λ_N)‖_{A⁻¹} ≤ ‖Bᵀ(ν − λ_N)‖_{X⁻¹}/√α + δ,
-
-δ = ½ (γ − α)/√α ‖û − u_N‖_X. w is the correction of u_N + z/c in place of u_N. Only the part of r in the span of the
-basis of residuals is used; the rest, and what is not known of r, adds its norm to that of the residual.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from math import inf, sqrt
 
 import numpy as np
 import scipy.linalg
@@ -111,62 +101,6 @@ def descent(M: Array, fixed: Array) -> Array:
     return np.asarray(M @ v)
 
 
-def tied_correction(
-    compliance: ContactCompliance,
-    contact: Contact,
-    excess: Array,
-    round_off: Array,
-    size: Array,
-    lam: Array,
-    gamma: float,
-) -> tuple[Array, float, float, Array, float, float, float] | None:
-    """The attributes of a `ContactCorrection` besides its unknowns; `None` without equalities, or if no w was found.
-
-    `excess` is s (m,), with bounds of its round-off and of its terms.
-    """
-    B = sp.csr_array(contact.B)
-    # opposite rows with less room than 1e-12 of the terms of s are an equality, as in `vibench.model.error_bounds`
-    rows = rows_that_matter(B, contact.g, 1e-12 * size, lam)
-    if not rows.equal.any():
-        return None
-    L, kept, lengths = np.linalg.cholesky(compliance.matrix), rows.kept, row_norms(B)[rows.kept]
-    # what C misses of the energy of values of w, and the factor and solutions with it of C
-    condition = float(np.linalg.norm(abs(scipy.linalg.solve_triangular(L, np.eye(len(L)), lower=True)) @ abs(L)))
-    loss = compliance.error + 4.0 * EPS * (len(L) + 4.0) * condition**2
-    if not loss <= 0.1:  # η is twice what it would be without
-        return None
-    whitened = np.asarray((B @ L).T)
-    equalities = Equalities.from_rows(whitened[:, rows.equalities], lambda y: np.asarray(L @ y), B)
-    K, load = -whitened[:, kept] / lengths / np.sqrt(gamma), -(whitened @ lam) / np.sqrt(gamma)
-    margin = np.where(rows.equal, 0.0, first_margin(round_off)[kept])
-    for _ in range(4):
-        if (forces := least_distance(K, load, -(excess[kept] + margin) / lengths, rows.equal)) is None:
-            return None
-        w = L @ (load - K @ forces) / np.sqrt(gamma)
-        missed = (B @ w - excess)[rows.equalities]
-        w = w - equalities.step(missed)
-        slack = B @ w - excess
-        rounded = round_off + 1.01 * EPS * (np.diff(B.indptr) + 4.0) * (abs(B) @ np.abs(w))
-        eta = equalities.distance((np.abs(slack) + rounded)[rows.equalities])
-        # ν belongs to the w before the step: its distance counts twice.
-        eta += equalities.distance(np.abs(missed))
-        moved = equalities.reach * eta
-        lacking = np.where(rows.implied, 0.0, rounded + moved - slack)
-        if np.all(lacking <= 0.0):  # NaN is not
-            y = scipy.linalg.solve_triangular(L, w, lower=True)
-            nu = rows.multipliers(np.where(rows.equal, forces, np.maximum(forces, 0.0)) / lengths, len(lam))
-            # slack may be infinite on absent rows, where multipliers are zero
-            most = slack + rounded
-            kappa, gap = (dual_gap(one, np.where(one > 0.0, most, 0.0)) + float(one @ moved) for one in (lam, nu))
-            c = scipy.linalg.solve_triangular(L, y, lower=True, trans="T")
-            norm = float(np.linalg.norm(y)) * (1.0 + loss)
-            # also the round-off in the forces of ν − λ
-            away = loss * norm + EPS * (len(L) + len(lam) + 8.0) * float(abs(B) @ compliance.root @ (lam + nu)) / gamma
-            return c, norm + eta, kappa, nu, gap, eta, away
-        margin = 10.0 * np.maximum(margin, np.where(rows.equal, 0.0, np.nan_to_num(lacking[kept], posinf=0.0)))
-    return None
-
-
 @dataclass(frozen=True)
 class ContactCorrection:
     """Correction w = X⁻¹ E c with B w ≥ s."""
@@ -206,21 +140,14 @@ class ContactCompliance:
         return np.asarray(np.sqrt(np.diag(self.matrix)))
 
     @cached_property
-    def blocks(self) -> tuple[tuple[Indices, Indices, BlockDiagonal], tuple[Indices, Indices, BlockDiagonal]]:
+    def blocks(self) -> list[tuple[Indices, Indices, BlockDiagonal]]:
         """Unknowns, the position of every unknown among them or −1, and C on them: the near ones, and all."""
-        return self._block(self.near), self._block(np.arange(len(self.matrix)))
-
-    def _block(self, chosen: Indices) -> tuple[Indices, Indices, BlockDiagonal]:
-        position = np.full(len(self.matrix), -1, np.intp)
-        position[chosen] = np.arange(len(chosen))
-        return chosen, position, BlockDiagonal.of(self.matrix[np.ix_(chosen, chosen)])
-
-
-def held_rows(compliance: ContactCompliance, contact: Contact, on_contact: Array, lam: Array) -> Mask:
-    """Rows (m,) that are violated, or in which the best w for u_N (k,) and λ (m,) may hold B w = s for γ = 1."""
-    B = sp.csr_array(contact.B)
-    excess, reach = B @ on_contact - contact.g, abs(B) @ compliance.root
-    return np.asarray((excess > 0.0) | (lam * reach**2 > np.abs(excess)))
+        found = []
+        for chosen in (self.near, np.arange(len(self.matrix))):
+            position = np.full(len(self.matrix), -1, np.intp)
+            position[chosen] = np.arange(len(chosen))
+            found.append((chosen, position, BlockDiagonal.of(self.matrix[np.ix_(chosen, chosen)])))
+        return found
 
 
 def find_contact_correction(
@@ -230,57 +157,54 @@ def find_contact_correction(
 
     `on_contact` is u_N (k,) on the contact unknowns, and `uncertain` a bound (k,) of its round-off.
     """
-    B = sp.csr_array(contact.B)
-    if not B.has_canonical_format or len(B.indices) > B.nnz:
-        B = B.copy()
-        B.sum_duplicates()
-    size, terms = sp.csr_array((np.abs(B.data), B.indices, B.indptr), B.shape), 1.01 * EPS * (np.diff(B.indptr) + 4.0)
-    excess = B @ on_contact - contact.g
-    total = size @ np.abs(on_contact) + np.abs(contact.g)
-    round_off = 1.01 * (size @ uncertain) + terms * total
-    reach = size @ compliance.root
-    for unknowns, position, C in compliance.blocks:
-        if not len(C):
-            continue  # no generator, no unknown near one
-        # The near unknowns are tried first: their rows are enough unless λ or a violation is elsewhere.
-        inside = position[B.indices] >= 0
-        restricted = sp.csr_array((B.data * inside, np.maximum(position[B.indices], 0), B.indptr), (len(lam), len(C)))
-        near = np.ones(len(lam), bool)
-        near[np.repeat(np.arange(len(lam)), np.diff(B.indptr))[~inside]] = False
-        if not near[lam > 0.0].all():
-            continue
-        root = compliance.root[unknowns]
-        best = _Program(C, restricted, near, excess, round_off, reach, terms, lam, gamma, root, compliance.error).best()
-        if best is not None:
-            return ContactCorrection(unknowns, *best)
-    tied = tied_correction(compliance, contact, excess, round_off, total, lam, gamma)
-    return None if tied is None else ContactCorrection(np.arange(len(compliance.matrix)), *tied)
+    program = _Program(compliance, contact, on_contact, uncertain, lam, gamma)
+    # The near unknowns are tried first: their rows are enough unless λ or a violation is elsewhere.
+    for block in compliance.blocks:
+        if program.restrict(*block) and (found := program.best()) is not None:
+            return found
+    return program.tied()
 
 
-@dataclass(frozen=True)
 class _Program:
-    """The program in the unknowns of a block of C; rows that are not `near` involve others, too."""
+    """The program for w of one solution, on all contact unknowns or on some of them."""
 
-    compliance: BlockDiagonal
-    B: SparseMatrix
-    near: Mask
-    excess: Array
-    round_off: Array
-    reach: Array
-    terms: Array
-    lam: Array
-    gamma: float
-    root: Array
-    error: float
+    def __init__(
+        self, whole: ContactCompliance, contact: Contact, on_contact: Array, uncertain: Array, lam: Array, gamma: float
+    ) -> None:
+        B = sp.csr_array(contact.B)
+        if not B.has_canonical_format or len(B.indices) > B.nnz:
+            B = B.copy()
+            B.sum_duplicates()
+        self.whole, self.B, self.g, self.lam, self.gamma = whole, B, contact.g, lam, gamma
+        # |B|, the terms of s, their number times the round-off of one, and the round-off of s
+        self.sizes, self.terms = _absolute(B), 1.01 * EPS * (np.diff(B.indptr) + 4.0)
+        self.excess = B @ on_contact - contact.g
+        self.total = self.sizes @ np.abs(on_contact) + np.abs(contact.g)
+        self.round_off = 1.01 * (self.sizes @ uncertain) + self.terms * self.total
+        self.reach = self.sizes @ whole.root
 
-    def best(self) -> tuple[Array, float, float, Array | None, float, float, float] | None:
-        """The attributes of a `ContactCorrection` besides its unknowns, in their order."""
-        B, margin = self.B, first_margin(self.round_off)
-        size = sp.csr_array((np.abs(B.data), B.indices, B.indptr), B.shape)
-        unit = 1.01 * EPS * (len(self.root) + len(self.lam) + 8.0)
+    def restrict(self, unknowns: Indices, position: Indices, C: BlockDiagonal) -> bool:
+        """Leave the unknowns of a block of C; false where there are none, or λ presses rows that involve others."""
+        B, rows = self.B, np.diff(self.B.indptr)
+        inside = position[B.indices] >= 0
+        # rows that involve no other unknown
+        self.near = np.ones(len(rows), bool)
+        self.near[np.repeat(np.arange(len(rows)), rows)[~inside]] = False
+        if not len(C) or not self.near[self.lam > 0.0].all():
+            return False
+        places = np.maximum(position[B.indices], 0)
+        self.own = sp.csr_array((B.data * inside, places, B.indptr), (len(rows), len(C)))
+        self.unknowns, self.C, self.root = unknowns, C, self.whole.root[unknowns]
+        return True
+
+    def best(self) -> ContactCorrection | None:
+        """The best correction on the unknowns that are left; `None` if it is not feasible."""
+        B, lam, margin, size = self.own, self.lam, first_margin(self.round_off), _absolute(self.own)
+        unit = 1.01 * EPS * (len(self.root) + len(lam) + 8.0)
         for _ in range(4):
-            for load, values, norm, nu in self._minimisers(self.excess + margin):
-                slack = self.B @ values - self.excess
+            if (found := self._minimiser(self.excess + margin)) is not None:
+                load, values, norm, nu = found
+                slack = B @ values - self.excess
                 # with the round-off in C c
                 uncertain = unit * float(self.root @ np.abs(load))
                 rounded = self.terms * (size @ np.abs(values)) + self.round_off + self.reach * uncertain
@@ -290,49 +214,48 @@ class _Program:
                 if np.all(lacking <= 0.0):  # NaN is not
                     pushing, most = np.maximum(nu, 0.0), slack + rounded
                     # A force pulls if ν is negative beyond the round-off in ν − λ + λ.
-                    pulls = np.any(nu < -8.0 * EPS * self.lam)
-                    away = self.error * norm + unit * float(self.reach @ (pushing + self.lam)) / self.gamma
-                    kappa, gap = dual_gap(self.lam, most), dual_gap(pushing, most)
-                    return load, norm, kappa, None if pulls else pushing, gap, 0.0, away
+                    known = None if np.any(nu < -8.0 * EPS * lam) else pushing
+                    away = self.whole.error * norm + unit * float(self.reach @ (pushing + lam)) / self.gamma
+                    kappa, gap = dual_gap(lam, most), dual_gap(pushing, most)
+                    return ContactCorrection(self.unknowns, load, norm, kappa, known, gap, 0.0, away)
                 if np.any(lacking[~self.near] > 0.0):
                     return None
                 margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking, nan=0.0, posinf=0.0))
             margin = 10.0 * margin
         return None
 
-    def _minimisers(self, excess: Array) -> Iterator[tuple[Array, Array, float, Array]]:
+    def _minimiser(self, excess: Array) -> tuple[Array, Array, float, Array] | None:
         """The last w of the active set method: c, w on the unknowns of the block, its norm, and ν of any sign."""
         size = self.reach**2 / self.gamma  # at least the diagonal of S
         chosen = (self.lam > 0.0) & (self.lam * size > -excess)
         # each extension adds all rows that w violates; ten are never needed where rows are independent
         for _ in range(10):
             difference = self._difference(chosen, excess, size)
-            load = (self.B.T @ difference) / self.gamma
-            values = self.compliance @ load
-            violated = self.near & ~chosen & (excess - self.B @ values > self.round_off)
+            load = (self.own.T @ difference) / self.gamma
+            values = self.C @ load
+            violated = self.near & ~chosen & (excess - self.own @ values > self.round_off)
             if not violated.any():
                 rounded = 2.02 * EPS * (len(load) + 4.0) * float(self.root @ np.abs(load)) ** 2
-                square = (max(0.0, float(load @ values)) + rounded) * (1.0 + self.error)
-                yield load, values, float(np.sqrt(square)), self.lam + difference
-                return
+                square = (max(0.0, float(load @ values)) + rounded) * (1.0 + self.whole.error)
+                return load, values, float(np.sqrt(square)), self.lam + difference
             chosen |= violated
+        return None
 
     def _difference(self, chosen: Mask, excess: Array, size: Array) -> Array:
         """The difference ν − λ (m,) with ν = 0 on rows not chosen, or ν = λ where λ is negligible."""
-        lam, rows = self.lam, np.flatnonzero(chosen)
+        B, C, lam, rows = self.own, self.C, self.lam, np.flatnonzero(chosen)
         # Multipliers below 1e-6 of the row's slack are kept as they are: they do not change the minimiser.
         difference = np.where(chosen | (lam * size <= 1e-6 * np.abs(excess)), 0.0, -lam)
         if not len(rows):
             return difference
         # faster than a selection of rows, which checks indices
-        counts = np.diff(self.B.indptr)
-        kept = np.repeat(chosen, counts)
-        ends = np.concatenate([np.zeros(1, self.B.indptr.dtype), np.cumsum(counts[chosen], dtype=self.B.indptr.dtype)])
-        block = sp.csr_array((self.B.data[kept], self.B.indices[kept], ends), (len(rows), self.B.shape[1]))
+        counts = np.diff(B.indptr)
+        kept, ends = np.repeat(chosen, counts), np.append(0, np.cumsum(counts[chosen])).astype(B.indptr.dtype)
+        block = sp.csr_array((B.data[kept], B.indices[kept], ends), (len(rows), B.shape[1]))
         wanted = excess[rows]
         if difference.any():
-            wanted = wanted - block @ (self.compliance @ (self.B.T @ difference)) / self.gamma
-        S = self.compliance.congruent(block) / self.gamma
+            wanted = wanted - block @ (C @ (B.T @ difference)) / self.gamma
+        S = C.congruent(block) / self.gamma
         # Rows may have any scale: factorise in units of their own compliance.
         units = np.sqrt(S.diagonal())
         units[~(units > 0.0)] = 1.0
@@ -341,10 +264,59 @@ class _Program:
         S[np.diag_indices_from(S)] += 1e-13
         factor, singular = dpotrf(S, lower=1, clean=0)
         wanted, known = wanted / units, lam[rows] * units
-        difference[rows] = (
-            np.linalg.lstsq(S, wanted)[0] if singular else _complementary(factor, wanted, known) - known
-        ) / units
+        step = np.linalg.lstsq(S, wanted)[0] if singular else _complementary(factor, wanted, known) - known
+        difference[rows] = step / units
         return difference
+
+    def tied(self) -> ContactCorrection | None:
+        """A correction that holds equalities; `None` without these, or if none was found."""
+        B, lam, gamma, compliance = self.B, self.lam, self.gamma, self.whole
+        # opposite rows with less room than 1e-12 of the terms of s are an equality, as in `vibench.model.error_bounds`
+        rows = rows_that_matter(B, self.g, 1e-12 * self.total, lam)
+        if not rows.equal.any():
+            return None
+        L, kept, lengths = np.linalg.cholesky(compliance.matrix), rows.kept, row_norms(B)[rows.kept]
+        # what C misses of the energy of values of w, and the factor and solutions with it of C
+        condition = float(np.linalg.norm(abs(scipy.linalg.solve_triangular(L, np.eye(len(L)), lower=True)) @ abs(L)))
+        loss = compliance.error + 4.0 * EPS * (len(L) + 4.0) * condition**2
+        if not loss <= 0.1:  # η is twice what it would be without
+            return None
+        whitened = np.asarray((B @ L).T)
+        equalities = Equalities.from_rows(whitened[:, rows.equalities], lambda y: np.asarray(L @ y), B)
+        K, load = -whitened[:, kept] / lengths / np.sqrt(gamma), -(whitened @ lam) / np.sqrt(gamma)
+        margin = np.where(rows.equal, 0.0, first_margin(self.round_off)[kept])
+        for _ in range(4):
+            forces = least_distance(K, load, -(self.excess[kept] + margin) / lengths, rows.equal)
+            if forces is None:
+                return None
+            w = L @ (load - K @ forces) / np.sqrt(gamma)
+            missed = (B @ w - self.excess)[rows.equalities]
+            w = w - equalities.step(missed)
+            slack = B @ w - self.excess
+            rounded = self.round_off + self.terms * (self.sizes @ np.abs(w))
+            eta = equalities.distance((np.abs(slack) + rounded)[rows.equalities])
+            # ν belongs to the w before the step: its distance counts twice.
+            eta += equalities.distance(np.abs(missed))
+            moved = equalities.reach * eta
+            lacking = np.where(rows.implied, 0.0, rounded + moved - slack)
+            if np.all(lacking <= 0.0):  # NaN is not
+                y = scipy.linalg.solve_triangular(L, w, lower=True)
+                nu = rows.multipliers(np.where(rows.equal, forces, np.maximum(forces, 0.0)) / lengths, len(lam))
+                # slack may be infinite on absent rows, where multipliers are zero
+                most = slack + rounded
+                kappa, gap = (dual_gap(one, np.where(one > 0.0, most, 0.0)) + float(one @ moved) for one in (lam, nu))
+                c = scipy.linalg.solve_triangular(L, y, lower=True, trans="T")
+                norm = float(np.linalg.norm(y)) * (1.0 + loss)
+                # also the round-off in the forces of ν − λ
+                away = loss * norm + EPS * (len(L) + len(lam) + 8.0) * float(self.reach @ (lam + nu)) / gamma
+                return ContactCorrection(np.arange(len(L)), c, norm + eta, kappa, nu, gap, eta, away)
+            margin = 10.0 * np.maximum(margin, np.where(rows.equal, 0.0, np.nan_to_num(lacking[kept], posinf=0.0)))
+        return None
+
+
+def _absolute(B: SparseMatrix) -> SparseMatrix:
+    """|B|; `abs` would check indices."""
+    return sp.csr_array((np.abs(B.data), B.indices, B.indptr), B.shape)
 
 
 def _complementary(factor: Array, excess: Array, lam: Array) -> Array:
@@ -360,38 +332,3 @@ def _complementary(factor: Array, excess: Array, lam: Array) -> Array:
         return inverse[rows]
 
     return np.maximum(complementary(fixed, rows_of_inverse, fixed < 0.0), 0.0)
-
-
-def defect_corrected_bounds(
-    compliance: ContactCompliance,
-    directions: Array,
-    contact: Contact,
-    solution: tuple[Array, Array, Array],
-    residual: tuple[Array, float],
-    spectrum: tuple[float, float],
-    margin: float,
-) -> tuple[float, float]:
-    """Bounds of ‖u − u_N‖_A and of ‖Bᵀ(λ − λ_N)‖_{A⁻¹}; infinite where no correction was found.
-
-    `directions` are the coordinates (k×K) of the contact unknowns, as functionals, in the basis of residuals;
-    `solution` is u_N (k,) on the contact unknowns, a bound (k,) of its round-off, and λ_N ≥ 0 (m,); `residual` its
-    coordinates (K,) and the norm of what they lack; `spectrum` α > 0 and γ; `margin` that of the certificate.
-    """
-    (on_contact, uncertain, lam), (coordinates, outside), (lower, upper) = solution, residual, spectrum
-    middle = 0.5 * (lower + upper)
-    moved = coordinates / middle  # z/c
-    shift, terms = directions @ moved, len(moved) + 4.0
-    uncertain = uncertain + terms * EPS * (np.linalg.norm(directions, axis=1) * np.linalg.norm(moved) + np.abs(shift))
-    found = find_contact_correction(compliance, contact, on_contact + shift, uncertain, lam, middle)
-    if found is None or found.nu is None:
-        return inf, inf
-    # the coordinates of X w, whose rest is orthogonal to z
-    along = found.load @ directions[found.unknowns]
-    beside = max(0.0, found.norm**2 - float(along @ along))
-    round_off = (terms * EPS + margin) * (float(np.linalg.norm(moved)) + found.norm)
-    distance = float(np.linalg.norm(moved - along)) + round_off
-    distance = sqrt(distance**2 + beside + (terms * EPS + 2.0 * margin) * found.norm**2)
-    eta = found.eta + found.away
-    left = (outside + 0.5 * (upper - lower) * distance + middle * (eta + round_off)) / sqrt(lower)
-    delta = sqrt(left**2 + 2.0 * found.gap) + eta * sqrt(upper)
-    return sqrt(upper) * distance + delta, middle * found.norm / sqrt(lower) + delta

@@ -27,7 +27,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from math import isqrt, sqrt
-from typing import Protocol
 
 import numpy as np
 import scipy.linalg
@@ -39,73 +38,22 @@ from vibench.linalg import EPS
 from vibench.linalg.inner_product import project_out
 
 
-class ResidualTerms(Protocol):
-    """A block of the F⁻ᵀt_j, of which only some columns may be computed."""
-
-    @property
-    def norms(self) -> Array:
-        """Their norms (p,)."""
-
-    @property
-    def errors(self) -> Array:
-        """Their ε_j (p,)."""
-
-    def columns(self, chosen: Indices) -> Array:
-        """The chosen ones (n×c)."""
-
-    def combined(self, samples: Array) -> Array:
-        """Their sums (n×S) with coefficients (p×S)."""
-
-
 @dataclass(frozen=True)
 class ColumnBlock:
-    """A block that is stored as an array (n×p), with its ε_j (p,)."""
+    """A block of the F⁻ᵀt_j (n×p) with their ε_j (p,); only the last rows of `values` (·×p) are not zero."""
 
     values: Array
     errors: Array
-
-    @property
-    def norms(self) -> Array:
-        return np.asarray(np.linalg.norm(self.values, axis=0))
-
-    def columns(self, chosen: Indices) -> Array:
-        return self.values[:, chosen]
-
-    def combined(self, samples: Array) -> Array:
-        return np.asarray(self.values @ samples)
-
-
-@dataclass(frozen=True)
-class ContactFunctionals:
-    """The functionals that act on one contact unknown each, in coordinates that have these unknowns at the end.
-
-    There X = FᵀF with F upper triangular, and `trailing` is its last block (k×k); n is the dimension of the space. ε_j
-    is `error` times the norm.
-    """
-
-    trailing: Array
     dim: int
-    error: float
 
     @cached_property
     def norms(self) -> Array:
-        identity = np.eye(len(self.trailing))
-        columns = scipy.linalg.solve_triangular(self.trailing, identity, trans="T", check_finite=False)
-        return np.asarray(np.linalg.norm(columns, axis=0))
+        """Their norms (p,)."""
+        return np.asarray(np.linalg.norm(self.values, axis=0))
 
-    @property
-    def errors(self) -> Array:
-        return self.error * self.norms
-
-    def columns(self, chosen: Indices) -> Array:
-        return self.combined(np.eye(len(self.trailing))[:, chosen])
-
-    def combined(self, samples: Array) -> Array:
-        result = np.zeros((self.dim, samples.shape[1]))
-        if samples.size:
-            last = scipy.linalg.solve_triangular(self.trailing, samples, trans="T", check_finite=False)
-            result[self.dim - len(self.trailing) :] = last
-        return result
+    def padded(self, last: Array) -> Array:
+        """Columns of length n, from their last rows."""
+        return last if len(last) == self.dim else np.pad(last, ((self.dim - len(last), 0), (0, 0)))
 
 
 @dataclass(frozen=True)
@@ -145,7 +93,7 @@ class ResidualBasis:
 
 
 def residual_basis(
-    blocks: Sequence[ResidualTerms], samples: Array, beside: float, last: int | None = None
+    blocks: Sequence[ColumnBlock], samples: Array, beside: float, last: int | None = None
 ) -> tuple[ResidualBasis, Array]:
     """Basis of the F⁻ᵀt_j, blocks (n×·), from samples of their coefficients (Z×S), and U itself (n×K).
 
@@ -156,7 +104,8 @@ def residual_basis(
     norms = np.concatenate([block.norms for block in blocks])
     sizes, ranges = np.abs(samples), list(pairwise(np.cumsum([0, *(len(block.norms) for block in blocks)])))
     scale = sizes.max(axis=1, initial=0.0)
-    sampled = sum(block.combined(samples[a:b]) for block, (a, b) in zip(blocks, ranges, strict=True))
+    parts = list(zip(blocks, ranges, strict=True))
+    sampled = sum(block.padded(block.values @ samples[a:b]) for block, (a, b) in parts)
     typical = float(np.hypot(np.median(np.linalg.norm(sampled, axis=0)), beside))
     # Of many terms those are dropped that add up to 5 % of the typical norm. Few cost little: there 0.3 %, as what
     # they contribute elsewhere may be larger than in the samples.
@@ -166,8 +115,8 @@ def residual_basis(
     keep[order[np.cumsum(mean[order]) <= fraction * typical]] = False
     # contributions below 1e-12 of the largest one are round-off of the others
     kept = np.flatnonzero(keep & (largest > 1e-12 * largest.max(initial=0.0)))
-    pairs, errors = zip(blocks, ranges, strict=True), np.concatenate([block.errors for block in blocks])
-    R = np.hstack([block.columns(kept[(kept >= a) & (kept < b)] - a) for block, (a, b) in pairs])
+    R = np.hstack([block.padded(block.values[:, kept[(kept >= a) & (kept < b)] - a]) for block, (a, b) in parts])
+    errors = np.concatenate([block.errors for block in blocks])
     scale, rotated, lost = scale[kept], 0.0, 0.0
     if last is not None:
         R, rotated, lost = _with_fewer_rows(R, last, scale)

@@ -20,7 +20,6 @@ from vibench.interfaces.strategies import Enrichment, Kind
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import affine_decomposition
 from vibench.model.bound_terms import BoundNote
-from vibench.model.certificates import bounds as bounds_module
 from vibench.model.certificates import contact_correction
 from vibench.model.certificates.base import Guarantee, certificate_base, unsupported
 from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate, prepare
@@ -149,7 +148,7 @@ def found(kind: Prepared, mu: np.ndarray, x: np.ndarray, alpha: np.ndarray) -> t
     problem, model, certificate = kind
     reduced, vi = model.assemble(mu), problem.assemble(mu)
     u, lam = exact(VariationalInequality(vi.A.toarray(), vi.f, vi.B.toarray(), vi.g))
-    bound = certificate.evaluate(problem, mu, reduced, x, alpha)
+    bound = certificate.certify(problem, mu, reduced, x, alpha)[0]
     e, force = u - reduced.reconstruct(x[:, None])[:, 0], vi.B.T @ (lam - model.generators @ alpha)
     A = vi.A.toarray()
     energies = (e @ A @ e, force @ np.linalg.solve(A, force), u @ A @ u)
@@ -218,15 +217,15 @@ def test_what_equalities_may_miss_enters_where_the_derivation_says(
     problem, model, certificate = prepared(*kind)
     reduced = model.assemble(mu)
     x, alpha = disturbed(reduced.program, 1e-3, np.random.default_rng(4))
-    monkeypatch.setattr(bounds_module, "defect_corrected_bounds", lambda *_: (np.inf, np.inf))  # of these two sorts
-    (before, pair), of_ties = certificate.certify(problem, mu, reduced, x, alpha), contact_correction.tied_correction
+    monkeypatch.setattr(OnlineCertificate, "_defect_corrected", lambda *_: (np.inf, np.inf))  # of these two sorts
+    (before, pair), of_ties = certificate.certify(problem, mu, reduced, x, alpha), contact_correction._Program.tied
 
-    def missing_more(*given: Any) -> Any:
-        found = of_ties(*given)
-        assert found[-2] < 1e-9
-        return (*found[:-2], eta, found[-1])
+    def missing_more(program: Any) -> Any:
+        found = of_ties(program)
+        assert found.eta < 1e-9
+        return replace(found, eta=eta)
 
-    monkeypatch.setattr(contact_correction, "tied_correction", missing_more)
+    monkeypatch.setattr(contact_correction._Program, "tied", missing_more)
     bound, other = certificate.certify(problem, mu, reduced, x, alpha)
     spectral, at = certificate.base.spectral, certificate.base.coefficients(reduced.evaluated.samples)
     lower, upper = (1.0, 1.0) if spectral is None else spectral.evaluate(mu, at["A"])
@@ -264,9 +263,9 @@ def test_errors_are_told_apart_where_the_stiffness_varies_alone(
     problem, model, certificate = prepared(stiffness, True)
     reduced = model.assemble(mu)
     x, alpha = disturbed(reduced.program, 1e-3, np.random.default_rng(4))
-    before = certificate.evaluate(problem, mu, reduced, x, alpha)
-    monkeypatch.setattr(bounds_module, "defect_corrected_bounds", lambda *_: (0.0, 0.0))  # below all others
-    assert (certificate.evaluate(problem, mu, reduced, x, alpha) != before) is differs
+    before = certificate.certify(problem, mu, reduced, x, alpha)[0]
+    monkeypatch.setattr(OnlineCertificate, "_defect_corrected", lambda *_: (0.0, 0.0))  # below all others
+    assert (certificate.certify(problem, mu, reduced, x, alpha)[0] != before) is differs
 
 
 def test_where_a_constant_body_moves_at_a_parameter_there_is_no_inf_sup_constant() -> None:
@@ -277,7 +276,7 @@ def test_where_a_constant_body_moves_at_a_parameter_there_is_no_inf_sup_constant
     solution = exact(reduced.program)
     moved = Turned("constant", "half")
     reduced = replace(reduced, evaluated=replace(reduced.evaluated, contact=moved.contact(mu)))
-    bound = certificate.evaluate(moved, mu, reduced, *solution)
+    bound = certificate.certify(moved, mu, reduced, *solution)[0]
     assert (bound.inf_sup, bound.inf_sup_note, bound.lam) == (0.0, BoundNote.NOT_CONSTANT, np.inf)
     assert np.isfinite(bound.lambda_natural)
 
@@ -311,7 +310,7 @@ def test_prepared_corrections_are_the_best_ones_or_close_to_them(constraint: str
     for mu in BOX.sample(20, 6):
         reduced = model.assemble(mu)
         solution = exact(reduced.program)
-        quick, best = (one.evaluate(problem, mu, reduced, *solution) for one in (certificate, without))
+        quick, best = (one.certify(problem, mu, reduced, *solution)[0] for one in (certificate, without))
         assert quick.note == best.note == ""
         assert best.u_energy * (1.0 - 1e-6) <= quick.u_energy <= loss * best.u_energy * (1.0 + 1e-6)
         assert quick.lambda_natural <= loss * best.lambda_natural * (1.0 + 1e-6)
@@ -319,7 +318,7 @@ def test_prepared_corrections_are_the_best_ones_or_close_to_them(constraint: str
 
 def test_where_no_prepared_correction_is_feasible_the_best_one_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Corrections of the first two rows alone leave the others violated."""
-    monkeypatch.setattr(bounds_module, "defect_corrected_bounds", lambda *_: (np.inf, np.inf))  # if none are prepared
+    monkeypatch.setattr(OnlineCertificate, "_defect_corrected", lambda *_: (np.inf, np.inf))  # if none are prepared
     problem, model, certificate = prepared("affine", constraint="scaled")
     term, rows = problem.affine["B"].terms[0][:, CONTACT], np.arange(M) < 2
     at_contact = certificate.contact_basis, certificate.contact_directions
@@ -329,7 +328,7 @@ def test_where_no_prepared_correction_is_feasible_the_best_one_is_computed(monke
         reduced = model.assemble(mu)
         solution = exact(reduced.program)
         bound, error, natural, _ = found((problem, model, few), mu, *solution)
-        assert bound == replace(without.evaluate(problem, mu, reduced, *solution), note=BoundNote.NOT_PREPARED)
+        assert bound == replace(without.certify(problem, mu, reduced, *solution)[0], note=BoundNote.NOT_PREPARED)
         assert error <= bound.u_energy
         assert natural <= bound.lambda_natural
 
@@ -355,7 +354,7 @@ def test_small_residuals_keep_their_digits(constraint: str) -> None:
             of_lam = force[CONTACT]
         z = np.concatenate([np.ones(1), -x, -of_lam])
         whiten = certificate.base.X.whiten_functional
-        whitened = [ColumnBlock(whiten(block), np.zeros(block.shape[1])) for block in blocks]
+        whitened = [ColumnBlock(whiten(block), np.zeros(block.shape[1]), N) for block in blocks]
         basis, _ = residual_basis(whitened, z[:, None], 0.0)
         exact_norm = size * float(np.sqrt(away @ np.linalg.solve(A, away)))
         assert basis.norm(z) == pytest.approx(exact_norm, rel=1e-5)
@@ -476,14 +475,14 @@ def test_interpolation_errors_are_in_the_bound() -> None:
         assert error <= bound.u_energy
         assert natural <= bound.lambda_natural
         assert bound.coercivity > 2.0 * size
-        plain, lower = blind.evaluate(problem, mu, reduced, x, alpha), bound.coercivity
+        plain, lower = blind.certify(problem, mu, reduced, x, alpha)[0], bound.coercivity
         of_u = np.sqrt(x @ reduced.program.A @ x / (lower - size))
         assert bound.rho == pytest.approx(plain.rho + size * of_u / np.sqrt(lower), rel=1e-9)
         assert bound.rho > plain.rho * (1.0 + 1e-6)
     # nor have multipliers outside the cone a bound
     given = prepared("constant")
     mu, alpha = np.array([1.0, 0.0]), np.array([-10.0, 0.0, 0.0])
-    bound = given[2].evaluate(given[0], mu, given[1].assemble(mu), np.zeros(4), alpha)
+    bound = given[2].certify(given[0], mu, given[1].assemble(mu), np.zeros(4), alpha)[0]
     assert (bound.guarantee, bound.note, bound.u_energy) == (Guarantee.NONE, BoundNote.NOT_IN_CONE, np.inf)
 
 
@@ -516,7 +515,8 @@ def test_what_is_stored_is_of_contact_and_reduced_size() -> None:
     mu = np.array([1.2, 0.3])
     reduced = model.assemble(mu)
     solution = exact(reduced.program)
-    assert forgetful.evaluate(problem, mu, reduced, *solution) == certificate.evaluate(problem, mu, reduced, *solution)
+    one, other = (each.certify(problem, mu, reduced, *solution)[0] for each in (forgetful, certificate))
+    assert one == other
 
 
 @pytest.mark.parametrize("name", ["hertz", "moving"])

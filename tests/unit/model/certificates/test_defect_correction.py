@@ -1,3 +1,6 @@
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -6,7 +9,8 @@ from hypothesis import strategies as st
 from numerics import exact, spd
 
 from vibench.interfaces.problem import Contact, VariationalInequality
-from vibench.model.certificates.contact_correction import ContactCompliance, defect_corrected_bounds
+from vibench.model.certificates.bounds import OnlineCertificate
+from vibench.model.certificates.contact_correction import ContactCompliance
 
 N, M = 9, 4
 CONTACT = np.arange(2, 8)
@@ -42,10 +46,13 @@ class Pair:
         coordinates = rotated.T @ np.linalg.solve(half, f - A @ self.u_N - B.T @ self.lam_N)
         directions = np.linalg.solve(half, np.eye(N)[:, CONTACT]).T @ rotated
         compliance = ContactCompliance(np.linalg.inv(X)[np.ix_(CONTACT, CONTACT)], np.arange(len(CONTACT)), 0.0)
-        solution = self.u_N[CONTACT], np.zeros(len(CONTACT)), self.lam_N
+        on_contact, contact = (self.u_N[CONTACT], np.zeros(len(CONTACT))), Contact(sp.csr_array(B[:, CONTACT]), g)
+        certificate: Any = SimpleNamespace(
+            compliance=compliance, contact_directions=directions[:, :kept], margin=0.0, _on_contact=lambda _: on_contact
+        )
+        query: Any = SimpleNamespace(lam=self.lam_N, contact=contact, lower=self.spectrum[0], upper=self.spectrum[1])
         shown = coordinates[:kept], float(np.linalg.norm(coordinates[kept:]))
-        contact = Contact(sp.csr_array(B[:, CONTACT]), g)
-        return defect_corrected_bounds(compliance, directions[:, :kept], contact, solution, shown, self.spectrum, 0.0)
+        return OnlineCertificate._defect_corrected(certificate, query, *shown)
 
 
 SIZES = st.sampled_from([0.0, 1e-3, 1.0])

@@ -15,7 +15,7 @@ BLOCKS = [rng.standard_normal((40, 50)), rng.standard_normal((40, 10)), np.zeros
 
 def block_of(values: np.ndarray) -> ColumnBlock:
     """Columns that are what they stand for."""
-    return ColumnBlock(values, np.zeros(values.shape[1]))
+    return ColumnBlock(values, np.zeros(values.shape[1]), len(values))
 
 
 WHITENED = [block_of(X.whiten_functional(block)) for block in BLOCKS]
