@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, metadata
 from importlib.resources import files
@@ -36,27 +36,17 @@ from vibench.study.cells import Cell
 
 @dataclass(frozen=True)
 class ExportedModel:
-    """A reduced model as an exported file holds it.
+    """A reduced model as an exported file holds it."""
 
-    Attributes
-    ----------
-    members
-        A as packed upper triangle (row by row), f, B and g, as polynomials on the parameter box.
-    arrays
-        The other arrays of the file.
-    about
-        Everything else in it.
-    thetas
-        Polynomials of the θ that the certificate evaluates at a parameter, if there is one.
-    exact
-        Members and θ of a C source whose coefficients are declared as expressions.
-    """
-
+    # A as packed upper triangle (row by row), f, B and g, as polynomials on the parameter box.
     members: Mapping[str, AffinePolynomial]
+    # The other arrays of the file, and everything else in it.
     arrays: Mapping[str, Array]
     about: Mapping[str, Any]
-    thetas: Mapping[str, AffinePolynomial] = field(default_factory=dict)
-    exact: Mapping[str, ExactMember] = field(default_factory=dict)
+    # Polynomials of the θ that the certificate evaluates at a parameter, if there is one.
+    thetas: Mapping[str, AffinePolynomial]
+    # Members and θ of a C source whose coefficients are declared as expressions.
+    exact: Mapping[str, ExactMember]
 
     @property
     def error(self) -> float:

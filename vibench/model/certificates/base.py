@@ -303,15 +303,13 @@ def _constant_constraint(
     B, g, contact = members["B"], members["g"], contact_unknowns(problem)
     multiple = sp.csr_array(B.terms[0])[:, contact] if len(B.terms) == 1 and is_exact(problem, "B", B) else None
     if multiple is not None and is_exact(problem, "g", g):
-        inf_sup = online_inf_sup(X, problem.W, contact, multiple, None)
-        return multiple, np.column_stack(g.terms), inf_sup
+        return multiple, np.column_stack(g.terms), online_inf_sup(X, problem.W, contact, multiple, None)
     # copies: a problem may write the next constraint into the same arrays
     constraints = [contact_at(problem, mu).B.copy() for mu in training]
     same = constant_unknowns(compliance, constraints)
     constraint = sp.csr_array(sp.csr_array(constraints[0]) @ sp.diags_array(same.astype(float)))
-    if multiple is not None:
-        return constraint, None, online_inf_sup(X, problem.W, contact, multiple, None)
-    return constraint, None, online_inf_sup(X, problem.W, contact, constraint, same)
+    of_inf_sup = (constraint, same) if multiple is None else (multiple, None)
+    return constraint, None, online_inf_sup(X, problem.W, contact, *of_inf_sup)
 
 
 def _interpolation_errors(

@@ -52,7 +52,7 @@ from vibench.linalg.factorisations import implementation
 from vibench.model.affine import AffineMember
 from vibench.model.bound_terms import BoundNote, BoundTerms, CorrectionMode, in_dual_set
 from vibench.model.certificates.base import CertificateBase, Guarantee, contact_unknowns, is_exact
-from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction
+from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction, unknowns_near
 from vibench.model.certificates.prepared_correction import PreparedCorrections, prepare_corrections
 from vibench.model.certificates.residual import ColumnBlock, ResidualBasis, residual_basis, residual_coefficients
 from vibench.model.galerkin import ReducedProblem, contact_at
@@ -353,9 +353,10 @@ def prepare(
         for loads in (np.eye(len(dofs)), forces):
             values = scipy.linalg.solve_triangular(factor.trailing_factor, loads, trans="T", check_finite=False)
             blocks.append(ColumnBlock(values, of_solution * np.linalg.norm(values, axis=0), len(squares)))
-    compliance = ContactCompliance(base.compliance, _near(problem, chi, training), base.compliance_error)
+    near = np.any([unknowns_near(contact_at(problem, mu).B, chi) for mu in training], axis=0)
+    compliance = ContactCompliance(base.compliance, np.flatnonzero(near), base.compliance_error)
     contact_basis = np.ascontiguousarray(Phi[dofs])
-    z, typical, held = _sampled(model, base, compliance, contact_basis, forces, training)
+    z, typical, held = _sampled(model, base, compliance, forces, training)
     residual, U = residual_basis(blocks, z, typical, len(dofs))
     directions = scipy.linalg.solve_triangular(factor.trailing_factor, U)
     corrections = prepare_corrections(base.constraint, scaled, compliance, held, contact_basis, directions)
@@ -372,34 +373,17 @@ def prepare(
     return OnlineCertificate(base, residual, directions, compliance, contact_basis, chi, forces, margin, corrections)
 
 
-def _near(problem: Problem, chi: Array, training: Array) -> Indices:
-    """Contact unknowns that rows in the support of a generator, or next to it, touch at some training parameter."""
-    near = np.zeros(len(contact_unknowns(problem)), bool)
-    for mu in training:
-        contact = contact_at(problem, mu)
-        touches, rows = abs(sp.csr_array(contact.B)) > 0.0, np.any(chi > 0.0, axis=1)
-        # One ring of neighbours around the support: corrections seldom reach farther.
-        near |= touches.T @ (touches @ (touches.T @ rows))
-    return np.flatnonzero(near)
-
-
 def _sampled(
-    model: HyperReducedModel,
-    base: CertificateBase,
-    compliance: ContactCompliance,
-    rows: Array,
-    forces: Array | None,
-    training: Array,
+    model: HyperReducedModel, base: CertificateBase, compliance: ContactCompliance, forces: Array | None, mus: Array
 ) -> tuple[Array, float, Mask]:
-    """Samples of reduced solutions at training parameters.
+    """Samples of reduced solutions at training parameters, with the `forces` of `residual_coefficients`.
 
     They are coefficients (Z×S) of residuals, the median norm of corrections, and the rows (m,) that some of these hold.
-    `rows` are those of Φ (k×d) at the contact unknowns, `forces` those of `residual_coefficients`.
     """
-    problem, residuals, norms = model.problem, [], [0.0]
-    held = np.zeros(len(model.generators), bool)
+    problem, residuals, norms, held = model.problem, [], [0.0], np.zeros(len(model.generators), bool)
+    rows = np.ascontiguousarray(model.basis[contact_unknowns(problem)])
     # up to 200 samples, and a correction of every eighth: only medians and maxima of them are used
-    for number, mu in enumerate(training[:: -(-len(training) // 200)]):
+    for number, mu in enumerate(mus[:: -(-len(mus) // 200)]):
         reduced = model.assemble(mu)
         answer = solve_qp(reduced.program, "piqp", 1e-8, factor=reduced.factor)
         if answer.x is None or answer.alpha is None or not np.all(np.isfinite(answer.x)):

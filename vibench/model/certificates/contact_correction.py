@@ -150,6 +150,13 @@ class ContactCompliance:
         return found
 
 
+def unknowns_near(B: SparseMatrix, generators: Array) -> Mask:
+    """Contact unknowns (k,) that rows of B (m×k) in the support of a generator χ (m×R), or next to it, touch."""
+    touches, rows = abs(sp.csr_array(B)) > 0.0, np.any(generators > 0.0, axis=1)
+    # One ring of neighbours around the support: corrections seldom reach farther.
+    return np.asarray(touches.T @ (touches @ (touches.T @ rows)), bool)
+
+
 def find_contact_correction(
     compliance: ContactCompliance, contact: Contact, on_contact: Array, uncertain: Array, lam: Array, gamma: float
 ) -> ContactCorrection | None:

@@ -29,7 +29,7 @@ from vibench.highfidelity.active_set import (
     HighFidelitySolution,
     HighFidelitySolver,
     solve_unverified,
-)  # fmt: skip
+)
 from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Trainer
@@ -40,7 +40,7 @@ from vibench.linalg.definite import dense_inverse
 from vibench.linalg.inner_product import orthonormal_range
 from vibench.linalg.schur_complement import EliminationPattern, StaticCondensation
 from vibench.model.bound_terms import BoundTerms
-from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction
+from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction, unknowns_near
 from vibench.model.error_bounds import bound_terms, find_correction
 from vibench.model.errors import EnergyNorm, T
 from vibench.model.galerkin import contact_at, project
@@ -54,24 +54,15 @@ from vibench.timing import NO_TIME, Seconds, timed
 
 
 @dataclass(frozen=True)
-class Reduced:
-    """The reduced solution z (d,) and λ_N (m,) of an estimate, and what was assembled for it."""
-
-    vi: VariationalInequality
-    z: Array
-    lam: Array
-
-
-@dataclass(frozen=True)
 class ErrorEstimate:
     """Approximate value of `IncrementalModel.bound`, and whether it is this bound up to round-off.
 
-    `reduced` is of a problem whose A or f vary.
+    `reduced` are the inequality, z (d,) and λ_N (m,) of a problem whose A or f vary.
     """
 
     value: float
     is_bound: bool
-    reduced: Reduced | None
+    reduced: tuple[VariationalInequality, Array, Array] | None
 
 
 class ContactEstimates:
@@ -115,10 +106,7 @@ class ContactEstimates:
         self._at_contact = np.ascontiguousarray(self._basis[self._dofs])
         self._sizes = np.linalg.norm(self._at_contact, axis=1)
         self._stiffness, self._loads = self._grown(self._stiffness, self._A, self._f)
-        touches = abs(sp.csr_array(vi.B)[:, self._dofs]) > 0.0
-        rows = np.any(generators > 0.0, axis=1)
-        # contact unknowns in rows of the support of a generator, or in rows that touch one of these
-        near = self._near | np.asarray(touches.T @ (touches @ (touches.T @ rows)), bool)
+        near = self._near | unknowns_near(sp.csr_array(vi.B)[:, self._dofs], generators)
         if np.any(near & ~self._near):
             self._near = near
             self._compliance = ContactCompliance(self._compliance.matrix, np.flatnonzero(near), 0.0)
@@ -153,7 +141,7 @@ class ContactEstimates:
         # d products, their sum, and the round-off of Φ: as in `OnlineCertificate.unit_round_off`
         uncertain = (len(z) + 4.0) * EPS * float(np.linalg.norm(z)) * self._sizes
         best = find_contact_correction(self._compliance, contact, on_contact, uncertain, lam, gamma)
-        reduced = None if vi is None else Reduced(vi, z, lam)
+        reduced = None if vi is None else (vi, z, lam)
         if best is None:
             return ErrorEstimate(inf, False, reduced)
         _, _, C = self._compliance.blocks[len(best.unknowns) > len(self._compliance.near)]
@@ -215,8 +203,7 @@ class IncrementalModel:
 
     def __init__(self, problem: Problem, solver: HighFidelitySolver) -> None:
         self._problem, self._solver = problem, solver
-        self._whitened = np.zeros((problem.V.dim, 0))
-        self._basis = np.zeros((problem.V.dim, 0))
+        self._whitened, self._basis = np.zeros((problem.V.dim, 0)), np.zeros((problem.V.dim, 0))
         self.generators = np.zeros((problem.W.dim, 0))
         self._estimates: ContactEstimates | None = None
         self._last: tuple[bytes, ErrorEstimate] | None = None
@@ -247,10 +234,8 @@ class IncrementalModel:
     def solution(self, vi: VariationalInequality) -> tuple[Array, Array] | None:
         """The reduced solution u_N (n,) and λ_N ≥ 0 (m,) of `vi`; `None` if its program cannot be solved."""
         program = project(vi, self._basis, self.generators)
-        answer: ExactSolution | QPSolution | None = exact_solution(program)
-        if answer is None:
-            # No active set is exact up to round-off: the generators are dependent, for instance.
-            answer = solve_qp(program, "piqp", 1e-9)
+        # No active set is exact up to round-off where the generators are dependent, for instance.
+        answer: ExactSolution | QPSolution = exact_solution(program) or solve_qp(program, "piqp", 1e-9)
         if answer.x is None or answer.alpha is None:
             return None
         return self._basis @ answer.x, self.generators @ np.maximum(answer.alpha, 0.0)
@@ -284,10 +269,16 @@ class IncrementalModel:
             estimated = self._estimated(self._estimates, mu)
             if estimated.is_bound:
                 return estimated.value
-        vi, solved = self._assembled(mu)
-        if solved is None:
-            return inf
-        u, lam = solved
+        # the inequality and its reduced solution, those of the last estimate if it was there
+        last, self._last, self._state = self._last, None, None
+        if last is not None and last[0] == mu.tobytes() and (reduced := last[1].reduced) is not None:
+            vi, z, lam = reduced
+            u = self._basis @ z
+        else:
+            vi = checked_assembly(self._problem, mu)
+            if (solved := self.solution(vi)) is None:
+                return inf
+            u, lam = solved
         energy = EnergyNorm(vi.A, self._solver.condensed(vi))
         if (corrected := find_correction(vi, energy, u, lam)) is None:
             return inf
@@ -299,14 +290,6 @@ class IncrementalModel:
             return of_u
         in_W = ratio(float(W.norm(corrected.nu - lam)), float(W.norm(lam)))
         return max(of_u, ratio(terms.dual, pressed), in_W)
-
-    def _assembled(self, mu: Array) -> tuple[VariationalInequality, tuple[Array, Array] | None]:
-        """The inequality at mu (d,) and its reduced solution, those of the last estimate if it was there."""
-        last, self._last, self._state = self._last, None, None
-        if last is not None and last[0] == mu.tobytes() and (reduced := last[1].reduced) is not None:
-            return reduced.vi, (self._basis @ reduced.z, reduced.lam)
-        vi = checked_assembly(self._problem, mu)
-        return vi, self.solution(vi)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ and bounds of round-off. Otherwise there is no prepared one.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import scipy.linalg
@@ -104,7 +103,7 @@ class PreparedCorrections:
         margin, here = first_margin(round_off), lam.take(self.rows)
         for _ in range(4):
             wanted, scale = (excess + margin).take(self.rows), gamma / theta**2
-            released = here * self._diagonal <= -scale * wanted
+            released = here * self.compliance.diagonal() <= -scale * wanted
             nu = complementary(here + scale * (self.inverse @ wanted), self.inverse.__getitem__, released)
             nu = np.maximum(nu, 0.0)
             a = (theta / gamma) * (nu - here)  # c = B₀ᵀ a
@@ -122,10 +121,6 @@ class PreparedCorrections:
                 return None
             margin = margin + 2.0 * np.maximum(lacking, 0.0)
         return None
-
-    @cached_property
-    def _diagonal(self) -> Array:
-        return self.compliance.diagonal().copy()
 
 
 def _times(B: float | SparseMatrix, x: Array) -> Array:

@@ -123,9 +123,8 @@ class AnchorGrid:
         """
         values = np.linspace(box.lower, box.upper, 33)
         starts = np.vstack([0.5 * (box.lower + box.upper), box.sample(3, 17)])
-        paths = (
-            np.array([[_path(theta, mu, axis, values[:, axis]) for mu in starts] for axis in range(box.dim)]) * norms
-        )
+        every = range(box.dim)
+        paths = norms * np.array([[_path(theta, mu, axis, values[:, axis]) for mu in starts] for axis in every])
         lengths = np.linalg.norm(np.diff(paths, axis=2), axis=3).sum(axis=1)
         places = np.pad(np.cumsum(lengths, axis=1), ((0, 0), (1, 0)))
         moving = places[:, -1] > 0.0
@@ -262,21 +261,14 @@ def spectral_bounds(
     constants = [coercivity_and_continuity(checked_assembly(problem, mu).A, X) for mu in points]
     error = max(missed(mu) for mu in points)
     alpha, gamma = (np.array([constant.value for constant in one]) for one in zip(*constants, strict=True))
-    coefficients, proved = (
-        np.column_stack([theta(mu) for mu in points]),
-        all(c.proved for pair in constants for c in pair),
-    )
-    plain = SpectralBounds(grid, alpha, gamma, leading, leading @ coefficients, np.ones(len(terms)), error, proved)
+    coefficients = np.column_stack([theta(mu) for mu in points])
+    proved = all(constant.proved for pair in constants for constant in pair)
+    start, ones = leading @ coefficients, np.ones(len(terms))
+    plain = SpectralBounds(grid, alpha, gamma, leading, start, ones, error, proved, ranges)
     turn = plain.turned(box, theta)
     norms = [operator_norm(term, X) for term in combined(terms, turn.T)]
-    return replace(
-        plain,
-        turn=turn @ leading,
-        theta=turn @ plain.theta,
-        norms=np.array([norm.value for norm in norms]),
-        proved=proved and all(norm.proved for norm in norms),
-        ranges=ranges,
-    )
+    proved, values = proved and all(norm.proved for norm in norms), np.array([norm.value for norm in norms])
+    return replace(plain, turn=turn @ leading, theta=turn @ plain.theta, norms=values, proved=proved)
 
 
 def rotated(terms: tuple[SparseMatrix, ...], theta: Array) -> tuple[Array, list[SparseMatrix]]:

@@ -14,6 +14,7 @@ from numerics import exact, space, spd
 from vibench import create
 from vibench.errors import UnsupportedError
 from vibench.interfaces.affine import AffineSum
+from vibench.interfaces.affine_problem import AffineProblem
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import Contact, Problem, Sampler, VariationalInequality
 from vibench.interfaces.strategies import Enrichment, Kind
@@ -373,6 +374,32 @@ def test_a_multiplier_that_is_small_beside_the_error_of_u_is_bounded() -> None:
         x = np.linalg.lstsq(given[1].assemble(mu).basis, u_N)[0]
         bound, _, natural, _ = found(given, mu, x, np.zeros(M))
         assert natural <= bound.lambda_natural <= 1e-5 * bound.rho
+
+
+class Loose(AffineProblem):
+    """Two unknowns, one tied to the other, on springs so weak that round-off in the factor of A shows in the bound."""
+
+    parameters = ParameterBox(("load",), np.array([1.0]), np.array([2.0]), ("1",))
+
+    def __init__(self, springs: float) -> None:
+        self.V, self.W = (InnerProduct(sp.eye_array(size, format="csc")) for size in (2, 1))
+        A, B = (sp.csr_array(rows) for rows in ([[1.0 + springs, -1.0], [-1.0, 1.0 + springs]], [[-1.0, 0.0]]))
+        self.declare(A=A, f=[("load", np.ones(2))], B=B, g=np.ones(1))
+
+    def training_set(self) -> np.ndarray:
+        return self.parameters.grid(2)
+
+
+def test_a_residual_is_not_smaller_than_without_the_round_off_of_the_factor() -> None:
+    """Without contact the bound of u_N = 0 is ‖u‖_A: the computed norm is 2e-8 of it too small."""
+    problem: Any = Loose(3e-9)
+    _, model, certificate = certified(problem, np.eye(2, 1), np.ones((1, 1)))
+    stiffness = problem.assemble(np.ones(1)).A[0, 0] - 1.0  # of both unknowns together, without round-off
+    for load in (1.0, 1.5, 2.0):
+        mu = np.array([load])
+        bound, _ = certificate.certify(problem, mu, model.assemble(mu), np.zeros(1), np.zeros(1))
+        assert bound.guarantee is Guarantee.CERTIFIED
+        assert 0.0 <= bound.u_energy / (load * np.sqrt(2.0 / stiffness)) - 1.0 <= 1e-5
 
 
 @pytest.mark.parametrize("kind", KINDS[2::2])
