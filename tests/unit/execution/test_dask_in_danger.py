@@ -1,4 +1,4 @@
-"""A run on a dask cluster of which one worker dies, and another one comes late: rows as locally."""
+"""Runs on a dask cluster whose workers die, come late, are many, or whose scheduler disappears: rows as locally."""
 
 import json
 import os
@@ -8,8 +8,8 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from distributed import Client
@@ -17,6 +17,8 @@ from running import Vibench, assert_same_numbers, read_until, started
 from samples import wire_study, write_study
 
 pytestmark = pytest.mark.long
+
+Workers = Callable[[int], list[subprocess.Popen[bytes]]]
 
 SECONDS = 300.0
 """Longest wait for what happens in another process."""
@@ -30,66 +32,120 @@ def until(holds: Callable[[], object]) -> None:
         time.sleep(0.05)
 
 
+@contextmanager
+def scheduled(folder: Path, plugins: Path) -> Iterator[tuple[str, subprocess.Popen[bytes], Workers]]:
+    """The address and the process of a scheduler, and a function that starts workers of it in processes of their own.
+
+    All are killed at the end.
+    """
+    environment = os.environ | {"PYTHONPATH": str(plugins), "OMP_NUM_THREADS": "1"}
+    folder.mkdir(parents=True)
+    file, log = folder / "scheduler.json", (folder / "log").open("wb")
+
+    def start(*arguments: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "distributed.cli." + arguments[0], *arguments[1:]]
+        process = subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=log, start_new_session=True)
+        stack.callback(process.wait)
+        stack.callback(stop, process)
+        return process
+
+    def workers(count: int) -> list[subprocess.Popen[bytes]]:
+        options = ("--scheduler-file", str(file), "--nthreads", "1", "--no-nanny", "--no-dashboard")
+        return [start("dask_worker", *options, "--host", "127.0.0.1") for _ in range(count)]
+
+    with ExitStack() as stack:
+        stack.enter_context(log)
+        scheduler = start(
+            "dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)
+        )
+        until(file.exists)
+        yield str(json.loads(file.read_text())["address"]), scheduler, workers
+
+
+@pytest.fixture
+def waiting(tmp_path: Path, vibench: Vibench) -> str:
+    """A study of four cells, of which two wait for the file "go on"; it was run here, which has its rows in "local"."""
+    go_on = tmp_path / "go on"
+    waits = {"name": "cone-waits", "options": {"file": str(go_on)}}
+    path = write_study(tmp_path, wire_study(dual=["cpg", waits], solvers=["piqp", "proxqp"]))
+    go_on.touch()
+    here(vibench, tmp_path, path)
+    go_on.unlink()
+    return path
+
+
+def here(vibench: Vibench, folder: Path, path: str) -> None:
+    """Run a study on this machine; its artefacts are removed, of which the cluster would make no others."""
+    done = vibench(folder, "run", path, "--jobs", "2", "--out", "local")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def on(address: str, path: str) -> list[str]:
+    """The arguments of the command that runs a study on a cluster."""
+    return ["run", path, "--executor", "dask", "--scheduler", address, "--out", "dask"]
+
+
+def ended(process: subprocess.Popen[str]) -> list[str]:
+    """The lines of errors of a command that ends with exit code 0, but for that on the connection."""
+    _, err = process.communicate(timeout=SECONDS)
+    assert process.returncode == 0, err
+    return [line for line in err.splitlines() if "the connection is not authenticated" not in line]
+
+
+def test_a_late_worker_does_what_one_that_dies_leaves(
+    command: str, plugins_folder: Path, waiting: str, tmp_path: Path
+) -> None:
+    with scheduled(tmp_path / "cluster", plugins_folder) as (address, _, workers):
+        (first,) = workers(1)
+        until(lambda: arrived(address) == 1)
+        with started([command, *on(address, waiting)], tmp_path, plugins_folder) as process:
+            read_until(process, "[2/4] ok")
+            workers(1)
+            until(lambda: arrived(address) == 2)
+            stop(first)
+            (tmp_path / "go on").touch()
+            assert ended(process) == []
+    assert_same_numbers(tmp_path / "local", tmp_path / "dask")
+
+
+def test_a_scheduler_that_disappears_ends_the_run_which_goes_on_here(
+    command: str, plugins_folder: Path, waiting: str, vibench: Vibench, tmp_path: Path
+) -> None:
+    with scheduled(tmp_path / "cluster", plugins_folder) as (address, scheduler, workers):
+        workers(2)
+        until(lambda: arrived(address) == 2)
+        with started([command, *on(address, waiting)], tmp_path, plugins_folder) as process:
+            read_until(process, "[2/4] ok")
+            stop(scheduler)
+            _, err = process.communicate(timeout=SECONDS)
+    assert process.returncode == 1
+    assert err.splitlines()[-1].startswith("vibench: the dask ")
+    assert err.splitlines()[-1].endswith("run the same command again to continue")
+    (tmp_path / "go on").touch()
+    done = vibench(tmp_path, "run", waiting, "--jobs", "2", "--out", "dask")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert_same_numbers(tmp_path / "local", tmp_path / "dask")
+
+
+def test_twenty_workers_change_no_row(command: str, plugins_folder: Path, vibench: Vibench, tmp_path: Path) -> None:
+    axes: dict[str, Any] = {"dual": ["cpg", "mcpg", "nmf"], "solvers": ["piqp", "proxqp"]}
+    path = write_study(tmp_path, wire_study(primal=["online-supremizers", "decorrelated"], **axes))
+    here(vibench, tmp_path, path)
+    with scheduled(tmp_path / "cluster", plugins_folder) as (address, _, workers):
+        workers(20)
+        until(lambda: arrived(address) == 20)
+        with started([command, *on(address, path)], tmp_path, plugins_folder) as process:
+            assert ended(process) == []
+    assert_same_numbers(tmp_path / "local", tmp_path / "dask")
+
+
 def stop(process: subprocess.Popen[bytes]) -> None:
     """Kill a process and what it started."""
     if process.poll() is None:
         os.killpg(process.pid, signal.SIGKILL)
 
 
-@contextmanager
-def scheduled(folder: Path, plugins: Path) -> Iterator[tuple[str, Callable[[], subprocess.Popen[bytes]]]]:
-    """The address of a scheduler, and a function that starts a worker in a process of its own; all are killed."""
-    environment = os.environ | {"PYTHONPATH": str(plugins), "OMP_NUM_THREADS": "1"}
-    folder.mkdir(parents=True)
-    file, log = folder / "scheduler.json", (folder / "log").open("wb")
-
-    def start(*arguments: str) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", f"distributed.cli.{arguments[0]}", *arguments[1:], "--host", "127.0.0.1"]
-        command += ["--scheduler-file", str(file), "--no-dashboard"]
-        process = subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=log, start_new_session=True)
-        stack.callback(process.wait)
-        stack.callback(stop, process)
-        return process
-
-    with ExitStack() as stack:
-        stack.enter_context(log)
-        start("dask_scheduler", "--port", "0")
-        until(file.exists)
-        yield (
-            str(json.loads(file.read_text())["address"]),
-            partial(start, "dask_worker", "--nthreads", "1", "--no-nanny"),
-        )
-
-
 def arrived(address: str) -> int:
     """Number of workers that a scheduler has."""
     with Client(address, timeout="30s", set_as_default=False) as client:
         return len(client.scheduler_info(n_workers=-1)["workers"])
-
-
-def test_a_late_worker_does_what_one_that_dies_leaves(
-    command: str, plugins_folder: Path, vibench: Vibench, tmp_path: Path
-) -> None:
-    """Two of four cells wait for the file "go on"."""
-    go_on = tmp_path / "go on"
-    waits = {"name": "cone-waits", "options": {"file": str(go_on)}}
-    path = write_study(tmp_path, wire_study(dual=["cpg", waits], solvers=["piqp", "proxqp"]))
-    go_on.touch()
-    # the artefacts are removed, of which the cluster would make no others
-    done = vibench(tmp_path, "run", path, "--jobs", "2", "--out", "local")
-    assert (done.returncode, done.stderr) == (0, "")
-    go_on.unlink()
-    with scheduled(tmp_path / "cluster", plugins_folder) as (address, start_worker):
-        first = start_worker()
-        until(lambda: arrived(address) == 1)
-        options = ["run", path, "--executor", "dask", "--scheduler", address, "--out", "dask"]
-        with started([command, *options], tmp_path, plugins_folder) as process:
-            read_until(process, "[2/4] ok")
-            start_worker()
-            until(lambda: arrived(address) == 2)
-            stop(first)
-            go_on.touch()
-            _, err = process.communicate(timeout=SECONDS)
-            assert process.returncode == 0, err
-            assert all("the connection is not authenticated" in line for line in err.splitlines())
-    assert_same_numbers(tmp_path / "local", tmp_path / "dask")
