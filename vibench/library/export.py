@@ -222,11 +222,8 @@ def _licence(distribution: str) -> str:
 def _npz(model: ExportedModel) -> bytes:
     arrays: dict[str, Any] = {"format": np.array(FORMAT), "about": np.array(json.dumps(dict(model.about)))}
     # the script bounds no errors, and of a certificate only the C source needs more than its `lift`
-    arrays |= {
-        name: array
-        for name, array in model.arrays.items()
-        if name == "certificate_lift" or not name.startswith("certificate_")
-    }
+    left_out = {name for name in model.arrays if name.startswith("certificate_") and name != "certificate_lift"}
+    arrays |= {name: array for name, array in model.arrays.items() if name not in left_out}
     for name, member in model.members.items():
         arrays |= {f"{name}_indices": member.indices, f"{name}_coefficients": member.coefficients}
         arrays |= {f"{name}_terms": member.terms}
@@ -272,10 +269,10 @@ def _certificate_arrays(
     """The arrays of a certificate for which there is no `reason_for_none`."""
     # With the positions of the contact `unknowns`, those that take ν to a corrected u at mesh size are among them.
     # Bounds grow by what the measured errors of the polynomials, of A and of all θ, may add.
-    base, residual, corrections, terms = (
-        certificate.base, certificate.residual, certificate.prepared, certificate.base.bound_terms
-    )  # fmt: skip
-    assert corrections is not None  # there is no reason for none
+    base, residual, corrections = certificate.base, certificate.residual, certificate.prepared
+    terms = base.bound_terms
+    # there is no reason for none
+    assert corrections is not None
     assert terms is not None
     responses = np.zeros((len(corrections.basis), len(corrections.rows)))
     responses[corrections.moved] = corrections.responses
@@ -349,9 +346,8 @@ def _output_arrays(
     problem, outputs = model.problem, _linear(model.problem)
     if not outputs:
         return {}
-    of_u, of_lam = (
-        np.array(rows) for rows in zip(*(output_coefficients(problem, output) for output in outputs), strict=True)
-    )
+    pairs = [output_coefficients(problem, output) for output in outputs]
+    of_u, of_lam = (np.array(rows) for rows in zip(*pairs, strict=True))
     found = {"outputs_x": of_u @ basis, "outputs_alpha": of_lam @ generators}
     if certificate is not None and certificate.prepared is not None:
         B, X = certificate.base.constraint[certificate.prepared.rows], certificate.base.X

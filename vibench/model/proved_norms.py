@@ -55,11 +55,9 @@ class ProvedNorms:
         """Upper bounds of ‖v‖_A (k,) of vectors (n×k), and the largest share that round-off may have in the square."""
         found = np.maximum(np.sum(vectors * (self._A @ vectors), axis=0).astype(float), 0.0)
         lost = 1.01 * self._of_squares * self._largest_sum * (self._squares @ vectors.astype(float) ** 2)
-        share = float(
-            np.max(np.divide(lost, found, out=np.full_like(lost, np.inf), where=found > 0.0)[lost > 0.0], initial=0.0)
-        )
+        shares = np.divide(lost, found, out=np.full_like(lost, np.inf), where=found > 0.0)[lost > 0.0]
         # a little more than the round-off of what follows, and of the sums of these norms in bounds
-        return np.asarray(np.sqrt(found + lost) * (1.0 + 16.0 * EPS)), share
+        return np.asarray(np.sqrt(found + lost) * (1.0 + 16.0 * EPS)), float(np.max(shares, initial=0.0))
 
     def largest(self, vectors: Array) -> float:
         """An upper bound of ‖V y‖_A / |y| over y, for vectors V (n×k)."""

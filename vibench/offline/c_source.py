@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from importlib.resources import files
@@ -112,9 +112,8 @@ def source(
 
 
 def _filled(template: str, values: Mapping[str, Any]) -> str:
-    return Template(
-        (files("vibench.offline") / "templates" / f"{template}.template").read_text(encoding="utf-8")
-    ).substitute(values)
+    text = (files("vibench.offline") / "templates" / f"{template}.template").read_text(encoding="utf-8")
+    return Template(text).substitute(values)
 
 
 def _of_certificate(
@@ -189,5 +188,4 @@ def _numbers(values: Array | Indices) -> str:
 
 def _comment(text: str) -> str:
     """A text that cannot end a comment, in ASCII."""
-    kept: Iterable[str] = (char if re.fullmatch(r"[\w .,;:()\[\]=+-]", char, re.ASCII) else "_" for char in text)
-    return "".join(kept)
+    return "".join(char if re.fullmatch(r"[\w .,;:()\[\]=+-]", char, re.ASCII) else "_" for char in text)

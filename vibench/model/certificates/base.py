@@ -228,8 +228,7 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
         raise UnsupportedError(reason)
     A, f, dofs = members["A"], members["f"], contact_unknowns(problem)
     constant = is_exact(problem, "A", A) and A.way is Evaluation.CONSTANT
-    box = problem.parameters
-    centre = 0.5 * (box.lower + box.upper)
+    centre = 0.5 * (problem.parameters.lower + problem.parameters.upper)
     at_centre = A.terms[0] if constant else checked_assembly(problem, centre).A
     X = InnerProduct(at_centre, "A", problem.factorisation)
     terms, rotation, spectral, leading = list(A.terms), None, None, len(A.terms)

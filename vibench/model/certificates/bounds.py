@@ -19,8 +19,7 @@ has the residual r − (c X − A) w and violates nothing, so that both of its e
 ‖r − (c X − A) w‖²_{A⁻¹} + 2 νᵀ(B w − s). The norm is at most ρ/√α + ½ (γ − α)/√α ‖w‖_X for c = ½ (α + γ).
 
 **Bounds of u and λ apart.** If one error is much smaller than the other, its bound above is that of the larger one. A
-step of defect correction (docs/mathematics.md, "Bounds at online cost") separates them: û = u_N + z/c − w with
-z = X⁻¹r, c X w = Bᵀ(ν − λ_N) and c = ½ (α + γ) gives
+step of defect correction separates them: û = u_N + z/c − w with z = X⁻¹r, c X w = Bᵀ(ν − λ_N) and c = ½ (α + γ) gives
 
     ‖u − u_N‖_A ≤ √γ ‖û − u_N‖_X + δ,         ‖Bᵀ(λ − λ_N)‖_{A⁻¹} ≤ ‖Bᵀ(ν − λ_N)‖_{X⁻¹}/√α + δ,
 
@@ -157,17 +156,10 @@ class OnlineCertificate:
     def unit_round_off(self) -> Array:
         """Round-off (k,) of u_N at the contact unknowns, for coefficients of norm 1."""
         # d products, their sum, and the round-off of Φ itself: at most (d + 4) eps by Cauchy and Schwarz
-        terms = self.contact_basis.shape[1] + 4.0
-        return np.asarray(terms * EPS * np.linalg.norm(self.contact_basis, axis=1))
+        return np.asarray((self.contact_basis.shape[1] + 4.0) * EPS * np.linalg.norm(self.contact_basis, axis=1))
 
     def certify(
-        self,
-        problem: Problem,
-        mu: Array,
-        reduced: ReducedProblem,
-        x: Array,
-        alpha: Array,
-        mode: CorrectionMode = CorrectionMode.FEASIBLE,
+        self, problem: Problem, mu: Array, reduced: ReducedProblem, x: Array, alpha: Array, mode: CorrectionMode
     ) -> tuple[OnlineBound, OnlineCorrection | None]:
         """Bounds of a solution x (N',), α (R,) of a reduced program that a `HyperReducedModel` assembled at mu (d,).
 
@@ -335,32 +327,33 @@ def prepare(
     squares = X.diagonal()
     eliminated, of_solution = np.array(factor.backward_errors(squares)) / [base.share.value, sqrt(base.share.value)]
 
-    def block(matrix: SparseMatrix, vectors: Array, terms: int) -> ColumnBlock:
+    def block(values: Array, rounded: Array | float) -> ColumnBlock:
+        """Solutions with the factor, and the round-off in what they solve."""
+        return ColumnBlock(values, rounded + of_solution * np.linalg.norm(values, axis=0), len(squares))
+
+    def products(matrix: SparseMatrix, vectors: Array, terms: int) -> ColumnBlock:
         """The products with a sparse matrix, which enter sums of so many terms."""
-        values = factor.solve_factor_transposed(np.asarray(matrix @ vectors))
         unit = 1.01 * EPS * (np.max(np.diff(sp.csr_array(matrix).indptr)) + terms + 4.0) / sqrt(base.share.value)
         rounded = unit * (abs(matrix) @ np.abs(vectors)) / np.sqrt(squares)[:, None]
-        errors = np.linalg.norm(rounded, axis=0) + of_solution * np.linalg.norm(values, axis=0)
-        return ColumnBlock(values, errors, len(squares))
+        return block(factor.solve_factor_transposed(np.asarray(matrix @ vectors)), np.linalg.norm(rounded, axis=0))
 
-    loads = np.column_stack(members["f"].terms)
-    blocks = [block(sp.eye_array(len(loads), format="csr"), loads, loads.shape[1])]
-    blocks += [block(term, Phi, 0) for term in ([X] if base.spectral is None else base.terms)]
+    loads, trailing = np.column_stack(members["f"].terms), factor.trailing_factor
+    blocks = [products(sp.eye_array(len(loads), format="csr"), loads, loads.shape[1])]
+    blocks += [products(term, Phi, 0) for term in ([X] if base.spectral is None else base.terms)]
     if forces is None:
-        blocks += [block(B_q.T, chi, len(B.terms) + chi.shape[1]) for B_q in B.terms]
+        blocks += [products(B_q.T, chi, len(B.terms) + chi.shape[1]) for B_q in B.terms]
     else:
         # loads on the contact unknowns, which come last: the others are not touched
-        for loads in (np.eye(len(dofs)), forces):
-            values = scipy.linalg.solve_triangular(factor.trailing_factor, loads, trans="T", check_finite=False)
-            blocks.append(ColumnBlock(values, of_solution * np.linalg.norm(values, axis=0), len(squares)))
+        on_contact = np.eye(len(dofs)), forces
+        blocks += [block(scipy.linalg.solve_triangular(trailing, load, trans="T"), 0.0) for load in on_contact]
     near = np.any([unknowns_near(contact_at(problem, mu).B, chi) for mu in training], axis=0)
     compliance = ContactCompliance(base.compliance, np.flatnonzero(near), base.compliance_error)
     contact_basis = np.ascontiguousarray(Phi[dofs])
     z, typical, held = _sampled(model, base, compliance, forces, training)
     residual, U = residual_basis(blocks, z, typical, len(dofs))
-    directions = scipy.linalg.solve_triangular(factor.trailing_factor, U)
+    directions = scipy.linalg.solve_triangular(trailing, U)
     corrections = prepare_corrections(base.constraint, scaled, compliance, held, contact_basis, directions)
-    trailing, scale = np.abs(factor.trailing_factor), np.sqrt(squares[dofs])
+    trailing, scale = np.abs(trailing), np.sqrt(squares[dofs])
     # of the dense factor γ_{k+1}|F|ᵀ|F|, whose largest row sum in units of S is at least its norm
     dense = (len(dofs) + 2.0) * UNIT_ROUND_OFF * float(np.max(trailing.T @ (trailing @ (1.0 / scale)) / scale))
     eta = 1.01 * eliminated + 1.02 * dense / base.share.value

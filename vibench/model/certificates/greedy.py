@@ -81,7 +81,6 @@ class ContactEstimates:
             condensed = StaticCondensation(vi.A, EliminationPattern.of(vi.A, self._dofs))
             self._solve, compliance = SparseCholesky(vi.A, "A").solve, dense_inverse(condensed.dense_schur, "A")
         self._compliance = ContactCompliance(compliance, np.zeros(0, np.intp), 0.0)
-        self._near = np.zeros(len(self._dofs), bool)
         load = self._solve(self._f[:, None])[:, 0]
         self._load, self._square_of_load = load[self._dofs], float(self._f @ load)
         self._basis, self._at_contact = np.zeros((len(vi.f), 0)), np.zeros((len(self._dofs), 0))
@@ -106,9 +105,9 @@ class ContactEstimates:
         self._at_contact = np.ascontiguousarray(self._basis[self._dofs])
         self._sizes = np.linalg.norm(self._at_contact, axis=1)
         self._stiffness, self._loads = self._grown(self._stiffness, self._A, self._f)
-        near = self._near | unknowns_near(sp.csr_array(vi.B)[:, self._dofs], generators)
-        if np.any(near & ~self._near):
-            self._near = near
+        near = unknowns_near(sp.csr_array(vi.B)[:, self._dofs], generators)
+        near[self._compliance.near] = True
+        if near.sum() > len(self._compliance.near):
             self._compliance = ContactCompliance(self._compliance.matrix, np.flatnonzero(near), 0.0)
 
     def _grown(self, projected: Array, A: SparseMatrix, f: Array) -> tuple[Array, Array]:

@@ -86,11 +86,6 @@ class ResidualBasis:
         missing = float(self.norms @ np.abs(z)) + self.round_off * size
         return self.factor @ represented, self.remainder * size, missing
 
-    def norm(self, z: Array) -> float:
-        """Upper bound of the dual norm of the residual."""
-        coordinates, beside, missing = self.parts(z)
-        return float(np.hypot(np.linalg.norm(coordinates), beside)) * (1.0 + self.distortion) + missing
-
 
 def residual_basis(
     blocks: Sequence[ColumnBlock], samples: Array, beside: float, last: int | None = None

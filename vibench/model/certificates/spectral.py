@@ -220,7 +220,7 @@ class SpectralBounds:
 
         `declared` are the θ(µ) of the declared terms.
         """
-        lower, upper, delta = self._interpolated(mu, theta)
+        lower, upper, delta = self.interpolated(mu, theta)
         lacking = float(np.abs(delta) @ self.norms) + 2.0 * self.error
         lower, upper = lower - lacking, upper + lacking
         if self.ranges is None or declared is None:
@@ -228,7 +228,7 @@ class SpectralBounds:
         others = self.ranges.evaluate(declared)
         return max(lower, others[0]), min(upper, others[1])
 
-    def _interpolated(self, mu: Array, theta: Array) -> tuple[float, float, Array]:
+    def interpolated(self, mu: Array, theta: Array) -> tuple[float, float, Array]:
         """The interpolated α and γ, and the turned δ (L,)."""
         where, c = self.grid.weights(mu)
         # `take` is three times as fast as an index that is a list
@@ -239,11 +239,6 @@ class SpectralBounds:
     def _rows(self) -> Array:
         """α_i, γ_i and θ(µ_i), one row per anchor."""
         return np.column_stack([self.alpha, self.gamma, self.theta.T])
-
-    def turned(self, box: ParameterBox, theta: Callable[[Array], Array]) -> Array:
-        """Principal directions (L×L) of δ relative to α over the box, for these bounds without a second rotation."""
-        found = [self._interpolated(mu, theta(mu)) for mu in box.sample(200, 19)]
-        return np.linalg.svd(np.column_stack([delta / lower for lower, _, delta in found]))[0].T
 
 
 def spectral_bounds(
@@ -265,7 +260,9 @@ def spectral_bounds(
     proved = all(constant.proved for pair in constants for constant in pair)
     start, ones = leading @ coefficients, np.ones(len(terms))
     plain = SpectralBounds(grid, alpha, gamma, leading, start, ones, error, proved, ranges)
-    turn = plain.turned(box, theta)
+    # principal directions (L×L) of δ relative to α over the box, without a second rotation
+    found = [plain.interpolated(mu, theta(mu)) for mu in box.sample(200, 19)]
+    turn = np.linalg.svd(np.column_stack([delta / lower for lower, _, delta in found]))[0].T
     norms = [operator_norm(term, X) for term in combined(terms, turn.T)]
     proved, values = proved and all(norm.proved for norm in norms), np.array([norm.value for norm in norms])
     return replace(plain, turn=turn @ leading, theta=turn @ plain.theta, norms=values, proved=proved)
