@@ -244,12 +244,13 @@ def draw_figures(
     forms = tuple(dict.fromkeys(map(str, formats or ("png", "svg"))))
     if out is not None and len(paths) > 1:
         raise RequestError("--out is for the figures of one run; those of several go into their folders")
-    for path in paths:
-        draw_run(path, out or path.parent / "figures", forms)
+    whole = [draw_run(path, out or path.parent / "figures", forms) for path in paths]
+    if not all(whole):
+        raise Exit(1)
 
 
-def draw_run(path: Path, folder: Path, formats: tuple[str, ...] = ("png", "svg")) -> None:
-    """Draw all figures of a results file; Ctrl-C leaves the results and the figures that are drawn."""
+def draw_run(path: Path, folder: Path, formats: tuple[str, ...] = ("png", "svg")) -> bool:
+    """Draw all figures of a results file, and return whether none failed; Ctrl-C leaves those that are drawn."""
     from vibench.library.progress import DrawingDisplay
     from vibench.report import figures
 
@@ -264,6 +265,7 @@ def draw_run(path: Path, folder: Path, formats: tuple[str, ...] = ("png", "svg")
     for line in failures:
         warn(line)
     echo(f"{len(drawn)} figures: {folder}")
+    return not failures
 
 
 def publish_runs(

@@ -12,6 +12,7 @@ from typing import Any
 
 from vibench import provenance
 from vibench.errors import RequestError
+from vibench.execution.supervisor import OUT_OF_MEMORY
 from vibench.files import locked
 from vibench.model.certificates.base import Guarantee
 from vibench.plugins.plugin import Plugin
@@ -80,8 +81,7 @@ def ended_by_smaller_limits(database: ResultsDatabase, limits: Limits) -> set[st
     for cell, study, status, reason in database.ends():
         raised = {name for name, value in limits.model_dump().items() if value > known.get(study, {}).get(name, value)}
         late = status == Status.TIMEOUT and raised & {"query_seconds", "cell_seconds"}
-        # Workers name this limit in the reason.
-        if late or ("the limit is memory_gib" in reason and "memory_gib" in raised):
+        if late or (OUT_OF_MEMORY in reason and "memory_gib" in raised):
             ended.add(cell)
     return ended
 

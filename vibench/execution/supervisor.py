@@ -30,6 +30,9 @@ from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, ItemwiseStage, Stage, Unstored
 from vibench.timing import ONE_THREAD
 
+# Prefix of the reason of a job that exceeds the memory limit; the limit follows.
+OUT_OF_MEMORY = "out of memory: the limit is memory_gib"
+
 
 def code_here() -> str:
     """The code of vibench that determines numbers, and the libraries, in this process."""

@@ -138,9 +138,8 @@ def perform(
             return Failed(Status.ERROR, f"{error}; a plugin limits or closes the files of its process")
         return Unstored(str(error))
     except _NoMemoryError:
-        return supervisor.OutOfMemory(
-            Failed(Status.ERROR, f"out of memory: the limit is memory_gib = {job.memory_gib:g}")
-        )
+        reason = f"{supervisor.OUT_OF_MEMORY} = {job.memory_gib:g}"
+        return supervisor.OutOfMemory(Failed(Status.ERROR, reason))
 
 
 def _check_code(job: Job, batch: Batch) -> None:

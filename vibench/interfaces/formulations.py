@@ -34,8 +34,6 @@ AssemblingModel: TypeAlias = Any
 """A reduced model, whose `assemble(mu)` has the reduced `program`."""
 Certificate: TypeAlias = Any
 """A certificate at online cost."""
-ProgramSolution: TypeAlias = Any
-"""A `vibench.QPSolution`."""
 
 AXES = ("pod", "dual", "primal", "solvers", "accuracy", "assembly")
 """The axes of a study that a formulation may have; it is not repeated over those that it does not have."""
@@ -150,6 +148,26 @@ class FormulationAnswer:
     def none(cls, reason: str, outcome: Outcome = Outcome.FAILED) -> FormulationAnswer:
         """No answer, and why."""
         return cls(None, None, outcome, reason)
+
+
+class ProgramSolution(Protocol):
+    """The solution of a quadratic program, as `vibench.QPSolution`."""
+
+    @property
+    def x(self) -> Array | None:
+        """The unknowns (n,)."""
+
+    @property
+    def alpha(self) -> Array | None:
+        """The multipliers (m,) ≥ 0."""
+
+    @property
+    def solver_status(self) -> str:
+        """The status that the solver reports."""
+
+    @property
+    def iterations(self) -> int | None:
+        """Its steps, where it counts any."""
 
 
 class SolveQP(Protocol):

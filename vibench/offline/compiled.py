@@ -100,8 +100,8 @@ class CompiledProgram:
         code = self._solve(at.ctypes.data, x.ctypes.data, alpha.ctypes.data, residuals.ctypes.data)
         # The program adds 16 to its code at parameters outside the box.
         outcome = code % 16
-        texts = dict(enumerate(["solved", "inaccurate", "the constraints contradict each other", "not solved"]))
-        text = texts.get(outcome, f"code {code}")
+        texts = ("solved", "inaccurate", "the constraints contradict each other", "not solved")
+        text = texts[outcome] if outcome < len(texts) else f"code {code}"
         return QPSolution(x, alpha, text) if outcome in {0, 1} else QPSolution(None, None, text)
 
 

@@ -406,8 +406,7 @@ class Model:
             return pd.DataFrame([self._answered(at, settings).columns() for at in points])
         rows = []
         # Blocks bound the memory of the programs that are assembled together.
-        for start in range(0, len(points), size := 256):
-            block = points[start : start + size]
+        for block in (points[start : start + 256] for start in range(0, len(points), 256)):
             if isinstance(self.reduced, HyperReducedModel):
                 together, spent = timed(partial(self.reduced.assemble_all, np.array(block)))
                 assembled = ((reduced, spent.cpu / len(block)) for reduced in together)

@@ -149,8 +149,10 @@ class Reduction:
             raise RequestError("without a primal strategy there is no tolerance" if self.primal is None else of_one)
 
     def given(self, **steps: Any) -> Reduction:
-        """A reduction with the same inputs and these steps, by attributes; steps computed before are computed again."""
-        # Steps that were given before are kept; computed ones may depend on the new.
+        """A reduction with the same inputs and these steps prescribed, by the names of the attributes.
+
+        Steps that were given before are kept; computed ones are computed again, since they may depend on the new.
+        """
         other, kept = replace(self), self.__dict__.get("_given", {}) | steps
         # Cached properties look at the attributes of the instance first, so that these steps are never computed.
         other.__dict__.update(kept, _given=kept)

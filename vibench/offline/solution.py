@@ -200,8 +200,10 @@ class Solution:
 
     @property
     def output_bounds(self) -> dict[str, float]:
-        """Bounds of the absolute errors of `outputs`, by name, from `bound`; infinite where there are none."""
-        # There are none without `bound`, of outputs that are not linear, and of those of λ without a bound in W.
+        """Bounds of the absolute errors of `outputs`, by name, from `bound`; infinite where there are none.
+
+        There are none without `bound`, of outputs that are not linear, and of those of λ without a bound in W.
+        """
         bound, certificate, bounds = self.bound, self._model.certificate, dict.fromkeys(self._model.output_weights, inf)
         for name, weight in self._model.output_weights.items():
             if bound is not None and certificate is not None and weight is not None:

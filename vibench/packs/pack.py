@@ -35,7 +35,7 @@ class Listing(NamedTuple):
         away = np.abs((self.parameters - mu) / self.widths).max(axis=1)
         nearest = int(away.argmin())
         # Far above round-off, since assemblies are timed next to a parameter, far below distances of listed ones.
-        if away[nearest] > 1e-8:
+        if not away[nearest] <= 1e-8:  # not a number is not listed either
             raise NumericalError(f"the pack has arrays at its listed parameters only; mu = {mu.tolist()} is not listed")
         return nearest
 

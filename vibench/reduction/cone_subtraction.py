@@ -29,6 +29,7 @@ def subtract_cone_component(theta: Array, generators: Array, W: InnerProduct) ->
     # The solver may violate Υ ≤ θ. Scaling Υ down restores that and stays in the cone; round-off is clamped below.
     if np.any(over):
         shrink = float(np.min(theta[over] / part[over]))
+        # By less than the residual that is accepted below it is round-off.
         part *= shrink if shrink < 1.0 - 1e-9 else 1.0
     rest = np.maximum(theta - part, 0.0)
     units = np.sqrt(W.matrix.diagonal())

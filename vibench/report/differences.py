@@ -100,9 +100,13 @@ class ComparedRun:
         timings = read_table(self.path, "timings").sort_values(["cell", "round"])
         return {str(cell): list(rows["total_s"]) for cell, rows in timings.groupby("cell")}
 
+    @cached_property
+    def thresholds(self) -> pd.DataFrame:
+        return read_table(self.path, "thresholds")
+
     def thresholds_of(self, cells: Collection[str]) -> pd.DataFrame:
         """Rows of the break-evens in which no other cells take part."""
-        thresholds, keys = read_table(self.path, "thresholds"), set(cells)
+        thresholds, keys = self.thresholds, set(cells)
         of_a, of_b = (thresholds[end].isin(keys) for end in ("cell_a", "cell_b"))
         return thresholds[(of_a | thresholds["cell_a"].isna()) & of_b]
 

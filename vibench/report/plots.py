@@ -184,7 +184,10 @@ def _panel_text(panel: Axes) -> str:
         return ""
     named = [(unbroken(str(line.get_label())), np.asarray(line.get_ydata(), dtype=float)) for line in panel.lines]
     drawn = [(name, values[np.isfinite(values)]) for name, values in named if np.isfinite(values).any()]
+    extremes = []
     if len(drawn) > 6:
+        lowest, highest = min(drawn, key=lambda one: one[1].min())[0], max(drawn, key=lambda one: one[1].max())[0]
+        extremes = [f"the lowest is that of {lowest}", f"the highest that of {highest}"]
         drawn = [(f"{len(drawn)} series", np.concatenate([values for _, values in drawn]))]
     if not drawn:
         fields = [np.asarray(array) for one in panel.collections if (array := one.get_array()) is not None]
@@ -193,7 +196,7 @@ def _panel_text(panel: Axes) -> str:
         return ""
     # Matplotlib calls a line without a label "_child".
     ranges = [(name * (not name.startswith("_child")), values.min(), values.max()) for name, values in drawn]
-    said = "; ".join(f"{name} between {low:.3g} and {high:.3g}".strip() for name, low, high in ranges)
+    said = "; ".join([*(f"{name} between {low:.3g} and {high:.3g}".strip() for name, low, high in ranges), *extremes])
     title, x, y = (unbroken(text) for text in (panel.get_title(), panel.get_xlabel(), panel.get_ylabel()))
     what = f"{y} over {x}" if x and y else x or y
     return f"{': '.join(filter(None, (title, what)))}: {said}."

@@ -128,6 +128,9 @@ class SnapshotStage(Stage):
 
     def _sweep(self, problem: Problem, store: Store) -> Result:
         first, mus = chunk_of(self.parameters.of(problem), self.chunk)
+        # The factors of another problem are released before those of this one need memory.
+        if problem not in _set_up:
+            _set_up.clear()
         solver = _set_up[problem][0] if problem in _set_up else HighFidelitySolver(problem)
         work = _Work(problem, solver, ReferenceAssembly(problem), mus, mus.copy())
         # No solution may depend on what this process has solved before.
@@ -156,7 +159,6 @@ class SnapshotStage(Stage):
             beginning, seconds[0] = seconds[0], self._once_started(work, solutions, mus)
             # The first chunk of a process does the set-up; the others have none.
             if problem not in _set_up:
-                _set_up.clear()
                 _set_up[problem] = solver, beginning.beyond(seconds[0])
         self._probe(problem, work.reference)
         work.reference.refuse_rewritten_constants()

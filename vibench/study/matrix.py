@@ -246,8 +246,8 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
 def _plugin_entry(plugin: Plugin, label: str, **keys: Any) -> Any:
     given = plugin.registered
     name = given.given if isinstance(given, GivenPlugin) else plugin.name
-    kinds: dict[str, type[Entry]] = {"problem": ProblemEntry, "formulation": FormulationEntry}
-    entry = (kinds | {"sampling strategy": SamplingEntry}).get(plugin.kind, Entry)
+    kinds: dict[str, type[Entry]] = {PluginKind.PROBLEM: ProblemEntry, PluginKind.FORMULATION: FormulationEntry}
+    entry = (kinds | {PluginKind.SAMPLING: SamplingEntry}).get(plugin.kind, Entry)
     content = {"name": name, "label": label, "options": json.loads(plugin.options)} | keys
     return entry.model_validate(content).at(json.loads(plugin.places))
 

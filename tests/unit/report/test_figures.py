@@ -429,7 +429,7 @@ def test_a_figure_that_fails_costs_itself_and_has_a_line(
     monkeypatch.setattr(figures, "KINDS", failing)
     line = "the figure 'obstacle-solvers' could not be drawn: KeyError: 'nan'"
     code, out, err = main("figures", str(results), "--out", str(tmp_path / "here"), "--format", "svg")
-    assert (code, err) == (0, f"vibench: {line}\n")
+    assert (code, err) == (1, f"vibench: {line}\n")
     assert "\n1 figures: " in out
     assert line in html.unescape(report_page(results))
 

@@ -134,7 +134,8 @@ def render(
         progress(task[0], k, len(tasks))
         with styled():
             try:
-                rendered += [finish(name, page) for name, page in pages_of(task)]
+                for name, page in pages_of(task):
+                    rendered.append(finish(name, page))
             except OSError:
                 raise
             except Exception as error:  # noqa: BLE001  results nobody thought of cost their figure, not the run

@@ -371,6 +371,8 @@ def write_figure(figure: Figure, target: Path | BinaryIO, form: str) -> None:
     metadata: dict[str, str | None] = {{"png": "Software", "svg": "Date", "pdf": "CreationDate"}[form]: None}
     if caption := caption_of(figure):
         metadata["Subject" if form == "pdf" else "Description"] = printable(caption)
+    # Weak compression: line drawings are small anyway, and there are many of them.
+    more: dict[str, Any] = {"pil_kwargs": {"compress_level": 3}} if form == "png" else {}
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", r"Glyph \d+|Matplotlib currently does not support", UserWarning)
-        figure.savefig(target, format=form, metadata=metadata)
+        figure.savefig(target, format=form, metadata=metadata, **more)
