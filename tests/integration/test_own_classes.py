@@ -102,7 +102,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_same_classes_are_not_run_wire_and_edited_ones_are(folder: Path) -> None:
+def test_the_same_classes_are_not_run_again_and_edited_ones_are(folder: Path) -> None:
     before = vibench.open_run(folder / "out").cells
     assert run_source(folder, f"# a remark\n{SCRIPT}")[0] == 0
     count, status, _ = run_source(folder, SCRIPT.replace("DEPTH = 0.2", "DEPTH = 0.15"))

@@ -104,7 +104,7 @@ def test_other_cells_join_those_of_a_study_and_strict_fails_where_one_is_not_ok(
         assert (done.returncode, done.stderr) == (code, "")
 
 
-def test_an_edited_plugin_is_run_wire(vibench: Vibench, again: Path, plugins_folder: Path, tmp_path: Path) -> None:
+def test_an_edited_plugin_is_run_again(vibench: Vibench, again: Path, plugins_folder: Path, tmp_path: Path) -> None:
     """Problem and solvers come from the package that was edited, and one of them now does its work."""
     shutil.copytree(plugins_folder, tmp_path / "edited")
     with (tmp_path / "edited" / "fake_plugins.py").open("a", encoding="utf-8") as source:

@@ -162,6 +162,8 @@ def test_without_a_bulge_it_is_the_problem_of_the_paper() -> None:
         for name in ("A", "f", "B", "g"):
             exact = getattr(two, name)
             assert abs(getattr(one, name) - exact).max() <= 1e-13 * abs(exact).max()
+    form, outside = laplace.assemble(Basis(ROUND.mesh, ElementTriP1())), np.setdiff1d(ROUND.free, ROUND.disc_nodes)
+    assert np.abs(form[outside] @ (ROUND.points(OFF[:3]) - ROUND.mesh.p).T).max() < 1e-13  # harmonic outside the disc
     assert EGG.parameters.names == ("scale", "centre_x", "centre_y", "bulge")
     assert EGG.training_set().shape == (320, 4)
     assert EGG.validation_set(5, 1).shape == (5, 4)

@@ -80,6 +80,8 @@ def test_equilibrium_and_no_interpenetration(options: dict[str, Any], point: tup
 def test_a_and_f_are_constant_and_b_truly_varies(coarse: Hertz) -> None:
     one, two = (coarse.assemble(np.array([mu])) for mu in (0.8, 1.1))
     assert coarse.constant == {"A", "f"}
+    assert abs(one.A - two.A).max() == 0.0
+    assert np.array_equal(one.f, two.f)
     assert proportionality(one.B, two.B) is None
     assert not np.allclose(one.g, two.g)
 

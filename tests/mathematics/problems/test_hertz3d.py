@@ -167,7 +167,7 @@ def test_force_axes_peak_and_far_field_agree_with_the_closed_form(mu: np.ndarray
 
 
 def test_the_force_converges_from_above_with_second_order() -> None:
-    """Errors of odd and of even numbers of cells lie on two curves: 4, 6 and 8 cells have rates of 2.2 and 1.9."""
+    """Errors of odd and of even numbers of cells lie on two curves: these are even."""
     cells = np.array([2, 4, 6])
     errors = np.array([excess(count, flattened(MUS[1])) for count in cells])
     rates = np.log(errors[:-1] / errors[1:]) / np.log(cells[1:] / cells[:-1])

@@ -11,11 +11,12 @@ from skfem import Basis, ElementTriP1, Functional, MeshTri
 from skfem.helpers import dot, grad
 from skfem.models.poisson import laplace, unit_load
 
-from vibench import HighFidelitySolver, checked_assembly
+from vibench import HighFidelitySolver, Problem, checked_assembly
 from vibench.highfidelity import active_set
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
 from vibench_problems.p1_entries import LoadEntries, StiffnessEntries
+from vibench_problems.radial import Radial
 
 CENTRE = np.array([1.0, 0.0, 0.0])
 OFF = np.array([1.1, 0.03, -0.02])
@@ -185,6 +186,15 @@ def test_forms_are_those_of_a_finite_element_library_and_declared_sums_what_is_a
     assert vi.A.has_canonical_format
     assert abs(OBSTACLE.affine["B"].at(mu) - vi.B).max() <= 1e-15 * abs(vi.B).max()
     assert np.allclose(OBSTACLE.affine["g"].at(mu), vi.g, rtol=1e-14)
+
+
+@pytest.mark.parametrize("problem", [SMALL, Hertz(300), Radial(200)], ids=lambda one: type(one).__name__)
+@given(seeds)
+def test_the_constraint_on_the_contact_is_the_whole_one(problem: Problem, seed: int) -> None:
+    mu = problem.parameters.sample(1, seed)[0]
+    contact, vi = problem.contact(mu), problem.assemble(mu)
+    np.testing.assert_allclose(contact.B.toarray(), vi.B.toarray()[:, problem.contact_dofs], rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(contact.g, vi.g, rtol=1e-12, atol=1e-16)
 
 
 @pytest.mark.parametrize("names", [("A",), ("f",), ("A", "f"), ()])

@@ -18,7 +18,7 @@ from vibench_problems.line_contact import theory
 from vibench_problems.obstacle import RADIUS, Obstacle
 from vibench_problems.paper import published
 from vibench_problems.paper.__main__ import main
-from vibench_problems.paper.claims import Agreement, Claim, compared, holds, typeset
+from vibench_problems.paper.claims import Agreement, Claim, compared, exceptions, holds, typeset
 from vibench_problems.paper.evidence import Evidence, reached
 from vibench_problems.paper.figures import PAGE, drawings
 from vibench_problems.paper.sections import figure_claims, sections
@@ -210,6 +210,7 @@ def test_claims_are_sorted_by_their_verdicts() -> None:
     assert compared(claims) == "Agrees: a: x; d: x. Differs: b: x. Cannot be compared: c: x."
     assert reached({0: 1.0, 3: 0.1, 4: 0.05}, 0.1) == 3
     assert np.isnan(reached({0: 1.0}, 0.1))
+    assert exceptions({1: 1.0, 2: 3.0, 9: 1.0}, {1: 1.0, 2: 2.0}) == [2]
 
 
 def test_the_command_draws_the_figures_of_runs_and_a_page(

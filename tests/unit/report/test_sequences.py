@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -121,6 +122,9 @@ def test_an_exported_sequence_is_a_test_set_of_what_qpbenchmark_offers(
     stand_in: None, loaded: Any, run: Path, exported: Path
 ) -> None:
     examine(loaded, run, exported)
+    command = [sys.executable, "-I", str(exported / "check.py")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.strip()) == (0, "10 solutions, 10 claimed ok, 0 wrong")
 
 
 def test_the_released_qpbenchmark_loads_and_solves_it(run: Path, exported: Path, tmp_path: Path) -> None:

@@ -182,6 +182,10 @@ def test_labels_of_points_cover_neither_each_other_nor_leave_the_panel(points: l
     assert caption_of(figure) == (f"{missing} points have no label, since others are too close." if missing else "")
 
 
+def test_panels_that_are_left_over_are_hidden() -> None:
+    assert [one.axison for one in Sheet.with_panels(7, "seven").panels] == [True] * 7 + [False] * 2
+
+
 def test_a_point_without_a_text_is_kept_clear() -> None:
     """The label stands on another side than it would otherwise, and the empty one is not missed."""
     sides = []
