@@ -338,6 +338,13 @@ def test_a_reference_is_verified_by_its_bound_where_residuals_do_not_tell() -> N
     assert REFERENCE < module.reference_bound(vi, energy(vi), u, lam) < 1e-3
 
 
+def test_a_correction_without_room_for_round_off_is_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "first_margin", np.zeros_like)
+    vi, u, lam = scalar(lam=0.8, u=0.6)
+    found = find_correction(vi, energy(vi), u, lam)
+    assert np.all(found.constraints.lacking(found.contact.values(u), found.values, np.abs(u))[0] <= 0.0)
+
+
 def test_an_active_set_method_that_fails_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     """The w of dependent constraints is feasible and may be huge: a multiplier that no row alone would have tells."""
     vi, u, lam = scalar(lam=0.8, u=0.6)
