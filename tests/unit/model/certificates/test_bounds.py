@@ -393,11 +393,13 @@ class Loose(AffineProblem):
         return self.parameters.grid(2)
 
 
-def test_a_residual_is_not_smaller_than_without_the_round_off_of_the_factor() -> None:
+def test_round_off_of_the_factor_is_in_the_residual_and_in_the_compliance() -> None:
     """Without contact the bound of u_N = 0 is ‖u‖_A: the computed norm is 2e-8 of it too small."""
     problem: Any = Loose(3e-9)
     _, model, certificate = certified(problem, np.eye(2, 1), np.ones((1, 1)))
     stiffness = problem.assemble(np.ones(1)).A[0, 0] - 1.0  # of both unknowns together, without round-off
+    missed = certificate.base.compliance[0, 0] * stiffness * (2.0 + stiffness) / (1.0 + stiffness) - 1.0
+    assert 1e-9 <= abs(missed) <= certificate.base.compliance_error <= 1e-5
     for load in (1.0, 1.5, 2.0):
         mu = np.array([load])
         bound, _ = certificate.certify(problem, mu, model.assemble(mu), np.zeros(1), np.zeros(1), EVERY)
