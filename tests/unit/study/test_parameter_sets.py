@@ -57,6 +57,9 @@ def test_problems_and_restored_cells_have_sets_of_their_own(tmp_path: Path) -> N
     (alone,) = expand(study_of_cell(cell, "sample"))
     assert (alone.key, str(alone)) == (cell.key, str(cell))
     assert (alone.training.label, alone.validation.label) == ("sobol", "random")
+    # one parameter of both sets is allowed, see "same" below
+    shared = changed(STUDY, "training", to={"name": "list", "points": [[1.0, 0, 0], [0.9, 0, 0]]})
+    assert cells_of(changed(shared, "validation", to={"name": "list", "points": [[1.0, 0, 0], [1.1, 0, 0]]}), tmp_path)
 
 
 def test_files_are_beside_the_study_part_of_the_code_and_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
