@@ -182,21 +182,24 @@ def _panel_text(panel: Axes) -> str:
     """Title, axes, and every line of a panel with its range; of more than six lines the range of all."""
     if not panel.axison and not panel.collections:
         return ""
-    named = [(unbroken(str(line.get_label())), np.asarray(line.get_ydata(), dtype=float)) for line in panel.lines]
+    labels = (unbroken(str(line.get_label())) for line in panel.lines)
+    # Matplotlib calls a line without a label "_child".
+    names = ["" if label.startswith("_child") else label for label in labels]
+    named = [(name, np.asarray(line.get_ydata(), dtype=float)) for name, line in zip(names, panel.lines, strict=True)]
     drawn = [(name, values[np.isfinite(values)]) for name, values in named if np.isfinite(values).any()]
     extremes = []
     if len(drawn) > 6:
-        lowest, highest = min(drawn, key=lambda one: one[1].min())[0], max(drawn, key=lambda one: one[1].max())[0]
-        extremes = [f"the lowest is that of {lowest}", f"the highest that of {highest}"]
+        lowest, highest = min(drawn, key=lambda one: one[1].min()), max(drawn, key=lambda one: one[1].max())
+        ends = {"lowest": lowest[0], "highest": highest[0]}
+        extremes = [f"the {which} is that of {name}" for which, name in ends.items() if name]
         drawn = [(f"{len(drawn)} series", np.concatenate([values for _, values in drawn]))]
     if not drawn:
         fields = [np.asarray(array) for one in panel.collections if (array := one.get_array()) is not None]
         drawn = [("a field", field[np.isfinite(field)]) for field in fields if np.isfinite(field).any()]
     if not drawn:
         return ""
-    # Matplotlib calls a line without a label "_child".
-    ranges = [(name * (not name.startswith("_child")), values.min(), values.max()) for name, values in drawn]
-    said = "; ".join([*(f"{name} between {low:.3g} and {high:.3g}".strip() for name, low, high in ranges), *extremes])
+    ranges = (f"{name} between {values.min():.3g} and {values.max():.3g}".strip() for name, values in drawn)
+    said = "; ".join([*ranges, *extremes])
     title, x, y = (unbroken(text) for text in (panel.get_title(), panel.get_xlabel(), panel.get_ylabel()))
     what = f"{y} over {x}" if x and y else x or y
     return f"{': '.join(filter(None, (title, what)))}: {said}."

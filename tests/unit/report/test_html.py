@@ -9,10 +9,11 @@ from typing import Any
 
 import pytest
 from markupsafe import escape
+from matplotlib.figure import Figure
 from outputs import Links, clean, elements
 from running import Changed, Main
 
-from vibench.report import html
+from vibench.report import html, plots
 from vibench.report.figures.data import problem_tables
 from vibench.report.findings import Finding, Weight, findings
 from vibench.results.ranking import leaderboard
@@ -202,3 +203,17 @@ def test_answers_that_are_all_undecided_are_shown(changed: Changed) -> None:
     path = changed("UPDATE thresholds SET meaning = 'undecided', benefit_threshold = NULL, threshold_low = 7")
     table = data(html.page(path, figures=False), "table-data")["model"]
     assert "break-even" not in table["hidden"]
+
+
+def test_a_picture_is_described_by_its_lines_or_by_the_ends_of_many() -> None:
+    figure = Figure()
+    few, many = figure.subplots(1, 2)
+    few.set(title="few", xlabel="x [1]", ylabel="y [1]")
+    few.plot([1, 2], [3.0, 0.5], label="a model")
+    many.set(title="many")
+    for k in range(7):
+        many.plot([1, 2], [k, k + 1.0], label=f"δ = {k}" if k else None)  # the lowest has no name
+    assert plots.seen(figure) == (
+        "2 panels. few: y [1] over x [1]: a model between 0.5 and 3. "
+        "many: 7 series between 0 and 7; the highest is that of δ = 6."
+    )
