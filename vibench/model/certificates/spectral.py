@@ -121,8 +121,8 @@ class AnchorGrid:
 
         Bounds hold on any grid: if θ varies elsewhere than is seen here, they are only less sharp.
         """
-        values = np.linspace(box.lower, box.upper, 33)
-        starts = np.vstack([0.5 * (box.lower + box.upper), box.sample(3, 17)])
+        values = np.linspace(box.lower, box.upper, 257)
+        starts = np.vstack([0.5 * (box.lower + box.upper), box.sample(1, 17)])
         every = range(box.dim)
         paths = norms * np.array([[_path(theta, mu, axis, values[:, axis]) for mu in starts] for axis in every])
         lengths = np.linalg.norm(np.diff(paths, axis=2), axis=3).sum(axis=1)
