@@ -84,7 +84,11 @@ class Model:
         return [numbers.setdefault(key, len(numbers)) for key in keys], degrees, matrices
 
     def _check(self, file: str) -> None:
-        """Refuse indices that are none, which NumPy would count from the end, and arrays that do not fit them."""
+        """Refuse numbers that are not finite, indices that NumPy counts from the end, and arrays that do not fit."""
+        for name, array in self.data.items():
+            text = name in {"format", "about"}
+            if array.dtype.kind not in ("U" if text else "fiu") or (not text and not np.isfinite(array).all()):
+                raise ValueError(f"'{file}' is damaged: the array {name} does not consist of finite numbers")
         lower = self.data.get("lower", np.zeros(0))
         for name in [key.removesuffix("_indices") for key in self.data if key.endswith("_indices")]:
             of = [self.data.get(f"{name}_{part}", np.zeros(0)) for part in ("indices", "coefficients", "terms")]

@@ -395,8 +395,17 @@ def test_any_constraints(case: str, scale: float, tmp_path: Path) -> None:
     assert set(codes) <= {0, 2}
 
 
-def test_matrices_that_are_not_positive_definite_fail(tmp_path: Path) -> None:
-    one = {name: linear(np.array([value]), {}, 1) for name, value in zip("AfBg", (-1.0, 1.0, 1.0, 1.0), strict=True)}
-    text = c_source.source(one, {"lower": np.zeros(1), "upper": np.ones(1)}, about(["t"]), "9-lives")[0]
+def test_matrices_that_are_not_positive_definite_and_numbers_that_are_not_finite_fail(tmp_path: Path) -> None:
+    """No constraint seems violated where its bound is NaN, and `fmin` hides a parameter that is NaN or infinite."""
+    members = {name: linear(np.zeros(1), {k: 0}, 4) for k, name in enumerate("AfBg")}
+    arrays, hidden = {"lower": -np.ones(4), "upper": np.ones(4)}, c_source.ExactMember(("fmin(mu[2], 1.0)",), np.eye(1))
+    text = c_source.source(members, arrays, about(["t"] * 4), "9-lives", exact={"B": hidden})[0]
     (tmp_path / "model_9_lives.c").write_text(text, encoding="utf-8")
-    assert compiled(tmp_path / "model_9_lives.c", 1, 1)(np.array([0.5]))[0] == 3
+    solve = compiled(tmp_path / "model_9_lives.c", 1, 1)
+    wrong = ((k, value, 19) for k in range(4) for value in (np.nan, np.inf, -np.inf))
+    for k, value, expected in ((1, 0.5, 0), (0, -1.0, 3), *wrong):
+        mu = np.full(4, 0.5)
+        mu[k] = value
+        code, *numbers = solve(mu)
+        assert code == expected
+        assert np.isnan(np.concatenate(numbers)).all() == (code > 0)

@@ -370,7 +370,7 @@ def test_a_file_that_is_no_model_is_refused(tmp_path: Path) -> None:
             Exported(other)
 
 
-def test_indices_that_lead_elsewhere_are_refused(run: vibench.Run, tmp_path: Path) -> None:
+def test_indices_that_lead_elsewhere_and_numbers_that_are_none_are_refused(run: vibench.Run, tmp_path: Path) -> None:
     per_file(model_of(run, "radial-obstacle"), tmp_path)
     with np.load(tmp_path / "model.npz") as data:
         arrays = dict(data)
@@ -379,9 +379,12 @@ def test_indices_that_lead_elsewhere_are_refused(run: vibench.Run, tmp_path: Pat
         ("g_indices", lambda indices: indices.astype(np.uint64) + np.uint64(2**63)),
         ("f_indices", lambda indices: indices + 0.5), ("f_indices", lambda indices: indices[:, :0]),
         ("A_coefficients", lambda values: values[:-1]), ("A_terms", lambda values: values[:, 0]),
+        *((name, lambda values: values / 0.0) for name in ("generators", "basis", "g_terms", "lower")),
     ):  # fmt: skip
-        np.savez(tmp_path / "other.npz", **arrays | {name: alter(arrays[name])})
-        with pytest.raises(ValueError, match=r"other\.npz' is damaged: the arrays of . are no polynomial in"):
+        with np.errstate(all="ignore"):
+            np.savez(tmp_path / "other.npz", **arrays | {name: alter(arrays[name])})
+        reasons = f"the arrays of {name[0]} are no polynomial in|the array {name} does not consist of finite numbers"
+        with pytest.raises(ValueError, match=rf"other\.npz' is damaged: ({reasons})"):
             Exported(tmp_path / "other.npz")
 
 
