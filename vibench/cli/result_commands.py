@@ -182,6 +182,9 @@ def _print_overview(compared: Comparison) -> None:
 
     _print_compared(compared.by_run, "runs", every=True)
     echo("")
+    if len(compared.verdicts):
+        _print_compared(compared.verdicts, "the best models within 1 % for u and λ")
+        echo("")
     names = [run.name for run in compared.runs]
     title = f"{names[1]} against {names[0]}" if len(names) == 2 else f"against {names[0]}"
     by_column = compared.by_column

@@ -10,7 +10,7 @@ import typer
 from typer import Argument, Option
 
 from vibench.cli.completion import corrections, duals, formulations, primals, problems, solvers, studies
-from vibench.cli.console import echo, print_frame, run_argument, warn
+from vibench.cli.console import echo, run_argument, warn
 from vibench.cli.result_commands import At, draw_run, places_of
 from vibench.errors import RequestError, VibenchError
 from vibench.interrupts import interrupted_at_once
@@ -79,10 +79,10 @@ def run_study_command(
     options = Options(jobs or 0, fresh, retry, executor, scheduler, repeats or 0)
     with ProgressDisplay() as progress:
         outcome = run_study(loaded, folder, progress, options)
-    _conclude(loaded.name, outcome, folder, draw=draw, fresh=fresh, strict=strict)
+    _conclude(outcome, folder, draw=draw, fresh=fresh, strict=strict)
 
 
-def _conclude(name: str, outcome: RunResult, folder: Path, *, draw: bool, fresh: bool, strict: bool) -> None:
+def _conclude(outcome: RunResult, folder: Path, *, draw: bool, fresh: bool, strict: bool) -> None:
     """Write the tables, print the summary and draw the figures of a run; exit by its statuses."""
     from vibench.results import show
     from vibench.results.read import results_file
@@ -99,7 +99,8 @@ def _conclude(name: str, outcome: RunResult, folder: Path, *, draw: bool, fresh:
     # A run without any result still has its tables, but no summary and no figures.
     statuses = [row["status"] for row in outcome.rows]
     nothing_ran = set(statuses) == {Status.UNAVAILABLE}
-    whole = not nothing_ran and print_summary(name, path, outcome.rows)
+    if not nothing_ran:
+        print_summary(path, outcome.rows)
     echo(f"results: {path}, tables: {folder / 'tables'}")
     # Figures of an earlier run would show other numbers.
     if (fresh or draw) and (folder / "figures").is_dir():
@@ -111,8 +112,7 @@ def _conclude(name: str, outcome: RunResult, folder: Path, *, draw: bool, fresh:
         raise VibenchError(f"no cell could run here: {'; '.join(_first(reasons, 'other reasons'))}")
     if draw:
         draw_run(path, folder / "figures")
-    table = "this table again" if whole else f"all {len(statuses)} cells"
-    next_steps(folder, table, all_ok=set(statuses) == {Status.OK}, figures=draw)
+    next_steps(folder, all_ok=set(statuses) == {Status.OK})
     if strict and any(status not in (Status.OK, Status.UNAVAILABLE) for status in statuses):
         raise typer.Exit(1)
 
@@ -146,37 +146,28 @@ def _first(lines: Sequence[str], others: str) -> list[str]:
 Rows = Sequence[Mapping[str, Any]]
 
 
-def print_summary(study: str, path: Path, rows: Rows) -> bool:
-    """Print the summary, failures and violated invariants of a run; returns whether the summary has all cells."""
-    from vibench.results import consistency, show
-    from vibench.results.read import read_in_parts, read_table
+def print_summary(path: Path, rows: Rows) -> None:
+    """Print whether reduction pays, failures, and violated invariants of a run."""
+    from vibench.results import consistency
+    from vibench.results.read import in_order, read_in_parts, read_table
+    from vibench.results.verdict import verdicts
 
-    cells = read_table(path, "cells")
-    # A table of more cells is longer than a screen: only the best are printed.
-    whole = len(cells) <= 20
-    table = show.look_up(path, "summary" if whole else "best")
-    if len(table.rows):
-        title = study if whole else f"{study}, the fastest query at every error reached"
-        print_frame(table.readable, title, table.priority, axes=table.axes)
-    elif len(cells):
-        echo(table.view.empty)
+    cells = in_order(read_table(path, "cells"))
+    echo(*map(str, verdicts(cells, read_table(path, "thresholds"))))
     echo(*failures(rows, run_argument(path.parent)))
-    ok = sum(row["status"] == Status.OK for row in rows)
-    echo(f"{len(rows)} cells, {ok} ok, {len(rows) - ok} not ok")
-    kinds, queries = cells.set_index("cell")["enrichment_kind"], 0
-    violations: list[consistency.Violation] = []
+    kinds, violations = cells.set_index("cell")["enrichment_kind"], list[consistency.Violation]()
     # Queries are read in parts: a large run has more than memory holds.
     for part in read_in_parts(path, "queries"):
-        queries += len(part)
         violations += consistency.violations(part, kinds)
     bug = "this is a bug of vibench or of a plugin's inner products"
     violated = [f"invariant: {violation}; {bug}" for violation in consistency.added_up(violations)]
     echo(*_first(violated, "more violated invariants"))
-    if queries and not violations:
-        echo(f"invariants of the constants and the error bounds hold in all {queries} queries")
-    if agreement := consistency.agreement_sentence(read_table(path, "disagreements"), cells["solver"].nunique()):
-        echo(agreement)
-    return whole
+    disagreements, ok = read_table(path, "disagreements"), sum(row["status"] == Status.OK for row in rows)
+    differ = bool(disagreements["flagged"].sum())
+    if differ:
+        echo(consistency.agreement_sentence(disagreements, cells["solver"].nunique()))
+    counted = f"{len(rows)} cells, {f'{ok} ok, {len(rows) - ok} not ok' if ok < len(rows) else 'all ok'}"
+    echo(counted + "; no check of constants, bounds and solvers failed" * (ok > 0 and not violated and not differ))
 
 
 def failures(rows: Rows, run: str) -> Iterator[str]:
@@ -214,15 +205,14 @@ def failures(rows: Rows, run: str) -> Iterator[str]:
         yield f"{sum(map(len, ranked[10:]))} cells not ok for {len(ranked) - 10} other reasons"
 
 
-def next_steps(folder: Path, table: str, *, all_ok: bool, figures: bool) -> None:
-    """Print the commands that show more of a run, each with its purpose; the first one prints a `table`."""
+def next_steps(folder: Path, *, all_ok: bool) -> None:
+    """Print the commands that show more of a run, each with its purpose."""
     run = run_argument(folder)
-    steps = [(f"vibench show {run}", table)]
-    if not all_ok:
+    steps = [(f"vibench report {run}", "one HTML page: answers, tables, figures")]
+    if all_ok:
+        steps.append((f"vibench show {run} --table benefits", "which model pays, from how many queries on"))
+    else:
         steps.append((f"vibench show {run} --columns cell,reason --where \"status != 'ok'\"", "what is not ok"))
-    steps.append((f"vibench report {run}", "one HTML page: findings, tables, figures"))
-    if not figures:
-        steps.append((f"vibench figures {run}", "the figures as PNG and SVG"))
     # Beside 36 characters of a command 80 columns have room for its purpose; a longer command has its own line.
     width = max((len(command) for command, _ in steps if len(command) <= 36), default=36)
     echo("next:")

@@ -23,6 +23,7 @@ from vibench.results import formats, ranking, show
 from vibench.results.read import cells_with_errors, in_order, read_table, results_file
 from vibench.results.schema import TABLES
 from vibench.results.sqlite import read_meta, study_of
+from vibench.results.verdict import Verdict, verdicts
 from vibench.study.spec import Study
 
 if TYPE_CHECKING:
@@ -119,6 +120,11 @@ class Run:
         # An empty measure is the default of the table, whose heading then needs no name.
         of_solution = "" if measure == "solution" else measure
         return show.look_up(self.path, "best", error=of_solution, largest=error, queries=queries).rows
+
+    @property
+    def verdict(self) -> list[Verdict]:
+        """Whether reduction pays: for every problem the cost of a full solution, and the best model within 1 %."""
+        return list(verdicts(self.cells, self.thresholds))
 
     @property
     def summary(self) -> pd.DataFrame:

@@ -56,6 +56,25 @@ class Comparison:
         return frame
 
     @property
+    def verdicts(self) -> pd.DataFrame:
+        """A row per run and problem with a model within the error of a verdict: its seconds, and when it pays."""
+        axes = ["formulation", "dual", "primal", "solver"]
+        found = [(run.name, one, one.best) for run in self.runs for one in run.verdicts]
+        rows = [
+            (
+                name,
+                one.problem,
+                *(best[axis] for axis in axes),
+                1e3 * one.full_s,
+                1e3 * best["online_s"],
+                one.break_even,
+            )
+            for name, one, cell in found
+            if cell and one.within
+        ]
+        return pd.DataFrame(rows, columns=["run", "problem", *axes, "full [ms]", "query [ms]", "pays"])
+
+    @property
     def by_column(self) -> pd.DataFrame:
         """A row per column and pair of runs: how many cells have which verdict; the median ratio and its interval."""
         rows = []

@@ -21,6 +21,7 @@ from vibench.results.paired_timing import DRAWS
 from vibench.results.read import in_order, read_table
 from vibench.results.schema import STORED
 from vibench.results.sqlite import FILE, read_meta, study_of
+from vibench.results.verdict import Verdict, verdicts
 from vibench.stability.infsup import VANISHES
 from vibench.timing import FEWEST_ROUNDS
 
@@ -48,6 +49,11 @@ class ComparedRun:
         validation = study.get("validation")
         shown = validation if isinstance(validation, int) else json.dumps(validation, sort_keys=True)
         return {"study": study.get("name"), "seed": study.get("seed"), "validation": shown}
+
+    @cached_property
+    def verdicts(self) -> tuple[Verdict, ...]:
+        """Whether reduction pays, problem by problem."""
+        return tuple(verdicts(in_order(read_table(self.path, "cells")), self.thresholds))
 
     @property
     def ok(self) -> int:

@@ -17,11 +17,10 @@ from vibench.model.bound_terms import CorrectionMode
 from vibench.model.errors import UNMEASURABLE
 from vibench.qp.status import Status
 from vibench.report.figures import data as tables
-from vibench.report.figures.data import Comparable, ProblemTables, label, label_of, whole
+from vibench.report.figures.data import Comparable, ProblemTables, label, label_of
 from vibench.results import consistency, formats
 from vibench.results.consistency import agreement_sentence
-from vibench.results.paired_timing import PairedTiming
-from vibench.results.ranking import LARGEST_BAND, Criterion, eligible, leaderboard, too_loose
+from vibench.results.ranking import LARGEST_BAND, eligible, too_loose
 from vibench.results.read import read_table
 from vibench.results.schema import KEYS, TABLES
 from vibench.stability.infsup import VANISHES
@@ -32,7 +31,6 @@ class Weight(IntEnum):
 
     ALARM = auto()
     WHOLE_RUN = auto()
-    ANSWER = auto()
     COMPARISON = auto()
     DETAIL = auto()
 
@@ -59,11 +57,10 @@ def all_findings(
     read: Mapping[str, pd.DataFrame], by_problem: Iterable[tuple[str, ProblemTables]]
 ) -> Iterator[Finding]:
     """Findings from the tables of a run and from its `problem_tables`: on the whole run, then problem by problem."""
-    paired = PairedTiming(read["timings"].to_dict("records"))
     for weight, text in _whole_run(read):
         yield Finding("", text, weight)
     for name, data in by_problem:
-        about = [(name, Weight.ANSWER, _answer(data, paired))]
+        about = list[tuple[str, Weight, Iterator[str]]]()
         for title, cells in tables.by_dimensions(tables.best_solver(data.cells)):
             compared = tables.on_common_queries(cells, data.queries)
             about.append((f"{name}, {title}", Weight.COMPARISON, _stability(cells, compared)))
@@ -136,32 +133,6 @@ def _number(count: int, noun: str) -> str:
 
 def _are(items: pd.DataFrame | list[Any]) -> str:
     return "is" if len(items) == 1 else "are"
-
-
-def _answer(data: ProblemTables, paired: PairedTiming) -> Iterator[str]:
-    """The fastest query of a problem in the widest and in the narrowest band of the leaderboard."""
-    for standings in leaderboard(data.cells, paired):
-        if not standings.bands:
-            none = f"None of {_number(standings.cells, 'cell')} has every query ok and mean errors of at most"
-            yield f"{none} {_percent(LARGEST_BAND)}."
-        # The widest and the narrowest band, which are one where there is one.
-        for band in standings.bands[:1] + standings.bands[1:][-1:]:
-            winner = band.winner(Criterion.QUERY)
-            if winner is None:
-                continue
-            cell, ties = winner.cell, len(winner.ties)
-            shared = f"; {_number(ties, 'other model')} may be as fast" if ties else ""
-            of_these = f"Of {_number(band.cells, 'cell')} with mean errors of at most {_percent(band.error)}"
-            if not cell["cell"]:
-                solution = f"a high-fidelity solution, which takes {_milliseconds(winner.value)}"
-                yield f"{of_these}, none has a query faster than {solution}{shared}."
-                continue
-            sizes = f"(N, R) = ({whole(cell['N'])}, {whole(cell['R'])}), {cell['solver']}"
-            yield (
-                f"{of_these}, the fastest query is that of {label_of(cell)} on the cone of {cell['dual']}, {sizes}: "
-                f"{_milliseconds(winner.value)}, with mean errors of {_errors(cell)}; a high-fidelity solution takes "
-                f"{_milliseconds(cell['hf_s'])}{shared}."
-            )
 
 
 def _percent(error: float) -> str:

@@ -182,6 +182,7 @@ def page(path: Path, *, figures: bool = True) -> str:
     return template.render(
         study=run.identity["study"] or path.parent.name,
         facts=list(run.facts),
+        verdicts=run.verdicts,
         standings=leaderboard(cells, paired),
         criteria=Criterion,
         largest_band=LARGEST_BAND,

@@ -207,29 +207,13 @@ def test_a_model_that_is_too_inexact_is_praised_nowhere(said: Said) -> None:
     assert len(praised(0.1, 1e-3)) == len(praised(0.0, 1e-3)) > 6
 
 
-def test_where_no_model_is_good_enough_that_is_said(said: Said) -> None:
-    texts = said("UPDATE cells SET error_lambda_mean = 0.5 WHERE problem = 'hertz'")
-    assert texts["hertz"] == ["None of 18 cells has every query ok and mean errors of at most 10 %."]
-    assert not [text for subject, found in texts.items() if "hertz, " in subject for text in found if "fastest" in text]
-
-
-def test_the_fastest_of_a_problem_is_named_with_its_errors(said: Said, quick_run: Path) -> None:
-    slow = "UPDATE cells SET online_s = 1e-3 * rowid, hf_s = 1, error_lambda_mean = 0.02, error_u_mean = 0.001"
-    texts = said(slow)["hertz"]
-    cells = read_table(quick_run / FILE, "cells")
-    mine = cells[cells["problem"] == "hertz"]
-    assert len(texts) == 1
-    assert texts[0].startswith(f"Of {len(mine)} cells with mean errors of at most 10 %, the fastest query is that of")
-    assert f": {mine.index.min() + 1} ms, with mean errors of 0.001 in u and 0.02 in λ;" in texts[0]
-
-
 def test_findings_that_say_most_come_first_and_every_subject_has_a_turn(quick_run: Path) -> None:
     read = {name: read_table(quick_run / FILE, name) for name in TABLES}
     found = list(all_findings(read, problem_tables(quick_run / FILE, read)))
     first = leading(found, 10)
     assert len(first) == 10 < len(found)
     assert [one.weight for one in first] == sorted(one.weight for one in first)
-    answer = Weight.ANSWER
+    answer = Weight.COMPARISON
     others = [Finding("a", "3", answer), Finding("b", "4", answer), Finding("", "5", Weight.ALARM)]
     made = [Finding("a", "1", Weight.DETAIL), Finding("a", "2", answer), *others]
     assert [one.text for one in leading(made, 10)] == ["5", "2", "4", "3", "1"]
