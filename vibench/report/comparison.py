@@ -64,9 +64,9 @@ class Comparison:
             (
                 name,
                 one.problem,
-                *(best[axis] for axis in axes),
+                *(cell[axis] for axis in axes),
                 1e3 * one.full_s,
-                1e3 * best["online_s"],
+                1e3 * cell["online_s"],
                 one.break_even,
             )
             for name, one, cell in found
