@@ -18,7 +18,7 @@ ASSEMBLIES = ("full", "reduced", "certified", "compiled")
 
 
 class Results:
-    """The tables below `results/`, read once; of the study `solvers` alone all solvers, elsewhere PIQP."""
+    """The tables below `results/`, read once; of the study `solvers` alone all solvers, elsewhere PIQP or none."""
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
@@ -28,8 +28,9 @@ class Results:
         """A table of a page, "cells" or another CSV file beside it."""
         if (study, name) not in self._read:
             frame = pd.read_csv(self.folder / study / f"{name}.csv")
+            # Formulations without a solver have rows of their own, and compete.
             everything = "solver" not in frame or study == "solvers"
-            self._read[study, name] = frame if everything else frame[frame["solver"] == "piqp"]
+            self._read[study, name] = frame if everything else frame[frame["solver"].isin(["piqp", "–"])]
         return self._read[study, name]
 
     @cached_property

@@ -1,5 +1,6 @@
 """The folder `results/` is light: it holds pages, their scripts, and the files that pages show or link."""
 
+import csv
 import importlib
 import inspect
 import re
@@ -71,6 +72,11 @@ def test_the_first_page_and_the_documentation_are_made_from_the_tables(monkeypat
     results, page = committed.Results(RESULTS), (ROOT / "README.md").read_text(encoding="utf-8")
     assert first_page.PLACE.search(page)
     assert first_page.filled(page, results) == page
+    # Formulations without a solver compete, too.
+    table = (RESULTS / "formulations" / "cells.csv").read_text(encoding="utf-8")
+    assert set(results.table("formulations")["formulation"]) == {
+        row["formulation"] for row in csv.DictReader(table.splitlines())
+    }
     assert what_to_use.what_to_use(results) == (ROOT / "docs" / "what-to-use.md").read_text(encoding="utf-8")
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     (models,) = (part for part in text.split("\n\n") if part.startswith("| "))
