@@ -9,6 +9,8 @@ from vanishing import Declared, Tangled, TangledThird
 
 import vibench
 from vibench import NumericalError, Reduction, RequestError, Study
+from vibench.stages.artefacts import Store
+from vibench.stages.snapshots import solution_stages
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, study_of_cell
 
@@ -43,6 +45,19 @@ def test_the_third_training_parameter_ends_the_cells_or_is_skipped_and_recorded(
 
 def reduction(problem: Declared, on_failure: str) -> Reduction:
     return pga_reduction(problem, 1e-3, assembly="reduced", on_failure=on_failure)
+
+
+def test_what_failed_solutions_take_is_offline_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cell, clock, assemble = expand(study({"name": "own", "on_failure": "skip"}))[0], [0.0], Tangled.assemble
+
+    def slow(problem: Tangled, mu: np.ndarray) -> vibench.VariationalInequality:
+        clock[0] += 7.0 * bool((problem.wrong == mu).all(axis=1).any())
+        return assemble(problem, mu)
+
+    monkeypatch.setattr("vibench.timing.process_time", lambda: clock[0])
+    monkeypatch.setattr(Tangled, "assemble", slow)
+    stages = solution_stages(cell.problem, cell.training)
+    assert sum(stage.run(Store(tmp_path)).seconds.cpu for stage in stages) == 7.0
 
 
 @pytest.mark.parametrize("number", [0, 2, 14])

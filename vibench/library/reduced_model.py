@@ -150,7 +150,9 @@ class Model:
             # In v = x − A⁻¹f the size of the program is what contact does, however large the load is.
             free = of.inverse.T @ (of.inverse @ f)
             free += of.inverse.T @ (of.inverse @ (f - A @ free))
-            (v, forces), found = self._solved(of, g / of.norms - of.B @ free)
+            g = g / of.norms
+            noise = of.round_off * (of.sizes @ abs(free) + abs(g))
+            (v, forces), found = self._solved(of, g - of.B @ free, noise)
             x, alpha, status = free + v, forces / of.norms, "ok"
             if not all(residual <= self.about["accuracy"] for residual in found):  # NaN is not
                 status = "inaccurate"
@@ -165,8 +167,11 @@ class Model:
         """Values of the outputs by name."""
         return dict(zip(self._outputs, values.tolist(), strict=True))
 
-    def _solved(self, of: _Matrices, g: Array) -> tuple[tuple[Array, Array], Residuals]:
-        """The solver's v and α without load for rows of B of norm 1, or those of its active set; residuals."""
+    def _solved(self, of: _Matrices, g: Array, noise: Array) -> tuple[tuple[Array, Array], Residuals]:
+        """The solver's v and α without load for rows of B of norm 1, or those of its active set; residuals.
+
+        `noise` is the round-off in g.
+        """
         A, B, f = of.A, of.B, np.zeros(len(of.A))
         if (g >= 0.0).all():  # no constraint acts
             return (f, np.zeros(len(g))), (0.0, 0.0, 0.0)
@@ -177,15 +182,18 @@ class Model:
             y, z = (np.nan_to_num(vector, nan=0.0, posinf=0.0, neginf=0.0) for vector in (y, z))
         # forces below 1e-3 are often those of rows that touch without any: those that are missing come back
         best = _polished(of, g, (z > g / length - B @ y) & (z > 1e-3 * z.max(initial=0.0)))
-        found, given = residuals(of, f, g, *best), (length * y, force * np.maximum(z, 0.0))
+        found, given = residuals(of, f, g, *best, noise), (length * y, force * np.maximum(z, 0.0))
         # residuals of some 1e-13 are round-off; NaN is not
         if all(residual <= 1e-13 for residual in found):
             return best, found
-        return min((given, residuals(of, f, g, *given)), (best, found), key=lambda pair: _worst(pair[1]))
+        return min((given, residuals(of, f, g, *given, noise)), (best, found), key=lambda pair: _worst(pair[1]))
 
 
 class _Matrices(NamedTuple):
-    """A, B with rows of norm 1, these norms, |B|, the inverse L⁻¹ of A's factor, L⁻¹Bᵀ, and norms of its columns."""
+    """A, B with rows of norm 1, these norms, |B|, the inverse L⁻¹ of A's factor, L⁻¹Bᵀ, and norms of its columns.
+
+    Also the round-off in sums over rows of B, their cosines, and the pairs of opposite rows.
+    """
 
     A: Array
     B: Array
@@ -194,36 +202,57 @@ class _Matrices(NamedTuple):
     inverse: Array
     whitened: Array
     lengths: Array
+    round_off: Array
+    cosines: Array
+    opposite: list[NDArray[np.intp]]
 
 
 def _matrices(A: Array, B: Array) -> _Matrices:
     norms = np.sqrt((B * B).sum(axis=1))
     norms[norms == 0.0] = 1.0
     B, inverse = B / norms[:, None], np.linalg.inv(np.linalg.cholesky(A))
-    whitened = inverse @ B.T
-    return _Matrices(A, B, norms, abs(B), inverse, whitened, np.sqrt((whitened**2).sum(axis=0)))
+    whitened, cosines, eps = inverse @ B.T, B @ B.T, float(np.finfo(float).eps)
+    close = np.argwhere(np.triu(cosines < -1.0 + 1e-12))
+    # both rows were scaled to norm 1 with a rounding
+    opposite = [pair for pair in close if abs(B[pair].sum(axis=0)).max() <= 8.0 * eps]
+    lengths, round_off = np.sqrt((whitened**2).sum(axis=0)), 1.01 * eps * ((B != 0.0).sum(axis=1) + 2.0)
+    return _Matrices(A, B, norms, abs(B), inverse, whitened, lengths, round_off, cosines, opposite)
 
 
-def residuals(of: _Matrices, f: Array, g: Array, x: Array, alpha: Array) -> Residuals:
+def residuals(of: _Matrices, f: Array, g: Array, x: Array, alpha: Array, noise: Array) -> Residuals:
     """With s = B x − g and norms in A⁻¹: max (s_i)₊/‖B_i‖F, ‖f − A x − Bᵀα‖/F, |αᵀs|/F².
 
     F is the larger of ‖Bᵀα‖ and max (B_i u₀ − g_i)₊/‖B_i‖, u₀ = A⁻¹f; without contact S, S² = xᵀA x + ‖Bᵀα‖².
+    Opposite rows that are equalities hold in u₀, and their forces are neither in F nor in the gap. `noise` is the
+    round-off (R,) in g.
     """
-    A, B = of.A, of.B
-    free = of.inverse.T @ (of.inverse @ f)
-    way, least = (_step(of, at, B @ at - g, g) for at in (x, free))
+    A, B, white = of.A, of.B, of.inverse @ f
     Ax, force, s = A @ x, alpha @ B, B @ x - g
-    rest, pull = np.sqrt(((of.inverse @ np.array([f - Ax - force, force]).T) ** 2).sum(axis=0)).tolist()
-    F = max(pull, least) if least else float(np.hypot(np.sqrt(max(float(x @ Ax), 0.0)), pull))
-    return _ratio(way, F), _ratio(rest, F), _ratio(abs(float(alpha @ s)), F**2)
+    rest, pull = (of.inverse @ np.array([f - Ax - force, force]).T).T
+    S = float(np.hypot(np.sqrt(max(float(x @ Ax), 0.0)), _length(pull)))
+    room = of.round_off * (of.sizes @ abs(x) + abs(g))
+    way, room, is_open = _step(of, s, room), np.maximum(room, noise), g < np.inf
+    tied = [pair for pair in of.opposite if abs(g[pair].sum()) <= room[pair].max() < np.inf]
+    if tied:
+        rows = np.array(tied)[:, 0]
+        W = of.whitened[:, rows]
+        white = white - W @ np.linalg.lstsq(W.T @ W, W.T @ white - g[rows], rcond=None)[0]
+        pull = pull - W @ np.linalg.lstsq(W, pull, rcond=None)[0]
+        is_open &= (abs(of.cosines[rows]) < 1.0 - 1e-12).all(axis=0)
+        alpha = np.where(np.isin(np.arange(len(g)), tied), 0.0, alpha)
+    free = of.inverse.T @ white
+    least = _step(of, np.where(is_open, B @ free - g, 0.0), of.round_off * (of.sizes @ abs(free) + abs(g)) + noise)
+    F = max(_length(pull), least) if least else S
+    return _ratio(way, F), _ratio(_length(rest), F), _ratio(abs(float(alpha @ s)), F**2)
 
 
-def _step(of: _Matrices, x: Array, s: Array, g: Array) -> float:
-    """The largest s_i/‖B_i‖ of rows that are violated at x by more than round-off; infinite for a row of zeros."""
-    rows = (s > 0.0).nonzero()[0]
-    if len(rows):
-        sizes = of.sizes[rows] @ abs(x) + abs(g[rows])
-        rows = rows[s[rows] > 1.01 * np.finfo(float).eps * ((of.B[rows] != 0.0).sum(axis=1) + 2.0) * sizes]
+def _length(vector: Array) -> float:
+    return float(np.sqrt(vector @ vector))
+
+
+def _step(of: _Matrices, s: Array, room: Array) -> float:
+    """The largest s_i/‖B_i‖ of rows that are violated by more than round-off; infinite for a row of zeros."""
+    rows = (s > room).nonzero()[0]
     with np.errstate(divide="ignore"):
         return float((s[rows] / of.lengths[rows]).max(initial=0.0))
 
@@ -238,7 +267,7 @@ def _worst(found: Residuals) -> float:
 
 def _polished(of: _Matrices, g: Array, active: NDArray[np.bool_]) -> tuple[Array, Array]:
     """The solution without load up to round-off: equations on an active set, which changes until signs are right."""
-    A, B, _, sizes, inverse, whitened, _ = of
+    A, B, sizes, inverse, whitened = of.A, of.B, of.sizes, of.inverse, of.whitened
     k = np.sqrt(A.trace() / len(A))
     for step in range(20 + 4 * len(g)):
         chosen = active.nonzero()[0]

@@ -144,6 +144,11 @@ class ContactForm:
         room = round_off_of_terms(self.entries, np.abs(self.vi.g))
         return rows_that_matter(self.B, self.vi.g, room, directions=self.directions)
 
+    @property
+    def tied(self) -> Mask:
+        """Rows (m,) that are equalities with another one."""
+        return self._matter.tied
+
     def contact_energy(self, multiplier: Array) -> float:
         """F of a multiplier η (m,): the norm of its force in A⁻¹, but for what equalities hold."""
         if not len(self._matter.equalities):

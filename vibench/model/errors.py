@@ -290,8 +290,8 @@ def high_fidelity_residuals(
     if not least:
         unit = float(np.hypot(energy.norm(u) if u_energy is None else u_energy, on.force_norm(lam)))
     violated = np.flatnonzero(excess > round_off_of_terms(on.entries, on.sizes @ np.abs(values) + np.abs(vi.g)))
-    # s may be infinite where λ is zero.
-    pressed = lam > 0.0
+    # s may be infinite where λ is zero; the force of an equality times round-off is no gap.
+    pressed = (lam > 0.0) & ~on.tied
     gap = abs(float(lam[pressed] @ excess[pressed]))
     return Residuals.relative(on.largest_step(violated, excess[violated]), rho, gap, unit)
 

@@ -353,7 +353,9 @@ class Model:
                 bound, correction = self.certificate.certify(self.problem, at, assembled, x, alpha, settings.mode)
                 last = bound if correction is None else correction.bound
                 if settings.of == "contact":
-                    of_contact = self.certificate.least_contact(self.problem, at, assembled, alpha, bound)
+                    lam = self.reduced.generators @ alpha if correction is None else correction.nu
+                    known = alpha, lam, last.lambda_natural
+                    of_contact = self.certificate.least_contact(self.problem, at, assembled, *known)
                     worst = max(last.u_energy, last.lambda_natural)
                     last = replace(last, relative=worst / of_contact if of_contact > 0.0 else inf)
                 bound = last

@@ -48,6 +48,13 @@ class Rows:
         """The numbers (e,) of equalities."""
         return self.kept[self.equal]
 
+    @property
+    def tied(self) -> Mask:
+        """Rows (m,) that are equalities with another one; their multipliers need no sign, and open no gap."""
+        tied = np.zeros(len(self.implied), bool)
+        tied[self.equalities] = tied[self.opposite[self.equal]] = True
+        return tied
+
     def program(self, vi: VariationalInequality) -> VariationalInequality:
         """The program `vi` with these rows alone."""
         if len(self.kept) == len(vi.g):

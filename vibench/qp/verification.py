@@ -9,9 +9,9 @@ r = f − A x − Bᵀα and s = B x − g the *natural* residuals
 are the same in all units of x and f, in any basis of x, and for any scaling of rows of B with g ("Residuals" in
 docs/mathematics.md). Their unit is the F of the answer; where that does not suffice, the larger of it and of
 F_low = max_i (B_i u₀ − g_i)₊ / ‖B_i‖_{A⁻¹} ≤ F. Without contact, F_low = 0, it is S, S² = ‖x‖²_A + ‖Bᵀα‖²_{A⁻¹}.
-Pairs of opposite rows are equalities and belong to u₀, or a loaded tie would hide the contact. Whether a row is
-violated is decided row by row, against the round-off of its own s_i: a far row, as one with g_i = ∞, says nothing of
-the others.
+Pairs of opposite rows are equalities and belong to u₀, or a loaded tie would hide the contact; they open no gap, which
+would be their force times round-off. Whether a row is violated is decided row by row, against the round-off of its own
+s_i: a far row, as one with g_i = ∞, says nothing of the others.
 
 Two solutions of one program whose residuals meet an accuracy have a bounded distance. For solutions k = 1, 2 with
 α_k ≥ 0, residuals r_k = f − Ax_k − Bᵀα_k and excesses s_k = Bx_k − g, the difference d = x₁ − x₂ satisfies
@@ -128,13 +128,14 @@ def kkt_residuals(
     if len(rows.equalities):
         held = inverse.holding(replace(program, f=force, g=np.zeros_like(g)), rows.equalities)
         contact = _energy(program.A, held)
-    found = Residuals.relative(step, left, _gap(alpha, excess), contact)
+    pressing = np.where(rows.tied, 0.0, alpha)
+    found = Residuals.relative(step, left, _gap(pressing, excess), contact)
     if found.worst <= accuracy or not np.isfinite([step, left, contact]).all():
         return found
     free, moved = _refined_solution(program.A, inverse, program.f), _refined_solution(program.A, inverse, -force)
     least = _least_contact(program, inverse, free, rows)
     unit = max(contact, least) if least else float(np.hypot(_energy(program.A, x), lengths[-2]))
-    found = Residuals.relative(step, left, _gap(alpha, excess), unit)
+    found = Residuals.relative(step, left, _gap(pressing, excess), unit)
     # What rounding leaves of x says nothing of α, which is then judged with v = −A⁻¹Bᵀα, the x of no round-off being
     # u₀ + v: the factor allows for sums of as many terms as a reduced program has.
     if not left <= 64.0 * EPS * float(np.sqrt(np.abs(x) @ (abs(program.A) @ np.abs(x)))):
@@ -144,7 +145,7 @@ def kkt_residuals(
     rest = np.asarray(-force - extended(program.A) @ sum(moved), dtype=float)
     lengths = inverse.dual_norms(np.column_stack([_dense_rows(B, violated).T, rest]))
     step = _largest_step(excess[violated], lengths[:-1])
-    return min(found, Residuals.relative(step, float(lengths[-1]), _gap(alpha, excess), unit), key=lambda r: r.worst)
+    return min(found, Residuals.relative(step, float(lengths[-1]), _gap(pressing, excess), unit), key=lambda r: r.worst)
 
 
 def _largest_step(excess: Array, lengths: Array) -> float:

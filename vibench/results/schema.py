@@ -172,7 +172,7 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "terms_g": integer("Likewise for g."),
         "correction_cost": text("Cost of a correction: online, with a certificate, or high-fidelity; empty without."),
         "corrected_share": real("1", "Share of the ok queries that are corrected; empty without corrections."),
-        "offline_snapshots_s": real("s", "High-fidelity solutions at the training parameters, with one set-up."),
+        "offline_snapshots_s": real("s", "High-fidelity training solutions, failed ones too, with one set-up."),
         "offline_selection_s": real("s", "Greedy choice of parameters, part of offline_snapshots_s; 0 for fixed sets."),
         "offline_pod_s": real("s", "POD."),
         "offline_cone_s": real("s", "Dual strategy, with the orthonormal basis of the span."),

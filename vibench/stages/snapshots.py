@@ -28,7 +28,7 @@ from vibench.stages.artefacts import History, Store, storable
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.study.cells import Axes
 from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_of, chunk_size
-from vibench.timing import NO_TIME, SLOW, Seconds, median_of, timed
+from vibench.timing import NO_TIME, SLOW, Seconds, Stopwatch, median_of, timed
 
 T = TypeVar("T")
 
@@ -136,14 +136,17 @@ class SnapshotStage(Stage):
         # No solution may depend on what this process has solved before.
         work.solver.forget()
         solutions, seconds = list[HighFidelitySolution](), list[Seconds]()
-        skipped, solved = list[str](), np.zeros(len(mus), bool)
+        skipped, solved, lost = list[str](), np.zeros(len(mus), bool), NO_TIME
         for k, mu in enumerate(mus):
+            watch = Stopwatch()
             try:
                 vi, solution, taken = self._solved(work, k, mu)
             except NumericalError as error:
                 if not self.parameters.skips or isinstance(error, _WrongProblemError):
                     raise
                 skipped.append(message_of(error))
+                # Whoever trains pays for what fails, too.
+                lost += watch.seconds()
             else:
                 work.reference.refuse_false_declarations(mu, vi)
                 work.solver.remember(mu, solution)
@@ -167,7 +170,7 @@ class SnapshotStage(Stage):
         fallbacks, bounds = (solution.fallback for solution in solutions), self._bounds(problem, mus, u, lam)
         measured = tuple(seconds), setups, tuple(fallbacks), work.reference.fingerprint
         swept = TimedSnapshots(mus, u, lam, *measured, bounds=tuple(bounds), skipped=tuple(skipped))
-        return Result(swept, sum(seconds, NO_TIME), self._diagnostics(problem, mus, first))
+        return Result(swept, sum(seconds, lost), self._diagnostics(problem, mus, first))
 
     def _probe(self, problem: Problem, reference: ReferenceAssembly) -> None:
         """Compare declarations with assembly at random parameters where the validation set is short.

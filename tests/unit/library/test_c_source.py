@@ -19,14 +19,17 @@ from samples import small_study, with_ways
 import vibench
 from vibench.interfaces.affine_problem import AffineProblem
 from vibench.interfaces.outputs import Output
+from vibench.interfaces.strategies import Enrichment, Kind
+from vibench.library import reduced_model
 from vibench.library.export import export_model, exported
 from vibench.library.reduced_model import Model as Exported
 from vibench.model.certificates import contact_correction as complementarity
 from vibench.model.certificates.base import Guarantee
 from vibench.model.chebyshev import AffinePolynomial, products
+from vibench.model.galerkin import ReducedModel
 from vibench.offline import c_source
 from vibench.qp.exact import exact_solution
-from vibench.qp.verification import infeasibility_certificate
+from vibench.qp.verification import infeasibility_certificate, kkt_residuals
 
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="NO C COMPILER (cc, gcc): exported C sources are not tested")
@@ -101,16 +104,18 @@ Certify = Callable[[np.ndarray, bool], tuple[int, np.ndarray, np.ndarray, np.nda
 
 
 def certify(model: vibench.Model, file: Path, tolerance: float) -> tuple[Certify, Any, ctypes.CDLL]:
-    """The C source of a model: the code, u, λ and three bounds at a parameter, corrected or not; what it is made of."""
+    """The C source of a model: the code, u, λ and four bounds at a parameter, corrected or not; what it is made of."""
     whole = export_model(model, file, tolerance=tolerance, evaluations=6000, c=True)
     arrays, found = whole.arrays, library(file.with_suffix(".c"))
     (rows, loads), basis = arrays["certificate_responses"].shape, arrays["basis"]
+    found.model_of_contact.restype = ctypes.c_double
 
     def certified(mu: np.ndarray, corrected: bool) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
         x, alpha, residuals = np.zeros(basis.shape[1]), np.zeros(arrays["generators"].shape[1]), np.zeros(3)
         lam, shift, bounds = np.full(rows, np.nan), np.full(loads, np.nan), np.full(3, np.nan)
         assert found.model_solve(*pointers(mu, x, alpha, residuals)) in {0, 16}
         code = found.model_certify(*pointers(mu, x, alpha), int(corrected), *pointers(lam, shift, bounds))
+        bounds = np.append(bounds, found.model_of_contact(*pointers(mu, alpha, lam, bounds)))
         return code, basis @ x - arrays["certificate_lift"] @ shift, lam, bounds
 
     return certified, whole, found
@@ -179,8 +184,10 @@ def assert_certified_alike(
         assert code == 0
         assert np.linalg.norm(u - own.u) <= of_u * np.linalg.norm(own.u)
         assert np.linalg.norm(lam - own.lam) <= 1e-9 * np.linalg.norm(own.lam)
-        for bound, name, rel in zip(bounds, ("u_energy", "lambda_natural", "relative"), tolerances, strict=True):
-            assert bound == pytest.approx(getattr(own.bound, name), rel=rel), name
+        beside = model.solve(mu, accuracy=1e-13, corrected=corrected, of="contact").bound.relative
+        proved = own.bound.u_energy, own.bound.lambda_natural, own.bound.relative, beside
+        for number, (bound, expected, rel) in enumerate(zip(bounds, proved, tolerances, strict=True)):
+            assert bound == pytest.approx(expected, rel=rel), number
         if bounded:
             assert_bounded(model, mu, u, lam, bounds)
 
@@ -196,7 +203,7 @@ def test_expressions_are_exact_in_c_and_bounds_are_certified(tmp_path: Path) -> 
     assert whole.about["certificate"] == "certified"
     assert whole.error > 1e-8
     assert "the bounds are\n * certified" in (tmp_path / "model.h").read_text()
-    assert_certified_alike(model, certified, (1e-7, 1e-7, 1e-7), 1e-10, bounded=True)
+    assert_certified_alike(model, certified, (1e-7,) * 4, 1e-10, bounded=True)
 
 
 @pytest.mark.parametrize("problem", PROBLEMS)
@@ -213,7 +220,9 @@ def test_a_c_source_has_bounds_pair_and_outputs_of_the_model(
     )
     monkeypatch.setattr(type(model.problem), "outputs", outputs)
     certified, whole, found = certify(model, tmp_path / "model.npz", tolerance=2e-13)
-    assert_certified_alike(model, certified, (1e-9, 1e-9, 2e-9), 1e-9)  # the last one has the error of ‖u‖, too
+    assert_certified_alike(
+        model, certified, (1e-9, 1e-9, 2e-9, 2e-9), 1e-9
+    )  # the last ones have the error of sizes, too
     assert certified(model.parameters.upper, corrected=True)[0] == 0
     code, u, lam, bounds = certified(model.parameters.upper * 1.001, corrected=True)
     assert code == 4
@@ -393,6 +402,52 @@ def test_any_constraints(case: str, scale: float, tmp_path: Path) -> None:
             assert np.allclose(B.T @ alpha, B.T @ exact.alpha, rtol=0.0, atol=1e-8 * (1.0 + scale))
     assert codes.count(0) > 67
     assert set(codes) <= {0, 2}
+
+
+class Beside(AffineProblem):
+    """A body in contact beside one that opposite rows hold against 1e4 times its load, in a common basis."""
+
+    parameters = vibench.ParameterBox(("load",), np.array([1.0]), np.array([2.0]), ("1",))
+
+    def __init__(self) -> None:
+        Q = np.linalg.qr(np.random.default_rng(0).standard_normal((5, 5)))[0]
+        A = sp.block_diag([[[2.0, -1.0], [-1.0, 3.0]], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.5], [0.0, 0.5, 2.0]]]).toarray()
+        B = np.array([[1, 0, 0, 0, 0], [0, 1, 0, 0, 0], [0, 0, 0, 1, 2], [0, 0, 0, -2, -4], [0, 0, 1, 0, 0]], float)
+        self.V, self.W = (vibench.InnerProduct(sp.eye_array(5, format="csc")) for _ in range(2))
+        f, g = np.array([1.0, 1.0, -1.0, 1e4, -2e4]), np.array([0.1, 0.2, 1e3, -2e3, 0.0])
+        self.declare(A=Q @ A @ Q.T, f=[("load", Q @ f)], B=B @ Q.T, g=g)
+
+    def training_set(self) -> np.ndarray:
+        return self.parameters.grid(2)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.99, 0.0])  # of the forces of contact
+def test_loaded_ties_hide_no_contact_from_scripts_and_c(share: float, tmp_path: Path, monkeypatch: Patch) -> None:
+    """Both judge as vibench does: the unit is that of the contact beside the tie, and the tie opens no gap."""
+    whole, stop = ReducedModel(Beside(), np.eye(5), Enrichment(Kind.NONE), np.eye(5), np.eye(5)), vibench.Stop(size=5)
+    strategy = vibench.create("dual strategy", "cpg")
+    model = vibench.Reduction(whole.problem, strategy, None, stop, stop).given(assembled=whole).model
+    export_model(model, tmp_path / "model.npz", c=True)
+    script, text = Exported(tmp_path / "model.npz"), (tmp_path / "model.c").read_text()
+    spoilt = f"    alpha[0] *= {share};\n    alpha[1] *= {share};\n    return verify(&set"
+    (tmp_path / "model.c").write_text(text.replace("    return verify(&set", spoilt), encoding="utf-8")
+    solve, polished = compiled(tmp_path / "model.c", 5, 5), reduced_model._polished
+
+    def lacking(*given: Any) -> tuple[np.ndarray, np.ndarray]:
+        v, forces = polished(*given)
+        return v, forces * np.where(np.arange(5) < 2, share, 1.0)
+
+    monkeypatch.setattr(reduced_model, "_polished", lacking)
+    monkeypatch.setitem(reduced_model.SOLVERS, script.solver, lambda A, f, B, g, _: (f, np.ones(5)))
+    for mu in model.parameters.sample(5, seed=3):
+        code, x, alpha, found = solve(mu)
+        program, own = model.reduced.assemble(mu).program, script.solve(mu)
+        residuals = kkt_residuals(program, x, alpha, accuracy=model.accuracy)
+        expected = (residuals.primal, residuals.dual, residuals.gap)
+        assert residuals.unit < 10.0
+        assert (code == 0, own.status == "ok") == ((residuals.worst <= model.accuracy),) * 2 == (share == 1.0,) * 2
+        assert found == pytest.approx(expected, abs=1e-10)
+        assert own.residuals == pytest.approx(expected, abs=1e-10)
 
 
 def test_matrices_that_are_not_positive_definite_and_numbers_that_are_not_finite_fail(tmp_path: Path) -> None:

@@ -204,7 +204,7 @@ def test_residuals_are_those_of_vibench(run: vibench.Run, tmp_path: Path) -> Non
         x, alpha = random.standard_normal(len(f)), random.random(len(g))
         program = vibench.VariationalInequality(A, load, B, g)
         expected = vibench.qp.kkt_residuals(program, x, alpha)
-        found = reduced_model.residuals(reduced_model._matrices(A, B), load, g / rows, x, rows * alpha)
+        found = reduced_model.residuals(reduced_model._matrices(A, B), load, g / rows, x, rows * alpha, 0.0 * g)
         assert found == pytest.approx((expected.primal, expected.dual, expected.gap), rel=1e-12)
 
 
@@ -290,7 +290,8 @@ def test_polishing_ends_where_changes_of_all_rows_at_once_cycle() -> None:
         g[8:] = B[8:] @ np.linalg.lstsq(B[:8], g[:8], rcond=None)[0]
         A, f = np.eye(12), 3.0 * rng.random(12)
         of, g = reduced_model._matrices(A, B), g - B @ f  # of x − A⁻¹f
-        assert max(reduced_model.residuals(of, 0.0 * f, g, *reduced_model._polished(of, g, np.ones(11, bool)))) <= 1e-12
+        found = reduced_model.residuals(of, 0.0 * f, g, *reduced_model._polished(of, g, np.ones(11, bool)), 0.0 * g)
+        assert max(found) <= 1e-12
 
 
 def test_wrong_solvers_are_not_believed(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,14 +27,14 @@ step of defect correction separates them: û = u_N + z/c − w with z = X⁻¹r,
 basis of residuals is used; the rest, and what is not known of r, adds its norm to that of the residual.
 
 **Round-off** is bounded in all terms, however large the condition number of X: in ρ (`residual`), in w and its norm
-by the μ of C (`contact_correction`), in κ, and in A(µ) and its spectrum (`base`). With FᵀF between (1 ± η) X, the
-distortion of U and the computed directions, rᵀw differs from the product of coordinates by at most m ρ ω, and ρ is at
-most (1 + m) times what they give (`OnlineCertificate.margin`).
+by the μ of C (`contact_correction`), in κ, in A(µ) and its spectrum (`base`), and in the energy of u_N, which relative
+bounds are divided by. With FᵀF between (1 ± η) X, the distortion of U and the computed directions, rᵀw differs from the
+product of coordinates by at most m ρ ω, and ρ is at most (1 + m) times what they give (`OnlineCertificate.margin`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf, sqrt
@@ -145,6 +145,8 @@ class OnlineCertificate:
     margin: float
     # Corrections that take no factorisation at the parameter, where there are any.
     prepared: PreparedCorrections | None
+    # Round-off (Q,) in energies of vectors with coefficients of norm 1, for every term of A that a query evaluates.
+    energy_round_off: Array
 
     @cached_property
     def bound_sizes(self) -> Array:
@@ -172,21 +174,30 @@ class OnlineCertificate:
         return bound, self._corrected_pair(query, bound)
 
     def least_contact(
-        self, problem: Problem, mu: Array, reduced: ReducedProblem, alpha: Array, bound: OnlineBound
+        self, problem: Problem, mu: Array, reduced: ReducedProblem, alpha: Array, lam: Array, natural: float
     ) -> float:
-        """A lower bound of ‖u − A⁻¹f‖_A = ‖Bᵀλ‖_{A⁻¹} at mu (d,), from the α (R,) that has this bound; may be negative.
+        """A lower bound of ‖u − A⁻¹f‖_A = ‖Bᵀλ‖_{A⁻¹} at mu (d,), from a λ_N (m,) with this natural bound.
 
-        ‖Bᵀλ_N‖ is at least λ_NᵀBz / ‖z‖_A for every z, such as that of the reduced program.
+        ‖Bᵀλ_N‖ is at least λ_NᵀBz / ‖z‖_A for every z, such as that of the reduced program for its α (R,). May be
+        negative.
         """
-        program, lam = reduced.program, self.generators @ alpha
+        program = reduced.program
         z = scipy.linalg.solve(program.A, program.B.T @ alpha, assume_a="pos")
         query = _Query(self.base, problem, mu, reduced, z, lam)
-        if bound.guarantee is Guarantee.NONE or not (size := float(z @ (program.A @ z))) > 0.0:
+        if not natural < inf or not (size := float(z @ (program.A @ z))) > 0.0:
             return 0.0
         # The interpolated stiffness may be softer than A by its error: ‖z‖²_A ≤ zᵀA_N z (1 + ε/(α − ε)).
-        energy = size * query.lower / (query.lower - self.base.stiffness_error)
-        force = float(lam @ (query.contact.B @ (self.contact_basis @ query.y)))
-        return force / sqrt(energy) - bound.lambda_natural
+        energy = (size + self._energy_error(query)) * query.lower / (query.lower - query.error)
+        values, uncertain = self._on_contact(query)
+        uncertain = uncertain + EPS * (len(values) + len(lam) + 4.0) * np.abs(values)
+        force = float(lam @ (query.contact.B @ values)) - float(lam @ (abs(query.contact.B) @ uncertain))
+        return force / sqrt(energy) - natural
+
+    def _energy_error(self, query: _Query) -> float:
+        """Round-off in xᵀA x, the energy of the vector with the coordinates x of a query."""
+        terms = float(np.abs(query.samples.get("A", self.base.one)) @ self.energy_round_off)
+        # Absolute values of an orthonormal basis of a part of the space have at most the norm √N.
+        return terms * float(query.x @ query.x) * (1.0 if query.y is query.x else len(query.x))
 
     def _bound(self, query: _Query, alpha: Array) -> OnlineBound:
         base, lam, lower, upper = self.base, query.lam, query.lower, query.upper
@@ -214,7 +225,8 @@ class OnlineCertificate:
         coordinates, beside, missing = self.residual.parts(z)
         square_of_u = float(query.x @ (query.A @ query.x))
         # ‖u_N‖_X from ‖u_N‖ in the interpolated stiffness, whose coercivity is at least α less its error
-        u_norm = sqrt(max(0.0, square_of_u) / (lower - query.error))
+        rounded = self._energy_error(query)
+        u_norm = sqrt(max(0.0, square_of_u + rounded) / (lower - query.error))
         lacking = base.load_error + query.error * u_norm
         if contact is not None:
             # the round-off in what B₀ᵀλ_N lacks, from all |B_ij| λ_i √C_jj; |B| as a matrix would show
@@ -232,7 +244,7 @@ class OnlineCertificate:
             others = self._defect_corrected(query, coordinates, beside + missing + lacking)
             of_u, of_lam = min(of_u, others[0]), min(of_lam, others[1])
         # a lower bound of ‖u‖_A, from that of ‖u_N‖_A and the triangle inequality
-        least = sqrt(max(0.0, square_of_u - query.error * u_norm**2)) - of_u
+        least = sqrt(max(0.0, square_of_u - rounded - query.error * u_norm**2)) - of_u
         relative = of_u / least if least > 0.0 else inf
         beta, which = base.inf_sup.lower_bound(float(query.theta["B"][0]), lambda: query.contact.B, upper)
         in_W = of_lam / beta if beta > 0.0 else inf
@@ -363,7 +375,17 @@ def prepare(
     spread = sqrt(len(dofs) * float(np.diag(base.compliance) @ np.sum(trailing**2, axis=0)))
     rounded = EPS * (sum(directions.shape) + 16.0) * (solved + spread)
     margin = 1.01 * (2.0 * eta + residual.distortion + base.compliance_error + rounded) if eta < 0.5 else inf
-    return OnlineCertificate(base, residual, directions, compliance, contact_basis, chi, forces, margin, corrections)
+    own = residual, directions, compliance, contact_basis, chi, forces, margin, corrections
+    return OnlineCertificate(base, *own, _energy_round_off(members["A"].terms, Phi))
+
+
+def _energy_round_off(terms: Sequence[SparseMatrix], Phi: Array) -> Array:
+    """Bounds (Q,) of |xᵀÃ_q x − xᵀΦᵀA_qΦ x| for |x| = 1 and the computed Ã_q = ΦᵀA_qΦ, and of sums of these."""
+    size = np.abs(Phi)
+    sizes = [float(np.linalg.norm(size.T @ (abs(term) @ size))) for term in terms]
+    entries = max(int(np.max(np.diff(sp.csr_array(term).indptr))) for term in terms)
+    # the numbers of terms in a column of AΦ, ΦᵀAΦ, the sum over q, and xᵀA x, also in another basis of the space
+    return np.asarray(1.01 * EPS * (entries + len(size) + len(terms) + 4.0 * size.shape[1] + 16.0) * np.array(sizes))
 
 
 def _sampled(

@@ -1,5 +1,6 @@
 from collections.abc import Mapping
 from dataclasses import replace
+from fractions import Fraction
 from functools import lru_cache
 from types import MappingProxyType, SimpleNamespace
 from typing import Any, cast
@@ -405,6 +406,21 @@ def test_round_off_of_the_factor_is_in_the_residual_and_in_the_compliance() -> N
         bound, _ = certificate.certify(problem, mu, model.assemble(mu), np.zeros(1), np.zeros(1), EVERY)
         assert bound.guarantee is Guarantee.CERTIFIED
         assert 0.0 <= bound.u_energy / (load * np.sqrt(2.0 / stiffness)) - 1.0 <= 1e-5
+
+
+def test_relative_bounds_hold_whatever_rounding_leaves_of_energies() -> None:
+    """The energy of u_N is what cancellation leaves of terms 1e9 times as large."""
+    problem: Any = Loose(3e-9)
+    mu, A = np.ones(1), [[Fraction(entry) for entry in row] for row in problem.assemble(np.ones(1)).A.toarray()]
+    for size in 1.0 + 1e-5 * np.linspace(-1.0, 1.0, 5):
+        _, model, certificate = certified(problem, np.array([[1.0], [size]]), np.ones((1, 1)))
+        reduced = model.assemble(mu)
+        x = 1.3 * reduced.program.f / reduced.program.A[0]
+        u = [Fraction(entry) for entry in model.basis @ x]
+        energy = float(sum(u[i] * A[i][j] * u[j] for i in range(2) for j in range(2)))
+        bound, _ = certificate.certify(problem, mu, reduced, x, np.zeros(1), EVERY)
+        assert 0.0 < bound.relative < 0.5
+        assert bound.u_energy / bound.relative <= np.sqrt(energy) - bound.u_energy
 
 
 @pytest.mark.parametrize("kind", KINDS[2::2])
