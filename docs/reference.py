@@ -10,6 +10,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from typer.main import get_command
+
+from vibench.cli.main import app
 from vibench.packs.manifest import Manifest
 from vibench.plugins.options import keys, places
 from vibench.results.ranking import added_columns
@@ -99,6 +102,19 @@ def _for_reading(table: Mapping[str, Column]) -> str:
     return markdown(("column", "unit", "meaning"), rows)
 
 
+def commands() -> str:
+    """What each command does, with its arguments and options."""
+    group: Any = get_command(app)
+    parts = []
+    for name in sorted(group.commands):
+        command = group.get_command(None, name)
+        if not command.hidden:
+            names = [p.opts if p.opts[0].startswith("-") else [p.metavar or p.name.upper()] for p in command.params]
+            rows = [(f"`{', '.join(of)}`", p.help or "") for of, p in zip(names, command.params, strict=True)]
+            parts.append(f"## {name}\n\n{command.help}\n\n{markdown(('option', 'meaning'), rows)}")
+    return "\n\n".join(parts)
+
+
 def markdown(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """A table in Markdown."""
     cells = [list(head), *map(list, rows)]
@@ -107,7 +123,8 @@ def markdown(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 GENERATED = {
-    "study": study_fields, "pack": pack_fields, "units": units, "summary": summary, "best": best, "benefits": benefits,
+    "commands": commands, "study": study_fields,
+    "pack": pack_fields, "units": units, "summary": summary, "best": best, "benefits": benefits,
 } | {table: lambda table=table: columns(table) for table in STORED}  # fmt: skip
 """What may stand in a page, by name."""
 

@@ -607,11 +607,62 @@ def space() -> Sequence[str]:
     ]
 
 
+def first_page() -> Sequence[str]:
+    """The answer of README for the two problems of the paper: a table of models, and what holds beyond it."""
+    names = ("obstacle", "hertz")
+    benefit, others = cells("benefit"), pd.read_csv(ROOT / "results" / "formulations" / "cells.csv")
+    own = others[(others["training"] == "own") & (others["dual"] == "mcpg") & (others["dual_tol"] == 1e-2)]
+    # The models of the pair with more generators than modes on the obstacle, where enrichment decides.
+    pair = benefit[(benefit["assembly"] == "reduced") & (benefit["dual_tol"] == 1e-2)]
+    weakest = pair[pair["primal_tol"].isna() | (pair["primal_tol"] == 0.5)]
+    models = {
+        "no enrichment": weakest[weakest["primal"] == BARE],
+        "enriched offline (`offline-pga`)": weakest[weakest["primal"] == OFFLINE],
+        "enriched at every query": weakest[weakest["primal"] == ONLINE],
+        "penalty for the constraint ¹": own[own["formulation"] == "penalty"],
+        "regression on the parameter ¹": own[own["formulation"] == "regression (radial)"],
+    }
+    rows, pays = [], []
+    for model, table in models.items():
+        of = [table[table["problem"] == name].iloc[0] for name in names]
+        numbers = [(one["offline_s"] - one["hf_setup_s"]) / (one["hf_s"] - one["online_s"]) for one in of]
+        pays += numbers
+        texts = (
+            ", ".join(f"{100 * one['error_u_mean']:.2g} %" for one in of),
+            ", ".join(f"{100 * one['error_lambda_mean']:.2g} %" for one in of),
+            ", ".join(f"{one['hf_s'] / one['online_s']:.0f}" for one in of),
+            ", ".join(f"{float(f'{number:.2g}'):.0f}" for number in numbers),
+        )
+        rows.append(f"| {model} | {' | '.join(texts)} |")
+    full = pd.concat([cells(f"paper-{name}") for name in names])
+    full = full[full["assembly"] == "full"].set_index(
+        ["problem", "dual", "pod_tol", "pod_size", "dual_tol", "dual_size"]
+    )
+    plain = full[full["primal"] == BARE]
+    enriched = full[full["primal"] != BARE]
+    factors = plain["error_lambda_mean"].reindex(enriched.index) / enriched["error_lambda_mean"]
+    few = (plain["N"] < plain["R"]).reindex(enriched.index)
+
+    def divided(where: pd.Series, problem: str) -> str:
+        values = factors[where & (factors.index.get_level_values("problem") == problem)]
+        return f"{values.min():.2g} to {values.max():.2g} (median {values.median():.2g})"
+
+    tally = re.search(r"^\| all \| (\d+) \| (\d+) \| (\d+) \|", (ROOT / "docs" / "reproduction.md").read_text(), re.M)
+    assert tally
+    return (
+        "\n".join(rows)[2:-2],
+        f"Below {np.floor(min(pays) / 10) * 10:.0f} queries, no. Above {np.ceil(max(pays) / 10) * 10:.0f}, yes,",
+        f"by {divided(few, 'obstacle')} on the obstacle and by {divided(few, 'hertz')} on Hertz",
+        f"by {divided(~few, 'obstacle')} and {divided(~few, 'hertz')}",
+        f"{tally[1]} agree with ours and {tally[2]} differ",
+    )
+
+
 TOPICS: dict[str, Callable[[], Sequence[str]]] = {
     topic.__name__: topic
     for topic in (
         cones, guarantees, slowest, setting, cones_and_controls, enrichments, fronts, formulations, break_evens,
-        certified, unseen_parameters, elliptic_contact, space,
+        certified, unseen_parameters, elliptic_contact, space, first_page,
     )
 }  # fmt: skip
 
@@ -628,7 +679,7 @@ def rendered(page: str) -> str:
 
 def main() -> None:
     """Render the parts of all pages."""
-    for path in sorted(Path(__file__).parent.glob("*.md")):
+    for path in [ROOT / "README.md", *sorted(Path(__file__).parent.glob("*.md"))]:
         text = path.read_text(encoding="utf-8")
         if (made := rendered(text)) != text:
             path.write_text(made, encoding="utf-8")

@@ -34,7 +34,8 @@ SMALLER = {
 
 CONCLUSIONS = (
     "python tests/benchmarks/certified.py runs/certified --table results/certified/unseen.csv",
-    "python results/scripts/first_page.py results README.md",
+    "python results/scripts/one_picture.py results docs/one-picture.png",
+    "python docs/sentences.py",
     "python results/scripts/what_to_use.py results docs/what-to-use.md",
 )
 """What is made from tables of several pages, in the end."""

@@ -57,14 +57,14 @@ class Verdict:
             return f"{full}. No model of this run takes part in a comparison; `vibench show` gives the reasons."
         errors = f"{_percent(self.best['error_u_mean'])} for u and {_percent(self.best['error_lambda_mean'])} for λ"
         if not self.within:
-            closest = f"the closest is {self.model}, with {errors}"
-            return f"{full}. No model is within {limit} for both u and λ; {closest}. Smaller tolerances would help."
+            closest = f"No model is within {limit} for both u and λ; the closest is {self.model}, with {errors}"
+            return f"{full}. {closest}. Smaller tolerances or more training would help."
         cost = f"a query of the best model within {limit} takes {_time(self.best['online_s'])}"
         return f"{full}, {cost}: {self.model}, {_proof(self.best)}. {self._payment}{self._advice}."
 
     @property
     def model(self) -> str:
-        """The best model in words, such as "offline-pga on the cone of mcpg, 13 modes, 18 generators, piqp"."""
+        """The best model in words: its strategies, its numbers of modes and generators, its solver."""
         cell = self.best or {}
         usual = cell["formulation"] == default_formulation()
         parts = [] if usual else [str(cell["formulation"])]

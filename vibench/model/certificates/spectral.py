@@ -121,7 +121,7 @@ class AnchorGrid:
 
         Bounds hold on any grid: if θ varies elsewhere than is seen here, they are only less sharp.
         """
-        # Between tabulated places weights are linear in mu: 33 of them left the bearing without a bound here and there.
+        # Between tabulated places weights are linear in mu: with 33 of them some A had no bound here and there.
         values = np.linspace(box.lower, box.upper, 257)
         starts = np.vstack([0.5 * (box.lower + box.upper), box.sample(1, 17)])
         every = range(box.dim)
