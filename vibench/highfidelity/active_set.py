@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Mask, SparseMatrix
+from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.errors import NumericalError, at_parameter
 from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness, condensed_stiffness
 from vibench.interfaces.problem import NestedStart, Problem, VariationalInequality
@@ -19,7 +19,7 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import check_positive_definite, check_symmetric
 from vibench.linalg.schur_complement import FEW_PER_UNKNOWN, EliminationPattern
 from vibench.qp import verification
-from vibench.qp.exact import least_distance_solution, rows_that_matter
+from vibench.qp.exact import Directions, least_distance_solution, rows_that_matter
 from vibench.qp.scaling import peak, ratio, row_norms
 from vibench.qp.solve import solve_qp
 
@@ -213,6 +213,7 @@ def solve_unverified(
             fallback = ""
             break
     else:
+        _refuse_contradictions(program, reading.kept)
         (u, forces, iterations), fallback = _without_cycling(program, reading.equal, system)
     lam = reading.multipliers(forces, len(vi.g))
     # A large rigid displacement amplifies round-off in the eliminated unknowns; a stiff problem does so everywhere.
@@ -256,6 +257,16 @@ def _refined_to_accuracy(
         u, lam = _refined(vi, stiffness, u, lam)
         residuals = verification.kkt_residuals(vi, u, lam, stiffness, ACCURACY)
     return HighFidelitySolution(u, lam, unverified.fallback, unverified.iterations, residuals)
+
+
+def _refuse_contradictions(vi: VariationalInequality, numbers: Indices) -> None:
+    """Raise a `NumericalError` with the `numbers` of two opposite rows of B that no u satisfies together."""
+    found = Directions.of(sp.csr_array(vi.B), np.ones(len(vi.g), bool))
+    bounds = vi.g[found.members] / found.lengths[found.members]
+    gaps = np.where(np.bincount(found.group, found.side) == 0.0, np.bincount(found.group, bounds), 0.0)
+    if len(gaps) and gaps.min() < -1e-6 * np.abs(bounds).max():
+        i, j = numbers[found.members[found.group == np.argmin(gaps)]]
+        raise NumericalError(f"rows {i} and {j} of B are opposite, and no u satisfies both of their bounds g")
 
 
 def _without_cycling(

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
 from scipy.optimize import nnls
-from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.sparse.csgraph import reverse_cuthill_mckee, structural_rank
 from scipy.sparse.linalg import splu
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix, times_dense
@@ -27,7 +27,7 @@ from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal, Factor
 from vibench.linalg.factorisations import DEFAULT, implementation
 from vibench.linalg.inner_product import check_regular
 from vibench.linalg.schur_complement import EliminationPattern, PrincipalSubmatrix, StaticCondensation
-from vibench.qp.scaling import row_norms
+from vibench.qp.scaling import peak, row_norms
 from vibench.qp.verification import Inverse, norms_by_solutions
 
 
@@ -384,15 +384,18 @@ class SaddlePointSolver:
     def __call__(self, active: Indices) -> tuple[Array, Array]:
         """The solution u (c,), λ (m,) with the active constraints as equalities and no other multiplier.
 
-        Raises a `RuntimeError` if the system is exactly singular.
+        Raises a `RuntimeError` if the system is exactly singular, or is so whatever the entries of B are.
         """
         solution, is_active = None, np.zeros(len(self._g), bool)
         is_active[active] = True
         if self._factorisation is not None and np.count_nonzero(is_active != self._is_factorised) <= self._border:
             solution = self._solve_bordered(self._factorisation, active, is_active)
         if solution is None:
-            # Keep this order: the set must stay that of the last factorisation where this one fails.
             B = self._B[active]
+            # SuperLU takes minutes for systems that cannot be regular, or destroys the heap.
+            if structural_rank(B) < len(active):
+                raise RuntimeError("the active constraints are dependent")
+            # Keep this order: the set must stay that of the last factorisation where this one fails.
             zero = sp.csr_array((len(active), len(active)))  # blocks that are all CSR are stacked without triplets
             saddle = sp.block_array([[self._A, sp.csr_array(B.T)], [B, zero]], format="csr").T
             self._factorisation = _BorderedFactorisation(saddle, len(active) if self._ordered else None)
@@ -449,9 +452,9 @@ def _in_units(rows: Array, matrix: SparseMatrix, columns: Array) -> SparseMatrix
 class _BorderedFactorisation:
     """The LU factorisation of a symmetric system K (k×k), solved with borders of a few rows and columns.
 
-    Raises a `RuntimeError` if it is exactly singular. A system that is singular up to round-off may still be
-    consistent; its solution is verified by the active set method. `pivots` are those of a saddle point system whose
-    `last` unknowns are multipliers, in natural order, where all have their signs beyond round-off.
+    Raises a `RuntimeError` if it is exactly singular, or has no solution. A system that is singular up to round-off may
+    still be consistent; its solution is verified by the active set method. `pivots` are those of a saddle point system
+    whose `last` unknowns are multipliers, in natural order, where all have their signs beyond round-off.
     """
 
     def __init__(self, matrix: SparseMatrix, last: int | None = None) -> None:
@@ -499,7 +502,11 @@ class _BorderedFactorisation:
             return unbordered - solved @ y, y
 
         x, y = bordered(self._unbordered, values)
-        dx, dy = bordered(self._factor.solve(right - self._matrix @ x - border @ y), values - border.T @ x)
+        rest = right - self._matrix @ x - border @ y
+        # The constraints contradict each other, or round-off alone made their system regular.
+        if self.pivots is None and not peak(rest) <= 1e-3 * peak(right):
+            raise RuntimeError("the system has no solution")
+        dx, dy = bordered(self._factor.solve(rest), values - border.T @ x)
         return x + dx, y + dy
 
 
@@ -534,6 +541,8 @@ class ComplianceSolver:
         lam, rows = np.zeros(len(self._g)), self._B[active]
         if not len(active):
             return self._unconstrained, lam
+        if len(active) > rows.shape[1]:
+            raise np.linalg.LinAlgError("more constraints than unknowns are active")
         contact, excess = self._contact_of(active), self._excess[active]
         scale = 1.0 / np.sqrt(np.diag(contact))  # rows of any length
         factor = scipy.linalg.cho_factor(contact * np.outer(scale, scale), overwrite_a=True, check_finite=False)

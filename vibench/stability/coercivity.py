@@ -22,6 +22,7 @@ from functools import cached_property, lru_cache, partial
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
+from scipy.sparse.csgraph import structural_rank
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.linalg.cholesky import SparseCholesky, symmetric_lu
@@ -237,6 +238,9 @@ def _smallest_compliance(
     m, n = B.shape
     if m <= FEW:
         return smallest_root(np.asarray(B @ factor.solve(B.toarray().T)), W.matrix)
+    # SuperLU may destroy the heap where the system cannot be regular.
+    if structural_rank(sp.csr_array(B)) < m:
+        return lambda _: 0.0
     saddle = _saddle_point(A, B, sp.csc_array((m, m)))[order][:, order]
     try:
         solve = symmetric_lu(sp.csc_array(saddle), "NATURAL").solve

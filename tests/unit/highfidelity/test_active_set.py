@@ -12,9 +12,12 @@ from scipy.spatial import KDTree
 from vibench import Array, HighFidelitySolver, NestedStart, Reduction, create
 from vibench.arrays import Mask
 from vibench.errors import NumericalError
-from vibench.highfidelity import active_set
+from vibench.highfidelity import active_set, kkt_systems
+from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Stop
+from vibench.linalg.factorisations import DEFAULT
+from vibench.linalg.schur_complement import EliminationPattern
 from vibench.offline.checked_tools import solve_high_fidelity
 from vibench.qp.verification import kkt_residuals
 from vibench_problems import obstacle
@@ -93,8 +96,39 @@ def test_no_active_constraint_all_active_and_what_is_infeasible() -> None:
     assert not found.lam.any()
     infeasible = replace(vi, B=sp.csr_array(sp.vstack([vi.B[:4], -vi.B[:4]])), g=-np.ones(8))
     problem.assemble = lambda mu: infeasible  # type: ignore[method-assign]
-    with pytest.raises(NumericalError, match=r"^at mu = \[0.5\]: no active set solves .*; is it feasible\?$"):
+    with pytest.raises(NumericalError, match=r"^at mu = \[0.5\]: rows . and . of B are opposite, and no u satisfies"):
         active_set.HighFidelitySolver(problem).solve(mu)
+
+
+ONE, SHIFTED, ANY = sp.eye_array(36, format="csr"), sp.eye_array(36, k=1, format="csr"), np.random.default_rng(0)
+MANY, FEW = ANY.standard_normal((150, 36)), ANY.standard_normal((36, 9)) @ ANY.standard_normal((9, 36))
+OPPOSITE, NONE = r"rows \d+ and \d+ of B are opposite", "no active set solves the high-fidelity problem; is it feasible"
+SYSTEMS = [
+    ([ONE, -ONE], -1.0, OPPOSITE), ([ONE, -ONE, 1e6 * ONE, -2.0 * ONE], -1.0, OPPOSITE), ([ONE, 1e6 * ONE], 0.1, ""),
+    ([ONE, ONE + 1e-10 * SHIFTED], 0.1, ""), ([ONE, -ONE[:-1] - 1e-10 * SHIFTED[:-1]], -1.0, NONE),
+    ([ONE, 0.0 * ONE], 0.1, ""), ([ONE, 0.0 * ONE], -0.1, "row 36 of B is zero"),
+    ([ONE, ONE[:-1] + ONE[1:], ONE[:-1] - ONE[1:]], -0.1, ""),
+    ([MANY], 0.1, ""), ([MANY], -1.0, NONE), ([FEW], -1.0, NONE), ([FEW, ONE], 0.1, ""),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("rows", "bound", "reason"), SYSTEMS)
+@pytest.mark.parametrize("whole", [True, False])
+def test_systems_that_cannot_be_regular_are_not_factorised(
+    rows: list, bound: float, reason: str, whole: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """SuperLU took minutes for such systems, or destroyed the heap."""
+    vi = replace(string(36, 0.0, -1.0), B=sp.csr_array(sp.vstack([sp.csr_array(part) for part in rows])))
+    stiffness = CondensedStiffness(vi.A, EliminationPattern.of_none(vi.A, DEFAULT) if whole else None)
+    vi, factorised, plain = replace(vi, g=np.full(vi.B.shape[0], bound)), [], kkt_systems.splu
+    monkeypatch.setattr(kkt_systems, "splu", lambda matrix: factorised.append(matrix.shape[0]) or plain(matrix))
+    if reason:
+        with pytest.raises(NumericalError, match=reason):
+            active_set.solve_high_fidelity(vi, stiffness)
+    else:
+        assert (vi.B @ active_set.solve_high_fidelity(vi, stiffness).u).max() <= bound + 1e-10
+    assert max(factorised, default=0) <= 72
+    assert len(factorised) < 15
 
 
 def test_a_contact_set_that_moves_node_by_node_is_followed_to_its_end() -> None:
