@@ -132,9 +132,9 @@ class Run:
         return formats.summary(read_table(self.path, "cells"))
 
     @property
-    def findings(self) -> dict[str, list[str]]:
-        """Sentences computed from the tables, by problem; "" for the whole run."""
-        from vibench.report.findings import findings  # noqa: PLC0415  loads the figures
+    def findings(self) -> list[str]:
+        """Sentences on what a reader has to know beside the numbers, what is alarming first."""
+        from vibench.report.findings import findings  # noqa: PLC0415  of the layer above
 
         return findings(self.path)
 

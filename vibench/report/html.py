@@ -6,7 +6,6 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -164,10 +163,6 @@ def page(path: Path, *, figures: bool = True) -> str:
     # Histories may have millions of rows, and `data_of` has them.
     del read["histories"]
     grids = list(_grids({**read, "cells": cells}))
-    everything = list(findings.all_findings(read, data_of.items()))
-    # Ten are shown and 300 can be unfolded; nobody would read the thousands of a large study.
-    first, listed = (findings.leading(everything, most) for most in (10, 310))
-    rest = [one for one in everything if one in set(listed) - set(first)]
     key_length = short_keys(cells["cell"])
     rows = {str(cell): k for k, cell in enumerate(cells["cell"])}
     live = [plot for name, data in data_of.items() for plot in plots.plots(name, data, rows)]
@@ -189,9 +184,7 @@ def page(path: Path, *, figures: bool = True) -> str:
         way=way,
         vanishes=VANISHES,
         short=lambda cell: str(cell)[:key_length],
-        findings=first,
-        findings_left_out=len(everything) - len(first) - len(rest),
-        more_findings=[(subject, list(group)) for subject, group in groupby(rest, key=lambda one: one.subject)],
+        findings=list(findings.all_findings(read)),
         cells=len(cells),
         failed=int((cells["status"] != Status.OK).sum()),
         missing=failures + [f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason],
@@ -254,7 +247,7 @@ def _grids(read: Mapping[str, pd.DataFrame]) -> Iterator[TableGrid]:
             cells,
             "Errors are relative; they are means over the ok queries whose high-fidelity solution is not zero. Where a "
             "run has others, columns u = 0 and λ = 0 have their number and their largest error over the largest "
-            "training norm. Means over other queries are not comparable: findings and figures take those over queries "
+            "training norm. Means over other queries are not comparable: figures take those over queries "
             "that all solved.",
         ),
     ]

@@ -71,7 +71,8 @@ def test_figures_and_findings(run: vibench.Run) -> None:
     figure = run.figure("inf-sup", dual="cpg")
     assert isinstance(figure, matplotlib.figure.Figure)
     assert figure.axes
-    assert any(title.startswith("radial-obstacle, cpg") for title in run.findings)
+    assert run.findings[0].startswith("2 cells, 2 with every query ok")
+    assert [one.problem for one in run.verdict] == ["radial-obstacle"]
     for kind, options, line in (
         ("infsup", {}, "no figure is called 'infsup'; did you mean 'inf-sup'"),
         ("inf-sup", {}, "the figure is of one dual strategy: name one of cpg, mcpg"),

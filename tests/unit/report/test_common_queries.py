@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import query_rows
 
-from vibench.report.figures.data import common_programs, on_common_queries, program_columns
+from vibench.report.figures.data import on_common_queries, program_columns
 
 QUERIES = 6
 solved_by_cell = st.lists(st.sets(st.integers(0, QUERIES - 1)), min_size=1, max_size=5)
@@ -44,22 +44,3 @@ def test_means_are_over_the_queries_that_all_compared_cells_solved(solved: list[
             assert mean == pytest.approx(np.mean(errors)) if errors else np.isnan(mean)
     some = f" over the {found.common} of {found.asked} queries that all solved"
     assert found.over == some * (found.common != found.asked)
-
-
-@given(solved_by_cell)
-def test_common_programs_are_those_of_all_compared_solvers(solved: list[set[int]]) -> None:
-    _, queries = tables(solved)
-    found = common_programs(queries)
-    kept = [mine for mine in solved if len(mine) >= 0.5 * QUERIES]
-    common = set.intersection(*kept) if kept else set()
-    assert len(found) == len(kept) * len(common)
-    assert set(found["query"]) == common
-    assert set(found["status"]) <= {"ok"}
-
-
-def test_one_program_at_two_accuracies_is_solved_in_two_ways() -> None:
-    _, queries = tables([{0, 1, 2, 3}, {0, 1, 2, 4}])
-    tight = queries.assign(accuracy=1e-9, status=np.where(queries["query"] < 3, "ok", "inaccurate"))
-    found = common_programs(pd.concat([queries, tight]))
-    assert len(found) == 4 * 3
-    assert set(found["query"]) == {0, 1, 2}

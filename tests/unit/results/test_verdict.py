@@ -7,6 +7,7 @@ import pytest
 from samples import cell_row
 
 from vibench.interfaces.strategies import Kind
+from vibench.results import formats
 from vibench.results.verdict import Verdict, verdicts
 
 PLAIN: dict[str, Any] = {
@@ -40,6 +41,7 @@ def test_the_fastest_query_within_the_error_is_the_best_and_says_when_it_pays() 
         "enriching V divides the error of λ by 20 here."
     )
     assert "with proved error bounds. It pays from 25 queries on (95 % interval: 23 to 28)." in str(rope)
+    assert (formats.break_even("from", 203.4), formats.interval(202.9, 204.6)) == ("from 203", "203–205")
     # Seconds of the second cell come from a machine that was half as fast.
     (best,) = judged(ENRICHED, ENRICHED | {"online_s": 5e-3, "hf_s": 0.2})
     assert best.best is not None

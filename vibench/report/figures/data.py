@@ -319,18 +319,6 @@ def on_common_queries(cells: pd.DataFrame, queries: pd.DataFrame) -> Comparable:
     return Comparable(compared, len(common), int(kept["queries"].max()) if len(kept) else 0)
 
 
-def common_programs(queries: pd.DataFrame) -> pd.DataFrame:
-    """Rows of the programs of one problem that are ok with every solver at every accuracy."""
-    # Solvers that have fewer than half of their programs ok at an accuracy are left out there.
-    queries, by = of_solvers(queries), ["solver", "accuracy"]
-    fine = queries[queries["status"] == Status.OK]
-    solved, asked = fine.groupby(by).size(), queries.groupby(by).size()
-    compared = solved.index[solved >= 0.5 * asked.reindex(solved.index)]
-    fine = fine[pd.MultiIndex.from_frame(fine[by]).isin(compared)]
-    ways = fine.groupby(program_columns(), dropna=False)["solver"].transform("size")
-    return fine[ways == len(compared)]
-
-
 def of_solvers(queries: pd.DataFrame) -> pd.DataFrame:
     """Rows of the queries that a QP solver answered."""
     return queries[queries["solver"] != NO_SUCH_AXIS]
