@@ -34,7 +34,7 @@ def all_findings(read: Mapping[str, pd.DataFrame]) -> Iterator[str]:
 
 
 def _checks(read: Mapping[str, pd.DataFrame]) -> Iterator[tuple[bool, str]]:
-    """What each check of a run says, and whether it failed."""
+    """Sentences of the checks of a run, and whether each failed."""
     cells, queries, disagreements = read["cells"], read["queries"], read["disagreements"]
     violated = consistency.violations(queries, cells.set_index("cell")["enrichment_kind"]) if len(queries) else []
     invariants = "of the inf-sup constants and the error bounds"
