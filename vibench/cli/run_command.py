@@ -12,7 +12,7 @@ from typer import Argument, Option
 from vibench.cli.completion import corrections, duals, formulations, primals, problems, solvers, studies
 from vibench.cli.console import echo, run_argument, warn
 from vibench.cli.result_commands import At, draw_run, places_of
-from vibench.errors import RequestError, VibenchError
+from vibench.errors import RequestError, VibenchError, in_a_line, unknown_name
 from vibench.interrupts import interrupted_at_once
 from vibench.qp.status import Status
 from vibench.text import unbroken
@@ -27,10 +27,13 @@ Tolerances = list[float] | None
 
 def run_study_command(
     study: Annotated[
-        str, Argument(help="A study, or a TOML file; with --cell a results file, too.", autocompletion=studies)
-    ] = "quick",
+        str | None,
+        Argument(help="A study, quick by default, or a file; with --cell a results file, too.", autocompletion=studies),
+    ] = None,
     cell: Annotated[str, Option(metavar="KEY", help="Run one cell alone, by its key or the beginning of that.")] = "",
-    problem: Annotated[Names, Option(help="Replace the problems (repeatable).", autocompletion=problems)] = None,
+    problem: Annotated[
+        Names, Option(help="The problem: NAME, FILE.py:CLASS, or a pack (repeatable).", autocompletion=problems)
+    ] = None,
     formulation: Annotated[Names, Option(help="Replace the formulations.", autocompletion=formulations)] = None,
     dual: Annotated[Names, Option(help="Replace the dual strategies.", autocompletion=duals)] = None,
     primal: Annotated[Names, Option(help="Replace the primal strategies.", autocompletion=primals)] = None,
@@ -59,9 +62,11 @@ def run_study_command(
         from vibench.study.matrix import expand
 
         overrides = {
-            "problem": problem, "formulation": formulation, "dual": dual, "primal": primal, "solvers": solver,
-            "correction": correction, "pod": pod_tol, "dual_tol": dual_tol, "primal_tol": primal_tol,
+            "problem": [_problem(one) for one in problem or ()], "formulation": formulation, "dual": dual,
+            "primal": primal, "solvers": solver, "correction": correction, "pod": pod_tol, "dual_tol": dual_tol,
+            "primal_tol": primal_tol,
         }  # fmt: skip
+        study = study or ("default" if problem else "quick")
         loaded = _study(study, cell, {axis: values for axis, values in overrides.items() if values}, at)
     if dry_run:
         cells = expand(loaded)
@@ -115,6 +120,27 @@ def _conclude(outcome: RunResult, folder: Path, *, draw: bool, fresh: bool, stri
     next_steps(folder, all_ok=set(statuses) == {Status.OK})
     if strict and any(status not in (Status.OK, Status.UNAVAILABLE) for status in statuses):
         raise typer.Exit(1)
+
+
+def _problem(text: str) -> Any:
+    """A problem of the command line: its name, the class of a Python file, or the entry of a pack's folder."""
+    import runpy
+
+    from vibench.packs.manifest import FILE
+
+    if (Path(text) / FILE).is_file():
+        return {"name": "pack", "label": Path(text).absolute().name, "options": {"path": str(Path(text).absolute())}}
+    file, _, name = text.rpartition(":")
+    if not file.endswith(".py"):
+        return text
+    try:
+        contents = runpy.run_path(file)
+    except (Exception, SystemExit) as error:  # noqa: BLE001  the file may raise anything
+        raise RequestError(f"the problem '{text}': {file} cannot be run: {in_a_line(error)}") from None
+    if not isinstance(contents.get(name), type):
+        classes = [one for one, value in contents.items() if isinstance(value, type)]
+        raise unknown_name(f"class of {file}", name, classes)
+    return contents[name]
 
 
 def _study(request: str, key: str, overrides: dict[str, list[Any]], at: list[str] | None) -> Study:

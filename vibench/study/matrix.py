@@ -72,7 +72,7 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
     source = str(path) if path == Path(request) else f"study '{request}'"
     # The fault may be in either of them.
     source += " with the options of the command line" if given else ""
-    content = _replace_axes(content, given)
+    content = _replace_axes({"name": path.stem} | content, given)
     # Paths in the options of problems and sampling strategies are relative to the folder of the file.
     problems = _tables(content.get("problem"))
     sets = [_tables(table.get(key)) for table in [content, *problems] for key in ("training", "validation")]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import tomllib
 import warnings
 from collections.abc import Mapping, Sequence
 from datetime import date, time
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
@@ -343,7 +345,7 @@ class Study(_Model):
     def _checked(cls, given: Any, build: ModelWrapValidatorHandler[Study]) -> Study:
         named = ("problem", "formulation", "dual", "primal", "training", "validation")
         try:
-            study = build(_in_present_words(given))
+            study = build(_completed(_in_present_words(given)))
         except ValidationError as error:
             raise RequestError(fault_line(error, cls, named)) from None
         if study.factorisation != DEFAULT:
@@ -387,6 +389,20 @@ def _in_present_words(given: Any) -> Any:
     written = "; ".join(f"{key} = {json.dumps(now[key], default=str)}" for key in keys)
     warnings.warn(f"assembly = {json.dumps(assembly)} is of before; write now: {written}", stacklevel=2)
     return now
+
+
+def _completed(given: Any) -> Any:
+    """A study with what it leaves out, from the registered study `default`: the smallest names its problem alone."""
+    usual, together = registered(PluginKind.STUDY).get("default"), ("dual", "primal", "tolerances")
+    if not isinstance(given, dict) or usual is None or usual.conflict:
+        return given
+    # Tolerances name strategies: these keys are left out together or not at all.
+    others = () if any(key in given for key in together) else (*together, "assembly")
+    lacking = [key for key in ("name", "validation", "solvers", *others) if key not in given]
+    if not lacking:
+        return given
+    content = tomllib.loads(Path(usual.load()).read_text(encoding="utf-8"))
+    return {key: content[key] for key in lacking} | given
 
 
 def _sampling(entry: SamplingEntry) -> Plugin | None:

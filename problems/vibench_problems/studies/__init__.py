@@ -6,6 +6,7 @@ from pathlib import Path
 
 benefit = Path(__file__).with_name("benefit.toml")
 certified = Path(__file__).with_name("certified.toml")
+default = Path(__file__).with_name("default.toml")
 field = Path(__file__).with_name("field.toml")
 formulations = Path(__file__).with_name("formulations.toml")
 formulations_compiled = Path(__file__).with_name("formulations-compiled.toml")

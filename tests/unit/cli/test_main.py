@@ -115,6 +115,30 @@ def test_a_plugin_that_cannot_be_loaded_is_refused(option: str, group: str, main
         assert "no_such_module" in out
 
 
+OWN = """
+from vibench_problems.radial import Radial
+class Own(Radial):
+    "A problem of one's own."
+"""
+
+
+def test_a_problem_alone_is_run_with_the_usual_choices(main: Main, tmp_path: Path) -> None:
+    """By its name or as a class in a file; a wrong one, or a pack that is none, is refused in a line."""
+    (tmp_path / "own.py").write_text(OWN)
+    (tmp_path / "broken.py").write_text("1 / 0\n")
+    (tmp_path / "pack.toml").write_text("")
+    for problem, label in (("obstacle", "obstacle"), (f"{tmp_path}/own.py:Own", "Own")):
+        code, out, _ = main("run", "--problem", problem, "--dry-run")
+        assert (code, out.count(f"  {label} · mcpg · ")) == (0, 8)
+    for problem, said in (
+        (f"{tmp_path}/own.py:Onw", "did you mean 'Own'"), (f"{tmp_path}/broken.py:Own", "division by zero"),
+        (str(tmp_path), "pack.toml: format: required"),
+    ):  # fmt: skip
+        code, _, err = main("run", "--problem", problem, "--dry-run")
+        assert (code, err.count("\n")) == (2, 1)
+        assert said in err
+
+
 def test_a_dry_run_lists_the_matrix_and_does_nothing_else(main: Main, tmp_path: Path) -> None:
     labelled = write_study(tmp_path, changed(STUDY, "problem", 0, "label", to="a\n0 cells\x1b[2J"))
     for study, words in (("quick", ""), (labelled, r"a\n0 cells\u001b[2J · ")):
@@ -170,12 +194,12 @@ def test_interrupts_are_told_and_unforeseen_errors_not_hidden(
         main("run")
 
 
-def test_a_run_ends_with_the_summary_and_says_where_things_are(main: Main, quick_run: Path) -> None:
+def test_a_run_ends_with_whether_it_pays_and_says_where_things_are(main: Main, quick_run: Path) -> None:
     printed, frame = (quick_run / "printed.txt").read_text(encoding="utf-8"), read_table(quick_run / FILE, "cells")
-    fine = frame["status"] == "ok"
-    assert f"{len(fine)} cells, {fine.sum()} ok, {len(fine) - fine.sum()} not ok" in printed
+    assert f"{len(frame)} cells, all ok; no check of constants, bounds and solvers failed\n" in printed
+    assert [f"\n{problem}: a full solution takes " in printed for problem in ("obstacle", "hertz")] == [True, True]
     assert str(quick_run / FILE) in printed
-    assert "next:\n  vibench show " in printed
+    assert "next:\n  vibench report " in printed
     assert len(printed.splitlines()) < 100
     assert "\x1b" not in printed
     code, out, err = main("show", str(quick_run))

@@ -55,7 +55,6 @@ TABLE = ("tolerances", 0)
 
 WRONG: Mapping[str, tuple[tuple[str | int, ...], Any, tuple[str, ...]]] = {
     # what is wrong: (where, the wrong value, words that say the key and what is expected)
-    "name missing": (("name",), REMOVE, ("name", "required")),
     "name empty": (("name",), "", ("name", "1 character")),
     "name of no text": (("name",), 3, ("name", "string", "3")),
     "name that leaves the folder": (("name",), "../elsewhere", ("name", "letters")),
@@ -64,14 +63,12 @@ WRONG: Mapping[str, tuple[tuple[str | int, ...], Any, tuple[str, ...]]] = {
     "seed a truth value": (("seed",), True, ("seed", "integer")),
     "seed text": (("seed",), "7", ("seed", "integer", "'7'")),
     "seed beyond what a table holds": (("seed",), 2**63, ("seed", "less")),
-    "validation missing": (("validation",), REMOVE, ("validation", "required")),
     "validation zero": (("validation",), 0, ("validation", "greater than or equal to 1")),
     "accuracy nan": (("accuracy",), float("nan"), ("accuracy", "finite")),
     "accuracy zero": (("accuracy",), 0.0, ("accuracy", "greater than")),
     "accuracy too loose": (("accuracy",), 0.5, ("accuracy", "less than")),
     "accuracies none": (("accuracy",), [], ("accuracy", "at least 1")),
     "accuracies with one too loose": (("accuracy",), [1e-7, 0.5], ("accuracy.1", "less than", "0.5")),
-    "solvers missing": (("solvers",), REMOVE, ("solvers", "required")),
     "solvers empty": (("solvers",), [], ("solvers", "at least 1")),
     "solvers one word": (("solvers",), "piqp", ("solvers", "'available'", "list", "'piqp'")),
     "solvers of numbers": (("solvers",), [3], ("solvers", "string")),
@@ -152,6 +149,18 @@ def test_what_is_wrong_is_said_in_one_line_without_the_key_itself(tmp_path: Path
         line = refusal(write_study(tmp_path, changed(changed(STUDY, "limits", to={}), *where, key, to=1)))
         assert f"'{key}'" in line
         assert f"did you mean '{key}'" not in line
+
+
+def test_the_smallest_study_names_its_problem(tmp_path: Path) -> None:
+    """What is left out is that of the study `default`; tolerances are left out with the strategies that they name."""
+    path = tmp_path / "smallest.toml"
+    path.write_text('problem = ["obstacle"]\n')
+    study, usual = read_study(str(path)), read_study("default")
+    assert study.name == "smallest"
+    for key in ("validation", "solvers", "dual", "primal", "tolerances", "assembly"):
+        assert getattr(study, key) == getattr(usual, key)
+    path.write_text('problem = ["obstacle"]\ndual = ["cpg"]\n')
+    assert "tolerances" in refusal(str(path))
 
 
 def test_what_is_no_file_of_a_study_or_invalid_toml_is_refused(tmp_path: Path) -> None:
