@@ -241,6 +241,24 @@ def test_what_equalities_may_miss_enters_where_the_derivation_says(
     assert other.bound.u_energy == pytest.approx(np.sqrt(rho**2 + 2.0 * pair.bound.kappa) + eta * np.sqrt(upper))
 
 
+@pytest.mark.parametrize(("constraint", "size"), [("moving", 1.0), ("scaled", 1e-2)])
+def test_margins_of_round_off_are_in_every_term(constraint: str, size: float) -> None:
+    """m of ρ, of κ and, with ω, of rᵀw; μ of ω: larger ones show in these terms alone."""
+    mu, more = np.array([1.2, 0.3]), 0.1
+    problem, model, certificate = prepared("constant", constraint=constraint)
+    reduced = model.assemble(mu)
+    given = problem, mu, reduced, *disturbed(reduced.program, size, np.random.default_rng(4))
+    before, name = certificate.certify(*given, EVERY)[0], "compliance" if certificate.prepared is None else "prepared"
+    bound = replace(certificate, margin=certificate.margin + more).certify(*given, EVERY)[0]
+    one, other = (np.array([each.rho, each.kappa, each.omega]) for each in (before, bound))
+    assert before.kappa > 1e-2
+    assert other / one == pytest.approx([1.0 + more, 1.0 + more, 1.0])
+    added = bound.rho**2 - before.rho**2 + 2.0 * (bound.kappa - before.kappa) + 2.0 * more * bound.rho * bound.omega
+    assert bound.lambda_natural**2 - before.lambda_natural**2 == pytest.approx(added)
+    looser = replace(certificate, **{name: replace(getattr(certificate, name), error=0.21)}).certify(*given, EVERY)[0]
+    assert [looser.rho, looser.kappa, looser.omega] == pytest.approx(one * [1.0, 1.0, 1.1])
+
+
 def test_the_residual_of_a_corrected_pair_is_that_of_the_inner_product_in_place_of_the_stiffness() -> None:
     """u_N and λ_N satisfy the equation, and violate the constraints: what is left is (c X − A) w alone."""
     problem, reduced, certificate = certified(Family("affine", "scaled"), np.eye(N), np.eye(M))
