@@ -71,13 +71,13 @@ class HighFidelitySolver:
         self._solved: list[Array] = []
         self._active: list[Mask] = []
 
-    def solve(self, mu: Array) -> HighFidelitySolution:
-        """Assemble and solve at mu (d,).
+    def solve(self, mu: Array, vi: VariationalInequality | None = None) -> HighFidelitySolution:
+        """Assemble and solve at mu (d,), or solve what has been assembled there.
 
         Raises a `NumericalError` if the assembly is invalid, the solution does not reach `ACCURACY`, the problem
         refuses it, or B touches unknowns outside the declared `contact_dofs`.
         """
-        vi = checked_assembly(self._problem, mu)
+        vi = vi or checked_assembly(self._problem, mu)
         solution = self.verify(mu, vi, self.solve_assembled(mu, vi))
         self.remember(mu, solution)
         return solution

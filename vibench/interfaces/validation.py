@@ -289,6 +289,16 @@ class ReferenceAssembly:
         for difference in contradictions(self._problem, mu, vi, elements=self._compared <= 4):
             raise NumericalError(f"refuted at mu = {mu.tolist()}: {difference}")
 
+    def refuse_at_random(self, count: int, seed: int) -> None:
+        """Compare at random parameters, unless the problem has validation parameters of its own.
+
+        With k parameters a declaration is false in at most 3/k of the box, at 95 %. A set of the problem's own may
+        avoid parts of the box, which are not entered then.
+        """
+        if type(self._problem).validation_set is Problem.validation_set:
+            for mu in self._problem.parameters.sample(count, seed):
+                self.refuse_false_declarations(mu, checked_assembly(self._problem, mu))
+
     def refuse_rewritten_constants(self) -> None:
         """Raise a `NumericalError` if later assemblies have written other entries into a member declared `constant`."""
         constants = {name: getattr(self._vi, name) for name in self._problem.constant}

@@ -27,6 +27,7 @@ from vibench.interfaces.strategies import (
     Stop,
     no_free,
 )
+from vibench.interfaces.validation import ReferenceAssembly, checked_assembly
 from vibench.linalg.inner_product import check_symmetric
 from vibench.model import hyperreduced
 from vibench.model.affine import INTERPOLATION_RTOL, AffineMember, affine_decomposition
@@ -45,17 +46,26 @@ from vibench.text import brief
 Assembly: TypeAlias = Literal["full", "reduced"]  # of the programs, as in a study
 
 
-def high_fidelity_sweep(problem: Problem, mus: Array, *, skip: bool = False) -> Snapshots:
-    """High-fidelity solutions at parameters (P×d); `skip` leaves out those without one, as many as may be skipped."""
+def high_fidelity_sweep(
+    problem: Problem, mus: Array, *, skip: bool = False, reference: ReferenceAssembly | None = None
+) -> Snapshots:
+    """High-fidelity solutions at parameters (P×d); `skip` leaves out those without one, as many as may be skipped.
+
+    With a `reference`, a `NumericalError` names the first declaration that is not what is assembled.
+    """
     solver, solutions, skipped, solved = HighFidelitySolver(problem), [], [], np.zeros(len(mus), bool)
     for k, mu in enumerate(mus):
         try:
-            solutions.append(solver.solve(mu))
-            solved[k] = True
+            vi = checked_assembly(problem, mu)
+            solutions.append(solver.solve(mu, vi))
         except NumericalError as error:
             if not skip:
                 raise
             skipped.append(message_of(error))
+            continue
+        solved[k] = True
+        if reference is not None:
+            reference.refuse_false_declarations(mu, vi)
     check_skipped(skipped, len(solutions))
     u, lam = (np.column_stack([getattr(s, name) for s in solutions]) for name in ("u", "lam"))
     return Snapshots(mus[solved], u, lam, skipped=tuple(skipped))
@@ -166,10 +176,14 @@ class Reduction:
     @cached_property
     def snapshots(self) -> Snapshots:
         """High-fidelity solutions at the training parameters; an adaptive sampling strategy chooses these itself."""
+        reference = ReferenceAssembly(self.problem)
         if not isinstance(self.training, AdaptiveSampling):
             mus = validation.training_parameters(self.problem, self.training)
-            return high_fidelity_sweep(self.problem, mus, skip=self.on_failure == "skip")
-        trainer = GreedyTrainer(self.problem, validation.ReferenceAssembly(self.problem))
+            swept = high_fidelity_sweep(self.problem, mus, skip=self.on_failure == "skip", reference=reference)
+            # Bounds rest on declarations at any parameter.
+            reference.refuse_at_random(16 if self.bounds else 0, 1)
+            return swept
+        trainer = GreedyTrainer(self.problem, reference)
         self.training.train(self.problem.parameters, trainer)
         mus, solutions = np.array([s.mu for s in trainer.solved]), [s.solution for s in trainer.solved]
         return Snapshots(mus, np.column_stack([s.u for s in solutions]), np.column_stack([s.lam for s in solutions]))

@@ -163,7 +163,10 @@ class SnapshotStage(Stage):
             # The first chunk of a process does the set-up; the others have none.
             if problem not in _set_up:
                 _set_up[problem] = solver, beginning.beyond(seconds[0])
-        self._probe(problem, work.reference)
+        if self.parameters.role == "validation" and self.parameters.sampling is None and not self.chunk:
+            # A short validation set is random in the box, but not enough.
+            missing = max(0, 16 - len(self.parameters.of(problem)))
+            work.reference.refuse_at_random(missing, self.parameters.seed + 1)
         work.reference.refuse_rewritten_constants()
         work.refuse_shifted()
         setups = (_set_up[problem][1],) if problem in _set_up else ()
@@ -171,18 +174,6 @@ class SnapshotStage(Stage):
         measured = tuple(seconds), setups, tuple(fallbacks), work.reference.fingerprint
         swept = TimedSnapshots(mus, u, lam, *measured, bounds=tuple(bounds), skipped=tuple(skipped))
         return Result(swept, sum(seconds, lost), self._diagnostics(problem, mus, first))
-
-    def _probe(self, problem: Problem, reference: ReferenceAssembly) -> None:
-        """Compare declarations with assembly at random parameters where the validation set is short.
-
-        A default validation set is random in the box: with k parameters a declaration is false in at most 3/k of it,
-        at 95 %. A set of the problem's own may avoid parts of the box, which are not entered then.
-        """
-        of_default = self.parameters.sampling is None and type(problem).validation_set is Problem.validation_set
-        if self.parameters.role == "validation" and of_default and not self.chunk:
-            missing = max(0, 16 - len(self.parameters.of(problem)))
-            for mu in problem.parameters.sample(missing, self.parameters.seed + 1):
-                reference.refuse_false_declarations(mu, checked_assembly(problem, mu))
 
     def _solved(self, work: _Work, k: int, mu: Array) -> tuple[VariationalInequality, HighFidelitySolution, Seconds]:
         """The inequality at mu (d,), its verified solution, and the seconds of that without the verification."""

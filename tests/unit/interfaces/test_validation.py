@@ -1,6 +1,7 @@
 """Members of any unambiguous type are sparse matrices and vectors of float64 afterwards; others are named."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 from unittest.mock import Mock
 
@@ -187,6 +188,22 @@ def test_what_assembly_does_not_confirm_is_named_with_its_parameter(what: str) -
     assert said.startswith(what.removesuffix(" at some parameters"))
     with pytest.raises(NumericalError, match=rf"refuted at mu = \[{mu[0]}.*\]: `"):
         ReferenceAssembly(problem).refuse_false_declarations(mu, problem.assemble(mu))
+    with pytest.raises(NumericalError, match=r"refuted at mu = \[.*\]: `"):
+        Reduction(problem, None, None, None, None).snapshots  # noqa: B018
+
+
+def test_bounds_rest_on_declarations_that_are_compared_between_training_parameters_too() -> None:
+    """At 9 training parameters the load is proportional to the force, as declared, and not between them."""
+
+    def assemble(self: Any, mu: np.ndarray) -> VariationalInequality:
+        vi = Wire.assemble(self, mu)
+        return replace(vi, f=vi.f * (1.0 + 0.5 * (abs(2.0 * mu[0] % 1.0 - 0.5) < 0.3)))
+
+    problem = variant(Wire, affine=sum_of("f", lambda force: force / 6.0), assemble=assemble)
+    reduction = Reduction(problem, None, None, None, None)
+    assert len(reduction.snapshots.mu) == 9
+    with pytest.raises(NumericalError, match=r"refuted at mu = \[.*\]: `affine` of f"):
+        replace(reduction, bounds=True, assembly="reduced").snapshots  # noqa: B018
 
 
 def test_what_is_true_is_confirmed_whatever_the_units_and_absent_rows() -> None:
