@@ -3,6 +3,7 @@
 import csv
 import importlib
 import inspect
+import json
 import re
 import shutil
 import subprocess
@@ -243,6 +244,8 @@ def test_citations_and_the_lock_file_agree_with_the_project() -> None:
     assert text.count(f'- name: "{fields["author"]}"') == 2
     assert text.count(f"version: {fields['version']}\n") == 2
     assert f"  year: {fields['year']}\n" in text
+    deposit = json.loads((ROOT / ".zenodo.json").read_text(encoding="utf-8"))
+    assert (deposit["title"], deposit["creators"][0]["name"]) == (fields["title"], fields["author"])
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert fields["version"] == project["version"]
     locked = set(
