@@ -1,0 +1,67 @@
+"""The sentences of the pages that people read: none is long, none is full of numbers, and none chains genitives.
+
+`python docs/prose.py` prints every sentence that is not so, with its page, and what is wrong; exit code 1 if there is one.
+Tables, code, formulas and what is generated are no prose.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from statistics import median
+
+ROOT = Path(__file__).parents[1]
+# Lists of names, and claims that are compared one by one.
+OTHERS = {"api", "bibliography", "changelog", "contributing", "glossary", "reproduction", "commands", "tables"}
+NUMBER = re.compile(r"(?<![\w.])\d[\d.,]*")
+CHAINS = re.compile(r"\b(those of|that of the|of which)\b")
+
+
+def pages() -> Iterator[Path]:
+    """README and the pages of the documentation."""
+    yield ROOT / "README.md"
+    yield from (path for path in sorted((ROOT / "docs").rglob("*.md")) if path.stem not in OTHERS)
+
+
+def sentences(text: str) -> Iterator[str]:
+    """The sentences of a page, a formula or code in a line as one word."""
+    text = re.sub(r"^(```|~~~).*?^\1", "", text, flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(r"<!-- generated: .*?<!-- end: .*? -->|<!--.*?-->|\$\$.*?\$\$", "", text, flags=re.DOTALL)
+    text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", re.sub(r"`[^`\n]*`|\$[^$\n]*\$", "code", text))
+    text = re.sub(r"^\|.*$|^#.*$|^ {4,}\S.*$|^[!?]{3}.*$|^-+$", "\n", text, flags=re.MULTILINE)
+    for part in re.split(r"\n\s*\n|^\s*(?:[-*+]|\d+\.)\s", text, flags=re.MULTILINE):
+        plain = " ".join(re.sub(r"<[^>]*>|[*_]{1,2}(?=\S)|(?<=\S)[*_]{1,2}", "", part).split())
+        yield from filter(None, re.split(r"(?<=[.!?:;])\s+(?=[A-ZÄÖÜ(]|code\b)", plain))
+
+
+def faults(sentence: str) -> Iterator[str]:
+    """What is wrong with a sentence."""
+    if (count := len(sentence.split())) > 35:
+        yield f"{count} words"
+    if (count := len(NUMBER.findall(sentence))) > 3:
+        yield f"{count} numbers"
+    if chain := CHAINS.search(sentence):
+        yield f"'{chain[0]}'"
+
+
+def main() -> None:
+    """Print what is wrong with all pages."""
+    wrong = 0
+    for path in pages():
+        found = list(sentences(path.read_text(encoding="utf-8")))
+        for sentence in found:
+            for fault in faults(sentence):
+                print(f"{path.relative_to(ROOT)}: {fault}: {sentence}")
+                wrong += 1
+        middle = median(len(one.split()) for one in found) if found else 15
+        if not 10 <= middle <= 20:
+            print(f"{path.relative_to(ROOT)}: the median sentence has {middle} words, not 10 to 20")
+            wrong += 1
+    print(f"{wrong} faults")
+    sys.exit(wrong > 0)
+
+
+if __name__ == "__main__":
+    main()
