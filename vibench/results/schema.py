@@ -135,9 +135,13 @@ def _effectivities(*names: str) -> dict[str, Column]:
         "divided by the absolute error; empty where the relative error in V or W, or the scaled one if there is none, "
         "is at most 1e-8."
     )
-    of_sum = " The bound is of the sum with λ: this is large where the error of λ is, as without enrichment."
-    sums = "u_energy", "u", "online_u_energy"
-    return {f"effectivity_{name}": real("1", f"bound_{name} {meaning}{of_sum * (name in sums)}") for name in names}
+    return {f"effectivity_{name}": real("1", f"bound_{name} {meaning}{_of_sum(name)}") for name in names}
+
+
+def _of_sum(bound: str) -> str:
+    """The sentence by which effectivities of bounds of u are read."""
+    sentence = " The bound is of the sum with λ: this is large where the error of λ is, as without enrichment."
+    return sentence * (bound in {"u_energy", "u", "online_u_energy"})
 
 
 # All tables of the results file, by name.
@@ -215,7 +219,8 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "error_lambda_max": real("1", "Largest relative error of λ in W over these queries."),
         "queries_zero_lambda": integer("Ok queries with zero_lambda = 1, likewise for the error of λ.", "λ = 0", 20),
         "error_lambda_zero_max": real("1", "Largest error_lambda_scaled of these queries.", "error, λ = 0", 21),
-        **{f"effectivity_{name}_median": real("1", f"Median effectivity of bound_{name} over the ok queries.")
+        **{f"effectivity_{name}_median":
+           real("1", f"Median effectivity of bound_{name} over the ok queries.{_of_sum(name)}")
            for name in (
             "u_energy", "u", "lambda_natural", "lambda", "online_u_energy", "online_lambda_natural", "online_lambda",
             "hsw_u", "hsw_lambda",

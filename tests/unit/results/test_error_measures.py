@@ -1,5 +1,6 @@
 """Models compared by the error of a quantity of interest: break-even, the fastest cells and the figure of both."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -148,3 +149,9 @@ def test_no_measure_is_refused_and_a_pair_without_an_error_has_none(path: Path, 
     found = with_errors(thresholds, cells, pd.Series([np.nan, 0.5]))
     np.testing.assert_array_equal(found[["error_a", "error_b"]], [[0.0, 0.5], [np.nan, 0.5]])
     assert list(within(found, 0.5).index) == [0]
+
+
+def test_effectivities_of_u_are_described_as_those_of_a_sum_wherever_they_are_columns() -> None:
+    columns = {name: column.meaning for table in STORED.values() for name, column in table.items()}
+    meanings = [columns[name] for name in columns if re.fullmatch(r"effectivity_(online_)?u(_energy)?(_median)?", name)]
+    assert ["of the sum with λ" in meaning for meaning in meanings] == [True] * 6
