@@ -59,6 +59,8 @@ class ContactForm:
         self.vi, self._stiffness, self.retained = vi, stiffness, stiffness.retained
         self.B: SparseMatrix = sp.csr_array(sp.csc_array(vi.B)[:, self.retained])
         self.sizes: SparseMatrix = abs(self.B)
+        # made once: SciPy takes longer for a transpose than for its product with a vector
+        self._transposed = self.B.T
         m, c = self.B.shape
         # For a sparse Ŝ a D that is large, or not reused by the next pair, costs more than a sparse system per set.
         self.is_dense = stiffness.dense or (shared and m * c <= 2**18)
@@ -129,7 +131,7 @@ class ContactForm:
 
     def force_representer(self, multiplier: Array) -> Representer:
         """The representer of a force Bᵀη of a multiplier η (m,)."""
-        load = np.asarray(self.B.T @ multiplier)
+        load = np.asarray(self._transposed @ multiplier)
         values = self._displaced(multiplier) if self.is_dense else self._stiffness.compliance(load)
         return Representer(values, load, 0.0)
 
@@ -198,7 +200,7 @@ class ContactForm:
 
     def load(self, values: Array, multiplier: Array) -> Array:
         """Ŝ v (c,) of retained unknowns v (c,), which a force Bᵀη of a multiplier η (m,) displaces up to round-off."""
-        return np.asarray(self.B.T @ multiplier) if self.is_dense else self._stiffness.load(values)
+        return np.asarray(self._transposed @ multiplier) if self.is_dense else self._stiffness.load(values)
 
     def norm(self, terms: Representer, largest: float) -> float:
         """The norm of a sum of terms whose norm is at most about `largest`."""

@@ -79,7 +79,7 @@ class EnergyNorm:
 def of_stiffness(energies: Sequence[EnergyNorm], vectors: Array) -> Array:
     """Products A v (n×P) of vectors (n×P), each at its own parameter; those of one A in one block."""
     product = np.empty_like(vectors)
-    for numbers in _with_one_stiffness(energies):
+    for numbers in with_one_stiffness(energies):
         product[:, numbers] = energies[numbers[0]].A @ vectors[:, numbers]
     return product
 
@@ -89,7 +89,7 @@ def energy_norms(vectors: Array, products: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(np.einsum("ik,ik->k", vectors, products), 0.0)))
 
 
-def _with_one_stiffness(energies: Sequence[EnergyNorm]) -> list[list[int]]:
+def with_one_stiffness(energies: Sequence[EnergyNorm]) -> list[list[int]]:
     """Numbers of the energies that share a stiffness."""
     numbers: dict[int, list[int]] = {}
     for k, energy in enumerate(energies):
@@ -100,7 +100,7 @@ def _with_one_stiffness(energies: Sequence[EnergyNorm]) -> list[list[int]]:
 def solutions(energies: Sequence[EnergyNorm], functionals: Sequence[Array]) -> list[Array]:
     """The solutions A⁻¹ℓ (n,) for functionals (n,), each at its own parameter; those of one A in one block."""
     found: dict[int, Array] = {}
-    for numbers in _with_one_stiffness(energies):
+    for numbers in with_one_stiffness(energies):
         of_one = energies[numbers[0]].stiffness.solve(np.column_stack([functionals[k] for k in numbers]))
         found |= dict(zip(numbers, of_one.T, strict=True))
     return [found[k] for k in range(len(energies))]

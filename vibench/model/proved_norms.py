@@ -17,13 +17,13 @@ may be as large as small bounds: there v is that of extended precision, and p ma
 
 from __future__ import annotations
 
+from functools import cached_property
 from math import inf, sqrt
 
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array
-from vibench.interfaces.problem import VariationalInequality
+from vibench.arrays import Array, SparseMatrix
 from vibench.linalg import EPS, UNIT_ROUND_OFF
 from vibench.linalg.inner_product import InnerProduct
 from vibench.qp.verification import extended
@@ -31,56 +31,61 @@ from vibench.stability.coercivity import share_of_diagonal
 
 
 class ProvedNorms:
-    """Norms of one inequality, summed in extended precision if `precise`; `floor` is T² (n,) with A ≽ diag(T²).
+    """Norms in one A and its inverse, summed in extended precision if `precise`, of vectors in either precision.
 
-    Vectors may be in either precision. `unit` is v, the unit round-off of the sums.
+    `unit` is v, the unit round-off of the sums, `A` is in their precision, and `magnitude` is |A|.
     """
 
-    def __init__(self, vi: VariationalInequality, floor: Array, *, precise: bool) -> None:
-        self._vi, self._magnitude, self._weights = vi, abs(vi.A), 1.0 / np.sqrt(floor)
-        self._A, self._B = (extended(vi.A), extended(vi.B)) if precise else (vi.A, vi.B)
+    def __init__(self, A: SparseMatrix, *, precise: bool) -> None:
+        self.A, self.magnitude, self._squares = extended(A) if precise else A, abs(A), A.diagonal()
         # where the machine has no extended precision it is the double one
         self.unit = 0.5 * max(float(np.finfo(np.longdouble).eps), 2.0**-63) if precise else UNIT_ROUND_OFF
-        rows, columns = (int(np.max(np.diff(sp.csr_array(one).indptr), initial=0)) for one in (vi.A, vi.B.T))
-        self._of_squares, self._of_residual = self._gamma(len(vi.f) + rows + 4), self._gamma(rows + columns + 8)
-        self._squares = vi.A.diagonal()
-        lengths = np.sqrt(self._squares)
-        self._largest_sum = float(np.max((self._magnitude @ (1.0 / lengths)) / lengths, initial=0.0))
+        lengths, self._row = np.sqrt(self._squares), int(np.max(np.diff(sp.csr_array(A).indptr), initial=0))
+        largest_sum = float(np.max((self.magnitude @ (1.0 / lengths)) / lengths, initial=0.0))
+        self._of_squares = 1.01 * self._gamma(A.shape[0] + self._row + 4) * largest_sum
+
+    @cached_property
+    def precise(self) -> ProvedNorms:
+        """Those in extended precision."""
+        return ProvedNorms(self.A, precise=True)
 
     def _gamma(self, terms: int) -> float:
         """The bound γ of round-off in a sum of so many terms."""
         return terms * self.unit / (1.0 - terms * self.unit)
 
-    def energies(self, vectors: Array) -> tuple[Array, float]:
-        """Upper bounds of ‖v‖_A (k,) of vectors (n×k), and the largest share that round-off may have in the square."""
-        found = np.maximum(np.sum(vectors * (self._A @ vectors), axis=0).astype(float), 0.0)
-        lost = 1.01 * self._of_squares * self._largest_sum * (self._squares @ vectors.astype(float) ** 2)
-        shares = np.divide(lost, found, out=np.full_like(lost, np.inf), where=found > 0.0)[lost > 0.0]
+    def energies(self, vectors: Array, products: Array) -> tuple[Array, Array]:
+        """Upper bounds of ‖v‖_A (k,) of vectors (n×k) from A v, and shares (k,) that round-off may have in squares."""
+        found = np.maximum(np.einsum("ik,ik->k", vectors, products).astype(float), 0.0)
+        lost = self._of_squares * (self._squares @ vectors.astype(float, copy=False) ** 2)
+        shares = np.divide(lost, found, out=np.where(lost > 0.0, np.inf, 0.0), where=found > 0.0)
         # a little more than the round-off of what follows, and of the sums of these norms in bounds
-        return np.asarray(np.sqrt(found + lost) * (1.0 + 16.0 * EPS)), float(np.max(shares, initial=0.0))
+        return np.asarray(np.sqrt(found + lost) * (1.0 + 16.0 * EPS)), shares
 
     def largest(self, vectors: Array) -> float:
         """An upper bound of ‖V y‖_A / |y| over y, for vectors V (n×k)."""
         lengths = np.sqrt(self._squares @ vectors.astype(float) ** 2)
-        squares = np.abs(vectors.T @ (self._A @ vectors)).astype(float)
-        squares += 1.01 * self._of_squares * self._largest_sum * np.outer(lengths, lengths)
+        squares = np.abs(vectors.T @ (self.A @ vectors)).astype(float)
+        squares += self._of_squares * np.outer(lengths, lengths)
         return sqrt(float(np.max(squares.sum(axis=0), initial=0.0))) * (1.0 + EPS * len(lengths))
 
-    def missed(self, u: Array, p: Array, lam: Array) -> tuple[Array, float]:
-        """The computed q = f − A(u + p) − Bᵀλ (n,), and an upper bound of its norm in A⁻¹, for λ ≥ 0 (m,)."""
-        vi = self._vi
-        q = np.asarray(vi.f - self._A @ (u + p) - self._B.T @ lam, float)
-        size = np.abs(vi.f) + self._magnitude @ (np.abs(u) + np.abs(p).astype(float)) + abs(vi.B).T @ lam
-        lost = 1.01 * (self._of_residual * size + EPS * np.abs(q))
-        return q, float(np.linalg.norm(self._weights * (np.abs(q) + lost))) * (1.0 + 16.0 * EPS * sqrt(len(q)))
+    def dual_norms(self, q: Array, sizes: Array, others: int, floor: Array) -> Array:
+        """Upper bounds (k,) in A⁻¹ of computed q (n×k), sums of products with rows of A and of `others` further terms.
+
+        `sizes` (n×k) bound the sums of the absolute values of all terms.
+        """
+        lost = 1.01 * (self._gamma(self._row + others + 8) * sizes + EPS * np.abs(q))
+        return np.asarray(np.sqrt((1.0 / floor) @ (np.abs(q) + lost) ** 2) * (1.0 + (len(q) + 16.0) * EPS))
 
 
 def dual_norm(X: InnerProduct, functional: Array, error: Array | float) -> float:
     """Upper bound of the norm in X⁻¹ of all functionals (n,) that differ from one by at most an error (n,)."""
-    share, none = share_of_diagonal(X), np.zeros(0)
+    share = share_of_diagonal(X)
     if not share.proved:
         return inf
-    floor, p = share.value * X.matrix.diagonal(), extended(X.riesz(functional))
-    load = VariationalInequality(X.matrix, functional, sp.csr_array((0, X.dim)), none)
-    norms, beside = ProvedNorms(load, floor, precise=True), float(np.linalg.norm(error / np.sqrt(floor)))
-    return float(norms.energies(p[:, None])[0][0]) + norms.missed(np.zeros(X.dim), p, none)[1] + beside
+    norms, floor = ProvedNorms(X.matrix, precise=True), share.value * X.matrix.diagonal()
+    p = extended(X.riesz(functional))[:, None]
+    product = norms.A @ p
+    q, sizes = (functional[:, None] - product).astype(float), norms.magnitude @ np.abs(p).astype(float)
+    sizes += np.abs(functional)[:, None]
+    found = norms.energies(p, product)[0] + norms.dual_norms(q, sizes, 0, floor)
+    return float(found[0]) + float(np.linalg.norm(error / np.sqrt(floor)))

@@ -50,8 +50,8 @@ def stability(vi: VariationalInequality) -> Stability:
 
 def bounds_or_note(vi: VariationalInequality, u: np.ndarray, lam: np.ndarray, known: Stability | None = None) -> Any:
     space_of = V if len(u) == V.dim else InnerProduct(sp.eye_array(len(u), format="csc"))
-    (found,) = module.error_bounds(space_of, [vi], [energy(vi)], [known or stability(vi)], u[:, None], lam[:, None])
-    return found
+    known = known or stability(vi)
+    return bound_errors_at(space_of, vi, energy(vi), known.coercivity, known.energy_inf_sup, u, lam)
 
 
 def bounds(vi: VariationalInequality, u: np.ndarray, lam: np.ndarray, known: Stability | None = None) -> ErrorBounds:
@@ -343,6 +343,25 @@ def test_a_correction_without_room_for_round_off_is_found_again(monkeypatch: pyt
     vi, u, lam = scalar(lam=0.8, u=0.6)
     found = find_correction(vi, energy(vi), u, lam)
     assert np.all(found.constraints.lacking(found.contact.values(u), found.values, np.abs(u))[0] <= 0.0)
+
+
+def test_pairs_with_one_stiffness_share_its_solutions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two extensions a pair, eight pairs at once; the bounds are those of each pair alone."""
+    extend, columns, rng, vi = CondensedStiffness.extend, [], np.random.default_rng(0), scalar(lam=0.8, u=0.6)[0]
+
+    def counted(stiffness: CondensedStiffness, values: np.ndarray) -> np.ndarray:
+        columns.append(values.shape[1])
+        return extend(stiffness, values)
+
+    norm, constants = energy(vi), (Constant(1.0, True), Constant(1.0, True))
+    u, lam = rng.standard_normal((1, 9)), rng.random((1, 9))
+    monkeypatch.setattr(CondensedStiffness, "extend", counted)
+    together = module.error_bounds(InnerProduct(vi.A), 9 * [vi], 9 * [norm], 9 * [constants], u, lam)
+    assert columns == [16, 2]
+    for found, *pair in zip(together, u.T, lam.T, strict=True):
+        assert numbers(found) == pytest.approx(
+            numbers(bound_errors_at(InnerProduct(vi.A), vi, norm, *constants, *pair))
+        )
 
 
 def test_an_active_set_method_that_fails_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -180,7 +180,8 @@ def test_errors_and_bounds_of_many_queries_are_those_of_each() -> None:
         some, stable, energies = ([of[k] for k in which] for of in (vis, known, [energy(vi) for vi in vis]))
         given = u[:, which], lam[:, which]
         of_error = errors(problem, some, energies, reference.restrict(which), *given)
-        of_bound = error_bounds(problem.V, some, energies, stable, *given), hsw_bounds(problem, some, stable, *given)
+        proved = [(one.coercivity, one.energy_inf_sup) for one in stable]
+        of_bound = error_bounds(problem.V, some, energies, proved, *given), hsw_bounds(problem, some, stable, *given)
         return list(zip(of_error, *of_bound, strict=True))
 
     for k, together in enumerate(of_queries([0, 1, 2])):
