@@ -432,6 +432,7 @@ def find_correction(
     margin = np.where(equal, 0.0, first_margin(_round_off(contact, np.abs(u), np.zeros_like(u)))[kept])
     # the largest multiplier s / b A⁻¹bᵀ that a row b w ≥ s would have alone, from above
     alone = float(np.max(excess * contact.stiffnesses[kept], initial=0.0))
+    lengths = np.sqrt(contact.stiffnesses[kept])
     # multipliers 10⁸ times larger are those of dependent constraints, solved in round-off
     largest = 1e8 * max(np.max(lam, initial=0.0), alone)
     starts, doubtful = [chosen[kept] for chosen in (pressed, lam > 0.0) if chosen is not None], None
@@ -443,7 +444,9 @@ def find_correction(
             w, multipliers = constraints.moved(u, values, multipliers)
             lacking, eta = constraints.lacking(u, w, np.abs(u))
             if not np.all(lacking <= 0.0):  # NaN is not
-                margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking[kept], nan=0.0, posinf=0.0))
+                # w is solved for as a whole: what one row lacks by its round-off others may lack in the next attempt
+                missed = np.nan_to_num(lacking[kept], nan=0.0, posinf=0.0) * lengths
+                margin = np.maximum(margin, np.where(equal, 0.0, 2.0 * np.max(missed, initial=0.0) / lengths))
                 continue
             nu, load = constraints.rows.multipliers(forces, len(vi.g)), contact.load(w, multipliers - lam)
             correction = Correction(w, load, nu, eta, constraints)

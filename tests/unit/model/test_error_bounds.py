@@ -338,11 +338,19 @@ def test_a_reference_is_verified_by_its_bound_where_residuals_do_not_tell() -> N
     assert REFERENCE < module.reference_bound(vi, energy(vi), u, lam) < 1e-3
 
 
-def test_a_correction_without_room_for_round_off_is_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "first_margin", np.zeros_like)
-    vi, u, lam = scalar(lam=0.8, u=0.6)
-    found = find_correction(vi, energy(vi), u, lam)
-    assert np.all(found.constraints.lacking(found.contact.values(u), found.values, np.abs(u))[0] <= 0.0)
+@pytest.mark.parametrize("decades", [1.0, 12.0, 20.0])
+def test_a_correction_without_room_for_round_off_is_found_again(decades: float) -> None:
+    """Solutions round rows of u ≤ 0 in units of all of w, far above the round-off of the small ones itself."""
+    n = 30
+    A = sp.diags_array([-np.ones(n - 1), np.full(n, 2.1), -np.ones(n - 1)], offsets=[-1, 0, 1], format="csc")
+    for seed in range(3):
+        rng, B = np.random.default_rng(seed), sp.eye_array(n - 2, n, format="csr")
+        u, lam = rng.choice([-1.0, 1.0], n) * np.geomspace(1.0, 10.0**-decades, n), rng.random(n - 2)
+        vi = VariationalInequality(A, A @ u + B.T @ lam + 1e-2 * rng.standard_normal(n), B, np.zeros(n - 2))
+        norm = EnergyNorm(A, CondensedStiffness(A), shared=True)
+        # it is one of u + d, too
+        found = bound_errors_at(InnerProduct(A), vi, norm, Constant(1.0, True), Constant(1.0, True), u, lam)
+        assert found.rho_range < found.rho < np.inf
 
 
 def test_pairs_with_one_stiffness_share_its_solutions(monkeypatch: pytest.MonkeyPatch) -> None:
