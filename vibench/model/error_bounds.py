@@ -203,10 +203,9 @@ def _terms_of(pairs: Sequence[_Pair], norms: ProvedNorms, floor: Array) -> Itera
     np.add(parts[:, :count], parts[:, count:], out=vectors[:, 3 * count :])
     products = norms.A @ vectors
     rest, sizes = np.asarray(r - products[:, :count], float), norms.magnitude @ (np.abs(u) + np.abs(p).astype(float))
-    for k, pair in enumerate(pairs):
-        own = pair.correction.contact
+    for k, (own, lam) in enumerate((pair.correction.contact, pair.lam) for pair in pairs):
         sizes[:, k] += np.abs(own.vi.f)
-        sizes[own.retained, k] += own.sizes.T @ pair.lam
+        sizes[own.retained, k] += own.sizes.T @ lam
     columns = max(int(np.max(np.bincount(pair.correction.contact.B.indices), initial=0)) for pair in pairs)
     missed = norms.dual_norms(rest, sizes, columns, floor) / np.sqrt([pair.alpha for pair in pairs])
     lengths, shares = (values.reshape(4, count).T for values in norms.energies(vectors, products))
