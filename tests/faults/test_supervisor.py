@@ -271,7 +271,7 @@ def test_a_worker_does_not_outlive_its_supervisor(tmp_path: Path) -> None:
         "from vibench.execution.supervisor import Job; from vibench.execution.supervisor import Supervisor\n"
         "from fake_stages import InItems, Whole\n"
         f"one = Supervisor(); one.run(Job({str(tmp_path)!r}, InItems(('daemon {seconds}',)), 1.0, 600.0, 8.0))\n"
-        f"one.run(Job({str(tmp_path)!r}, Whole('sleep', {str(diary)!r}), 1.0, 600.0, 8.0))"
+        f"one.run(Job({str(tmp_path)!r}, Whole('hang', {str(diary)!r}), 1.0, 600.0, 8.0))"
     )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     process = subprocess.Popen([sys.executable, "-c", code], env=environment)

@@ -8,7 +8,6 @@ itself. Tests of how processes start and what belongs to them take new interpret
 
 import atexit
 import contextlib
-import faulthandler
 import gc
 import os
 import pickle
@@ -313,6 +312,7 @@ def _be(request: Mapping[str, Any], files: Sequence[int]) -> None:
                     runpy.run_path(sys.argv[0], run_name="__main__")
         else:
             sys.argv[1] = str(files[0])
+            signal.alarm(3600)  # it has no guardian
             import_module("vibench.execution.worker").main()
         code = 0
     except SystemExit as error:
@@ -320,7 +320,6 @@ def _be(request: Mapping[str, Any], files: Sequence[int]) -> None:
     except BaseException:  # noqa: BLE001  as an interpreter prints it
         traceback.print_exc()
     finally:
-        faulthandler.cancel_dump_traceback_later()
         threading._shutdown()
         atexit._run_exitfuncs()
         for stream in (sys.stdout, sys.stderr):

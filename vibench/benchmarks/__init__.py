@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -12,6 +13,7 @@ from typing import Any, NamedTuple
 
 from vibench.errors import RequestError, VibenchError
 from vibench.execution.supervisor import manner_of_death
+from vibench.guardian import MARK, guarded
 from vibench.interfaces.strategies import Stop
 from vibench.plugins.kinds import CHECKED, PluginKind
 from vibench.plugins.registry import find, find_named, registered
@@ -131,13 +133,14 @@ def _choices(axis: str, chosen: Mapping[str, Sequence[str]]) -> Iterable[Any]:
 def run_pytest(options: Sequence[str]) -> None:
     """Run the benchmarks by pytest with options of `vibench.benchmarks.plugin` in a process of its own."""
     folder = str(files("vibench.benchmarks"))
-    command = [sys.executable, "-P", "-m", "pytest", "-c", f"{folder}/pytest.ini", "--rootdir", folder]
-    command += ["-p", "pytest_benchmark.plugin", "-p", "no:terminal", "--benchmark-quiet", "--progress", *options]
+    arguments = ["-c", f"{folder}/pytest.ini", "--rootdir", folder, "-p", "pytest_benchmark.plugin"]
+    arguments += ["-p", "no:terminal", "--benchmark-quiet", "--progress", *options, f"{folder}/stages.py"]
     # Nothing but these options counts: neither those nor the plugins that somebody else's tests have.
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")} | ONE_THREAD
     path = os.pathsep.join(folder for folder in sys.path if folder)
-    environment |= {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTHONPATH": path}
-    done = subprocess.run([*command, f"{folder}/stages.py"], env=environment, stdout=subprocess.DEVNULL, check=False)
+    environment |= {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTHONPATH": path, MARK: secrets.token_hex(8)}
+    process = guarded("pytest", *arguments, environment=environment)
+    done = subprocess.run(**process, stdout=subprocess.DEVNULL, check=False)
     if done.returncode not in (0, 1, 5):  # passed, some failed, there are none
         raise VibenchError(f"the process of the benchmarks failed with {manner_of_death(done.returncode)}")
 

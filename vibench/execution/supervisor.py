@@ -25,6 +25,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from vibench.guardian import MARK, guarded, kill_marked
 from vibench.provenance import libraries, numerical_code
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, ItemwiseStage, Stage, Unstored
@@ -138,10 +139,6 @@ class OutOfMemory:
     """The worker has to be replaced: it has no memory left for its work (`failed`) or for another job."""
 
     failed: Failed | None
-
-
-# Variable in the environment of a worker process and of whatever is started in it; its value is unique.
-MARK = "VIBENCH_WORKER"
 
 
 class StoppedError(Exception):
@@ -364,8 +361,8 @@ def start_worker(descriptor: int, log: str, environment: Mapping[str, str]) -> s
     It leads its own process group: Ctrl-C on the terminal does not reach it, and children of plugins die with it, as do
     those in other groups, by their mark.
     """
-    command = [sys.executable, "-P", "-m", "vibench.execution.worker", str(descriptor), log]
-    return subprocess.Popen(command, env=environment, pass_fds=[descriptor], stdin=subprocess.DEVNULL, process_group=0)
+    options = guarded("vibench.execution.worker", str(descriptor), log, environment=environment)
+    return subprocess.Popen(**options, pass_fds=[descriptor])
 
 
 def _beyond(name: str, limit: float) -> Failed:
@@ -382,18 +379,3 @@ def _cause_of_death(process: subprocess.Popen[bytes]) -> str:
 def manner_of_death(code: int) -> str:
     names = {number.value: number.name for number in signal.Signals}
     return f"exit code {code}" if code >= 0 else f"signal {names.get(-code, -code)}"
-
-
-def kill_marked(mark: str) -> None:
-    """Kill all processes with this value of `MARK` but the calling one, daemons included, on systems with /proc."""
-    entry, found = f"{MARK}={mark}".encode(), True
-    # Processes may be started during a search. The number is bounded in case one multiplies for ever.
-    for _ in range(100):
-        found, searched = False, found
-        for folder in Path("/proc").glob("[0-9]*") if searched else ():
-            # Processes of others cannot be read; those that have just ended are not there, or have no environment.
-            with contextlib.suppress(OSError):
-                # Compare whole entries: the mark could be a part of another variable.
-                if int(folder.name) != os.getpid() and entry in (folder / "environ").read_bytes().split(b"\0"):
-                    found = True
-                    os.kill(int(folder.name), signal.SIGKILL)

@@ -7,10 +7,8 @@ import faulthandler
 import io
 import os
 import resource
-import signal
 import socket
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -60,7 +58,6 @@ def main() -> None:
     interrupts.ignore()
     # Seconds are those of one thread.
     threadpool_limits(1)
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     own, first = os.getpid(), True
 
     def end_in_child() -> None:
@@ -87,18 +84,7 @@ def main() -> None:
             send(supervisor.OutOfMemory(None))
             return
         first = False
-        # The supervisor enforces the limits; this one is for a supervisor that has died.
-        faulthandler.dump_traceback_later(2.0 * job.cell_seconds + 60.0, exit=True)
         send(perform(job, progress, batch, send, enter))
-        faulthandler.cancel_dump_traceback_later()
-
-
-def _end_with(parent: int) -> None:
-    """Kill this process and the children of plugins once the parent has died, which enforced their limits."""
-    while os.getppid() == parent:
-        time.sleep(1.0)
-    supervisor.kill_marked(os.environ[supervisor.MARK])
-    os.killpg(0, signal.SIGKILL)
 
 
 def perform(

@@ -1,6 +1,6 @@
 """Meshes in files of others, read by meshio in a process that has limits of memory and time.
 
-The process runs this module: `python -m vibench.packs.meshes FORMAT FILE BYTES`, arrays on its output.
+The process runs this module with the arguments FORMAT FILE BYTES SECONDS; arrays are on its output.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import importlib.util
 import io
 import os
 import resource
+import secrets
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import RequestError, message_of
+from vibench.guardian import MARK, guarded
 from vibench.text import one_line
 from vibench.timing import ONE_THREAD
 
@@ -45,13 +47,11 @@ def read_mesh(path: Path, limit: int, seconds: int) -> tuple[Array, Array]:
     form = format_of(path)
     if importlib.util.find_spec("meshio") is None:
         raise RequestError("it needs meshio: pip install 'vibench[mesh]'")
-    command = [sys.executable, "-P", "-m", __name__, form, str(path.absolute()), str(limit), str(seconds)]
+    environment = {**os.environ, **ONE_THREAD, MARK: secrets.token_hex(8)}
+    process = guarded(__name__, form, str(path.absolute()), str(limit), str(seconds), environment=environment)
     try:
         # A busy machine takes longer than the seconds of the processor; a process that sleeps ends, too.
-        done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, check=False, timeout=600,
-            env={**os.environ, **ONE_THREAD},
-        )  # fmt: skip
+        done = subprocess.run(**process, capture_output=True, check=False, timeout=600)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise RequestError(f"'{path.name}' cannot be read: {message_of(error)}") from None
     if done.returncode == 0:

@@ -1,0 +1,70 @@
+"""Processes that end with the one that started them, however that died and whatever they are doing.
+
+`python -m vibench.guardian MODULE …` is `python -m MODULE …` in such a process, whose standard input is a pipe.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import runpy
+import select
+import signal
+import sys
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+# Variable in the environment of a guarded process and of whatever is started in it; its value is unique.
+MARK = "VIBENCH_WORKER"
+
+
+def guarded(module: str, *arguments: str, environment: Mapping[str, str]) -> dict[str, Any]:
+    """Arguments of `subprocess.Popen` for a guarded process that runs a module; the environment has a new `MARK`."""
+    command = [sys.executable, "-P", "-m", __name__, module, *arguments]
+    return {"args": command, "env": environment, "stdin": _line(os.getpid())[0], "process_group": 0}
+
+
+@cache
+def _line(process: int) -> tuple[int, int]:  # noqa: ARG001  a forked process has a line of its own
+    """A pipe whose writing end only this process has, until it dies."""
+    return os.pipe()
+
+
+def guard() -> None:
+    """Fork a guardian, which kills the group and the descendants of this process once that or its parent has died.
+
+    A thread could not, as plugins may hold the interpreter. Standard input, a pipe from the parent, becomes empty.
+    """
+    own = os.getpid()
+    if os.fork():
+        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        return
+    # Whoever reads what the guarded process writes would wait for this one, too.
+    os.closerange(1, os.sysconf("SC_OPEN_MAX"))
+    while os.getppid() == own and not select.select([0], [], [], 1.0)[0]:
+        pass
+    kill_marked(os.environ[MARK])
+    os.killpg(0, signal.SIGKILL)
+
+
+def kill_marked(mark: str) -> None:
+    """Kill all processes with this value of `MARK` but the calling one, daemons included, on systems with /proc."""
+    entry, found = f"{MARK}={mark}".encode(), True
+    # Processes may be started during a search. The number is bounded in case one multiplies for ever.
+    for _ in range(100):
+        found, searched = False, found
+        for folder in Path("/proc").glob("[0-9]*") if searched else ():
+            # Processes of others cannot be read; those that have just ended are not there, or have no environment.
+            with contextlib.suppress(OSError):
+                # Compare whole entries: the mark could be a part of another variable.
+                if int(folder.name) != os.getpid() and entry in (folder / "environ").read_bytes().split(b"\0"):
+                    found = True
+                    os.kill(int(folder.name), signal.SIGKILL)
+
+
+if __name__ == "__main__":
+    guard()
+    del sys.argv[0]
+    runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
