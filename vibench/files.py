@@ -8,7 +8,9 @@ import fcntl
 import os
 import platform
 import secrets
+import shutil
 import stat
+import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TextIO
@@ -40,6 +42,22 @@ def write_atomically(path: Path, content: bytes | Iterable[bytes], *, durable: b
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def scratch(parent: Path | None = None) -> Iterator[Path]:
+    """A new folder in another one, or that of temporary files, without those that killed processes left there."""
+    with contextlib.ExitStack() as stack:
+        own = Path(stack.enter_context(tempfile.TemporaryDirectory(".part", TEMPORARY, parent)))
+        # Living processes hold their folders; where a file system has no locks, all others stay.
+        for folder in (own, *(set(own.parent.glob(f"{TEMPORARY}*.part")) - {own})):
+            with contextlib.suppress(OSError):
+                handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+                stack.callback(os.close, handle)
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if folder != own:
+                    shutil.rmtree(folder)
+        yield own
 
 
 @contextlib.contextmanager

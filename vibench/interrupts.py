@@ -1,4 +1,4 @@
-"""Ctrl-C: how it ends a command and a run, and how processes that these start ignore it."""
+"""Ctrl-C, and SIGTERM: how they end a command and a run, and how processes that these start ignore the first."""
 
 from __future__ import annotations
 
@@ -15,17 +15,20 @@ Handler = Callable[[int, FrameType | None], object] | int | None
 
 
 class Interrupted(Exception):  # noqa: N818  what happened is no error
-    """Ctrl-C has ended a command."""
+    """Ctrl-C or SIGTERM has ended a command."""
 
 
 def interruptible(command: Callable[..., None]) -> Callable[..., None]:
-    """A command that raises `Interrupted` in place of `KeyboardInterrupt`, at which Typer would exit silently."""
+    """A command that raises `Interrupted` at Ctrl-C, where Typer would exit silently, and at SIGTERM."""
 
     @functools.wraps(command)
     def wrapped(*arguments: object, **options: object) -> None:
         raising = signal.getsignal(signal.SIGINT) is _leave
         try:
-            with _handled(signal.default_int_handler) if raising else contextlib.nullcontext():
+            with (
+                _handled(signal.default_int_handler) if raising else contextlib.nullcontext(),
+                _handled(signal.default_int_handler, signal.SIGTERM),
+            ):
                 command(*arguments, **options)
         except KeyboardInterrupt:
             raise Interrupted from None
@@ -75,21 +78,21 @@ def held() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _handled(handler: Handler) -> Iterator[None]:
-    """Handle Ctrl-C inside the block; the previous handler returns unless the block has set another one."""
-    before = signal.getsignal(signal.SIGINT)
-    _set(handler)
+def _handled(handler: Handler, number: int = signal.SIGINT) -> Iterator[None]:
+    """Handle a signal inside the block; the previous handler returns unless the block has set another one."""
+    before = signal.getsignal(number)
+    _set(handler, number)
     try:
         yield
     finally:
-        if signal.getsignal(signal.SIGINT) is handler:
-            _set(before)
+        if signal.getsignal(number) is handler:
+            _set(before, number)
 
 
-def _set(handler: Handler) -> None:
+def _set(handler: Handler, number: int = signal.SIGINT) -> None:
     # Only the main thread can set handlers.
     if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, handler)
+        signal.signal(number, handler)
 
 
 def _leave(number: int, frame: FrameType | None) -> None:  # noqa: ARG001  the signature of a handler

@@ -3,6 +3,7 @@
 import os
 import signal
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 
@@ -31,8 +32,10 @@ def test_commands_catch_raise_or_ignore_what_ends_the_process_outside(handler: o
     assert outside is not handler
     assert seen == [handler]
     assert now() is handler
-    with interrupted_at_once(), pytest.raises(Interrupted):
-        interruptible(lambda: os.kill(os.getpid(), signal.SIGINT))()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        with interrupted_at_once(), pytest.raises(Interrupted):
+            interruptible(partial(os.kill, os.getpid(), number))()
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     with interrupted_at_once():
         interruptible(lambda: signal.signal(signal.SIGINT, signal.SIG_IGN))()  # type: ignore[arg-type, return-value]
         assert now() is signal.SIG_IGN

@@ -14,13 +14,13 @@ import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import RequestError, UnsupportedError
+from vibench.files import scratch
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.model.chebyshev import AffinePolynomial
 from vibench.model.hyperreduced import AnyReducedModel
@@ -88,8 +88,8 @@ class CompiledProgram:
 
     def __init__(self, source: str, unknowns: int, constraints: int) -> None:
         # A library that is loaded needs its file no longer.
-        with TemporaryDirectory(prefix="vibench-") as folder:
-            self._solve = ctypes.CDLL(str(_compiled(source, Path(folder)))).model_solve
+        with scratch() as folder:
+            self._solve = ctypes.CDLL(str(_compiled(source, folder))).model_solve
         self._sizes = unknowns, constraints
         self._solve.argtypes, self._solve.restype = [ctypes.c_void_p] * 4, ctypes.c_int
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array
 from vibench.errors import RequestError
+from vibench.files import scratch
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import MEMBERS, Problem
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
@@ -60,8 +60,8 @@ def _new_folder(folder: Path) -> Iterator[Path]:
         raise RequestError(f"'{folder}' exists; a pack is written into a new folder")
     if not folder.absolute().parent.is_dir():
         raise RequestError(f"'{folder.absolute().parent}' is not a folder")
-    with tempfile.TemporaryDirectory(dir=folder.absolute().parent, prefix="vibench-") as temporary:
-        part = Path(temporary) / "pack"
+    with scratch(folder.absolute().parent) as temporary:
+        part = temporary / "pack"
         part.mkdir()
         yield part
         # At once: a folder of this name is complete, whenever the program stops.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from itertools import chain
@@ -18,7 +17,7 @@ from vibench.arrays import Array
 from vibench.errors import RequestError
 from vibench.execution.isolated import Trial, solver_trials
 from vibench.execution.recorded_cell import RecordedCell, recorded_cells
-from vibench.files import TEMPORARY, write_atomically, writing
+from vibench.files import scratch, write_atomically, writing
 from vibench.interfaces.problem import VariationalInequality
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import registered
@@ -118,9 +117,9 @@ def export(run: str, folder: Path, places: Mapping[str, str] = {}, *, sequence: 
         raise RequestError(f"no cell of '{run}' has a reduced program{which}")
     with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=TEMPORARY) as scratch:
+        with scratch(folder.parent) as part:
             # An interruption leaves nothing under the name of the folder.
-            new = Path(scratch) / folder.name
+            new = part / folder.name
             new.mkdir()
             programs = [rows for cells in models.values() for rows in _exported(cells, new)]
             (new / "rows.csv").write_text(to_csv(pd.DataFrame(chain.from_iterable(programs))), encoding="utf-8")

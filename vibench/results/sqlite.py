@@ -9,7 +9,6 @@ import marshal
 import os
 import shutil
 import sqlite3
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
@@ -18,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from vibench.errors import RequestError
-from vibench.files import TEMPORARY
+from vibench.files import scratch
 from vibench.qp.status import Status
 from vibench.results.schema import STORED, VERSION
 from vibench.text import brief, json_object, one_line, printable
@@ -154,7 +153,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
     with contextlib.ExitStack() as stack:
         connection = stack.enter_context(contextlib.closing(connect(path, "ro")))
         if not _has_index(connection) and path.is_file():
-            copy = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=TEMPORARY))) / path.name
+            copy = stack.enter_context(scratch()) / path.name
             for end in ("", "-wal"):
                 with contextlib.suppress(FileNotFoundError):
                     shutil.copyfile(f"{path}{end}", f"{copy}{end}")
@@ -175,6 +174,8 @@ def connect(path: Path, mode: Literal["ro", "rwc"]) -> sqlite3.Connection:
     """Open a database that is no pipe or device, to read it only or to create it where it is missing."""
     refuse_pipes(path)
     # Another program may hold a lock for long; a minute is the longest wait.
+    if (length := len(os.fsencode(path.absolute()))) > 504:
+        raise RequestError(f"'{path}' has a path of {length} bytes, and SQLite opens none beyond 504: move its folder")
     return sqlite3.connect(f"{path.absolute().as_uri()}?mode={mode}", uri=True, timeout=60.0)
 
 

@@ -24,7 +24,7 @@ from vibench.results import database as module
 from vibench.results.database import ResultsDatabase
 from vibench.results.read import read_table, results_file
 from vibench.results.schema import STORED, TABLES, VERSION
-from vibench.results.sqlite import FILE, DamagedResultsError, open_read_only, read_meta, read_rows, set_aside
+from vibench.results.sqlite import FILE, DamagedResultsError, connect, open_read_only, read_meta, read_rows, set_aside
 from vibench.text import LONGEST
 
 
@@ -401,3 +401,8 @@ def test_other_columns_are_another_version() -> None:
     ]
     # the first digits of the digest of tables and columns, by version
     assert {VERSION: hashlib.sha256(repr(declared).encode()).hexdigest()[:4]} == {21: "4cee"}
+
+
+def test_a_path_that_sqlite_does_not_open_is_refused_with_its_length() -> None:
+    with pytest.raises(RequestError, match="has a path of 601 bytes, and SQLite opens none beyond 504"):
+        connect(Path(f"/{'d' * 600}/"), "ro")
