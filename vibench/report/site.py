@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import re
 import shlex
 import sqlite3
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,7 +18,7 @@ import pandas as pd
 from jinja2 import Environment
 
 from vibench.errors import RequestError
-from vibench.files import TEMPORARY, write_atomically
+from vibench.files import scratch, write_atomically
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import default_formulation, registered
 from vibench.provenance import distribution_version
@@ -55,8 +55,8 @@ def write(site: Path, fill: Callable[[Path], None]) -> None:
     check(site)
     try:
         site.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=site.parent, prefix=TEMPORARY) as scratch:
-            new = Path(scratch) / "site"
+        with scratch(site.parent) as folder:
+            new = folder / "site"
             new.mkdir()
             fill(new)
             written = (path for path in sorted(new.rglob("*")) if path.is_file())
@@ -214,10 +214,10 @@ def publish(
     others or cannot be written.
     """
     check(site)
-    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as scratch:
+    with scratch() as folder:
         # The last folder or the file alone, since other folders could identify somebody.
         names = numbered((one.absolute().parent.name if one.name == FILE else one.stem for one in paths), "{} ({})")
-        copies = [Path(scratch, name, FILE) for name in names]
+        copies = [folder / name / FILE for name in names]
         for path, copy in zip(paths, copies, strict=True):
             cleaned(path, copy)
         runs = compared_runs(copies)
@@ -248,6 +248,10 @@ def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation, *, figur
     _write_page(pages, site / "comparison.html", "comparison", "", sections=sections, limit=limit)
     filters = {name: sorted({value for run in runs for value in run.values[name]}) for name in runs[0].values}
     _write_page(pages, site / "index.html", "index", "", runs=runs, filters=filters)
+    # What publishes the same site once more, from its results files.
+    asked = {"names": [run.run.name for run in runs], "notes": [run.note for run in runs], "figures": figures}
+    asked |= {"citation": dataclasses.asdict(citation), "vibench": distribution_version("vibench")}
+    _write(site / "publication.json", json.dumps(asked, indent=1, sort_keys=True) + "\n")
     _write(site / "CITATION.cff", citation.cff())
     _write(site / "citation.bib", citation.bibtex())
 

