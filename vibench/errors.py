@@ -135,7 +135,7 @@ def unknown_name(kind: str, name: str, choices: Iterable[str]) -> RequestError:
     # A longer list helps nobody.
     if len(choices) > 30:
         listed = f"{len(choices)} are known{', such as ' * bool(near[1:])}{', '.join(near[1:])}"
-    return RequestError(f"no {kind} is called '{name}'{hint} ({listed})")
+    return RequestError(f"no {kind} is called '{brief(name, 80)}'{hint} ({listed})")
 
 
 def fault_line(fault: ValidationError, root: type[BaseModel], named: Collection[str] = ()) -> str:

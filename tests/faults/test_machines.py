@@ -82,7 +82,10 @@ def test_a_distribution_with_unreadable_entry_points_costs_its_own(
 ) -> None:
     site = tmp_path / "site"
     shutil.copytree(plugins_folder, site)
-    for name, content in (("bytes", b"\xff\xfe[vibench.problems]\n"), ("words", b"[vibench.problems]\nno entry\n")):
+    for name, content in (
+        ("bytes", b"\xff\xfe[vibench.problems]\n"), ("words", b"[vibench.problems]\nno entry\n"),
+        ("groups", b"[vibench.formulation]\nmine = a:B\n"),
+    ):  # fmt: skip
         information = site / f"{name}-1.0.dist-info"
         information.mkdir()
         (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
@@ -90,9 +93,11 @@ def test_a_distribution_with_unreadable_entry_points_costs_its_own(
     listed = vibench(tmp_path, "list", "problems", plugins=site)
     assert (listed.returncode, listed.stderr) == (0, "")
     assert " wire " in listed.stdout
-    reasons = {line.partition(":")[0]: line for line in listed.stdout.splitlines() if "cannot be read" in line}
+    reasons = {line.partition(":")[0]: line for line in listed.stdout.splitlines() if ": its " in line}
     assert "UnicodeDecodeError" in reasons["bytes"]
     assert "TypeError" in reasons["words"]
+    assert "'mine' is not used: no group" in reasons["groups"]
+    assert "did you mean 'vibench.formulations'?" in reasons["groups"]
     done = vibench(tmp_path, "run", write_study(tmp_path, wire_study()), "--dry-run", plugins=site)
     assert (done.returncode, done.stderr) == (0, "")
     monkeypatch.setattr(doctor, "unreadable", lambda: {"words": "unreadable"})

@@ -31,7 +31,7 @@ from vibench.cli.run_command import run_study_command
 from vibench.errors import RequestError, VibenchError, unknown_name
 from vibench.interrupts import Interrupted, interruptible
 from vibench.plugins.kinds import PluginKind
-from vibench.text import unbroken
+from vibench.text import one_line, unbroken
 
 app = typer.Typer(
     name="vibench",
@@ -295,5 +295,5 @@ def _warning(message: Warning | str, category: type[Warning], filename: str, lin
 
 
 def _print_error(error: object, code: int) -> int:
-    sys.stderr.write(f"{fitted(f'vibench: {unbroken(str(error))}', sys.stderr)}\n")
+    sys.stderr.write(f"{fitted(f'vibench: {one_line(str(error))}', sys.stderr)}\n")
     return code

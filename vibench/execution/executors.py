@@ -111,11 +111,14 @@ class Dask(Executor):
         self._token = secrets.token_hex(8)
         self._cluster: Any = None
         if scheduler is None:
-            with interrupts.held():
-                self._cluster = LocalCluster(
-                    n_workers=slots, threads_per_worker=1, processes=True, host="127.0.0.1", protocol="tls",
-                    security=own, dashboard_address="127.0.0.1:0", memory_limit=0, silence_logs="CRITICAL",
-                )  # fmt: skip
+            try:
+                with interrupts.held():
+                    self._cluster = LocalCluster(
+                        n_workers=slots, threads_per_worker=1, processes=True, host="127.0.0.1", protocol="tls",
+                        security=own, dashboard_address="127.0.0.1:0", memory_limit=0, silence_logs="CRITICAL",
+                    )  # fmt: skip
+            except Exception as error:  # noqa: BLE001  what dask preloads may raise anything
+                raise RequestError(f"dask cannot start its workers: {in_a_line(error)}") from None
         try:
             self._client = Client(self._cluster or scheduler, timeout="10s", set_as_default=False)
         except (OSError, ValueError) as error:

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, Mask, real_matrix, real_vector
-from vibench.errors import NumericalError, at_parameter
+from vibench.errors import NumericalError, RequestError, at_parameter
 from vibench.interfaces.absent_rows import ABSENT, is_absent, settled_bounds
 from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment, Sampling, check_sample
@@ -73,25 +73,24 @@ def _matrix(name: str, value: object, rows: int) -> Array:
 
 
 def training_parameters(problem: Problem, sampling: Sampling | None = None) -> Array:
-    """The training set (P×d), by default the problem's; refused if it is empty, of the wrong shape or not finite."""
+    """The training set (P×d), by default the problem's; refused if it is no set of parameters of the box."""
     if sampling is not None:
         return check_sample(problem.parameters, sampling.parameters(problem.parameters))
-    return _finite_parameters(problem, "training_set", np.asarray(problem.training_set(), float), None)
+    try:
+        return check_sample(problem.parameters, problem.training_set())
+    except RequestError as error:
+        raise NumericalError(f"training_set: {error}") from None
 
 
 def validation_parameters(problem: Problem, count: int, seed: int, sampling: Sampling | None = None) -> Array:
-    """The validation set (count×d), by default the problem's, with the same checks."""
+    """The validation set (count×d), by default the problem's; refused if it has the wrong shape or is not finite."""
     if sampling is not None:
         return check_sample(problem.parameters, sampling.parameters(problem.parameters))
-    return _finite_parameters(problem, "validation_set", np.asarray(problem.validation_set(count, seed), float), count)
-
-
-def _finite_parameters(problem: Problem, name: str, mus: Array, count: int | None) -> Array:
-    expected = f"({'P' if count is None else count}, {problem.parameters.dim}){' with P > 0' if count is None else ''}"
-    if mus.ndim != 2 or mus.shape[1] != problem.parameters.dim or not len(mus) or count not in (None, len(mus)):
-        raise NumericalError(f"{name} has shape {mus.shape}, expected {expected}")
+    mus, expected = np.asarray(problem.validation_set(count, seed), float), (count, problem.parameters.dim)
+    if mus.shape != expected:
+        raise NumericalError(f"validation_set has shape {mus.shape}, expected {expected}")
     if not np.all(np.isfinite(mus)):
-        raise NumericalError(f"{name} has parameters that are not finite")
+        raise NumericalError("validation_set has parameters that are not finite")
     return mus
 
 

@@ -277,7 +277,7 @@ def entry_points(*, group: str) -> list[EntryPoint]:
 
 
 def unreadable() -> dict[str, str]:
-    """Distributions whose entry points cannot be read, each with the reason in a line."""
+    """Distributions whose entry points cannot be read, or are in groups that vibench has not, each with a line."""
     return _readable()[1]
 
 
@@ -294,6 +294,10 @@ def _readable() -> tuple[tuple[EntryPoint, ...], dict[str, str]]:
             readable[name] = tuple(distribution.entry_points)
         except Exception as error:  # noqa: BLE001  importlib.metadata raises whatever its parser does
             broken[name] = f"its entry_points.txt cannot be read: {in_a_line(error)}"
+        groups = {entry.group: entry.name for entry in readable.get(name, ()) if entry.group.startswith("vibench.")}
+        for group in groups.keys() - {kind.entry_points for kind in PluginKind}:
+            wrong = unknown_name("group of entry points", group, (kind.entry_points for kind in PluginKind))
+            broken[name] = f"its entry point '{groups[group]:.80}' is not used: {wrong}"
     return tuple(entry for entries in readable.values() for entry in entries), broken
 
 

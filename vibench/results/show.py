@@ -120,7 +120,11 @@ class Table:
                 given, keys = _options(text), self.varying.get((axis, name), ())
                 texts.append(" ".join([name, *(f"{key} {given[key]}" for key in keys if key in given)]))
             rows = rows.assign(**{axis: texts})
-        return formats.under_headings(rows, names, self.view.headings or {}).rename(columns=dict(self.parameters))
+        frame = formats.under_headings(rows, names, self.view.headings or {})
+        # An empty place would not say whether the seconds are small, or were lost.
+        seconds = [name for name in frame if name.endswith(("[s]", "[ms]")) and frame[name].isna().any()]
+        frame = frame.assign(**{name: frame[name].astype(object).fillna("not timed") for name in seconds})
+        return frame.rename(columns=dict(self.parameters))
 
     @property
     def described(self) -> tuple[pd.DataFrame, list[str]]:

@@ -416,8 +416,7 @@ def parameters(case: ProblemCase) -> Iterator[str]:
 def training_set(case: ProblemCase) -> Iterator[str]:
     """Training parameters lie in the box, are reproducible, and there are at least two."""
     mus = training_parameters(case.plugin)
-    yield from _outside("training_set", mus, case.plugin.parameters)
-    if len(np.unique(mus, axis=0)) < 2:
+    if len(mus) < 2:
         yield f"training_set has mu = {mus[0].tolist()} alone; expected at least two different parameters"
     if what := difference(training_parameters(case.plugin), mus, 0.0):
         yield f"training_set differs in a second call: {what} before"
@@ -426,16 +425,12 @@ def training_set(case: ProblemCase) -> Iterator[str]:
 
 def validation_set(case: ProblemCase) -> Iterator[str]:
     """Validation parameters lie in the box and are reproducible."""
-    mus = validation_parameters(case.plugin, 5, seed=0)
-    yield from _outside("validation_set", mus, case.plugin.parameters)
-    if what := difference(validation_parameters(case.plugin, len(mus), seed=0), mus, 0.0):
-        yield f"validation_set is not the same for the same seed: {what} before; draw from default_rng(seed)"
-
-
-def _outside(name: str, mus: Array, box: ParameterBox) -> Iterator[str]:
+    mus, box = validation_parameters(case.plugin, 5, seed=0), case.plugin.parameters
     for k, i in np.argwhere(box.outside(mus))[:1]:
         interval = f"[{box.lower[i]:g}, {box.upper[i]:g}]"
-        yield f"{name} leaves the box: parameter {k}, {at(mus[k])}, has '{box.names[i]}' outside {interval}"
+        yield f"validation_set leaves the box: parameter {k}, {at(mus[k])}, has '{box.names[i]}' outside {interval}"
+    if what := difference(validation_parameters(case.plugin, len(mus), seed=0), mus, 0.0):
+        yield f"validation_set is not the same for the same seed: {what} before; draw from default_rng(seed)"
 
 
 def constants(case: ProblemCase) -> Iterator[str]:

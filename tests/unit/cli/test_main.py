@@ -54,6 +54,7 @@ def test_a_wrong_request_is_refused_in_one_line(main: Main, quick_run: Path, tmp
         ([*show, "--table", "summray"], ["did you mean 'summary'"]),
         ([*show, "--format", "xml"], ["--format", "xml", "markdown"]), ([*show, "--tabel", "cells"], ["--tabel"]),
         ([*show, "--columns", "online ms"], ["did you mean 'online [ms]'?"]),
+        (["show", "/".join(["d" * 100] * 6)], ["no results in"]), (["list", "x" * 5000], ["x… (5000 characters)'"]),
     ):  # fmt: skip
         refused(main(*arguments), *words)
     assert list(Path.cwd().iterdir()) == []

@@ -159,6 +159,12 @@ def test_a_client_that_closes_while_it_is_asked_holds_up_nobody(client: str, job
         assert (ours.result(timeout=0), len(asked)) == ("outcome", 3)
 
 
+def test_a_cluster_that_cannot_start_is_refused_in_a_line(tmp_path: Path) -> None:
+    refused = pytest.raises(RequestError, match="dask cannot start its workers: ModuleNotFoundError: No module named")
+    with dask.config.set({"distributed.nanny.preload": ["no_such_module"]}), refused:
+        Dask(None, 1, tmp_path)
+
+
 def test_other_code_and_workers_without_artefacts_are_refused(
     cluster: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,6 +1,7 @@
 """Tables: found, read, put in order, written, and printed for reading, with the names of parameters."""
 
 import csv
+import dataclasses
 import io
 import json
 import math
@@ -288,6 +289,14 @@ def test_json_has_no_text_in_place_of_an_infinite_number() -> None:
 
 
 COMMAND = re.compile(r"\\(?:[a-zA-Z]+|[&%$#_{}\\,|])")
+
+
+def test_seconds_that_are_missing_have_a_word(quick_run: Path) -> None:
+    table = look_up(quick_run / FILE, "summary")
+    some = table.rows.assign(online_s=table.rows["online_s"].where(table.rows["solver"] == "piqp"))
+    shown = dataclasses.replace(table, rows=some).readable
+    assert {value == "not timed" for value in shown["online [ms]"][some["solver"] != "piqp"]} == {True}
+    assert {isinstance(value, float) for value in shown["online [ms]"][some["solver"] == "piqp"]} == {True}
 
 
 @pytest.mark.parametrize("view", ["summary", "benefits", "disagreements"])
