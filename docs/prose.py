@@ -1,6 +1,6 @@
 """The sentences of the pages that people read: none is long, none is full of numbers, and none chains genitives.
 
-`python docs/prose.py` prints every sentence that is not so, with its page, and what is wrong; exit code 1 if there is one.
+`python docs/prose.py` prints every sentence that is not so, with its page, and what is wrong; with exit code 1.
 Tables, code, formulas and what is generated are no prose.
 """
 

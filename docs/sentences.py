@@ -9,7 +9,7 @@ longer true. Other numbers come from the commands that the pages name beside the
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -607,6 +607,128 @@ def space() -> Sequence[str]:
     ]
 
 
+def pays(values: pd.Series) -> str:
+    """The range of some numbers of queries, to two digits."""
+    return " to ".join(dict.fromkeys(f"{float(f'{end:.2g}'):.0f}" for end in (values.min(), values.max())))
+
+
+def table_rows(rows: Iterable[Sequence[object]]) -> str:
+    """Rows of a Markdown table, without the bars at both ends."""
+    return " |\n| ".join(" | ".join(map(str, row)) for row in rows)
+
+
+def factors_of_enriching() -> pd.DataFrame:
+    """Of every enriched model of the paper's study its problem, whether N < R, and the factor of the error of λ."""
+    full = pd.concat([cells(f"paper-{name}") for name in ("obstacle", "hertz")])
+    cone = ["problem", "dual", "pod_tol", "pod_size", "dual_tol", "dual_size"]
+    full = full[full["assembly"] == "full"].set_index(cone)
+    plain, enriched = full[full["primal"] == BARE], full[full["primal"] != BARE]
+    factor = plain["error_lambda_mean"].reindex(enriched.index) / enriched["error_lambda_mean"]
+    few = (plain["N"] < plain["R"]).reindex(enriched.index)
+    return pd.DataFrame({"few": few, "factor": factor}).reset_index("problem")
+
+
+def enriching() -> Sequence[str]:
+    """What enriching does to the error of λ, with fewer modes than generators and with more."""
+    table, rows = factors_of_enriching(), []
+    for problem in ("obstacle", "hertz"):
+        parts = [table["factor"][(table["problem"] == problem) & (table["few"] == few)] for few in (True, False)]
+        rows.append([problem, *(f"{part.median():.2g} ({span(part)}; {len(part)} models)" for part in parts)])
+    return (table_rows(rows),)
+
+
+def chosen_cone() -> Sequence[str]:
+    """Every cone at the tighter tolerance of the study `field`."""
+    table = cells("field")
+    kept = (table["primal"] == ONLINE) & (table["assembly"] == "reduced") & ~table["dual"].str.contains("control")
+    tight = table[kept & (table["pod_tol"] == table["pod_tol"].min())]
+    rows = []
+    for dual, mine in tight.groupby("dual"):
+        rows.append([f"`{dual}`"])
+        for problem in ("obstacle", "hertz"):
+            one = mine[mine["problem"] == problem].iloc[0]
+            rows[-1] += [str(one["R"]), f"{one['error_lambda_mean']:.2g}", f"{one['offline_cone_s']:.2g}"]
+    return (table_rows(rows),)
+
+
+def chosen_solver() -> Sequence[str]:
+    """Every QP solver: seconds relative to the fastest one of a model, and models that it solves."""
+    table = pd.read_csv(ROOT / "results" / "solvers" / "cells.csv")
+    least = table.groupby([*MODEL, "accuracy"], dropna=False)["online_solve_s"].transform("min")
+    table = table.assign(ratio=(table["online_solve_s"] / least).where(table["status"] == "ok"))
+    rows = []
+    for solver, mine in table.groupby("solver"):
+        texts, means = [f"`{solver}`"], []
+        for accuracy in (1e-4, 1e-7, 1e-10):
+            one = mine[mine["accuracy"] == accuracy]
+            fine = int((one["status"] == "ok").sum())
+            means.append(float(np.exp(np.log(one["ratio"]).mean())) if fine == len(one) else np.inf)
+            texts.append(f"{means[-1]:.2g}" if fine == len(one) else f"– ({fine} of {len(one)})")
+        rows.append((sorted(means, reverse=True), texts))
+    assert min(rows)[1][0] == "`daqp`"
+    return (table_rows(texts for _, texts in sorted(rows)),)
+
+
+def chosen_assembly() -> Sequence[str]:
+    """Gains of the models of `benefit` in every assembly."""
+    table = cells("benefit")
+    gain = (table["hf_s"] / table["online_s"]).groupby([table["assembly"], table["problem"]])
+    ranges = {key: span(values.dropna()) if values.notna().any() else "no program" for key, values in gain}
+    names = {"full": "full", "reduced": "reduced", "certified": "reduced, with bounds", "compiled": "compiled to C"}
+    return (table_rows([name, ranges[how, "obstacle"], ranges[how, "hertz"]] for how, name in names.items()),)
+
+
+def chosen_formulation() -> Sequence[str]:
+    """All formulations at equal error and at equal cost, on four problems."""
+    table = pd.read_csv(ROOT / "results" / "formulations" / "cells.csv")
+    own, fastest, exact = table[table["training"] == "own"], [], []
+    for name in dict.fromkeys(["mixed", *sorted(own["formulation"].unique())]):
+        word, _, kind = name.partition(" ")
+        ms, errors = [f"`{word}` {kind}".strip()], [f"`{word}` {kind}".strip()]
+        for problem in ("obstacle", "hertz", "bearing", "american-put"):
+            mine = own[own["problem"] == problem]
+            usual = mine[(mine["formulation"] == "mixed") & (mine["dual"] == "mcpg") & (mine["pod_tol"] == 1e-3)].iloc[
+                0
+            ]
+            of = mine[mine["formulation"] == name]
+            near = [of[column] <= 1.5 * usual[column] for column in ("error_u_mean", "error_lambda_mean")]
+            equal, cheap = of[near[0] & near[1]], of[of["online_s"] <= 1.25 * usual["online_s"]]
+            ms.append(f"{1e3 * equal['online_s'].min():.2g}" if len(equal) else "–")
+            errors.append("–")
+            if len(cheap):
+                best = cheap.loc[cheap["error_lambda_mean"].idxmin()]
+                errors[-1] = f"{100 * best['error_lambda_mean']:.2g} %, {100 * best['error_u_mean']:.2g} %"
+        fastest.append(ms)
+        exact.append(errors)
+    return table_rows(fastest), table_rows(exact)
+
+
+def chosen_training() -> Sequence[str]:
+    """Greedy training against fixed training where no error is larger."""
+    table = pd.read_csv(ROOT / "results" / "certified" / "training.csv")
+    rows = []
+    for problem, mine in table[table["largest ratio of errors"] <= 1.0].groupby("problem"):
+        solutions = float((mine["greedy snapshots"] / mine["fixed snapshots"]).median())
+        rows.append([problem, f"{solutions:.2g}", span(mine["greedy offline_s"] / mine["fixed offline_s"])])
+    return (table_rows(rows),)
+
+
+def when_not() -> Sequence[str]:
+    """From how many queries models pay, by problem and assembly, and regression beside them."""
+    rows, studies = [], ("benefit", "paper-obstacle", "paper-hertz")
+    tables = [pd.read_csv(ROOT / "results" / study / "thresholds.csv") for study in studies]
+    every = pd.concat([table[table["cell_a"].isna() & (table["solver"] == "piqp")] for table in tables])
+    for (problem, how), mine in every.groupby(["problem", "assembly_b"]):
+        begins = mine["benefit_threshold"][mine["meaning"] == "from"]
+        if len(begins):
+            rows.append([problem, how, len(mine), pays(begins), int(mine["meaning"].isin(["never", "until"]).sum())])
+    table = pd.read_csv(ROOT / "results" / "formulations" / "cells.csv")
+    radial = table[(table["formulation"] == "regression (radial)") & (table["training"] == "own")]
+    from_on = (radial["offline_s"] - radial["hf_setup_s"]) / (radial["hf_s"] - radial["online_s"])
+    rows += [[problem, "regression", len(some), pays(some), 0] for problem, some in from_on.groupby(radial["problem"])]
+    return (table_rows(rows),)
+
+
 def first_page() -> Sequence[str]:
     """The answer of README for the two problems of the paper: a table of models, and what holds beyond it."""
     names = ("obstacle", "hertz")
@@ -634,26 +756,18 @@ def first_page() -> Sequence[str]:
             ", ".join(f"{float(f'{number:.2g}'):.0f}" for number in numbers),
         )
         rows.append(f"| {model} | {' | '.join(texts)} |")
-    full = pd.concat([cells(f"paper-{name}") for name in names])
-    full = full[full["assembly"] == "full"].set_index(
-        ["problem", "dual", "pod_tol", "pod_size", "dual_tol", "dual_size"]
-    )
-    plain = full[full["primal"] == BARE]
-    enriched = full[full["primal"] != BARE]
-    factors = plain["error_lambda_mean"].reindex(enriched.index) / enriched["error_lambda_mean"]
-    few = (plain["N"] < plain["R"]).reindex(enriched.index)
+    factors = factors_of_enriching()
 
-    def divided(where: pd.Series, problem: str) -> str:
-        values = factors[where & (factors.index.get_level_values("problem") == problem)]
-        return f"{values.median():.2g}"
+    def divided(few: bool, problem: str) -> str:
+        return f"{factors['factor'][(factors['few'] == few) & (factors['problem'] == problem)].median():.2g}"
 
     tally = re.search(r"^\| all \| (\d+) \| (\d+) \| (\d+) \|", (ROOT / "docs" / "reproduction.md").read_text(), re.M)
     assert tally
     return (
         "\n".join(rows)[2:-2],
         f"Below {np.floor(min(pays) / 10) * 10:.0f} queries, no. Above {np.ceil(max(pays) / 10) * 10:.0f}, yes,",
-        f"by {divided(few, 'obstacle')} on the obstacle and by {divided(few, 'hertz')} on Hertz, in the median",
-        f"by {divided(~few, 'obstacle')} and {divided(~few, 'hertz')}",
+        f"by {divided(True, 'obstacle')} on the obstacle and by {divided(True, 'hertz')} on Hertz, in the median",
+        f"by {divided(False, 'obstacle')} and {divided(False, 'hertz')}",
         f"{tally[1]} agree with ours and {tally[2]} differ",
     )
 
@@ -662,7 +776,8 @@ TOPICS: dict[str, Callable[[], Sequence[str]]] = {
     topic.__name__: topic
     for topic in (
         cones, guarantees, slowest, setting, cones_and_controls, enrichments, fronts, formulations, break_evens,
-        certified, unseen_parameters, elliptic_contact, space, first_page,
+        certified, unseen_parameters, elliptic_contact, space, first_page, enriching, chosen_cone,
+        chosen_solver, chosen_assembly, chosen_formulation, chosen_training, when_not,
     )
 }  # fmt: skip
 

@@ -36,7 +36,6 @@ CONCLUSIONS = (
     "python tests/benchmarks/certified.py runs/certified --table results/certified/unseen.csv",
     "python results/scripts/one_picture.py results docs/one-picture.png",
     "python docs/sentences.py",
-    "python results/scripts/what_to_use.py results docs/what-to-use.md",
 )
 """What is made from tables of several pages, in the end."""
 
