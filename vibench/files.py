@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import hashlib
 import os
 import platform
 import secrets
@@ -12,6 +13,7 @@ import shutil
 import stat
 import tempfile
 from collections.abc import Iterable, Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import TextIO
 
@@ -67,6 +69,19 @@ def writing(target: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise RequestError(f"'{target}' cannot be written: {error.strerror or error}") from None
+
+
+def file_digest(path: Path) -> bytes:
+    """The SHA-256 of a file; raises an `OSError` if it cannot be read."""
+    state = path.stat()
+    return _digest_of(path, state.st_size, state.st_mtime_ns, state.st_ino)
+
+
+# Cached: a run computes the key of its problem in every process, and data may be large.
+@lru_cache(maxsize=10_000)
+def _digest_of(path: Path, size: int, changed: int, inode: int) -> bytes:  # noqa: ARG001  the state is part of the key
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").digest()
 
 
 def read_regular(path: Path) -> bytes:

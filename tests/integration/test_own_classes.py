@@ -20,8 +20,6 @@ import vibench
 from vibench import InnerProduct, ParameterBox, Problem, VariationalInequality
 from vibench.execution.run import Observer
 
-DEPTH = 0.2
-
 @functools.cache
 def steps(nodes):
     return 1.0 / (nodes + 1)
@@ -40,8 +38,9 @@ class Wire(Problem):
         return self.parameters.grid(5)
 
     def assemble(self, mu):
+        import depth
         ones = self.step * np.ones(self.V.dim)
-        return VariationalInequality(self.stiffness, -mu[0] * ones, -self.mass, DEPTH * ones)
+        return VariationalInequality(self.stiffness, -mu[0] * ones, -self.mass, depth.DEPTH * ones)
 
 class Slack(Wire):
     def assemble(self, mu):
@@ -55,7 +54,9 @@ class MyCone(vibench.DualStrategy):
         return vibench.greedy_cone(snapshots, W, stop)
 
 class Told(Observer):
-    cells = 0
+    cells, lines = 0, ""
+    def note(self, line):
+        self.lines += line
     def cell(self, cell, row):
         self.cells += 1
 
@@ -70,13 +71,14 @@ if __name__ == "__main__":
     cells = run.cells.set_index("problem", drop=False).loc[["Wire", "short", "Slack"]]
     model = run.model(cells["cell"].iloc[0])
     rows = cells[["cell", "problem", "dual", "dual_options", "status", "reason", "error_u_mean"]]
-    print(json.dumps([told.cells, model.solve([5.0]).status, json.loads(rows.to_json(orient="records"))]))
+    print(json.dumps([told.cells, model.solve([5.0]).status + told.lines, json.loads(rows.to_json(orient="records"))]))
 '''
 
 
-def run_source(folder: Path, source: str, *, anew: bool = False) -> tuple[int, str, list[Any]]:
-    """Cells that had to be run, the status of a query of the first one's model, and the rows."""
+def run_source(folder: Path, source: str, depth: float = 0.2, *, anew: bool = False) -> tuple[int, str, list[Any]]:
+    """Cells that had to be run, the status of a query of the first one's model with notes of the run, and the rows."""
     (folder / "script.py").write_text(source)
+    (folder / "depth.py").write_text(f"DEPTH = {depth}")
     if anew:  # by a new interpreter
         line = [sys.executable, "script.py", "out"]
         done = subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False, timeout=PATIENCE)
@@ -105,13 +107,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_same_classes_are_not_run_again_and_edited_ones_are(folder: Path) -> None:
     before = vibench.open_run(folder / "out").cells
     assert run_source(folder, f"# a remark\n{SCRIPT}")[0] == 0
-    count, status, _ = run_source(folder, SCRIPT.replace("DEPTH = 0.2", "DEPTH = 0.15"))
-    assert (count, status) == (3, "ok")
+    count, said, _ = run_source(folder, SCRIPT, 0.15)
+    # A method imports it, and the third class raises before.
+    assert count == 2
+    for name in ("Wire", "short"):
+        assert f"the problem '{name}' reads {folder / 'depth.py'}, changed since: what it computes is computed" in said
     after = vibench.open_run(folder / "out").cells
     assert list(after["cell"]) == list(before["cell"])
-    assert set(after["code"]).isdisjoint(before["code"])
-    changed = after["error_u_mean"] != before["error_u_mean"]
-    assert changed[after["problem"] != "Slack"].all()
+    edited = after["problem"] != "Slack"
+    for changed in (after["code"] != before["code"], after["error_u_mean"] != before["error_u_mean"]):
+        assert changed[edited].all()
+    assert (after["code"] == before["code"])[~edited].all()
 
 
 def test_other_processes_read_the_run_and_refuse_its_models_in_a_line(folder: Path, main: Main) -> None:

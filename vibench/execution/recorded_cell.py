@@ -15,6 +15,7 @@ import pandas as pd
 
 from vibench.arrays import Array
 from vibench.errors import RequestError
+from vibench.execution.first_use import recall_reads
 from vibench.execution.graph import Graph
 from vibench.execution.supervisor import Job, Supervisor
 from vibench.interfaces.problem import VariationalInequality
@@ -44,7 +45,10 @@ class RecordedCell:
 
     @cached_property
     def cell(self) -> Cell:
-        return Cell.from_definition(self.row["definition"], self.places)
+        cell = Cell.from_definition(self.row["definition"], self.places)
+        if any(one.is_given for one in cell.plugins) and recall_reads(cell.plugins, usable_store()):
+            return Cell.from_definition(self.row["definition"], self.places)
+        return cell
 
     @cached_property
     def model(self) -> Model:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence, Set
 from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import closing
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from vibench import interrupts, provenance
 from vibench.errors import ExecutorError, RequestError, StorageError, VibenchError, in_a_line
 from vibench.execution.executors import Dask, Executor, Local
+from vibench.execution.first_use import recall_reads, watch_first_use
 from vibench.execution.graph import Graph
 from vibench.execution.recording import LOG, ResultWriter, claimed, clear, ended_by_smaller_limits, labels_of, refute
-from vibench.execution.supervisor import Job
+from vibench.execution.supervisor import Job, Supervisor
 from vibench.execution.timing_plan import OfflinePlan, TimingPlan
 from vibench.linalg.factorisations import DEFAULT, implementation
 from vibench.plugins.kinds import PluginKind
@@ -132,6 +135,11 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
     """
     cells, store = expand(study), usable_store()
     with claimed(folder), store.used():
+        with closing(Supervisor(folder / LOG)) as supervisor:
+            limits: Any = {"supervisor": supervisor, "seconds": study.limits.cell_seconds}
+            watch = partial(watch_first_use, note=observer.note, **limits)
+            if recall_reads((one for cell in cells for one in cell.plugins), store, watch):
+                cells = expand(study)
         if options.fresh:
             clear(folder, study.name, observer.note)
         database = ResultsDatabase(folder, identity(study), anew=options.fresh)

@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError, RequestError, requested
+from vibench.files import file_digest
 from vibench.interfaces.absent_rows import without_infinities
 from vibench.interfaces.affine import Expression, normal_names
 from vibench.interfaces.outputs import Output
@@ -44,8 +45,7 @@ def pack_digest(path: str | Path) -> str:
         manifest = read_manifest(folder)
         for place, reference in (("manifest", FILE), *references(manifest)):
             for file in _files(folder, place, reference.partition(":")[0], manifest.index_base):
-                state = file.stat()
-                content.update(_file_digest(file, state.st_size, state.st_mtime_ns, state.st_ino))
+                content.update(file_digest(file))
     return content.hexdigest()[:16]
 
 
@@ -59,13 +59,6 @@ def _files(folder: Path, place: str, name: str, first: int) -> list[Path]:
     except RequestError as error:
         raise RequestError(f"{place}: {error}") from None
     return files
-
-
-# Cached: a run computes the key of its problem in every process, and packs may be large.
-@lru_cache(maxsize=10_000)
-def _file_digest(path: Path, size: int, changed: int, inode: int) -> bytes:  # noqa: ARG001  the state is part of the key
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").digest()
 
 
 @contextlib.contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dis
 import functools
 import hashlib
 import io
@@ -13,7 +12,6 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
 from types import CodeType, FunctionType, GetSetDescriptorType, MemberDescriptorType, ModuleType
@@ -23,7 +21,8 @@ import cloudpickle
 
 from vibench.errors import RequestError, in_a_line, message_of
 from vibench.plugins.kinds import PluginKind
-from vibench.plugins.options import named_path
+from vibench.plugins.options import named_path, options_as_json
+from vibench.plugins.reads import states
 from vibench.plugins.registry import RegisteredPlugin, find
 from vibench.provenance import distribution_version, package_hash
 
@@ -112,10 +111,11 @@ class GivenPlugin(RegisteredPlugin):
 
     fingerprint: str = ""  # "object " and the hash of its code and state
     pickled: bytes = b""  # by cloudpickle; empty where only another process has it
-    modules: Mapping[str, str] = field(default_factory=dict, compare=False)  # versions of those that it imports
+    # States of what it reads when it is first used, by its options.
+    reads: dict[str, dict[str, str]] = field(default_factory=dict, compare=False)
 
     def __reduce__(self) -> Any:
-        return GivenPlugin, (self.kind, self.name, (), self.fingerprint, self.pickled, self.modules)
+        return GivenPlugin, (self.kind, self.name, (), self.fingerprint, self.pickled, self.reads)
 
     @cached_property
     def given(self) -> Any:
@@ -139,10 +139,9 @@ class GivenPlugin(RegisteredPlugin):
 
     @cached_property
     def code(self) -> str:
-        """Its fingerprint; another text if a module was edited since."""
-        self.given  # noqa: B018  raises if this process does not have it
-        edited = (name for name, version in self.modules.items() if module_version(import_module(name)) != version)
-        return " ".join([self.fingerprint, *edited])
+        """Its fingerprint; a `RequestError` if this process does not have it."""
+        self.given  # noqa: B018  raises it
+        return self.fingerprint
 
     def load(self) -> Any:
         return self.given if self.is_class else type(self.given)
@@ -156,7 +155,9 @@ class GivenPlugin(RegisteredPlugin):
 
     def data_digest(self, options: Mapping[str, Any]) -> str:
         # An object has read its files already.
-        return super().data_digest(options) if self.is_class else ""
+        own = super().data_digest(options) if self.is_class else ""
+        read = states(self.reads.get(options_as_json(options), ()))
+        return f"{own} {hashlib.sha256(str(read).encode()).hexdigest()[:16]}".strip() if read else own
 
     def create(self, options: Mapping[str, Any]) -> Any:
         return super().create(options) if self.is_class else copy.deepcopy(self.given)
@@ -186,12 +187,12 @@ def give(kind: PluginKind, name: str, given: Any) -> GivenPlugin:
             snapshot = copy.deepcopy(bare)
         _Pickler(file := io.BytesIO()).dump(snapshot)
         needs = {one: distribution_version(one) for one in getattr(cls, "requires", ())}
-        code, modules = fingerprint_of([snapshot, needs])
+        code = fingerprint_of([snapshot, needs])
     except Exception as error:  # noqa: BLE001  pickling runs third-party code
         why = f"the {kind} '{name}' cannot be sent to worker processes: {message_of(error)}"
         advice = "keep such objects out of attributes and global names, or make them where they are used"
         raise RequestError(f"{why}; {advice}") from None
-    plugin = GivenPlugin(kind, name, (), f"object {code}", file.getvalue(), modules)
+    plugin = GivenPlugin(kind, name, (), f"object {code}", file.getvalue())
     # Keep the original: unpickled here, a class of a notebook would lose its global names.
     plugin.__dict__["given"] = snapshot
     return _given.setdefault((kind, name, plugin.fingerprint), plugin)
@@ -223,18 +224,15 @@ def _computed_once(function: Callable[[Any], Any], name: str) -> Any:
 def _received(kind: PluginKind, name: str, options: str, code: str, places: str, given: GivenPlugin | None) -> Plugin:
     """A plugin that was pickled, with its class or object if it is a given one."""
     if given is not None:
-        _given.setdefault((kind, name, given.fingerprint), given)
+        _given.setdefault((kind, name, given.fingerprint), given).reads.update(given.reads)
     return Plugin(kind, name, options, code, places)
 
 
-def fingerprint_of(value: Any) -> tuple[str, dict[str, str]]:
-    """Hash of a value and of its code, equal in all processes that make it in the same way; versions of its modules."""
-    # Functions and classes of scripts and notebooks count with their bytecode and the global names that it uses, those
-    # of modules with the `module_version`. Values of cached properties do not count.
-    seen: dict[int, tuple[int, Any]] = {}
-    own = _hash_of(value, seen)
-    modules = [one for _, one in seen.values() if isinstance(one, ModuleType)]
-    return own, {one.__name__: version for one in modules if (version := module_version(one))}
+def fingerprint_of(value: Any) -> str:
+    """Hash of a value and of its code, equal in all processes that make it in the same way."""
+    # Functions and classes of scripts and notebooks count with their bytecode and the global names that occur in it,
+    # those of modules with the `module_version`. Values of cached properties do not count.
+    return _hash_of(value, {})
 
 
 def _hash_of(value: Any, seen: dict[int, tuple[int, Any]]) -> str:
@@ -303,13 +301,12 @@ def is_cached(cls: type, name: str) -> bool:
 
 
 def _globals(function: FunctionType) -> dict[str, Any]:
-    """The global names that a function uses, with their values."""
+    """The global names that occur in a function, with their values."""
     code = [function.__code__]
     for part in code:
         code += [one for one in part.co_consts if isinstance(one, CodeType)]
     # Names in nested functions and comprehensions count as well.
-    loads = (one for part in code for one in dis.get_instructions(part) if one.opname.startswith("LOAD_"))
-    names = {str(one.argval) for one in loads if one.opname.endswith(("GLOBAL", "GLOBALS", "NAME"))}
+    names = {name for part in code for name in part.co_names}
     return {name: function.__globals__[name] for name in names if name in function.__globals__}
 
 

@@ -249,7 +249,7 @@ def test_import_refuses_a_pack_without_a_solution_and_says_which_rows_constrain_
     write_manifest(tmp_path / "pack", manifest({"solutions": ..., GAP: "-depth"}))
     code, out, line = main("pack", str(tmp_path / "pack"))
     assert (code, out) == (2, "")
-    assert "there is no solution: at mu = [4.0, 0.2]: no active set solves the high-fidelity problem" in line
+    assert "there is no solution: at mu = [4.0, 0.2]: rows 3 and 9 of B are opposite, and no u satisfies both" in line
     cable.B = sp.csr_array(sp.diags_array(np.arange(SIZE) % 2, dtype=float) @ kept)
     write_arrays(tmp_path / "pack", cable)
     write_manifest(tmp_path / "pack", manifest({"solutions": ...}))

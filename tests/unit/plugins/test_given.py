@@ -1,5 +1,6 @@
 """Classes and objects on the axes of a study: what identifies them, what is refused, and how they reach workers."""
 
+import importlib
 import json
 import linecache
 import os
@@ -7,7 +8,9 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from textwrap import dedent
 from typing import Any
@@ -17,9 +20,12 @@ from fake_plugins import Wire
 
 import vibench
 from vibench.errors import RequestError
+from vibench.execution.first_use import recall_reads, watch_first_use
+from vibench.execution.supervisor import Supervisor
 from vibench.plugins import plugin as module
 from vibench.plugins.kinds import PluginKind
-from vibench.plugins.plugin import fingerprint_of, give
+from vibench.plugins.plugin import Plugin, fingerprint_of, give
+from vibench.stages.artefacts import Store
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, study_of_cell
 
@@ -70,7 +76,7 @@ def notebook(source: str = SOURCE, cell: str = "<cell 1>") -> dict[str, Any]:
 
 
 def hashed(source: str = SOURCE, what: str = "Shape()") -> str:
-    return fingerprint_of(eval(what, notebook(source)))[0]
+    return fingerprint_of(eval(what, notebook(source)))
 
 
 EDITS = {
@@ -101,14 +107,14 @@ def test_fingerprints_change_with_exactly_the_edits_that_may_change_a_number() -
     used = names["Shape"]()
     assert used.area == 10.0
     assert fingerprint_of(used) == fingerprint_of(names["Shape"]())
-    assert len({fingerprint_of(one)[0] for one in (used, names["Shape"], names["Shape"](6))}) == 3
+    assert len({fingerprint_of(one) for one in (used, names["Shape"], names["Shape"](6))}) == 3
 
 
 def test_processes_with_other_hash_seeds_agree(tmp_path: Path) -> None:
     """A script, `__main__`, and here a cell of a notebook in another file: one class, one fingerprint."""
     script = tmp_path / "script.py"
     script.write_text(
-        f"{dedent(SOURCE)}\nfrom vibench.plugins.plugin import fingerprint_of\nprint(fingerprint_of(Shape())[0])\n"
+        f"{dedent(SOURCE)}\nfrom vibench.plugins.plugin import fingerprint_of\nprint(fingerprint_of(Shape()))\n"
     )
     seeds = ({"PYTHONHASHSEED": seed} for seed in ("1", "2"))
     run = [sys.executable, str(script)]
@@ -240,3 +246,85 @@ def test_the_definition_of_a_cell_holds_no_object_and_a_pickled_plugin_brings_it
     assert received == cell.problem
     assert pickle.loads(pickle.dumps(received)) == received  # a worker of dask sends it on
     assert received.registered.package == "__main__"
+
+
+WHOLE = """
+    import builtins, importlib, json, os, sys
+    from pathlib import Path
+    import numpy as np
+    import fake_plugins
+
+    class Reading(fake_plugins.Wire):
+        def __init__(self, file: Path = Path()):
+            super().__init__(9)
+            self.name = os.getenv("READS_GET", "") + os.environ["READS_ITEM"] * ("READS_ASKED" in os.environ)
+            self.table, self.text = np.loadtxt("table.txt"), Path("text.json").read_text()
+            eval(compile("import reads_evaluated", "<cell>", "exec"))
+            self.later = os.path.exists("later.txt") or None
+            try:
+                open("later.txt")
+            except FileNotFoundError:
+                Path("written.txt").write_text(str(os.getpid()))
+                self.pid = Path("written.txt").read_text()
+
+        def assemble(self, mu):
+            import reads_statement
+            from reads_package import inner
+            globals()["importlib"].import_module("reads_by_name")
+            getattr(builtins, "exec")(open("script.py").read(), {})
+            return super().assemble(mu)
+"""
+FILES = [
+    "reads_whole.py",
+    "table.txt",
+    "text.json",
+    "reads_evaluated.py",
+    "reads_statement.py",
+    "reads_package/inner.py",
+]
+FILES += ["reads_package/__init__.py", "reads_by_name.py", "reads_second.py", "script.py", "later.txt"]
+
+
+def test_what_a_class_reads_when_it_is_first_used_identifies_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows stayed when a method imports what is edited, or opens it, or asks for a variable."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    names, store, notes = {f"READS_{one}" for one in ("GET", "ITEM", "ASKED")}, Store(tmp_path / "store"), list[str]()
+    for name in FILES[:-1]:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(
+            {"reads_by_name.py": "import reads_second", "reads_whole.py": dedent(WHOLE)}.get(name, "1")
+        )
+    for name in names:
+        monkeypatch.setenv(name, "1")
+    plugin = Plugin.of(give(PluginKind.PROBLEM, "reading", importlib.import_module("reads_whole").Reading), {})
+    with closing(Supervisor()) as supervisor:
+        watch = partial(watch_first_use, note=notes.append, supervisor=supervisor, seconds=60.0)
+        assert recall_reads([plugin], store, watch)
+        again = watch(plugin, ["table.txt", "text.json"])
+    assert notes == [
+        "the problem 'reading' reads table.txt and 1 more, changed since: what it computes is computed again"
+    ]
+    (read,), before = plugin.registered.reads.values(), plugin.as_installed()
+    own = {str(tmp_path / name) for name in FILES} | {f"${name}" for name in names}
+    for one in (read, again):
+        assert own == {name for name in one if not name.startswith(str(Path(__file__).parents[2]))}
+    for name in FILES:
+        content = (tmp_path / name).read_text() if name != "later.txt" else None
+        (tmp_path / name).write_text(f"{content}# edited")
+        assert plugin.as_installed() != before, name
+        (tmp_path / name).unlink() if content is None else (tmp_path / name).write_text(content)
+        assert plugin.as_installed() == before
+    for name in names:
+        with monkeypatch.context() as other:
+            other.setenv(name, "2")
+            assert plugin.as_installed() != before
+    assert pickle.loads(pickle.dumps(plugin)).as_installed() == before
+    (tmp_path / "table.txt").write_text("2")
+    read.clear()
+    told = list[str]()
+    assert recall_reads([plugin], store, lambda _, changed: told.extend(changed) or again)
+    assert told == [str(tmp_path / "table.txt")]
+    assert plugin.as_installed() != before
