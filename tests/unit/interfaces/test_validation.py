@@ -159,6 +159,12 @@ def sum_of(name: str, theta: Any) -> dict[str, AffineSum]:
     return {name: AffineSum((at_six,), lambda mu: np.array([theta(mu[0])]))}
 
 
+def bumpy(self: Any, mu: np.ndarray) -> VariationalInequality:
+    """A wire whose load is proportional to the force at its training parameters, and not between them."""
+    vi = Wire.assemble(self, mu)
+    return replace(vi, f=vi.f * (1.0 + 0.5 * (abs(2.0 * mu[0] % 1.0 - 0.5) < 0.3)))
+
+
 WRONG = {
     "`contact`, g": variant(Declared, contact=contact_of(g=1.2)),
     "`contact`, B": variant(Declared, contact=contact_of(B=1.2)),
@@ -171,6 +177,7 @@ WRONG = {
     "`affine` of A": variant(Wire, affine=sum_of("A", lambda force: 1.0 + 1e-6 * force)),
     "`element_sampler` of A": variant(ByElements, element_sampler=sampler_of("element_sampler", "A")),
     "`affine` of g": variant(Wire, affine=sum_of("g", lambda force: force / 6.0)),
+    "`affine` of f at some parameters": variant(Wire, affine=sum_of("f", lambda force: force / 6.0), assemble=bumpy),
 }
 RIGHT = [Declared(), variant(Declared, contact_loads=loads_of()), ByElements(), Wire(),
          variant(Wire, affine=sum_of("f", lambda force: force / 6.0))]  # fmt: skip
@@ -188,22 +195,9 @@ def test_what_assembly_does_not_confirm_is_named_with_its_parameter(what: str) -
     assert said.startswith(what.removesuffix(" at some parameters"))
     with pytest.raises(NumericalError, match=rf"refuted at mu = \[{mu[0]}.*\]: `"):
         ReferenceAssembly(problem).refuse_false_declarations(mu, problem.assemble(mu))
+    reduction = Reduction(problem, None, None, None, None, assembly="reduced", bounds=True)
     with pytest.raises(NumericalError, match=r"refuted at mu = \[.*\]: `"):
-        Reduction(problem, None, None, None, None).snapshots  # noqa: B018
-
-
-def test_bounds_rest_on_declarations_that_are_compared_between_training_parameters_too() -> None:
-    """At 9 training parameters the load is proportional to the force, as declared, and not between them."""
-
-    def assemble(self: Any, mu: np.ndarray) -> VariationalInequality:
-        vi = Wire.assemble(self, mu)
-        return replace(vi, f=vi.f * (1.0 + 0.5 * (abs(2.0 * mu[0] % 1.0 - 0.5) < 0.3)))
-
-    problem = variant(Wire, affine=sum_of("f", lambda force: force / 6.0), assemble=assemble)
-    reduction = Reduction(problem, None, None, None, None)
-    assert len(reduction.snapshots.mu) == 9
-    with pytest.raises(NumericalError, match=r"refuted at mu = \[.*\]: `affine` of f"):
-        replace(reduction, bounds=True, assembly="reduced").snapshots  # noqa: B018
+        reduction.snapshots  # noqa: B018
 
 
 def test_what_is_true_is_confirmed_whatever_the_units_and_absent_rows() -> None:

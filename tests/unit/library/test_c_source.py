@@ -19,14 +19,12 @@ from samples import small_study, with_ways
 import vibench
 from vibench.interfaces.affine_problem import AffineProblem
 from vibench.interfaces.outputs import Output
-from vibench.interfaces.strategies import Enrichment, Kind
 from vibench.library import reduced_model
-from vibench.library.export import export_model, exported
+from vibench.library.export import export_model
 from vibench.library.reduced_model import Model as Exported
 from vibench.model.certificates import contact_correction as complementarity
 from vibench.model.certificates.base import Guarantee
-from vibench.model.chebyshev import AffinePolynomial, products
-from vibench.model.galerkin import ReducedModel
+from vibench.model.chebyshev import AffinePolynomial
 from vibench.offline import c_source
 from vibench.qp.exact import exact_solution
 from vibench.qp.verification import infeasibility_certificate, kkt_residuals
@@ -322,22 +320,6 @@ def test_both_methods_of_the_correction_in_c_find_that_of_vibench(steps: int, tm
             assert one == pytest.approx(expected, abs=1e-9 * np.abs(fixed).max())
 
 
-def test_terms_that_a_problem_declares_are_exported_as_they_are(model: vibench.Model) -> None:
-    found, declared = exported(model, bases=False), model.problem.affine
-    assert set(declared) == ({"g"} if "B" in model.problem.constant else {"B", "g"})
-    mu = model.parameters.sample(1, seed=5)[0]
-    theta = {name: member.coefficients(mu) for name, member in declared.items()}
-    unit = (mu - model.parameters.lower) / (model.parameters.upper - model.parameters.lower)
-    for name in declared:
-        terms = found.members[name].terms
-        assert len(terms) == len(declared[name].terms)
-        for q, term in enumerate(declared[name].terms):
-            projected = model.reduced.generators.T @ (term if name == "g" else term @ model.reduced.basis)
-            assert np.allclose(terms[q], np.ravel(projected), rtol=1e-12, atol=1e-15)
-        values = products(found.members[name].indices, unit[None]) @ found.members[name].coefficients
-        assert np.allclose(values, theta[name])
-
-
 def linear(constant: np.ndarray, factors: dict[int, int], dimension: int) -> AffinePolynomial:
     """A constant, plus mu_k in the entry of every k: entry, on the box [−1, 1]^dimension."""
     indices, terms = [np.zeros(dimension, np.intp)], [constant.ravel()]
@@ -404,50 +386,35 @@ def test_any_constraints(case: str, scale: float, tmp_path: Path) -> None:
     assert set(codes) <= {0, 2}
 
 
-class Beside(AffineProblem):
-    """A body in contact beside one that opposite rows hold against 1e4 times its load, in a common basis."""
-
-    parameters = vibench.ParameterBox(("load",), np.array([1.0]), np.array([2.0]), ("1",))
-
-    def __init__(self) -> None:
-        Q = np.linalg.qr(np.random.default_rng(0).standard_normal((5, 5)))[0]
-        A = sp.block_diag([[[2.0, -1.0], [-1.0, 3.0]], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.5], [0.0, 0.5, 2.0]]]).toarray()
-        B = np.array([[1, 0, 0, 0, 0], [0, 1, 0, 0, 0], [0, 0, 0, 1, 2], [0, 0, 0, -2, -4], [0, 0, 1, 0, 0]], float)
-        self.V, self.W = (vibench.InnerProduct(sp.eye_array(5, format="csc")) for _ in range(2))
-        f, g = np.array([1.0, 1.0, -1.0, 1e4, -2e4]), np.array([0.1, 0.2, 1e3, -2e3, 0.0])
-        self.declare(A=Q @ A @ Q.T, f=[("load", Q @ f)], B=B @ Q.T, g=g)
-
-    def training_set(self) -> np.ndarray:
-        return self.parameters.grid(2)
-
-
 @pytest.mark.parametrize("share", [1.0, 0.99, 0.0])  # of the forces of contact
-def test_loaded_ties_hide_no_contact_from_scripts_and_c(share: float, tmp_path: Path, monkeypatch: Patch) -> None:
-    """Both judge as vibench does: the unit is that of the contact beside the tie, and the tie opens no gap."""
-    whole, stop = ReducedModel(Beside(), np.eye(5), Enrichment(Kind.NONE), np.eye(5), np.eye(5)), vibench.Stop(size=5)
-    strategy = vibench.create("dual strategy", "cpg")
-    model = vibench.Reduction(whole.problem, strategy, None, stop, stop).given(assembled=whole).model
-    export_model(model, tmp_path / "model.npz", c=True)
-    script, text = Exported(tmp_path / "model.npz"), (tmp_path / "model.c").read_text()
-    spoilt = f"    alpha[0] *= {share};\n    alpha[1] *= {share};\n    return verify(&set"
-    (tmp_path / "model.c").write_text(text.replace("    return verify(&set", spoilt), encoding="utf-8")
-    solve, polished = compiled(tmp_path / "model.c", 5, 5), reduced_model._polished
-
-    def lacking(*given: Any) -> tuple[np.ndarray, np.ndarray]:
-        v, forces = polished(*given)
-        return v, forces * np.where(np.arange(5) < 2, share, 1.0)
-
-    monkeypatch.setattr(reduced_model, "_polished", lacking)
-    monkeypatch.setitem(reduced_model.SOLVERS, script.solver, lambda A, f, B, g, _: (f, np.ones(5)))
-    for mu in model.parameters.sample(5, seed=3):
-        code, x, alpha, found = solve(mu)
-        program, own = model.reduced.assemble(mu).program, script.solve(mu)
-        residuals = kkt_residuals(program, x, alpha, accuracy=model.accuracy)
-        expected = (residuals.primal, residuals.dual, residuals.gap)
-        assert residuals.unit < 10.0
-        assert (code == 0, own.status == "ok") == ((residuals.worst <= model.accuracy),) * 2 == (share == 1.0,) * 2
-        assert found == pytest.approx(expected, abs=1e-10)
-        assert own.residuals == pytest.approx(expected, abs=1e-10)
+def test_loaded_ties_hide_no_contact_from_c_and_scripts(share: float, tmp_path: Path) -> None:
+    """A body in contact beside one that opposite rows hold against 1e4 times its load, in a common basis."""
+    rng = np.random.default_rng(0)
+    Q = np.linalg.qr(rng.standard_normal((5, 5)))[0]
+    A = sp.block_diag([[[2.0, -1.0], [-1.0, 3.0]], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.5], [0.0, 0.5, 2.0]]]).toarray()
+    B = np.array([[1, 0, 0, 0, 0], [0, 1, 0, 0, 0], [0, 0, 0, 1, 2], [0, 0, 0, -2, -4], [0, 0, 1, 0, 0]]) @ Q.T
+    A, f, g = Q @ A @ Q.T, Q @ np.array([1.0, 1.0, -1.0, 1e4, -2e4]), np.array([0.1, 0.2, 1e3, -2e3, 0.0])
+    A = 0.5 * (A + A.T)
+    members = {"A": linear(A[np.triu_indices(5)], {}, 1), "f": linear(f, {}, 1), "B": linear(B, {}, 1)}
+    members["g"] = linear(g, {}, 1)
+    text = c_source.source(members, {"lower": np.zeros(1), "upper": np.ones(1)}, about(["t"]), "case")[0]
+    judged = "    return verify(&set"
+    spoilt = text.replace(judged, f"    alpha[0] *= {share};\n    alpha[1] *= {share};\n{judged}")
+    (tmp_path / "case.c").write_text(spoilt, encoding="utf-8")
+    code, x, alpha, found = compiled(tmp_path / "case.c", 5, 5)(np.zeros(1))
+    expected = kkt_residuals(vibench.VariationalInequality(A, f, B, g), x, alpha, accuracy=1e-9)
+    assert expected.unit < 10.0
+    assert (code == 0) == (expected.worst <= 1e-9) == (share == 1.0)
+    assert found == pytest.approx((expected.primal, expected.dual, expected.gap), abs=1e-10)
+    of, rows, free = reduced_model._matrices(A, B), np.linalg.norm(B, axis=1), np.linalg.solve(A, f)
+    noise, none = of.round_off * (of.sizes @ abs(free) + abs(g / rows)), 0.0 * f
+    script = reduced_model.residuals(of, none, g / rows - of.B @ free, x - free, rows * alpha, noise)
+    assert script == pytest.approx(found, abs=1e-10)
+    for load in (f, none):  # without a load other scales count
+        x, alpha = rng.standard_normal(5), rng.random(5)
+        expected = kkt_residuals(vibench.VariationalInequality(A, load, B, g), x, alpha)
+        script = reduced_model.residuals(of, load, g / rows, x, rows * alpha, none)
+        assert script == pytest.approx((expected.primal, expected.dual, expected.gap), rel=1e-9)
 
 
 def test_matrices_that_are_not_positive_definite_and_numbers_that_are_not_finite_fail(tmp_path: Path) -> None:

@@ -193,21 +193,6 @@ def test_an_exported_model_reproduces_random_queries(run: vibench.Run, way: str,
     assert {file.name for file in tmp_path.iterdir()} == FILES
 
 
-def test_residuals_are_those_of_vibench(run: vibench.Run, tmp_path: Path) -> None:
-    model = model_of(run, "obstacle")
-    exported = per_file(model, tmp_path)
-    mu = model.parameters.sample(1, seed=3)[0]
-    A, f, B, g, _ = exported.program(mu)
-    rows = np.linalg.norm(B, axis=1)
-    random = np.random.default_rng(0)
-    for load in (f, np.zeros(len(f))):  # without a load other scales count
-        x, alpha = random.standard_normal(len(f)), random.random(len(g))
-        program = vibench.VariationalInequality(A, load, B, g)
-        expected = vibench.qp.kkt_residuals(program, x, alpha)
-        found = reduced_model.residuals(reduced_model._matrices(A, B), load, g / rows, x, rows * alpha, 0.0 * g)
-        assert found == pytest.approx((expected.primal, expected.dual, expected.gap), rel=1e-12)
-
-
 def per_file(model: vibench.Model, folder: Path, solver: str = "") -> Exported:
     file = folder / "model.npz"
     if not file.exists():

@@ -30,6 +30,7 @@ from vibench.packs.reader import pack_digest
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import create
 from vibench.study.matrix import read_study
+from vibench.testing.problems import continuity
 
 MU = np.array([5.0, 0.2])
 MASS, GAP = "operators.f.affine.0.array", "operators.g.affine.0.theta"
@@ -163,6 +164,8 @@ def test_tables_and_arrays_by_parameter_hold_at_listed_parameters_only(tmp_path:
     assert not pack.everywhere
     with pytest.raises(NumericalError, match=r"mu = \[5.5, 0.2\] is not listed"):
         pack.at(np.array([5.5, 0.2]))
+    (note,) = continuity(Mock(points=9, plugin=create("problem", "pack", {"path": str(tmp_path / "pack")})))
+    assert "listed parameters only" in str(note)
 
 
 def test_rows_of_dirichlet_unknowns_are_removed_where_free_ones_are_named(tmp_path: Path) -> None:
