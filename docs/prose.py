@@ -15,7 +15,7 @@ from statistics import median
 ROOT = Path(__file__).parents[1]
 # Lists of names, and claims that are compared one by one.
 OTHERS = {"api", "bibliography", "changelog", "contributing", "glossary", "reproduction", "commands", "tables"}
-NUMBER = re.compile(r"(?<![\w.])\d[\d.,]*")
+NUMBER = re.compile(r"(?<![\w.])\d[\d.,]*(?:e-?\d+)?")
 CHAINS = re.compile(r"\b(those of|that of the|of which)\b")
 
 
