@@ -82,22 +82,6 @@ def test_a_second_interrupt_changes_nothing(plugins_folder: Path, waiting: Path)
     assert len(rows(waiting / "runs" / "wire")) == 1
 
 
-def test_a_run_that_is_terminated_leaves_no_worker_behind(command: str, plugins_folder: Path, waiting: Path) -> None:
-    """As where a terminal is closed, or a scheduler ends a job: only the command itself is told."""
-    with started([command, *RUN], waiting, plugins_folder) as process:
-        read_until(process, "[1/2] ok")
-        left = set(workers(process.pid))
-        assert left
-        process.terminate()
-        process.wait(timeout=PATIENCE)
-        for _ in range(600):  # a busy machine takes its time
-            left = {worker for worker in left if Path(f"/proc/{worker}").exists()}
-            if not left:
-                return
-            time.sleep(0.1)
-        pytest.fail("a worker goes on")
-
-
 def test_two_runs_do_not_write_into_one_folder(plugins_folder: Path, vibench: Vibench, waiting: Path) -> None:
     with forked(RUN, waiting, plugins_folder) as process:
         read_until(process, "[1/2] ok")
@@ -111,7 +95,7 @@ def test_two_runs_do_not_write_into_one_folder(plugins_folder: Path, vibench: Vi
         (waiting / "go on").touch()
         out, err = process.communicate(timeout=PATIENCE)
     assert (process.returncode, err) == (0, "")
-    assert "2 cells, 2 ok" in out
+    assert "2 cells, all ok" in out
 
 
 @pytest.mark.parametrize("swapped", [False, True], ids=["removed", "swapped"])

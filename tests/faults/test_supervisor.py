@@ -4,9 +4,6 @@ import contextlib
 import itertools
 import os
 import random
-import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -262,34 +259,6 @@ def test_a_keeper_that_is_closed_stops_at_once_and_leaves_nobody(watcher: Superv
     assert stopped == [True]
     with pytest.raises(ProcessLookupError):
         os.kill(worker, 0)
-
-
-def test_a_worker_does_not_outlive_its_supervisor(tmp_path: Path) -> None:
-    """Not even one that sleeps in a plugin, nor what that started, when the supervisor's process is killed."""
-    diary, seconds = tmp_path / "diary", unique()
-    code = (
-        "from vibench.execution.supervisor import Job; from vibench.execution.supervisor import Supervisor\n"
-        "from fake_stages import InItems, Whole\n"
-        f"one = Supervisor(); one.run(Job({str(tmp_path)!r}, InItems(('daemon {seconds}',)), 1.0, 600.0, 8.0))\n"
-        f"one.run(Job({str(tmp_path)!r}, Whole('hang', {str(diary)!r}), 1.0, 600.0, 8.0))"
-    )
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    process = subprocess.Popen([sys.executable, "-c", code], env=environment)
-    while not (diary.exists() and diary.read_text().endswith("\n")):
-        time.sleep(0.05)
-        assert process.poll() is None
-    worker = int(diary.read_text().split()[0])
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    for _ in range(600):  # a busy machine takes its time
-        try:
-            os.kill(worker, 0)
-        except ProcessLookupError:
-            break
-        time.sleep(0.1)
-    else:
-        pytest.fail("the worker goes on")
-    assert not sleepers(seconds)
 
 
 def test_an_operation_that_raised_has_no_limit(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

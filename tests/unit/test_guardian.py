@@ -1,31 +1,38 @@
-"""Processes that end with their parent, however it dies: twelve kinds of death, and three of processes."""
+"""Processes that end with their parent, however it dies: twelve kinds of death, and four of processes."""
 
 from __future__ import annotations
 
 import contextlib
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from forking import run_script
+import fake_stages
 
 ORPHANS = """
 import os, resource, signal, subprocess, sys, time
 from pathlib import Path
 from vibench.benchmarks import run_pytest
+from vibench.execution.supervisor import Job, Supervisor
 from vibench.guardian import MARK, guarded
 from vibench.packs.meshes import read_mesh
 
 here = Path(sys.argv[1])
+sys.path.append(sys.argv[2])
+from fake_stages import Whole
 os.environ["TESTS_ORPHAN"] = str(here)
 killed = [signal.SIGTERM, signal.SIGKILL, signal.SIGHUP, signal.SIGINT, signal.SIGABRT, signal.SIGSEGV]
 ends = {
     "exit": lambda: os._exit(1), "sys.exit": sys.exit, "exception": lambda: 1 / 0,
     "exec": lambda: os.execv("/bin/true", ["true"]),
+    "worker": lambda: Supervisor().run(Job(str(here), Whole("hang"), 600.0, 600.0, 8.0)),
     "mesh": lambda: read_mesh(here / "pipe.msh", 2**30, 600),
     "benchmarks": lambda: run_pytest(["--plugin", "obstacle"]),
     **{number.name: lambda number=number: os.kill(os.getpid(), number) for number in killed},
 }
+running = [ends[name] for name in ("worker", "mesh", "benchmarks")]
 os.mkfifo(here / "pipe.msh")
 resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -36,8 +43,8 @@ for name, end in ends.items():
         parents[parent] = name
         continue
     os.setpgid(0, 0)
-    signal.alarm(1 if name in ("mesh", "benchmarks") else 600)
-    if name not in ("mesh", "benchmarks"):
+    signal.alarm(2 if ends[name] in running else 600)
+    if ends[name] not in running:
         environment = {**os.environ, MARK: name, "PYTHONPATH": os.pathsep.join(sys.path)}
         subprocess.Popen(**guarded("holding", str(here / name), environment=environment), stdout=subprocess.DEVNULL)
         while not (here / name).exists():
@@ -59,10 +66,12 @@ ctypes.PyDLL(None).sleep(3600)
 def test_nothing_outlives_its_parent_however_it_dies(tmp_path: Path) -> None:
     (tmp_path / "orphans.py").write_text(ORPHANS)
     (tmp_path / "holding.py").write_text(HOLDING)
-    done = run_script(tmp_path / "orphans.py", str(tmp_path))
+    command = [sys.executable, str(tmp_path / "orphans.py"), str(tmp_path), str(Path(fake_stages.__file__).parent)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert dict(line.split() for line in done.stdout.splitlines()) == {
-        "exit": "1", "sys.exit": "0", "exception": "1", "exec": "0", "mesh": "-14", "benchmarks": "-14",
-        "SIGTERM": "-15", "SIGKILL": "-9", "SIGHUP": "-1", "SIGINT": "-2", "SIGABRT": "-6", "SIGSEGV": "-11",
+        "exit": "1", "sys.exit": "0", "exception": "1", "exec": "0",
+        "worker": "-14", "mesh": "-14", "benchmarks": "-14", "SIGTERM": "-15",
+        "SIGKILL": "-9", "SIGHUP": "-1", "SIGINT": "-2", "SIGABRT": "-6", "SIGSEGV": "-11",
     }  # fmt: skip
     deadline, left = time.monotonic() + 10.0, {""}
     while left and time.monotonic() < deadline:

@@ -197,7 +197,7 @@ def test_a_cluster_that_is_shut_down_stops_the_run_with_a_line_and_it_goes_on_wi
     done = vibench(tmp_path, "run", path, "--jobs", "1")
     assert (done.returncode, done.stderr) == (0, "")
     assert "2 cells, 1 to run" in done.stdout
-    assert "2 cells, 2 ok" in done.stdout
+    assert "2 cells, all ok" in done.stdout
 
 
 def test_wrong_requests_for_dask_are_refused_in_a_line(vibench: Vibench, tmp_path: Path) -> None:
