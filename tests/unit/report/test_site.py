@@ -216,18 +216,6 @@ def test_runs_of_one_study_are_compared(site: Path) -> None:
     assert (errors["ratio"] > 2.9).all()
 
 
-def test_the_same_runs_give_the_same_site(
-    site: Path, three: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(html, "page", lambda *_, **__: REPORT)
-    publish(three, tmp_path / "again", CITATION, {three[1]: "measured on a <server>"})
-    one, two = (
-        {path.relative_to(root): path.is_file() and path.read_bytes() for path in root.rglob("*")}
-        for root in (site, tmp_path / "again")
-    )
-    assert [name for name in {**one, **two} if one.get(name) != two.get(name)] == []
-
-
 def of_yaml(text: str) -> dict[str, str]:
     """Keys and values at the top of a file of YAML that has strings in double quotes, which are JSON's."""
     lines = (line.partition(": ") for line in text.splitlines() if line[:1].isalpha() and ": " in line)

@@ -30,7 +30,7 @@ def script() -> Iterator[ModuleType]:
 @pytest.fixture(scope="module")
 def site(quick_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("submitted") / "site"
-    publish([quick_run / FILE], folder, Citation("quick"), figures=False)
+    publish([quick_run / FILE] * 2, folder, Citation("quick"), {quick_run / FILE: "a <note>"}, figures=False)
     return folder
 
 
