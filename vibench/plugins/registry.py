@@ -27,6 +27,12 @@ if TYPE_CHECKING:
     from vibench.qp.verification import QPSolver
 
 
+@cache
+def _identity(distribution: Distribution) -> tuple[str, str]:
+    """Name and version of a distribution, whose metadata are read and parsed again at each access."""
+    return distribution.name, distribution.version
+
+
 @dataclass(frozen=True)
 class RegisteredPlugin:
     """The entry points of a name: several if packages register different objects, none if nobody does."""
@@ -44,7 +50,7 @@ class RegisteredPlugin:
     def origins(self) -> list[str]:
         """Distributions that provide it, with version: "vibench 0.1.0"."""
         owners = (one.dist for one in self.entries)
-        named = ["unknown" if owner is None else f"{owner.name} {owner.version}" for owner in owners]
+        named = ["unknown" if owner is None else " ".join(_identity(owner)) for owner in owners]
         return ["qpsolvers", *named] if self._in_qpsolvers else named
 
     @property
@@ -74,9 +80,8 @@ class RegisteredPlugin:
         """Third-party distribution that provides it; "" for plugins of vibench and solvers of qpsolvers."""
         if not self.entries:
             return ""
-        # Look at the entry once: the metadata of a distribution are read again at each access.
         entry = self.entries[0]
-        owner = entry.module.partition(".")[0] if entry.dist is None else entry.dist.name
+        owner = entry.module.partition(".")[0] if entry.dist is None else _identity(entry.dist)[0]
         return "" if owner == "vibench" else owner
 
     @property

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -203,8 +204,9 @@ def page(path: Path, *, figures: bool = True) -> str:
     )
 
 
+@cache
 def environment(folder: str, **options: Any) -> Environment:
-    """The templates of a folder, in which a text from others is printable and no markup."""
+    """The templates of a folder, each compiled once, in which a text from others is printable and no markup."""
 
     def finalize(value: Any) -> Any:
         return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import qmc
 
 from vibench import Array
 from vibench_strategies.samplings.drawn import Drawn
@@ -17,4 +16,6 @@ class LatinHypercube(Drawn):
 
     def drawn(self, dim: int) -> Array:
         """The points of one hypercube."""
+        from scipy.stats import qmc  # noqa: PLC0415  slow, see `sobol`
+
         return np.asarray(qmc.LatinHypercube(dim, rng=np.random.default_rng(self.seed)).random(self.size))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import qmc
 
 from vibench import Array
 from vibench_strategies.samplings.drawn import Drawn
@@ -17,6 +16,9 @@ class Sobol(Drawn):
 
     def drawn(self, dim: int) -> Array:
         """The points in the order of the sequence."""
+        # Whoever lists plugins or reads a study imports this module, and scipy.stats takes half a second.
+        from scipy.stats import qmc  # noqa: PLC0415
+
         sequence = qmc.Sobol(dim, rng=np.random.default_rng(self.seed))
         # Any other number of points at once is a warning; the first ones of the next power are the same.
         return np.asarray(sequence.random_base2((self.size - 1).bit_length())[: self.size])
