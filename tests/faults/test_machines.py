@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-import resource
 import shutil
 import sqlite3
-import subprocess
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from running import PATIENCE, Main, Register, Vibench, by_solver, refused, started
@@ -26,53 +25,39 @@ def test_more_jobs_than_a_machine_can_bear_are_refused(main: Main, tmp_path: Pat
     assert list(Path.cwd().iterdir()) == []
 
 
-def test_too_few_open_files_are_said_to_be_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
-    monkeypatch.setattr("vibench.results.database.sqlite3.connect", unable)
-    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-    monkeypatch.setattr("vibench.results.database.resource.getrlimit", lambda _: (7, limits[1]))
-    with pytest.raises(RequestError, match=r"this process may open only 7 files \(`ulimit -n`\)"):
-        ResultsDatabase(tmp_path / "out", {})
+def test_too_few_open_files_are_said_to_be_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, main: Main) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        unable = Mock(side_effect=sqlite3.OperationalError("unable to open database file"))
+        patch.setattr("vibench.results.database.sqlite3.connect", unable)
+        patch.setattr("vibench.results.database.resource.getrlimit", lambda _: (7, 7))
+        with pytest.raises(RequestError, match=r"this process may open only 7 files \(`ulimit -n`\)"):
+            ResultsDatabase(tmp_path / "out", {})
     study = write_study(tmp_path, wire_study(problem=["obstacle"]))
-    limited = ["bash", "-c", 'ulimit -n 32; exec "$0" "$@"', command, "run", study, "--executor", "dask", "--jobs", "2"]
-    done = subprocess.run(limited, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr == (
-        "vibench: the executor 'dask' needs 96 open files, the limit is 32: raise it (`ulimit -n 96`), "
-        "ask for fewer --jobs, or use the executor 'local'\n"
-    )
-
-
-def unable(*_: object, **__: object) -> None:
-    raise sqlite3.OperationalError("unable to open database file")
-
-
-def test_a_run_does_not_depend_on_asserts_nor_on_an_encoding_that_has_all_letters(
-    command: str, plugins_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As `python -O` (classes were registered inside an assert), for a log of a batch system, without δ and …."""
-    write_study(tmp_path, wire_study())
-    for name, value in {"PYTHONOPTIMIZE": "1", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0", "LC_ALL": "C"}.items():
-        monkeypatch.setenv(name, value)
-    with started([command, "run", "study.toml", "--jobs", "1", "--no-figures"], tmp_path, plugins_folder) as process:
-        printed, errors = process.communicate(timeout=PATIENCE)
-    assert (process.returncode, errors) == (0, "")
-    assert "[1/1] ok: wire" in printed
-    assert [row["status"] for row in by_solver(tmp_path / "runs" / "wire").values()] == ["ok"]
+    monkeypatch.setattr("vibench.execution.executors.resource.getrlimit", lambda _: (32, 32))
+    remedy = "raise it (`ulimit -n 96`), ask for fewer --jobs, or use the executor 'local'"
+    line = f"the executor 'dask' needs 96 open files, the limit is 32: {remedy}\n"
+    assert refused(main("run", study, "--executor", "dask", "--jobs", "2")) == f"vibench: {line}"
 
 
 @pytest.mark.skipif(solver_version("daqp") != "", reason="daqp is installed")
-def test_folders_called_like_a_library_are_not_taken_for_it(
+def test_a_run_does_not_depend_on_asserts_letters_of_an_encoding_nor_folders_called_like_a_library(
     command: str, plugins_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`PYTHONPATH=FOLDER:$PYTHONPATH` has an empty entry, the working directory, where the variable was not set."""
+    """As `python -O` (classes were registered inside an assert), for a log of a batch system, without δ and ….
+
+    `PYTHONPATH=FOLDER:$PYTHONPATH` has an empty entry, the working directory, where the variable was not set.
+    """
+    for name, value in {"PYTHONOPTIMIZE": "1", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0", "LC_ALL": "C"}.items():
+        monkeypatch.setenv(name, value)
     (tmp_path / "daqp").mkdir()  # can be imported
     (tmp_path / "piqp").mkdir()
     (tmp_path / "piqp" / "__init__.py").write_text("raise OSError('not the solver')")
     write_study(tmp_path, wire_study(solvers=["piqp", "daqp", "careful"]))
     run = [command, "run", "study.toml", "--jobs", "1", "--no-figures"]
     with started(run, tmp_path, Path(f"{plugins_folder}:")) as process:
-        _, errors = process.communicate(timeout=PATIENCE)
+        printed, errors = process.communicate(timeout=PATIENCE)
     assert (process.returncode, errors) == (0, "")
+    assert "[3/3] ok: wire" in printed
     found = {solver: row["status"] for solver, row in by_solver(tmp_path / "runs" / "wire").items()}
     assert found == {"piqp": "ok", "careful": "ok", "daqp": "unavailable"}
 

@@ -1,24 +1,27 @@
 """Twins of the paper's figures: they show the numbers of the run and of the paper, and judge by both."""
 
 import re
+import shutil
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
-from running import Changed
+from running import Changed, execute
 
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.report.figures.data import ProblemTables, problem_tables
 from vibench.results.read import read_table
+from vibench.results.sqlite import FILE
 from vibench_problems.hertz import Hertz
 from vibench_problems.line_contact import theory
 from vibench_problems.obstacle import RADIUS, Obstacle
 from vibench_problems.paper import published
 from vibench_problems.paper.__main__ import main
-from vibench_problems.paper.claims import Agreement, Claim, compared, exceptions, holds, typeset
+from vibench_problems.paper.claims import Agreement, compared, exceptions, holds, typeset
 from vibench_problems.paper.evidence import Evidence, reached
 from vibench_problems.paper.figures import PAGE, drawings
 from vibench_problems.paper.sections import figure_claims, sections
@@ -54,22 +57,27 @@ def twins(path: Path, problem: str) -> dict[str, Callable[[], Any]]:
     return {f"figure-{number}": draw for number, draw in drawings(tables_of(path, problem)).items()}
 
 
-def the_claim(path: Path, problem: str, statement: str) -> Claim:
-    (claim,) = [one for one in figure_claims(Evidence(tables_of(path, problem))) if one.statement == statement]
-    return claim
-
-
 def line_called(axes: Axes, label: str) -> np.ndarray:
     (line,) = [line for line in axes.get_lines() if line.get_label() == label]
     return np.asarray(line.get_xydata(), float)
 
 
-def test_every_figure_from_3_to_15_has_a_twin(changed: Changed) -> None:
-    path = changed(*OBSTACLE, *HERTZ)
-    found = {name: draw for problem in ("obstacle", "hertz") for name, draw in twins(path, problem).items()}
-    assert list(found) == [f"figure-{number}" for number in range(3, 16)]
-    for name, draw in found.items():
-        figure = draw()
+@pytest.fixture(scope="module")
+def both(quick_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A results file with the models of the paper for both problems."""
+    path = Path(shutil.copy(quick_run / FILE, tmp_path_factory.mktemp("published")))
+    execute(path.parent, *OBSTACLE, *HERTZ)
+    return path
+
+
+@pytest.fixture(scope="module")
+def drawn(both: Path) -> dict[str, Any]:
+    return {name: draw() for problem in ("obstacle", "hertz") for name, draw in twins(both, problem).items()}
+
+
+def test_every_figure_from_3_to_15_has_a_twin(drawn: dict[str, Any]) -> None:
+    assert list(drawn) == [f"figure-{number}" for number in range(3, 16)]
+    for name, figure in drawn.items():
         number = name.removeprefix("figure-")
         assert figure.get_suptitle().startswith(f"Figure {number}: "), name
         assert figure.caption, name
@@ -87,12 +95,10 @@ def test_a_run_without_the_pairs_of_the_paper_has_fewer_and_no_page(quick_run: P
         sections(obstacle, hertz, hertz, {})
 
 
-@pytest.mark.parametrize(
-    ("problem", "given"), [("obstacle", '{"bulge": true}'), ("hertz", '{"approach": "parameter"}')]
-)
-def test_a_problem_with_another_parameter_is_not_the_paper_s(problem: str, given: str, changed: Changed) -> None:
-    update = f"SET problem_options = '{given}' WHERE problem = '{problem}'"
-    assert twins(changed(*(f"UPDATE {table} {update}" for table in TABLES)), problem) == {}
+def test_a_problem_with_another_parameter_is_not_the_paper_s(changed: Changed) -> None:
+    given = """iif(problem = 'hertz', '{"approach": "parameter"}', '{"bulge": true}')"""
+    path = changed(*(f"UPDATE {table} SET problem_options = {given}" for table in TABLES))
+    assert twins(path, "obstacle") == twins(path, "hertz") == {}
 
 
 def test_projection_errors_stand_beside_the_published_sizes(quick_run: Path) -> None:
@@ -120,56 +126,54 @@ def test_a_violated_inequality_differs(changed: Changed) -> None:
     assert f"{statement}: over the span not at all, over the cone at all 16" in text.partition("Differs: ")[2]
 
 
-@pytest.mark.parametrize(("factor", "verdict"), [(0.5, "differs"), (1.5, "differs"), (None, "agrees")])
-def test_orders_are_missing_where_panels_have_none(factor: float | None, verdict: str, changed: Changed) -> None:
-    """All tolerances of a run together say nothing of a figure that shows some of them."""
-    other = f"beta_hf_span = {factor or 0.5} * beta_span" + " * (1.0 + 2.0 * (query % 2))" * (factor is None)
-    path = changed(*OBSTACLE, f"UPDATE queries SET {other} WHERE primal_tol = 0.5")
-    assert the_claim(path, "obstacle", "no order between β_off and β_HF").verdict.value == verdict
+NO_ORDER, VANISHES = "no order between β_off and β_HF", "N < R implies β_dec = 0, (19, 50), over the cone as in (14)"
 
 
 @pytest.mark.parametrize(
-    ("lower", "upper", "verdict"), [(0.01, 0.02, "differs"), (0.0, 0.02, "cannot be compared"), (0.0, 0.0, "agrees")]
+    ("statement", "values", "verdict"),
+    [
+        # All tolerances of a run together say nothing of a figure that shows some of them.
+        (NO_ORDER, "beta_hf_span = iif(primal_tol = 0.5, 0.5 * beta_span, beta_hf_span)", "differs"),
+        (NO_ORDER, "beta_hf_span = iif(primal_tol = 0.5, 1.5 * beta_span, beta_hf_span)", "differs"),
+        (NO_ORDER, "beta_hf_span = iif(primal_tol = 0.5, (0.5 + query % 2) * beta_span, beta_hf_span)", "agrees"),
+        (VANISHES, "beta_plain_cone_lower = 0.01, beta_plain_cone_upper = 0.02", "differs"),
+        (VANISHES, "beta_plain_cone_lower = 0.0, beta_plain_cone_upper = 0.02", "cannot be compared"),
+        (VANISHES, "beta_plain_cone_lower = 0.0, beta_plain_cone_upper = 0.0", "agrees"),
+    ],
 )
-def test_a_constant_vanishes_by_its_upper_bound(lower: float, upper: float, verdict: str, changed: Changed) -> None:
-    bounds = f"beta_plain_cone_lower = {lower}, beta_plain_cone_upper = {upper}"
-    path = changed(*OBSTACLE, f"UPDATE queries SET {bounds}")
-    statement = "N < R implies β_dec = 0, (19, 50), over the cone as in (14)"
-    assert the_claim(path, "obstacle", statement).verdict.value == verdict
+def test_a_claim_is_judged_by_its_figure(statement: str, values: str, verdict: str, changed: Changed) -> None:
+    data = tables_of(changed(*OBSTACLE, f"UPDATE queries SET {values}"), "obstacle")
+    assert [one.verdict.value for one in figure_claims(Evidence(data)) if one.statement == statement] == [verdict]
 
 
-@pytest.mark.parametrize("problem", ["obstacle", "hertz"])
-def test_figures_and_the_page_of_claims_have_the_same_verdicts(problem: str, changed: Changed) -> None:
-    path = changed(*OBSTACLE, *HERTZ)
-    said = {name: draw().compared for name, draw in twins(path, problem).items()}
-    judged = list(figure_claims(Evidence(tables_of(path, problem))))
-    assert len(judged) > 15
-    for claim in judged:
+def test_figures_and_the_page_of_claims_have_the_same_verdicts(both: Path, drawn: dict[str, Any]) -> None:
+    judged = [list(figure_claims(Evidence(tables_of(both, problem)))) for problem in ("obstacle", "hertz")]
+    assert min(map(len, judged)) > 15
+    for claim in chain(*judged):
         (number,) = re.findall(r"Fig\. (\d+)", claim.place)
-        before, found, after = said[f"figure-{number}"].partition(f"{typeset(f'{claim.statement}: {claim.ours}')}")
+        said = drawn[f"figure-{number}"].compared
+        before, found, after = said.partition(f"{typeset(f'{claim.statement}: {claim.ours}')}")
         assert found, claim.name
         groups = re.findall("|".join(verdict.capitalize() for verdict in Agreement), before)
         assert groups[-1].lower() == claim.verdict.value
         assert after[0] in ";."
 
 
-def test_constants_of_the_third_pair_are_over_the_only_parameter(changed: Changed) -> None:
-    path = changed(*HERTZ)
-    figure = twins(path, "hertz")["figure-13"]()
-    queries = read_table(path, "queries")
+def test_constants_of_the_third_pair_are_over_the_only_parameter(both: Path, drawn: dict[str, Any]) -> None:
+    figure = drawn["figure-13"]
+    queries = read_table(both, "queries")
     mine = queries.query("problem == 'hertz' and dual == 'mcpg' and primal_tol == 0.4 and solver == 'piqp'")
     mine = mine.sort_values("mu_1")
     expected = mine[["mu_1", "beta_plain_span"]].to_numpy(float)
     np.testing.assert_allclose(line_called(figure.axes[0], "β_dec over the span"), expected)
-    (panel, *_) = twins(path, "hertz")["figure-15"]().axes
+    (panel, *_) = drawn["figure-15"].axes
     np.testing.assert_allclose(line_called(panel, "β_off"), mine[["mu_1", "beta_span"]].to_numpy(float))
 
 
-def test_the_greedy_algorithm_is_that_of_the_histories(changed: Changed) -> None:
-    path = changed(*HERTZ)
-    figure = twins(path, "hertz")["figure-14"]()
+def test_the_greedy_algorithm_is_that_of_the_histories(both: Path, drawn: dict[str, Any]) -> None:
+    figure = drawn["figure-14"]
     sigma, least, _ = figure.axes
-    histories = read_table(path, "histories")
+    histories = read_table(both, "histories")
     mine = histories.query("problem == 'hertz' and dual == 'mcpg' and primal_tol == 0.3")
     for panel, quantity in ((sigma, "sigma"), (least, "beta_span_min")):
         steps = mine[mine["quantity"] == quantity].sort_values("step")[["step", "value"]].to_numpy(float)
@@ -178,8 +182,8 @@ def test_the_greedy_algorithm_is_that_of_the_histories(changed: Changed) -> None
     assert "PGA converges to δ_PGA = 0.3: σ = 0.4" in figure.compared.partition("Differs: ")[2]  # δ was 0.5
 
 
-def test_the_membrane_is_that_of_figure_4(quick_run: Path) -> None:
-    figure = twins(quick_run / "results.sqlite", "obstacle")["figure-4"]()
+def test_the_membrane_is_that_of_figure_4(drawn: dict[str, Any]) -> None:
+    figure = drawn["figure-4"]
     problem = Obstacle("coarse")
     mu = np.array(published.MEMBRANE)
     assert RADIUS * mu[0] == pytest.approx(0.18)
@@ -190,8 +194,8 @@ def test_the_membrane_is_that_of_figure_4(quick_run: Path) -> None:
     assert f"{np.count_nonzero(found.lam > 0.0)} of {problem.W.dim} multipliers positive" in figure.compared
 
 
-def test_five_pressures_lie_in_one_panel_with_hertz_s_theory(quick_run: Path) -> None:
-    figure = twins(quick_run / "results.sqlite", "hertz")["figure-10"]()
+def test_five_pressures_lie_in_one_panel_with_hertz_s_theory(drawn: dict[str, Any]) -> None:
+    figure = drawn["figure-10"]
     problem = Hertz("coarse")
     panel = figure.axes[1]
     ellipses = [line for line in panel.get_lines() if line.get_label() == "Hertz's theory"]

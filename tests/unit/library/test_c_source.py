@@ -36,7 +36,9 @@ Answer = tuple[int, np.ndarray, np.ndarray, np.ndarray]
 Solve = Callable[[np.ndarray], Answer]
 POINTER = ctypes.POINTER(ctypes.c_double)
 Patch = pytest.MonkeyPatch
-STRICT = ("-std=c99", "-pedantic", "-O2", "-Wall", "-Wextra", "-Wshadow", "-Wstrict-prototypes", "-Werror")
+PLAIN = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wshadow", "-Wstrict-prototypes", "-Werror")
+STRICT = (*PLAIN, "-O2")
+"""An optimising compiler sees more, and takes three times as long: once for every part of a source."""
 
 
 def library(file: Path, strict: tuple[str, ...] = STRICT) -> ctypes.CDLL:
@@ -51,9 +53,9 @@ def pointers(*arrays: np.ndarray) -> list[Any]:
     return [array.ctypes.data_as(POINTER) for array in arrays]
 
 
-def compiled(file: Path, unknowns: int, constraints: int) -> Solve:
+def compiled(file: Path, unknowns: int, constraints: int, strict: tuple[str, ...] = PLAIN) -> Solve:
     """The function of a C source: its code, x, α, residuals."""
-    function = getattr(library(file), f"{file.stem}_solve")
+    function = getattr(library(file, strict), f"{file.stem}_solve")
 
     def solve(mu: np.ndarray) -> Answer:
         arrays = [np.ascontiguousarray(mu), np.zeros(unknowns), np.zeros(constraints), np.zeros(3)]
@@ -79,7 +81,7 @@ def test_a_c_source_gives_the_answers_of_the_model(model: vibench.Model, tmp_pat
     export_model(model, tmp_path / "model.npz", tolerance=1e-11, c=True)
     script = Exported(tmp_path / "model.npz")
     A, _, _, g, _ = script.program(script.lower)
-    solve = compiled(tmp_path / "model.c", len(A), len(g))
+    solve = compiled(tmp_path / "model.c", len(A), len(g), STRICT)
     for mu in model.parameters.sample(100, seed=3):
         code, x, alpha, residuals = solve(mu)
         assert code == 0
@@ -104,7 +106,7 @@ Certify = Callable[[np.ndarray, bool], tuple[int, np.ndarray, np.ndarray, np.nda
 def certify(model: vibench.Model, file: Path, tolerance: float) -> tuple[Certify, Any, ctypes.CDLL]:
     """The C source of a model: the code, u, λ and four bounds at a parameter, corrected or not; what it is made of."""
     whole = export_model(model, file, tolerance=tolerance, evaluations=6000, c=True)
-    arrays, found = whole.arrays, library(file.with_suffix(".c"))
+    arrays, found = whole.arrays, library(file.with_suffix(".c"), PLAIN)
     (rows, loads), basis = arrays["certificate_responses"].shape, arrays["basis"]
     found.model_of_contact.restype = ctypes.c_double
 
@@ -374,9 +376,9 @@ def test_any_constraints(case: str, scale: float, tmp_path: Path) -> None:
         codes.append(code)
         program = vibench.VariationalInequality(A, mu[:n], B, mu[n:])
         exact = exact_solution(program)
-        if infeasibility_certificate(program) is not None:
-            assert code == 2
-        elif exact is not None:
+        if exact is None:
+            assert code == 2 or infeasibility_certificate(program) is None
+        else:
             assert code == 0
             assert residuals.max() <= 1e-9
             assert np.linalg.norm(x - exact.x) <= 1e-9 * max(np.linalg.norm(exact.x), np.linalg.norm(mu[:n]) / scale)
