@@ -64,6 +64,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
     Parallel workers begin to collect with different files, and find the bytecode of the others.
     """
+    # Garbage collections leave alone for longer what thousands of tests are made of.
+    gc.set_threshold(20_000, 20, 20)
     config.option.loadscopereorder = False
     parallel = getattr(config, "workerinput", None)
     if parallel and [Path(given).resolve() for given in config.args] == [TESTS]:
@@ -83,10 +85,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Let garbage collections leave alone what thousands of tests are made of, and take place less often."""
     gc.collect()
     gc.freeze()
-    gc.set_threshold(20_000, 20, 20)
 
 
 @pytest.fixture(scope="session", autouse=True)

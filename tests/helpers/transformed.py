@@ -13,7 +13,7 @@ from vibench_problems.pack import Pack
 from vibench_problems.radial import Radial
 
 BASES = {"hertz": Hertz, "obstacle": Obstacle, "radial-obstacle": Radial, "pack": Pack}
-FAR_ROWS, TRAINING = 3, 40
+FAR_ROWS, TRAINING = 3, 24
 
 
 class Transformed(Problem):

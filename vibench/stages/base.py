@@ -89,6 +89,8 @@ class Stage(ABC):
     dispensable: ClassVar[bool] = False
 
     @cached_property
+    # Cells make equal stages again and again, and hashing one takes a fifth of describing it.
+    @lru_cache(maxsize=2**16)  # noqa: B019  processes that run stages keep them anyway
     def key(self) -> str:
         """Name of the artefact: the label, and a hash of everything that determines the value."""
         # These are the fields of the stage, the keys of its inputs, the libraries, its own module with those of other

@@ -33,8 +33,11 @@ def solver(cells: int, **options: str) -> HighFidelitySolver:
     return HighFidelitySolver(problem(cells, **options))
 
 
+solved_at = cache(lambda cells, mu, **options: solver(cells, **options).solve(np.array(mu)))
+
+
 def solved(cells: int, mu: np.ndarray, **options: str) -> HighFidelitySolution:
-    return solver(cells, **options).solve(mu)
+    return solved_at(cells, tuple(mu), **options)
 
 
 def excess(cells: int, mu: np.ndarray, **options: str) -> float:
