@@ -59,6 +59,17 @@ def _text_of(error: BaseException) -> str:
 
 
 @contextmanager
+def foreign(what: str) -> Iterator[None]:
+    """Turn whatever the import, compilation or load of `what` raises in the block into an `UnsupportedError`."""
+    try:
+        yield
+    except (VibenchError, MemoryError):
+        raise
+    except (Exception, SystemExit) as error:  # noqa: BLE001  the code of others raises anything
+        raise UnsupportedError(f"{what} cannot be used: {in_a_line(error)}") from None
+
+
+@contextmanager
 def at_parameter(mu: Any) -> Iterator[None]:
     """Name mu (d,) in every error of the block; what a plugin raises becomes a `NumericalError`."""
     where = f"mu = {mu.tolist()}"

@@ -9,6 +9,7 @@ import numpy as np
 from annotated_types import Ge, Lt
 
 from vibench import Array, Cone, DualStrategy, InnerProduct, NumericalError, Stop, no_free
+from vibench.errors import foreign
 from vibench.linalg import singular_values
 from vibench.reduction import refuse_negative
 from vibench_strategies.snapshot_cones import normalised, projection_errors
@@ -26,8 +27,9 @@ class NonnegativeFactors(DualStrategy):
 
     def __init__(self, seed: Annotated[int, Ge(0), Lt(2**32)] = 0, iterations: Annotated[int, Ge(1)] = 1000) -> None:
         # Imported here, since scikit-learn is optional, and not in `reduce`, whose seconds count.
-        from sklearn.decomposition import NMF  # noqa: PLC0415
-        from sklearn.exceptions import ConvergenceWarning  # noqa: PLC0415
+        with foreign("scikit-learn"):
+            from sklearn.decomposition import NMF  # noqa: PLC0415
+            from sklearn.exceptions import ConvergenceWarning  # noqa: PLC0415
 
         self.seed, self.iterations = seed, iterations
         self._factorisation, self._not_converged = NMF, ConvergenceWarning

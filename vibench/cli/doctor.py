@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import platform
 import re
@@ -33,7 +32,7 @@ from vibench.linalg.factorisations import IMPLEMENTATIONS
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import RegisteredPlugin, find, registered, unreadable
 from vibench.qp.settings import SETTINGS
-from vibench.qp.solve import installed_solvers
+from vibench.qp.solve import installed_solvers, load_qpsolvers
 from vibench.qp.status import Status
 from vibench.stages.artefacts import Store, default_folder
 from vibench.study.matrix import read_study
@@ -129,7 +128,7 @@ def check_factorisations() -> Iterator[Diagnosis]:
             continue
         try:
             left = float(np.abs(A @ one.factorise(A, "A").solve(np.ones(A.shape[0])) - 1.0).max())
-        except Exception as error:  # noqa: BLE001  a library may raise anything when it is imported
+        except (Exception, SystemExit) as error:  # noqa: BLE001  a library may raise anything when it is imported
             yield Diagnosis(name, f"{version}: {in_a_line(error)}", Health.BROKEN)
         else:
             yield Diagnosis(name, f"{version}: residual {left:.0e} ({one.summary})")
@@ -146,12 +145,7 @@ def _unavailable(solver: str, version: str) -> Diagnosis:
     """The reason why a solver cannot be run."""
     distribution = provenance.solver_distribution(solver)
     if version:
-        try:
-            importlib.import_module(distribution)
-        except (Exception, SystemExit) as error:  # noqa: BLE001  a library may raise anything when it is imported
-            reason = f"cannot be imported: {in_a_line(error)}"
-        else:
-            reason = "qpsolvers does not know it"
+        reason = load_qpsolvers()[1].get(solver, "qpsolvers does not know it")
         return Diagnosis(solver, f"{version} is installed and {reason}", Health.BROKEN)
     extras = required_distributions().get(distribution)
     if extras == []:

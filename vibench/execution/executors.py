@@ -99,8 +99,8 @@ class Dask(Executor):
 
             # Anybody who can connect to a scheduler can run code on its workers: keep out other users of this machine.
             own = Security.temporary() if scheduler is None else None
-        except ImportError:
-            needs = "the executor 'dask' needs dask.distributed and cryptography"
+        except (Exception, SystemExit) as error:  # noqa: BLE001  a broken library raises anything
+            needs = f"the executor 'dask' needs dask.distributed and cryptography ({in_a_line(error)})"
             raise RequestError(f"{needs}: install vibench with its extra 'cluster'") from None
         credentials = Security().get_connection_args("client")
         if scheduler is not None and is_authenticated(scheduler) and credentials["ssl_context"] is None:

@@ -24,7 +24,7 @@ from vibench.plugins.kinds import PluginKind
 from vibench.plugins.plugin import Plugin
 from vibench.plugins.registry import find, registered
 from vibench.provenance import solver_distribution
-from vibench.qp.solve import installed_solvers
+from vibench.qp.solve import installed_solvers, load_qpsolvers
 from vibench.qp.status import Status
 from vibench.results.break_even import break_even_rows
 from vibench.results.consistency import disagreement_rows
@@ -329,12 +329,16 @@ def unavailable(cell: Cell) -> str:
     chosen = implementation(cell.problem.arguments.get("factorisation", DEFAULT))
     needs = [(str(plugin), plugin.missing) for plugin in plugins]
     needs += [] if chosen.is_installed else [(f"factorisation '{chosen.name}'", [chosen.distribution])]
+    if chosen.is_installed and chosen.fault:
+        return chosen.fault
     for name, missing in needs:
         if missing:
             what = f"the {name} needs {', '.join(missing)}, which is not installed"
             return f"{what}: `pip install {' '.join(missing)}`"
     if cell.solver is None or cell.solver in installed_solvers(registered(PluginKind.SOLVER)):
         return ""
+    if fault := load_qpsolvers()[1].get(cell.solver) if provenance.solver_version(cell.solver) else "":
+        return f"the QP solver '{cell.solver}' cannot be imported: {fault}"
     return f"the QP solver '{cell.solver}' is not installed: `pip install {solver_distribution(cell.solver)}`"
 
 

@@ -6,6 +6,8 @@ A factor solves; an elimination condenses a matrix on some unknowns.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from functools import cached_property
+from importlib import import_module
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,7 +15,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.errors import NumericalError, RequestError, unknown_name
+from vibench.errors import NumericalError, RequestError, UnsupportedError, foreign, unknown_name
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky, elimination_order
 from vibench.linalg.definite import BlockDiagonal, Elimination, Factor, FactoredElimination, checked
 from vibench.provenance import distribution_version
@@ -37,6 +39,17 @@ class Implementation(ABC):
     name: ClassVar[str]
     summary: ClassVar[str]
     distribution: ClassVar[str] = ""
+    module: ClassVar[str] = __name__
+
+    @cached_property
+    def fault(self) -> str:
+        """Reason why its module cannot be imported; "" if it can."""
+        try:
+            with foreign(f"the factorisation '{self.name}'"):
+                import_module(self.module)
+        except UnsupportedError as error:
+            return str(error)
+        return ""
 
     @property
     def is_installed(self) -> bool:
@@ -83,6 +96,7 @@ class _SuperLU(Implementation):
 
 class _Pardiso(Implementation):
     name, summary, distribution = "pardiso", "PARDISO of the Intel MKL", "pypardiso"
+    module = "vibench.linalg.pardiso"
 
     def _factor(self, matrix: SparseMatrix, name: str) -> Factor:
         from vibench.linalg.pardiso import PardisoFactor  # noqa: PLC0415  an optional library
@@ -106,6 +120,7 @@ class _Pardiso(Implementation):
 
 class _Cholmod(Implementation):
     name, summary, distribution = "cholmod", "CHOLMOD, supernodal", "kvxopt"
+    module = "kvxopt.cholmod"
 
     def _factor(self, matrix: SparseMatrix, name: str) -> Factor:
         return CholmodFactor(matrix, name)
@@ -152,7 +167,7 @@ def implementation(name: str) -> Implementation:
         raise RequestError(f"the factorisation is {brief(repr(name), 80)}, expected the name of one")
     if name == "available":
         fastest_first = (IMPLEMENTATIONS[one] for one in ("pardiso", "cholmod", DEFAULT))
-        return next(one for one in fastest_first if one.is_installed)
+        return next(one for one in fastest_first if one.is_installed and not one.fault)
     if name not in IMPLEMENTATIONS:
         raise unknown_name("factorisation", name, [*IMPLEMENTATIONS, "available"])
     return IMPLEMENTATIONS[name]

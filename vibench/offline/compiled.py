@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.errors import RequestError, UnsupportedError
+from vibench.errors import RequestError, UnsupportedError, foreign
 from vibench.files import scratch
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.model.chebyshev import AffinePolynomial
@@ -88,7 +88,7 @@ class CompiledProgram:
 
     def __init__(self, source: str, unknowns: int, constraints: int) -> None:
         # A library that is loaded needs its file no longer.
-        with scratch() as folder:
+        with foreign("the C compiler, or what it makes,"), scratch() as folder:
             self._solve = ctypes.CDLL(str(_compiled(source, folder))).model_solve
         self._sizes = unknowns, constraints
         self._solve.argtypes, self._solve.restype = [ctypes.c_void_p] * 4, ctypes.c_int

@@ -21,7 +21,7 @@ import scipy.io
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.errors import RequestError, message_of, unknown_name
+from vibench.errors import RequestError, in_a_line, message_of, unknown_name
 from vibench.provenance import memory
 
 
@@ -201,8 +201,9 @@ class ArrayFiles:
     def _hdf5(self, path: Path, inner: str) -> Any:
         try:
             import h5py  # noqa: PLC0415  optional
-        except ImportError:
-            raise RequestError("HDF5 files need h5py: pip install 'vibench[hdf5]'") from None
+        except (Exception, SystemExit) as error:  # noqa: BLE001  a broken library raises anything
+            needs = f"HDF5 files need h5py ({in_a_line(error)})"
+            raise RequestError(f"{needs}: pip install 'vibench[hdf5]'") from None
         with h5py.File(path, "r") as file:
             node: Any = file
             for part in [part for part in inner.split("/") if part]:

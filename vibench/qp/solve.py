@@ -6,10 +6,11 @@ multipliers α ≥ 0 such that A x + Bᵀα = f.
 
 from __future__ import annotations
 
+import builtins
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ import scipy.sparse as sp
 from scipy.linalg.lapack import dposv, dtrtrs
 
 from vibench.arrays import Array, Mask
-from vibench.errors import NumericalError, in_a_line, message_of
+from vibench.errors import NumericalError, UnsupportedError, foreign, in_a_line, message_of
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.provenance import solver_version
@@ -254,10 +255,33 @@ def installed_solvers(extra: Iterable[str] = ()) -> list[str]:
 
     A solver counts only with its distribution: a folder of that name in the working directory can be imported, too.
     """
-    import qpsolvers  # noqa: PLC0415  loads every solver there is, which processes that use none of them need not
-
-    installed = {name for name in qpsolvers.available_solvers if name in SETTINGS and solver_version(name)}
+    installed = {name for name in load_qpsolvers()[0].available_solvers if name in SETTINGS and solver_version(name)}
     return sorted(installed | set(extra))
+
+
+@cache
+def load_qpsolvers() -> tuple[Any, Mapping[str, str]]:
+    """The module qpsolvers, and why it cannot import some solvers, by name; an `UnsupportedError` if it is broken."""
+    usual, faults = builtins.__import__, dict[str, str]()
+
+    def importing(name: str, within: Any = None, *given: Any, **named: Any) -> Any:
+        if (within or {}).get("__name__") != "qpsolvers.solvers":
+            return usual(name, within, *given, **named)
+        try:
+            with foreign(name):
+                return usual(name, within, *given, **named)
+        except UnsupportedError as error:
+            faults[name.removesuffix("_")] = str(error)
+            # It catches nothing else: one broken library would stop every study.
+            raise ImportError(str(error)) from None
+
+    builtins.__import__ = importing  # type: ignore[assignment]
+    try:
+        with foreign("qpsolvers"):
+            import qpsolvers  # noqa: PLC0415  loads every solver there is, which processes that use none need not
+    finally:
+        builtins.__import__ = usual
+    return qpsolvers, faults
 
 
 def takes_start(solver: str) -> bool:
@@ -277,14 +301,13 @@ def _call(
     if solver in DIRECT and isinstance(program.A, np.ndarray) and isinstance(program.B, np.ndarray):
         solution = DIRECT[solver](program, bounds, **settings, **start)
     else:
-        import qpsolvers  # noqa: PLC0415  as above
-
+        library, _ = load_qpsolvers()
         rows = {"lb": -program.g} if bounds else {"G": _as_csc(program.B), "h": program.g}
-        problem = qpsolvers.Problem(_as_csc(program.A), -program.f, **rows)
+        problem = library.Problem(_as_csc(program.A), -program.f, **rows)
         with warnings.catch_warnings():
             # Warnings repeat the status, which is part of the solution and is verified later.
             warnings.simplefilter("ignore")
-            solution = qpsolvers.solve_problem(problem, solver=solver, **settings, **start)
+            solution = library.solve_problem(problem, solver=solver, **settings, **start)
     status, iterations = SETTINGS[solver].report(solution)
     z = solution.z
     if bounds and not isinstance(solution, DirectSolution):

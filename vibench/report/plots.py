@@ -14,17 +14,20 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from PIL import Image
 
+from vibench.errors import foreign
 from vibench.report.figures.data import ProblemTables, best_solver, label, on_common_queries
 from vibench.report.figures.style import Look, Looks, Series, caption_of
 from vibench.results import ranking
 from vibench.results.break_even import HIGH_FIDELITY, TAIL
 from vibench.results.paired_timing import PairedTiming
 from vibench.text import printable, unbroken
+
+with foreign("matplotlib"):
+    from matplotlib.axes import Axes
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
 
 
 @cache

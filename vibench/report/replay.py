@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import qpsolvers
 
 from vibench.arrays import Array
 from vibench.errors import RequestError
@@ -21,7 +20,7 @@ from vibench.files import scratch, write_atomically, writing
 from vibench.interfaces.problem import VariationalInequality
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import registered
-from vibench.qp.solve import installed_solvers
+from vibench.qp.solve import installed_solvers, load_qpsolvers
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, verify
 from vibench.results.consistency import vectors
@@ -88,7 +87,7 @@ def write_program(program: VariationalInequality, file: Path) -> None:
     """
     # In memory: on a full disk zipfile leaves half a file, and a traceback when that is closed.
     content = io.BytesIO()
-    qpsolvers.Problem(program.A, -program.f, program.B, program.g).save(content)  # type: ignore[arg-type]  # a file will do
+    load_qpsolvers()[0].Problem(program.A, -program.f, program.B, program.g).save(content)
     file.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(file, content.getvalue())
 

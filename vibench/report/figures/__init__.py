@@ -9,16 +9,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from matplotlib.figure import Figure
-
-from vibench.errors import RequestError, in_a_line, unknown_name
+from vibench.errors import RequestError, foreign, in_a_line, unknown_name
 from vibench.files import read_regular, write_atomically
-from vibench.report.figures.convergence import enrichment, inf_sup, projection_errors
-from vibench.report.figures.costs import solvers, total_cost, work_precision
-from vibench.report.figures.data import Extent, ProblemTables, file_names, problem_tables
-from vibench.report.figures.solutions import solutions
-from vibench.report.figures.style import Pages, caption_of, save, styled
 from vibench.text import json_object
+
+with foreign("matplotlib"):
+    from matplotlib.figure import Figure
+
+    from vibench.report.figures.convergence import enrichment, inf_sup, projection_errors
+    from vibench.report.figures.costs import solvers, total_cost, work_precision
+    from vibench.report.figures.data import Extent, ProblemTables, file_names, problem_tables
+    from vibench.report.figures.solutions import solutions
+    from vibench.report.figures.style import Pages, caption_of, save, styled
 
 DrawPages = Callable[[ProblemTables], Pages]
 
