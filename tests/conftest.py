@@ -55,9 +55,6 @@ sys.dont_write_bytecode = False
 
 leave_syncing_to_the_system()
 
-# OSQP would otherwise search the whole path for two algebras that are not installed, in every solve.
-os.environ.setdefault("OSQP_ALGEBRA_BACKEND", "builtin")
-
 
 def pytest_configure(config: pytest.Config) -> None:
     """Let pytest-xdist, where it is, keep the order of the files; of its own it would begin with the most tests.
