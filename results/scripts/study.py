@@ -28,7 +28,7 @@ TABLES = ("cells", "thresholds", "disagreements")
 
 FIGURES = {
     "benefit": ("total-cost", "work-precision", "inf-sup"),
-    "hertz-quadrature": ("solutions", "errors"),
+    "hertz-quadrature": ("solutions", "convergence"),
     "solvers": ("solvers",),
 }
 """Kinds of figures on the page of a study; all of them on other pages."""

@@ -76,7 +76,7 @@ def _reduce_cones(folder: Path, dual: list[str], dual_tol: float, out: Path) -> 
     from vibench.packs.pack import pack_multipliers, reduce_multipliers
     from vibench.packs.reader import naming
     from vibench.plugins.registry import find, registered
-    from vibench.report.figures.convergence import cone_errors
+    from vibench.report.figures.spaces import cone_errors
     from vibench.report.figures.style import save, styled
     from vibench.results.formats import to_csv
 

@@ -140,7 +140,7 @@ class Run:
 
     @requested
     def figure(self, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
-        """One figure of the run, to be shown or saved; the kind is "inf-sup", "errors", "total-cost", ….
+        """One figure of the run, to be shown or saved; the kind is "inf-sup", "convergence", "total-cost", ….
 
         `problem` and, for figures of a cone, `dual` are labels, not needed where the run has one. Raises a
         `RequestError` if there is no such figure, or the run has no data for it.

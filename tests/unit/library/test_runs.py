@@ -77,7 +77,7 @@ def test_figures_and_findings(run: vibench.Run) -> None:
         ("infsup", {}, "no figure is called 'infsup'; did you mean 'inf-sup'"),
         ("inf-sup", {}, "the figure is of one dual strategy: name one of cpg, mcpg"),
         ("inf-sup", {"dual": "gpc"}, "no dual strategy is called 'gpc'"),
-        ("errors", {"problem": "hertz"}, "no problem is called 'hertz'"),
+        ("convergence", {"problem": "hertz"}, "no problem is called 'hertz'"),
         ("dimension", {}, "no figure is called 'dimension'"),
     ):
         with pytest.raises(vibench.RequestError, match=line):
@@ -97,7 +97,7 @@ def test_progress_in_a_notebook_is_lines(monkeypatch: pytest.MonkeyPatch, capsys
 
 
 def test_what_a_run_writes(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(figures, "KINDS", {"errors": figures.KINDS["errors"]})
+    monkeypatch.setattr(figures, "KINDS", {"convergence": figures.KINDS["convergence"]})
     assert {file.name for file in run.write_tables(tmp_path / "tables")} == set(show.exported_files())
     drawn = run.write_figures(tmp_path / "figures")
     assert {file.suffix for file in drawn} == {".png", ".svg"}

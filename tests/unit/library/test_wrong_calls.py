@@ -60,7 +60,7 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calls:
         "create": (vibench.create, {"kind": "problem", "name": "radial-obstacle", "options": {}}),
         "Run.table": (run.table, {"name": "cells"}),
         "Run.break_even": (run.break_even, {"error": "u", "within": 0.1}),
-        "Run.figure": (run.figure, {"kind": "errors", **bases}),
+        "Run.figure": (run.figure, {"kind": "convergence", **bases}),
         "Run.write_tables": (run.write_tables, {"folder": "t"}),
         "Run.write_figures": (run.write_figures, {"folder": "f", "formats": ()}),
         "Run.report": (run.report, {"path": "r.html", "figures": False}),

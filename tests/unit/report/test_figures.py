@@ -23,7 +23,7 @@ from running import DECIDED, Changed, Main, execute
 
 from vibench.errors import RequestError
 from vibench.report import figures
-from vibench.report.figures import KINDS, convergence, costs, draw_all
+from vibench.report.figures import KINDS, costs, draw_all, spaces
 from vibench.report.figures import problem_tables as of_file
 from vibench.report.figures.data import Extent, ProblemTables, _per_combination
 from vibench.report.figures.style import save, styled
@@ -142,7 +142,7 @@ def test_every_figure_can_be_read(drawn: Drawn, folder: Path) -> None:
     for problem in problems():
         assert {f"{problem}-{kind}" for kind, (_, of_dual) in KINDS.items() if not of_dual} <= names
         for dual in read_study("quick").dual:
-            assert {f"{problem}-{dual.title}-enrichment", f"{problem}-{dual.title}-inf-sup"} <= names
+            assert f"{problem}-{dual.title}-inf-sup" in names
     assert {path.stem for path in folder.glob("*.svg")} == names == {*drawn} == {*captions} != set()
     for name, figure in drawn.items():
         picture = Image.open(folder / f"{name}.png")
@@ -176,7 +176,7 @@ def test_projection_errors_are_those_of_the_histories_and_dual_strategies_have_o
 ) -> None:
     histories = read_table(results, "histories")
     for problem in problems():
-        pod, cones = drawn[f"{problem}-errors"].axes
+        pod, cones, sigma, beta = drawn[f"{problem}-convergence"].axes
         mine = histories[(histories["problem"] == problem) & (histories["quantity"] == "error")]
         (line,) = pod.get_lines()
         expected = mine[mine["stage"] == "pod"].set_index("step")["value"]
@@ -188,26 +188,26 @@ def test_projection_errors_are_those_of_the_histories_and_dual_strategies_have_o
             cone = mine[(mine["stage"] == "cone") & (mine["dual"] == dual.title)].sort_values("step")
             np.testing.assert_array_equal(line.get_ydata(), cone["value"])
             assert line.get_ydata()[-1] <= 1e-2
-        assert {axes.get_yscale() for axes in (pod, cones)} == {"log"}
+        assert {axes.get_yscale() for axes in (pod, cones, sigma, beta)} == {"log"}
+        assert np.all(np.diff(data_of(sigma)[0]) <= 1e-12)
+        assert data_of(sigma)[0][-1] <= 0.5
+        assert data_of(beta)[0][-1] > 0.0
 
 
 def test_the_figures_of_a_cone_show_sigma_beta_and_the_high_fidelity_pair(drawn: Drawn, results: Path) -> None:
     queries = read_table(results, "queries")
     for problem in problems():
         for dual in read_study("quick").dual:
-            sigma, beta, validation = drawn[f"{problem}-{dual.title}-enrichment"].axes
-            assert np.all(np.diff(data_of(sigma)[0]) <= 1e-12)
-            assert data_of(sigma)[0][-1] <= 0.5
-            assert data_of(beta)[0][-1] > 0.0
             mine = queries[(queries["problem"] == problem) & (queries["dual"] == dual.title)]
             fixed = mine[mine["primal_tol"].notna() & (mine["solver"] == "piqp")]
+            span, cone = drawn[f"{problem}-{dual.title}-inf-sup"].axes
             alone = problem == "hertz"  # one parameter, which is the abscissa
             expected = fixed.sort_values("mu_1" if alone else "beta_span")
-            np.testing.assert_allclose(data_of(validation)[0], expected["beta_span"])
+            of_pga = next(line for line in span.get_lines() if str(line.get_label()).startswith("offline-pga"))
+            np.testing.assert_allclose(of_pga.get_ydata(), expected["beta_span"])
             if alone:
-                np.testing.assert_array_equal(validation.get_lines()[0].get_xdata(), expected["mu_1"])
-                assert validation.get_xlabel() == "radius µ [m]"
-            span, cone = drawn[f"{problem}-{dual.title}-inf-sup"].axes
+                np.testing.assert_array_equal(of_pga.get_xdata(), expected["mu_1"])
+                assert span.get_xlabel() == "radius µ [m]"
             _, labels = span.get_legend_handles_labels()
             for primal in read_study("quick").primal:
                 assert any(label.startswith(primal.title) for label in labels)
@@ -227,7 +227,7 @@ def test_a_logarithmic_panel_with_nothing_to_show_stays_empty(change: Change, dr
         "DELETE FROM histories WHERE quantity = 'sigma'",
         "UPDATE histories SET value = 0.0 WHERE quantity = 'beta_span_min'",
     )
-    sigma, beta, _ = draw("enrichment")["obstacle-mcpg-enrichment"].axes[:3]
+    _, _, sigma, beta = draw("convergence")["obstacle-convergence"].axes
     assert not sigma.get_lines()
     for axes in (sigma, beta):
         low, high = axes.get_ylim()
@@ -245,7 +245,7 @@ def test_cells_that_failed_stop_no_others_and_no_tolerance_has_no_name(
         *(f"UPDATE {table} SET primal_tol = NULL" for table in ("cells", "queries", "histories")),
     )
     drawn = draw()
-    assert {"obstacle-mcpg-inf-sup", "obstacle-mcpg-enrichment"} <= set(drawn)
+    assert {"obstacle-mcpg-inf-sup", "obstacle-convergence"} <= set(drawn)
     for name, figure in drawn.items():
         for axes in figure.axes:
             assert not [label for label in axes.get_legend_handles_labels()[1] if "nan" in label], name
@@ -263,25 +263,25 @@ def test_a_solver_that_failed_takes_no_strategy_out_of_a_figure(change: Change, 
     assert {"decorrelated", "decorrelated (k = 1)"} <= set(labels)
 
 
-def test_without_a_fixed_enrichment_there_is_no_enrichment_figure(change: Change, draw: Draw, results: Path) -> None:
+def test_without_a_fixed_enrichment_its_panels_are_left_out(change: Change, draw: Draw, results: Path) -> None:
     """Nor does one need cones: where every snapshot has no contact there is no generator, so no e_orth."""
     change(ONE_PAIR, "DELETE FROM queries WHERE primal = 'offline-pga'", "DELETE FROM histories WHERE stage = 'cone'")
-    drawn = draw("errors", "enrichment", "inf-sup", "total-cost", "work-precision")
-    assert not [name for name in drawn if name.endswith("enrichment")]
+    drawn = draw("convergence", "inf-sup", "total-cost", "work-precision")
+    assert len(drawn["obstacle-convergence"].axes) == 2
     assert "obstacle-mcpg-inf-sup" in drawn
-    with pytest.raises(RequestError, match="the run has no data for the figure 'enrichment' of obstacle"):
-        figures.draw(results, "enrichment", "obstacle", "mcpg")
+    change("UPDATE queries SET solver = '–'")
+    with pytest.raises(RequestError, match="the run has no data for the figure 'solvers' of obstacle"):
+        figures.draw(results, "solvers", "obstacle")
 
 
 def test_prescribed_sizes_are_drawn_too_and_two_pairs_of_tolerances_get_two_panels(change: Change, draw: Draw) -> None:
     change(ONE_PAIR, *(f"UPDATE {table} SET pod_tol = 0.1 WHERE solver = 'osqp'" for table in ("queries", "cells")))
-    drawn = draw("inf-sup", "enrichment")
+    drawn = draw("inf-sup")
     assert len(drawn["obstacle-mcpg-inf-sup"].axes) == 4
-    assert len(drawn["obstacle-mcpg-enrichment"].axes) == 6
     sizes = "pod_tol = NULL, pod_size = 13, dual_tol = NULL, dual_size = 20"
     enrichments = f"UPDATE histories SET {sizes} WHERE stage = 'enrichment'"
     change(*(f"UPDATE {table} SET {sizes}" for table in ("queries", "cells")), enrichments)
-    figure = draw("enrichment")["obstacle-mcpg-enrichment"]
+    figure = draw("convergence")["obstacle-convergence"]
     assert all(data_of(axes) for axes in figure.axes)
 
 
@@ -294,8 +294,8 @@ def test_entries_that_share_a_label_get_files_of_their_own(change: Change, draw:
         "INSERT INTO histories SELECT * FROM histories",
         f"UPDATE histories SET problem_options = '{other}' WHERE rowid % 2 = 0",
     )
-    drawn = draw("errors", "inf-sup")
-    assert {f"obstacle-{k}-{kind}" for k in (1, 2) for kind in ("errors", "mcpg-inf-sup")} <= set(drawn)
+    drawn = draw("convergence", "inf-sup")
+    assert {f"obstacle-{k}-{kind}" for k in (1, 2) for kind in ("convergence", "mcpg-inf-sup")} <= set(drawn)
 
 
 def test_any_label_makes_a_file_in_the_folder(change: Change, draw: Draw) -> None:
@@ -319,12 +319,11 @@ def test_every_strategy_is_drawn_ten_to_a_panel(count: int, tables: Tables) -> N
 
     cones = replace(data, histories=pd.concat([data.histories[data.histories["stage"] == "pod"],
                                                many(data.histories, "dual", "mcpg")]))  # fmt: skip
-    assert in_tens(next(convergence.projection_errors(cones)).axes[1:]) == count
+    assert len(next(spaces.convergence(cones)).axes[1].get_lines()) == min(count, 10)
     mine = data.restrict_to_dual("mcpg")
     fixed = replace(mine, queries=many(mine.queries, "primal", "offline-pga"),
                     histories=many(mine.histories, "primal", "offline-pga"))  # fmt: skip
-    assert in_tens(next(convergence.enrichment(fixed)).axes[::3]) == count
-    spans = [axes for axes in next(convergence.inf_sup(fixed)).axes if axes.get_ylabel().endswith("span")]
+    spans = [axes for axes in next(spaces.inf_sup(fixed)).axes if axes.get_ylabel().endswith("span")]
     assert in_tens(spans) == count + len(spans)  # the high-fidelity pair is in each
 
 
@@ -414,7 +413,7 @@ def test_a_profile_ends_at_the_share_that_was_solved(change: Change, draw: Draw)
 
 def test_the_same_results_give_the_same_files(tables: Tables, tmp_path: Path) -> None:
     data = tables["hertz"]
-    for name, drawing in ((name, KINDS[name][0]) for name in ("solutions", "errors")):
+    for name, drawing in ((name, KINDS[name][0]) for name in ("solutions", "convergence")):
         files = []
         for folder in ("one", "two"):
             (tmp_path / folder).mkdir(exist_ok=True)
@@ -428,7 +427,7 @@ def test_a_figure_that_fails_costs_itself_and_progress_names_every_one(
     change: Change, results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, main: Main
 ) -> None:
     change("DELETE FROM cells WHERE problem = 'hertz' OR dual = 'cpg'", ONE_PAIR)
-    failing = {"solvers": (lambda _: {}["nan"], False), "enrichment": KINDS["enrichment"]}
+    failing = {"solvers": (lambda _: {}["nan"], False), "inf-sup": KINDS["inf-sup"]}
     monkeypatch.setattr(figures, "KINDS", failing)
     line = "the figure 'obstacle-solvers' could not be drawn: KeyError: 'nan'"
     code, out, err = main("figures", str(results), "--out", str(tmp_path / "here"), "--format", "svg")
@@ -437,20 +436,19 @@ def test_a_figure_that_fails_costs_itself_and_progress_names_every_one(
     assert line in html.unescape(report_page(results))
     shown: list[tuple[str, int, int]] = []
     draw_all(results, tmp_path, ("svg",), lambda *now: shown.append(now))
-    assert shown == [("obstacle-solvers", 0, 2), ("obstacle-mcpg-enrichment", 1, 2), ("", 2, 2)]
+    assert shown == [("obstacle-solvers", 0, 2), ("obstacle-mcpg-inf-sup", 1, 2), ("", 2, 2)]
 
 
-def test_the_tightest_enrichment_is_the_one_that_went_farthest(tables: Tables) -> None:
+def test_the_tightest_enrichment_is_the_one_that_went_farthest(results: Path) -> None:
     """Whichever way its tolerance runs, and however many training parameters there are."""
-    mine = tables["obstacle"].restrict_to_dual("mcpg")
-    steps = mine.histories[mine.histories["stage"] == "enrichment"]
-    longer = steps[steps["quantity"].isin(["sigma", "beta_span_min"])]
-    last = longer[longer["step"] == longer["step"].max()].assign(step=longer["step"].max() + 1)
+    mine = dict(of_file(results))["obstacle"].restrict_to_dual("mcpg")
+    steps = mine.histories[mine.histories["quantity"] == "beta_span_min"]
+    last = steps[steps["step"] == steps["step"].max()].assign(step=steps["step"].max() + 1)
     tighter = pd.concat([steps, last]).assign(primal_tol=0.9, artefact="tighter")
-    both = pd.concat([steps, tighter])
-    assert set(convergence._tightest(both)["primal_tol"]) == {0.9}
-    looser = pd.concat([steps.assign(primal_tol=0.95), tighter])
-    assert set(convergence._tightest(looser)["primal_tol"]) == {0.9}
+    for tolerance in (0.5, 0.95):
+        both = pd.concat([steps.assign(primal_tol=tolerance), tighter])
+        ((_, found),) = spaces.longest(both, "primal")
+        assert set(found["primal_tol"]) == {0.9}
 
 
 def test_a_caption_says_which_tolerances_are_left_out(change: Change, draw: Draw) -> None:

@@ -175,7 +175,7 @@ def test_a_large_study_has_pictures_of_the_cones_that_win(changed: Changed, monk
     ((name, data), _) = problem_tables(path)
     names = [task[0] for task in html.tasks_of(name, data)]
     assert [one for one in names if one.endswith("inf-sup")] == [f"hertz-{winner.cell['dual']}-inf-sup"]
-    assert {"hertz-errors", "hertz-total-cost"} <= {*names}
+    assert {"hertz-convergence", "hertz-total-cost"} <= {*names}
 
 
 def test_only_rows_of_a_disturbed_machine_are_marked_and_undecided_answers_are_shown(changed: Changed) -> None:

@@ -16,19 +16,18 @@ from vibench.text import json_object
 with foreign("matplotlib"):
     from matplotlib.figure import Figure
 
-    from vibench.report.figures.convergence import enrichment, inf_sup, projection_errors
     from vibench.report.figures.costs import solvers, total_cost, work_precision
     from vibench.report.figures.data import Extent, ProblemTables, file_names, problem_tables
     from vibench.report.figures.solutions import solutions
+    from vibench.report.figures.spaces import convergence, inf_sup
     from vibench.report.figures.style import Pages, caption_of, save, styled
 
 DrawPages = Callable[[ProblemTables], Pages]
 
 # Figures by the end of their file names, and whether every dual strategy of a problem has one.
 KINDS: dict[str, tuple[DrawPages, bool]] = {
-    "solutions": (solutions, False), "errors": (projection_errors, False), "work-precision": (work_precision, False),
-    "solvers": (solvers, False), "total-cost": (total_cost, False), "enrichment": (enrichment, True),
-    "inf-sup": (inf_sup, True),
+    "solutions": (solutions, False), "convergence": (convergence, False), "work-precision": (work_precision, False),
+    "solvers": (solvers, False), "total-cost": (total_cost, False), "inf-sup": (inf_sup, True),
 }  # fmt: skip
 
 # A figure to be drawn: name of its first file, function that draws its pages, and their data.

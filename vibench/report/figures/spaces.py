@@ -1,9 +1,8 @@
-"""Figures of projection errors, enrichment and inf-sup constants (paper, Figures 5 to 8 and 11 to 15)."""
+"""Figures of the reduced spaces: their convergence and their inf-sup constants (paper, Figures 5 to 8 and 11 to 15)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import starmap
 from typing import Any
 
 import numpy as np
@@ -12,30 +11,49 @@ from matplotlib.axes import Axes
 
 from vibench.interfaces.strategies import Kind
 from vibench.report.figures import style
-from vibench.report.figures.data import ProblemTables, by_strategy, dimensions, parts, series, titled_parts
+from vibench.report.figures.data import ProblemTables, by_strategy, dimensions, parts, titled_parts
 from vibench.report.figures.style import CaptionedFigure, Looks, Pages, Series, Sheet, counted, plot, positive
 from vibench.stability.infsup import VANISHES
 
 
-def projection_errors(data: ProblemTables) -> Pages:
-    """Relative projection errors of the POD and of the cones against their size (paper, Figures 5 and 11)."""
+def convergence(data: ProblemTables) -> Pages:
+    """POD and cones against their sizes, and fixed enrichments against the vectors added (paper, Figures 5, 7, 11, 14).
+
+    Enrichments are those of the first cone at its tightest tolerances.
+    """
     errors = data.histories[data.histories["quantity"] == "error"]
-    cones = parts([(str(dual), rows) for dual, rows in longest(errors[errors["stage"] == "cone"])]) or [[]]
-    sheet = Sheet.with_panels(1 + len(cones), f"{data.problem}: projection errors over the training set")
-    left, *others = sheet.panels
-    for _, steps in longest(errors[errors["stage"] == "pod"]):
+    # Nobody tells more than ten curves of a panel apart.
+    cones = [(str(dual), rows) for dual, rows in longest(errors[errors["stage"] == "cone"])][:10]
+    fixed = data.queries.loc[data.queries["enrichment_kind"] == Kind.FIXED, "primal"]
+    grown = data.histories[(data.histories["stage"] == "enrichment") & data.histories["primal"].isin(set(fixed))]
+    grown = grown[grown["dual"] == grown["dual"].iloc[0]] if len(grown) else grown
+    # The strategies at the tolerances with the most vectors.
+    most = [rows for _, rows in longest(grown[grown["quantity"] == "beta_span_min"], "primal")][:10]
+    steps = grown[grown["artefact"].isin({name for rows in most for name in rows["artefact"]})]
+    looks = Looks(key for _, key, _ in by_strategy(steps))
+    sheet = Sheet(2 if most else 1, 2, f"{data.problem}: convergence over the training set")
+    pod, cone, *others = sheet.panels
+    for _, rows in longest(errors[errors["stage"] == "pod"]):
         # A tail below this is round-off.
-        shown = steps[steps["value"] > 1e-12]
-        plot(left, shown["step"], shown["value"], style.look_of("POD"), "POD")
-    left.set(xlabel="number of modes N", ylabel="relative error of the POD", title="primal", yscale="log")
-    counted(left)
-    for panel, group in zip(others, cones, strict=False):
-        panel.set(title="dual")
-        _cones(panel, group)
+        shown = rows[rows["value"] > 1e-12]
+        plot(pod, shown["step"], shown["value"], style.HIGH_FIDELITY_LOOK, "POD")
+    pod.set(xlabel="number of modes N", ylabel="relative error of the POD", title="primal", yscale="log")
+    counted(pod)
+    cone.set(title="dual")
+    _cones(cone, cones)
+    quantities = (("sigma", "largest σ"), ("beta_span_min", "min β over span"))
+    for panel, (quantity, label) in zip(others, quantities, strict=False):
+        for name, key, rows in by_strategy(steps[steps["quantity"] == quantity]):
+            # Round-off is drawn at the floor, so that the curve of σ ends at the last vector.
+            values = np.maximum(rows["value"], 1e-14) if quantity == "sigma" else positive(rows["value"], 1e-14)
+            plot(panel, rows["step"], values, looks[key], name)
+        panel.set(xlabel="vectors added", ylabel=label, title="enrichment", xlim=(0, None), yscale="log")
+        counted(panel)
     yield sheet.finish(
-        f"Projection errors of {data.problem} over the training set: left, the relative tail of the POD against the "
-        "number N of modes; right, the largest relative distance of a multiplier from the cone of the first R "
-        "generators, for every dual strategy. Each curve is that of the tightest tolerance, which contains the others."
+        f"Convergence of {data.problem} over the training set: the relative tail of the POD against the number N of "
+        "modes; the largest relative distance of a multiplier from the cone of the first R generators, for every dual "
+        "strategy; and, for fixed enrichments of the first cone, the largest σ, where a strategy reports it, and the "
+        "smallest β over the span against the number of vectors added. Each curve is that of the tightest tolerance."
     )
 
 
@@ -57,81 +75,6 @@ def _cones(panel: Axes, cones: Sequence[tuple[str, pd.DataFrame]]) -> None:
         plot(panel, steps["step"], positive(steps["value"], 0.0), looks[Series(dual)], dual)
     panel.set(xlabel="number of generators R", ylabel="largest relative error of the cone", yscale="log")
     counted(panel)
-
-
-def enrichment(data: ProblemTables) -> Pages:
-    """Fixed enrichments: σ and min β against the vectors added, β over the validation set (paper, Figures 7 and 14)."""
-    fixed = data.queries[data.queries["enrichment_kind"] == Kind.FIXED]
-    strategies = fixed.drop_duplicates(["primal", "primal_tol"])
-    # Sines below this are round-off.
-    floor = 1e-14
-    looks = Looks(starmap(series, zip(strategies["primal"], strategies["primal_tol"], strict=True)))
-    for rows, part in data.pages(_enrichment_rows(fixed), 4):
-        sheet = Sheet(len(rows), 3, f"{data.problem}, {data.duals[0]}: fixed enrichments", sharey="col")
-        for row, (title, pair, names) in enumerate(rows):
-            histories = data.histories[(data.histories["stage"] == "enrichment") & (data.histories["pair"] == pair)]
-            steps = _tightest(histories[histories["primal"].isin({name for name, _ in names})])
-            for column, quantity in enumerate(("sigma", "beta_span_min")):
-                panel, name_of = sheet.panel(row, column), ("largest σ", "min β over span")[column]
-                for name, key, one in by_strategy(steps[steps["quantity"] == quantity]):
-                    # σ that is round-off is drawn at the floor, so that its curve ends at the last vector.
-                    sines = quantity == "sigma"
-                    values = np.maximum(one["value"], floor) if sines else positive(one["value"], floor)
-                    plot(panel, one["step"], values, looks[key], name)
-                panel.set(xlabel="vectors added", ylabel=f"{name_of}, training set", title=title)
-                panel.set(xlim=(0, None), yscale="log")
-                counted(panel)
-            _validation(sheet.panel(row, 2), data, fixed[fixed["pair"] == pair], names, looks)
-            sheet.panel(row, 2).set_title(title)
-        # All rows share this axis.
-        sheet.panel(0, 2).set_ylim(0, None)
-        yield sheet.finish(_enrichment_caption(data, fixed, floor), part)
-
-
-def _enrichment_caption(data: ProblemTables, fixed: pd.DataFrame, floor: float) -> str:
-    tolerances = ", ".join(
-        f"{primal} at δ = {some(mine['primal_tol'].dropna())}"
-        for primal, mine in fixed.groupby("primal", sort=False)
-        if mine["primal_tol"].notna().any()
-    )
-    return (
-        f"Fixed enrichments of {data.problem} with the cones of {data.duals[0]}, a row for every pair (N, R). Left, "
-        f"the largest σ over the training set against the number of vectors added, for strategies that report it, at "
-        f"{floor:g} where it is smaller, which is round-off; "
-        "middle, the smallest β over the span on the training set; both for the tolerance that went farthest. Right, "
-        f"β over the span at the validation parameters, for every tolerance{f' ({tolerances})' * bool(tolerances)}."
-    )
-
-
-def _enrichment_rows(fixed: pd.DataFrame) -> list[tuple[str, str, list[tuple[str, float]]]]:
-    """Title, pair, and strategies with their tolerances of every row of panels."""
-    rows = list[tuple[str, str, list[tuple[str, float]]]]()
-    for pair, group in fixed.groupby("pair", sort=False):
-        strategies = group.drop_duplicates(["primal", "primal_tol"]).sort_values(["primal", "primal_tol"])
-        names = list(zip(strategies["primal"], strategies["primal_tol"], strict=True))
-        rows += [(title, str(pair), some_names) for title, some_names in titled_parts(dimensions(group), names)]
-    return rows
-
-
-def _validation(
-    panel: Axes, data: ProblemTables, queries: pd.DataFrame, names: list[tuple[str, float]], looks: Looks
-) -> None:
-    """β at the validation parameters: over the only parameter, or each curve sorted for itself."""
-    axis, wanted = data.parameter, {series(*name) for name in names}
-    for name, key, one in by_strategy(one_solver(queries)):
-        if key in wanted:
-            ordered = one.sort_values("mu_1" if axis else "beta_span")
-            plot(panel, ordered["mu_1"] if axis else np.arange(1, len(one) + 1), ordered["beta_span"], looks[key], name)
-    panel.set(xlabel=axis or "validation parameters, sorted by β", ylabel="β over span")
-    if not axis:
-        counted(panel)
-
-
-def _tightest(steps: pd.DataFrame) -> pd.DataFrame:
-    """The histories of every strategy at the tolerance with the most vectors."""
-    # This quantity has a value per vector added.
-    grown = steps[steps["quantity"] == "beta_span_min"]
-    return at_best_tolerance(steps, grown.groupby(["primal", "primal_tol"])["step"].max())
 
 
 def inf_sup(data: ProblemTables) -> Pages:
@@ -253,11 +196,11 @@ def common_tolerances(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[common | ~rows["primal"].isin(everywhere.index.get_level_values("primal"))]
 
 
-def longest(histories: pd.DataFrame) -> Iterator[tuple[Any, pd.DataFrame]]:
-    """The longest history for each dual strategy."""
-    # It contains the others: POD and cones are nested, so a looser tolerance stops at an earlier step.
-    for dual, group in histories.groupby("dual", dropna=False):
-        yield dual, group[group["artefact"] == group.groupby("artefact")["step"].max().idxmax()]
+def longest(histories: pd.DataFrame, axis: str = "dual") -> Iterator[tuple[Any, pd.DataFrame]]:
+    """The longest history for each dual strategy, or on another axis."""
+    # It contains the others: bases are nested, so that a looser tolerance stops at an earlier step.
+    for name, group in histories.groupby(axis, dropna=False):
+        yield name, group[group["artefact"] == group.groupby("artefact")["step"].max().idxmax()]
 
 
 def one_solver(queries: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFrame:
