@@ -43,8 +43,7 @@ def interrupted_at_once() -> Iterator[None]:
     A `KeyboardInterrupt` in the import of an extension module may become an `ImportError`, or be lost; outside of all
     commands nobody catches it.
     """
-    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    with contextlib.nullcontext() if ignored else _handled(_leave):
+    with _handled(_leave):
         yield
 
 
@@ -79,9 +78,10 @@ def held() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _handled(handler: Handler, number: int = signal.SIGINT) -> Iterator[None]:
-    """Handle a signal inside the block; the previous handler returns unless the block has set another one."""
+    """Handle a signal inside the block unless it is ignored; the handler before returns if no other one is set."""
     before = signal.getsignal(number)
-    _set(handler, number)
+    if before is not signal.SIG_IGN:
+        _set(handler, number)
     try:
         yield
     finally:

@@ -40,6 +40,9 @@ def test_commands_catch_raise_or_ignore_what_ends_the_process_outside(handler: o
         interruptible(lambda: signal.signal(signal.SIGINT, signal.SIG_IGN))()  # type: ignore[arg-type, return-value]
         assert now() is signal.SIG_IGN
     assert now() is signal.SIG_IGN
+    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    interruptible(partial(os.kill, os.getpid(), signal.SIGTERM))()
+    signal.signal(signal.SIGTERM, before)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with interrupted_at_once():
         interruptible(lambda: os.kill(os.getpid(), signal.SIGINT))()

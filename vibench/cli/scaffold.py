@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-import tempfile
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from string import Template
 
 from vibench.errors import RequestError, StorageError
+from vibench.files import scratch
 from vibench.plugins.kinds import PluginKind
 from vibench.plugins.registry import find
 from vibench.provenance import distribution_version
@@ -62,8 +62,8 @@ def _write(target: Path, contents: Mapping[str, str]) -> Path:
         raise RequestError(f"--out '{parent}' cannot be made: {error.strerror or error}") from None
     # A draft is renamed when it is complete, so that a full disk leaves nothing half written.
     try:
-        with tempfile.TemporaryDirectory(dir=parent, prefix=".vibench-new-") as scratch:
-            draft = Path(scratch) / target.name
+        with scratch(parent) as folder:
+            draft = folder / target.name
             for path, text in contents.items():
                 (draft / path).parent.mkdir(parents=True, exist_ok=True)
                 (draft / path).write_text(text, encoding="utf-8")
