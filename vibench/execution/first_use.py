@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import Any
 
 from vibench.execution.isolated import call_isolated
 from vibench.execution.supervisor import Supervisor
@@ -16,28 +15,25 @@ from vibench.stages.artefacts import Store
 from vibench.study.cells import digest
 from vibench.timing import NO_TIME
 
+# Gives the states of what a plugin reads; gets those names in an earlier record whose states have changed.
+Watch = Callable[[Plugin, list[str]], Mapping[str, str]]
 
-def recall_reads(
-    plugins: Iterable[Plugin], store: Store, watch: Callable[[Plugin, list[str]], Any] | None = None
-) -> bool:
-    """Let given plugins know what they read; whether there are any that read something.
 
-    `watch` gives the states of what a plugin reads where these are not in the store, or some, which it gets, have
-    changed.
-    """
+def recall_reads(plugins: Iterable[Plugin], store: Store, watch: Watch | None = None) -> bool:
+    """Let given plugins know what they read, as recorded in the store or watched; whether any reads something."""
     found = False
     for plugin in dict.fromkeys(plugins):
-        if isinstance(given := plugin.registered, GivenPlugin):
-            options = options_as_json(plugin.arguments)
-            key, known = f"reads-{digest([given.fingerprint, options])}", dict[str, str]()
-            if (artefact := store.get(key)) is not None:
-                known = artefact.value
-            changed = [name for name, state in states(known).items() if state != known[name]]
-            if watch is not None and (artefact is None or changed):
-                known = watch(plugin, changed)
-                store.put(key, known, NO_TIME, ())
-            given.reads[options] = known
-            found |= bool(known)
+        given, options = plugin.registered, options_as_json(plugin.arguments)
+        assert isinstance(given, GivenPlugin)
+        key = f"reads-{digest([given.fingerprint, options])}"
+        artefact = store.get(key)
+        known = {} if artefact is None else artefact.value
+        changed = [name for name, state in states(known).items() if state != known[name]]
+        # Nothing is stored where the first use ends its process: the next run tries again.
+        if watch is not None and (artefact is None or changed) and (known := watch(plugin, changed)):
+            store.put(key, known, NO_TIME, ())
+        given.reads[options] = known
+        found |= bool(known)
     return found
 
 

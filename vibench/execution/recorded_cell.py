@@ -46,9 +46,9 @@ class RecordedCell:
     @cached_property
     def cell(self) -> Cell:
         cell = Cell.from_definition(self.row["definition"], self.places)
-        if any(one.is_given for one in cell.plugins) and recall_reads(cell.plugins, usable_store()):
-            return Cell.from_definition(self.row["definition"], self.places)
-        return cell
+        given = [one for one in cell.plugins if one.is_given]
+        known = bool(given) and recall_reads(given, usable_store())
+        return Cell.from_definition(self.row["definition"], self.places) if known else cell
 
     @cached_property
     def model(self) -> Model:

@@ -138,7 +138,7 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
         with closing(Supervisor(folder / LOG)) as supervisor:
             limits: Any = {"supervisor": supervisor, "seconds": study.limits.cell_seconds}
             watch = partial(watch_first_use, note=observer.note, **limits)
-            if recall_reads((one for cell in cells for one in cell.plugins), store, watch):
+            if recall_reads((one for cell in cells for one in cell.plugins if one.is_given), store, watch):
                 cells = expand(study)
         if options.fresh:
             clear(folder, study.name, observer.note)
