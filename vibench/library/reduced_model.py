@@ -229,7 +229,7 @@ def residuals(of: _Matrices, f: Array, g: Array, x: Array, alpha: Array, noise: 
     A, B, white = of.A, of.B, of.inverse @ f
     Ax, force, s = A @ x, alpha @ B, B @ x - g
     rest, pull = (of.inverse @ np.array([f - Ax - force, force]).T).T
-    S = float(np.hypot(np.sqrt(max(float(x @ Ax), 0.0)), _length(pull)))
+    S = float(np.hypot(np.sqrt(max(float(x @ Ax), 0.0)), np.linalg.norm(pull)))
     room = of.round_off * (of.sizes @ abs(x) + abs(g))
     way, room, is_open = _step(of, s, room), np.maximum(room, noise), g < np.inf
     tied = [pair for pair in of.opposite if abs(g[pair].sum()) <= room[pair].max() < np.inf]
@@ -242,12 +242,8 @@ def residuals(of: _Matrices, f: Array, g: Array, x: Array, alpha: Array, noise: 
         alpha = np.where(np.isin(np.arange(len(g)), tied), 0.0, alpha)
     free = of.inverse.T @ white
     least = _step(of, np.where(is_open, B @ free - g, 0.0), of.round_off * (of.sizes @ abs(free) + abs(g)) + noise)
-    F = max(_length(pull), least) if least else S
-    return _ratio(way, F), _ratio(_length(rest), F), _ratio(abs(float(alpha @ s)), F**2)
-
-
-def _length(vector: Array) -> float:
-    return float(np.sqrt(vector @ vector))
+    F = max(float(np.linalg.norm(pull)), least) if least else S
+    return _ratio(way, F), _ratio(float(np.linalg.norm(rest)), F), _ratio(abs(float(alpha @ s)), F**2)
 
 
 def _step(of: _Matrices, s: Array, room: Array) -> float:
