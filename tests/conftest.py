@@ -61,10 +61,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
     Parallel workers begin to collect with different files, and find the bytecode of the others.
     """
-    # Garbage collections leave alone for longer what thousands of tests are made of.
-    gc.set_threshold(20_000, 20, 20)
     config.option.loadscopereorder = False
     parallel = getattr(config, "workerinput", None)
+    if parallel:
+        gc.disable()  # until all tests are collected, which makes no garbage
     if parallel and [Path(given).resolve() for given in config.args] == [TESTS]:
         files = sorted(map(str, TESTS.rglob("test_*.py")))
         begin = int(parallel["workerid"].removeprefix("gw")) * len(files) // parallel["workercount"]
@@ -82,8 +82,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
+    gc.enable()
     gc.collect()
     gc.freeze()
+    gc.set_threshold(20_000, 20, 20)  # later collections leave alone what thousands of tests are made of
 
 
 @pytest.fixture(scope="session", autouse=True)
