@@ -15,8 +15,8 @@ from vibench.stages.artefacts import Store
 from vibench.study.cells import digest
 from vibench.timing import NO_TIME
 
-# Gives the states of what a plugin reads; gets those names in an earlier record whose states have changed.
-Watch = Callable[[Plugin, list[str]], Mapping[str, str]]
+# Gives the states of what a plugin reads, `None` if its process ended; it gets the recorded names that have changed.
+Watch = Callable[[Plugin, list[str]], Mapping[str, str] | None]
 
 
 def recall_reads(plugins: Iterable[Plugin], store: Store, watch: Watch | None = None) -> bool:
@@ -29,9 +29,11 @@ def recall_reads(plugins: Iterable[Plugin], store: Store, watch: Watch | None = 
         artefact = store.get(key)
         known = {} if artefact is None else artefact.value
         changed = [name for name, state in states(known).items() if state != known[name]]
-        # Nothing is stored where the first use ends its process: the next run tries again.
-        if watch is not None and (artefact is None or changed) and (known := watch(plugin, changed)):
-            store.put(key, known, NO_TIME, ())
+        if watch is not None and (artefact is None or changed):
+            # Nothing is stored where the first use ends its process: the next run tries again.
+            if (watched := watch(plugin, changed)) is not None:
+                store.put(key, watched, NO_TIME, ())
+            known = watched or {}
         given.reads[options] = known
         found |= bool(known)
     return found
@@ -39,15 +41,16 @@ def recall_reads(plugins: Iterable[Plugin], store: Store, watch: Watch | None = 
 
 def watch_first_use(
     plugin: Plugin, changed: list[str], *, note: Callable[[str], None], supervisor: Supervisor, seconds: float
-) -> dict[str, str]:
-    """Use a plugin for some seconds at most, in a process that does nothing else; the states of what it reads."""
+) -> dict[str, str] | None:
+    """Use a plugin for some seconds at most, in a process that does nothing else; see `Watch`."""
     if changed:
         more = f" and {len(changed) - 1} more" * (len(changed) > 1)
         note(f"the {plugin} reads {changed[0]}{more}, changed since: what it computes is computed again")
     there = call_isolated(reads_of, partial(_first_use, plugin), seconds=seconds, supervisor=supervisor)
+    if not isinstance(there, Mapping):
+        return None
     # A process of ours has some variables of its own.
-    here = states(there) if isinstance(there, Mapping) else {}
-    return {name: state for name, state in here.items() if not name.startswith("$") or state == there[name]}
+    return {name: state for name, state in states(there).items() if not name.startswith("$") or state == there[name]}
 
 
 def _first_use(plugin: Plugin) -> None:
