@@ -213,12 +213,9 @@ def _corrected(corrector: Corrector, mu: Array, solution: ExactSolution) -> Answ
 def summarise(rows: Sequence[Row]) -> Row:
     """The columns of a cell from those of its queries; means and maxima are over the queries with status ok."""
     fine = [row for row in rows if row["status"] == Status.OK]
-    worst = max((Status(row["status"]) for row in rows), key=lambda status: status.severity)
 
     def mu(row: Row) -> str:
         return ", ".join(f"{row[name]:.4g}" for name in sorted(row) if name.startswith("mu_"))
-
-    reasons = [f"mu=({mu(row)}): {row['reason']}" for row in rows if row["status"] == worst and row["reason"]]
 
     def column(name: str, among: Sequence[Row] = fine) -> Array:
         return np.array([row[name] for row in among if row.get(name) is not None], dtype=float)
@@ -251,12 +248,18 @@ def summarise(rows: Sequence[Row]) -> Row:
             f"queries_zero_{name}": len(zero), f"error_{name}_zero_max": over(np.max, f"error_{name}_scaled", zero),
         }  # fmt: skip
 
+    # The worst status is that of the cell; its reason has all of them, with their counts.
+    kinds = sorted({Status(row["status"]) for row in rows}, key=lambda status: -status.severity)
+    broken = {kind: [row for row in rows if row["status"] == kind] for kind in kinds if kind is not Status.OK}
+    counted = ", ".join(f"{len(mine)} of {len(rows)} {kind.value}" for kind, mine in broken.items())
+    firsts = [f"mu=({mu(mine[0])}): {mine[0]['reason']}" for mine in broken.values()]
+    if len(broken) == 1:
+        counted = counted.replace(kinds[0].value, "queries")
     violated = column("bound_online_violated")
     medians = [name for name in STORED["cells"] if name.startswith("effectivity_")]
     smallest = ("beta_span", "beta_cone_lower", "beta_cone_upper")
     return {
-        "status": worst.value,
-        "reason": f"{len(reasons)} of {len(rows)} queries, first {reasons[0]}" if reasons else "",
+        "status": kinds[0].value, "reason": f"{counted}, first {'; '.join(firsts)}" if broken else "",
         "queries": len(rows), "queries_ok": len(fine),
         **errors("u"), **errors("lambda"), **contributions("solver"), **contributions("assembly"),
         **{name: over(np.median, name.removesuffix("_median")) for name in medians},

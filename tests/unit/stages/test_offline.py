@@ -289,10 +289,12 @@ def query(status: str, error: float | None = 1.0, **columns) -> dict:
     return base | constants | {"error_u": error} | columns
 
 
-def test_means_are_over_the_ok_queries_and_the_worst_status_names_the_cell() -> None:
+def test_means_are_over_the_ok_queries_and_the_reason_counts_every_status() -> None:
     found = summarise([query("ok", 1.0), query("ok", 3.0), query("inaccurate", 100.0), query("failed", None)])
     assert found["status"] == "failed"
-    assert found["reason"] == "1 of 4 queries, first mu=(0.5): it was failed"
+    words = "1 of 4 failed, 1 of 4 inaccurate, first mu=(0.5): it was failed; mu=(0.5): it was inaccurate"
+    assert found["reason"] == words
+    assert summarise([query("failed")] * 2)["reason"] == "2 of 2 queries, first mu=(0.5): it was failed"
     assert (found["queries"], found["queries_ok"]) == (4, 2)
     assert (found["error_u_mean"], found["error_u_max"]) == (2.0, 3.0)
     found = summarise([query("nonfinite", None)])
