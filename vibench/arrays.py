@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from hashlib import sha256
+from numbers import Integral
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -49,6 +50,52 @@ def real_vector(value: Any, name: str) -> Array:
         raise NumericalError(f"{name} is a {type(value).__name__}, expected a vector, an array of NumPy")
     _check_real(value, name)
     return np.asarray(value, np.float64)
+
+
+def taken(value: object, what: str, *shape: int | str, finite: bool = True) -> Array:
+    """A read-only copy in float64 of an array that a plugin returned; a `NumericalError` says `what` is wrong with it.
+
+    A size of the shape that is a name may be any. What a plugin keeps and refills, or another one is given, is not
+    shared by this.
+    """
+    expected = f"({', '.join(map(str, shape))}{',' * (len(shape) == 1)})"
+    if not isinstance(value, np.ndarray):
+        raise NumericalError(f"{what} has the type {type(value).__name__}, expected an array {expected}")
+    _check_real(value, what)
+    sizes = zip(value.shape, shape, strict=False)
+    if value.ndim != len(shape) or any(size != right for size, right in sizes if isinstance(right, int)):
+        raise NumericalError(f"{what} has shape {value.shape}, expected {expected}")
+    copied = np.array(value, np.float64)
+    if finite and not (fine := np.isfinite(copied)).all():
+        first = np.argwhere(~fine)[0][-1]
+        raise NumericalError(f"{what} is not finite, first in {'entry' if len(shape) == 1 else 'column'} {first}")
+    copied.flags.writeable = False
+    return copied
+
+
+def is_sound(array: Array | None) -> bool:
+    """Whether there is no array, or its entries and the squares of their sums are finite."""
+    return array is None or bool(np.max(np.abs(array), initial=0.0) < 1e100)
+
+
+def is_count(value: object) -> bool:
+    """Whether a value is a whole number of at least 0, which a truth value is not."""
+    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 0
+
+
+def read_only(array: Array) -> Array:
+    """A view of an array into which nobody writes by chance."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def frozen(matrix: SparseMatrix) -> SparseMatrix:
+    """A sparse matrix with read-only views in place of its arrays, which SciPy does not sort any more."""
+    if matrix.format in ("csr", "csc") and matrix.has_canonical_format:
+        for name in ("data", "indices", "indptr"):
+            setattr(matrix, name, read_only(getattr(matrix, name)))
+    return matrix
 
 
 def _check_real(value: Any, name: str) -> None:

@@ -17,7 +17,7 @@ BAD_PROBLEMS: Mapping[str, tuple[set[str], str]] = {
     "wire-nan": ({"error"}, "in high-fidelity solutions: f has entries that are not finite at mu = ["),
     "wire-shape": ({"error"}, "in high-fidelity solutions: g has shape (11,) at mu = ["),
     "wire-indefinite": ({"error"}, "not positive definite"),
-    "wire-broken": ({"error"}, "in high-fidelity solutions: OSError: no wire in stock"),
+    "wire-broken": ({"error"}, "in high-fidelity solutions: the problem 'wire-broken' raised OSError: no wire "),
     "wire-hungry": ({"error"}, "out of memory: the limit is memory_gib = 8"),
     "wire-sleeps": ({"timeout"}, "in high-fidelity solutions: stopped after cell_seconds = 20 s"),
     "wire-exits": ({"crashed"}, "in high-fidelity solutions: the worker process died with exit code 3"),
@@ -26,21 +26,21 @@ BAD_PROBLEMS: Mapping[str, tuple[set[str], str]] = {
     "wire-crooked": ({"error"}, "in high-fidelity solutions: X_V is not positive definite"),
 }
 BAD_DUALS: Mapping[str, tuple[set[str], str]] = {
-    "cone-raises": ({"error"}, "in cone: LookupError: no generator found"),
+    "cone-raises": ({"error"}, "in cone: the dual strategy 'cone-raises' raised LookupError: no generator found"),
     "cone-waits": ({"timeout"}, "in cone: stopped after cell_seconds = 20 s"),
-    "cone-nan": ({"error"}, "in cone: the generators have entries that are not finite"),
-    "cone-shape": ({"error"}, "in cone: the generators have shape (11, 2), expected (12, count)"),
+    "cone-nan": ({"error"}, "in cone: `generators` of the cone is not finite, first in column 0"),
+    "cone-shape": ({"error"}, "in cone: `generators` of the cone has shape (11, 2), expected (12, count)"),
     "cone-negative": ({"error"}, "in cone: a generator has the negative coefficient -"),
     "cone-long": ({"error"}, "in cone: the generators do not all have unit norm in W"),
     "cone-nothing": ({"error"}, "in cone: the dual strategy returned a NoneType, expected a Cone"),
 }
 BAD_PRIMALS: Mapping[str, tuple[set[str], str]] = {
-    "enrichment-raises": ({"error"}, "in enrichment: LookupError: no vector found"),
-    "enrichment-nan": ({"error"}, "in enrichment: the vectors of the enrichment have entries that are not finite"),
-    "enrichment-shape": ({"error"}, "in enrichment: the vectors of the enrichment have shape (11, 1), expected (12, "),
+    "enrichment-raises": ({"error"}, "in enrichment: the primal strategy 'enrichment-raises' raised LookupError: no"),
+    "enrichment-nan": ({"error"}, "in enrichment: `vectors` of the enrichment is not finite, first in column 0"),
+    "enrichment-shape": ({"error"}, "in enrichment: `vectors` of the enrichment has shape (11, 1), expected (12, cou"),
     "enrichment-long": ({"error"}, "in enrichment: the vectors of the enrichment are not orthonormal in V"),
-    "enrichment-supply": ({"error"}, "in assembly: the enrichment supplied vectors of shape (12,), expected (12, "),
-    "enrichment-writes": ({"error"}, "in enrichment: ValueError: assignment destination is read-only"),
+    "enrichment-supply": ({"error"}, "in assembly: the supply of the enrichment has shape (12,), expected (12, count)"),
+    "enrichment-writes": ({"error"}, "in enrichment: the primal strategy 'enrichment-bad' raised ValueError: assignme"),
     "enrichment-nothing": ({"error"}, "in enrichment: the primal strategy returned a NoneType, expected an Enrichm"),
 }
 BAD_SOLVERS: Mapping[str, tuple[set[str], str]] = {

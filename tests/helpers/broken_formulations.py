@@ -2,7 +2,6 @@
 
 import os
 import signal
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -109,7 +108,7 @@ class Misbehaves(Program):
 
     uses: ClassVar[tuple[str, ...]] = ("pod", "dual", "primal", "solvers", "accuracy")
 
-    def __init__(self, how: str = "nan") -> None:
+    def __init__(self, how: str = "raises") -> None:
         self.how = how
 
     def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:
@@ -126,18 +125,8 @@ class MisbehavingModel(ProgramModel):
         answer = super().solve(mu, settings)
         if mu[0] < self.middle:
             return answer
-        if self.how == "hangs":
-            time.sleep(600.0)
         if self.how == "dies":
             os.kill(os.getpid(), signal.SIGKILL)
         if self.how == "raises":
             raise ArithmeticError("no pivot")
-        if self.how == "nan":
-            return replace(answer, x=np.full_like(answer.x, np.nan))
         return answer
-
-    def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
-        u, lam = super().reconstruct(mu, answer)
-        if mu[0] < self.middle or self.how not in ("size", "pulls"):
-            return u, lam
-        return (u[:-1], lam) if self.how == "size" else (u, lam - 1.0)

@@ -167,12 +167,6 @@ class Raises(Wire):
         return super().assemble(mu)
 
 
-class NormChangedLater(Wire):
-    def __init__(self) -> None:
-        super().__init__()
-        self.V.matrix.data *= -1.0
-
-
 class CountsInstances(Wire):
     """Every instance has finer steps than the one before."""
 

@@ -141,10 +141,10 @@ def test_a_solution_that_is_zero_up_to_round_off_is_a_snapshot(rows, primal: str
 
 def test_parameters_nobody_can_train_or_validate_on_are_refused(rows) -> None:
     for case, line in (
-        (NoSnapshot, r"training_set has shape \(0, 1\), expected \(P, 1\) with P > 0"),
-        (FlatSnapshots, r"training_set has shape \(3,\), expected \(P, 1\) with P > 0"),
-        (LostSnapshot, "training_set has parameters that are not finite"),
-        (ShortValidation, r"validation_set has shape \(2, 1\), expected \(3, 1\)"),
+        (NoSnapshot, r"training_set: parameters of shape \(0, 1\); expected \(P, 1\)"),
+        (FlatSnapshots, r"training_set: parameters of shape \(3,\); expected \(P, 1\)"),
+        (LostSnapshot, "training_set: parameter 1 has 'force' = nan, which is not finite"),
+        (ShortValidation, r"`validation_set` has shape \(2, 1\), expected \(3, 1\)"),
     ):
         with pytest.raises(NumericalError, match=line):
             rows(case, "cpg", "decorrelated")

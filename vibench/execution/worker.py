@@ -22,10 +22,12 @@ from threadpoolctl import threadpool_limits
 from vibench import interrupts
 from vibench.errors import NumericalError, StorageError, UnsupportedError, VibenchError, in_a_line, message_of
 from vibench.execution import supervisor
+from vibench.execution.process_state import ProcessState
 from vibench.execution.supervisor import Batch, Job, Progress
 from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, Items, ItemwiseStage, Unstored
+from vibench.stages.snapshots import unchanged
 
 T = TypeVar("T")
 Send = Callable[[Any], None]
@@ -79,8 +81,10 @@ def main() -> None:
         except EOFError:
             return
         send(supervisor.Begun())
-        # The allocator keeps freed memory: replace a large process before the next job, which it might fail.
-        if not first and not _last and _address_space() > 0.5 * job.memory_gib * 2**30:
+        # The allocator keeps freed memory: replace a large process before the next job, which it might fail. A process
+        # of other packages is replaced after anything that has failed in it: who knows what that has left behind.
+        is_large = not _last and _address_space() > 0.5 * job.memory_gib * 2**30
+        if not first and (is_large or _failed):
             send(supervisor.OutOfMemory(None))
             return
         first = False
@@ -98,7 +102,13 @@ def perform(
         # Artefacts that were read stay in memory: at most 1 GiB, and an eighth of the limit.
         store = _store(job.store, min(2**30, int(0.125 * job.memory_gib * 2**30)))
         store.lost = job.lost
-        if isinstance(job.stage, ItemwiseStage):
+        if not isinstance(job.stage, ItemwiseStage):
+            store.progress = lambda fraction: send(supervisor.FractionDone(fraction))
+            with unchanged(job.stage):
+                result = job.stage.run(store)
+            store.put(job.stage.key, result.value, result.seconds, result.histories)
+            return Done(result.histories, None, time.perf_counter() - start, result.seconds)
+        with unchanged(job.stage):
             if job.stage.key not in _last:
                 _last.clear()
                 _last[job.stage.key] = job.stage.begin(store)
@@ -109,14 +119,12 @@ def perform(
                 return supervisor.BatchDone()
             _last.clear()
             value = items.collect([done[number] for number in range(job.stage.items)])
-            return Done((), value, time.perf_counter() - start)
-        store.progress = lambda fraction: send(supervisor.FractionDone(fraction))
-        result = job.stage.run(store)
-        store.put(job.stage.key, result.value, result.seconds, result.histories)
-        return Done(result.histories, None, time.perf_counter() - start, result.seconds)
+        if job.stage.has_failed(value) and job.stage.packages:
+            _failed.append(job.stage.key)
+        return Done((), value, time.perf_counter() - start)
 
     try:
-        return _guarded(job.memory_gib, work)
+        return _guarded(job, work)
     except StorageError as error:
         # Other processes can still write: the fault is one of this process.
         own = (errno.EBADF, errno.EFBIG, errno.EMFILE)
@@ -141,6 +149,9 @@ def _check_code(job: Job, batch: Batch) -> None:
         raise NumericalError(f"{changed[0]} was changed since the run began; run the study again")
 
 
+# Keys of the stages of other packages that failed in this process, of which it is the last one then.
+_failed: list[str] = []
+
 # Items of the stage that this process has begun and not ended, by its key; other processes may do batches of it.
 _last: dict[str, Items] = {}
 
@@ -158,13 +169,27 @@ def _done(job: Job, items: Items, batch: Batch, send: Send, enter: Enter) -> dic
                 enter(number, False)
 
         enter(number, False)
-        value = _guarded(job.memory_gib, partial(items.run_item, number, time_limit))
+        value = _guarded(job, partial(items.run_item, number, time_limit))
         done[number] = items.failed(number, value) if isinstance(value, Failed) else value
         send(supervisor.ItemDone(number, done[number]))
     return done
 
 
-def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:
+def _guarded(job: Job, work: Callable[[], T]) -> T | Failed:
+    """The outcome of some work; what plugins of other packages have changed in this process is put back after it."""
+    if not job.stage.packages:
+        return _outcome(job.memory_gib, work)
+    before = ProcessState()
+    outcome = _outcome(job.memory_gib, work)
+    changed = before.put_back()
+    if isinstance(outcome, Failed) or before.has_new_threads:
+        _failed.append(job.stage.key)
+    if isinstance(outcome, Failed) and changed:
+        outcome = Failed(outcome.status, f"{outcome.reason}; before that it changed {', '.join(changed)}")
+    return outcome
+
+
+def _outcome(memory_gib: float, work: Callable[[], T]) -> T | Failed:
     try:
         with _memory_limit(memory_gib):
             return work()

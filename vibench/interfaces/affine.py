@@ -10,6 +10,7 @@ import math
 import operator
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices, SparseMatrix, real_vector
+from vibench.arrays import Array, Indices, SparseMatrix, frozen, read_only, real_vector
 from vibench.errors import NumericalError, RequestError, unknown_name
 from vibench.interfaces.absent_rows import ABSENT, is_absent
 from vibench.text import normal_name
@@ -230,7 +231,10 @@ class AffineSum:
             raise NumericalError(f"the terms of an affine sum have the shapes {shapes}; expected one shape for all")
         if len(shapes[0]) == 1 and not sp.issparse(self.terms[0]):
             terms = tuple(real_vector(term, "a term of an affine sum") for term in self.terms)
-            object.__setattr__(self, "terms", _with_absent_rows(terms, self.thetas))
+            object.__setattr__(self, "terms", tuple(map(read_only, _with_absent_rows(terms, self.thetas))))
+        elif sp.issparse(self.terms[0]):
+            # Shallow copies: the arrays of the caller remain as they are.
+            object.__setattr__(self, "terms", tuple(frozen(copy(term)) for term in self.terms))
 
     @classmethod
     def of(cls, pairs: Sequence[tuple[Theta, Any]], names: Sequence[str]) -> AffineSum:

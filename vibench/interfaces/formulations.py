@@ -8,8 +8,8 @@ The life of a formulation in a study:
 1. `Formulation.build` prepares it, offline and timed. Its result is stored under a key and shared by cells.
 2. `Formulation.model` makes the model from the stored data, in every process that needs one; not timed.
 3. `FormulationModel.solve` answers a query, timed: whatever it assembles is part of the query.
-4. `FormulationModel.reconstruct` turns the answer into u (n,) and λ (m,), not timed. Errors, error bounds and residuals
-   of the high-fidelity problem are those of this pair.
+4. `FormulationModel.reconstruct` turns the answer into u (n,) and λ (m,). Its seconds are part of the query unless it
+   is linear in the coefficients. Errors, error bounds and high-fidelity residuals are those of this pair.
 
 Two capabilities are optional. With a `FormulationModel.program`, assembly and solution are timed apart, programs are
 assembled once for all QP solvers, and solver and assembly errors are reported; `vibench.ProgramModel` has all of it.
@@ -228,10 +228,11 @@ class FormulationModel(ABC):
 
     @abstractmethod
     def reconstruct(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array | None]:
-        """The pair u (n,) and λ (m,) ≥ 0 of an answer at mu (d,), not timed; bases may depend on the parameter.
+        """The pair u (n,) and λ (m,) ≥ 0 of an answer at mu (d,); bases may depend on the parameter.
 
-        Of the answer `x` and `alpha` alone are kept in results, and given here. λ is `None` for `Multiplier.RESIDUAL`,
-        and for no other. A negative coefficient of λ is an error, even one of round-off: every bound needs λ ≥ 0.
+        It is part of the query where half of the coefficients do not give half of the pair. Of the answer `x` and
+        `alpha` alone are kept in results, and given here. λ is `None` for `Multiplier.RESIDUAL`, and for no other. A
+        negative coefficient of λ is an error, even one of round-off: every bound needs λ ≥ 0.
         """
 
     def program(self, mu: Array) -> Any:

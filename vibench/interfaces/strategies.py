@@ -259,7 +259,8 @@ def check_sample(box: ParameterBox, returned: object) -> Array:
     Raises a `RequestError` if they have the wrong shape, are not finite, lie outside the box, occur twice, or are not
     among the listed ones of a problem that has no other.
     """
-    mus = np.asarray(returned, float)
+    mus = np.array(returned, float)
+    mus.flags.writeable = False
     if mus.ndim != 2 or mus.shape[1] != box.dim or not len(mus):
         raise RequestError(f"parameters of shape {mus.shape}; expected (P, {box.dim}), a row for each, with P > 0")
     # Of every kind of fault the first one is named.

@@ -13,42 +13,50 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices, Mask, real_matrix, real_vector
+from vibench.arrays import Array, Indices, Mask, real_matrix, real_vector, taken
 from vibench.errors import NumericalError, RequestError, at_parameter
 from vibench.interfaces.absent_rows import ABSENT, is_absent, settled_bounds
 from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment, Sampling, check_sample
 from vibench.linalg.inner_product import InnerProduct
+from vibench.text import brief
 
 
 def check_cone(cone: object, W: InnerProduct) -> Cone:
-    """Refuse a cone whose generators have the wrong shape, are not finite, of unit norm in W, or in W⁺ unless free."""
+    """A copy of a cone; refused if generators are not finite, of the right shape, unit norm in W, or in W⁺ or free."""
     if not isinstance(cone, Cone):
         raise NumericalError(f"the dual strategy returned a {type(cone).__name__}, expected a Cone")
-    chi = _matrix("generators", cone.generators, W.dim)
+    chi = taken(cone.generators, "`generators` of the cone", W.dim, "count")
+    errors, R = taken(cone.errors, "`errors` of the cone", "count"), chi.shape[1]
+    if len(errors) not in (1, R + 1) or errors.min() < 0.0:
+        expected = f"expected e(0) … e({R}), or e({R}) alone, none negative"
+        raise NumericalError(f"`errors` of the cone has shape {errors.shape}; {expected}")
+    if not isinstance(cone.free, np.ndarray) or cone.free.dtype != bool or cone.free.shape != (R,):
+        raise NumericalError(f"`free` of the cone is {brief(repr(cone.free), 80)}, expected {R} truth values")
     norms = W.norm(chi)
     away = np.abs(norms - 1.0)
     # Strategies normalise by norms with round-off of their own: half of the digits are asked for.
     if away.max(initial=0.0) > 1e-8:
         worst = f"generator {away.argmax()} has norm {norms[away.argmax()]:.6g}"
         raise NumericalError(f"the generators do not all have unit norm in W: {worst}")
-    if cone.free.shape != (chi.shape[1],):
-        raise NumericalError(f"'free' has shape {cone.free.shape} for {chi.shape[1]} generators")
     # Free generators may have any sign.
     signed = np.where(cone.free, 0.0, chi)
     if signed.min(initial=0.0) < 0.0:
         i, r = np.unravel_index(signed.argmin(), signed.shape)
         worst = f"the negative coefficient {signed[i, r]:.1e} and is not declared free"
         raise NumericalError(f"a generator has {worst}: look at coefficient {i} of generator {r}")
-    return cone
+    return Cone(chi, errors, cone.free.copy(), tuple(map(str, cone.fallbacks)))
 
 
 def check_enrichment(enrichment: object, V: InnerProduct, basis: Array) -> Enrichment:
-    """Refuse an enrichment whose fixed vectors are not finite, orthonormal in V and orthogonal to V_N."""
+    """A copy of an enrichment; refused if fixed vectors are not finite, orthonormal in V and orthogonal to V_N."""
     if not isinstance(enrichment, Enrichment):
         raise NumericalError(f"the primal strategy returned a {type(enrichment).__name__}, expected an Enrichment")
-    if enrichment.vectors is not None:
-        vectors = _matrix("vectors of the enrichment", enrichment.vectors, V.dim)
+    vectors, eta = enrichment.vectors, enrichment.eta
+    if eta is not None:
+        eta = taken(eta, "`eta` of the enrichment", "m", "count")
+    if vectors is not None:
+        vectors = taken(vectors, "`vectors` of the enrichment", V.dim, "count")
         off = V.gram(np.hstack([basis, vectors]), vectors)
         off[basis.shape[1] :] -= np.eye(vectors.shape[1])
         # As for norms of generators: vectors are orthonormal up to round-off.
@@ -59,17 +67,7 @@ def check_enrichment(enrichment: object, V: InnerProduct, basis: Array) -> Enric
                 "the vectors of the enrichment are not orthonormal in V and orthogonal to V_N: "
                 f"the inner product of vector {j} with {other} is off by {off[i, j]:.1e}"
             )
-    return enrichment
-
-
-def _matrix(name: str, value: object, rows: int) -> Array:
-    if not isinstance(value, np.ndarray) or value.ndim != 2 or value.shape[0] != rows:
-        shape = getattr(value, "shape", type(value).__name__)
-        raise NumericalError(f"the {name} have shape {shape}, expected ({rows}, count)")
-    wrong = np.flatnonzero(~np.isfinite(value).all(axis=0))
-    if len(wrong):
-        raise NumericalError(f"the {name} have entries that are not finite, the first in column {wrong[0]}")
-    return value
+    return replace(enrichment, vectors=vectors, eta=eta, fallbacks=tuple(map(str, enrichment.fallbacks)))
 
 
 def training_parameters(problem: Problem, sampling: Sampling | None = None) -> Array:
@@ -86,12 +84,7 @@ def validation_parameters(problem: Problem, count: int, seed: int, sampling: Sam
     """The validation set (count×d), by default the problem's; refused if it has the wrong shape or is not finite."""
     if sampling is not None:
         return check_sample(problem.parameters, sampling.parameters(problem.parameters))
-    mus, expected = np.asarray(problem.validation_set(count, seed), float), (count, problem.parameters.dim)
-    if mus.shape != expected:
-        raise NumericalError(f"validation_set has shape {mus.shape}, expected {expected}")
-    if not np.all(np.isfinite(mus)):
-        raise NumericalError("validation_set has parameters that are not finite")
-    return mus
+    return taken(np.asarray(problem.validation_set(count, seed)), "`validation_set`", count, problem.parameters.dim)
 
 
 def in_float64(vi: VariationalInequality) -> VariationalInequality:
@@ -165,8 +158,11 @@ class Fingerprint:
 
 def fingerprint(problem: Problem, vi: VariationalInequality) -> Fingerprint:
     """The fingerprint of `vi`, an assembly of the problem, and of its inner products."""
-    arrays = {name: getattr(vi, name) for name in MEMBERS}
-    return _fingerprint(arrays | {"X_V": problem.V.matrix, "X_W": problem.W.matrix})
+    arrays, box = {name: getattr(vi, name) for name in MEMBERS}, problem.parameters
+    arrays |= {"X_V": problem.V.matrix, "X_W": problem.W.matrix, "the box": np.append(box.lower, box.upper)}
+    if problem.has_contact and (contact := problem.contact(training_parameters(problem)[0])) is not None:
+        arrays["B of `contact`"] = contact.B
+    return _fingerprint(arrays)
 
 
 def _fingerprint(arrays: Mapping[str, Any]) -> Fingerprint:

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
 
-from vibench.arrays import Array, SparseMatrix
+from vibench.arrays import Array, SparseMatrix, frozen
 from vibench.errors import NumericalError, RequestError
 from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky
@@ -57,7 +57,7 @@ class InnerProduct:
         is_matrix = (sp.issparse(matrix) or isinstance(matrix, np.ndarray)) and matrix.ndim == 2
         if not is_matrix or matrix.dtype.kind not in "fiub":
             raise RequestError(f"{name} is {brief(repr(matrix), 80)}, expected a matrix of real numbers")
-        self.matrix = sp.csc_array(matrix, dtype=float)
+        self.matrix = frozen(sp.csc_array(matrix, dtype=float))
         self._name, self.factorisation = name, factorisation
         check_symmetric(self.matrix, name)
         if (postponed := _postponed.get()) is not None:

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vibench.arrays import Array, SparseMatrix
-from vibench.errors import NumericalError
+from vibench.arrays import Array, SparseMatrix, taken
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.interfaces.strategies import Enrichment
 from vibench.interfaces.validation import checked_assembly, first_assembly
@@ -82,10 +81,7 @@ class ReducedModel:
         if enrichment.eta is not None:
             whitened = V.whiten_functional(np.asarray(vi.B.T @ enrichment.eta))  # coordinates of T(mu)η
         elif enrichment.supply is not None:
-            added = enrichment.supply(V, vi, self.span)
-            if added.ndim != 2 or added.shape[0] != V.dim:
-                shape = f"vectors of shape {added.shape}, expected ({V.dim}, count)"
-                raise NumericalError(f"the enrichment supplied {shape}")
+            added = taken(enrichment.supply(V, vi, self.span), "the supply of the enrichment", V.dim, "count")
             whitened = V.whiten(added)
         else:
             return self.fixed_basis

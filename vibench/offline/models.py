@@ -11,12 +11,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from math import inf
-from numbers import Integral
+from numbers import Real
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vibench.arrays import Array
+from vibench.arrays import Array, is_count, is_sound, read_only, taken
 from vibench.errors import NumericalError, RequestError, unknown_name
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.formulations import (
@@ -25,6 +25,7 @@ from vibench.interfaces.formulations import (
     FormulationModel,
     Multiplier,
     OfflinePhase,
+    Outcome,
     QuerySettings,
 )
 from vibench.interfaces.parameters import ParameterBox
@@ -45,7 +46,7 @@ from vibench.qp.solve import installed_solvers, solve_qp, takes_start
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, verify
 from vibench.text import brief, normal_name
-from vibench.timing import timed
+from vibench.timing import NO_TIME, Seconds, timed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -90,6 +91,13 @@ class QueryStatus(NamedTuple):
     reason: str
     pair: tuple[Array, Array] | None = None
     residuals: Residuals | None = None  # of the program, or of the last one that the formulation solved
+    reconstruction: Seconds | None = None  # of `reconstruct`, where the pair is its work
+    counts: bool = False  # whether these seconds are part of the query
+
+    @property
+    def counted(self) -> Seconds:
+        """Seconds of reconstruction that are part of the query: its answer is more than a linear map of (x, α)."""
+        return self.reconstruction if self.counts and self.reconstruction is not None else NO_TIME
 
 
 class _Settings(NamedTuple):
@@ -160,10 +168,13 @@ class Model:
         made = self.formulation.model(self.offline, self.built)
         if not isinstance(made, FormulationModel):
             raise NumericalError(f"the formulation made a {type(made).__name__}, expected a FormulationModel")
-        sizes = {"dimension": getattr(made, "dimension", None), "generators": made.generators or 0}
-        for name, size in sizes.items():
-            if not isinstance(size, Integral) or size < 0:
-                raise NumericalError(f"`{name}` of the model is {brief(repr(size), 80)}, expected a whole number")
+        dimension, added = getattr(made, "dimension", None), made.enrichment or 0
+        for name, size in (("dimension", dimension), ("generators", made.generators or 0), ("enrichment", added)):
+            if not is_count(size):
+                found = f"`{name}` of the model is {brief(repr(size), 80)}"
+                raise NumericalError(f"{found}, expected a whole number of at least 0")
+        if added > made.dimension:
+            raise NumericalError(f"`enrichment` of the model is {added}, more than its `dimension`, {dimension}")
         if self.formulation.has_program and not hasattr(made, "reduced"):
             raise NumericalError("the formulation declares `has_program`, but its model has no `reduced`")
         return made
@@ -204,10 +215,8 @@ class Model:
     ) -> QueryStatus:
         """The status of an answer of the formulation at mu (d,), found with this solver, or of its `program`.
 
-        Residuals may be `slackened` times the accuracy. A `NumericalError` names another type or size of the answer.
+        Residuals may be `slackened` times the accuracy.
         """
-        if not isinstance(answer, FormulationAnswer):
-            raise NumericalError(f"`solve` returned a {type(answer).__name__}, expected a FormulationAnswer")
         if program is not None:
             solution = QPSolution(answer.x, answer.alpha, answer.reason)
             status, reason, residuals = verify(program, solution, slackened * self.accuracy)
@@ -219,35 +228,60 @@ class Model:
         of_qp, why, residuals = solver.verdict(slackened)
         if of_qp.severity > status.severity:
             status, reason = of_qp, f"its last quadratic program: {why}"
-        for name in ("x", "alpha"):
-            _refuse_other_size(f"`solve` returned an answer whose {name} has", getattr(answer, name))
-            if not _finite(getattr(answer, name)):
-                return QueryStatus(Status.NONFINITE, f"{name} of the answer is not finite", residuals=residuals)
-        u, lam = self.pair(mu, answer)
-        if not (_finite(u) and _finite(lam)):
+        if not (is_sound(answer.x) and is_sound(answer.alpha)):
+            return QueryStatus(Status.NONFINITE, "x or alpha of the answer is not finite", residuals=residuals)
+        made, spent = timed(lambda: self.online.reconstruct(mu, answer))
+        u, lam = self._pair(made)
+        counts = not self._is_linear(mu, answer, u, lam)
+        lam = self._multiplier(mu, u) if lam is None else lam
+        if not (is_sound(u) and is_sound(lam)):
             return QueryStatus(Status.NONFINITE, "the reconstructed u or λ is not finite", residuals=residuals)
         # Even round-off below zero is refused: every bound needs λ ≥ 0.
         if lam.min(initial=0.0) < 0.0:
             worst = f"{lam.min():.1e} in row {int(lam.argmin())}"
             return QueryStatus(Status.FAILED, f"a broken answer: λ has negative coefficients, as {worst}")
-        return QueryStatus(status, reason, (u, lam), residuals)
+        return QueryStatus(status, reason, (u, lam), residuals, spent, counts)
+
+    def answered(self, mu: Array, settings: QuerySettings) -> tuple[FormulationAnswer, Seconds]:
+        """The answer of the formulation at mu (d,), and its seconds; a `NumericalError` names what is none."""
+        answer, seconds = timed(lambda: self.online.solve(mu, settings))
+        return _taken(answer, self.online), seconds
 
     def pair(self, mu: Array, answer: FormulationAnswer) -> tuple[Array, Array]:
         """The pair u (n,), λ (m,) of an answer, its sizes checked; λ from the residual if the formulation has none."""
+        u, lam = self._pair(self.online.reconstruct(mu, answer))
+        return u, self._multiplier(mu, u) if lam is None else lam
+
+    def _pair(self, made: object) -> tuple[Array, Array | None]:
+        """What `reconstruct` returned."""
         problem, declared = self.problem, self.formulation.multiplier
-        made = self.online.reconstruct(mu, answer)
         if not isinstance(made, tuple) or len(made) != 2:
             raise NumericalError(f"`reconstruct` returned a {type(made).__name__}, expected a pair (u, λ)")
         u, lam = made
-        _refuse_other_size("`reconstruct` returned a u of", u, problem.V.dim)
         if (lam is None) != (declared is Multiplier.RESIDUAL):
             which = "no λ" if lam is None else "a λ"
             raise NumericalError(f"`reconstruct` returned {which}, and the formulation declares `{declared.value}`")
-        if lam is None:
-            cache = assemblies(problem)
-            return u, residual_multiplier(cache.at(mu), cache.energy_at(mu), u)
-        _refuse_other_size("`reconstruct` returned a λ of", lam, problem.W.dim)
-        return u, lam
+        u = taken(u, "u of `reconstruct`", problem.V.dim, finite=False)
+        return u, None if lam is None else taken(lam, "λ of `reconstruct`", problem.W.dim, finite=False)
+
+    def _multiplier(self, mu: Array, u: Array) -> Array:
+        cache = assemblies(self.problem)
+        return residual_multiplier(cache.at(mu), cache.energy_at(mu), u)
+
+    def _is_linear(self, mu: Array, answer: FormulationAnswer, u: Array, lam: Array | None) -> bool:
+        """Whether half of the coefficients make half of the pair."""
+        alpha = None if answer.alpha is None else read_only(0.5 * answer.alpha)
+        half = FormulationAnswer(None if answer.x is None else read_only(0.5 * answer.x), alpha)
+        try:
+            halved = self._pair(self.online.reconstruct(mu, half))
+        except MemoryError:
+            raise
+        except Exception:  # noqa: BLE001  it may refuse other coefficients than its own
+            return False
+        return all(
+            one is None or whole is None or np.abs(2.0 * one - whole).max() <= 1e-12 * np.abs(whole).max()
+            for one, whole in zip(halved, (u, lam), strict=True)
+        )
 
     def solve(
         self,
@@ -322,7 +356,7 @@ class Model:
         """The answer of the formulation itself."""
         model, online = self.solving(settings.solver, settings.accuracy), self.online
         query, solver = model.settings()
-        answer, seconds = timed(lambda: online.solve(at, query))
+        answer, seconds = model.answered(at, query)
         # An answer to a program is verified against the program, not by what the formulation says of it.
         if self.formulation.has_program:
             found = QPSolution(answer.x, answer.alpha, answer.reason, answer.iterations)
@@ -330,7 +364,8 @@ class Model:
         judged = model.status_of(at, answer, solver, 1.0)
         coefficients = judged.status, judged.reason, answer.x, answer.alpha, judged.residuals
         own = None, settings.mode, answer.iterations, answer.uncertainty
-        return Solution(at, *coefficients, 0.0, seconds.cpu, self, lambda: judged.pair, None, None, *own)
+        spent = seconds + judged.counted
+        return Solution(at, *coefficients, 0.0, spent.cpu, self, lambda: judged.pair, None, None, *own)
 
     def _solution(self, at: Array, assembled: ReducedProblem, assembly: float, settings: _Settings) -> Solution:
         """The verified solution of a program that took some seconds to assemble, by the QP solver."""
@@ -457,7 +492,7 @@ def parameter_in(box: ParameterBox, mu: Parameters) -> Array:
     if outside := [name for name, out in zip(box.names, box.outside(at), strict=True) if out]:
         text = f"{', '.join(outside)}: outside the parameter domain, where the model was not trained"
         warnings.warn(text, stacklevel=3)
-    return at
+    return read_only(at)
 
 
 def check_built(built: object) -> Mapping[str, Any]:
@@ -467,18 +502,26 @@ def check_built(built: object) -> Mapping[str, Any]:
     return built
 
 
-def _finite(vector: Array | None) -> bool:
-    return vector is None or bool(np.all(np.isfinite(vector)))
-
-
-def _refuse_other_size(what: str, vector: object, size: int | None = None) -> None:
-    """Refuse what is no vector of real numbers, of this size if one is given."""
-    if vector is None and size is None:
-        return
-    array = vector if isinstance(vector, np.ndarray) else None
-    if array is None or array.dtype != np.float64 or array.shape != (array.size if size is None else size,):
-        found = f"the type {type(vector).__name__}" if array is None else f"{array.dtype} and the shape {array.shape}"
-        raise NumericalError(f"{what} {found}, expected float64 and ({'count' if size is None else size},)")
+def _taken(answer: object, model: FormulationModel) -> FormulationAnswer:
+    """A copy of what `solve` returned, its vectors read-only, or a `NumericalError` that names what it cannot be."""
+    if not isinstance(answer, FormulationAnswer):
+        raise NumericalError(f"`solve` returned a {type(answer).__name__}, expected a FormulationAnswer")
+    vectors = dict[str, Array | None]()
+    for name, most in (("x", model.dimension), ("alpha", model.generators or 0)):
+        value = getattr(answer, name)
+        vectors[name] = None if value is None else taken(value, f"{name} of the answer", "count", finite=False)
+        if value is not None and len(value) > most:
+            raise NumericalError(f"{name} of the answer has {len(value)} coefficients, the model declares {most}")
+    steps, estimate = answer.iterations, 0.0 if answer.uncertainty is None else answer.uncertainty
+    for name, fine, right in (
+        ("outcome", isinstance(answer.outcome, Outcome), "a vibench.Outcome"),
+        ("reason", isinstance(answer.reason, str), "a text"),
+        ("iterations", steps is None or is_count(steps), "a whole number"),
+        ("uncertainty", isinstance(estimate, Real) and 0.0 <= float(estimate) < inf, "a number of at least 0"),
+    ):  # fmt: skip
+        if not fine:
+            raise NumericalError(f"{name} of the answer is {brief(repr(getattr(answer, name)), 80)}, expected {right}")
+    return replace(answer, x=vectors["x"], alpha=vectors["alpha"])
 
 
 class ProgramModel(FormulationModel):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Mask, SparseMatrix
+from vibench.arrays import Array, Mask, SparseMatrix, read_only
 from vibench.interfaces.absent_rows import zero_rows
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import VariationalInequality
@@ -180,7 +180,7 @@ def in_units(program: VariationalInequality, d: Array) -> VariationalInequality:
 def nearby(box: ParameterBox, mu: Array, *seed: int) -> Array:
     """A parameter (d,) of the box next to mu (d,), new to a problem that caches; the same for the same seed."""
     elsewhere = box.lower + _uniform(box.dim, seed) * (box.upper - box.lower)
-    return np.asarray(mu + 1e-10 * (elsewhere - mu))
+    return read_only(mu + 1e-10 * (elsewhere - mu))
 
 
 def _uniform(count: int, seed: tuple[int, ...]) -> Array:

@@ -14,7 +14,7 @@ Row: TypeAlias = Mapping[str, Any]
 """A row of a table: column → value."""
 
 # Increase it with every change of the schema: a results file of another version is refused.
-VERSION = 21
+VERSION = 22
 
 
 class SqlType(StrEnum):
@@ -198,6 +198,8 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "online_assemble_s": real("s", "Assembly of a query: median over the rounds."),
         "online_solve_s": real("s", "Solution of a query by the solver: median over the rounds."),
         "online_certify_s": real("s", "Certificate and correction of a query: median over the rounds; empty without."),
+        "online_reconstruct_s": real("s", "Reconstruction of u and λ by a formulation: median over the rounds; part "
+            "of `online_solve_s` where they are more than a linear map of its coefficients."),
         "timing_rounds": integer("Maximal number of timing rounds of the study; empty if the timing is not finished."),
         "timed_rounds": integer("Rounds that were timed: they end when all comparisons of the cell are decided."),
         "timing_reason": text("Why rounds are missing."),
@@ -265,6 +267,7 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "assemble_s": real("s", "Assembly of the reduced program: median over the rounds."),
         "solve_s": real("s", "The solver: median over the rounds."),
         "certify_s": real("s", "The certificate and the correction: median over the rounds; empty without either."),
+        "reconstruct_s": real("s", "As `online_reconstruct_s`, of this query: median over the rounds."),
         "total_s": real("s", "Sum of the three."),
         "total_wall_s": real("s", "The same in wall seconds."),
         "corrected": integer("1 if the corrected pair is returned, 0 if the reduced one; empty without corrections."),
@@ -364,6 +367,7 @@ STORED: Mapping[str, Mapping[str, Column]] = {
         "assemble_s": real("s", "Assembly of a query: mean over these, or with full assembly that of one of them."),
         "solve_s": real("s", "Solution of a query by the solver: mean over these."),
         "certify_s": real("s", "Certificate and correction of a query: mean over these; empty without either."),
+        "reconstruct_s": real("s", "As `online_reconstruct_s`: mean over these."),
         "total_s": real("s", "Sum of the three."),
         "total_wall_s": real("s", "The same in wall seconds."),
         "block": text("Block of rounds, which cells timed together share; each block is a process of its own."),

@@ -25,7 +25,7 @@ import safetensors.numpy
 import scipy.sparse as sp
 from cachetools import LRUCache
 
-from vibench.arrays import SparseMatrix
+from vibench.arrays import SparseMatrix, frozen
 from vibench.errors import NumericalError, RequestError, StorageError, VibenchError
 from vibench.files import TEMPORARY, locked, write_atomically
 from vibench.provenance import machine
@@ -189,7 +189,7 @@ class _Reader:
             matrix.check_format(full_check=True)
             # The constructor may have converted them.
             matrix.indices, matrix.indptr = arrays[1], arrays[2]
-        return matrix if wanted == kind else matrix.asformat(wanted)
+        return frozen(matrix) if wanted == kind else matrix.asformat(wanted)
 
     def _object(self, name: str, described: dict[str, Any]) -> Any:
         kind = make = _class(name, object)

@@ -11,7 +11,7 @@ from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
-from vibench.errors import NumericalError
+from vibench.errors import NumericalError, VibenchError, in_a_line
 from vibench.interfaces.problem import Problem
 from vibench.plugins.plugin import Plugin
 from vibench.provenance import libraries, numerical_code, source_hash
@@ -34,11 +34,15 @@ def build_problem(plugin: Plugin) -> Problem:
 
 @contextmanager
 def faults_of(plugin: Plugin) -> Iterator[None]:
-    """Add the command that checks a plugin to the `NumericalError` that it causes."""
+    """Name a plugin in what it raises, and the command that checks it in a `NumericalError`."""
     try:
         yield
     except NumericalError as error:
         raise NumericalError(f"{error}; run `{plugin.check}`") from error
+    except (VibenchError, MemoryError):
+        raise
+    except Exception as error:
+        raise NumericalError(f"the {plugin} raised {in_a_line(error)}; run `{plugin.check}`") from error
 
 
 @dataclass(frozen=True)
@@ -218,6 +222,10 @@ class ItemwiseStage(Stage):
     def stage_of(self, number: int) -> Stage:  # noqa: ARG002
         """The stage whose plugins an item runs; items that run those of other packages get other processes."""
         return self
+
+    def has_failed(self, value: Any) -> bool:  # noqa: ARG002
+        """Whether the value tells of something that failed: its process serves no other stage then."""
+        return False
 
     @abstractmethod
     def begin(self, store: Store) -> Items:

@@ -174,6 +174,9 @@ class CellQueries(ItemwiseStage):
     def begin(self, store: Store) -> _Queries:
         return _Queries(self, store)
 
+    def has_failed(self, value: CellRows) -> bool:
+        return Status(value.cell["status"]).severity >= Status.FAILED.severity
+
 
 def cell_queries(cell: Cell, query_seconds: float) -> CellQueries:
     """The last stage of a cell; all its other stages are inputs of it, directly or indirectly."""

@@ -152,9 +152,9 @@ class SingleEnrichment(EnrichmentStage):
 
     def run(self, store: Store) -> Result:
         offline, strategy = _offline(store, self.pod, self.cone), self.primal.create()
-        enrichment, seconds = timed(lambda: strategy.build(offline, self.tolerance))
         with faults_of(self.primal):
-            check_enrichment(enrichment, offline.problem.V, offline.basis)
+            enrichment, seconds = timed(lambda: strategy.build(offline, self.tolerance))
+            enrichment = check_enrichment(enrichment, offline.problem.V, offline.basis)
         quantities = dict(enrichment.history)
         # The assessment on the training set is not timed.
         if enrichment.vectors is not None:

@@ -200,7 +200,7 @@ class FormulationStage(Stage):
         snapshots = solution_stages(self.problem, self.training)
         read: dict[str, Callable[[], Any]] = {"snapshots": lambda: gather(store, snapshots)}
         if (decomposition := self.decomposition) is not None:
-            read["members"] = lambda: value_of(store, decomposition)
+            read["members"] = lambda: dict(value_of(store, decomposition))
         steps: dict[str, Any] = {}
         if pod is not None:
             steps["pod"] = value_of(store, pod)

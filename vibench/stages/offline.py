@@ -81,10 +81,10 @@ class ConeStage(Stage):
         """Reduce; histories are the projection error and e_orth over the number of generators."""
         snapshots, W = gather(store, self.inputs()).lam, build_problem(self.problem).W
         strategy = self.dual.create()
-        cone, reducing = timed(lambda: strategy.reduce(snapshots, W, self.stop))
         # Verification is no part of the offline time.
         with faults_of(self.dual):
-            check_cone(cone, W)
+            cone, reducing = timed(lambda: strategy.reduce(snapshots, W, self.stop))
+            cone = check_cone(cone, W)
         prepared, preparing = timed(lambda: cone_basis(cone.generators, W, cone.free))
         orthogonal = orthogonality(cone.generators, W, cone.free)
         histories = History.of("cone", "error", cone.errors), History.of("cone", "e_orth", orthogonal)

@@ -132,21 +132,22 @@ class ModelQuery:
         model, start = self.model, None
         if self.start is not None:
             with time_limit():
-                start = model.online.solve(self.start[1], model.settings()[0])
+                start = model.answered(self.start[1], model.settings()[0])[0]
 
         def solution() -> tuple[Answered, Seconds]:
             settings, solver = model.settings(start)
             with time_limit():
-                answer, seconds = timed(lambda: model.online.solve(self.mu, settings))
+                answer, seconds = model.answered(self.mu, settings)
             return Answered(answer, solver), seconds
 
         return solution
 
-    def check(self, answered: Answered) -> None:
-        """Raise a `NumericalError` if the answer of a timed repetition is wrong."""
+    def check(self, answered: Answered) -> QueryStatus:
+        """The status of the answer of a timed repetition; a `NumericalError` if it is wrong."""
         status = self.model.status_of(self.mu, *answered, RECOGNISED, self.program)
         if status.status is not Status.OK:
             raise NumericalError(f"timed at a parameter next to its own, {status.status.value}: {status.reason}")
+        return status
 
     def assess(self, answered: Answered, time_limit: TimeLimit) -> tuple[QueryStatus, Row, Row | None]:
         """The status of an answer, and its columns in the tables of queries and of solutions."""

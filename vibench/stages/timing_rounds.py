@@ -46,6 +46,8 @@ class TimedRound:
     certify: Mapping[int, Seconds] = field(default_factory=dict)
     # Mean seconds of the high-fidelity solutions beside the queries, their assembly included.
     beside: Seconds | None = None
+    # Seconds of `reconstruct`, those that count in `solve`, too.
+    reconstruct: Mapping[int, Seconds] = field(default_factory=dict)
 
     @property
     def cpu(self) -> float:
@@ -153,9 +155,9 @@ class _Rounds(Items):
         part = parts[at % QUERY_SUBSETS] or parts[0]
         solutions: list[MarginalSolution] = []
         alternated = self._beside.alternated(self._order(cell, at, part), solutions, at, cell)
-        assemble, solve, certify = self._time_queries(time_limit, alternated, at, cell, 0)
-        self._slowdown = calibration().slowdown()
-        return TimedRound(assemble, solve, max(before, self._slowdown), certify, self._beside.seconds(solutions, part))
+        assemble, solve, certify, reconstruct = self._time_queries(time_limit, alternated, at, cell, 0)
+        self._slowdown, spent = calibration().slowdown(), self._beside.seconds(solutions, part)
+        return TimedRound(assemble, solve, max(before, self._slowdown), certify, spent, reconstruct)
 
     def _order(self, cell: int, at: int, part: Sequence[int]) -> Sequence[int]:
         fine = self._stage.queries[cell]
@@ -168,13 +170,14 @@ class _Rounds(Items):
     def _time_queries(
         self, time_limit: TimeLimit, alternated: Iterable[tuple[int, MarginalSolution | None]], at: int, cell: int,
         warm_up: int,
-    ) -> tuple[dict[int, Seconds], dict[int, Seconds], dict[int, Seconds]]:  # fmt: skip
-        """Seconds of assembly, solution and certificate of queries; `warm_up` is part of the seeds."""
+    ) -> tuple[dict[int, Seconds], ...]:  # fmt: skip
+        """Seconds of assembly, solution, certificate and reconstruction of queries; `warm_up` is part of the seeds."""
         # Every repetition is perturbed, so that a caching solver or problem cannot be timed on a cache hit.
         stage, seed = self._stage.cells[cell], (at, cell, warm_up)
         assemble: dict[int, Seconds] = {}
         solve: dict[int, Seconds] = {}
         certify: dict[int, Seconds] = {}
+        reconstruct: dict[int, Seconds] = {}
         queries = self._queries(stage)
         certified = stage.certificate is not None or stage.correction is not CorrectionMode.NONE
         for k, solution in alternated:
@@ -190,13 +193,16 @@ class _Rounds(Items):
                 assemble |= {} if seconds is None else {k: seconds}
                 query = query.repeated(stage.validation_set.seed, k, *seed)
             answer, solve[k] = query.prepare(time_limit)()
-            query.check(answer)  # type: ignore[arg-type]  # what `prepare` has made
+            judged = query.check(answer)  # type: ignore[arg-type]  # what `prepare` has made
+            if judged is not None and judged.reconstruction is not None:
+                reconstruct[k] = judged.reconstruction
+                solve[k] += judged.counted
             if certified and answer.x is not None and answer.alpha is not None:
                 certify[k] = self._certified(stage, queries, near, (query.in_model(answer.x), answer.alpha))
             # A slow solver ends its part of a round after 5 s, so that the cells keep alternating.
             if sum(seconds.wall for seconds in solve.values()) > 5.0:
                 break
-        return assemble, solve, certify
+        return assemble, solve, certify, reconstruct
 
     def _certified(self, stage: CellQueries, queries: Queries, near: Array, solution: tuple[Array, Array]) -> Seconds:
         """Seconds of the certificate and the correction of a solution at a parameter."""
@@ -271,7 +277,8 @@ def block_rows(stage: TimingRounds, timed: Sequence[TimedCell]) -> list[list[Row
 
 def round_columns(one: TimedRound) -> Row:
     """Seconds of the parts of a query and of the whole, means over the queries of a round."""
-    return _columns(*(_of_all(fmean, parts.values()) for parts in (one.assemble, one.solve, one.certify)))
+    parts = one.assemble, one.solve, one.certify, one.reconstruct
+    return _columns(*(_of_all(fmean, part.values()) for part in parts))
 
 
 def _of_all(average: Callable[[Sequence[float]], float], parts: Iterable[Seconds]) -> Array | None:
@@ -279,12 +286,13 @@ def _of_all(average: Callable[[Sequence[float]], float], parts: Iterable[Seconds
     return np.array([average(column) for column in zip(*every, strict=True)]) if every else None
 
 
-def _columns(assemble: Array | None, solve: Array | None, certify: Array | None) -> Row:
+def _columns(assemble: Array | None, solve: Array | None, certify: Array | None, reconstruct: Array | None) -> Row:
     """The columns that rounds and queries share, from CPU and wall seconds of the parts of a query (2,)."""
     parts = {"assemble_s": assemble, "solve_s": solve, "certify_s": certify}
     total, wall = sum((part for part in parts.values() if part is not None), np.zeros(2))
     seconds = {name: None if part is None else part[0] for name, part in parts.items()}
-    return seconds | {"total_s": total, "total_wall_s": wall}
+    own = None if reconstruct is None else reconstruct[0]
+    return seconds | {"reconstruct_s": own, "total_s": total, "total_wall_s": wall}
 
 
 def seconds_of_cell(rows: Sequence[Row]) -> Row:
@@ -292,10 +300,10 @@ def seconds_of_cell(rows: Sequence[Row]) -> Row:
     if not rows:
         return dict.fromkeys((
             "online_s", "online_q1_s", "online_q3_s", "online_wall_s", "online_assemble_s", "online_solve_s",
-            "online_certify_s", "slowdown", "disturbed",
+            "online_certify_s", "online_reconstruct_s", "slowdown", "disturbed",
         ))  # fmt: skip
     total, wall, slowdown = (np.array([row[name] for row in rows]) for name in ("total_s", "total_wall_s", "slowdown"))
-    certified = [row["certify_s"] for row in rows if row["certify_s"] is not None]
+    optional = {name: [row[name] for row in rows if row[name] is not None] for name in ("certify_s", "reconstruct_s")}
     low, high = np.quantile(total, (0.25, 0.75))
     # Geometric means over the blocks of medians over their rounds: the quotient of the two is the paired one.
     online, high_fidelity = mean_seconds(blocks_of(rows).values())
@@ -303,7 +311,8 @@ def seconds_of_cell(rows: Sequence[Row]) -> Row:
         "online_s": online, "online_q1_s": low, "online_q3_s": high, "online_wall_s": np.median(wall),
         "online_assemble_s": np.median([row["assemble_s"] for row in rows]),
         "online_solve_s": np.median([row["solve_s"] for row in rows]),
-        "online_certify_s": np.median(certified) if certified else None, "slowdown": np.median(slowdown),
+        **{f"online_{name}": np.median(known) if known else None for name, known in optional.items()},
+        "slowdown": np.median(slowdown),
         "disturbed": int(is_disturbed(float(np.median(slowdown)))),
     } | ({} if high_fidelity is None else {"hf_s": high_fidelity})  # fmt: skip
 
@@ -316,7 +325,8 @@ def seconds_of_queries(rounds: Sequence[TimedRound]) -> dict[int, Row]:
         assembled = [one.assemble[k] if k in one.assemble else next(iter(one.assemble.values())) for one in rounds]
         solved = [one.solve[k] for one in rounds if k in one.solve]
         certified = [one.certify[k] for one in rounds if k in one.certify]
-        rows[k] = _columns(*(_of_all(median, parts) for parts in (assembled, solved, certified)))
+        reconstructed = [one.reconstruct[k] for one in rounds if k in one.reconstruct]
+        rows[k] = _columns(*(_of_all(median, parts) for parts in (assembled, solved, certified, reconstructed)))
     return rows
 
 

@@ -199,17 +199,15 @@ def test_a_value_is_read_as_it_was_written(value: Any) -> None:
 
 
 def test_arrays_are_stored_once_without_what_they_are_parts_of_and_read_only() -> None:
-    """What a process keeps for several stages no plugin may write into; SciPy sorts indices in place."""
+    """What a process keeps for several stages no plugin may write into."""
     whole = np.arange(60_000.0).reshape(300, 200)
     content = dumps([whole[:2, ::3], whole[3]])
     assert len(content) < 5_000
     assert_same([np.ascontiguousarray(whole[:2, ::3]), whole[3]], loads(content))
     dense, columns, matrix = loads(dumps((np.eye(3), np.asfortranarray(np.ones((2, 3))), sp.eye_array(3).tocsr())))
-    for array in (dense, columns):
+    for array in (dense, columns, matrix.data, matrix.indices, matrix.indptr):
         with pytest.raises(ValueError, match="read-only"):
-            array[0] = 1.0
-    matrix.data[:] = 2.0
-    matrix.sort_indices()
+            array[0] = 1
     one = np.arange(1000.0)
     first, second = loads(dumps((one, one)))
     assert first is second
@@ -225,7 +223,8 @@ def test_sparse_matrices_of_every_format(kind: str, box: int) -> None:
         assert (type(found), found.shape, found.dtype) == (type(matrix), matrix.shape, matrix.dtype)
         np.testing.assert_array_equal(found.toarray(), entries)
         for name in {"data", "indices", "indptr", "offsets"} & set(dir(matrix)) if kind not in ("lil", "dok") else ():
-            assert_same(np.asarray(getattr(matrix, name)), getattr(found, name), writeable=True)
+            written = np.asarray(getattr(matrix, name))
+            assert_same(written, getattr(found, name), writeable=kind not in ("csr", "csc"))
 
 
 def test_factors_coordinates_and_unsorted_indices_stay_as_they_are() -> None:

@@ -1,0 +1,171 @@
+"""Formulations that do all they can to their process and their neighbours, and two honest ones of the same package."""
+
+import os
+import signal
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+from formulations import Nearest, Program, ProgramModel
+
+from vibench import Array, FormulationAnswer, FormulationModel, HighFidelitySolver, OfflinePhase, QuerySettings
+
+Acts = Mapping[str, tuple[str, Callable[[Any], Any]]]
+"""What is done, by its name, and what its cell says of it: the status and words of the reason."""
+
+CHANGED = "error: writes into what it is given, and the problem 'Wire' is another one since: row "
+
+
+class Honest(Program):
+    pass
+
+
+class HonestNearest(Nearest):
+    pass
+
+
+def throw(error: BaseException) -> Any:
+    raise error
+
+
+def fill(array: Array) -> None:
+    array[...] = 0.0
+
+
+def double(matrix: Any) -> None:
+    matrix.data *= 2.0
+
+
+def vi(owner: Any) -> Any:
+    return owner.problem.assemble(np.array([5.0]))
+
+
+def hang(_: object) -> None:
+    time.sleep(600.0)
+
+
+ANYWHERE: Acts = {
+    "path": ("ok: ", lambda _: sys.path.clear()), "errors": ("ok: ", lambda _: np.seterr(all="raise")),
+    "recursion": ("error: RecursionError", lambda _: sys.setrecursionlimit(5)),
+    "warnings": ("ok: ", lambda _: warnings.simplefilter("error")), "folder": ("ok: ", lambda _: os.chdir("/")),
+    "environment": ("ok: ", lambda _: os.environ.clear()),
+    "thread": ("ok: ", lambda _: threading.Thread(target=hang, args=(0,), daemon=True).start()),
+    "raises": ("error: ArithmeticError: no pivot", lambda _: throw(ArithmeticError("no pivot"))),
+    "leaves": ("error: SystemExit: 3", lambda _: sys.exit(3)), "exits": ("crashed: exit code 3", lambda _: os._exit(3)),
+    "dies": ("crashed: signal SIGKILL", lambda _: os.kill(os.getpid(), signal.SIGKILL)),
+}  # fmt: skip
+BUILD: Acts = {
+    "A": (CHANGED, lambda offline: double(vi(offline).A)),
+    "B": ("ok: ", lambda offline: double(vi(offline).B)),
+    "indices": (CHANGED, lambda offline: fill(vi(offline).A.indices)),
+    "multiplied": (CHANGED, lambda offline: vi(offline).A.__imul__(2.0)),
+    "box": (CHANGED, lambda offline: fill(offline.problem.parameters.lower)),
+    "depth": (CHANGED, lambda offline: setattr(offline.problem, "depth", 0.1)),
+    "stiffness": (CHANGED, lambda offline: setattr(offline.problem, "stiffness", 2.0 * offline.problem.stiffness)),
+    "method": ("error: is another one since", lambda offline: setattr(offline.problem, "assemble", lambda mu: None)),
+    "V": ("error: read-only", lambda offline: double(offline.problem.V.matrix)),
+    "W": ("error: read-only", lambda offline: double(offline.problem.W.matrix)),
+    "basis": ("error: read-only", lambda offline: fill(offline.pod.basis)),
+    "cone": ("error: read-only", lambda offline: fill(offline.cone.generators)),
+    "span": ("error: read-only", lambda offline: fill(offline.multipliers.span)),
+    "snapshots": ("ok: ", lambda offline: fill(offline.snapshots.u)),
+}
+MODEL: Acts = {
+    "true": ("error: `dimension` of the model is True", lambda made: setattr(made, "dimension", True)),
+    "nan": ("error: `generators` of the model is nan", lambda made: setattr(made, "generators", np.nan)),
+    "less": ("error: `enrichment` of the model is -5", lambda made: setattr(made, "enrichment", -5)),
+    "more": ("error: `enrichment` of the model is 99, more", lambda made: setattr(made, "enrichment", 99)),
+}
+SOLVE: Acts = {
+    "mu": ("error: read-only", lambda model: fill(model.mu)),
+    "A": (CHANGED, lambda model: double(vi(model).A)),
+    "slow": ("timeout: query_seconds = 1 s", hang),
+}
+ANSWER: Acts = {
+    "tuple": ("error: `solve` returned a tuple", lambda one: (one.x, one.alpha)),
+    "nothing": ("error: `solve` returned a NoneType", lambda one: None),
+    "list": ("error: x of the answer has the type list", lambda one: replace(one, x=one.x.tolist())),
+    "complex": ("error: x of the answer is complex", lambda one: replace(one, x=one.x + 1j)),
+    "masked": ("error: x of the answer is a masked", lambda one: replace(one, x=np.ma.masked_array(one.x))),
+    "long": ("error: x of the answer has 99 coeff", lambda one: replace(one, x=np.zeros(99))),
+    "table": ("error: x of the answer has shape", lambda one: replace(one, x=one.x[:, None])),
+    "outcome": ("error: outcome of the answer is 'ok'", lambda one: replace(one, outcome="ok")),
+    "reason": ("error: reason of the answer is None", lambda one: replace(one, reason=None)),
+    "steps": ("error: iterations of the answer is nan", lambda one: replace(one, iterations=np.nan)),
+    "backwards": ("error: iterations of the answer is -1", lambda one: replace(one, iterations=-1)),
+    "negative": ("error: uncertainty of the answer is -1.0", lambda one: replace(one, uncertainty=-1.0)),
+    "infinite": ("error: uncertainty of the answer is inf", lambda one: replace(one, uncertainty=np.inf)),
+    "lost": ("nonfinite: x or alpha of the answer is not", lambda one: replace(one, x=one.x * np.nan)),
+}
+PAIR: Acts = {
+    "short": ("error: u of `reconstruct` has shape (11,), expected (12,)", lambda pair: (pair[0][1:], pair[1])),
+    "pulls": ("failed: λ has negative coefficients, as -", lambda pair: (pair[0], pair[1] - 1.0)),
+    "one": ("error: expected a pair (u, λ)", lambda pair: pair[0]),
+    "undone": ("error: `reconstruct` returned no λ", lambda pair: (pair[0], None)),
+    "far": ("nonfinite: u or λ is not finite", lambda pair: (1e200 * pair[0], pair[1])),
+    "unreal": ("error: u of `reconstruct` is complex", lambda pair: (pair[0] + 0j, pair[1])),
+    "force": ("nonfinite: u or λ is not finite", lambda pair: (pair[0], np.inf * pair[1])),
+    "buffer": ("ok: ", lambda pair: (np.copyto(BUFFER, pair[0]), (BUFFER, pair[1]))[1]),
+}
+RECONSTRUCT: Acts = {
+    "mu": ("error: read-only", lambda model: fill(model.mu)),
+    "A": (CHANGED, lambda model: double(vi(model).A)),
+    "solves": ("ok: ", lambda model: None),
+}
+BUFFER = np.zeros(12)
+
+PHASES = {
+    "build": BUILD | ANYWHERE, "model": MODEL, "solve": SOLVE | ANYWHERE, "answer": ANSWER, "pair": PAIR,
+    "reconstruct": RECONSTRUCT | {how: ANYWHERE[how] for how in ("raises", "exits")},
+}  # fmt: skip
+
+
+class Hostile(Program):
+    """It does what its option says, in a phase, by the tables above."""
+
+    uses: ClassVar[tuple[str, ...]] = ("pod", "dual", "primal", "solvers", "accuracy")
+
+    def __init__(self, how: str) -> None:
+        self.how = how
+
+    def build(self, offline: OfflinePhase) -> Mapping[str, Any]:
+        return act(self.how, "build", offline, {})
+
+    def model(self, offline: OfflinePhase, built: Mapping[str, Any]) -> FormulationModel:
+        made = HostileModel(offline)
+        made.how, made.problem = self.how, offline.problem
+        act(self.how, "model", made)
+        return made
+
+
+def act(how: str, phase: str, given: Any, otherwise: Any = None) -> Any:
+    own, name = how.split("-")
+    if own != phase:
+        return otherwise
+    done = PHASES[phase][name][1](given)
+    return otherwise if phase == "build" else done
+
+
+class HostileModel(ProgramModel):
+    how = ""
+    mu = problem = None
+
+    def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
+        self.mu = mu
+        act(self.how, "solve", self)
+        answer = super().solve(mu, settings)
+        return act(self.how, "answer", answer, answer)
+
+    def reconstruct(self, mu: Array, answer: FormulationAnswer) -> Any:
+        self.mu = mu
+        if self.how == "reconstruct-solves":
+            found = HighFidelitySolver(self.problem).solve(mu)
+            return found.u, found.lam
+        act(self.how, "reconstruct", self)
+        pair = super().reconstruct(mu, answer)
+        return act(self.how, "pair", pair, pair)
