@@ -98,11 +98,9 @@ def drawn(path: Path, folder: Path) -> Iterator[tuple[str, str]]:
     """Draw the figures of the page; returns the name of each, and the picture with its caption."""
     kinds = FIGURES.get(folder.name, ())
     with styled():
-        for task in figures.drawings(path):
-            pages = figures.pages_of(task) if not kinds or task[0].endswith(kinds) else ()
-            for name, figure in pages:
-                if kinds and not name.endswith(kinds):
-                    continue
+        for name, draw, data in figures.drawings(path):
+            figure = draw(data) if not kinds or name.endswith(kinds) else None
+            if figure is not None:
                 file = write_figure(figure, folder, name)
                 yield name, f"![{alternative(figure, name)}]({file.name})\n\n{escaped(caption_of(figure))}"
 

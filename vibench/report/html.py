@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -20,7 +20,7 @@ from vibench.qp.status import Status
 from vibench.report import findings, plots
 from vibench.report.differences import ComparedRun
 from vibench.report.figures import FigureTask, figures_of, render
-from vibench.report.figures.data import Extent, ProblemTables, label_of, problem_tables, whole
+from vibench.report.figures.data import ProblemTables, label_of, problem_tables, whole
 from vibench.report.plots import image_of, script_safe, short
 from vibench.results import formats, pictures, ranking, show
 from vibench.results.paired_timing import PairedTiming
@@ -192,7 +192,7 @@ def page(path: Path, *, figures: bool = True) -> str:
         grids=grids,
         drawn=figures,
         images=images,
-        cut=any(image.cut for image in images) or any(len(data.duals) > 1 for data in data_of.values()),
+        cut=any(len(data.duals) > 1 for data in data_of.values()),
         plots={plot.name: plot for plot in live},
         overviews=first_plots,
         plots_alone=[plot for plot in live if plot.name not in {image.name for image in images}],
@@ -216,10 +216,10 @@ def environment(folder: str, **options: Any) -> Environment:
 
 
 def tasks_of(name: str, data: ProblemTables) -> Iterator[FigureTask]:
-    """The figures of a problem on the page: the beginning of long ones, and of the leading dual strategy alone."""
+    """The figures of a problem on the page, those of a cone for the leading dual strategy alone."""
     winners = (winner for one in leaderboard(data.cells) for band in one.bands for winner in band.winners)
     ranked = dict.fromkeys([*filter(None, (str(winner.cell["dual"]) for winner in winners)), *data.duals])
-    return figures_of(name, replace(data, extent=Extent.BEGINNING), list(ranked)[:1])
+    return figures_of(name, data, list(ranked)[:1])
 
 
 def way(winner: Winner) -> str:

@@ -152,7 +152,6 @@ class FigureImage:
 
     name: str
     caption: str
-    cut: bool  # only the beginning of the figure is shown
     alternative: str  # text for readers who do not see it
     source: str  # data URI
     width: int  # pixels
@@ -170,7 +169,7 @@ def image_of(name: str, figure: Figure) -> FigureImage:
     # A third of the time of more thorough compression, for a quarter more bytes.
     dots.save(stream, "webp", lossless=True, method=1, quality=0)
     source = "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
-    return FigureImage(name, caption_of(figure), bool(getattr(figure, "part", "")), seen(figure), source, *dots.size)
+    return FigureImage(name, caption_of(figure), seen(figure), source, *dots.size)
 
 
 def seen(figure: Figure) -> str:

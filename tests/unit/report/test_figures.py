@@ -25,9 +25,10 @@ from vibench.errors import RequestError
 from vibench.report import figures
 from vibench.report.figures import KINDS, costs, draw_all, spaces
 from vibench.report.figures import problem_tables as of_file
-from vibench.report.figures.data import Extent, ProblemTables, _per_combination
+from vibench.report.figures.data import ProblemTables, _per_combination
 from vibench.report.figures.style import save, styled
 from vibench.report.html import page as report_page
+from vibench.report.html import tasks_of
 from vibench.results.read import read_table
 from vibench.results.sqlite import FILE
 from vibench.study.matrix import read_study
@@ -319,11 +320,11 @@ def test_every_strategy_is_drawn_ten_to_a_panel(count: int, tables: Tables) -> N
 
     cones = replace(data, histories=pd.concat([data.histories[data.histories["stage"] == "pod"],
                                                many(data.histories, "dual", "mcpg")]))  # fmt: skip
-    assert len(next(spaces.convergence(cones)).axes[1].get_lines()) == min(count, 10)
+    assert len(spaces.convergence(cones).axes[1].get_lines()) == min(count, 10)
     mine = data.restrict_to_dual("mcpg")
     fixed = replace(mine, queries=many(mine.queries, "primal", "offline-pga"),
                     histories=many(mine.histories, "primal", "offline-pga"))  # fmt: skip
-    spans = [axes for axes in next(spaces.inf_sup(fixed)).axes if axes.get_ylabel().endswith("span")]
+    spans = [axes for axes in spaces.inf_sup(fixed).axes if axes.get_ylabel().endswith("span")]
     assert in_tens(spans) == count + len(spans)  # the high-fidelity pair is in each
 
 
@@ -331,7 +332,8 @@ def test_thresholds_are_marked_where_the_lines_cross(results: Path, change: Chan
     """With their intervals; however many there are, a panel has one artist for each meaning and one for intervals."""
     change(*DECIDED)
     data = dict(of_file(results))["obstacle"]
-    (figure,), seen = costs.total_cost(data), 0
+    figure, seen = costs.total_cost(data), 0
+    assert figure is not None
     for axes in figure.axes:
         marks = [line for line in axes.get_lines() if line.get_marker() in "<>"]
         assert len({line.get_label() for line in marks}) == len(marks)
@@ -418,7 +420,7 @@ def test_the_same_results_give_the_same_files(tables: Tables, tmp_path: Path) ->
         for folder in ("one", "two"):
             (tmp_path / folder).mkdir(exist_ok=True)
             with styled():
-                files.append(save(next(drawing(data)), tmp_path / folder, name))
+                files.append(save(drawing(data), tmp_path / folder, name))
         for first, second in zip(*files, strict=True):
             assert first.read_bytes() == second.read_bytes(), first.name
 
@@ -466,43 +468,19 @@ def test_a_caption_says_which_tolerances_are_left_out(change: Change, draw: Draw
     assert "offline-pga is shown at δ = 0.7, its loosest; left out: 0.5." in figure.caption
 
 
-def test_a_long_figure_is_drawn_in_parts(tables: Tables) -> None:
+def test_a_long_figure_has_four_panels_and_says_what_it_leaves_out(tables: Tables) -> None:
     data = tables["obstacle"].restrict_to_dual("mcpg")
     pairs = pd.concat([data.queries.assign(pair=f"pair {k}") for k in range(8)])
-    task = ("name", figures.inf_sup, replace(data, queries=pairs, extent=Extent.PAGES))
-    drawn = dict(figures.render([task], lambda name, figure: (name, figure))[0])
-    assert list(drawn) == ["name", "name-2"]
-    assert [len([axes for axes in figure.axes if axes.get_title()]) for figure in drawn.values()] == [6, 2]
-    assert [figure.caption[-12:] for figure in drawn.values()] == ["Part 1 of 2.", "Part 2 of 2."]
-    (whole,) = figures.inf_sup(replace(data, queries=pairs))
-    assert len([axes for axes in whole.axes if axes.get_title()]) == 8
-    assert "Part" not in whole.caption
+    figure = spaces.inf_sup(replace(data, queries=pairs))
+    assert figure is not None
+    assert len([axes for axes in figure.axes if axes.get_title()]) == 4
+    assert "The tables have the other 4 panels." in figure.caption
 
 
-def test_a_report_has_half_a_page_of_a_long_figure_and_the_whole_of_any_other(tables: Tables) -> None:
-    name, data = "obstacle", tables["obstacle"]
-    mine = data.restrict_to_dual("mcpg")
-
-    def long(frame: pd.DataFrame) -> pd.DataFrame:
-        clones = [frame.assign(dual=f"mcpg {k}", cell=frame["cell"] + str(k)) for k in range(13)]
-        return pd.concat(clones, ignore_index=True)
-
-    queries = pd.concat([long(mine.queries), data.restrict_to_dual("cpg").queries])
-    many = replace(data, cells=long(mine.cells), queries=queries)
-    tasks = list(figures.figures_of(name, replace(many, extent=Extent.BEGINNING), ["cpg"]))
-    assert {one.removeprefix("obstacle-") for one, *_ in tasks} >= {
-        kind for kind, (_, of_dual) in KINDS.items() if not of_dual
-    } | {"cpg-inf-sup"}
-    assert "obstacle-mcpg-inf-sup" not in [one for one, *_ in tasks]
-    found = {one: list(draw(part)) for one, draw, part in tasks}
-    assert max(map(len, found.values())) == 1
-    cut = {one for one, pages in found.items() for page in pages if page.part}
-    long_ones = {"work-precision": (4, 7), "total-cost": (6, 3)}
-    assert cut == {f"obstacle-{kind}" for kind in long_ones}
-    for kind, (titles, parts) in long_ones.items():
-        (figure,) = found[f"obstacle-{kind}"]
-        assert len([axes for axes in figure.axes if axes.get_title()]) == titles
-        assert f"Part 1 of {parts}." in figure.caption
+def test_a_report_has_the_figures_of_the_leading_cone(tables: Tables) -> None:
+    names = [one for one, *_ in tasks_of("obstacle", tables["obstacle"])]
+    assert len([one for one in names if one.endswith("inf-sup")]) == 1 < len(tables["obstacle"].duals)
+    assert {f"obstacle-{kind}" for kind, (_, of_dual) in KINDS.items() if not of_dual} <= {*names}
 
 
 def test_a_problem_has_an_abscissa_of_its_own_only_with_one_parameter(tables: Tables) -> None:

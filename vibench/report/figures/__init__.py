@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -17,29 +16,29 @@ with foreign("matplotlib"):
     from matplotlib.figure import Figure
 
     from vibench.report.figures.costs import solvers, total_cost, work_precision
-    from vibench.report.figures.data import Extent, ProblemTables, file_names, problem_tables
+    from vibench.report.figures.data import ProblemTables, file_names, problem_tables
     from vibench.report.figures.solutions import solutions
     from vibench.report.figures.spaces import convergence, inf_sup
-    from vibench.report.figures.style import Pages, caption_of, save, styled
+    from vibench.report.figures.style import CaptionedFigure, caption_of, save, styled
 
-DrawPages = Callable[[ProblemTables], Pages]
+Draw = Callable[[ProblemTables], CaptionedFigure | None]
 
 # Figures by the end of their file names, and whether every dual strategy of a problem has one.
-KINDS: dict[str, tuple[DrawPages, bool]] = {
+KINDS: dict[str, tuple[Draw, bool]] = {
     "solutions": (solutions, False), "convergence": (convergence, False), "work-precision": (work_precision, False),
     "solvers": (solvers, False), "total-cost": (total_cost, False), "inf-sup": (inf_sup, True),
 }  # fmt: skip
 
-# A figure to be drawn: name of its first file, function that draws its pages, and their data.
-FigureTask = tuple[str, DrawPages, ProblemTables]
+# A figure to be drawn: name of its file, function that draws it, and its data.
+FigureTask = tuple[str, Draw, ProblemTables]
 Made = TypeVar("Made")
 Progress = Callable[[str, int, int], None]
 
 
 def drawings(path: Path) -> Iterator[FigureTask]:
-    """Every figure a results file may have, in files of a size that a page takes."""
+    """Every figure a results file may have."""
     for name, data in problem_tables(path):
-        yield from figures_of(name, replace(data, extent=Extent.PAGES), data.duals)
+        yield from figures_of(name, data, data.duals)
 
 
 def figures_of(name: str, data: ProblemTables, duals: Collection[str]) -> Iterator[FigureTask]:
@@ -62,11 +61,11 @@ def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = N
     by_problem = {data.problem: data for _, data in problem_tables(path)}
     if kind not in KINDS:
         raise unknown_name("figure", kind, KINDS)
-    data, (pages, of_dual) = _only("problem", by_problem, problem), KINDS[kind]
+    data, (drawn, of_dual) = _only("problem", by_problem, problem), KINDS[kind]
     if of_dual:
         data = _only("dual strategy", {name: data.restrict_to_dual(name) for name in data.duals}, dual)
     with styled():
-        figure = next(pages(data), None)
+        figure = drawn(data)
     if figure is None:
         raise RequestError(f"the run has no data for the figure '{kind}' of {data.problem}")
     return figure
@@ -117,36 +116,29 @@ def draw_all(
         folder.mkdir(parents=True, exist_ok=True)
         return name, caption_of(figure), save(figure, folder, name, formats)
 
-    pages, failures = render(list(drawings(path)), write, progress)
-    if pages:
-        captions = read_captions(folder) | {name: caption for name, caption, _ in pages}
+    made, failures = render(list(drawings(path)), write, progress)
+    if made:
+        captions = read_captions(folder) | {name: caption for name, caption, _ in made}
         text = json.dumps(captions, ensure_ascii=False, indent=1) + "\n"
         write_atomically(folder / "captions.json", text.encode("utf-8"))
-    return [file for *_, files in pages for file in files], failures
+    return [file for *_, files in made for file in files], failures
 
 
 def render(
     tasks: Sequence[FigureTask], finish: Callable[[str, Figure], Made], progress: Progress = lambda *_: None
 ) -> tuple[list[Made], list[str]]:
-    """Draw figures; returns the results of `finish(name, page)` of all their pages, and a line for each that fails."""
+    """Draw figures; returns the results of `finish(name, figure)` of all of them, and a line for each that fails."""
     rendered: list[Made] = []
     failures: list[str] = []
-    for k, task in enumerate(tasks):
-        progress(task[0], k, len(tasks))
+    for k, (name, drawn, data) in enumerate(tasks):
+        progress(name, k, len(tasks))
         with styled():
             try:
-                for name, page in pages_of(task):
-                    rendered.append(finish(name, page))
+                if (figure := drawn(data)) is not None:
+                    rendered.append(finish(name, figure))
             except OSError:
                 raise
             except Exception as error:  # noqa: BLE001  results nobody thought of cost their figure, not the run
-                failures.append(f"the figure '{task[0]}' could not be drawn: {in_a_line(error)}")
+                failures.append(f"the figure '{name}' could not be drawn: {in_a_line(error)}")
     progress("", len(tasks), len(tasks))
     return rendered, failures
-
-
-def pages_of(task: FigureTask) -> Iterator[tuple[str, Figure]]:
-    """The pages of a figure with the names of their files, numbered after the first."""
-    name, draw, data = task
-    for k, page in enumerate(draw(data), 1):
-        yield name + f"-{k}" * (k > 1), page

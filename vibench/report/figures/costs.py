@@ -11,11 +11,20 @@ from matplotlib.axes import Axes
 from vibench.qp.status import Status
 from vibench.report.figures import data as tables
 from vibench.report.figures.data import ProblemTables, label, parts, series, titled_parts, whole
-from vibench.report.figures.style import HIGH_FIDELITY_LOOK, Layout, Looks, Pages, Series, Sheet, plot, scatter
+from vibench.report.figures.style import (
+    HIGH_FIDELITY_LOOK,
+    CaptionedFigure,
+    Layout,
+    Looks,
+    Series,
+    Sheet,
+    plot,
+    scatter,
+)
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
 
 
-def work_precision(data: ProblemTables) -> Pages:
+def work_precision(data: ProblemTables) -> CaptionedFigure | None:
     """Errors against the time of a query, a point per cell; no cell is both faster and more accurate than the front.
 
     Dual strategies, assemblies and corrections have a row of panels each.
@@ -32,28 +41,30 @@ def work_precision(data: ProblemTables) -> Pages:
         for (dual, way), mine in cells.groupby(["dual", "way"], sort=False)
         for title, names in titled_parts(f"{dual}{f', {way}' * bool(way)}", list(map(str, mine["primal"].unique())))
     ]
-    for rows, part in data.pages(ways, 4):
-        heading = f"{data.problem}, {cells['solver'].iloc[0]}: work and precision{compared.over}"
-        sheet = Sheet(len(rows), 2, heading, Layout(4.4, 3.3), "all", "col")
-        for row, (way, mine, names) in enumerate(rows):
-            for place, (column, symbol) in enumerate((("error_u_mean", "u"), ("error_lambda_mean", "λ"))):
-                panel, drawn = sheet.panel(row, place), mine[mine[column].notna()]
-                for name in names:
-                    own = drawn.index[drawn["primal"] == name]
-                    scatter(panel, seconds[own], drawn[column][own], looks[Series(str(name))], str(name))
-                for index, text in _point_names(drawn[drawn["primal"].isin(names)]).items():
-                    sheet.label(panel, seconds[index], drawn[column][index], text)
-                best = drawn.index[_front(seconds[drawn.index].to_numpy(float), drawn[column].to_numpy(float))]
-                panel.plot(seconds[best], drawn[column][best], c="0.6", lw=0.8, drawstyle="steps-post", zorder=0)
-                panel.set(xlabel="mean time of a query [ms]", ylabel=f"mean relative error of {symbol}", title=way)
-                panel.set(xscale="log", yscale="log")
-        yield sheet.finish(
-            f"Relative errors of u (left) and of λ (right) of the reduced models of {data.problem}, means{over}, "
-            f"against the mean time of a query; solver {cells['solver'].iloc[0]}. A row for every {rows_of}, a point "
-            "for every model, with its (N, R) and the tolerance δ of its primal strategy; a number alone is another δ. "
-            "The thin line is the Pareto front: no model is both faster and more accurate.",
-            part,
-        )
+    rows, part = tables.leading(ways, 2)
+    if not rows:
+        return None
+    heading = f"{data.problem}, {cells['solver'].iloc[0]}: work and precision{compared.over}"
+    sheet = Sheet(len(rows), 2, heading, Layout(4.4, 3.3), "all", "col")
+    for row, (way, mine, names) in enumerate(rows):
+        for place, (column, symbol) in enumerate((("error_u_mean", "u"), ("error_lambda_mean", "λ"))):
+            panel, drawn = sheet.panel(row, place), mine[mine[column].notna()]
+            for name in names:
+                own = drawn.index[drawn["primal"] == name]
+                scatter(panel, seconds[own], drawn[column][own], looks[Series(str(name))], str(name))
+            for index, text in _point_names(drawn[drawn["primal"].isin(names)]).items():
+                sheet.label(panel, seconds[index], drawn[column][index], text)
+            best = drawn.index[_front(seconds[drawn.index].to_numpy(float), drawn[column].to_numpy(float))]
+            panel.plot(seconds[best], drawn[column][best], c="0.6", lw=0.8, drawstyle="steps-post", zorder=0)
+            panel.set(xlabel="mean time of a query [ms]", ylabel=f"mean relative error of {symbol}", title=way)
+            panel.set(xscale="log", yscale="log")
+    return sheet.finish(
+        f"Relative errors of u (left) and of λ (right) of the reduced models of {data.problem}, means{over}, "
+        f"against the mean time of a query; solver {cells['solver'].iloc[0]}. A row for every {rows_of}, a point "
+        "for every model, with its (N, R) and the tolerance δ of its primal strategy; a number alone is another δ. "
+        "The thin line is the Pareto front: no model is both faster and more accurate.",
+        part,
+    )
 
 
 def _point_names(cells: pd.DataFrame) -> dict[Any, str]:
@@ -76,7 +87,7 @@ def _front(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.asarray(order[np.concatenate([np.ones(min(len(best), 1), dtype=bool), best[1:] < best[:-1]])])
 
 
-def total_cost(data: ProblemTables) -> Pages:
+def total_cost(data: ProblemTables) -> CaptionedFigure | None:
     """Offline and online seconds against the number of queries; triangles mark where two models break even."""
     cells, queries = tables.best_solver(data.cells), np.geomspace(1.0, 1e6, 61)
     panels = []
@@ -87,28 +98,30 @@ def total_cost(data: ProblemTables) -> Pages:
         models = most.drop_duplicates(["primal", "way"]).sort_index()
         groups = titled_parts(title, list(range(len(models))), "models", beside_reference=True)
         panels += [(part, models.iloc[places]) for part, places in groups]
-    for shown, part in data.pages(panels, 12):
-        sheet = Sheet.with_panels(len(shown), f"{data.problem}, {cells['solver'].iloc[0]}: total cost", share="all")
-        drawn = [cell for _, mine in shown for cell in mine.itertuples()]
-        looks = Looks(series(cell.primal, cell.primal_tol, cell.way) for cell in drawn)
-        for panel, (title, mine) in zip(sheet.panels, shown, strict=False):
-            model = mine.iloc[0]
-            plot(panel, queries, model["hf_setup_s"] + queries * model["hf_s"], HIGH_FIDELITY_LOOK, HIGH_FIDELITY)
-            for cell in mine.itertuples():
-                key = (cell.primal, cell.primal_tol, cell.way)
-                plot(panel, queries, cell.offline_s + queries * cell.online_s, looks[series(*key)], label(*key))
-            _marks(panel, mine, data.thresholds, queries[-1])
-            panel.set(xlabel="number of queries", ylabel="offline + online [s]", title=title)
-            panel.set(xlim=(1.0, queries[-1]), xscale="log", yscale="log")
-        yield sheet.finish(
-            f"CPU seconds offline and online of the models of {data.problem} together against the number of queries; "
-            f"solver {cells['solver'].iloc[0]}. A panel for every dual strategy and pair (N, R); every primal strategy "
-            "and assembly is shown at the tolerance δ with the most vectors. Triangles mark where two models cost the "
-            "same and point to the side on which the reduced model is cheaper than the high-fidelity one, the fixed "
-            "enrichment than the one per parameter, or another formulation than the mixed program; bars are 95 % "
-            "intervals of that number of queries.",
-            part,
-        )
+    shown, part = tables.leading(panels, 4)
+    if not shown:
+        return None
+    sheet = Sheet.with_panels(len(shown), f"{data.problem}, {cells['solver'].iloc[0]}: total cost", share="all")
+    drawn = [cell for _, mine in shown for cell in mine.itertuples()]
+    looks = Looks(series(cell.primal, cell.primal_tol, cell.way) for cell in drawn)
+    for panel, (title, mine) in zip(sheet.panels, shown, strict=False):
+        model = mine.iloc[0]
+        plot(panel, queries, model["hf_setup_s"] + queries * model["hf_s"], HIGH_FIDELITY_LOOK, HIGH_FIDELITY)
+        for cell in mine.itertuples():
+            key = (cell.primal, cell.primal_tol, cell.way)
+            plot(panel, queries, cell.offline_s + queries * cell.online_s, looks[series(*key)], label(*key))
+        _marks(panel, mine, data.thresholds, queries[-1])
+        panel.set(xlabel="number of queries", ylabel="offline + online [s]", title=title)
+        panel.set(xlim=(1.0, queries[-1]), xscale="log", yscale="log")
+    return sheet.finish(
+        f"CPU seconds offline and online of the models of {data.problem} together against the number of queries; "
+        f"solver {cells['solver'].iloc[0]}. A panel for every dual strategy and pair (N, R); every primal strategy "
+        "and assembly is shown at the tolerance δ with the most vectors. Triangles mark where two models cost the "
+        "same and point to the side on which the reduced model is cheaper than the high-fidelity one, the fixed "
+        "enrichment than the one per parameter, or another formulation than the mixed program; bars are 95 % "
+        "intervals of that number of queries.",
+        part,
+    )
 
 
 def _marks(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame, most: float) -> None:
@@ -124,14 +137,14 @@ def _marks(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame, most: flo
     panel.hlines(bounded["cost"], bounded["threshold_low"], bounded["threshold_high"], colors="black", lw=0.8, zorder=5)
 
 
-def solvers(data: ProblemTables) -> Pages:
+def solvers(data: ProblemTables) -> CaptionedFigure | None:
     """Time of every solver against the accuracy it achieves, and its performance profile (Dolan and Moré, 2002).
 
     Failures count as infinite times, so that a curve ends at the fraction its solver solved. One solver has no profile.
     """
     queries = tables.of_solvers(data.queries)
     if not queries["solve_s"].notna().any():
-        return
+        return None
     names = [str(name) for name in queries["solver"].unique()]
     groups = parts(names)
     compared = len(names) > 1
@@ -142,7 +155,7 @@ def solvers(data: ProblemTables) -> Pages:
         sheet.panel(row, 0).axhline(1.0, color="0.4", linewidth=0.8, linestyle=(0, (1, 2)), label="prescribed accuracy")
         if compared:
             _profile(sheet.panel(row, 1), queries, group, looks)
-    yield sheet.finish(
+    return sheet.finish(
         f"QP solvers on the programs of {data.problem}. {'Left, the' if compared else 'The'} largest residual of a "
         "reduced model's programs, relative to the prescribed accuracy, against the median time of a program, one "
         "point for each model; points above the dotted line miss the accuracy. "

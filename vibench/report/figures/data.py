@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum
 from itertools import count, pairwise
 from pathlib import Path
 from types import MappingProxyType
@@ -27,14 +26,6 @@ from vibench.text import json_object
 Panel = TypeVar("Panel")
 
 
-class Extent(Enum):
-    """How much is drawn of a figure that has too many panels for one page."""
-
-    WHOLE = "all panels in one figure"
-    PAGES = "all panels in several figures"
-    BEGINNING = "the first half of the first page"
-
-
 @dataclass(frozen=True)
 class ProblemTables:
     """The tables of one problem of a run, and of one training set where it has several.
@@ -52,8 +43,6 @@ class ProblemTables:
         Rows of the tables of the results file, in the order of the axes.
     pictures
         Its recorded solutions.
-    extent
-        How much is drawn of a long figure.
     """
 
     problem: str
@@ -65,20 +54,6 @@ class ProblemTables:
     thresholds: pd.DataFrame
     outputs: pd.DataFrame
     pictures: tuple[pictures.Shown, ...]
-    extent: Extent = Extent.WHOLE
-
-    def pages(self, panels: Sequence[Panel], most: int) -> Iterator[tuple[Sequence[Panel], str]]:
-        """The panels of every page of a figure, `most` to a page, and which part of the figure it is.
-
-        A page takes three panels in a row and four rows. The part is a sentence, "" where there is one page.
-        """
-        if self.extent is Extent.WHOLE:
-            most = len(panels)
-        elif self.extent is Extent.BEGINNING and len(panels) > most:
-            most //= 2
-        count = -(-len(panels) // most) if panels else 0
-        for k in range(count)[: 1 if self.extent is Extent.BEGINNING else count]:
-            yield panels[k * most : (k + 1) * most], f"Part {k + 1} of {count}." * (count > 1)
 
     def restrict_to_dual(self, dual: str) -> ProblemTables:
         frames = {name: value for name, value in vars(self).items() if isinstance(value, pd.DataFrame)}
@@ -190,6 +165,12 @@ def _plugin_name(cells: pd.DataFrame, axis: str) -> str:
         plugin = (json_object(definition) or {}).get(axis)
         return str(plugin.get("name", "")) if isinstance(plugin, dict) else ""
     return ""
+
+
+def leading(panels: Sequence[Panel], most: int) -> tuple[Sequence[Panel], str]:
+    """The panels that a figure has room for, and a sentence on the others, "" where there are none."""
+    left_out = len(panels) - most
+    return panels[:most], f"The tables have the other {left_out} panels." if left_out > 0 else ""
 
 
 def dimensions(rows: pd.DataFrame) -> str:

@@ -13,16 +13,15 @@ from matplotlib.tri import Triangulation
 from vibench.arrays import Array
 from vibench.interfaces.outputs import Picture
 from vibench.report.figures.data import ProblemTables
-from vibench.report.figures.style import COLOURS, CaptionedFigure, Layout, Pages, Sheet
+from vibench.report.figures.style import COLOURS, CaptionedFigure, Layout, Sheet
 
 Limits = tuple[float, float]
 
 
-def solutions(data: ProblemTables) -> Pages:
+def solutions(data: ProblemTables) -> CaptionedFigure | None:
     """High-fidelity solution above and multiplier below, at some training parameters; one range of values for all."""
     shown = [(one.title, one.picture) for one in data.pictures if one.picture is not None][:3]
-    if shown:
-        yield draw_solutions(f"{data.problem}: high-fidelity solutions", shown)
+    return draw_solutions(f"{data.problem}: high-fidelity solutions", shown) if shown else None
 
 
 def draw_solutions(title: str, shown: Sequence[tuple[str, Picture]]) -> CaptionedFigure:

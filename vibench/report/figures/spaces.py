@@ -11,12 +11,12 @@ from matplotlib.axes import Axes
 
 from vibench.interfaces.strategies import Kind
 from vibench.report.figures import style
-from vibench.report.figures.data import ProblemTables, by_strategy, dimensions, parts, titled_parts
-from vibench.report.figures.style import CaptionedFigure, Looks, Pages, Series, Sheet, counted, plot, positive
+from vibench.report.figures.data import ProblemTables, by_strategy, dimensions, leading, parts, titled_parts
+from vibench.report.figures.style import CaptionedFigure, Looks, Series, Sheet, counted, plot, positive
 from vibench.stability.infsup import VANISHES
 
 
-def convergence(data: ProblemTables) -> Pages:
+def convergence(data: ProblemTables) -> CaptionedFigure:
     """POD and cones against their sizes, and fixed enrichments against the vectors added (paper, Figures 5, 7, 11, 14).
 
     Enrichments are those of the first cone at its tightest tolerances.
@@ -49,7 +49,7 @@ def convergence(data: ProblemTables) -> Pages:
             plot(panel, rows["step"], values, looks[key], name)
         panel.set(xlabel="vectors added", ylabel=label, title="enrichment", xlim=(0, None), yscale="log")
         counted(panel)
-    yield sheet.finish(
+    return sheet.finish(
         f"Convergence of {data.problem} over the training set: the relative tail of the POD against the number N of "
         "modes; the largest relative distance of a multiplier from the cone of the first R generators, for every dual "
         "strategy; and, for fixed enrichments of the first cone, the largest σ, where a strategy reports it, and the "
@@ -77,34 +77,36 @@ def _cones(panel: Axes, cones: Sequence[tuple[str, pd.DataFrame]]) -> None:
     counted(panel)
 
 
-def inf_sup(data: ProblemTables) -> Pages:
+def inf_sup(data: ProblemTables) -> CaptionedFigure | None:
     """Inf-sup constants β of every primal strategy and of the high-fidelity pair over the validation set."""
     # Without the other columns: a run may have thousands of pairs, each with a copy of its rows.
     needed = ["pair", "query", "cell", "mu_1", "enrichment_kind", "primal", "primal_tol"]
     needed += [name for name in data.queries if name.startswith("beta_")]
     constants = one_solver(data.queries[needed], ["pair"])
     shown, axis = loosest(constants), data.parameter
-    for panels, part in data.pages(list(_panels(data, shown)), 6):
-        sheet, over, below = style.two_rows(len(panels), f"{data.problem}, {data.duals[0]}: inf-sup constants")
-        looks = Looks(key for _, strategies, _, _ in panels for _, key, _ in strategies)
-        zeros: list[list[str]] = []
-        for (title, strategies, first, order), span, cone in zip(panels, over, below, strict=True):
-            reference, both = first.set_index("query").reindex(order), (span, cone)
-            # Without a single parameter the abscissae are places in the order.
-            x = reference["mu_1"].to_numpy(float) if axis else np.arange(1, len(reference) + 1)
-            _draw_constants(both, x, reference, "beta_hf_", style.HIGH_FIDELITY_LOOK, "high-fidelity")
-            drawn = {
-                name: _draw_constants(both, x, rows.set_index("query").reindex(order), "beta_", looks[key], name)
-                for name, key, rows in strategies
-            }
-            zeros.append([name for name, zero in drawn.items() if zero])
-            span.set_title(title)
-            for axes, generated in ((span, "span"), (cone, "cone")):
-                axes.set(ylabel=f"β over {generated}", xlabel=axis or "validation parameters, sorted", yscale="log")
-                if not axis:
-                    counted(axes)
-        _name_zeros(over, zeros)
-        yield sheet.finish(_caption(data, constants, shown, bool(axis)), part)
+    panels, part = leading(list(_panels(data, shown)), 4)
+    if not panels:
+        return None
+    sheet, over, below = style.two_rows(len(panels), f"{data.problem}, {data.duals[0]}: inf-sup constants")
+    looks = Looks(key for _, strategies, _, _ in panels for _, key, _ in strategies)
+    zeros: list[list[str]] = []
+    for (title, strategies, first, order), span, cone in zip(panels, over, below, strict=True):
+        reference, both = first.set_index("query").reindex(order), (span, cone)
+        # Without a single parameter the abscissae are places in the order.
+        x = reference["mu_1"].to_numpy(float) if axis else np.arange(1, len(reference) + 1)
+        _draw_constants(both, x, reference, "beta_hf_", style.HIGH_FIDELITY_LOOK, "high-fidelity")
+        drawn = {
+            name: _draw_constants(both, x, rows.set_index("query").reindex(order), "beta_", looks[key], name)
+            for name, key, rows in strategies
+        }
+        zeros.append([name for name, zero in drawn.items() if zero])
+        span.set_title(title)
+        for axes, generated in ((span, "span"), (cone, "cone")):
+            axes.set(ylabel=f"β over {generated}", xlabel=axis or "validation parameters, sorted", yscale="log")
+            if not axis:
+                counted(axes)
+    _name_zeros(over, zeros)
+    return sheet.finish(_caption(data, constants, shown, bool(axis)), part)
 
 
 def loosest(constants: pd.DataFrame) -> pd.DataFrame:

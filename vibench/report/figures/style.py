@@ -117,14 +117,11 @@ class CaptionedFigure(Figure):
     ----------
     caption
         What it shows, in sentences for readers who do not see it, and what it leaves out.
-    part
-        Which part it is of a figure that has too many panels for one page, as a sentence; "" if it is the whole.
     published, compared
         What is published of a figure that is drawn again, and what agrees and what differs.
     """
 
     caption: str = ""
-    part: str = ""
     published: str = ""
     compared: str = ""
 
@@ -132,10 +129,6 @@ class CaptionedFigure(Figure):
     def alternative(self) -> str:
         """Alternative text for a page: the first sentence of the caption."""
         return first_sentence(self.caption)
-
-
-Pages = Iterator[CaptionedFigure]
-"""A figure: one page, several where it has too many panels for one, none where there is nothing to draw."""
 
 
 def caption_of(figure: Figure) -> str:
@@ -199,7 +192,7 @@ class Sheet:
     def finish(self, caption: str = "", part: str = "") -> CaptionedFigure:
         """Set ticks, sizes and a legend in which every label of the panels occurs once; returns the figure.
 
-        The caption says, too, which part of a figure it is, and how many labels of points have no room.
+        The caption says, too, what it leaves out (`part`), and how many labels of points have no room.
         """
         layout = self._layout
         # Room in inches left of and below a panel for ticks and labels, right of it, and for the title above it.
@@ -220,7 +213,6 @@ class Sheet:
         missing = sum(_label_points(self.panels[k], points) for k, points in self._labels.items())
         unlabelled = f"{missing} points have no label, since others are too close." if missing else ""
         self.figure.caption = " ".join(f"{caption} {part} {unlabelled}".split())
-        self.figure.part = part
         return self.figure
 
     def _legend(self, wide: float) -> float:
