@@ -30,7 +30,7 @@ def reads_of(work: Callable[[], Any]) -> dict[str, str]:
         os.environ.__class__ = _Environment
     _watched.append((set(), set()))
     # The stage that does the same says what a plugin raises.
-    with contextlib.suppress(Exception):
+    with contextlib.suppress(Exception, SystemExit):
         work()
     read, written = _watched[-1]
     files = {name: file for name, one in sys.modules.items() if (file := getattr(one, "__file__", None))}
@@ -68,12 +68,9 @@ def _is_for_own_code(*, direct: bool = False) -> bool:
 @cache
 def is_own(file: str) -> bool:
     """Whether a file belongs neither to Python, nor to vibench, nor to an installed library."""
-    path = Path(file)
-    python, vibench = sysconfig.get_path("stdlib"), Path(__file__).parents[1]
-    return not (path.is_relative_to(python) or path.is_relative_to(vibench)) and not {
-        "site-packages",
-        "dist-packages",
-    } & {*path.parts}
+    path, installed = Path(file), {"site-packages", "dist-packages"}
+    folders = (sysconfig.get_path("stdlib"), Path(__file__).parents[1])
+    return not any(path.is_relative_to(one) for one in folders) and installed.isdisjoint(path.parts)
 
 
 def states(names: Iterable[str]) -> dict[str, str]:
