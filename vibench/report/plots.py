@@ -18,14 +18,13 @@ from PIL import Image
 
 from vibench.errors import foreign
 from vibench.report.figures.data import ProblemTables, best_solver, label, on_common_queries
-from vibench.report.figures.style import Look, Looks, Series, caption_of
+from vibench.report.figures.style import Look, Looks, Series, caption_of, first_sentence
 from vibench.results import ranking
 from vibench.results.break_even import HIGH_FIDELITY, TAIL
 from vibench.results.paired_timing import PairedTiming
-from vibench.text import printable, unbroken
+from vibench.text import printable
 
 with foreign("matplotlib"):
-    from matplotlib.axes import Axes
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -169,42 +168,8 @@ def image_of(name: str, figure: Figure) -> FigureImage:
     # A third of the time of more thorough compression, for a quarter more bytes.
     dots.save(stream, "webp", lossless=True, method=1, quality=0)
     source = "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
-    return FigureImage(name, caption_of(figure), seen(figure), source, *dots.size)
-
-
-def seen(figure: Figure) -> str:
-    """Alternative text of a figure: panel by panel the series and their ranges."""
-    panels = [text for panel in figure.axes if (text := _panel_text(panel))]
-    title = unbroken(figure.get_suptitle())
-    count = f"{len(panels)} panels. " if len(panels) > 1 else ""
-    return f"{f'{title}. ' if title else ''}{count}{' '.join(panels)}"
-
-
-def _panel_text(panel: Axes) -> str:
-    """Title, axes, and every line of a panel with its range; of more than six lines the range of all."""
-    if not panel.axison and not panel.collections:
-        return ""
-    labels = (unbroken(str(line.get_label())) for line in panel.lines)
-    # Matplotlib calls a line without a label "_child".
-    names = ["" if label.startswith("_child") else label for label in labels]
-    named = [(name, np.asarray(line.get_ydata(), dtype=float)) for name, line in zip(names, panel.lines, strict=True)]
-    drawn = [(name, values[np.isfinite(values)]) for name, values in named if np.isfinite(values).any()]
-    extremes = []
-    if len(drawn) > 6:
-        lowest, highest = min(drawn, key=lambda one: one[1].min()), max(drawn, key=lambda one: one[1].max())
-        ends = {"lowest": lowest[0], "highest": highest[0]}
-        extremes = [f"the {which} is that of {name}" for which, name in ends.items() if name]
-        drawn = [(f"{len(drawn)} series", np.concatenate([values for _, values in drawn]))]
-    if not drawn:
-        fields = [np.asarray(array) for one in panel.collections if (array := one.get_array()) is not None]
-        drawn = [("a field", field[np.isfinite(field)]) for field in fields if np.isfinite(field).any()]
-    if not drawn:
-        return ""
-    ranges = (f"{name} between {values.min():.3g} and {values.max():.3g}".strip() for name, values in drawn)
-    said = "; ".join([*ranges, *extremes])
-    title, x, y = (unbroken(text) for text in (panel.get_title(), panel.get_xlabel(), panel.get_ylabel()))
-    what = f"{y} over {x}" if x and y else x or y
-    return f"{': '.join(filter(None, (title, what)))}: {said}."
+    caption = caption_of(figure)
+    return FigureImage(name, caption, first_sentence(caption), source, *dots.size)
 
 
 def script_safe(value: Any) -> str:

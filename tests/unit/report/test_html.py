@@ -9,12 +9,11 @@ from typing import Any
 
 import pytest
 from markupsafe import escape
-from matplotlib.figure import Figure
 from outputs import Links, clean, elements
 from running import Changed, Main
 
 from vibench.library.runs import Run
-from vibench.report import html, plots
+from vibench.report import html
 from vibench.report.figures.data import problem_tables
 from vibench.report.findings import findings
 from vibench.results.ranking import leaderboard
@@ -194,15 +193,10 @@ def test_only_rows_of_a_disturbed_machine_are_marked_and_undecided_answers_are_s
     assert page.count("marks rows") == sum(bool(table["disturbed"]) for table in embedded.values())
 
 
-def test_a_picture_is_described_by_its_lines_or_by_the_ends_of_many() -> None:
-    figure = Figure()
-    few, many = figure.subplots(1, 2)
-    few.set(title="few", xlabel="x [1]", ylabel="y [1]")
-    few.plot([1, 2], [3.0, 0.5], label="a model")
-    many.set(title="many")
-    for k in range(7):
-        many.plot([1, 2], [k, k + 1.0], label=f"δ = {k}" if k else None)  # the lowest has no name
-    assert plots.seen(figure) == (
-        "2 panels. few: y [1] over x [1]: a model between 0.5 and 3. "
-        "many: 7 series between 0 and 7; the highest is that of δ = 6."
-    )
+def test_a_picture_is_described_by_the_first_sentence_of_its_caption(made: Path) -> None:
+    page = made.read_text(encoding="utf-8")
+    (caption,) = re.findall(r"obstacle-total-cost: (.+?)</figcaption>", page)
+    (alternative,) = re.findall(r'<figure id="obstacle-total-cost".*?<img [^>]*alt="([^"]+)"', page, re.DOTALL)
+    assert len(alternative) > 40
+    assert caption.startswith(alternative)
+    assert caption != alternative
