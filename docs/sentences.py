@@ -267,7 +267,13 @@ def fronts() -> Sequence[str]:
 
 def span(values: pd.Series) -> str:
     """The range of some numbers, to two digits."""
-    return f"{values.min():.2g} to {values.max():.2g}"
+    return " to ".join(dict.fromkeys(f"{end:.2g}" for end in (values.min(), values.max())))
+
+
+def formulation_name(name: str) -> str:
+    """A formulation and its variant, as tables of the pages write it."""
+    word, _, variant = name.partition(" ")
+    return f"`{word}` {variant}".strip()
 
 
 def formulations() -> Sequence[str]:
@@ -281,56 +287,43 @@ def formulations() -> Sequence[str]:
         pairs = table.merge(mixed[column].rename(f"{column} of mixed"), left_on=key, right_index=True)
         ratios[column] = pairs[column] / pairs[f"{column} of mixed"]
     own, of = table["training"] == "own", table["formulation"]
-    mcpg, kind = table["dual"] == "mcpg", of.str.split().str[0]
-
-    def times(name: str, chosen: pd.Series | bool = True) -> str:
-        return span(ratios["online_s"][own & (kind == name) & chosen])
-
-    def errors(names: Sequence[str], chosen: pd.Series) -> str:
-        return span(ratios["error_lambda_mean"][own & kind.isin(names) & chosen])
-
-    def beside(column: str, *names: str) -> str:
-        return span(ratios[column][own & (kind.isin(names) | of.isin(names))])
-
-    same = ("penalty", "proximal", "sparse-dictionary")
-    added = ratios["offline_s"][own & kind.isin(same)].max() - 1.0
-    fastest = table[own].loc[table[own].groupby("problem")["online_s"].idxmin()]
+    mcpg = table["dual"] == "mcpg"
+    beside = []
+    for name in sorted(set(of) - {"mixed"}):
+        mine = own & (of == name)
+        parts = [(column, mine & cone) for column in ("online_s", "error_lambda_mean") for cone in (mcpg, ~mcpg)]
+        parts += [("offline_s", mine), ("violation_max", mine)]
+        beside.append([formulation_name(name), *(span(ratios[column][chosen]) for column, chosen in parts)])
+    same = own & of.isin(["penalty", "proximal", "sparse-dictionary"])
+    assert ratios["error_lambda_mean"][same & mcpg].max() < 1.15
+    assert ratios["offline_s"][same].max() < 1.0015
+    assert ratios["online_s"][own & of.str.startswith("hyper-reduced")].min() > 0.8
+    fastest = table[own].loc[table[own].groupby("problem")["online_s"].idxmin()].set_index("problem")
     assert set(fastest["formulation"]) == {"regression (radial)"}
     errors_of = table.pivot_table(index=["formulation", "problem", "dual", "pod_tol"], columns="training",
                                   values="error_lambda_mean")  # fmt: skip
     grown = np.log(errors_of[["half", "inner"]].div(errors_of["own"], axis=0))
     growth = np.exp(grown.groupby(level=["formulation", "problem"]).mean()).reset_index("problem", drop=True)
-    regression = growth[growth.index.str.startswith("regression")]
+    kinds, told = growth.groupby(growth.index.str.split().str[0]), ("mixed", "local", "regression")
     levels, *_ = page_tables("formulations")
     (compiled,) = [table for table in page_tables("formulations") if "query / compiled" in table]
     best = levels.groupby("problem").last()
-    places = {"hertz": "Hertz contact", "obstacle": "the obstacle", "bearing": "the bearing", "american-put": "the put"}
-    least = (places[problem] + best["smallest error"].map(" ({:.2g})".format)[problem] for problem in places)
-    winners = pd.Series(list(least), best["formulation"][list(places)]).groupby(level=0).agg(" and ".join)
+    problems = {"obstacle": "obstacle", "hertz": "Hertz", "bearing": "bearing", "american-put": "American put"}
     return (
-        ", and of ".join(
-            f"`{name.replace(' (', '` (')}{'' if '(' in name else '`'} on {at}" for name, at in winners.items()
+        table_rows(
+            [
+                label,
+                f"{100.0 * fastest['error_lambda_mean'][problem]:.2g} %",
+                f"{formulation_name(best['formulation'][problem])}, `{best['dual'][problem]}`",
+                f"{100.0 * best['smallest error'][problem]:.2g} %",
+            ]
+            for problem, label in problems.items()
         ),
-        f"queries of `mixed` are {span(pd.to_numeric(compiled['query / compiled']).dropna())} times as fast",
-        f"{of.str.split().str[0].nunique()} formulations, {len(table)} cells".replace("7 ", "seven "),
-        f"has the fastest queries on all four problems, with errors of λ of {span(fastest['error_lambda_mean'])}",
-        f"have {errors(same, mcpg)} times the errors of λ of `mixed` with `mcpg`, and {errors(same, ~mcpg)} times with",
-        f"take {times(same[0])}, {times(same[1])} and, with `mcpg`, {times(same[2], mcpg)} times as long",
-        f"`sparse-dictionary` takes {times(same[2], ~mcpg)} times as long",
-        f"`local` takes {times('local')} times as long as `mixed` in the same cell, with "
-        f"{errors(['local'], mcpg | ~mcpg)} times its errors",
-        f"`hyper-reduced` has {errors(['hyper-reduced'], mcpg)} times its errors of λ with `mcpg`, "
-        f"{errors(['hyper-reduced'], ~mcpg)} times with a dictionary, and takes {times('hyper-reduced')} times as long",
-        f"grow by factors of {span(growth.loc['mixed', 'inner'])}, those of `regression` of "
-        f"{span(regression['inner'])}",
-        f"with half of the solutions, of {span(growth.loc['mixed', 'half'])} and {span(regression['half'])}",
+        f"{span(pd.to_numeric(compiled['query / compiled']).dropna())} times as fast",
+        f"{of.str.split().str[0].nunique()} formulations and {len(table)} cells".replace("7 ", "seven "),
+        table_rows(beside),
+        table_rows([f"`{name}`", *map(span, (some["inner"], some["half"]))] for name, some in kinds if name in told),
         f"in {table['queries'].sum():,} queries",
-        f"radial basis functions {beside('offline_s', 'regression (radial)')} times, with Gaussian processes "
-        f"{span(ratios['offline_s'][own & (of == 'regression')])}; `local` {beside('offline_s', 'local')}, "
-        f"`hyper-reduced` {beside('offline_s', 'hyper-reduced')}; the others add at most {100 * added:.1g} %",
-        f"`hyper-reduced` {beside('violation_max', 'hyper-reduced')} times that of `mixed`, `local` "
-        f"{beside('violation_max', 'local')}, `regression` {beside('violation_max', 'regression')}, the others "
-        f"{beside('violation_max', *same)}",
     )
 
 
@@ -339,43 +332,29 @@ def break_evens() -> Sequence[str]:
     table = pd.read_csv(ROOT / "results" / "formulations" / "thresholds.csv")
     assert (table["formulation_a"] == "mixed").all()
     assert set(table.groupby("formulation_b").size()) == {16}
-    of, meaning, kind = table["formulation_b"], table["meaning"], table["formulation_b"].str.split().str[0]
-
-    def some(chosen: pd.Series, name: str) -> int:
-        return int((chosen & (meaning == name)).sum())
-
-    def number(chosen: pd.Series, name: str) -> str:
-        numbers = table["benefit_threshold"][chosen & (meaning == name)]
-        return " to ".join(dict.fromkeys(f"{end:.0f}" for end in (numbers.min(), numbers.max()))) + " queries"
-
-    def tally(chosen: pd.Series) -> str:
-        words = {"from": "from some query on", "until": "until some query"}
-        return ", ".join(
-            f"{words.get(name, name)} in {count}" for name, count in meaning[chosen].value_counts().items()
-        )
-
-    processes, contact = of == "regression", of == "local (contact sets)"
-    sparse, hyper, undecided = of == "sparse-dictionary", kind == "hyper-reduced", meaning == "undecided"
-    cones = set(table["dual"][sparse & (meaning == "never")])
+    of, meaning = table["formulation_b"], table["meaning"]
+    verdicts = ("at once", "from", "until", "as fast", "undecided", "never")
+    assert set(meaning) == set(verdicts)
+    rows = []
+    for name, mine in table.groupby("formulation_b"):
+        counts = mine["meaning"].value_counts().reindex(verdicts, fill_value=0)
+        numbers = mine["benefit_threshold"][mine["meaning"] == "from"]
+        starts = " to ".join(dict.fromkeys(f"{end:.0f}" for end in (numbers.min(), numbers.max())))
+        rows.append([formulation_name(name), *counts[:2], starts if len(numbers) else "–", *counts[2:]])
+    assert (meaning[of == "regression (radial)"] == "at once").all()
+    assert (meaning[of == "proximal"] == "never").all()
+    assert set(table["dual"][(of == "sparse-dictionary") & (meaning == "never")]) == {"mcpg"}
+    hyper, undecided = of.str.startswith("hyper-reduced"), meaning == "undecided"
     offline = undecided & table["rounds_missing"].isna()
     others = table[undecided & ~offline]
     timed = pd.read_csv(ROOT / "results" / "formulations" / "cells.csv").set_index("cell").loc[others["cell_b"]]
-    missing, done = others["rounds_missing"].to_numpy(), timed["timed_rounds"].to_numpy()
+    missing = others["rounds_missing"].to_numpy()
     (most,) = timed["timing_rounds"].unique()
     return (
-        f"radial basis functions is cheaper at once in {some(of == 'regression (radial)', 'at once')} of 16;",
-        f"whose training takes longer, at once in {some(processes, 'at once')} and from {number(processes, 'from')} on "
-        f"in {some(processes, 'from')}",
-        f"is cheaper from {number(of == 'local', 'from')} on in {some(of == 'local', 'from')} of 16, with contact sets "
-        f"from {number(contact, 'from').removesuffix(' queries')} in {some(contact, 'from')} of 16",
-        f"from at most {table['benefit_threshold'][sparse].max():.0f} queries on in {some(sparse, 'from')}, never in "
-        f"{some(sparse, 'never')}{', all with `mcpg`' * (cones == {'mcpg'})}",
-        f"{tally(hyper)}",
-        f"{undecided.sum()} of the {len(table)} pairs are undecided, {(undecided & hyper).sum()} of them of `hyper",
-        f"In {offline.sum()} of the {undecided.sum()} the offline seconds are too close, which no further rounds would "
-        f"change; the others would need {span(missing)} rounds more (`rounds_missing`) after {span(done)}, of which "
-        f"{most} are permitted,",
-        *(tally(of == name) for name in ("penalty", "proximal")),
+        table_rows(rows),
+        f"{undecided.sum()} of the {len(table)} pairs are undecided, {(undecided & hyper).sum()} of them of",
+        f"In {offline.sum()} the offline seconds are too close, and further rounds would not change that. The others "
+        f"need {span(missing)} more rounds than they had (`rounds_missing`), where {most} are permitted",
     )
 
 
