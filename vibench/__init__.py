@@ -6,6 +6,7 @@ algorithms and figures are in the submodules of `GROUPS`. A name is imported whe
 """
 
 from importlib import import_module
+from types import FunctionType
 
 import lazy_loader
 
@@ -16,7 +17,7 @@ _attached, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> object:
-    """A public name.
+    """A public name; of a function the one that checks its arguments.
 
     Raises an `ImportError` that names the submodule if a submodule has it: `from vibench import NAME` would not show
     the message of an `AttributeError`.
@@ -25,4 +26,7 @@ def __getattr__(name: str) -> object:
         for group in GROUPS:
             if name in import_module(f"vibench.{group}").__all__:
                 raise ImportError(f"'{name}' is in vibench.{group}: from vibench.{group} import {name}")
-    return _attached(name)
+    found = _attached(name)
+    if isinstance(found, FunctionType):
+        globals()[name] = found = import_module("vibench.signatures").public(found, __name__)
+    return found

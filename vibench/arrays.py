@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from hashlib import sha256
 from numbers import Integral
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from vibench.errors import NumericalError
+from vibench.signatures import Rule, is_plain
 
 Array: TypeAlias = NDArray[np.float64]
 """A dense array of floats; the docstring of its user gives the shape."""
@@ -21,7 +22,13 @@ Indices: TypeAlias = NDArray[np.intp]
 Mask: TypeAlias = NDArray[np.bool_]
 """A vector of truth values."""
 
-SparseMatrix: TypeAlias = Any
+
+def _is_matrix(value: Any) -> bool:
+    is_matrix = (sp.issparse(value) or is_plain(value)) and value.ndim == 2 and value.dtype.kind in "fiub"
+    return is_matrix and bool(np.isfinite(sp.coo_array(value).data if sp.issparse(value) else value).all())
+
+
+SparseMatrix: TypeAlias = Annotated[Any, Rule("a matrix of finite real numbers", _is_matrix)]
 """A SciPy sparse array or matrix (SciPy ships no types)."""
 
 

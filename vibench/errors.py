@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import difflib
-import functools
-import inspect
 import typing
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from vibench.text import brief, one_line
+from vibench.text import shown as in_words
 
 if TYPE_CHECKING:
-    from pydantic import BaseModel, TypeAdapter, ValidationError
+    from pydantic import BaseModel, ValidationError
 
 
 class VibenchError(Exception):
@@ -85,58 +83,6 @@ def at_parameter(mu: Any) -> Iterator[None]:
         raise NumericalError(f"at {where}: {in_a_line(error)}") from error
 
 
-P = ParamSpec("P")
-T = TypeVar("T")
-
-
-def requested(function: Callable[P, T]) -> Callable[P, T]:
-    """Check the arguments of a public function against their annotations, by a `RequestError`; nothing is converted.
-
-    Arguments that the function does not have remain a `TypeError`, as Python's own.
-    """
-    signature = inspect.signature(function)
-
-    @functools.wraps(function)
-    def call(*arguments: P.args, **named: P.kwargs) -> T:
-        from pydantic import ValidationError  # noqa: PLC0415  slow to import
-
-        for name, value in signature.bind(*arguments, **named).arguments.items():
-            # In strict mode pydantic refuses scalars of NumPy.
-            is_scalar = type(value).__module__ == "numpy" and getattr(value, "shape", None) == ()
-            try:
-                if name != "self":
-                    _adapters(function)[name].validate_python(value.item() if is_scalar else value)
-                # No path and no name holds this character.
-                fits = not (isinstance(value, str) and "\0" in value)
-            except ValidationError:
-                fits = False
-            if not fits:
-                expected = str(signature.parameters[name].annotation)
-                shown = brief(repr(value), 80)
-                raise RequestError(f"{name} of {function.__qualname__} is {shown}, expected {expected}")
-        return function(*arguments, **named)
-
-    return call
-
-
-@functools.cache
-def _adapters(function: Callable[..., Any]) -> dict[str, TypeAdapter[Any]]:
-    """Validators of the arguments of a function, by name; an instance of a model or dataclass passes as it is."""
-    from dataclasses import is_dataclass  # noqa: PLC0415
-
-    from pydantic import BaseModel, ConfigDict, InstanceOf, TypeAdapter  # noqa: PLC0415
-
-    given = SimpleNamespace(__annotations__={k: v for k, v in function.__annotations__.items() if k != "return"})
-    hints = typing.get_type_hints(given, function.__globals__, include_extras=True)
-    config = ConfigDict(strict=True, arbitrary_types_allowed=True)
-    return {
-        name: TypeAdapter(InstanceOf[hint])  # type: ignore[misc,valid-type]
-        if isinstance(hint, type) and (issubclass(hint, BaseModel) or is_dataclass(hint))
-        else TypeAdapter(hint, config=config)
-        for name, hint in hints.items()
-    }
-
-
 def unknown_name(kind: str, name: str, choices: Iterable[str]) -> RequestError:
     """Error for a name that is not among the choices, which suggests the nearest of them."""
     choices = sorted(choices)
@@ -160,7 +106,7 @@ def fault_line(fault: ValidationError, root: type[BaseModel], named: Collection[
     # Parts with brackets are validators and types of unions, no keys.
     where = [part for part in outer if isinstance(part, int) or not {*"<["} & {*part}]
     message = error["msg"].removeprefix("Value error, ")
-    shown = f" (found {error['input']!r:.80})" if isinstance(error["input"], str | int | float) else ""
+    shown = f" (found {in_words(error['input'])})" if isinstance(error["input"], str | int | float) else ""
     match error["type"]:
         case "extra_forbidden":
             fields = _model_at(root, where).model_fields

@@ -54,6 +54,14 @@ def brief(text: str, longest: int = LONGEST) -> str:
     return _cut(printable(text[:longest]), len(text), longest)
 
 
+def shown(value: object) -> str:
+    """A value in a line of bounded length, whatever its own representation does."""
+    try:
+        return f"the class {value.__qualname__}" if isinstance(value, type) else brief(repr(value), 80)
+    except Exception:  # noqa: BLE001  `__repr__` of a stranger may raise anything
+        return f"a {type(value).__name__}"
+
+
 def one_line(text: str) -> str:
     """An `unbroken` text of at most `LONGEST` characters, cut as a `brief` one."""
     return _cut(unbroken(text[:LONGEST]), len(text), LONGEST)

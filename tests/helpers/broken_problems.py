@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from fake_plugins import Wire
 
 import vibench
-from vibench import Array, Contact, InnerProduct, MeshFields, Output, ParameterBox, Picture, VariationalInequality
+from vibench import Array, Contact, InnerProduct, MeshFields, Output, Picture, VariationalInequality
 
 
 class Declared(Wire):
@@ -97,8 +97,6 @@ OtherValidation = _variant(
         count, int(np.random.default_rng().integers(2**31))
     ),
 )
-BackwardsBox = _variant("BackwardsBox", parameters=ParameterBox(("force",), np.array([8.0]), np.array([4.0]), ("N/m",)))
-NamedByText = _variant("NamedByText", parameters=ParameterBox("force", np.array([4.0]), np.array([8.0]), ("N/m",)))  # type: ignore[arg-type]
 OutputsOfOneName = _variant(
     "OutputsOfOneName",
     outputs=property(

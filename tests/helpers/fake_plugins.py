@@ -16,7 +16,8 @@ from annotated_types import Ge, Le
 
 from vibench import Array, Indices, InnerProduct, ParameterBox, Problem, QPSolution, Sampler, VariationalInequality
 from vibench.interfaces.strategies import Cone, DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, Stop
-from vibench.offline.checked_tools import greedy_cone, solve_qp
+from vibench.qp.solve import solve_qp
+from vibench.reduction.cones import greedy_cone
 
 
 class Wire(Problem):

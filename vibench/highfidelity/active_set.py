@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import scipy.sparse as sp
@@ -22,6 +23,7 @@ from vibench.qp import verification
 from vibench.qp.exact import Directions, least_distance_solution, rows_that_matter
 from vibench.qp.scaling import peak, ratio, row_norms
 from vibench.qp.solve import solve_qp
+from vibench.signatures import bordered
 
 # Largest natural residual of a snapshot (`vibench.qp.verification`).
 ACCURACY = 1e-10
@@ -47,6 +49,7 @@ class HighFidelitySolution(ActiveSetSolution):
     residuals: verification.Residuals
 
 
+@bordered
 class HighFidelitySolver:
     """Solves one problem at many parameters, each from the contact set of the nearest one solved, or its `start`.
 
@@ -71,7 +74,7 @@ class HighFidelitySolver:
         self._solved: list[Array] = []
         self._active: list[Mask] = []
 
-    def solve(self, mu: Array, vi: VariationalInequality | None = None) -> HighFidelitySolution:
+    def solve(self, mu: Annotated[Array, "d"], vi: VariationalInequality | None = None) -> HighFidelitySolution:
         """Assemble and solve at mu (d,), or solve what has been assembled there.
 
         Raises a `NumericalError` if the assembly is invalid, the solution does not reach `ACCURACY`, the problem
@@ -82,7 +85,7 @@ class HighFidelitySolver:
         self.remember(mu, solution)
         return solution
 
-    def solve_assembled(self, mu: Array, vi: VariationalInequality) -> ActiveSetSolution:
+    def solve_assembled(self, mu: Annotated[Array, "d"], vi: VariationalInequality) -> ActiveSetSolution:
         """Solve the variational inequality `vi` assembled at mu (d,); unless remembered, no other starts from it.
 
         Raises a `NumericalError` that names mu, and what A lacks if that is the cause.
@@ -108,7 +111,7 @@ class HighFidelitySolver:
                 raise NumericalError(reason)
             return solution
 
-    def remember(self, mu: Array, solution: ActiveSetSolution) -> None:
+    def remember(self, mu: Annotated[Array, "d"], solution: ActiveSetSolution) -> None:
         """Let later solutions start from the contact set of this one, at mu (d,)."""
         self._solved.append(mu)
         self._active.append(solution.lam > 0.0)
@@ -168,7 +171,9 @@ class HighFidelitySolver:
 
 
 def solve_high_fidelity(
-    vi: VariationalInequality, stiffness: CondensedStiffness | None = None, start: Mask | None = None
+    vi: VariationalInequality,
+    stiffness: CondensedStiffness | None = None,
+    start: Annotated[Mask, "m"] | None = None,
 ) -> HighFidelitySolution:
     """Solve one variational inequality, with sparse A and B, to `ACCURACY`; see `HighFidelitySolver`.
 

@@ -21,6 +21,7 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices, SparseMatrix, frozen, read_only, real_vector
 from vibench.errors import NumericalError, RequestError, unknown_name
 from vibench.interfaces.absent_rows import ABSENT, is_absent
+from vibench.signatures import bordered, constructed
 from vibench.text import normal_name
 
 CONSTANTS: Mapping[str, float] = {"pi": math.pi, "e": math.e}
@@ -205,6 +206,7 @@ class Thetas:
         return np.array([theta(mu) if callable(theta) else theta for theta in self.functions], float)
 
 
+@constructed
 @dataclass(frozen=True)
 class AffineSum:
     """A member Σ_q θ_q(mu) · terms_q of a variational inequality.
@@ -237,6 +239,7 @@ class AffineSum:
             object.__setattr__(self, "terms", tuple(frozen(copy(term)) for term in self.terms))
 
     @classmethod
+    @bordered
     def of(cls, pairs: Sequence[tuple[Theta, Any]], names: Sequence[str]) -> AffineSum:
         """The sum of pairs (θ_q, term_q); expressions are in these names of the parameters.
 
@@ -281,11 +284,13 @@ class AffineSum:
         data = np.concatenate([term.data for term in coo])
         return pattern, sp.csr_array((data, (places, number)), shape=(len(keys), len(coo)))
 
+    @bordered
     def entries(self, rows: Indices, columns: Indices) -> Callable[[Array], Array]:
         """Function that evaluates these entries (k,) at mu; `columns` is not used for vectors."""
         values = np.stack([entries_of(term, rows, columns) for term in self.terms], axis=-1)
         return lambda mu: np.asarray(values @ self.coefficients(mu))
 
+    @bordered
     def mapped(self, change: Callable[[Any], Any]) -> AffineSum:
         """The sum with a linear map applied to every term."""
         return AffineSum(tuple(change(term) for term in self.terms), self.thetas)

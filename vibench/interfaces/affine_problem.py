@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
@@ -13,6 +13,7 @@ from vibench.arrays import Array, Indices, real_matrix, real_vector
 from vibench.errors import NumericalError
 from vibench.interfaces.affine import AffineSum, Theta, Thetas
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
+from vibench.signatures import bordered
 
 Declaration: TypeAlias = Any | Sequence[tuple[Theta, Any]] | AffineSum
 """A constant matrix or vector, the pairs (θ_q, term_q) of an affine sum, or the sum."""
@@ -27,6 +28,7 @@ class AffineProblem(Problem):
     full and reduced, follows: reduced assembly uses the terms and is exact, without interpolation.
     """
 
+    @bordered
     def declare(
         self,
         *,
@@ -34,7 +36,7 @@ class AffineProblem(Problem):
         f: Declaration,
         B: Declaration,
         g: Declaration,
-        free: Indices | None = None,
+        free: Annotated[Indices, "n"] | None = None,
         dirichlet_lift: Declaration | None = None,
     ) -> None:
         """Declare the members.

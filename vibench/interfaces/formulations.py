@@ -22,12 +22,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, ClassVar, Protocol, TypeAlias
+from typing import Annotated, Any, ClassVar, Protocol, TypeAlias
 
 from vibench.arrays import Array
 from vibench.errors import RequestError
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment, PrimalStrategy, Stop
+from vibench.signatures import bordered
 
 # The layers above define these classes; nothing here imports them.
 AssemblingModel: TypeAlias = Any
@@ -39,6 +40,7 @@ AXES = ("pod", "dual", "primal", "solvers", "accuracy", "assembly")
 """The axes of a study that a formulation may have; it is not repeated over those that it does not have."""
 
 
+@bordered
 @dataclass(frozen=True)
 class Snapshots:
     """High-fidelity solutions at some parameters.
@@ -53,9 +55,9 @@ class Snapshots:
         Reasons why other training parameters have no solution and are left out; each names its parameter.
     """
 
-    mu: Array
-    u: Array
-    lam: Array
+    mu: Annotated[Array, "P", "d"]
+    u: Annotated[Array, "n", "P"]
+    lam: Annotated[Array, "m", "P"]
     skipped: tuple[str, ...] = field(default=(), kw_only=True)
 
 

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from vibench.arrays import Array, Indices
-from vibench.errors import NumericalError, in_a_line
+from vibench.errors import NumericalError, RequestError, in_a_line
+from vibench.signatures import constructed
 
 OutputFunction = Callable[[Array, Array, Array], float]
 """From a parameter mu (d,) and a solution u (n,), λ (m,) to a number."""
 
 
+@constructed
 @dataclass(frozen=True)
 class Output:
     """A quantity of interest s: linear, s = uᵀ`u` + λᵀ`lam`, or else any function of (mu, u, λ).
@@ -31,13 +33,13 @@ class Output:
 
     name: str
     unit: str
-    u: Array | None = None
-    lam: Array | None = None
+    u: Annotated[Array, "n"] | None = None
+    lam: Annotated[Array, "m"] | None = None
     function: OutputFunction | None = None
 
     def __post_init__(self) -> None:
         if self.linear == (self.function is not None):
-            raise ValueError(f"the output '{self.name}' has either coefficients of u and λ, or a function")
+            raise RequestError(f"the output '{self.name}' has either coefficients of u and λ, or a function")
 
     @property
     def linear(self) -> bool:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from vibench.arrays import Array, Mask
 from vibench.errors import RequestError, unknown_name
+from vibench.signatures import Count, Seed, bordered
 from vibench.text import normal_name
 
 
+@bordered
 @dataclass(frozen=True)
 class ParameterBox:
     """The parameter domain D: a box.
@@ -28,11 +31,15 @@ class ParameterBox:
         The only parameters (L×d) at which the problem can be assembled; `None` if it can be everywhere in the box.
     """
 
-    names: tuple[str, ...]
-    lower: Array
-    upper: Array
-    units: tuple[str, ...]
-    listed: Array | None = None
+    names: Annotated[tuple[str, ...], "d"]
+    lower: Annotated[Array, "d"]
+    upper: Annotated[Array, "d"]
+    units: Annotated[tuple[str, ...], "d"]
+    listed: Annotated[Array, "L", "d"] | None = None
+
+    def __post_init__(self) -> None:
+        if (self.lower > self.upper).any():
+            raise RequestError(f"lower bounds {self.lower.tolist()} are above the upper ones {self.upper.tolist()}")
 
     @property
     def dim(self) -> int:
@@ -45,23 +52,23 @@ class ParameterBox:
         # A parameter that does not vary is measured by its size, one near zero by 1.
         return np.where(self.upper > self.lower, self.upper - self.lower, np.maximum(np.abs(self.lower), 1.0))
 
-    def grid(self, *counts: int) -> Array:
+    def grid(self, *counts: Count) -> Array:
         """Regular grid (P×d) with `counts` points per direction; the last parameter varies fastest."""
+        if len(counts) != self.dim:
+            raise RequestError(f"{len(counts)} counts of a grid for {self.dim} parameters, expected one for each")
         axes = [np.linspace(a, b, k) for a, b, k in zip(self.lower, self.upper, counts, strict=True)]
         return np.stack([m.ravel() for m in np.meshgrid(*axes, indexing="ij")], axis=1)
 
-    def sample(self, count: int, seed: int) -> Array:
+    def sample(self, count: Count, seed: Seed) -> Array:
         """`count` uniform random points (count×d), the same for the same seed."""
         uniform = np.random.default_rng(seed).random((count, self.dim))
         return np.asarray(self.lower + uniform * (self.upper - self.lower))
 
-    def outside(self, mus: Array) -> Mask:
+    def outside(self, mus: Annotated[Array, "…", "d"]) -> Mask:
         """Which components of points (…×d) lie outside the box, by more than round-off."""
-        # Bounds and parameters are often computed, or read from decimals: the last digits must not refuse one.
-        slack = 1e-12 * np.maximum(np.abs(self.lower), np.abs(self.upper))
-        return np.asarray((mus < self.lower - slack) | (mus > self.upper + slack))
+        return outside(self, mus)
 
-    def from_unit(self, unit: Array, log: Sequence[str] = ()) -> Array:
+    def from_unit(self, unit: Annotated[Array, "P", "d"], log: Sequence[str] = ()) -> Array:
         """The points (P×d) of the box at the places `unit` (P×d) of the unit cube, some parameters on a log scale.
 
         Raises a `RequestError` if `log` names no parameter, or one whose lower bound is not positive.
@@ -73,7 +80,7 @@ class ParameterBox:
             linear[:, i] = np.clip(np.exp(low + unit[:, i] * (high - low)), self.lower[i], self.upper[i])
         return linear
 
-    def to_unit(self, mus: Array) -> Array:
+    def to_unit(self, mus: Annotated[Array, "…", "d"]) -> Array:
         """The places (…×d) of points (…×d) in the unit cube; the inverse of `from_unit` without `log`."""
         return np.asarray((mus - self.lower) / self.widths)
 
@@ -92,3 +99,10 @@ class ParameterBox:
         if normal_name(name) not in known:
             raise unknown_name("parameter", name, self.names)
         return known[normal_name(name)]
+
+
+def outside(box: ParameterBox, mus: Array) -> Mask:
+    """As `ParameterBox.outside`, of parameters that are known to be some."""
+    # Bounds and parameters are often computed, or read from decimals: the last digits must not refuse one.
+    slack = 1e-12 * np.maximum(np.abs(box.lower), np.abs(box.upper))
+    return np.asarray((mus < box.lower - slack) | (mus > box.upper + slack))

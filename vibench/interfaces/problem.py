@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
@@ -21,6 +21,7 @@ from vibench.interfaces.outputs import MeshFields, Output, Picture
 from vibench.interfaces.parameters import ParameterBox
 from vibench.linalg.factorisations import DEFAULT
 from vibench.linalg.inner_product import InnerProduct
+from vibench.signatures import Rule, bordered
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,10 @@ class VariationalInequality:
         Lifting of inhomogeneous Dirichlet data, added to u in pictures only; `None` for homogeneous data.
     """
 
-    A: SparseMatrix
-    f: Array
-    B: SparseMatrix
-    g: Array
+    A: Annotated[SparseMatrix, "n", "n"]
+    f: Annotated[Array, "n"]
+    B: Annotated[SparseMatrix, "m", "n"]
+    g: Annotated[Array, "m"]
     dirichlet_lift: Array | None = None
 
     def __post_init__(self) -> None:
@@ -127,9 +128,9 @@ class Problem(ABC):
 
     parameters: ParameterBox
     """Names, bounds and units of the parameters."""
-    V: InnerProduct
+    V: Annotated[InnerProduct, "n"]
     """Inner product of the primal space, X_V (n×n), independent of the parameter."""
-    W: InnerProduct
+    W: Annotated[InnerProduct, "m"]
     """Inner product of the multiplier space, X_W (m×m), in a basis whose nonnegative coefficients are the cone W⁺."""
     constant: ClassVar[frozenset[str]] = frozenset()
     """Members of `VariationalInequality`, "A", "f", "B" or "g", that do not depend on mu."""
@@ -281,6 +282,10 @@ class Problem(ABC):
         return {}
 
 
+Points = Annotated[Array, Rule("points (dim×m)", lambda points: points.ndim in (1, 2))]
+
+
+@bordered
 class NestedStart:
     """A problem on a coarser mesh, whose contact set is the initial one at the constraints of a finer mesh.
 
@@ -297,7 +302,7 @@ class NestedStart:
         Places of the constraints (dim×M) and (dim×m), one for each row of B, on one reference domain.
     """
 
-    def __init__(self, coarse: Problem, coarse_points: Array, points: Array) -> None:
+    def __init__(self, coarse: Problem, coarse_points: Points, points: Points) -> None:
         self.coarse, self._coarse_points, self._points = coarse, np.atleast_2d(coarse_points), np.atleast_2d(points)
 
     @cached_property

@@ -10,8 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from numbers import Integral, Real
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
@@ -20,9 +19,10 @@ from vibench.errors import RequestError
 from vibench.interfaces.parameters import ParameterBox
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.linalg.inner_product import InnerProduct
-from vibench.text import brief
+from vibench.signatures import Count, NotNegative, bordered, constructed
 
 
+@constructed
 @dataclass(frozen=True)
 class Stop:
     """Stopping criterion of a nested construction: a tolerance or a prescribed size, exactly one of the two.
@@ -35,23 +35,19 @@ class Stop:
         Number of vectors.
     """
 
-    tolerance: float | None = None
-    size: int | None = None
+    tolerance: NotNegative | None = None
+    size: Count | None = None
 
     def __post_init__(self) -> None:
         if (self.tolerance is None) == (self.size is None):
             raise RequestError("a Stop has either a tolerance or a size")
-        kinds = (("tolerance", self.tolerance, Real, "a number"), ("size", self.size, Integral, "a whole number"))
-        for name, value, kind, right in kinds:
-            fine = isinstance(value, kind) and not isinstance(value, bool) and value >= 0  # NaN is not
-            if value is not None and not fine:
-                raise RequestError(f"{name} of Stop is {brief(repr(value), 80)}, expected {right} of at least 0")
 
     def reached(self, size: int, error: float) -> bool:
         """Whether a construction stops with `size` vectors and this relative error."""
         return error <= self.tolerance if self.tolerance is not None else size >= (self.size or 0)
 
-    def first_reached(self, errors: Array) -> int | None:
+    @bordered
+    def first_reached(self, errors: Annotated[Array, "k"]) -> int | None:
         """Smallest k at which `errors[k]`, the error with k vectors, meets the criterion; `None` if there is none."""
         return next((k for k, error in enumerate(errors) if self.reached(k, float(error))), None)
 
@@ -59,6 +55,7 @@ class Stop:
         return f"tolerance {self.tolerance:g}" if self.tolerance is not None else f"size {self.size}"
 
 
+@bordered
 @dataclass(frozen=True)
 class Cone:
     """A reduced multiplier cone K_R = { χ α : α ≥ 0 } (paper, equation (12)).
@@ -75,9 +72,9 @@ class Cone:
         One line for every step that deviates from the algorithm.
     """
 
-    generators: Array
-    errors: Array
-    free: Mask
+    generators: Annotated[Array, "m", "R"]
+    errors: Annotated[Array, "k"]
+    free: Annotated[Mask, "R"]
     fallbacks: tuple[str, ...] = ()
 
     @property
@@ -110,6 +107,7 @@ class Kind(StrEnum):
     PER_PARAMETER = "per-parameter"
 
 
+@bordered
 @dataclass(frozen=True)
 class Offline:
     """The offline data of a primal strategy.
@@ -130,16 +128,17 @@ class Offline:
     """
 
     problem: Problem
-    basis: Array
+    basis: Annotated[Array, "n", "N"]
     cone: Cone
-    span: Array
-    training: Array
+    span: Annotated[Array, "m", "rank"]
+    training: Annotated[Array, "P", "d"]
 
 
 Supply = Callable[[InnerProduct, VariationalInequality, Array], Array]
 """Vectors (n×k) at one parameter, from V, the assembled forms and `Offline.span`; in the strategy's module."""
 
 
+@bordered
 @dataclass(frozen=True)
 class Enrichment:
     """The vectors that a primal strategy adds to V_N.
@@ -161,17 +160,17 @@ class Enrichment:
     """
 
     kind: Kind
-    vectors: Array | None = None
-    eta: Array | None = None
+    vectors: Annotated[Array, "n", "S"] | None = None
+    eta: Annotated[Array, "m", "k"] | None = None
     supply: Supply | None = None
-    history: Mapping[str, Array] = field(default_factory=dict)
+    history: Mapping[str, Annotated[Array, "k"]] = field(default_factory=dict)
     fallbacks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if (self.vectors is not None) != (self.kind is Kind.FIXED):
-            raise ValueError("a fixed enrichment, and no other, has vectors")
+            raise RequestError("a fixed enrichment, and no other, has vectors")
         if (self.supply is not None) + (self.eta is not None) != (self.kind is Kind.PER_PARAMETER):
-            raise ValueError("a per-parameter enrichment, and no other, has either eta or a supply")
+            raise RequestError("a per-parameter enrichment, and no other, has either eta or a supply")
 
 
 class PrimalStrategy(ABC):
@@ -194,7 +193,7 @@ def rays(generators: Array, free: Mask) -> Array:
     return np.hstack([generators, -generators[:, free]])
 
 
-def no_free(count: int) -> Mask:
+def no_free(count: Count) -> Mask:
     """The `free` mask (count,) of an ordinary cone."""
     return np.zeros(count, dtype=bool)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -48,7 +48,9 @@ def check_cone(cone: object, W: InnerProduct) -> Cone:
     return Cone(chi, errors, cone.free.copy(), tuple(map(str, cone.fallbacks)))
 
 
-def check_enrichment(enrichment: object, V: InnerProduct, basis: Array) -> Enrichment:
+def check_enrichment(
+    enrichment: object, V: Annotated[InnerProduct, "n"], basis: Annotated[Array, "n", "N"]
+) -> Enrichment:
     """A copy of an enrichment; refused if fixed vectors are not finite, orthonormal in V and orthogonal to V_N."""
     if not isinstance(enrichment, Enrichment):
         raise NumericalError(f"the primal strategy returned a {type(enrichment).__name__}, expected an Enrichment")
@@ -101,7 +103,7 @@ def settled(vi: VariationalInequality) -> VariationalInequality:
     return vi if g is vi.g else replace(vi, g=g)
 
 
-def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
+def checked_assembly(problem: Problem, mu: Annotated[Array, "d"]) -> VariationalInequality:
     """`problem.assemble(mu)` in sparse matrices and vectors of float64.
 
     Raises a `NumericalError`, with mu, the member, the fault and the expected value, if it fails, shapes are wrong,

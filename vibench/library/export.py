@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from vibench.arrays import Array, Indices
-from vibench.errors import RequestError, requested
+from vibench.errors import RequestError
 from vibench.files import write_atomically, writing
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import MEMBERS, Problem
@@ -31,6 +31,7 @@ from vibench.offline.models import Model
 from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, InaccurateError, declared_terms, member_polynomials
 from vibench.provenance import distribution_version
 from vibench.qp.settings import SETTINGS
+from vibench.signatures import Count, Share, bordered
 from vibench.study.cells import Cell
 
 
@@ -54,12 +55,12 @@ class ExportedModel:
         return max(found.error for found in (*self.members.values(), *self.thetas.values()))
 
 
-@requested
+@bordered
 def export_model(
     model: Model,
     file: Path | str,
-    tolerance: float = TOLERANCE,
-    evaluations: int = EVALUATIONS,
+    tolerance: Share = TOLERANCE,
+    evaluations: Count = EVALUATIONS,
     bases: bool = True,
     c: bool = False,
 ) -> ExportedModel:
@@ -88,10 +89,6 @@ def export_model(
     file = Path(file)
     if file.suffix != ".npz":
         raise RequestError(f"'{file}': the model is written as an npz file, whose name must end in .npz")
-    if not 0.0 < tolerance < 1.0:
-        raise RequestError(f"the tolerance of the interpolation is {tolerance:g}, expected a number between 0 and 1")
-    if evaluations < 1:
-        raise RequestError(f"evaluations is {evaluations}, expected a number of parameters")
     if file.parent.exists() and not file.parent.is_dir():
         raise RequestError(f"'{file.parent}' is no folder")
     # The script that is written beside exported files evaluates them without vibench.

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import pandas as pd
 
 from vibench import interrupts
-from vibench.errors import requested, unknown_name
+from vibench.errors import unknown_name
 from vibench.execution.recorded_cell import recorded_cell
 from vibench.execution.recording import REPORT
 from vibench.execution.run import Observer, Options, run_study
@@ -24,12 +24,14 @@ from vibench.results.read import cells_with_errors, in_order, read_table, result
 from vibench.results.schema import TABLES
 from vibench.results.sqlite import read_meta, study_of
 from vibench.results.verdict import Verdict, verdicts
+from vibench.signatures import Positive, bordered
 from vibench.study.spec import Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+@bordered
 class Run:
     """A run: its tables, figures and reduced models.
 
@@ -56,7 +58,6 @@ class Run:
         """Facts common to all rows: name and seed of the study, and the number of validation parameters."""
         return study_of(self.path, read_meta(self.path))
 
-    @requested
     def table(self, name: str) -> pd.DataFrame:
         """A table of the results file in the order of the axes; a `RequestError` if there is no such table."""
         if name not in TABLES:
@@ -83,8 +84,7 @@ class Run:
         """A row per pair of cells, or of the high-fidelity model and a cell: the break-even and its interval."""
         return self.table("thresholds")
 
-    @requested
-    def break_even(self, error: str = "solution", within: float | None = None) -> pd.DataFrame:
+    def break_even(self, error: str = "solution", within: Positive | None = None) -> pd.DataFrame:
         """The thresholds with the errors of both models, `error_a` and `error_b`; 0 of the high-fidelity model.
 
         Raises a `RequestError` if there is no such measure, or the largest error is not positive.
@@ -100,8 +100,9 @@ class Run:
         rows = ranking.with_errors(self.thresholds, *cells_with_errors(self.path, error))
         return rows if within is None else ranking.within(rows, within).reset_index(drop=True)
 
-    @requested
-    def best(self, queries: float | None = None, error: float | None = None, measure: str = "solution") -> pd.DataFrame:
+    def best(
+        self, queries: Positive | None = None, error: Positive | None = None, measure: str = "solution"
+    ) -> pd.DataFrame:
         """The best model of every problem: at every level of error that is reached, or within one.
 
         Raises a `RequestError` for a number that is not positive, an error without `queries`, or no such measure.
@@ -138,7 +139,6 @@ class Run:
 
         return findings(self.path)
 
-    @requested
     def figure(self, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
         """One figure of the run, to be shown or saved; the kind is "inf-sup", "convergence", "total-cost", ….
 
@@ -149,14 +149,12 @@ class Run:
 
         return draw(self.path, kind, problem, dual)
 
-    @requested
     def write_tables(self, folder: Path | str | None = None) -> list[Path]:
         """Write every table as CSV, and the summary as Markdown; into `tables` beside the results file by default."""
         target = self.path.parent / "tables" if folder is None else Path(folder)
         with writing(target):
             return show.export(self.path, target)
 
-    @requested
     def write_figures(
         self, folder: Path | str | None = None, formats: Sequence[Literal["png", "svg", "pdf"]] = ("png", "svg")
     ) -> list[Path]:
@@ -173,7 +171,6 @@ class Run:
             warnings.warn(line, stacklevel=3)
         return files
 
-    @requested
     def report(self, path: Path | str | None = None, *, figures: bool = True) -> Path:
         """Write the report, one HTML page; into the folder of the run by default. Returns its path.
 
@@ -184,7 +181,6 @@ class Run:
         target = self.path.parent / REPORT if path is None else Path(path)
         return html.write(self.path, target, figures=figures)
 
-    @requested
     def model(self, cell: str) -> Model:
         """The model of a cell, named by the beginning of its key; stages whose artefacts are missing are run again.
 
@@ -193,7 +189,6 @@ class Run:
         return recorded_cell(str(self.path), cell, self._at).model
 
 
-@requested
 def open_run(path: Path | str, *, at: Mapping[str, str] = {}) -> Run:
     """A finished run: its folder, its results file, or the name of a study that was run in this folder.
 
@@ -209,7 +204,6 @@ def open_run(path: Path | str, *, at: Mapping[str, str] = {}) -> Run:
     return Run(results_file(str(path)), {name: str(Path(place).absolute()) for name, place in at.items()})
 
 
-@requested
 def run(
     study: Study,
     out: Path | str | None = None,

@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.errors import RequestError, requested
+from vibench.errors import RequestError
 from vibench.files import write_atomically, writing
 from vibench.interfaces.outputs import MeshFields
 from vibench.offline.models import Model, Parameters
 
 
-@requested
 def export_vtu(model: Model, mu: Parameters, file: Path | str) -> Path:
     """Write u and λ of a reduced model and of the high-fidelity problem at one parameter, and their differences.
 

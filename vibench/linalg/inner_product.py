@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 import scipy.linalg
@@ -17,7 +18,8 @@ from vibench.linalg import EPS
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.definite import Factor
 from vibench.linalg.factorisations import DEFAULT, implementation
-from vibench.text import brief
+from vibench.signatures import Judged, bordered, constructed
+from vibench.text import shown
 
 RANK_RTOL = 1e-12
 """Directions below this fraction of the largest one are round-off and are dropped from every orthonormal basis."""
@@ -41,6 +43,7 @@ def factorised_later() -> Iterator[None]:
         product._solver  # noqa: B018
 
 
+@constructed
 class InnerProduct:
     """The inner product ⟨u, v⟩ = uᵀ X v of a space, X sparse symmetric positive definite (n×n).
 
@@ -53,10 +56,12 @@ class InnerProduct:
     given is not of the space.
     """
 
-    def __init__(self, matrix: SparseMatrix, name: str = "the Gram matrix", factorisation: str = DEFAULT) -> None:
+    def __init__(
+        self, matrix: Annotated[SparseMatrix, Judged], name: str = "the Gram matrix", factorisation: str = DEFAULT
+    ) -> None:
         is_matrix = (sp.issparse(matrix) or isinstance(matrix, np.ndarray)) and matrix.ndim == 2
         if not is_matrix or matrix.dtype.kind not in "fiub":
-            raise RequestError(f"{name} is {brief(repr(matrix), 80)}, expected a matrix of real numbers")
+            raise RequestError(f"{name} is {shown(matrix)}, expected a matrix of real numbers")
         self.matrix = frozen(sp.csc_array(matrix, dtype=float))
         self._name, self.factorisation = name, factorisation
         check_symmetric(self.matrix, name)
@@ -84,12 +89,13 @@ class InnerProduct:
         """The matrix X as an array."""
         return np.asarray(self.matrix.toarray())
 
+    @bordered
     def factorised_by(self, name: str) -> None:
         """Let an implementation (`vibench.linalg.factorisations`) solve with X and eliminate unknowns of it.
 
         F, which is explicit, is always SuperLU's.
         """
-        self.factorisation = name
+        self.factorisation = implementation(name).name
         self.__dict__.pop("_solver", None)
 
     @cached_property
@@ -104,8 +110,8 @@ class InnerProduct:
     def _refuse_others(self, u: Array) -> None:
         """Refuse an array without one row for each dimension of the space."""
         shape, n = getattr(u, "shape", ()), self.dim
-        if shape[:1] != (n,) or len(shape) > 2:
-            what = f"an array of the shape {shape}" if shape else brief(repr(u), 80)
+        if shape[:1] != (n,) or len(shape) > 2 or u.dtype.kind not in "fiub":
+            what = f"an array of the shape {shape}" if shape else shown(u)
             raise RequestError(f"{what} is not of a space of dimension {n}, expected the shape ({n},) or ({n}, k)")
 
     def apply(self, u: Array) -> Array:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -211,7 +211,7 @@ def project(
 
 
 def projected_members(
-    problem: Problem, Z: Array, chi: Array, left_out: Collection[str] = ()
+    problem: Problem, Z: Annotated[Array, "n", "N"], chi: Annotated[Array, "m", "R"], left_out: Collection[str] = ()
 ) -> Callable[[Array], dict[str, Array]]:
     """Return a function of mu (d,) for projections of members by name, on span Z (n×N') and the cone of χ (m×R).
 

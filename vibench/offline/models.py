@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from math import inf
 from numbers import Real
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from vibench.interfaces.formulations import (
     Outcome,
     QuerySettings,
 )
-from vibench.interfaces.parameters import ParameterBox
+from vibench.interfaces.parameters import ParameterBox, outside
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.model.bound_terms import CorrectionMode
@@ -45,14 +45,17 @@ from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers, solve_qp, takes_start
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, verify
-from vibench.text import brief, normal_name
+from vibench.signatures import Judged, Positive, Share, bordered, constructed
+from vibench.text import brief, normal_name, shown
 from vibench.timing import NO_TIME, Seconds, timed
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Parameters = Sequence[float] | Array | Mapping[str, float]
+Parameters = Annotated[Sequence[float] | Array | Mapping[str, float], Judged]
 """A parameter mu: its components in the order of `ParameterBox.names`, or by these names."""
+
+Measure = Literal["solution", "contact"]
 
 ACCURACY = 1e-7  # of formulations without an axis of accuracies
 
@@ -283,14 +286,15 @@ class Model:
             for one, whole in zip(halved, (u, lam), strict=True)
         )
 
+    @bordered
     def solve(
         self,
         mu: Parameters,
         solver: str | None = None,
-        accuracy: float | None = None,
-        tolerance: float | None = None,
+        accuracy: Share | None = None,
+        tolerance: Positive | None = None,
         corrected: bool | None = None,
-        of: str = "solution",
+        of: Measure = "solution",
     ) -> Solution:
         """Answer a query at a parameter, verify the answer, and bound its errors where the model has bounds.
 
@@ -330,22 +334,18 @@ class Model:
         return self._solution(at, assembled, assembly.cpu, settings)
 
     def _settings(
-        self, solver: str | None, accuracy: float | None, tolerance: float | None, corrected: bool | None, of: str
+        self, solver: str | None, accuracy: float | None, tolerance: float | None, corrected: bool | None, of: Measure
     ) -> _Settings:
         """The checked arguments of `solve`, with the defaults of the model."""
-        if tolerance is not None and not 0.0 < tolerance < inf:
-            raise RequestError(f"the tolerance is {tolerance:g}, expected a positive finite number")
         if tolerance is not None and self.certificate is None:
             raise RequestError("the model has no error bounds: a tolerance needs one with bounds = true")
-        if of not in {"solution", "contact"}:
-            raise RequestError(f"of is {of!r:.40}, expected 'solution' or 'contact'")
         # Corrections are made of programs: refuse a formulation without them before anything is solved.
         if corrected:
             self.reduced  # noqa: B018
         mode = self.correction if corrected is None else CorrectionMode("feasible" if corrected else "none")
         if solver is not None and self.solver is None:
             raise RequestError(f"the formulation {type(self.formulation).__name__} uses no QP solver")
-        name, own = solver or self.solver, registry.registered(PluginKind.SOLVER)
+        name, own = self.solver if solver is None else solver, registry.registered(PluginKind.SOLVER)
         if name is not None and name not in installed_solvers(own):
             if name in SETTINGS:
                 raise RequestError(f"the QP solver '{name}' is not installed")
@@ -414,14 +414,15 @@ class Model:
             found[output.name] = None if known is None else output_weights(self.problem, known, output)
         return found
 
+    @bordered
     def solve_all(
         self,
-        mus: Sequence[Sequence[float]] | Array,
+        mus: Annotated[Sequence[Sequence[float]] | Array, Judged],
         solver: str | None = None,
-        accuracy: float | None = None,
-        tolerance: float | None = None,
+        accuracy: Share | None = None,
+        tolerance: Positive | None = None,
         corrected: bool | None = None,
-        of: str = "solution",
+        of: Measure = "solution",
     ) -> pd.DataFrame:
         """A table of `solve` at parameters (P×d), a row for each: what a sample or an optimisation needs.
 
@@ -434,7 +435,7 @@ class Model:
         """
         import pandas as pd  # noqa: PLC0415  workers load models, and no tables
 
-        given = np.asarray(mus, dtype=float)
+        given = _numbers("mus", mus, f"parameters (P, {self.parameters.dim})")
         if given.ndim != 2:
             raise RequestError(f"the parameters have the shape {given.shape}, expected (P, {self.parameters.dim})")
         settings = self._settings(solver, accuracy, tolerance, corrected, of)
@@ -454,16 +455,18 @@ class Model:
                 rows.append(self._solution(at, reduced, seconds, settings).columns())
         return pd.DataFrame(rows)
 
+    @bordered
     def reconstruct(self, mu: Parameters, x: Array, alpha: Array) -> tuple[Array, Array]:
         """The solution u (n,), λ (m,) with coordinates x (N',) in the primal basis at mu and α (R,) on generators."""
         reduced = self.reduced.assemble(parameter_in(self.parameters, mu))
         sizes = {"x": (x, len(reduced.program.f)), "alpha": (alpha, self.reduced.generators.shape[1])}
         for name, (given, size) in sizes.items():
-            if np.shape(given) != (size,) or np.asarray(given).dtype.kind not in "fiu":
-                raise RequestError(f"{name} is {brief(repr(given), 80)}, expected {size} numbers")
-        u = reduced.reconstruct(np.asarray(x)[:, None])[:, 0]
+            if given.shape != (size,):
+                raise RequestError(f"{name} has the shape {given.shape}, expected ({size},)")
+        u = reduced.reconstruct(x[:, None])[:, 0]
         return np.asarray(u), np.asarray(self.reduced.generators @ alpha)
 
+    @bordered
     def high_fidelity(self, mu: Parameters) -> HighFidelitySolution:
         """The high-fidelity solution at a parameter, to compare with."""
         return self._high_fidelity.solve(parameter_in(self.parameters, mu))
@@ -474,25 +477,36 @@ class Model:
 
 
 def parameter_in(box: ParameterBox, mu: Parameters) -> Array:
-    """A parameter as an array (d,); outside the box there is a warning of the caller of the caller."""
+    """A parameter as an array (d,); outside the box there is a warning of the caller of a `bordered` method."""
     if isinstance(mu, Mapping):
         names = [normal_name(name) for name in box.names]
         given = {normal_name(str(name)): value for name, value in mu.items()}
         if set(given) != set(names) or len(mu) != len(names):
             raise RequestError(f"mu has the components {sorted(map(str, mu))}, expected {sorted(box.names)}")
         mu = [given[name] for name in names]
-    try:
-        at = np.asarray(mu, dtype=float)
-    except (TypeError, ValueError):
-        raise RequestError(f"mu is {brief(repr(mu), 80)}, expected numbers ({', '.join(box.names)})") from None
+    at = _numbers("mu", mu, expected := f"finite numbers ({', '.join(box.names)})")
     if at.ndim == 2:
         raise RequestError(f"mu has the shape {at.shape}: `solve_all` takes an array of parameters (P, {box.dim})")
-    if at.shape != (box.dim,) or not np.all(np.isfinite(at)):
-        raise RequestError(f"mu is {np.asarray(mu).tolist()}, expected finite numbers ({', '.join(box.names)})")
-    if outside := [name for name, out in zip(box.names, box.outside(at), strict=True) if out]:
-        text = f"{', '.join(outside)}: outside the parameter domain, where the model was not trained"
-        warnings.warn(text, stacklevel=3)
+    if at.shape != (box.dim,):
+        raise RequestError(f"mu is {shown(mu)}, expected {expected}")
+    if (beyond := outside(box, at)).any():
+        beside = ", ".join(np.array(box.names)[beyond])
+        warnings.warn(f"{beside}: outside the parameter domain, where the model was not trained", stacklevel=4)
     return read_only(at)
+
+
+def _numbers(name: str, value: Any, expected: str) -> Array:
+    """The array of finite numbers that a value is, of any type that NumPy converts."""
+    try:
+        array = np.asarray(value)
+    except Exception:  # noqa: BLE001  a conversion is code of the value's type
+        array = np.zeros(0, object)
+    # Truth values in a list, and masked entries, become numbers in the array.
+    listed = value if isinstance(value, list | tuple) else ()
+    is_mixed = isinstance(value, np.ma.MaskedArray) or any(isinstance(one, bool) for one in listed)
+    if is_mixed or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+        raise RequestError(f"{name} is {shown(value)}, expected {expected}")
+    return np.asarray(array, float)
 
 
 def check_built(built: object) -> Mapping[str, Any]:
@@ -524,6 +538,7 @@ def _taken(answer: object, model: FormulationModel) -> FormulationAnswer:
     return replace(answer, x=vectors["x"], alpha=vectors["alpha"])
 
 
+@constructed
 class ProgramModel(FormulationModel):
     """Assembles the program of a reduced model at a parameter, and leaves its solution to the QP solver of the cell."""
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_type_hints
 
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.errors import NumericalError, RequestError, UnsupportedError, message_of
+from vibench.errors import NumericalError, RequestError, UnsupportedError, message_of, unknown_name
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces import validation
 from vibench.interfaces.formulations import Formulation, Snapshots, axes_of
@@ -40,8 +40,8 @@ from vibench.offline.models import Model, check_built
 from vibench.plugins import registry
 from vibench.plugins.kinds import PluginKind
 from vibench.reduction.pod import POD, pod
+from vibench.signatures import Share, bordered, refuse_others, rule_of
 from vibench.stability.infsup import ConeBasis, cone_basis
-from vibench.text import brief
 
 Assembly: TypeAlias = Literal["full", "reduced"]  # of the programs, as in a study
 
@@ -80,6 +80,7 @@ def check_skipped(skipped: Sequence[str], solved: int) -> None:
         raise NumericalError(f"{count}, at most {limit} may be skipped; the first one: {skipped[0]}")
 
 
+@bordered
 @dataclass(frozen=True, eq=False)
 class Reduction:
     """The offline phase for one problem and one pair of strategies; every step is computed when it is first asked for.
@@ -125,34 +126,17 @@ class Reduction:
     tolerance: float | None = None
     training: Sampling | None = None
     assembly: Assembly = "full"
-    interpolation: float = INTERPOLATION_RTOL
+    interpolation: Share = INTERPOLATION_RTOL
     solver: str = "piqp"
-    accuracy: float = 1e-9
+    accuracy: Share = 1e-9
     formulation: Formulation | None = None
     bounds: bool = False
     on_failure: Literal["stop", "skip"] = "stop"
 
     def __post_init__(self) -> None:
-        classes = {"problem": Problem, "dual": DualStrategy, "primal": PrimalStrategy, "formulation": Formulation}
-        for name, kind in classes.items():
-            value = getattr(self, name)
-            if not isinstance(value, kind) and not (name != "problem" and value is None):
-                got = f"the class {value.__qualname__}" if isinstance(value, type) else brief(repr(value), 80)
-                raise RequestError(f"{name} is {got}, expected an instance of a subclass of {kind.__name__}")
         for name, by in (("modes", self.primal), ("generators", self.dual)):
-            if not isinstance(value := getattr(self, name), Stop) and not (value is None and by is None):
-                right = "a Stop: Stop(tolerance=…) or Stop(size=…)"
-                raise RequestError(f"{name} is {brief(repr(value), 80)}, expected {right}")
-        choices_of = {"assembly": get_args(Assembly), "bounds": (True, False), "on_failure": ("stop", "skip")}
-        for name, choices in choices_of.items():
-            value = getattr(self, name)
-            if not isinstance(value, str | bool) or value not in choices:
-                right = " or ".join(map(repr, choices))
-                raise RequestError(f"{name} is {brief(repr(value), 80)}, expected {right}")
-        for name in ("interpolation", "accuracy"):
-            value = getattr(self, name)
-            if not isinstance(value, int | float | np.number) or not 0.0 < value < 1.0:
-                raise RequestError(f"{name} is {brief(repr(value), 80)}, expected a number between 0 and 1")
+            if getattr(self, name) is None and by is not None:
+                raise RequestError(f"{name} of Reduction is None, expected a Stop: Stop(tolerance=…) or Stop(size=…)")
         takes = self.primal is not None and self.primal.takes_tolerance
         if takes == (self.tolerance is None):
             of_one = f"{type(self.primal).__qualname__} {'needs a' if takes else 'takes no'} tolerance"
@@ -163,6 +147,12 @@ class Reduction:
 
         Steps that were given before are kept; computed ones are computed again, since they may depend on the new.
         """
+        for name, step in steps.items():
+            if not isinstance(own := getattr(Reduction, name, None), cached_property):
+                known = (k for k, value in vars(Reduction).items() if isinstance(value, cached_property))
+                raise unknown_name("step of a Reduction", name, known)
+            hint = get_type_hints(own.func, include_extras=True)["return"]
+            refuse_others(f"{name} of Reduction.given", step, rule_of(hint))
         other, kept = replace(self), self.__dict__.get("_given", {}) | steps
         # Cached properties look at the attributes of the instance first, so that these steps are never computed.
         other.__dict__.update(kept, _given=kept)

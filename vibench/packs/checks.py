@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
-from vibench.errors import NumericalError, RequestError, at_parameter, requested
+from vibench.errors import NumericalError, RequestError, at_parameter
 from vibench.highfidelity.active_set import HighFidelitySolution, solve_high_fidelity
 from vibench.interfaces.absent_rows import settled_bounds, zero_rows
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
@@ -19,9 +19,10 @@ from vibench.packs.manifest import read_manifest
 from vibench.packs.pack import ModelPack, PackSolutions
 from vibench.packs.reader import PackReader, naming, one_triangle
 from vibench.qp.verification import kkt_residuals
+from vibench.signatures import bordered
 
 
-@requested
+@bordered
 def read_model_pack(path: str | Path) -> ModelPack:
     """Read a model pack and check it.
 

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
-from vibench.errors import NumericalError, RequestError, requested
+from vibench.errors import NumericalError, RequestError
 from vibench.files import file_digest
 from vibench.interfaces.absent_rows import without_infinities
 from vibench.interfaces.affine import Expression, normal_names
@@ -29,9 +29,10 @@ from vibench.packs.array_files import ArrayFiles, memory_limit, safe_path, size_
 from vibench.packs.manifest import FILE, Manifest, read_manifest, references
 from vibench.packs.meshes import read_mesh
 from vibench.packs.pack import Listing, ModelPack, PackMember, PackMesh, PackSolutions, TabulatedTheta
+from vibench.signatures import bordered
 
 
-@requested
+@bordered
 def pack_digest(path: str | Path) -> str:
     """Digest of the manifest and of the files it names; a `RequestError` if that is invalid, or a file is missing.
 

@@ -18,7 +18,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vibench.errors import RequestError, in_a_line, requested, unknown_name
+from vibench.errors import RequestError, in_a_line, unknown_name
 from vibench.plugins.kinds import PluginKind
 from vibench.provenance import distribution_version, package_hash, solver_version
 
@@ -255,7 +255,6 @@ def find_named(text: str, kinds: Mapping[str, PluginKind], solvers: Sequence[str
     return find(kinds[matching[0]], name)
 
 
-@requested
 def create(kind: str, name: str, options: Mapping[str, Any] | None = None) -> Any:
     """Instance of a registered plugin; a `RequestError` if there is none, or it does not take these options.
 

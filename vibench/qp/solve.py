@@ -11,20 +11,21 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.linalg.lapack import dposv, dtrtrs
 
 from vibench.arrays import Array, Mask
-from vibench.errors import NumericalError, UnsupportedError, foreign, in_a_line, message_of
+from vibench.errors import NumericalError, UnsupportedError, foreign, in_a_line, message_of, unknown_name
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.provenance import solver_version
 from vibench.qp.scaling import Units, drive, near, row_norms, units_driven, units_of_dual
 from vibench.qp.settings import SETTINGS
 from vibench.qp.verification import QPSolution, QPSolver
+from vibench.signatures import Share
 from vibench.text import one_line
 
 if TYPE_CHECKING:
@@ -81,9 +82,9 @@ DIRECT: Mapping[str, Callable[..., DirectSolution]] = {"piqp": _piqp, "daqp": _d
 def solve_qp(
     program: VariationalInequality,
     solver: str,
-    accuracy: float,
+    accuracy: Share,
     extra: Mapping[str, QPSolver] | None = None,
-    factor: Array | None = None,
+    factor: Annotated[Array, "n", "n"] | None = None,
     start: QPSolution | None = None,
 ) -> QPSolution:
     """Solve a quadratic program with a named solver.
@@ -99,9 +100,11 @@ def solve_qp(
     translated to its tolerances by `vibench.qp.settings`. With the Cholesky `factor` (lower) of a dense A the dual
     program is solved. `start` is a warm start of the same dimensions, for solvers with `takes_start`.
 
-    Raises a `NumericalError` if the solver does not return a `QPSolution` of the right shapes, with a text as its
-    status. What it raises itself becomes the status of an answer without x.
+    Raises a `RequestError` if there is no such solver, a `NumericalError` if it does not return a `QPSolution` of the
+    right shapes, with a text as its status. What it raises itself becomes the status of an answer without x.
     """
+    if solver not in SETTINGS and solver not in (extra or ()):
+        raise unknown_name("QP solver", solver, {*SETTINGS, *(extra or ())})
     if not len(program.g):
         return _unconstrained(program, factor)
     if not program.f.any() and (program.g >= 0.0).all():

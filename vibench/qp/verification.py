@@ -26,7 +26,7 @@ from data of one solution alone, and the smallest eigenvalue of A the distance â
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 import scipy.linalg
@@ -52,8 +52,8 @@ class QPSolution:
     status one printable line, and leaves out iterations that are no number of them.
     """
 
-    x: Array | None
-    alpha: Array | None
+    x: Annotated[Array, "n"] | None
+    alpha: Annotated[Array, "m"] | None
     solver_status: str
     iterations: int | None = None
     negative: float | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import scipy.linalg
@@ -68,7 +69,9 @@ class Projection:
     distance: float
 
 
-def project_on_cone(generators: Array, theta: Array, W: InnerProduct) -> Projection:
+def project_on_cone(
+    generators: Annotated[Array, "m", "R"], theta: Annotated[Array, "m"], W: Annotated[InnerProduct, "m"]
+) -> Projection:
     """Project θ (m,) on the cone of `generators` (m×R) in the W norm; a nonnegative least squares problem."""
     return _project_whitened(W.whiten(generators), W.whiten(theta))
 
@@ -170,7 +173,7 @@ class GrowingCone:
         return Cone(self.generators, np.array(self._errors), free, tuple(self._fallbacks))
 
 
-def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+def greedy_cone(snapshots: Annotated[Array, "m", "P"], W: Annotated[InnerProduct, "m"], stop: Stop) -> Cone:
     """Cone of snapshots (m×Q) chosen greedily (paper, Remark 4.3, and Benaceur, Ern and Ehrlacher 2020).
 
     Each step adds the snapshot farthest from the present cone, normalised. It ends before `stop` where all snapshots

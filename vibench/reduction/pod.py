@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -10,8 +11,10 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.strategies import Stop
 from vibench.linalg.inner_product import RANK_RTOL, InnerProduct, svd
+from vibench.signatures import bordered
 
 
+@bordered
 @dataclass(frozen=True)
 class POD:
     """A nested basis of V-orthonormal modes (n×N), the first k of which are the POD basis of dimension k.
@@ -19,11 +22,11 @@ class POD:
     `errors` are the relative tails e_POD(k) for k = 0 … number of snapshots (equation (11)).
     """
 
-    basis: Array
-    errors: Array
+    basis: Annotated[Array, "n", "N"]
+    errors: Annotated[Array, "k"]
 
 
-def pod(snapshots: Array, V: InnerProduct, stop: Stop) -> POD:
+def pod(snapshots: Annotated[Array, "n", "P"], V: Annotated[InnerProduct, "n"], stop: Stop) -> POD:
     """POD of snapshots u(mu_p) (n×P), by the singular value decomposition of the whitened snapshots.
 
     The eigenvalues of the correlation matrix UᵀX_V U, the method of snapshots, have a floor of 1e-8 in relative terms.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
 import scipy.sparse as sp
@@ -17,7 +18,9 @@ from vibench.linalg.factorisations import implementation
 from vibench.linalg.inner_product import InnerProduct, orthogonal_factorisation
 
 
-def supremizers(V: InnerProduct, B: SparseMatrix, eta: Array) -> Array:
+def supremizers(
+    V: Annotated[InnerProduct, "n"], B: Annotated[SparseMatrix, "m", "n"], eta: Annotated[Array, "m", "k"]
+) -> Array:
     """Supremizers T(mu)η = X_V⁻¹ Bᵀη (n×k) for B (m×n) and multipliers η (m×k)."""
     return V.riesz(np.asarray(B.T @ eta))
 

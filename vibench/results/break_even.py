@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.errors import requested
 from vibench.interfaces.strategies import Kind
 from vibench.plugins.registry import default_formulation
 from vibench.results.paired_timing import CONDITIONS, DRAWS, PairedTiming
 from vibench.results.schema import KEYS, STORED, Row
+from vibench.signatures import NotNegative, bordered
 from vibench.study.cells import NO_SUCH_AXIS
 from vibench.timing import Seconds
 
@@ -55,6 +55,7 @@ class BreakEven:
     high: float | None = None
     rounds: int | None = None
 
+    @bordered
     def overlaps(self, other: BreakEven) -> bool:
         """Whether both mean the same, and their intervals have a number in common."""
         if self.low is None or self.high is None or other.low is None or other.high is None:
@@ -65,8 +66,9 @@ class BreakEven:
         return self.meaning.value if self.number is None else f"{self.meaning.value} {self.number:.0f}"
 
 
-@requested
-def break_even(offline_a: float, online_a: float, offline_b: float, online_b: float) -> BreakEven:
+def break_even(
+    offline_a: NotNegative, online_a: NotNegative, offline_b: NotNegative, online_b: NotNegative
+) -> BreakEven:
     """Break-even of b against a, from their offline seconds and their seconds per query.
 
     The number is n* = (offline_b − offline_a) / (online_a − online_b). If b costs more offline, it is cheaper from n*

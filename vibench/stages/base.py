@@ -11,7 +11,7 @@ from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
-from vibench.errors import NumericalError, VibenchError, in_a_line
+from vibench.errors import NumericalError, RequestError, VibenchError, in_a_line
 from vibench.interfaces.problem import Problem
 from vibench.plugins.plugin import Plugin
 from vibench.provenance import libraries, numerical_code, source_hash
@@ -37,7 +37,7 @@ def faults_of(plugin: Plugin) -> Iterator[None]:
     """Name a plugin in what it raises, and the command that checks it in a `NumericalError`."""
     try:
         yield
-    except NumericalError as error:
+    except (NumericalError, RequestError) as error:
         raise NumericalError(f"{error}; run `{plugin.check}`") from error
     except (VibenchError, MemoryError):
         raise

@@ -10,7 +10,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
-from vibench.errors import RequestError, requested
+from vibench.errors import RequestError
 from vibench.files import read_regular
 from vibench.interfaces.strategies import Stop
 from vibench.model.bound_terms import CorrectionMode
@@ -39,7 +39,6 @@ def find_study(request: str) -> Path:
     return path
 
 
-@requested
 def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = None) -> Study:
     """Read and check a study.
 

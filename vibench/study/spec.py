@@ -199,7 +199,7 @@ Accuracies: TypeAlias = Annotated[list[Accuracy], MinLen(1), BeforeValidator(as_
 
 
 def _only_available(value: Any) -> Any:
-    if value != "available":
+    if not isinstance(value, str) or value != "available":
         raise ValueError("expected 'available' or a list of solver names")
     return value
 

@@ -15,11 +15,11 @@ from numerics import Varying
 
 from vibench import AffineProblem, Array, InnerProduct, ParameterBox, Reduction, VariationalInequality, create
 from vibench.errors import NumericalError
+from vibench.highfidelity.active_set import solve_high_fidelity
 from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.problem import Contact, ContactLoads, Problem
 from vibench.interfaces.strategies import Stop
 from vibench.interfaces.validation import ReferenceAssembly, checked_assembly, contradictions
-from vibench.offline.checked_tools import solve_high_fidelity
 
 MU = np.array([0.5])
 

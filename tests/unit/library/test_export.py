@@ -379,7 +379,7 @@ def test_what_is_not_exported_leaves_nothing_behind(run: vibench.Run, tmp_path: 
         (tmp_path / present).write_text("precious")
     for name, options, line in (
         ("model.txt", {}, "whose name must end in .npz"),
-        ("model.npz", {"tolerance": 0.0}, "the tolerance of the interpolation is 0, expected"),
+        ("model.npz", {"tolerance": 0.0}, "tolerance of export_model is 0.0, expected a number between 0 and 1"),
         ("old.npz", {}, "old.npz' exists; remove it"),
         ("old.npz/model.npz", {}, "old.npz' is no folder"),
         ("taken.npz", {"c": True}, "taken.c' exists; remove it"),

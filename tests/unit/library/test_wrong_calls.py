@@ -3,7 +3,9 @@
 import inspect
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from enum import Enum
+from numbers import Real
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -15,17 +17,39 @@ from packs import write_cable
 from sample_run import write_sample_run
 
 import vibench
-from vibench import NumericalError, RequestError, Stop
+from vibench import NumericalError, RequestError, Stop, UnsupportedError
 from vibench.library import runs
 
+
+class Hostile:
+    """An object whose methods raise."""
+
+    def __repr__(self) -> str:
+        raise RuntimeError
+
+    __array__ = __repr__
+
+
 VALUES = [
-    None, float("nan"), float("inf"), -1, 0, 1.5, 2**70, True, 1j, "", "x", "\0", "x" * 5000, b"x", [], ["x"],
-    [None], {}, {"x": 1}, ("png", "exe"), object(), len, np.zeros((2, 2)), np.array([np.nan, 1.0]), np.float64("nan"),
-    np.int64(3), Path("/dev/null"), Path("nowhere"),
+    None, float("nan"), float("inf"), -float("inf"), -1, 0, 2, 1.5, 2**70, 10**5000, True, 1j, "", "x", "0.5", "\0",
+    "x" * 5000, b"x", [], ["x"], ["0.5"], [None], [[1.0], [1.0, 2.0]], {}, {"x": 1}, set(), ("png", "exe"), object(),
+    Hostile(), Hostile, len, (one for one in ()), np.zeros(0), np.array(1.0), np.zeros(7), np.zeros((2, 2)),
+    np.zeros((2, 2, 2)), np.array([np.nan, 1.0]), np.array([np.inf, 1.0]), np.array([1j, 1.0]), np.array([None, 1.0]),
+    np.ma.array([5.0, 0.2], mask=[True, False]), np.array(["2020-01-01"] * 2, "datetime64[D]"), np.array([True, False]),
+    np.float64("nan"), np.int64(3), sp.eye_array(7), sp.csr_array([[np.nan] * 5] * 3), sp.csr_array([[1j]]),
+    Path("/dev/null"), Path("nowhere"),
 ]  # fmt: skip
 STUDY: dict[str, Any] = {
     "name": "x", "problem": ["radial-obstacle"], "solvers": ["piqp"], "dual": ["mcpg"], "primal": ["decorrelated"],
     "validation": 2, "tolerances": [{"N": [2], "R": [2]}],
+}  # fmt: skip
+# Made by vibench, by plugins in every query, whose answers are judged, or parts of a run.
+NOT_CALLED = {
+    "BreakEven", "CompiledModel", "CompiledProgram", "Contact", "ContactLoads", "ExportedModel", "FormulationAnswer",
+    "HighFidelitySolution", "MeshFields", "Model", "Model.answered", "Model.pair",
+    "Model.settings", "Model.status_of", "Picture",
+    "ProgramModel", "QPSolution", "QuerySettings", "Solution", "Step", "VariationalInequality", "AffineSum.at",
+    "AffineSum.coefficients", "AffineSum.mapped", "Model.solving", "Stop.reached", "OfflinePhase", "QPSolver",
 }  # fmt: skip
 
 
@@ -33,103 +57,127 @@ class ReachedError(Exception):
     """The arguments were accepted, and what takes long began."""
 
 
-Calls = dict[str, tuple[Callable[..., Any], dict[str, Any]]]
-
-
 @pytest.fixture
-def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Calls:
-    """The functions that users call, with right arguments for all of their parameters."""
+def right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Right arguments by name, where there are several meanings with the name of the callable."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(runs, "run_study", Mock(side_effect=ReachedError))
     monkeypatch.setattr("vibench.report.html.page", lambda *_, **__: "")
+    monkeypatch.setattr("vibench.report.figures.draw_all", lambda *_, **__: ([], []))
     run = vibench.open_run(write_sample_run(Path("run")))
     pack = vibench.create("problem", "pack", {"path": str(write_cable(tmp_path / "cable"))})
-    reduction = vibench.Reduction(pack, vibench.create("dual strategy", "mcpg"), None, Stop(size=2), Stop(size=2))
-    model, mu = reduction.model, [5.0, 0.2]
-    space, few = vibench.InnerProduct(sp.eye_array(5)), vibench.InnerProduct(sp.eye_array(3))
-    A, B = sp.eye_array(5, format="csr"), sp.eye_array(3, 5, format="csr")
-    vi = vibench.VariationalInequality(A, np.ones(5), B, np.ones(3))
-    spaces: dict[str, Any] = {"snapshots": np.eye(3, 4), "W": few, "stop": Stop(size=1)}
-    bases, coordinates = {"problem": "membrane", "dual": "wide"}, {"x": np.zeros(2), "alpha": np.zeros(2)}
-    return {
-        "open_run": (vibench.open_run, {"path": "run", "at": {}}),
-        "run": (vibench.run, {
-            "study": vibench.Study(**STUDY), "out": "o", "jobs": 1, "fresh": False, "retry": False, "executor": "local",
-            "scheduler": None, "observer": None, "progress": False, "repeats": 1}),
-        "read_study": (vibench.read_study, {"request": "quick", "overrides": {}}),
-        "create": (vibench.create, {"kind": "problem", "name": "radial-obstacle", "options": {}}),
-        "Run.table": (run.table, {"name": "cells"}),
-        "Run.break_even": (run.break_even, {"error": "u", "within": 0.1}),
-        "Run.figure": (run.figure, {"kind": "convergence", **bases}),
-        "Run.write_tables": (run.write_tables, {"folder": "t"}),
-        "Run.write_figures": (run.write_figures, {"folder": "f", "formats": ()}),
-        "Run.report": (run.report, {"path": "r.html", "figures": False}),
-        "Run.model": (run.model, {"cell": "0"}),
-        "export_model": (vibench.export_model, {
-            "model": model, "file": "m.npz", "tolerance": 1e-8, "evaluations": 64, "bases": True, "c": False}),
-        "Model.high_fidelity": (model.high_fidelity, {"mu": mu}),
-        "Model.reconstruct": (model.reconstruct, {"mu": mu, **coordinates}),
-        "break_even": (vibench.break_even, {"offline_a": 1.0, "online_a": 0.1, "offline_b": 2.0, "online_b": 0.05}),
-        "read_model_pack": (vibench.packs.read_model_pack, {"path": "cable"}),
-        "pack_digest": (vibench.packs.pack_digest, {"path": "cable"}),
-        "Reduction": (vibench.Reduction, {
-            "problem": pack, "dual": reduction.dual, "primal": None, "modes": Stop(size=2), "generators": Stop(size=2),
-            "tolerance": None, "training": None, "assembly": "full", "interpolation": 1e-9, "solver": "piqp",
-            "accuracy": 1e-9, "formulation": reduction.formulation, "bounds": False, "on_failure": "stop"}),
-        "Study": (vibench.Study, STUDY),
-        "Stop": (Stop, {"tolerance": 0.1, "size": None}),
-        "Stop of a size": (Stop, {"tolerance": None, "size": 3}),
-        "pod": (vibench.pod, {"snapshots": np.eye(5, 4), "V": space, "stop": Stop(size=1)}),
-        "greedy_cone": (vibench.greedy_cone, spaces),
-        "project_on_cone": (vibench.project_on_cone, {"generators": np.eye(3, 2), "theta": np.ones(3), "W": few}),
-        "supremizers": (vibench.supremizers, {"V": space, "B": sp.eye_array(3, 5), "eta": np.ones((3, 1))}),
-        "solve_high_fidelity": (vibench.solve_high_fidelity, {"vi": vi, "stiffness": None, "start": None}),
-        "solve_qp": (vibench.solve_qp, {
-            "program": vi, "solver": "piqp", "accuracy": 1e-8, "extra": None, "factor": None, "start": None}),
-        "InnerProduct": (vibench.InnerProduct, {"matrix": sp.eye_array(5), "name": "X", "factorisation": "superlu"}),
-        **{f"InnerProduct.{name}": (getattr(space, name), {argument: np.ones(5)}) for name, argument in (
-            ("apply", "u"), ("norm", "u"), ("whiten", "u"), ("riesz", "functional"),
-            ("whiten_functional", "functional"), ("unwhiten", "y"))},
-        "InnerProduct.gram": (space.gram, {"u": np.eye(5), "v": np.eye(5)}),
-        "InnerProduct.orthonormalise": (space.orthonormalise, {"u": np.eye(5), "against": None}),
+    size, mu, two = Stop(size=2), np.array([5.0, 0.2]), ("a", "b")
+    reduction = vibench.Reduction(pack, vibench.create("dual strategy", "mcpg"), None, size, size)
+    model, solver, sums = reduction.model, vibench.HighFidelitySolver(pack), vibench.AffineSum((mu,), np.ones)
+    space, few, B = vibench.InnerProduct(sp.eye_array(5)), vibench.InnerProduct(sp.eye_array(3)), sp.eye_array(3, 5)
+    vi = vibench.VariationalInequality(sp.eye_array(5, format="csr"), np.ones(5), B.tocsr(), np.ones(3))
+    own = {
+        "InnerProduct.gram.u": np.ones((5, 1)), "InnerProduct.gram.v": np.ones((5, 1)), "Reduction.generators": size,
+        "InnerProduct.orthonormalise.u": np.ones((5, 1)), "Output.u": mu, "Output.lam": mu, "Run.figure.dual": "wide",
+        "InnerProduct.name": "X", "Output.name": "X", "Output.unit": "X", "Run.table.name": "cells",
+        "create.kind": "problem", "Run.figure.problem": "membrane", "Run.break_even.error": "u",
+        "create.name": "radial-obstacle", "run.observer": None, "Reduction.tolerance": None, "Reduction.primal": None,
+        "Stop.tolerance": None, "Snapshots.mu": np.ones((4, 2)), "Enrichment.kind": vibench.Kind.NONE,
+        "Enrichment.eta": None, "export_vtu.file": "m.vtu", "Run.path": Path("run"),
+        "Reduction.enriched.tolerance": None, "Model.solve.tolerance": None, "Model.solve_all.tolerance": None,
+        "greedy_cone.snapshots": np.eye(3, 4), "Snapshots.u": np.eye(5, 4), "Snapshots.lam": np.eye(3, 4),
+        "solve_qp.start": None, "HighFidelitySolver.remember.solution": solver.solve(mu), "Offline.generators": size,
+        "ParameterBox.units": two, "check_enrichment.basis": reduction.pod.basis, "check_enrichment.V": pack.V,
+        "check_cone.W": pack.W,
+    }  # fmt: skip
+    return own | {
+        "instances": {type(one): one for one in (run, model, reduction, space, size, solver, sums, pack.parameters)},
+        "B": B, "V": space, "W": few, "Z": np.eye(pack.V.dim, 2), "accuracy": 1e-8, "alpha": np.zeros(2), "at": {},
+        "basis": np.eye(5, 2), "bounds": False, "cell": "0", "change": np.negative, "chi": np.eye(pack.W.dim, 2),
+        "coarse": pack, "columns": np.arange(2), "cone": reduction.cone, "corrected": False, "count": 2, "counts": 2,
+        "dual": reduction.dual, "error": 0.1, "errors": mu, "enrichment": reduction.enrichment,
+        "eta": np.ones((3, 1)), "evaluations": 64, "fallbacks": (), "history": {}, "skipped": (), "file": "m.npz",
+        "folder": "f", "formulation": reduction.formulation, "free": np.zeros(2, bool), "functional": np.ones(5),
+        "g": np.array([1.0, np.inf]), "formats": (), "generators": np.eye(3, 2), "interpolation": 1e-9,
+        "jobs": 1, "kind": "convergence", "listed": None,
+        "log": pack.parameters.names[:1], "lower": mu, "matrix": sp.eye_array(5), "measure": "u", "model": model,
+        "modes": size, "mu": mu, "mus": mu[None], "name": pack.parameters.names[0], "names": two, "offline_a": 1.0,
+        "offline_b": 2.0, "online_a": 0.1, "online_b": 0.1, "options": {}, "out": "o", "overrides": {},
+        "pairs": [(1.0, mu)], "path": "run", "points": mu[None], "coarse_points": mu[None], "problem": pack,
+        "program": vi, "queries": 10.0, "repeats": 1, "request": "quick", "rows": np.arange(2), "scheduler": "x",
+        "seed": 0, "size": 2, "snapshots": np.eye(5, 4), "solver": "piqp", "span": np.eye(3, 2), "stop": size,
+        "study": vibench.Study(**STUDY), "terms": (mu,), "theta": np.ones(3), "thetas": np.ones, "tolerance": 1e-8,
+        "training": None, "u": np.ones(5), "unit": mu[None], "units": two, "upper": mu + 1.0, "vi": vi, "within": 0.1,
+        "x": np.zeros(2), "y": np.ones(5), **STUDY,
     }  # fmt: skip
 
 
-def test_every_wrong_argument_is_refused_in_a_line(calls: Calls, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vibench.report.figures.draw_all", lambda *_, **__: ([], []))
+def called(instances: dict[type, Any]) -> Iterator[tuple[str, Callable[..., Any]]]:
+    """All public functions, constructors and methods, but for those of abstract classes, by name."""
+    for name in vibench.__all__:
+        found = getattr(vibench, name)
+        if inspect.isfunction(found):
+            yield name, found
+        elif inspect.isclass(found) and not issubclass(found, Exception | Enum) and not inspect.isabstract(found):
+            yield name, found
+            for method, member in vars(found).items() if found in instances else ():
+                if inspect.isfunction(member) and method[0] != "_":
+                    yield f"{name}.{method}", getattr(instances[found], method)
+    yield from ((name, getattr(vibench.packs, name)) for name in ("read_model_pack", "pack_digest"))
+
+
+def fits(value: Any, right: Any, default: Any) -> bool:
+    """Whether a value is like the right one, by another way than that of the checks."""
+    if value is None or right is None or callable(right):
+        return default is None or (callable(right) and callable(value)) or value is right
+    if isinstance(right, np.ndarray):
+        kinds = "b" if right.dtype == bool else "iuf"
+        plain = isinstance(value, np.ndarray) and not isinstance(value, np.ma.MaskedArray) and value.ndim > 0
+        return plain and value.dtype.kind in kinds and (bool(np.isfinite(value).all()) or np.inf in right)
+    if isinstance(right, int | float) and not isinstance(right, bool):
+        return isinstance(value, Real) and not isinstance(value, bool) and abs(value) < float("inf")
+    kinds = {str: str | Path, Path: str | Path, tuple: tuple | list, list: tuple | list}.get(type(right), type(right))
+    return isinstance(value, kinds)
+
+
+def test_every_wrong_argument_is_refused_in_a_line(right: dict[str, Any]) -> None:
     warnings.simplefilter("ignore")  # parameters outside the box
     refused, wrong = 0, list[str]()
-    for name, (function, right) in calls.items():
-        if name != "Study":
-            parameters = inspect.signature(function).parameters
-            assert {*right} == {*parameters}, f"{name} has other parameters"
-        for parameter in right:
-            for value in VALUES:
-                try:
-                    function(**{**right, parameter: value})
-                except ReachedError:
-                    continue
-                except (RequestError, NumericalError) as error:
-                    refused += 1
-                    if "\n" in str(error):
-                        wrong.append(f"{name}({parameter}={value!r:.30}): {error}")
-                except Exception as error:  # noqa: BLE001  what is searched for
-                    wrong.append(f"{name}({parameter}={value!r:.30}) raises {type(error).__name__}: {error}")
+    for name, function in called(right["instances"]):
+        parameters = {} if name in NOT_CALLED else inspect.signature(function).parameters
+        known = {one: right.get(f"{name}.{one}", right.get(one)) for one in parameters if one != "steps"}
+        for parameter, value in ((one, value) for one in known for value in VALUES):
+            given = known | {parameter: value}
+            counts = [given.pop("counts"), 2] if "counts" in given else []
+            what = f"{name}({parameter}=a {type(value).__name__})"
+            try:
+                function(*counts, **given)
+            except ReachedError:
+                pass
+            except (RequestError, NumericalError, UnsupportedError) as error:
+                refused += 1
+                wrong += [f"{what}: {error}"] * ("\n" in str(error))
+                continue
+            except Exception as error:  # noqa: BLE001  what is searched for
+                wrong.append(f"{what} raises {type(error).__name__}: {error}")
+                continue
+            if not fits(value, known[parameter], parameters[parameter].default):
+                wrong.append(f"{what} is accepted")
     assert wrong == [], "\n".join(wrong)
-    assert refused > 800
+    assert refused > 8000
 
 
 def test_messages_name_the_argument_and_what_is_right(tmp_path: Path) -> None:
     run, V = vibench.open_run(write_sample_run(tmp_path)), vibench.InnerProduct(sp.eye_array(5))
     one, no_number = Stop(size=1), np.full((5, 1), np.nan)
     for call, words in (
-        (lambda: run.write_figures(formats="x"), "formats of Run.write_figures is 'x', expected Sequence"),
-        (lambda: vibench.run("x"), "study of run is 'x', expected Study"),
-        (lambda: run.table(None), "name of Run.table is None, expected str"),
+        (lambda: run.write_figures(formats="x"), "formats of Run.write_figures is 'x', expected a sequence of 'png'"),
+        (lambda: run.figure("convergence", "membrane", "widde"), "no dual strategy is called 'widde'; did you mean"),
+        (lambda: Stop(toleranc=0.1), "no argument of Stop is called 'toleranc'; did you mean 'tolerance'"),
+        (lambda: vibench.Reduction.given(None, snapshot=None), "no step of a Reduction is called 'snapshot'; did you"),
+        (lambda: vibench.ParameterBox(("a",), np.ones(1), np.zeros(1), ("1",)), "[1.0] are above the upper ones [0.0]"),
+        (vibench.no_free, "no_free: missing a required argument: 'count'"),
+        (lambda: vibench.run("x"), "study of run is 'x', expected a Study"),
+        (lambda: run.table(None), "name of Run.table is None, expected a text"),
         (lambda: run.write_tables("/dev/null/x"), "'/dev/null/x' cannot be written: Not a directory"),
         (lambda: vibench.create("problems", "hertz"), "no kind of plugins is called 'problems'"),
         (lambda: vibench.pod(np.ones((4, 2)), V, one), "V of pod has n = 5, but that of snapshots is 4"),
-        (lambda: vibench.pod(np.ones(5), V, one), "snapshots of pod has the shape (5,), expected (n, P)"),
+        (lambda: vibench.pod(np.ones(5), V, one), "snapshots of pod has the shape (5,), expected an array of"),
         (lambda: vibench.project_on_cone(no_number, np.ones(5), V),
             "generators of project_on_cone has an entry that is not finite"),
         (lambda: vibench.pod(np.ones((5, 2)), V, 1), "stop of pod is 1, expected a Stop"),
@@ -141,8 +189,8 @@ def test_messages_name_the_argument_and_what_is_right(tmp_path: Path) -> None:
             call()
 
 
-def test_a_model_refuses_what_is_no_parameter(calls: Calls) -> None:
-    model = calls["export_model"][1]["model"]
+def test_a_model_refuses_what_is_no_parameter(right: dict[str, Any]) -> None:
+    model = right["model"]
     for value in [None, "x", b"x", 1j, object(), [1.0], {"load": "x", "depth": 1.0}, float("nan"), 5.0]:
         with pytest.raises(RequestError, match=r"\Amu (is|has) "):
             model.solve(value)

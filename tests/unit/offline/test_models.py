@@ -184,7 +184,7 @@ def test_certificates_bound_errors_and_tolerances_need_them(certified: vibench.R
     assert model.solve([1.0]).bound is None
     for wrong, line in (
         ({"tolerance": 1e-2}, "no error bounds"), ({"tolerance": 0.0}, "expected a positive finite number"),
-        ({"of": "body"}, "of is 'body', expected 'solution' or 'contact'"),
+        ({"of": "body"}, "is 'body', expected 'solution' or 'contact'"),
     ):  # fmt: skip
         with pytest.raises(vibench.RequestError, match=line):
             model.solve([1.0], **wrong)

@@ -112,12 +112,12 @@ def test_training_sets_of_sampling_strategies(reduce: partial[vibench.Reduction]
 def test_what_is_asked_for_wrongly_is_one_line(reduce: partial[vibench.Reduction]) -> None:
     right = reduce()
     for wrong, line in (
-        ({"problem": type(right.problem)}, r"problem is the class \w+, expected an instance of a sub"),
-        ({"dual": "mcpg"}, "dual is 'mcpg', expected an instance of a subclass of Du"),
-        ({"modes": 1e-3}, r"modes is 0\.001, expected a Stop"),
+        ({"problem": type(right.problem)}, r"problem of Reduction is the class \w+, expected a Problem"),
+        ({"dual": "mcpg"}, "dual of Reduction is 'mcpg', expected a DualStrategy"),
+        ({"modes": 1e-3}, r"modes of Reduction is 0\.001, expected a Stop"),
         ({"tolerance": None}, "OfflinePGA needs a tolerance"),
         ({"primal": None}, "without a primal strategy there is no tolerance"),
-        ({"assembly": "fulll"}, "assembly is 'fulll', expected 'full' or 'reduced'"),
+        ({"assembly": "fulll"}, "assembly of Reduction is 'fulll', expected 'full' or 'reduced'"),
     ):
         with pytest.raises(vibench.RequestError, match=line):
             replace(right, **wrong)

@@ -102,7 +102,7 @@ def traced(stage: Stage, store: Store) -> tuple[Result, set[str]]:
 
 CARRIERS = (
     "stages.artefacts", "stages.base", "plugins", "study", "errors", "text", "provenance",
-    "files",
+    "files", "signatures",
 )  # fmt: skip
 """Packages and modules that only hand over what determines numbers."""
 
@@ -156,7 +156,7 @@ def test_the_layers_are_those_of_the_import_contract_in_its_order() -> None:
     assert layers == sorted(layers, key=order.index)
     assert set(order) - set(layers) == {
         "cli", "benchmarks", "testing", "library", "report", "execution", "results", "study", "plugins",
-        "provenance", "files", "interrupts", "errors", "text", "guardian",
+        "provenance", "files", "interrupts", "signatures", "errors", "text", "guardian",
     }  # fmt: skip
     assert [layer for layer in provenance.LAYERS if not [*CORE.glob(f"{layer.replace('.', '/')}*")]] == []
 

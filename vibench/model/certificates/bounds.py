@@ -45,6 +45,7 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.errors import UnsupportedError
+from vibench.interfaces.parameters import outside
 from vibench.interfaces.problem import Contact, Problem
 from vibench.linalg import EPS, UNIT_ROUND_OFF
 from vibench.linalg.factorisations import implementation
@@ -203,7 +204,7 @@ class OnlineCertificate:
         base, lam, lower, upper = self.base, query.lam, query.lower, query.upper
         if not in_dual_set(lam):
             return OnlineBound.none(BoundNote.NOT_IN_CONE)
-        if not base.is_exact and query.problem.parameters.outside(query.mu).any():
+        if not base.is_exact and outside(query.problem.parameters, query.mu).any():
             return OnlineBound.none(BoundNote.OUTSIDE)
         if not lower > query.error:
             return OnlineBound.none(BoundNote.NOT_COERCIVE)

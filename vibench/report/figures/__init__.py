@@ -64,6 +64,8 @@ def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = N
     data, (drawn, of_dual) = _only("problem", by_problem, problem), KINDS[kind]
     if of_dual:
         data = _only("dual strategy", {name: data.restrict_to_dual(name) for name in data.duals}, dual)
+    elif dual is not None and dual not in data.duals:
+        raise unknown_name("dual strategy", dual, data.duals)
     with styled():
         figure = drawn(data)
     if figure is None:
