@@ -3,7 +3,7 @@
 import pandas as pd
 import pytest
 from fake_plugins import Wire
-from hostile import PHASES, Honest, HonestNearest, Hostile
+from hostile import CHANGED, PHASES, Honest, HonestNearest, Hostile
 from running import MEASURED
 
 from vibench import Run, Study, run
@@ -13,10 +13,11 @@ EXPECTED = {f"{phase}-{how}": said for phase, acts in PHASES.items() for how, (s
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Run]:
-    """The honest ones alone, and in the middle of the hostile ones."""
-    hostile = [{"name": Hostile, "label": how, "options": {"how": how}} for how in EXPECTED]
-    found, fair, half = [], [Honest, HonestNearest], len(hostile) // 2
-    for number, formulations in enumerate((fair, [*hostile[:half], *fair, *hostile[half:]])):
+    """The honest ones alone, and right after those that would make them wrong in silence."""
+    hows = sorted(EXPECTED, key=lambda how: EXPECTED[how] == CHANGED)
+    hostile = [{"name": Hostile, "label": how, "options": {"how": how}} for how in hows]
+    found, fair = [], [Honest, HonestNearest]
+    for number, formulations in enumerate((fair, [*hostile, *fair])):
         study = Study(
             name="borders", seed=3, validation=2, problem=[Wire], formulation=formulations, dual=["cpg"],
             primal=["decorrelated"], solvers=["piqp"], timing_rounds=1, limits={"query_seconds": 1.0},

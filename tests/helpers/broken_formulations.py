@@ -32,16 +32,6 @@ def _rebuilding(name: str, change: Callable[[Array, Array], Any]) -> type[Progra
     return _wrong(name, reconstruct=lambda self, mu, answer: change(*ProgramModel.reconstruct(self, mu, answer)))
 
 
-def _without_dimension(self: Any, offline: OfflinePhase) -> None:
-    ProgramModel.__init__(self, offline)
-    del self.dimension
-
-
-def _more_than_declared(self: Any, offline: OfflinePhase) -> None:
-    ProgramModel.__init__(self, offline)
-    self.generators = 3
-
-
 def _stepped_on(answer: FormulationAnswer, mu: Array) -> FormulationAnswer:
     mu += 1e-3
     return answer
@@ -59,22 +49,16 @@ MultiplierInWords = _variant("MultiplierInWords", multiplier="somehow")
 BuildsAList = _variant("BuildsAList", build=lambda self, offline: [offline.snapshots.u])
 BuildsAFunction = _variant("BuildsAFunction", build=lambda self, offline: {"tangent": lambda mu: mu})
 MakesADictionary = _variant("MakesADictionary", model=lambda self, offline, built: {"basis": offline.pod.basis})
-WithoutDimension = _wrong("WithoutDimension", __init__=_without_dimension)
-MoreThanDeclared = _wrong("MoreThanDeclared", __init__=_more_than_declared)
 # It says that it has a solver, and always calls the same one.
 NoProgram = _wrong("NoProgram", solve=_same_solver)
 # It changes the parameter that it is given.
 StepsOn = _answering("StepsOn", _stepped_on)
-AnswersInATuple = _answering("AnswersInATuple", lambda answer, mu: (answer.x, answer.alpha))
 NotANumber = _answering("NotANumber", lambda one, mu: replace(one, x=one.x * np.where(one.x == one.x[2], np.nan, 1.0)))
 NeverConverges = _answering(
     "NeverConverges", lambda answer, mu: replace(answer, outcome=Outcome.INACCURATE, reason="100 steps were too few")
 )
 SaysNotWhy = _answering("SaysNotWhy", lambda one, mu: replace(one, outcome=Outcome.FAILED if mu[0] > 0 else Outcome.OK))
 Rolls = _answering("Rolls", lambda one, mu: replace(one, x=one.x * (1.0 + 1e-9 * np.random.default_rng().random())))
-OfAnotherSize = _rebuilding("OfAnotherSize", lambda u, lam: (u[1:], lam))
-Pulls = _rebuilding("Pulls", lambda u, lam: (u, lam - 1e-12 * lam.max()))
-ForgetsTheMultiplier = _rebuilding("ForgetsTheMultiplier", lambda u, lam: (u, None))
 WrongSide = _rebuilding("WrongSide", lambda u, lam: (-u, lam))
 
 

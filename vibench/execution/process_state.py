@@ -12,6 +12,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 
+def _folder() -> str:
+    try:
+        return os.getcwd()
+    except OSError:
+        return os.sep  # it has been removed
+
+
 def _set_environment(known: Mapping[str, str]) -> None:
     os.environ.clear()
     os.environ.update(known)
@@ -26,7 +33,7 @@ class ProcessState:
         "the recursion limit": (sys.getrecursionlimit, sys.setrecursionlimit),
         "numpy.seterr": (np.geterr, lambda known: np.seterr(**known)),
         "warnings.filters": (lambda: warnings.filters[:], lambda known: setattr(warnings, "filters", known)),
-        "the working directory": (os.getcwd, os.chdir),
+        "the working directory": (_folder, os.chdir),
         "the environment": (os.environ.copy, _set_environment),
     }
 
