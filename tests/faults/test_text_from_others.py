@@ -65,7 +65,10 @@ def test_the_run_ends_with_a_row_for_every_cell(ended: tuple[Path, str]) -> None
     assert {row["problem"] for row in cells.values()} == {printable(LABEL)}
     for (dual, primal, solver), row in cells.items():
         if dual != cpg:
-            expected = ("error", f"in cone: OddError: {printable(' '.join(ODD.split()))}xxx")
+            expected = (
+                "error",
+                f"in cone: the dual strategy 'odd-cone' raised OddError: {printable(' '.join(ODD.split()))}xxx",
+            )
         elif primal == "wordy-enrichment":
             expected = ("error", "in enrichment: ValueError: could not convert string to float")
         else:
