@@ -242,6 +242,8 @@ const drawn = [];  // every panel that Bokeh has drawn, to be painted anew where
 function paint(panel) {
   const { ink, soft, line } = pageColours();
   for (const axis of [...panel.below, ...panel.left]) {
+    // Bokeh rounds the exponents of ticks between powers of ten: 0.30 would be called 10⁻¹, and 0.35 one.
+    axis.formatter = new Bokeh.CustomJSTickFormatter({ code: "return String(Number(tick.toPrecision(3)))" });
     Object.assign(axis, { axis_label_text_color: ink, major_label_text_color: soft, axis_line_color: soft, major_tick_line_color: soft, minor_tick_line_color: null });
   }
   for (const grid of panel.center) grid.grid_line_color = line;
