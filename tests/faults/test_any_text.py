@@ -95,7 +95,9 @@ def drawn(path: Path) -> str:
     stream = io.BytesIO()
     (data,) = [data for _, data in problem_tables(path)]
     with styled():
-        (figure,) = work_precision(data)
+        figure = work_precision(data)
+    assert figure is not None
+    with styled():
         write_figure(figure, stream, "svg")
     return stream.getvalue().decode("utf-8")
 

@@ -211,7 +211,7 @@ def test_paths_are_names_and_nothing_else(run: Path, tmp_path: Path) -> None:
 
 
 def test_only_figures_of_vibench_are_removed(tmp_path: Path) -> None:
-    ours, theirs = ["obstacle-errors.png", "hertz-mcpg-inf-sup.svg"], ["my-own.svg", "errors.txt", "errors.png"]
+    ours, theirs = ["obstacle-convergence.png", "hertz-mcpg-inf-sup.svg"], ["my-own.svg", "errors.txt", "errors.png"]
     for name in (*ours, *theirs):
         (tmp_path / name).touch()
     figures.remove(tmp_path)

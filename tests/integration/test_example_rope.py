@@ -98,8 +98,7 @@ def test_every_cell_of_the_rope_has_row_and_line(cells: tuple[pd.DataFrame, pd.D
     reduced = found[found["assembly"] == "reduced"]
     assert {name: set(reduced[f"terms_{name}"]) for name in MEMBERS} == {"A": {2}, "f": {0}, "B": {0}, "g": {2}}
     assert set(reduced["fallbacks"]) == {""}
-    shown = [line.split() for line in printed.splitlines()]
-    assert sum(OWN in words[:6] for words in shown) == 2
+    assert "rope: a full solution takes " in printed
     compared = pd.read_csv(example.parent / "runs" / STUDY["name"] / "tables" / "thresholds.csv")
     pairs = set(zip(compared["primal_a"], compared["primal_b"], strict=True))
     assert {("online-supremizers", OWN), ("online-supremizers", "offline-pga")} <= pairs

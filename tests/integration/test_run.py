@@ -160,8 +160,9 @@ def test_a_run_of_which_nothing_can_run_here_is_an_error(vibench: Vibench, tmp_p
     study = write_study(tmp_path, wire_study(primal=["decorrelated", "online-supremizers"], solvers=["ecos"]))
     done = vibench(tmp_path, "run", study, "--jobs", "1")
     assert done.returncode == 1
-    reason = "the QP solver 'ecos' is not installed: `pip install ecos`"
-    assert done.stderr == f"vibench: no cell could run here: {reason}\n"
+    # Where its distribution is installed the broken module is the reason.
+    reason = done.stderr.removeprefix("vibench: no cell could run here: ").removesuffix("\n")
+    assert re.fullmatch("the QP solver 'ecos' (is not installed: `pip install ecos`|cannot be imported: .+)", reason)
     first, results = done.stdout.splitlines()
     assert (first, results.split()[0]) == ("2 cells, 0 to run, 0 stages", "results:")
     assert {row["reason"] for row in rows(tmp_path / "runs" / "wire")} == {reason}

@@ -303,8 +303,8 @@ def test_the_certified_error_is_that_of_the_model_whichever_of_its_cells_is_the_
 
 def test_what_cannot_be_asked_is_refused(quick_run: Path) -> None:
     for asked, message in (
-        ({"queries": -1}, "the number of queries is -1, expected a positive number"),
-        ({"queries": 10, "error": 0.0}, "the largest error is 0, expected a positive number"),
+        ({"queries": -1}, "queries of Run.best is -1, expected a positive"),
+        ({"queries": 10, "error": 0.0}, "error of Run.best is 0.0, expected a positive"),
         ({"error": 0.1}, "--within is for tables of break-even points, and for the table best with --queries"),
     ):
         with pytest.raises(RequestError, match=message):
