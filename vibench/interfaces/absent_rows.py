@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Mask, SparseMatrix
 from vibench.errors import NumericalError
-from vibench.signatures import Rule, is_plain
 
 # The bound g of a row that constrains nothing: finite, so that no sum with it, and no product with zero, is NaN.
 ABSENT = 1e100
 
-Bound = Annotated[
-    Any,
-    Rule("numbers, or +inf", lambda g: is_plain(g) and g.ndim == 1 and g.dtype.kind in "fiu" and not np.isnan(g).any()),
-]
 
-
-def is_absent(g: Bound) -> Mask:
+def is_absent(g: Array) -> Mask:
     """Mask of the rows (m,) that constrain nothing: g is infinite, even with something finite added to it."""
     return np.asarray(g >= 0.5 * ABSENT)
 

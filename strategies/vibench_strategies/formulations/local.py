@@ -109,14 +109,15 @@ class LocalModel(PhasesModel):
 
     def __init__(self, box: ParameterBox, weights: Array, parts: Sequence[OfflinePhase]) -> None:
         super().__init__(parts)
-        self._box, self._weights = box, weights
+        # `to_unit` would check in every query what comes from a study.
+        self._lower, self._widths, self._weights = box.lower, box.widths, weights
         self.enrichment = self.dimension - max(parts, key=largest_dimension).pod.basis.shape[1]
         lines = [(*part.cone.fallbacks, *part.enrichment.fallbacks) for part in parts]
         self.fallbacks = tuple(f"cluster {number}: {line}" for number, of in enumerate(lines) for line in of)
 
     def phase(self, mu: Array) -> int:
         """The cluster that answers at mu (d,), at the cost of one polynomial for each."""
-        return _largest(self._box.to_unit(mu), self._weights)
+        return _largest((mu - self._lower) / self._widths, self._weights)
 
     def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:
         """The mixed program of the cluster, solved by the QP solver of the cell."""

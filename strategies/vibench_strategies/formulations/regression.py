@@ -155,12 +155,14 @@ class RegressionModel(FixedSpacesModel):
 
     def __init__(self, offline: OfflinePhase, built: Mapping[str, Any], functions: Radial | Processes) -> None:
         super().__init__(offline.pod.basis, offline.cone.generators)
-        self._box, self.functions = offline.problem.parameters, functions
+        # `to_unit` would check in every query what comes from a study.
+        box, self.functions = offline.problem.parameters, functions
+        self._lower, self._widths = box.lower, box.widths
         self._left_out, self._rays = built["left_out"], built["rays"]
 
     def solve(self, mu: Array, settings: QuerySettings) -> FormulationAnswer:  # noqa: ARG002
         """The coefficients, those of λ projected on the cone, and the uncertainty of u."""
-        x, lam, variance = self.functions.at(self._box.to_unit(mu))
+        x, lam, variance = self.functions.at((mu - self._lower) / self._widths)
         alpha = nnls(self._rays, lam)[0] if self._rays.size else np.zeros(self._rays.shape[1])
         stated = None if variance is None else np.sqrt(variance + self._left_out)
         return FormulationAnswer(x, alpha, uncertainty=stated)

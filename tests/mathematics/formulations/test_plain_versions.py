@@ -9,8 +9,9 @@ pytest.importorskip("sklearn")  # of both versions of `regression`
 
 import plain_formulations as plain
 
-from vibench import FormulationAnswer, Reduction, Stop, create
+from vibench import FormulationAnswer, QuerySettings, Reduction, Stop, create
 from vibench.offline.models import CellSolver
+from vibench.signatures import _Signature
 
 ACCURACY = 1e-9
 SOLVE = CellSolver("piqp", ACCURACY)
@@ -42,6 +43,18 @@ def test_answers_are_those_of_the_plain_version(
         assert discs.problem.W.norm(found.lam - lam) <= 10.0 * tolerance * discs.problem.W.norm(lam)
         if found.uncertainty is not None:
             assert found.uncertainty == pytest.approx(query(mu)[2], rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["mixed", "penalty", "proximal", "sparse-dictionary", "local", "regression"])
+def test_a_query_passes_no_border_of_public_callables(
+    discs: Reduction, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its arguments were checked where they came from: a check takes as long as a query of `regression`."""
+    model = discs.with_formulation(create("formulation", name)).model
+    mu, settings = discs.problem.validation_set(1, 0)[0], QuerySettings(ACCURACY, SOLVE)
+    model.online.solve(mu, settings)
+    monkeypatch.setattr(_Signature, "check", lambda self, *_: pytest.fail(f"{self._title} checks its arguments"))
+    model.online.solve(mu, settings)
 
 
 def test_a_plain_hyper_reduced_query_has_the_same_answer_on_the_same_domain(discs: Reduction) -> None:

@@ -49,7 +49,7 @@ NOT_CALLED = {
     "HighFidelitySolution", "MeshFields", "Model", "Model.answered", "Model.pair",
     "Model.settings", "Model.status_of", "Picture",
     "ProgramModel", "QPSolution", "QuerySettings", "Solution", "Step", "VariationalInequality", "AffineSum.at",
-    "AffineSum.coefficients", "AffineSum.mapped", "Model.solving", "Stop.reached", "OfflinePhase", "QPSolver",
+    "AffineSum.coefficients", "AffineSum.mapped", "Model.solving", "Stop.reached", "OfflinePhase", "QPSolver", "is_absent",
 }  # fmt: skip
 
 
