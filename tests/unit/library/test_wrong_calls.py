@@ -47,9 +47,9 @@ STUDY: dict[str, Any] = {
 NOT_CALLED = {
     "BreakEven", "CompiledModel", "CompiledProgram", "Contact", "ContactLoads", "ExportedModel", "FormulationAnswer",
     "HighFidelitySolution", "MeshFields", "Model", "Model.answered", "Model.pair",
-    "Model.settings", "Model.status_of", "Picture",
+    "Model.settings", "Model.status_of", "Picture", "is_absent",
     "ProgramModel", "QPSolution", "QuerySettings", "Solution", "Step", "VariationalInequality", "AffineSum.at",
-    "AffineSum.coefficients", "AffineSum.mapped", "Model.solving", "Stop.reached", "OfflinePhase", "QPSolver", "is_absent",
+    "AffineSum.coefficients", "AffineSum.mapped", "Model.solving", "Stop.reached", "OfflinePhase", "QPSolver",
 }  # fmt: skip
 
 
