@@ -57,7 +57,7 @@ def high_fidelity_sweep(
     for k, mu in enumerate(mus):
         try:
             vi = checked_assembly(problem, mu)
-            solutions.append(solver.solve(mu, vi))
+            solutions.append(solver.solve_next(mu, vi))
         except NumericalError as error:
             if not skip:
                 raise

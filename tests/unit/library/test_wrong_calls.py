@@ -45,11 +45,13 @@ STUDY: dict[str, Any] = {
 }  # fmt: skip
 # Made by vibench, by plugins in every query, whose answers are judged, or parts of a run.
 NOT_CALLED = {
-    "BreakEven", "CompiledModel", "CompiledProgram", "Contact", "ContactLoads", "ExportedModel", "FormulationAnswer",
-    "HighFidelitySolution", "MeshFields", "Model", "Model.answered", "Model.pair",
-    "Model.settings", "Model.status_of", "Picture", "is_absent",
-    "ProgramModel", "QPSolution", "QuerySettings", "Solution", "Step", "VariationalInequality", "AffineSum.at",
-    "AffineSum.coefficients", "AffineSum.mapped", "Model.solving", "Stop.reached", "OfflinePhase", "QPSolver",
+    "AffineSum.at", "AffineSum.coefficients", "AffineSum.mapped", "BreakEven", "CompiledModel", "CompiledProgram",
+    "Contact", "ContactLoads", "ExportedModel", "FormulationAnswer", "HighFidelitySolution",
+    "HighFidelitySolver.condensed", "HighFidelitySolver.remember", "HighFidelitySolver.solve_assembled",
+    "HighFidelitySolver.solve_next", "HighFidelitySolver.verify", "MeshFields", "Model", "Model.answered",
+    "Model.pair", "Model.settings", "Model.solving", "Model.status_of", "OfflinePhase", "Picture", "ProgramModel",
+    "QPSolution", "QPSolver", "QuerySettings", "Solution", "Step", "Stop.reached", "VariationalInequality",
+    "is_absent",
 }  # fmt: skip
 
 
