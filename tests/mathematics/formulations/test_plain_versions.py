@@ -9,7 +9,7 @@ pytest.importorskip("sklearn")  # of both versions of `regression`
 
 import plain_formulations as plain
 
-from vibench import FormulationAnswer, QuerySettings, Reduction, Stop, create
+from vibench import FormulationAnswer, HighFidelitySolver, QuerySettings, Reduction, Stop, create
 from vibench.offline.models import CellSolver
 from vibench.signatures import _Signature
 
@@ -46,15 +46,17 @@ def test_answers_are_those_of_the_plain_version(
 
 
 @pytest.mark.parametrize("name", ["mixed", "penalty", "proximal", "sparse-dictionary", "local", "regression"])
-def test_a_query_passes_no_border_of_public_callables(
+def test_what_is_timed_passes_no_border_of_public_callables(
     discs: Reduction, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its arguments were checked where they came from: a check takes as long as a query of `regression`."""
     model = discs.with_formulation(create("formulation", name)).model
     mu, settings = discs.problem.validation_set(1, 0)[0], QuerySettings(ACCURACY, SOLVE)
     model.online.solve(mu, settings)
+    solver, vi = HighFidelitySolver(discs.problem), discs.problem.assemble(mu)
     monkeypatch.setattr(_Signature, "check", lambda self, *_: pytest.fail(f"{self._title} checks its arguments"))
     model.online.solve(mu, settings)
+    solver.solve_next(mu, vi)
 
 
 def test_a_plain_hyper_reduced_query_has_the_same_answer_on_the_same_domain(discs: Reduction) -> None:
