@@ -66,8 +66,16 @@ def run_study_command(
             "primal": primal, "solvers": solver, "correction": correction, "pod": pod_tol, "dual_tol": dual_tol,
             "primal_tol": primal_tol,
         }  # fmt: skip
-        study = study or ("default" if problem else "quick")
-        loaded = _study(study, cell, {axis: values for axis, values in overrides.items() if values}, at)
+        usual = study is None and problem is not None
+        loaded = _study(
+            study or ("default" if usual else "quick"),
+            cell,
+            {axis: values for axis, values in overrides.items() if values},
+            at,
+        )
+    if usual:
+        # Runs of several problems have folders of their own.
+        loaded = loaded.model_copy(update={"name": " ".join(one.title for one in loaded.problem)})
     if dry_run:
         cells = expand(loaded)
         echo(*(f"{cell.key}  {cell}" for cell in cells), f"{len(cells)} cells")

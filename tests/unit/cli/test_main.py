@@ -131,6 +131,11 @@ def test_a_problem_alone_is_run_with_the_usual_choices(main: Main, tmp_path: Pat
     for problem, label in (("obstacle", "obstacle"), (f"{tmp_path}/own.py:Own", "Own")):
         code, out, _ = main("run", "--problem", problem, "--dry-run")
         assert (code, out.count(f"  {label} · mcpg · ")) == (0, 8)
+    ended = Mock(side_effect=KeyboardInterrupt)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("vibench.execution.run.run_study", ended)
+        main("run", "--problem", f"{tmp_path}/own.py:Own")
+    assert ended.call_args.args[:2][1] == Path("runs/Own")
     for problem, said in (
         (f"{tmp_path}/own.py:Onw", "did you mean 'Own'"), (f"{tmp_path}/broken.py:Own", "division by zero"),
         (str(tmp_path), "pack.toml: format: required"),
