@@ -39,7 +39,7 @@ def test_a_log_scale_spreads_the_logarithm_and_leaves_the_other_parameters(name:
 
 @pytest.mark.parametrize("size", [1, 7, 32])
 def test_a_latin_hypercube_has_one_point_in_every_interval_of_every_parameter(size: int) -> None:
-    found = points("latin-hypercube", size=size, seed=5, log=["a"])
+    found = points("latin-hypercube", size=size, seed=5, log=["a"]).copy()
     found[:, 0] = np.log(found[:, 0])
     lower, upper = BOX.lower.copy(), BOX.upper.copy()
     lower[0], upper[0] = np.log(lower[0]), np.log(upper[0])

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from numerics import Varying
 from other_problems import Torsion
 
+from vibench.errors import RequestError
 from vibench.highfidelity import active_set
 from vibench.highfidelity.active_set import HighFidelitySolution
 from vibench.interfaces.problem import MEMBERS, Problem
@@ -88,9 +89,9 @@ def test_training_snapshots_in_the_spaces_are_reproduced(kind: Kind, n: int, m: 
 
 
 def test_an_enrichment_is_what_its_kind_says() -> None:
-    with pytest.raises(ValueError, match="fixed enrichment"):
+    with pytest.raises(RequestError, match="fixed enrichment"):
         Enrichment(Kind.NONE, vectors=np.zeros((3, 1)))
-    with pytest.raises(ValueError, match="per-parameter enrichment"):
+    with pytest.raises(RequestError, match="per-parameter enrichment"):
         Enrichment(Kind.PER_PARAMETER)
 
 

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from samples import with_ways
 
 import vibench
-from vibench.errors import NumericalError
+from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.outputs import Output
 from vibench.model.certificates.base import output_weights
 from vibench.model.certificates.bounds import OnlineBound, output_error_bound
@@ -67,7 +67,7 @@ def test_an_output_that_vanishes_on_the_whole_training_set_has_absolute_errors()
     ("output", "words"),
     [
         (Output("long", "m", u=np.ones(3)), r"'long' has coefficients of u of shape \(3,\); expected \(2,\)"),
-        (Output("flat", "m", lam=np.ones((1, 1))), r"'flat' has coefficients of λ of shape \(1, 1\)"),
+        (Output("wide", "m", lam=np.ones(2)), r"'wide' has coefficients of λ of shape \(2,\); expected \(1,\)"),
         (Output("fails", "m", function=lambda *_: 1 / 0), r"'fails' fails at mu = \[1.0\]: ZeroDivisionError"),
         (Output("none", "m", function=lambda *_: None), "'none' fails at .*TypeError"),  # type: ignore[arg-type, return-value]
         (Output("nan", "m", function=lambda mu, *_: np.nan if mu[0] > 1 else 0.0), r"'nan' is nan at mu = \[2.0\]"),
@@ -83,7 +83,7 @@ def test_an_output_is_linear_or_a_function_which_cannot_change_the_solution() ->
     Output("greedy", "1", function=lambda mu, u, lam: np.multiply(u, 0.0, out=u).sum()).values(MUS, given, LAM)
     assert np.array_equal(given, U)
     for more in ({}, {"u": np.ones(2), "function": lambda *_: 0.0}):
-        with pytest.raises(ValueError, match="the output 's' has either coefficients of u and λ, or a function"):
+        with pytest.raises(RequestError, match="the output 's' has either coefficients of u and λ, or a function"):
             Output("s", "1", **more)
 
 
