@@ -172,8 +172,7 @@ def _greet(scheduler: str, seconds: float) -> None:
 
     async def greet() -> None:
         credentials = Security().get_connection_args("client")
-        comm = await asyncio.wait_for(connect(scheduler, timeout=seconds, **credentials), seconds)
-        comm.abort()
+        (await asyncio.wait_for(connect(scheduler, timeout=seconds, **credentials), seconds)).abort()
 
     # In another thread: a notebook has an event loop in this one.
     with ThreadPoolExecutor(1) as other:

@@ -69,10 +69,8 @@ class Graph:
                 heappush(self._ready, (self._numbers[key], key))
 
     def lost(self, stage: Stage) -> list[Stage]:
-        """Drop the stages that depend on a failed one, and those that no remaining goal needs.
-
-        Returns the goals that are lost in the order of the plan, the failed stage among them if it is a goal.
-        """
+        """Drop the stages that depend on a failed one, and those that no remaining goal needs."""
+        # Returns the goals that are lost in the order of the plan, the failed stage among them if it is a goal.
         gone, ahead = {stage.key}, [stage.key]
         while ahead:
             # The stages that need a dropped one were dropped with it, and are not listed any more.

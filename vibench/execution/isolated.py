@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -13,15 +13,19 @@ from typing import Any
 
 from vibench.errors import in_a_line
 from vibench.execution.supervisor import Job, Supervisor
-from vibench.interfaces.problem import VariationalInequality
+from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.plugins import registry
 from vibench.plugins.kinds import PluginKind
+from vibench.plugins.options import options_as_json
+from vibench.plugins.plugin import GivenPlugin, Plugin
+from vibench.plugins.reads import reads_of, states
 from vibench.qp.scaling import in_units, random_units
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, verify
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, Items, ItemwiseStage, TimeLimit
+from vibench.study.cells import digest
 from vibench.study.spec import Limits
 from vibench.timing import NO_TIME, Seconds, median_seconds
 
@@ -117,3 +121,49 @@ def solver_trials(
             outcome = call_isolated(_tried, program, accuracy, name, **limits)
             trials[name] = outcome if isinstance(outcome, Trial) else Trial(outcome.status, outcome.reason)
     return trials
+
+
+# Gives the states of what a plugin reads, `None` if its process ended; it gets the recorded names that have changed.
+Watch = Callable[[Plugin, list[str]], Mapping[str, str] | None]
+
+
+def recall_reads(plugins: Iterable[Plugin], store: Store, watch: Watch | None = None) -> bool:
+    """Let given plugins know what they read, as recorded in the store or watched; whether any reads something."""
+    found = False
+    for plugin in dict.fromkeys(plugins):
+        given, options = plugin.registered, options_as_json(plugin.arguments)
+        assert isinstance(given, GivenPlugin)
+        key = f"reads-{digest([given.fingerprint, options])}"
+        artefact = store.get(key)
+        known = {} if artefact is None else artefact.value
+        changed = [name for name, state in states(known).items() if state != known[name]]
+        if watch is not None and (artefact is None or changed):
+            # Nothing is stored where the first use ends its process: the next run tries again.
+            if (watched := watch(plugin, changed)) is not None:
+                store.put(key, watched, NO_TIME, ())
+            known = watched or {}
+        given.reads[options] = known
+        found |= bool(known)
+    return found
+
+
+def watch_first_use(
+    plugin: Plugin, changed: list[str], *, note: Callable[[str], None], supervisor: Supervisor, seconds: float
+) -> dict[str, str] | None:
+    """Use a plugin for some seconds at most, in a process that does nothing else; see `Watch`."""
+    if changed:
+        more = f" and {len(changed) - 1} more" * (len(changed) > 1)
+        note(f"the {plugin} reads {changed[0]}{more}, changed since: what it computes is computed again")
+    there = call_isolated(reads_of, partial(_first_use, plugin), seconds=seconds, supervisor=supervisor)
+    if not isinstance(there, Mapping):
+        return None
+    # A process of ours has some variables of its own.
+    return {name: state for name, state in states(there).items() if not name.startswith("$") or state == there[name]}
+
+
+def _first_use(plugin: Plugin) -> None:
+    # Another plugin may be the same class with other options.
+    vars(plugin.registered).pop("given", None)
+    made = plugin.create()
+    if isinstance(made, Problem):
+        made.assemble(made.training_set()[0])

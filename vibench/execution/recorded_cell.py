@@ -15,8 +15,8 @@ import pandas as pd
 
 from vibench.arrays import Array
 from vibench.errors import RequestError
-from vibench.execution.first_use import recall_reads
 from vibench.execution.graph import Graph
+from vibench.execution.isolated import recall_reads
 from vibench.execution.supervisor import Job, Supervisor
 from vibench.interfaces.problem import VariationalInequality
 from vibench.offline.models import Model
@@ -58,8 +58,7 @@ class RecordedCell:
             raise RequestError(f"cell {self.row['cell']} was computed {others}; run its study again")
         store, queries = usable_store(), cell_queries(self.cell, query_seconds=1e6)
         certificate, built = queries.certificate, queries.built
-        needed = () if certificate is None else (certificate.base, certificate)
-        _provide((*built.model_inputs, *needed), store)
+        _provide((*built.model_inputs, *(() if certificate is None else (certificate.base, certificate))), store)
         certified = None if certificate is None else certificate.certificate(store)
         model = built.model(store, queries.solver, queries.accuracy)
         return replace(model, certificate=certified, row=self.row, correction=queries.correction)
@@ -74,8 +73,7 @@ class RecordedCell:
 
     def rows(self, table: str) -> dict[int, dict[str, Any]]:
         names, rows = read_rows(self.path, table, (self.row["cell"],))
-        named = [dict(zip(names, row, strict=True)) for row in rows]
-        return {int(row["query"]): row for row in named}
+        return {int(row["query"]): row for row in (dict(zip(names, row, strict=True)) for row in rows)}
 
 
 def _provide(stages: Iterable[Stage], store: Store) -> None:

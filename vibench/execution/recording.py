@@ -147,8 +147,7 @@ def refute(database: ResultsDatabase) -> None:
         (row["problem"], row["problem_options"]): row for row in reversed(bounded) if row["status"] == Status.REFUTED
     }
     for row in bounded:
-        first = refuted.get((row["problem"], row["problem_options"]))
-        if first is None:
+        if (first := refuted.get((row["problem"], row["problem_options"]))) is None:
             continue
         # No table calls a refuted bound certified.
         for table in ("cells", "queries"):

@@ -14,8 +14,8 @@ from typing import Any
 from vibench import interrupts, provenance
 from vibench.errors import ExecutorError, RequestError, StorageError, VibenchError, in_a_line
 from vibench.execution.executors import Dask, Executor, Local
-from vibench.execution.first_use import recall_reads, watch_first_use
 from vibench.execution.graph import Graph
+from vibench.execution.isolated import recall_reads, watch_first_use
 from vibench.execution.recording import LOG, ResultWriter, claimed, clear, ended_by_smaller_limits, labels_of, refute
 from vibench.execution.supervisor import Job, Supervisor
 from vibench.execution.timing_plan import OfflinePlan, TimingPlan
@@ -187,8 +187,7 @@ class _Run:
     def execute(self, cells: Sequence[Cell], todo: Sequence[Cell]) -> bool:
         """Run some cells of the matrix, and time those that have no seconds; returns whether Ctrl-C ended it."""
         reasons = {cell.key: reason for cell in cells if (reason := unavailable(cell))}
-        seconds = self.study.limits.query_seconds
-        goals = {cell: cell_queries(cell, seconds) for cell in cells if cell.key not in reasons}
+        goals = {cell: cell_queries(cell, self.study.limits.query_seconds) for cell in cells if cell.key not in reasons}
         runnable = [cell for cell in todo if cell in goals]
         rounds, fewest = self.study.timing_rounds, self.study.timing_rounds_min
         requested = QUERY_SUBSETS * self.options.repeats
@@ -212,8 +211,7 @@ class _Run:
                 self._time(group, plan=False)
             slots = workers.slots if workers is not None else 0
             left_out = [cell for cell in todo if cell.key in reasons]
-            stages = list(self.graph.stages.values())
-            self.observer.start(Agenda(len(cells), len(todo), len(left_out), stages, slots))
+            self.observer.start(Agenda(len(cells), len(todo), len(left_out), [*self.graph.stages.values()], slots))
             for cell in left_out:
                 self._fail_cell(cell, Failed(Status.UNAVAILABLE, reasons[cell.key]))
             if workers is not None:
@@ -234,10 +232,8 @@ class _Run:
         return Local(self.options.workers, self.folder / LOG)
 
     def _is_available(self, stage: Stage) -> bool:
-        """Whether the artefact of a stage can be reused; its histories are recorded if so.
-
-        Seconds of different machines are not comparable: an artefact of another machine is computed again.
-        """
+        """Whether the artefact of a stage can be reused; its histories are recorded if so."""
+        # Seconds of different machines are not comparable: an artefact of another machine is computed again.
         if self.options.fresh or not stage.stored:
             return False
         artefact = self.store.get(stage.key)

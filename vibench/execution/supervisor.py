@@ -164,18 +164,16 @@ class _JobState:
     def __init__(self, job: Job) -> None:
         self.job, self.progress = job, Progress()
         self.seconds = self.fraction = 0.0
-        self._begin(Batch(frozenset(), (), ends=False), None)
+        self.start(Batch(frozenset(), (), ends=False), None)
 
-    def start(self, batch: Batch, current: CurrentItem) -> Progress:
+    def start(self, batch: Batch, current: CurrentItem | None) -> Progress:
         """Begin a batch of the job in a process; returns the values of other processes that it needs."""
-        current.leave()
-        self._begin(batch, current)
-        return self.progress if batch.ends else Progress()
-
-    def _begin(self, batch: Batch, current: CurrentItem | None) -> None:
+        if current is not None:
+            current.leave()
         self.batch, self._current = batch, current
         self._last, self._begun, self._starting = time.monotonic(), False, 0.0
         self._changes, self._item_limit = 0, float("inf")
+        return self.progress if batch.ends else Progress()
 
     @property
     def item(self) -> int | None:
@@ -356,11 +354,9 @@ class Supervisor:
 
 
 def start_worker(descriptor: int, log: str, environment: Mapping[str, str]) -> subprocess.Popen[bytes]:
-    """A worker process that serves the other end of a socket; the output of plugins goes to `log`.
-
-    It leads its own process group: Ctrl-C on the terminal does not reach it, and children of plugins die with it, as do
-    those in other groups, by their mark.
-    """
+    """A worker process that serves the other end of a socket; the output of plugins goes to `log`."""
+    # It leads its own process group: Ctrl-C on the terminal does not reach it, and children of plugins die with it, as
+    # do those in other groups, by their mark.
     options = guarded("vibench.execution.worker", str(descriptor), log, environment=environment)
     return subprocess.Popen(**options, pass_fds=[descriptor])
 

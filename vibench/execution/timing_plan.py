@@ -62,8 +62,7 @@ class OfflinePlan:
     def finish(self) -> None:
         phases = [some for goal in self._cells.values() for some in goal.offline_stages.values()]
         stages = {one.key: one for some in phases for one in some}
-        runs = {key: self._runs(stage) for key, stage in stages.items()}
-        known = {key: some for key, some in runs.items() if some}
+        known = {key: runs for key, stage in stages.items() if (runs := self._runs(stage))}
         deviation = scatter(known.values())
         for cell, goal in self._cells.items():
             row = self._writer.database.cell(cell.key)
@@ -151,10 +150,8 @@ class TimingPlan:
         return stage
 
     def record(self, stage: Stage, outcome: tuple[TimedCell, ...] | Failed) -> TimingRounds | None:
-        """Write the seconds of a block, or why there are none; returns the next block of its group, if any.
-
-        A stage that is not of this plan is ignored.
-        """
+        """Write the seconds of a block, or why there are none; returns the next block of its group, if any."""
+        # A stage that is not of this plan is ignored.
         if not isinstance(stage, TimingRounds):
             return None
         group = self._planned.pop(stage.key)

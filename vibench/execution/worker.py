@@ -9,20 +9,22 @@ import os
 import resource
 import socket
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache, partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from vibench import interrupts
 from vibench.errors import NumericalError, StorageError, UnsupportedError, VibenchError, in_a_line, message_of
 from vibench.execution import supervisor
-from vibench.execution.process_state import ProcessState
 from vibench.execution.supervisor import Batch, Job, Progress
 from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
@@ -31,8 +33,31 @@ from vibench.stages.snapshots import unchanged
 
 T = TypeVar("T")
 Send = Callable[[Any], None]
-Enter = Callable[[int, bool], None]
-"""Sets the item that this process is in, and whether its current operation has a time limit of its own."""
+Enter = Callable[[int, bool], None]  # sets the current item, and whether its operation has a time limit of its own
+
+
+def _folder() -> str:
+    try:
+        return str(Path.cwd())
+    except OSError:
+        return os.sep  # it has been removed
+
+
+def _set_environment(known: Mapping[str, str]) -> None:
+    os.environ.clear()
+    os.environ.update(known)
+
+
+def _state() -> dict[str, tuple[Any, Callable[[Any], object]]]:
+    """The state of this process that plugins may change, as it is now, and how every part is put back."""
+    return {
+        "sys.path": (sys.path[:], lambda known: setattr(sys, "path", known)),
+        "the recursion limit": (sys.getrecursionlimit(), sys.setrecursionlimit),
+        "numpy.seterr": (np.geterr(), lambda known: np.seterr(**known)),
+        "warnings.filters": (warnings.filters[:], lambda known: setattr(warnings, "filters", known)),
+        "the working directory": (_folder(), os.chdir),
+        "the environment": (os.environ.copy(), _set_environment),
+    }
 
 
 class _NoMemoryError(Exception):
@@ -83,8 +108,7 @@ def main() -> None:
         send(supervisor.Begun())
         # The allocator keeps freed memory: replace a large process before the next job, which it might fail. A process
         # of other packages is replaced after anything that has failed in it: who knows what that has left behind.
-        is_large = not _last and _address_space() > 0.5 * job.memory_gib * 2**30
-        if not first and (is_large or _failed):
+        if not first and (_failed or (not _last and _address_space() > 0.5 * job.memory_gib * 2**30)):
             send(supervisor.OutOfMemory(None))
             return
         first = False
@@ -132,8 +156,7 @@ def perform(
             return Failed(Status.ERROR, f"{error}; a plugin limits or closes the files of its process")
         return Unstored(str(error))
     except _NoMemoryError:
-        reason = f"{supervisor.OUT_OF_MEMORY} = {job.memory_gib:g}"
-        return supervisor.OutOfMemory(Failed(Status.ERROR, reason))
+        return supervisor.OutOfMemory(Failed(Status.ERROR, f"{supervisor.OUT_OF_MEMORY} = {job.memory_gib:g}"))
 
 
 def _check_code(job: Job, batch: Batch) -> None:
@@ -179,13 +202,16 @@ def _guarded(job: Job, work: Callable[[], T]) -> T | Failed:
     """The outcome of some work; what plugins of other packages have changed in this process is put back after it."""
     if not job.stage.packages:
         return _outcome(job.memory_gib, work)
-    before = ProcessState()
+    before, threads = _state(), set(threading.enumerate())
     outcome = _outcome(job.memory_gib, work)
-    changed = before.put_back()
-    if isinstance(outcome, Failed) or before.has_new_threads:
+    changed = [name for name, (value, _) in _state().items() if value != before[name][0]]
+    for value, put_back in map(before.__getitem__, changed):
+        put_back(value)
+    # Threads cannot be put back.
+    if isinstance(outcome, Failed) or not threads.issuperset(threading.enumerate()):
         _failed.append(job.stage.key)
     if isinstance(outcome, Failed) and changed:
-        outcome = Failed(outcome.status, f"{outcome.reason}; before that it changed {', '.join(changed)}")
+        return Failed(outcome.status, f"{outcome.reason}; before that it changed {', '.join(changed)}")
     return outcome
 
 

@@ -256,7 +256,7 @@ class Model:
         return u, self._multiplier(mu, u) if lam is None else lam
 
     def _pair(self, made: object) -> tuple[Array, Array | None]:
-        """What `reconstruct` returned."""
+        """The pair that `reconstruct` returned."""
         problem, declared = self.problem, self.formulation.multiplier
         if not isinstance(made, tuple) or len(made) != 2:
             raise NumericalError(f"`reconstruct` returned a {type(made).__name__}, expected a pair (u, λ)")

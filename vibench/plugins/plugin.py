@@ -186,8 +186,7 @@ def give(kind: PluginKind, name: str, given: Any) -> GivenPlugin:
                 del bare.__dict__[one]
             snapshot = copy.deepcopy(bare)
         _Pickler(file := io.BytesIO()).dump(snapshot)
-        needs = {one: distribution_version(one) for one in getattr(cls, "requires", ())}
-        code = fingerprint_of([snapshot, needs])
+        code = fingerprint_of([snapshot, {one: distribution_version(one) for one in getattr(cls, "requires", ())}])
     except Exception as error:  # noqa: BLE001  pickling runs third-party code
         why = f"the {kind} '{name}' cannot be sent to worker processes: {message_of(error)}"
         advice = "keep such objects out of attributes and global names, or make them where they are used"

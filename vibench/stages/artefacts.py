@@ -47,13 +47,15 @@ class DamagedArtefactError(VibenchError):
     """Bytes that `dumps` did not write."""
 
 
-def storable(kind: ClassT) -> ClassT:
-    """Add a class to the closed list of those whose objects may be stored; may be used as a decorator."""
+def storable(kind: ClassT, *others: type) -> ClassT:
+    """Add classes to the closed list of those whose objects may be stored; may be used as a decorator of one."""
     # A dataclass is stored by its fields, an enumeration by the name of the member, any other class by the value of
     # `__getstate__` without cached properties. A module that defines a stage lists the classes of its value.
     # Files name classes without their modules.
-    if _classes.setdefault(kind.__name__, kind) is not kind:
-        raise TypeError(f"two storable classes are called {kind.__name__}")
+    kinds: tuple[type, ...] = (kind, *others)
+    for one in kinds:
+        if _classes.setdefault(one.__name__, one) is not one:
+            raise TypeError(f"two storable classes are called {one.__name__}")
     return kind
 
 
@@ -70,8 +72,7 @@ def loads(content: bytes) -> Any:
     try:
         arrays = safetensors.numpy.load(content)
         text = arrays.pop("structure").tobytes().decode("ascii")
-        structure = json.loads(text, object_pairs_hook=_no_duplicates, parse_constant=_refuse)
-        return _Reader(arrays).value(structure)
+        return _Reader(arrays).value(json.loads(text, object_pairs_hook=_no_duplicates, parse_constant=_refuse))
     # Factorisations are computed again, which may fail with a `VibenchError`.
     except (
         safetensors.SafetensorError, LookupError, TypeError, ValueError, AttributeError, RecursionError, MemoryError,
@@ -199,8 +200,7 @@ class _Reader:
                 raise TypeError(f"other fields than those of {name}")
             return make(**state)
         made = object.__new__(kind)
-        set_state = getattr(made, "__setstate__", made.__dict__.update)
-        set_state(state)
+        getattr(made, "__setstate__", made.__dict__.update)(state)
         return made
 
 

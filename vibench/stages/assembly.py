@@ -21,8 +21,7 @@ from vibench.stages.enrichment import GrowthStage
 from vibench.stages.formulation import FormulationStage
 from vibench.study.parameter_sets import ParameterSet
 
-for _kind in (VariationalInequality, ExactSolution):
-    storable(_kind)
+storable(VariationalInequality, ExactSolution)
 
 
 @dataclass(frozen=True)

@@ -98,10 +98,8 @@ def online_columns(bound: OnlineBound, error: Row) -> Row:
 
 
 def refutation(row: Row) -> Row:
-    """Status and reason of an ok query whose error is above its bound plus the accuracy of the reference; or nothing.
-
-    Such a query shows that something is false on which the bound rests, a declaration of the problem or a proof.
-    """
+    """Status and reason of an ok query whose error exceeds its bound plus the accuracy of the reference, or nothing."""
+    # Such a query shows that something is false on which the bound rests, a declaration of the problem or a proof.
     for name in ("u_energy", "lambda_natural"):
         absolute, bound = row.get(f"error_{name}_absolute"), row.get(f"bound_online_{name}")
         force = row.get("error_lambda_natural")
@@ -147,8 +145,7 @@ def error_columns(
         if answer.bound is not None:
             row.update(online_columns(answer.bound, row))
     sizes = zip(problem.V.norm(reference.u), problem.W.norm(reference.lam), strict=True)
-    full = projected or [None] * len(rows)
-    programs = zip(solutions, exact, full, strict=True)
+    programs = zip(solutions, exact, projected or [None] * len(rows), strict=True)
     for row, mu, answer, norms, ((x, alpha), own, galerkin) in zip(rows, mus, answers, sizes, programs, strict=True):
         # A program that cannot be solved to round-off separates no errors.
         if own is None:

@@ -21,8 +21,7 @@ from vibench.study.cells import Axes, digest
 from vibench.study.parameter_sets import ParameterSet
 from vibench.timing import NO_TIME, Seconds
 
-Row = dict[str, Any]
-"""A row of a results table: column → value."""
+Row = dict[str, Any]  # a row of a results table: column → value
 
 
 @lru_cache(maxsize=4)
@@ -110,9 +109,8 @@ class Stage(ABC):
         """Hash of the code that determines the value; that of the inputs is in their keys."""
         # Of its own layer only the modules count that it imports from: an edit of one stage keeps most other artefacts.
         imported = {str(getattr(one, "__module__", "")) for one in vars(sys.modules[cls.__module__]).values()}
-        # These modules only pass values on.
-        carriers = {__name__, "vibench.stages.artefacts"}
-        own = {name for name in imported if name.startswith("vibench.stages.")} - carriers
+        # These two modules only pass values on.
+        own = {name for name in imported if name.startswith("vibench.stages.")} - {__name__, "vibench.stages.artefacts"}
         sources = [source_hash(Path(str(sys.modules[name].__file__))) for name in sorted({cls.__module__, *own})]
         return " ".join([*sources, numerical_code(below="stages")])
 
@@ -189,8 +187,7 @@ def _described(value: Any) -> Any:
     return value
 
 
-TimeLimit = Callable[[], AbstractContextManager[None]]
-"""Context of an operation that has a time limit of its own."""
+TimeLimit = Callable[[], AbstractContextManager[None]]  # context of an operation that has a time limit of its own
 
 
 class Items(ABC):

@@ -26,8 +26,7 @@ from vibench.stages.snapshots import parameters_in
 from vibench.study.cells import Axes, Cell
 from vibench.timing import Seconds, timed
 
-for _kind in (Kind, Grown, Milestone):
-    storable(_kind)
+storable(Kind, Grown, Milestone)
 
 
 @storable
@@ -240,9 +239,7 @@ def _reduction(store: Store, pod: PODStage, cone: ConeStage) -> Reduction:
 
 
 def _offline(store: Store, pod: PODStage, cone: ConeStage) -> Offline:
-    problem, basis = build_problem(pod.problem), value_of(store, pod).basis
-    reduced: ReducedCone = value_of(store, cone)
-    return Offline(problem, basis, reduced.cone, reduced.prepared.span, parameters_in(store, pod.problem, pod.training))
+    return _reduction(store, pod, cone).given(parameters=parameters_in(store, pod.problem, pod.training)).offline
 
 
 def _projected(offline: Offline, vectors: Array, classes: ConstraintClasses) -> ProjectedSupremizers:

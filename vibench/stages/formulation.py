@@ -36,15 +36,14 @@ from vibench.stages.snapshots import gather, parameters_in, solution_stages
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.timing import timed
 
-for _kind in (
+storable(
     AffineMember, Evaluation, ReducedOperators, ProjectedMember, ContactCoordinates, LoadCoordinates,
     SpannedCoordinates, InnerProduct, SparseCholesky, PartialCholesky, BlockDiagonal,
     # Formulations may build steps of other offline phases, and compiled programs.
     POD, Cone, Kind, Enrichment, CompiledModel, AffinePolynomial,
     CertificateBase, ContactCompliance, OnlineInfSup, PreparedCorrections, ResidualBasis, SpectralBounds,
     AnchorGrid, TermRanges,
-):  # fmt: skip
-    storable(_kind)
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

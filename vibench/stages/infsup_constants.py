@@ -22,8 +22,7 @@ from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage
 from vibench.study.parameter_sets import CHUNKS, ParameterSet, chunk_edges, chunk_of, chunk_size
 
-for _kind in (ConstraintClasses, Stability, Constant, infsup.InfSup):
-    storable(_kind)
+storable(ConstraintClasses, Stability, Constant, infsup.InfSup)
 
 
 @dataclass(frozen=True)

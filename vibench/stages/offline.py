@@ -18,8 +18,7 @@ from vibench.study.cells import Axes
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.timing import timed
 
-for _kind in (POD, Cone, ConeBasis, ConstraintClasses):
-    storable(_kind)
+storable(POD, Cone, ConeBasis, ConstraintClasses)
 
 
 @dataclass(frozen=True)

@@ -98,8 +98,7 @@ class ProgramQuery:
         row: Row = {"solver_status": answer.solver_status, "iterations": answer.iterations}
         solution = None
         if residuals is not None and answer.x is not None and answer.alpha is not None:
-            left_open = slack(self.program, answer.alpha, residuals, self.accuracy)
-            solution = solution_row(answer.x, answer.alpha, left_open)
+            solution = solution_row(answer.x, answer.alpha, slack(self.program, answer.alpha, residuals, self.accuracy))
         return QueryStatus(status, reason, residuals=residuals), row, solution
 
 

@@ -158,8 +158,7 @@ class SnapshotStage(Stage):
                 _set_up[problem] = solver, beginning.beyond(seconds[0])
         if self.parameters.role == "validation" and self.parameters.sampling is None and not self.chunk:
             # A short validation set is random in the box, but not enough.
-            missing = max(0, 16 - len(self.parameters.of(problem)))
-            work.reference.refuse_at_random(missing, self.parameters.seed + 1)
+            work.reference.refuse_at_random(max(0, 16 - len(self.parameters.of(problem))), self.parameters.seed + 1)
         work.reference.refuse_rewritten_constants()
         setups = (_set_up[problem][1],) if problem in _set_up else ()
         fallbacks, bounds = (solution.fallback for solution in solutions), self._bounds(problem, mus, u, lam)
@@ -279,10 +278,8 @@ def fingerprint_here(problem: Plugin) -> Fingerprint:
 
 @contextmanager
 def unchanged(stage: Stage) -> Iterator[None]:
-    """Raise a `NumericalError` if plugins change the problem of a stage in the block, which other stages share.
-
-    Plugins of vibench change nothing, and cost nothing here.
-    """
+    """Raise a `NumericalError` if plugins change the problem of a stage in the block, which other stages share."""
+    # Plugins of vibench change nothing, and cost nothing here.
     guests = [one for one in stage.plugins if one.kind is not PluginKind.PROBLEM and one.registered.package]
     problems = [one for one in stage.plugins if one.kind is PluginKind.PROBLEM] if guests else []
     before = {plugin: fingerprint_here(plugin) for plugin in problems}

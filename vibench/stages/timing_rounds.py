@@ -27,11 +27,10 @@ from vibench.stages.query import ModelQuery, Queries
 from vibench.stages.snapshots import gather
 from vibench.timing import NO_TIME, Seconds, calibration, is_disturbed, timed
 
+# A round takes a third of the queries of a cell, another one each time: short rounds interleave more closely.
 QUERY_SUBSETS = 3
-"""A round takes a third of the queries of a cell, another one each time: short rounds interleave more closely."""
-
+# CPU seconds of full assemblies after which no further one is timed in a cell's part of a round.
 ASSEMBLY_SECONDS = 0.02
-"""CPU seconds of full assemblies after which no further one is timed in a cell's part of a round."""
 
 
 @dataclass(frozen=True)
@@ -174,10 +173,7 @@ class _Rounds(Items):
         """Seconds of assembly, solution, certificate and reconstruction of queries; `warm_up` is part of the seeds."""
         # Every repetition is perturbed, so that a caching solver or problem cannot be timed on a cache hit.
         stage, seed = self._stage.cells[cell], (at, cell, warm_up)
-        assemble: dict[int, Seconds] = {}
-        solve: dict[int, Seconds] = {}
-        certify: dict[int, Seconds] = {}
-        reconstruct: dict[int, Seconds] = {}
+        assemble, solve, certify, reconstruct = (dict[int, Seconds]() for _ in range(4))
         queries = self._queries(stage)
         certified = stage.certificate is not None or stage.correction is not CorrectionMode.NONE
         for k, solution in alternated:
@@ -236,8 +232,7 @@ class _Rounds(Items):
                 failures[cell].append(outcome)
             else:
                 rounds[cell][self._stage.first + within] = outcome
-        cells = zip(rounds, failures, strict=True)
-        return tuple(TimedCell(mine, machine(), tuple(missing)) for mine, missing in cells)
+        return tuple(TimedCell(mine, machine(), tuple(missing)) for mine, missing in zip(rounds, failures, strict=True))
 
 
 def _assembly(
@@ -297,23 +292,19 @@ def _columns(assemble: Array | None, solve: Array | None, certify: Array | None,
 
 def seconds_of_cell(rows: Sequence[Row]) -> Row:
     """The columns of a cell from its rounds; empty without any."""
-    if not rows:
-        return dict.fromkeys((
-            "online_s", "online_q1_s", "online_q3_s", "online_wall_s", "online_assemble_s", "online_solve_s",
-            "online_certify_s", "online_reconstruct_s", "slowdown", "disturbed",
-        ))  # fmt: skip
-    total, wall, slowdown = (np.array([row[name] for row in rows]) for name in ("total_s", "total_wall_s", "slowdown"))
-    optional = {name: [row[name] for row in rows if row[name] is not None] for name in ("certify_s", "reconstruct_s")}
-    low, high = np.quantile(total, (0.25, 0.75))
+
+    def middle(name: str) -> float | None:
+        known = [row[name] for row in rows if row[name] is not None]
+        return float(np.median(known)) if known else None
+
+    low, high = np.quantile([row["total_s"] for row in rows], (0.25, 0.75)) if rows else (None, None)
     # Geometric means over the blocks of medians over their rounds: the quotient of the two is the paired one.
-    online, high_fidelity = mean_seconds(blocks_of(rows).values())
+    online, high_fidelity = mean_seconds(blocks_of(rows).values()) if rows else (None, None)
+    slowdown, parts = middle("slowdown"), ("assemble_s", "solve_s", "certify_s", "reconstruct_s")
     return {
-        "online_s": online, "online_q1_s": low, "online_q3_s": high, "online_wall_s": np.median(wall),
-        "online_assemble_s": np.median([row["assemble_s"] for row in rows]),
-        "online_solve_s": np.median([row["solve_s"] for row in rows]),
-        **{f"online_{name}": np.median(known) if known else None for name, known in optional.items()},
-        "slowdown": np.median(slowdown),
-        "disturbed": int(is_disturbed(float(np.median(slowdown)))),
+        "online_s": online, "online_q1_s": low, "online_q3_s": high, "online_wall_s": middle("total_wall_s"),
+        **{f"online_{name}": middle(name) for name in parts},
+        "slowdown": slowdown, "disturbed": None if slowdown is None else int(is_disturbed(slowdown)),
     } | ({} if high_fidelity is None else {"hf_s": high_fidelity})  # fmt: skip
 
 

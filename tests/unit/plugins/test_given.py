@@ -20,7 +20,7 @@ from fake_plugins import Wire
 
 import vibench
 from vibench.errors import RequestError
-from vibench.execution.first_use import recall_reads, watch_first_use
+from vibench.execution.isolated import recall_reads, watch_first_use
 from vibench.execution.supervisor import Supervisor
 from vibench.plugins import plugin as module
 from vibench.plugins.kinds import PluginKind
