@@ -48,7 +48,7 @@ def study_of(cells: int) -> vibench.Study:
 def run(cells: int, folder: Path) -> None:
     start = time.process_time()
     with ProgressDisplay() as progress:
-        run_study(study_of(cells), folder, progress, Options(jobs=2))
+        run_study(study_of(cells), folder, progress, Options(2, False, False, "local", None, 0))
     spent = time.process_time() - start
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20  # KiB on Linux
     (folder / "cost.json").write_text(json.dumps([spent, peak]))

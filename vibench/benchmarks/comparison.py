@@ -66,8 +66,8 @@ def _parsed(content: bytes) -> Timed:
     libraries = own.get("libraries") or f"python {info.get('python_version', '')}"
     machine = {"machine": own.get("machine") or processor, "libraries": libraries}
     machine |= {"timer": ", ".join(timers), "code": own.get("code", "")}
-    failed = len(file.get("failed", ()))
-    return Timed(benchmarks, failed, {name: unbroken(str(text)) for name, text in machine.items()})
+    machine = {name: unbroken(str(text)) for name, text in machine.items()}
+    return Timed(benchmarks, len(file.get("failed", ())), machine)
 
 
 def _measured(name: str, entry: Mapping[str, Any]) -> Measured:

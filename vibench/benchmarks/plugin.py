@@ -119,8 +119,7 @@ class Passes:
             seconds, budget = spent.wall, self._seconds
             if not number:
                 reached = judge(result)
-                sizes = {"n": inputs.problem.V.dim, "m": inputs.problem.W.dim}
-                benchmark.extra_info |= _plain({**sizes, **reached})
+                benchmark.extra_info |= _plain({"n": inputs.problem.V.dim, "m": inputs.problem.W.dim, **reached})
                 # The first call may have imported something.
                 if spent.cpu < 3.0 * budget:
                     spent = once()[1]
@@ -154,8 +153,7 @@ class Passes:
         if call.excinfo is not None:
             error = call.excinfo.value
             told = isinstance(error, VibenchError | RuntimeError | pytest.skip.Exception)
-            line = message_of(error) if told else in_a_line(error)
-            report.user_properties.append(("reason", line))
+            report.user_properties.append(("reason", message_of(error) if told else in_a_line(error)))
         benchmark: Any = getattr(item, "funcargs", {}).get("benchmark")
         if report.when == "call" and report.passed and benchmark.stats:
             parameters = item.callspec.params  # type: ignore[attr-defined]

@@ -11,7 +11,7 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Seq
 from concurrent.futures import Future
 from functools import partial, wraps
 from itertools import cycle
-from typing import Any, Concatenate, NamedTuple, ParamSpec, TypeVar
+from typing import Any, Concatenate, NamedTuple, ParamSpec, TypeVar, cast
 
 import numpy as np
 import pytest
@@ -70,8 +70,7 @@ def _once(make: Callable[Concatenate[StageInputs, P], T]) -> Callable[Concatenat
                 self.made[key].set_result(make(self, *args, **kwargs))
             except (Exception, SystemExit) as error:  # noqa: BLE001  plugins are code of strangers
                 self.made[key].set_exception(error)
-        value: T = self.made[key].result()
-        return value
+        return cast("T", self.made[key].result())
 
     return made
 
@@ -89,8 +88,7 @@ class StageInputs:
     @_once
     def problem(self) -> Problem:
         options = {} if self.case.resolution is None else {"resolution": self.case.resolution}
-        created: Problem = find(PluginKind.PROBLEM, self.case.problem).create(options)
-        return created
+        return cast("Problem", find(PluginKind.PROBLEM, self.case.problem).create(options))
 
     @property
     @_once
@@ -123,10 +121,8 @@ class StageInputs:
 
     @_once
     def reduction(self, spaces: ReducedSpaces, primal: PrimalChoice | None = None) -> Reduction:
-        """V_N and the cone at some spaces, and the enrichment where there is a primal strategy.
-
-        `given()` makes the same reduction anew, whose models have nothing in store from earlier queries.
-        """
+        """V_N and the cone at some spaces, and the enrichment where there is a primal strategy."""
+        # `given()` makes the same reduction anew, whose models have nothing in store from earlier queries.
         dual = find(PluginKind.DUAL, spaces.dual).create({})
         strategy = None if primal is None else find(PluginKind.PRIMAL, primal.name).create({})
         tolerance = None if primal is None else primal.tolerance
@@ -357,8 +353,7 @@ def test_solver(timing: Timing, inputs: StageInputs, size: Size, solver: str, ac
         figures = {} if residuals is None else residual_figures(residuals)
         return {**_shape(reduced), "N": N, "status": status.value, "reason": reason, "accuracy": figures}
 
-    registered = qp_solver(solver)
-    solve = partial(solve_qp, reduced.program, solver, accuracy, registered, reduced.factor)
+    solve = partial(solve_qp, reduced.program, solver, accuracy, qp_solver(solver), reduced.factor)
     timing(f"QP of N = {N}, R = {R}", solve, judge)
 
 

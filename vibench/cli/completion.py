@@ -11,6 +11,7 @@ import os
 import sqlite3
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 
@@ -31,10 +32,8 @@ def examples(command: str) -> str:
 
 @contextlib.contextmanager
 def whole_words() -> Iterator[None]:
-    """Give the completion of bash words that it breaks at ":" and "=": `primal:name` and `key=value` are one.
-
-    Bash completes only what comes after the last break of such a word, so what is printed begins there.
-    """
+    """Give the completion of bash words that it breaks at ":" and "=": `primal:name` and `key=value` are one."""
+    # Bash completes only what comes after the last break of such a word, so what is printed begins there.
     # Typer checks words with pydantic, which would look for plugins of its own.
     if "_VIBENCH_COMPLETE" in os.environ:
         os.environ["PYDANTIC_DISABLE_PLUGINS"] = "__all__"
@@ -63,11 +62,6 @@ def words(choices: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
     return lambda incomplete: _beginning(incomplete, choices())
 
 
-def names(*kinds: PluginKind) -> Callable[[str], list[str]]:
-    """A completion with the names of plugins of some kinds."""
-    return words(lambda: _registered(*kinds))
-
-
 def _registered(*kinds: PluginKind) -> set[str]:
     from vibench.plugins.registry import registered
 
@@ -88,8 +82,8 @@ def _error_measures() -> Iterable[str]:
     return [*columns_of_measures(), "output:"]
 
 
-problems, primals, duals, formulations = map(
-    names, (PluginKind.PROBLEM, PluginKind.PRIMAL, PluginKind.DUAL, PluginKind.FORMULATION)
+problems, primals, duals, formulations = (
+    words(partial(_registered, CHECKED[kind])) for kind in ("problem", "primal", "dual", "formulation")
 )
 # QP solvers, installed or not.
 solvers = words(lambda: {*SETTINGS, *_registered(PluginKind.SOLVER)})

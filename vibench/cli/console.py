@@ -35,10 +35,8 @@ def warn(*lines: str) -> None:
 
 
 def fitted(line: str, stream: TextIO) -> str:
-    """A line, wrapped between words on a terminal.
-
-    Elsewhere a program may read it, and an indented line holds a command that somebody may copy: both stay whole.
-    """
+    """A line, wrapped between words on a terminal."""
+    # Elsewhere a program may read it, and an indented line holds a command that somebody may copy: both stay whole.
     width = shutil.get_terminal_size().columns
     if len(line) <= width or line.startswith(" ") or not stream.isatty():
         return line
@@ -147,9 +145,7 @@ def _arranged(
         return own, kept
     # One column joins the axes of every row, and may be wrapped between two of them.
     in_order = [column for column in own if column in telling]
-    named = [
-        [f"{axis.heading}={cell}" * bool(cell) if axis.numeric else cell for cell in axis.cells] for axis in in_order
-    ]
+    named = [[f"{one.heading}={cell}" * bool(cell) if one.numeric else cell for cell in one.cells] for one in in_order]
     joined = tuple(" · ".join(text for text in row if text) for row in zip(*named, strict=True))
     together, first = PrintedColumn("row", joined), own.index(in_order[0])
     arranged = [*own[:first], together, *own[first:]]

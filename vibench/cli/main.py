@@ -92,8 +92,7 @@ def clean(
         if not sys.stdin.isatty():
             raise RequestError("nothing was deleted: answer the question on a terminal, or say --yes")
         typer.confirm(f"Delete {going} of {len(stored)} files?", abort=True)
-    freed = store.clear(seconds)
-    echo(f"{freed / 2**20:.1f} MiB freed; later runs recompute what they need")
+    echo(f"{store.clear(seconds) / 2**20:.1f} MiB freed; later runs recompute what they need")
 
 
 def doctor(out: Annotated[Path, Option(metavar="DIR", help="Folder of the runs.")] = Path("runs")) -> None:
@@ -188,10 +187,8 @@ def _tables_and_plugins() -> Explained:
 def glossary() -> Explained:
     """Entries of the glossary; each explains the words of its title and those that its text emphasises or quotes."""
     source = (files("vibench.cli") / "glossary.md").read_text(encoding="utf-8")
-    entries = re.findall(
-        r"^(?:\*\*(.+)\*\*\n:   |\| (?!symbol|status|verdict|---)(.+?) \| )(.+?)(?: \|)?$", source, re.M
-    )
-    for title, row, text in entries:
+    found = re.findall(r"^(?:\*\*(.+)\*\*\n:   |\| (?!symbol|status|verdict|---)(.+?) \| )(.+?)(?: \|)?$", source, re.M)
+    for title, row, text in found:
         head = (title or row).replace("`", "")
         # "Certificate: certified, verified" and "*as fast*" in a text are words that people look up.
         words = [*re.split(r"[,:()]|\band\b", head), *re.findall(r"(?<=\*)[^*]+(?=\*)|(?<=`)[^`]+(?=`)", text)]
@@ -208,16 +205,14 @@ class _Command(typer.core.TyperCommand):
         return [piece.removesuffix("...") if " " in piece else piece for piece in pieces]
 
 
-for _name, _command in dict[str, Callable[..., None]](
+for _name, _call in dict[str, Callable[..., None]](
     run=run_study_command, list=plugins.list_plugins, show=results.show, report=results.write_report,
     figures=results.draw_figures, compare=results.compare_runs, replay=results.replay_query, export=results.export,
     pack=pack, check=plugins.check_plugin, new=plugins.new_plugin, bench=plugins.bench_plugins,
     publish=results.publish_runs, clean=clean, doctor=doctor, help=help_on,
 ).items():  # fmt: skip
     # Without an own default map a command would take the default above of an option of the same name for its own.
-    app.command(_name, cls=_Command, epilog=examples(_name), context_settings={"default_map": {}})(
-        interruptible(_command)
-    )
+    app.command(_name, cls=_Command, epilog=examples(_name), context_settings={"default_map": {}})(interruptible(_call))
 
 
 def renamed(arguments: list[str]) -> list[str] | None:
@@ -276,10 +271,9 @@ def run_command_line() -> None:
 
 
 def _search_working_directory_last() -> None:
-    """Let nothing in the working directory take the place of an installed package.
-
-    An empty entry of PYTHONPATH, which `PYTHONPATH=FOLDER:$PYTHONPATH` leaves, puts it first. Workers search as we do.
-    """
+    """Let nothing in the working directory take the place of an installed package."""
+    # An empty entry of PYTHONPATH, which `PYTHONPATH=FOLDER:$PYTHONPATH` leaves, puts it first. Workers search as we
+    # do.
     first, *more = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     if more and "" in (first, *more):
         here = os.path.realpath(os.curdir)

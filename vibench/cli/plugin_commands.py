@@ -51,9 +51,8 @@ def list_plugins(
     known = {kind.plural: kind for kind in PluginKind}
     if what is None:
         for kind in PluginKind:
-            print_rows(
-                _solver_rows(load=False) if kind is PluginKind.SOLVER else _read_rows(kind), headings, kind.plural
-            )
+            rows = _solver_rows(load=False) if kind is PluginKind.SOLVER else _read_rows(kind)
+            print_rows(rows, headings, kind.plural)
         echo("", "what the options of one kind are, and whether its plugins can be loaded:")
         echo(f"  vibench list KIND, such as {PluginKind.PROBLEM.plural}")
     elif what in known:
@@ -220,8 +219,7 @@ def _solver_rows(load: bool) -> Iterator[Row]:
             state = find(PluginKind.SOLVER, name).conflict or ("installed" if name in loaded else "not installed")
             yield name, version, state, ""
         else:
-            missing = "" if version else f"not installed: `pip install {package}`"
-            yield plugins.get(name, (name, version, missing, ""))
+            yield plugins.get(name, (name, version, "" if version else f"not installed: `pip install {package}`", ""))
 
 
 def _find_object(module: str, name: str) -> RegisteredPlugin:
@@ -387,6 +385,4 @@ def _compared(rows: pd.DataFrame) -> pd.DataFrame:
     changes = rows[["figure", "before", "after"]].itertuples(index=False, name=None)
     reached = [f"{name} {cell_text(was)} → {cell_text(now)}" if name else "" for name, was, now in changes]
     seconds = {"before [ms]": 1e3 * rows["before_s"], "after [ms]": 1e3 * rows["after_s"]}
-    return rows[["ratio", "apart", "verdict"]].assign(**seconds, reached=reached)[
-        ["before [ms]", "after [ms]", "ratio", "apart", "reached", "verdict"]
-    ]
+    return rows.assign(**seconds, reached=reached)[[*seconds, "ratio", "apart", "reached", "verdict"]]

@@ -127,8 +127,7 @@ def compare_runs(
         sys.stdout.write(formats.to_text(whole_numbers(frame), form))
     elif column or table not in (None, "changes"):
         # What a table says of each run, in a column of its own, matters most.
-        names = [one.name for one in compared.runs]
-        _print_compared(frame, f"{column} of the cells" if column else str(table), names)
+        _print_compared(frame, f"{column} of the cells" if column else str(table), [one.name for one in compared.runs])
     else:
         if table is None:
             _print_overview(compared)
@@ -230,8 +229,7 @@ def write_report(
     from vibench.results.read import results_file
 
     path = results_file(run)
-    written = html.write(path, out or path.parent / REPORT, figures=figures)
-    echo(f"report: {written}")
+    echo(f"report: {html.write(path, out or path.parent / REPORT, figures=figures)}")
 
 
 def draw_figures(
@@ -359,9 +357,7 @@ def export(
         _export_model(run, cell[0], target, tolerance, bases, places_of(at))
 
 
-def _export_model(
-    run: str, cell: str, target: Path, tolerance: float | None, bases: bool, places: Mapping[str, str]
-) -> None:
+def _export_model(run: str, cell: str, out: Path, tolerance: float | None, bases: bool, at: Mapping[str, str]) -> None:
     """Export a model, and say which errors its polynomials have, what it bounds and how long its queries take."""
     from vibench.library import reduced_model
     from vibench.library.export import export_model
@@ -369,21 +365,19 @@ def _export_model(
     from vibench.offline.polynomials import TOLERANCE
     from vibench.timing import timed
 
-    model, file = open_run(run, at=places).model(cell), target.with_suffix(".npz")
-    exported = export_model(
-        model, file, TOLERANCE if tolerance is None else tolerance, bases=bases, c=target.suffix == ".c"
-    )
-    for name, member in exported.members.items():
+    model, file = open_run(run, at=at).model(cell), out.with_suffix(".npz")
+    made = export_model(model, file, TOLERANCE if tolerance is None else tolerance, bases=bases, c=out.suffix == ".c")
+    for name, member in made.members.items():
         terms = f"{len(member.terms)} term{'s' * (len(member.terms) > 1)}"
         form = f"{terms}, polynomials of degree ({', '.join(map(str, member.degrees))})"
         echo(f"{name}: {form if any(member.degrees) else 'constant'}, relative error {member.error:.1e}")
     echo("relative errors are those at random parameters and at the corners of the box")
     # The script has fewer solvers than vibench.
-    if exported.about["solver"] != model.solver:
-        echo(f"the cell's solver is {model.solver}, the script solves by {exported.about['solver']}")
-    why = exported.about["no_bounds"]
-    echo(f"no error bounds: {why}" if why else f"error bounds in C: {exported.about['certificate']}")
-    outputs = exported.about["outputs"]
+    if made.about["solver"] != model.solver:
+        echo(f"the cell's solver is {model.solver}, the script solves by {made.about['solver']}")
+    why = made.about["no_bounds"]
+    echo(f"no error bounds: {why}" if why else f"error bounds in C: {made.about['certificate']}")
+    outputs = made.about["outputs"]
     held, others = ", ".join(output["name"] for output in outputs["linear"]), ", ".join(outputs["left_out"])
     if held or others:
         echo(f"outputs: {held or 'none'}{f'; code that the file cannot hold computes {others}' * bool(others)}")
@@ -394,6 +388,6 @@ def _export_model(
     # The first query of both is longer than the others, as caches are cold.
     query, solution = (f"{1e3 * median(column):.2g} ms" for column in zip(*seconds[1:], strict=True))
     echo(f"a query takes {query}; the high-fidelity solution {solution}")
-    sources = [file.with_suffix(end) for end in (".c", ".h") if target.suffix == ".c"]
+    sources = [file.with_suffix(end) for end in (".c", ".h") if out.suffix == ".c"]
     written = ", ".join(map(str, [file, file.with_name("reduced_model.py"), *sources]))
     echo(f"{written}: `from reduced_model import Model`, then `Model({str(file)!r}).solve(mu)`")

@@ -205,10 +205,8 @@ def print_summary(path: Path, rows: Rows) -> None:
 
 
 def failures(rows: Rows, run: str) -> Iterator[str]:
-    """A line for every reason why cells are not ok; reasons that differ in their numbers alone are one.
-
-    For an inaccurate solver it names those that are ok on the same model, or the command that tries them.
-    """
+    """A line for every reason why cells are not ok; reasons that differ in their numbers alone are one."""
+    # For an inaccurate solver it names those that are ok on the same model, or the command that tries them.
     from vibench.library.progress import kind_of_failure
     from vibench.results import formats
 
@@ -229,9 +227,7 @@ def failures(rows: Rows, run: str) -> Iterator[str]:
         remedy = ""
         if first["status"] == Status.INACCURATE:
             # Solvers of one model solve the same programs.
-            same = [
-                row for row in rows if all(row[name] == first[name] for name in ("model", "accuracy", "correction"))
-            ]
+            same = [row for row in rows if all(row[key] == first[key] for key in ("model", "accuracy", "correction"))]
             fine = ", ".join(sorted({row["solver"] for row in same if row["status"] == Status.OK}))
             remedy = f"; ok with {fine}" if fine else f"; `vibench replay {run} {first['cell']}` tries other solvers"
         yield f"{count}{first['status']}: {which}{formats.name_of_cell(first)}: {queries}; {first['reason']}{remedy}"

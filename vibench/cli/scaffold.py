@@ -16,10 +16,8 @@ from vibench.provenance import distribution_version
 
 
 def write_package(kind: PluginKind, name: str, parent: Path) -> Path:
-    """Write a package with one plugin, completely or not at all; returns its folder `parent/vibench-NAME`.
-
-    Raises a `RequestError` if the name is invalid or taken, or the folder exists, a `StorageError` if a write fails.
-    """
+    """Write a package with one plugin, completely or not at all; returns its folder `parent/vibench-NAME`."""
+    # Raises a `RequestError` if the name is invalid or taken, or the folder exists, a `StorageError` if a write fails.
     check_name(kind, name)
     package, word = _package(name), kind.cli_name
     camel, snake = "".join(word.capitalize() for word in name.split("-")), name.replace("-", "_")

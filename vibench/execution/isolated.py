@@ -72,11 +72,9 @@ class IsolatedCall(ItemwiseStage, Items):
 def call_isolated(
     function: Callable[..., Any], *arguments: Any, seconds: float, supervisor: Supervisor, owners: tuple[str, ...] = ()
 ) -> Any:
-    """Call a function in the process of a supervisor for some packages, for some wall seconds at most.
-
-    The value is a `Failed` if the call raised, took longer or ended the process, and a `NotImportableError` if the
-    process cannot import the function or its arguments. Raises a `NotImportableError` if they cannot be pickled.
-    """
+    """Call a function in the process of a supervisor for some packages, for some wall seconds at most."""
+    # The value is a `Failed` if the call raised, took longer or ended the process, and a `NotImportableError` if the
+    # process cannot import the function or its arguments. Raises a `NotImportableError` if they cannot be pickled.
     try:
         pickled = pickle.dumps((function, arguments))
     except (pickle.PicklingError, AttributeError, TypeError) as error:
@@ -109,16 +107,14 @@ def _tried(program: VariationalInequality, accuracy: float, name: str) -> Trial:
     return Trial(status, reason, solution, residuals, seconds)
 
 
-def solver_trials(
-    program: VariationalInequality, accuracy: float, solvers: Sequence[str], seconds: float
-) -> dict[str, Trial]:
+def solver_trials(vi: VariationalInequality, accuracy: float, names: Sequence[str], seconds: float) -> dict[str, Trial]:
     """Outcomes of installed solvers on a dense program, by name; `seconds` limits each, including its import."""
     trials: dict[str, Trial] = {}
     with closing(Supervisor()) as supervisor:
-        for name in solvers:
+        for name in names:
             owners = (registry.find(PluginKind.SOLVER, name).package,)
             limits: Any = {"seconds": seconds, "supervisor": supervisor, "owners": owners}
-            outcome = call_isolated(_tried, program, accuracy, name, **limits)
+            outcome = call_isolated(_tried, vi, accuracy, name, **limits)
             trials[name] = outcome if isinstance(outcome, Trial) else Trial(outcome.status, outcome.reason)
     return trials
 

@@ -53,13 +53,10 @@ def claimed(folder: Path) -> Iterator[None]:
 
 
 def clear(folder: Path, study: str, note: Callable[[str], None]) -> None:
-    """Remove the tables, log and report of an earlier run of a study; refuse the folder of another study.
-
-    Other files stay: a user may keep notes there, and figures are removed when they are drawn anew. A results file that
-    cannot be read is kept under another name, which is passed to `note`.
-
-    Raises a `RequestError` if the folder holds results of another study.
-    """
+    """Remove the tables, log and report of an earlier run of a study; refuse the folder of another study."""
+    # Other files stay: a user may keep notes there, and figures are removed when they are drawn anew. A results file
+    # that cannot be read is kept under another name, which is passed to `note`. Raises a `RequestError` if the folder
+    # holds results of another study.
     path = folder / FILE
     try:
         meta = read_meta(path) if path.is_file() else {}
@@ -115,8 +112,7 @@ class ResultWriter:
     def seconds(self, cell: Cell, rows: list[Row], rounds: Sequence[TimedRound], machines: Set[str], lost: str) -> None:
         """Write the seconds of a cell that has its rows; more may follow until it has the column `timing_rounds`."""
         row = self.database.cell(cell.key)
-        # Cells are timed only when they have their rows.
-        assert row is not None
+        assert row is not None  # cells are timed only when they have their rows
         own = seconds_of_cell(rows) | {"timing_rounds": None, "timed_rounds": len(rows), "timing_reason": lost}
         if rows:
             own["machine"] = "; ".join(sorted({*row["machine"].split("; "), *machines}))

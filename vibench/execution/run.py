@@ -106,12 +106,12 @@ class Options:
     Raises a `RequestError` for too many worker processes or repeats.
     """
 
-    jobs: int = 0
-    fresh: bool = False
-    retry: bool = False
-    executor: str = "local"
-    scheduler: str | None = None
-    repeats: int = 0
+    jobs: int
+    fresh: bool
+    retry: bool
+    executor: str
+    scheduler: str | None
+    repeats: int
 
     def __post_init__(self) -> None:
         if not 0 <= self.repeats <= 100:
@@ -127,12 +127,10 @@ class Options:
         return self.jobs or provenance.cores()
 
 
-def run_study(study: Study, folder: Path, observer: Observer, options: Options = Options()) -> RunResult:
-    """Run the missing cells of a study and write every result into its folder, beside earlier ones of the same study.
-
-    Raises a `RequestError` if the folder, the store or the executor cannot be used, a `StorageError` if nothing can be
-    written; earlier results are kept.
-    """
+def run_study(study: Study, folder: Path, observer: Observer, options: Options) -> RunResult:
+    """Run the missing cells of a study and write every result into its folder, beside earlier ones of this study."""
+    # Raises a `RequestError` if the folder, the store or the executor cannot be used, a `StorageError` if nothing can
+    # be written; earlier results are kept.
     cells, store = expand(study), usable_store()
     with claimed(folder), store.used():
         with closing(Supervisor(folder / LOG)) as supervisor:

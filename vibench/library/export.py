@@ -131,11 +131,9 @@ def exported(
     beside = None if certificate is None else partial(_certificate_thetas, certificate)
     # The matrix from the θ of A as a query evaluates them to those of the certificate; none of a constant A.
     rotation = None if certificate is None else _stiffness_coefficients(certificate)
-    rotated = {} if rotation is None else {"theta_A": rotation}
+    rotated, limits = {} if rotation is None else {"theta_A": rotation}, (tolerance, evaluations)
     try:
-        queried, polynomials = member_polynomials(
-            model.reduced, tolerance, evaluations, fixed=c, beside=beside, rotated=rotated
-        )
+        queried, polynomials = member_polynomials(model.reduced, *limits, fixed=c, beside=beside, rotated=rotated)
     except InaccurateError as error:
         raise RequestError(
             f"{error}; `--tolerance {1.05 * error.error:.1e}` exports this approximation; more evaluations than "
@@ -268,9 +266,7 @@ def _certificate_arrays(
     # Bounds grow by what the measured errors of the polynomials, of A and of all θ, may add.
     base, residual, corrections = certificate.base, certificate.residual, certificate.prepared
     terms = base.bound_terms
-    # there is no reason for none
-    assert corrections is not None
-    assert terms is not None
+    assert corrections is not None and terms is not None  # noqa: PT018  there is no reason for none
     responses = np.zeros((len(corrections.basis), len(corrections.rows)))
     responses[corrections.moved] = corrections.responses
     found = {
@@ -286,11 +282,9 @@ def _certificate_arrays(
         loads[unknowns] = base.constraint[corrections.rows].toarray().T
         found["lift"] = base.X.riesz(loads)
     error = {name: 0.0 if name in exact else _error(polynomial) for name, polynomial in polynomials.items()}
-    sizes = residual.norms.copy()  # of all terms of residuals
-    sizes[residual.kept] = np.hypot(
-        np.linalg.norm(residual.factor, axis=0), residual.remainder * residual.inverse_scale
-    )
-    of_f, of_lam = sizes[: polynomials["theta_f"].terms.shape[1]], sizes[-certificate.generators.shape[1] :]
+    size = residual.norms.copy()  # of all terms of residuals
+    size[residual.kept] = np.hypot(np.linalg.norm(residual.factor, axis=0), residual.remainder * residual.inverse_scale)
+    of_f, of_lam = size[: polynomials["theta_f"].terms.shape[1]], size[-certificate.generators.shape[1] :]
     stiffness = 0.0
     if base.spectral is not None:  # terms whose norms are not needed otherwise are taken to have the largest one
         norms, (leading, every) = base.spectral.norms, base.spectral.turn.shape
@@ -339,9 +333,7 @@ def _linear(problem: Problem) -> list[Output]:
     return [output for output in problem.outputs if output.linear]
 
 
-def _output_arrays(
-    model: Model, basis: Array, generators: Array, certificate: OnlineCertificate | None
-) -> dict[str, Array]:
+def _output_arrays(model: Model, basis: Array, rays: Array, certificate: OnlineCertificate | None) -> dict[str, Array]:
     """Coefficients of x (O×N') and α (O×R), none without linear outputs."""
     # With a certificate also of λ on all rows (O×m), of a in u = u_N − lift · a (O×j), and the `output_weights` (O×2).
     problem, outputs = model.problem, _linear(model.problem)
@@ -349,7 +341,7 @@ def _output_arrays(
         return {}
     pairs = [output_coefficients(problem, output) for output in outputs]
     of_u, of_lam = (np.array(rows) for rows in zip(*pairs, strict=True))
-    found = {"outputs_x": of_u @ basis, "outputs_alpha": of_lam @ generators}
+    found = {"outputs_x": of_u @ basis, "outputs_alpha": of_lam @ rays}
     if certificate is not None and certificate.prepared is not None:
         B, X = certificate.base.constraint[certificate.prepared.rows], certificate.base.X
         lifted = np.array([X.riesz(row)[contact_unknowns(problem)] for row in of_u])

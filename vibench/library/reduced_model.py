@@ -70,10 +70,8 @@ class Model:
         self._packed[rows, columns] = self._packed[columns, rows] = np.arange(len(rows))
 
     def _prepared(self, name: str, numbers: dict[bytes, int]) -> tuple[list[int], NDArray[np.intp], list[Array]]:
-        """Numbers of the products of a member, of what each matrix makes of them, their degrees, and the matrices.
-
-        What several members have in common has one number.
-        """
+        """Numbers of the products of a member, of what each matrix makes of them, their degrees, and the matrices."""
+        # What several members have in common has one number.
         coefficients, terms = self.data[f"{name}_coefficients"], self.data[f"{name}_terms"]
         degrees = np.ascontiguousarray(self.data[f"{name}_indices"].T, dtype=np.intp)
         known = degrees.tobytes() + b"|" + coefficients.tobytes() in numbers  # θ of a member before
@@ -89,15 +87,13 @@ class Model:
             text = name in {"format", "about"}
             if array.dtype.kind not in ("U" if text else "fiu") or (not text and not np.isfinite(array).all()):
                 raise ValueError(f"'{file}' is damaged: the array {name} does not consist of finite numbers")
-        lower = self.data.get("lower", np.zeros(0))
+        low = self.data.get("lower", np.zeros(0))
         for name in [key.removesuffix("_indices") for key in self.data if key.endswith("_indices")]:
             of = [self.data.get(f"{name}_{part}", np.zeros(0)) for part in ("indices", "coefficients", "terms")]
-            fits = [array.ndim for array in of] == [2, 2, 2] and of[0].shape == (len(of[1]), lower.size)
+            fits = [array.ndim for array in of] == [2, 2, 2] and of[0].shape == (len(of[1]), low.size)
             whole = fits and of[0].size and of[0].dtype.kind in "iu" and 0 <= of[0].min() <= of[0].max() <= 2**20
             if not whole or of[1].shape[1] != len(of[2]):
-                raise ValueError(
-                    f"'{file}' is damaged: the arrays of {name} are no polynomial in {lower.size} variables"
-                )
+                raise ValueError(f"'{file}' is damaged: the arrays of {name} are no polynomial in {low.size} variables")
             self.data[f"{name}_indices"] = of[0].astype(np.int64)
 
     def program(self, mu: Sequence[float] | Array) -> tuple[Array, Array, Array, Array, Array]:
@@ -144,15 +140,14 @@ class Model:
         with suppress(np.linalg.LinAlgError):
             if not np.isfinite(A.sum() + f.sum() + B.sum() + g.sum()):
                 raise np.linalg.LinAlgError("an array is not finite")
-            of = self._matrices or _matrices(A, B)
+            of = self._matrices or _Matrices(A, B)
             if {"A", "B"} <= self._constant.keys() and "plain" not in self.data:
                 self._matrices = of
             # In v = x − A⁻¹f the size of the program is what contact does, however large the load is.
             free = of.inverse.T @ (of.inverse @ f)
             free += of.inverse.T @ (of.inverse @ (f - A @ free))
             g = g / of.norms
-            noise = of.round_off * (of.sizes @ abs(free) + abs(g))
-            (v, forces), found = self._solved(of, g - of.B @ free, noise)
+            (v, forces), found = self._solved(of, g - of.B @ free, of.round_off * (of.sizes @ abs(free) + abs(g)))
             x, alpha, status = free + v, forces / of.norms, "ok"
             if not all(residual <= self.about["accuracy"] for residual in found):  # NaN is not
                 status = "inaccurate"
@@ -168,10 +163,8 @@ class Model:
         return dict(zip(self._outputs, values.tolist(), strict=True))
 
     def _solved(self, of: _Matrices, g: Array, noise: Array) -> tuple[tuple[Array, Array], Residuals]:
-        """The solver's v and α without load for rows of B of norm 1, or those of its active set; residuals.
-
-        `noise` is the round-off in g.
-        """
+        """The solver's v and α without load for rows of B of norm 1, or those of its active set; residuals."""
+        # `noise` is the round-off in g.
         A, B, f = of.A, of.B, np.zeros(len(of.A))
         if (g >= 0.0).all():  # no constraint acts
             return (f, np.zeros(len(g))), (0.0, 0.0, 0.0)
@@ -186,37 +179,27 @@ class Model:
         # residuals of some 1e-13 are round-off; NaN is not
         if all(residual <= 1e-13 for residual in found):
             return best, found
-        return min((given, residuals(of, f, g, *given, noise)), (best, found), key=lambda pair: _worst(pair[1]))
+        pairs = (given, residuals(of, f, g, *given, noise)), (best, found)
+        return min(pairs, key=lambda pair: float(np.nan_to_num(np.max(pair[1]), nan=np.inf)))
 
 
-class _Matrices(NamedTuple):
-    """A, B with rows of norm 1, these norms, |B|, the inverse L⁻¹ of A's factor, L⁻¹Bᵀ, and norms of its columns.
+class _Matrices:
+    """A, B with rows of norm 1, these norms, |B|, the inverse L⁻¹ of A's factor, L⁻¹Bᵀ, and norms of its columns."""
 
-    Also the round-off in sums over rows of B, their cosines, and the pairs of opposite rows.
-    """
+    # Also the round-off in sums over rows of B, their cosines, and the pairs of opposite rows.
 
-    A: Array
-    B: Array
-    norms: Array
-    sizes: Array
-    inverse: Array
-    whitened: Array
-    lengths: Array
-    round_off: Array
-    cosines: Array
-    opposite: list[NDArray[np.intp]]
-
-
-def _matrices(A: Array, B: Array) -> _Matrices:
-    norms = np.sqrt((B * B).sum(axis=1))
-    norms[norms == 0.0] = 1.0
-    B, inverse = B / norms[:, None], np.linalg.inv(np.linalg.cholesky(A))
-    whitened, cosines, eps = inverse @ B.T, B @ B.T, float(np.finfo(float).eps)
-    close = np.argwhere(np.triu(cosines < -1.0 + 1e-12))
-    # both rows were scaled to norm 1 with a rounding
-    opposite = [pair for pair in close if abs(B[pair].sum(axis=0)).max() <= 8.0 * eps]
-    lengths, round_off = np.sqrt((whitened**2).sum(axis=0)), 1.01 * eps * ((B != 0.0).sum(axis=1) + 2.0)
-    return _Matrices(A, B, norms, abs(B), inverse, whitened, lengths, round_off, cosines, opposite)
+    def __init__(self, A: Array, B: Array) -> None:
+        norms = np.sqrt((B * B).sum(axis=1))
+        norms[norms == 0.0] = 1.0
+        B, eps = B / norms[:, None], float(np.finfo(float).eps)
+        self.A, self.B, self.norms, self.sizes = A, B, norms, abs(B)
+        self.inverse = np.linalg.inv(np.linalg.cholesky(A))
+        self.whitened, self.cosines = self.inverse @ B.T, B @ B.T
+        self.lengths = np.sqrt((self.whitened**2).sum(axis=0))
+        self.round_off = 1.01 * eps * ((B != 0.0).sum(axis=1) + 2.0)
+        close = np.argwhere(np.triu(self.cosines < -1.0 + 1e-12))
+        # both rows were scaled to norm 1 with a rounding
+        self.opposite = [pair for pair in close if abs(B[pair].sum(axis=0)).max() <= 8.0 * eps]
 
 
 def residuals(of: _Matrices, f: Array, g: Array, x: Array, alpha: Array, noise: Array) -> Residuals:
@@ -255,10 +238,6 @@ def _step(of: _Matrices, s: Array, room: Array) -> float:
 
 def _ratio(size: float, scale: float) -> float:
     return 0.0 if size == 0.0 else size / scale if scale else np.inf
-
-
-def _worst(found: Residuals) -> float:
-    return float(np.nan_to_num(np.max(found), nan=np.inf))
 
 
 def _polished(of: _Matrices, g: Array, active: NDArray[np.bool_]) -> tuple[Array, Array]:

@@ -178,8 +178,7 @@ class Run:
         """
         from vibench.report import html  # noqa: PLC0415  loads matplotlib
 
-        target = self.path.parent / REPORT if path is None else Path(path)
-        return html.write(self.path, target, figures=figures)
+        return html.write(self.path, self.path.parent / REPORT if path is None else Path(path), figures=figures)
 
     def model(self, cell: str) -> Model:
         """The model of a cell, named by the beginning of its key; stages whose artefacts are missing are run again.

@@ -21,16 +21,14 @@ from vibench.linalg import UNIT_ROUND_OFF
 from vibench.linalg.definite import BlockDiagonal, Factor, FactoredElimination, dense_cholesky, mirrored
 
 
-def symmetric_lu(matrix: SparseMatrix, permutation: str) -> SuperLU:
+def symmetric_lu(matrix: SparseMatrix, order: str) -> SuperLU:
     """LU of a symmetric matrix (CSC) without off-diagonal pivoting; raises a `RuntimeError` if it is exactly singular.
 
     For a definite matrix it is a Cholesky factorisation; SciPy has no sparse one of its own.
     """
     # Above 32 nonzeros per row, as in elasticity in space, SuperLU is fastest with panels of 20 columns, below with 1.
     panel = 20 if matrix.nnz > 32 * matrix.shape[0] else 1
-    return splu(
-        matrix, permc_spec=permutation, diag_pivot_thresh=0.0, panel_size=panel, options={"SymmetricMode": True}
-    )
+    return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, panel_size=panel, options={"SymmetricMode": True})
 
 
 def few_at_once(solve: Callable[[Array], Array], right: Array) -> Array:

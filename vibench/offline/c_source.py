@@ -103,7 +103,7 @@ def source(
         values |= {"output_arrays": "\n".join(_array(key, arrays[key]) for key in ("outputs_x", "outputs_alpha"))}
         parts.append("outputs")
     if thetas:
-        values |= _of_certificate({key: own[key] for key in thetas}, arrays) | {"guarantee": about["certificate"]}
+        values |= _certified({key: own[key] for key in thetas}, arrays) | {"guarantee": about["certificate"]}
         parts += ["certificate", "certified_outputs"] if parts else ["certificate"]
     for kind, name in (("h", "declarations"), ("c", "code")):
         values[name] = "".join(_filled(f"reduced_model_{part}.{kind}", values) for part in parts)
@@ -116,9 +116,7 @@ def _filled(template: str, values: Mapping[str, Any]) -> str:
     return Template(text).substitute(values)
 
 
-def _of_certificate(
-    thetas: Mapping[str, AffinePolynomial | ExactMember], arrays: Mapping[str, Array]
-) -> dict[str, Any]:
+def _certified(thetas: Mapping[str, AffinePolynomial | ExactMember], arrays: Mapping[str, Array]) -> dict[str, Any]:
     """Values for the templates of a certificate: sizes, polynomials and arrays."""
     # These arrays exist only where A depends on the parameter; C needs them always.
     spectral = (

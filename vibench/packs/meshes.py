@@ -40,10 +40,8 @@ def format_of(path: Path) -> str:
 
 
 def read_mesh(path: Path, limit: int, seconds: int) -> tuple[Array, Array]:
-    """The points (p×2) and triangles (t×3) of a mesh, read within bytes of memory and seconds of the processor.
-
-    The numbers of the triangles are of any type and any value. A `RequestError` says why a mesh cannot be read.
-    """
+    """The points (p×2) and triangles (t×3) of a mesh, read within bytes of memory and seconds of the processor."""
+    # The numbers of the triangles are of any type and any value. A `RequestError` says why a mesh cannot be read.
     form = format_of(path)
     if importlib.util.find_spec("meshio") is None:
         raise RequestError("it needs meshio: pip install 'vibench[mesh]'")

@@ -23,11 +23,9 @@ from vibench.packs.manifest import FILE
 def write_pack(
     problem: Problem, folder: Path, *, name: str, source: str, validation: int, seed: int, solutions: bool = False
 ) -> None:
-    """Write a pack of a problem at its training set and its validation set into a new folder, whole or not at all.
-
-    The manifest has `name` and `source`. `validation` parameters are drawn with `seed`; with `solutions` the problem is
-    solved at every parameter. Raises a `RequestError` if the folder exists.
-    """
+    """Write a pack of a problem at its training set and its validation set into a new folder, whole or not at all."""
+    # The manifest has `name` and `source`. `validation` parameters are drawn with `seed`; with `solutions` the problem
+    # is solved at every parameter. Raises a `RequestError` if the folder exists.
     training = training_parameters(problem)
     listed = np.vstack([training, validation_parameters(problem, validation, seed)])
     with _new_folder(folder) as part:
@@ -99,8 +97,7 @@ def _operator_table(problem: Problem, listed: Array, part: Path) -> list[str]:
             entries = (f'{{ table = "{name}.npz:theta{q}", array = "{name}.npz:term{q}" }}' for q in range(len(theta)))
             line = f"{name}.affine = [{', '.join(entries)}]"
         else:
-            constant = name in problem.constant
-            line = f'{name} = "{name}.npz:0"' if constant else f'{name}.each = "{name}.npz:{{}}"'
+            line = f'{name} = "{name}.npz:0"' if name in problem.constant else f'{name}.each = "{name}.npz:{{}}"'
         _save(part / f"{name}.npz", arrays[name])
         lines.append(line)
     return [*lines, ""]

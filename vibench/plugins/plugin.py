@@ -50,14 +50,12 @@ class Plugin:
         return _received, (self.kind, self.name, self.options, self.code, self.places, given)
 
     @classmethod
-    def of(
-        cls, registered: RegisteredPlugin, options: Mapping[str, Any], places: Mapping[str, str] | None = None
-    ) -> Plugin:
+    def of(cls, entry: RegisteredPlugin, options: Mapping[str, Any], places: Mapping[str, str] | None = None) -> Plugin:
         """A registered or given plugin with options; `places` are known paths of files and folders, by option."""
-        paths = {name: named_path(value) for name, value in options.items() if name in registered.path_options}
-        canonical = registered.canonical_options({**options, **{option: name for option, (name, _) in paths.items()}})
+        paths = {name: named_path(value) for name, value in options.items() if name in entry.path_options}
+        canonical = entry.canonical_options({**options, **{option: name for option, (name, _) in paths.items()}})
         where = json.dumps({option: place for option, (_, place) in paths.items()} | dict(places or {}))
-        return cls(registered.kind, registered.name, canonical, registered.code, where).as_installed()
+        return cls(entry.kind, entry.name, canonical, entry.code, where).as_installed()
 
     @property
     def is_given(self) -> bool:
@@ -170,8 +168,7 @@ _given: dict[tuple[str, str, str], GivenPlugin] = {}
 def give(kind: PluginKind, name: str, given: Any) -> GivenPlugin:
     """Register a class or an object in its present state as a plugin; a `RequestError` if it cannot be sent."""
     cls, base = given if isinstance(given, type) else type(given), kind.base
-    # Plugins of the axes are classes.
-    assert base is not None
+    assert base is not None  # plugins of the axes are classes
     if not issubclass(cls, base):
         instead = f"the class {cls.__name__}" if given is cls else f"a {cls.__name__}"
         expected = f"a name, or a class or an object of vibench.{base.__name__}"

@@ -80,13 +80,11 @@ class Digests:
             whose = f" of the cell {changed[0]}" if changed[0] else ""
             raise DigestError(f"rows{whose} in the table '{table}' are not those that were written")
 
-    def _opened(
-        self, table: str, cells: Sequence[str] = (), order: Sequence[str] = ()
-    ) -> tuple[list[str], sqlite3.Cursor]:
+    def _opened(self, table: str, keys: Sequence[str] = (), by: Sequence[str] = ()) -> tuple[list[str], sqlite3.Cursor]:
         # An index may be damaged, too: the table itself is read.
-        query = f'SELECT * FROM "{table}" NOT INDEXED WHERE {of_cells(cells)}'
+        query = f'SELECT * FROM "{table}" NOT INDEXED WHERE {of_cells(keys)}'
         try:
-            cursor = self._db.execute(f"{query} ORDER BY {', '.join(order)}" if order else query, cells)
+            cursor = self._db.execute(f"{query} ORDER BY {', '.join(by)}" if by else query, keys)
         except UnicodeDecodeError:  # of the name of a column
             raise DigestError(f"the columns of the table '{table}' are not those that were written") from None
         # Rows read at a time: a large table has more than memory should hold.

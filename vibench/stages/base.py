@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 from vibench.errors import NumericalError, RequestError, VibenchError, in_a_line
 from vibench.interfaces.problem import Problem
@@ -27,8 +27,7 @@ Row = dict[str, Any]  # a row of a results table: column → value
 @lru_cache(maxsize=4)
 def build_problem(plugin: Plugin) -> Problem:
     """The problem of a stage; one instance per process."""
-    problem: Problem = plugin.create()
-    return problem
+    return cast("Problem", plugin.create())
 
 
 @contextmanager

@@ -7,6 +7,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import FunctionType
+from typing import cast
 
 import numpy as np
 
@@ -165,8 +166,7 @@ class SingleEnrichment(EnrichmentStage):
         return Result(BuiltEnrichment.of(enrichment, strategy), seconds, _histories(quantities))
 
     def enrichment(self, store: Store) -> Enrichment:
-        stored: BuiltEnrichment = value_of(store, self)
-        return stored.restored(self.primal.create())
+        return cast("BuiltEnrichment", value_of(store, self)).restored(self.primal.create())
 
 
 @dataclass(frozen=True)
@@ -191,8 +191,7 @@ class NestedEnrichment(EnrichmentStage):
         return (self.pod, self.cone, self.growth, TrainingConstants(self.cone))
 
     def run(self, store: Store) -> Result:
-        # A nested strategy always has a tolerance.
-        assert self.tolerance is not None
+        assert self.tolerance is not None  # a nested strategy always has one
         offline, growth = _offline(store, self.pod, self.cone), value_of(store, self.growth)
         milestone: Milestone = growth.grown.milestone(self.tolerance)
         with faults_of(self.primal):
@@ -206,8 +205,7 @@ class NestedEnrichment(EnrichmentStage):
         return Result(milestone, milestone.seconds, _histories(quantities))
 
     def enrichment(self, store: Store) -> Enrichment:
-        stored: Enrichment = value_of(store, self.growth).grown.at(value_of(store, self))
-        return stored
+        return cast("AssessedGrowth", value_of(store, self.growth)).grown.at(value_of(store, self))
 
 
 def spaces_of(cell: Cell) -> tuple[PODStage | None, ConeStage | None, EnrichmentStage | None]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 from vibench.arrays import Array
 from vibench.interfaces.formulations import Formulation, Snapshots
@@ -108,14 +108,12 @@ class _StoredReduction(Reduction):
 
     @cached_property
     def snapshots(self) -> Snapshots:
-        snapshots: Snapshots = self.read["snapshots"]()
-        return snapshots
+        return cast("Snapshots", self.read["snapshots"]())
 
     @cached_property
     def members(self) -> Mapping[str, AffineMember]:
         # Only assembly at reduced cost has stored members.
-        members: Mapping[str, AffineMember] = self.read["members"]() if "members" in self.read else super().members
-        return members
+        return cast("Mapping[str, AffineMember]", self.read["members"]()) if "members" in self.read else super().members
 
 
 @dataclass(frozen=True)
@@ -155,8 +153,7 @@ class FormulationStage(Stage):
     @cached_property
     def kind(self) -> type[Formulation]:
         """The class of the formulation, which declares its axes and capabilities."""
-        kind: type[Formulation] = self.formulation.registered.load()
-        return kind
+        return cast("type[Formulation]", self.formulation.registered.load())
 
     @property
     def builds(self) -> bool:
@@ -268,8 +265,7 @@ class CertificateStage(Stage):
 
     @property
     def base(self) -> CertificateBaseStage:
-        # Cells with bounds have reduced assembly.
-        assert self.built.decomposition is not None
+        assert self.built.decomposition is not None  # cells with bounds have reduced assembly
         return CertificateBaseStage(self.built.decomposition)
 
     def inputs(self) -> tuple[Stage, ...]:

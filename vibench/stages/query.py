@@ -194,8 +194,7 @@ class Queries:
             program = None if self.programs is None else self.programs.programs[k]
             start = None if before is None else (before, self.mus[before])
             return ModelQuery(model, self.mus[k], partial(self.near, k), program, start)
-        # Formulations with programs for a QP solver have this axis.
-        assert accuracy is not None
+        assert accuracy is not None  # formulations with programs for a QP solver have this axis
         programs = self.programs.programs
         # Coordinates of two queries are not comparable if the primal basis changes with the parameter.
         may_start = takes_start(solver) and self.model.reduced.kind is not Kind.PER_PARAMETER

@@ -235,8 +235,7 @@ class AdaptiveTraining(Stage):
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """Train; histories are the bounds that led to solutions, the parameters, and the number of bounds so far."""
-        # A problem's own set is not adaptive.
-        assert self.training.sampling is not None
+        assert self.training.sampling is not None  # a problem's own set is not adaptive
         with faults_of(self.problem):
             problem, strategy = build_problem(self.problem), self.training.sampling.create()
             reference = ReferenceAssembly(problem)

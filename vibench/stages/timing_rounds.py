@@ -212,8 +212,7 @@ class _Rounds(Items):
         key = stage.certificate.key
         if key not in self._certificates:
             self._certificates[key] = stage.certificate.certificate(self._store)
-        # Only models assembled at reduced cost have certificates.
-        assert isinstance(model, HyperReducedModel)
+        assert isinstance(model, HyperReducedModel)  # others have no certificates
         query = model.problem, near, model.assemble(near), *solution
         return timed(partial(self._certificates[key].certify, *query, stage.correction))[1]
 

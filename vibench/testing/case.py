@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar, cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -111,8 +111,8 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
     def determinism(self) -> Iterator[str]:
         """A second call and another instance give the same results to the last bit."""
         # Results may depend on a state of the instance, or on one that it is made with.
-        again = list(self._deviations("a second call", self._evaluation(self.plugin), self.arguments, 0.0))
-        yield from again or self._deviations("another instance", self._evaluation(self.create()), self.arguments, 0.0)
+        again = list(self._changes("a second call", self._evaluation(self.plugin), self.arguments, 0.0))
+        yield from again or self._changes("another instance", self._evaluation(self.create()), self.arguments, 0.0)
 
     def another_process(self) -> Iterator[str]:
         """Another process, whose sets have another order, gives the same results up to `round_off`."""
@@ -123,7 +123,7 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
         except NotImportableError as error:
             yield Note(f"not compared: {error}")
             return
-        for line in self._deviations("another process", there.__getitem__, some, self.round_off):
+        for line in self._changes("another process", there.__getitem__, some, self.round_off):
             yield f"{line}; look for the order of sets, unseeded random numbers, time, folder and environment"
 
     def pickling(self) -> Iterator[str]:
@@ -141,19 +141,16 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
         for array, what in differences(self.arrays(after), self.arrays(before), 0.0):
             yield f"{name}: storing changes {array}: {what}"
         copy = pickle.loads(pickle.dumps(self.plugin))
-        yield from self._deviations("a pickled copy", self._evaluation(copy), self.arguments, 0.0)
+        yield from self._changes("a pickled copy", self._evaluation(copy), self.arguments, 0.0)
 
     def stored(self, result: ResultT) -> ResultT:
         """A result as a stage finds it in its artefact."""
-        again: ResultT = loads(dumps(result))
-        return again
+        return cast("ResultT", loads(dumps(result)))
 
     def _evaluation(self, plugin: PluginT) -> Callable[[str], Arrays]:
         return lambda name: self.arrays(self.evaluate(self.arguments[name], plugin))
 
-    def _deviations(
-        self, source: str, again: Callable[[str], Arrays], names: Iterable[str], rtol: float
-    ) -> Iterator[str]:
+    def _changes(self, source: str, again: Callable[[str], Arrays], names: Iterable[str], rtol: float) -> Iterator[str]:
         """Arrays that differ from those of all results, or of some, each named once."""
         faults: dict[str, str] = {}
         # The reverse order reveals results that depend on the previous call.

@@ -13,15 +13,7 @@ import numpy as np
 import vibench.stages.formulation  # noqa: F401  lists the classes that formulations may store
 from vibench.arrays import Array, read_only
 from vibench.errors import NumericalError, UnsupportedError, VibenchError
-from vibench.interfaces.formulations import (
-    Formulation,
-    FormulationAnswer,
-    Multiplier,
-    OfflinePhase,
-    Outcome,
-    Snapshots,
-    axes_of,
-)
+from vibench.interfaces.formulations import Formulation, FormulationAnswer, Multiplier, OfflinePhase, Outcome, axes_of
 from vibench.interfaces.strategies import Cone, no_free
 from vibench.model.errors import residual_multiplier
 from vibench.offline.assemblies import assemblies
@@ -56,14 +48,14 @@ class FormulationCase(Case[Formulation, Array, Answered]):
 
     def phase(self, plugin: Formulation) -> _Seen:
         """The offline phase that a formulation gets, without the steps that it does not use."""
-        uses, whole = axes_of(plugin, f"{type(plugin).__name__}"), self.whole
+        uses, whole = axes_of(plugin, type(plugin).__name__), self.whole
         steps = {"pod": ("pod",), "dual": ("cone", "multipliers"), "primal": ("enrichment",)}
         given = {name: getattr(whole, name) for axis, names in steps.items() if axis in uses for name in names}
         inputs = {"dual": "dual", "primal": "primal", "modes": "pod", "generators": "dual", "tolerance": "primal"}
         own: dict[str, Any] = {name: getattr(whole, name) if axis in uses else None for name, axis in inputs.items()}
         # Whoever writes into what it is given says so by an error at that line.
-        known = (read_only(getattr(whole.snapshots, name)) for name in ("mu", "u", "lam"))
-        phase = _Seen(whole.problem, **own).given(snapshots=Snapshots(*known), **given)
+        known: dict[str, Any] = {name: read_only(getattr(whole.snapshots, name)) for name in ("mu", "u", "lam")}
+        phase = _Seen(whole.problem, **own).given(snapshots=replace(whole.snapshots, **known), **given)
         assert isinstance(phase, _Seen)
         # The attributes that this function has read are no use by the formulation.
         phase.seen.clear()
@@ -108,8 +100,7 @@ class FormulationCase(Case[Formulation, Array, Answered]):
 
     def axes(self) -> Iterator[str]:
         """`uses`, `multiplier` and `takes_start` are declared as they should be."""
-        plugin = self.plugin
-        uses = axes_of(plugin, type(plugin).__name__)
+        plugin, uses = self.plugin, axes_of(self.plugin, type(self.plugin).__name__)
         if not isinstance(plugin.multiplier, Multiplier):
             yield f"multiplier is {plugin.multiplier!r}; expected a vibench.Multiplier"
         if not isinstance(plugin.takes_start, bool):

@@ -486,8 +486,7 @@ def interpolation(case: ProblemCase) -> Iterator[str]:
     if not names or case.one_assembly * (len(mus) + 5) > 0.25 * case.seconds:
         yield Note("an assembly takes too long" if names else "no member is interpolated")
         return
-    assembled = assembled_members(problem, [*mus, *validation_parameters(problem, 5, seed=0)], names)
-    for name, values in assembled.items():
+    for name, values in assembled_members(problem, [*mus, *validation_parameters(problem, 5, seed=0)], names).items():
         member = decomposed(name, values[: len(mus)], problem.V, INTERPOLATION_RTOL, contact=problem.has_contact)
         if not member.terms:
             yield Note(f"{name} is not interpolated: {member.reason or 'its terms are too many'}")

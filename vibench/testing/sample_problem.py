@@ -85,8 +85,7 @@ def sample_snapshots() -> tuple[Array, InnerProduct]:
 
 def sample_offline() -> Offline:
     """A reduced model of the sample problem to enrich: 4 POD modes and a greedy cone of 6 generators."""
-    reduction = Reduction(MovingSupport(), _Greedy(), None, Stop(size=4), Stop(size=6))
-    return reduction.given(snapshots=_snapshots()).offline
+    return Reduction(MovingSupport(), _Greedy(), None, Stop(size=4), Stop(size=6)).given(snapshots=_snapshots()).offline
 
 
 class _Supremizers(PrimalStrategy):

@@ -127,8 +127,7 @@ class SolverCase:
         """Residuals are below the accuracy that is asked for."""
         program = next(iter(self.programs.values())).program
         for accuracy in (1e-3, 1e-5, ACCURACY):
-            answer = self.solve(program, accuracy)
-            status, reason, residuals = verify(program, answer, accuracy)
+            status, reason, residuals = verify(program, self.solve(program, accuracy), accuracy)
             if status is not Status.OK or residuals is None:
                 yield f"accuracy {accuracy:.0e}: {status}, {reason}"
             else:

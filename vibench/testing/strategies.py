@@ -363,8 +363,7 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
         if "size" not in self.constructor_options:
             yield Note("no option is called 'size'")
             return
-        given = getattr(self.create, "keywords", {}).get("size", 16)
-        for size in dict.fromkeys([1, 5, 16, given]):
+        for size in dict.fromkeys([1, 5, 16, getattr(self.create, "keywords", {}).get("size", 16)]):
             for name, box in self.arguments.items():
                 try:
                     points = self.evaluate(box, self.create(size=size))

@@ -132,7 +132,7 @@ def test_dask_workers_get_the_classes_of_a_notebook(cluster: LocalCluster, tmp_p
         name="mine", validation=3, solvers=["piqp"], problem=problems, dual=["cpg"], primal=["decorrelated"],
         tolerances=tolerances, timing_rounds=1,
     )  # fmt: skip
-    options = Options(executor="dask", scheduler=cluster.scheduler_address)
+    options = Options(0, False, False, "dask", cluster.scheduler_address, 0)
     outcome = run_study(study, tmp_path, Observer(), options)
     assert sorted((row["problem"], row["status"]) for row in outcome.rows) == [("Mine", "ok"), ("short", "ok")]
 

@@ -408,7 +408,7 @@ def test_loaded_ties_hide_no_contact_from_c_and_scripts(share: float, tmp_path: 
     assert expected.unit < 10.0
     assert (code == 0) == (expected.worst <= 1e-9) == (share == 1.0)
     assert found == pytest.approx((expected.primal, expected.dual, expected.gap), abs=1e-10)
-    of, rows, free = reduced_model._matrices(A, B), np.linalg.norm(B, axis=1), np.linalg.solve(A, f)
+    of, rows, free = reduced_model._Matrices(A, B), np.linalg.norm(B, axis=1), np.linalg.solve(A, f)
     noise, none = of.round_off * (of.sizes @ abs(free) + abs(g / rows)), 0.0 * f
     script = reduced_model.residuals(of, none, g / rows - of.B @ free, x - free, rows * alpha, noise)
     assert script == pytest.approx(found, abs=1e-10)

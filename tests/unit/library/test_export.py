@@ -269,7 +269,7 @@ def test_polishing_ends_where_changes_of_all_rows_at_once_cycle() -> None:
         B /= np.linalg.norm(B, axis=1)[:, None]
         g[8:] = B[8:] @ np.linalg.lstsq(B[:8], g[:8], rcond=None)[0]
         A, f = np.eye(12), 3.0 * rng.random(12)
-        of, g = reduced_model._matrices(A, B), g - B @ f  # of x − A⁻¹f
+        of, g = reduced_model._Matrices(A, B), g - B @ f  # of x − A⁻¹f
         found = reduced_model.residuals(of, 0.0 * f, g, *reduced_model._polished(of, g, np.ones(11, bool)), 0.0 * g)
         assert max(found) <= 1e-12
 

@@ -277,9 +277,7 @@ def _compliance_error(schur: BlockDiagonal, compliance: Array, scale: Array, eta
     return distance / (1.0 - 2.0 * distance) if distance < 0.25 else inf
 
 
-def _term_errors(
-    declared: Sequence[SparseMatrix], rotation: Array, terms: Sequence[SparseMatrix], X: InnerProduct
-) -> Array:
+def _term_errors(declared: Sequence[SparseMatrix], T: Array, terms: Sequence[SparseMatrix], X: InnerProduct) -> Array:
     """Bounds (Q,) of the largest row sums of S⁻¹|A_q − Σ_p T_pq A'_p|S⁻¹, and of round-off in sums of the terms."""
     unit = 1.0 / np.sqrt(X.matrix.diagonal())
 
@@ -288,7 +286,7 @@ def _term_errors(
 
     turned, of_terms = [extended(sp.csr_array(term)) for term in terms], np.array([row_sums(term) for term in terms])
     errors, unit_of_sums = [], 1.01 * UNIT_ROUND_OFF * (len(declared) + 3.0)
-    for term, weights in zip(declared, rotation.T, strict=True):
+    for term, weights in zip(declared, T.T, strict=True):
         missed = extended(sp.csr_array(term)) - sum(t * one for t, one in zip(extended(weights), turned, strict=True))
         sums = row_sums(term) + float(np.abs(weights) @ of_terms)
         errors.append(row_sums(missed.astype(float)) + unit_of_sums * sums)

@@ -187,9 +187,7 @@ def _directions(R: Array, scale: Array, allowed: float) -> tuple[Array, bool]:
     return (Q if count <= 1000 else np.linalg.qr(R * scale)[0]), False
 
 
-def _random_range(
-    R: Array, scale: Array, allowed: float, *, limit: int, block: int
-) -> tuple[Array, Array, float] | None:
+def _random_range(R: Array, D: Array, allowed: float, *, limit: int, block: int) -> tuple[Array, Array, float] | None:
     """Orthonormal Q (n×k), QᵀS (k×p) and ‖S − QQᵀS‖ in the Frobenius norm, at most half of `allowed`, for S = R D.
 
     A randomised range finder by blocks of directions (Martinsson and Voronin, 2016): each of them is computed from the
@@ -199,7 +197,7 @@ def _random_range(
     rng, limit = np.random.default_rng(0), min(limit, *R.shape)
     # updated in place: allocating so much takes as long as computing it
     left = np.empty(R.shape, order="F")
-    np.multiply(R, scale, out=left)
+    np.multiply(R, D, out=left)
     bases, parts, rests = list[Array](), list[Array](), [float(np.linalg.norm(left))]
     while rests[-1] > 0.5 * allowed:
         remaining = limit - sum(basis.shape[1] for basis in bases)
