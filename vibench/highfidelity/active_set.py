@@ -25,6 +25,7 @@ from vibench.qp.scaling import peak, ratio, row_norms
 from vibench.qp.solve import solve_qp
 from vibench.signatures import bordered, constructed
 
+Iterated = tuple[Array, Array, int]  # u (n,), λ (m,) and the number of linear systems
 # Largest natural residual of a snapshot (`vibench.qp.verification`).
 ACCURACY = 1e-10
 
@@ -278,9 +279,7 @@ def _refuse_contradictions(vi: VariationalInequality, numbers: Indices) -> None:
         raise NumericalError(f"rows {i} and {j} of B are opposite, and no u satisfies both of their bounds g")
 
 
-def _without_cycling(
-    vi: VariationalInequality, equal: Mask, system: ActiveSetSystem
-) -> tuple[tuple[Array, Array, int], str]:
+def _without_cycling(vi: VariationalInequality, equal: Mask, system: ActiveSetSystem) -> tuple[Iterated, str]:
     """The solution where active sets cycle, or are linearly dependent, and the name of the fallback."""
     answer, guess = solve_qp(vi, "piqp", ACCURACY), np.zeros(len(vi.g), bool)
     if not equal.any() and answer.alpha is not None and np.all(np.isfinite(answer.alpha)):
@@ -313,9 +312,7 @@ def _refined(vi: VariationalInequality, stiffness: CondensedStiffness, u: Array,
     return u + change, np.maximum(lam + forces, 0.0)
 
 
-def _solution_everywhere(
-    system: ActiveSetSystem, active: Mask, equal: Mask | None = None
-) -> tuple[Array, Array, int] | None:
+def _solution_everywhere(system: ActiveSetSystem, active: Mask, equal: Mask | None = None) -> Iterated | None:
     """The u (n,), λ (m,) and iterations of the active set method; `None` where it finds no solution.
 
     Rows beyond the zone of the system are checked when those in it are settled, and enlarge it where they are violated.
@@ -341,9 +338,7 @@ def _unit(B: SparseMatrix) -> Array:
     return np.asarray(4.0 * EPS * (np.diff(B.indptr) + 2.0))
 
 
-def active_set_iterations(
-    system: ActiveSetSystem, active: Mask, equal: Mask | None = None
-) -> tuple[Array, Array, int] | None:
+def active_set_iterations(system: ActiveSetSystem, active: Mask, equal: Mask | None = None) -> Iterated | None:
     """Run the primal–dual active set method from an initial active set (m,): u (c,), λ (m,) and iterations.
 
     Constraints that are `equal` (m,) stay active, whatever the sign of their multiplier. The result is `None` if the

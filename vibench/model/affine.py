@@ -89,12 +89,10 @@ def affine_decomposition(problem: Problem, training: Array, tolerance: float) ->
     return members
 
 
-def evaluated_members(
-    members: Mapping[str, AffineMember],
-) -> tuple[dict[str, tuple[Indices, Indices]], tuple[str, ...]]:
+def evaluated_members(parts: Mapping[str, AffineMember]) -> tuple[dict[str, tuple[Indices, Indices]], tuple[str, ...]]:
     """Rows and columns of the entries that are evaluated at a parameter, by member, and the members declared affine."""
-    sampled = {name: (m.rows, m.columns) for name, m in members.items() if m.way is Evaluation.INTERPOLATED}
-    return sampled, tuple(name for name, m in members.items() if m.way is Evaluation.AFFINE)
+    sampled = {name: (m.rows, m.columns) for name, m in parts.items() if m.way is Evaluation.INTERPOLATED}
+    return sampled, tuple(name for name, m in parts.items() if m.way is Evaluation.AFFINE)
 
 
 def coefficients(

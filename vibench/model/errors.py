@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -143,8 +143,7 @@ class ReferenceSolutions:
     def _once(self, name: str | int, compute: Callable[[], T]) -> T:
         if name not in self._cache:
             self._cache[name] = compute()
-        found: T = self._cache[name]
-        return found
+        return cast("T", self._cache[name])
 
 
 @dataclass(frozen=True)

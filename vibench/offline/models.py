@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from math import inf
 from numbers import Real
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, cast
 
 import numpy as np
 
@@ -157,8 +157,7 @@ class Model:
     @property
     def problem(self) -> Problem:
         """The high-fidelity problem."""
-        problem: Problem = self.offline.problem
-        return problem
+        return self.offline.problem
 
     @property
     def parameters(self) -> ParameterBox:
@@ -188,8 +187,7 @@ class Model:
         if not self.formulation.has_program:
             name = type(self.formulation).__name__
             raise RequestError(f"the formulation {name} has no program to be replayed, corrected or exported")
-        reduced: AnyReducedModel = self.online.reduced
-        return reduced
+        return cast("AnyReducedModel", self.online.reduced)
 
     @property
     def solves_programs(self) -> bool:

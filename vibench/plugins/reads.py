@@ -1,4 +1,4 @@
-"""What a class given in Python reads while it is made and first used: sources, other files, environment variables.
+"""Sources, other files and environment variables that a class given in Python reads while it is made and first used.
 
 Neither its code nor its state tells what a method imports or opens, so that it is watched once, in a process of its
 own. Whoever uses the class again compares the states of what it has read.

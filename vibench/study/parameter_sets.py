@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 
@@ -59,8 +59,7 @@ class ParameterSet:
 
     def strategy(self) -> Sampling | None:
         """A new instance of the sampling strategy; `None` for the problem's own set."""
-        strategy: Sampling | None = None if self.sampling is None else self.sampling.create()
-        return strategy
+        return None if self.sampling is None else cast("Sampling", self.sampling.create())
 
     def of(self, problem: Problem) -> Array:
         """The parameters (P×d) of a problem; raises a `NumericalError` or a `RequestError` if there is no valid set."""

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from datetime import date, time
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar, cast
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 from pydantic import (
@@ -124,8 +124,7 @@ class FormulationEntry(Entry):
     def kind(self) -> type[Formulation]:
         """The class; a formulation that has all axes where several packages use its name: its cells cannot be run."""
         plugin = self.registered(PluginKind.FORMULATION)
-        kind: type[Formulation] = Formulation if plugin.conflict else plugin.load()
-        return kind
+        return Formulation if plugin.conflict else cast("type[Formulation]", plugin.load())
 
     @property
     def uses(self) -> tuple[str, ...]:
