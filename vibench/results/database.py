@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from vibench.errors import RequestError, StorageError, VibenchError
+from vibench.errors import RequestError, StorageError, VibenchError, message_of
 from vibench.qp.status import Status
 from vibench.results import sqlite
 from vibench.results.schema import KEYS, STORED, VERSION, Column, Row, SqlType, column_of
@@ -116,7 +116,7 @@ class ResultsDatabase:
             # SQLite does not say that it lacked a file descriptor.
             few = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
             hint = f"; this process may open only {few} files (`ulimit -n`)" * (0 <= few < 64)
-            raise RequestError(f"output folder '{folder}' cannot be written: {error}{hint}") from None
+            raise RequestError(f"output folder '{folder}' cannot be written: {message_of(error)}{hint}") from None
 
     def _create(self, study: Mapping[str, Any], anew: bool) -> None:
         old = "SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'"
@@ -338,7 +338,7 @@ class ResultsDatabase:
             ):  # fmt: skip
                 raise
             waited = " by another program for 60 s" if code == sqlite3.SQLITE_BUSY else ""
-            raise StorageError(f"results cannot be written: {error}{waited}") from None
+            raise StorageError(f"results cannot be written: {message_of(error)}{waited}") from None
 
     def _insert(self, table: str, rows: Iterable[Row]) -> None:
         for row in rows:

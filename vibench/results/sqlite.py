@@ -229,7 +229,7 @@ def read_meta(path: Path) -> dict[str, str]:
                 raise RequestError(f"'{path}' is not a results file of vibench: it has a {min(strange)}")
             damage = "; ".join(line for (line,) in db.execute("PRAGMA quick_check(1)") if line != "ok")
             if damage:
-                raise DamagedResultsError(f"'{path}' is damaged: {' '.join(damage.split())}")
+                raise DamagedResultsError(f"'{path}' is damaged: {one_line(damage)}")
             meta = dict(db.execute("SELECT key, value FROM meta")) if kinds else {}
             if meta.get("schema") == str(VERSION):  # other versions are refused, or have no digests
                 list(Digests(db).verified("meta"))
@@ -239,7 +239,7 @@ def read_meta(path: Path) -> dict[str, str]:
     except sqlite3.Error as error:
         damaged = code_of(error) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
         kind = DamagedResultsError if damaged else RequestError
-        raise kind(f"'{path}' is not a results file of vibench: {error}") from None
+        raise kind(f"'{path}' is not a results file of vibench: {one_line(str(error))}") from None
 
 
 # Columns and some rows of a table.
