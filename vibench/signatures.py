@@ -137,8 +137,8 @@ def refuse_others(what: str, value: Any, rule: Rule) -> None:
             refuse_others(f"{name} in {what}", getattr(value, name), inner)
     if rule.axes and is_plain(value) and not _has_axes(value, rule.axes):
         raise RequestError(f"{what} has the shape {value.shape}, expected {rule.right}")
-    if rule.axes and is_plain(value) and value.dtype.kind == "f" and not np.isfinite(value).all():
-        raise RequestError(f"{what} has an entry that is not finite")
+    if rule.axes and is_plain(value) and value.dtype.kind == "f" and len(wrong := np.argwhere(~np.isfinite(value))):
+        raise RequestError(f"{what} has an entry that is not finite, first at {wrong[0].tolist()}")
     raise RequestError(f"{what} is {shown(value)}, expected {rule.right}")
 
 

@@ -70,7 +70,7 @@ def test_the_run_ends_with_a_row_for_every_cell(ended: tuple[Path, str]) -> None
                 f"in cone: the dual strategy 'odd-cone' raised OddError: {printable(' '.join(ODD.split()))}xxx",
             )
         elif primal == "wordy-enrichment":
-            expected = ("error", "in enrichment: ValueError: could not convert string to float")
+            expected = ("error", "in enrichment: history of Enrichment is {'steps': array(['many'")
         else:
             expected = {
                 "odd-raises": ("failed", "3 of 3 queries, first mu="),
