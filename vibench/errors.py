@@ -68,6 +68,15 @@ def foreign(what: str) -> Iterator[None]:
 
 
 @contextmanager
+def placed(where: str, kind: type[VibenchError] = RequestError) -> Iterator[None]:
+    """Turn an error of a kind in the block into a `RequestError` that names the place."""
+    try:
+        yield
+    except kind as error:
+        raise RequestError(f"{where}: {error}") from None
+
+
+@contextmanager
 def at_parameter(mu: Any) -> Iterator[None]:
     """Name mu (d,) in every error of the block; what a plugin raises becomes a `NumericalError`."""
     where = f"mu = {mu.tolist()}"

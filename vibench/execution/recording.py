@@ -138,12 +138,10 @@ class ResultWriter:
 
 def refute(database: ResultsDatabase) -> None:
     """Give cells with bounds the status of a cell of their problem whose bound was refuted: they rest on the same."""
-    bounded = [row for row in database.rows("cells") if row["bounds"]]
-    refuted = {
-        (row["problem"], row["problem_options"]): row for row in reversed(bounded) if row["status"] == Status.REFUTED
-    }
-    for row in bounded:
-        if (first := refuted.get((row["problem"], row["problem_options"]))) is None:
+    rows = [row for row in database.rows("cells") if row["bounds"]]
+    known = {(row["problem"], row["problem_options"]): row for row in reversed(rows) if row["status"] == Status.REFUTED}
+    for row in rows:
+        if (first := known.get((row["problem"], row["problem_options"]))) is None:
             continue
         # No table calls a refuted bound certified.
         for table in ("cells", "queries"):

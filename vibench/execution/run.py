@@ -149,8 +149,7 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options) 
             todo = [cell for cell in cells if kept.get(cell.key) != cell.code]
             writer = ResultWriter(study, database, labels_of(cells))
             database.keep(f"limits of {writer.study_hash}", study.limits.model_dump_json())
-            run = _Run(study, folder, store, writer, observer, options)
-            interrupted = run.execute(cells, todo)
+            interrupted = _Run(study, folder, store, writer, observer, options).execute(cells, todo)
             refute(database)
             everything = list(database.rows("cells"))
             # Both tables compare cells of the whole file, those of earlier runs included.

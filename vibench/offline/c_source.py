@@ -151,15 +151,13 @@ def _array(name: str, array: Array | Indices) -> str:
 def _member(name: str, member: AffinePolynomial | ExactMember) -> str:
     """Terms of one member, and a function that evaluates its θ."""
     # A polynomial has arrays of degrees, and of coefficients that are not zero, product by product.
-    head = (
-        f"static void {name}_thetas(const double *mu, double polynomials[DIMENSION][DEGREE + 1], double *theta)\n{{\n"
-    )
+    top = f"static void {name}_thetas(const double *mu, double polynomials[DIMENSION][DEGREE + 1], double *theta)\n{{\n"
     if isinstance(member, ExactMember):
         lines = "".join(f"    theta[{q}] = {text};\n" for q, text in enumerate(member.thetas))
         return (
             f"enum {{ {name}_TERMS = {len(member.terms)} }};\n"
             f"static const double {name}_terms[] = {{\n{_numbers(member.terms)}\n}};\n"
-            f"{head}    (void)mu;\n    (void)polynomials;\n{lines}}}\n"
+            f"{top}    (void)mu;\n    (void)polynomials;\n{lines}}}\n"
         )
     products, terms = member.coefficients.shape
     rows, columns = np.nonzero(member.coefficients)
@@ -173,7 +171,7 @@ def _member(name: str, member: AffinePolynomial | ExactMember) -> str:
         f"static const int {name}_columns[] = {{\n{_numbers(columns)}\n}};\n"
         f"static const double {name}_coefficients[] = {{\n{_numbers(values)}\n}};\n"
         f"static const double {name}_terms[] = {{\n{_numbers(member.terms)}\n}};\n"
-        f"{head}    (void)mu;\n    add_products(polynomials, {name}_PRODUCTS, {name}_degrees, {name}_starts, "
+        f"{top}    (void)mu;\n    add_products(polynomials, {name}_PRODUCTS, {name}_degrees, {name}_starts, "
         f"{name}_columns, {name}_coefficients, theta);\n}}\n"
     )
 

@@ -21,7 +21,7 @@ import scipy.io
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.errors import RequestError, in_a_line, message_of, unknown_name
+from vibench.errors import RequestError, in_a_line, message_of, placed, unknown_name
 from vibench.provenance import memory
 
 
@@ -109,9 +109,8 @@ class ArrayFiles:
     @contextlib.contextmanager
     def _reading(self, reference: str, what: str) -> Iterator[None]:
         try:
-            yield
-        except RequestError as error:
-            raise RequestError(f"{what}: {error}") from None
+            with placed(what):
+                yield
         # NumPy, SciPy, zipfile and h5py raise these for damaged files.
         except (
             OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, NotImplementedError, RuntimeError,
@@ -259,10 +258,8 @@ class ArrayFiles:
         # SciPy may have allocated more entries than it uses.
         used = int(pointers[-1])
         indices = np.ravel(stored["indices"])[:used]
-        try:
+        with placed(f"indices do not fit {fits}"):
             indices = whole(indices, "indices", 0, short - 1, used)
-        except RequestError as error:
-            raise RequestError(f"indices do not fit {fits}: {error}") from None
         return _checked(kind((data[:used], indices, pointers), shape=(rows, columns)))
 
     def _based(self, values: Any, count: int) -> Indices:

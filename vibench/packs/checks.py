@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
-from vibench.errors import NumericalError, RequestError, at_parameter
+from vibench.errors import NumericalError, RequestError, at_parameter, placed
 from vibench.highfidelity.active_set import HighFidelitySolution, solve_high_fidelity
 from vibench.interfaces.absent_rows import settled_bounds, zero_rows
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
@@ -41,11 +41,8 @@ def read_model_pack(path: str | Path) -> ModelPack:
 def solve_at_training(pack: ModelPack) -> tuple[Array, HighFidelitySolution]:
     """The first training parameter (d,) of a pack with operators, and the solution; a `RequestError` if it has none."""
     mu = pack.training[0]
-    try:
-        with at_parameter(mu):
-            return mu, solve_high_fidelity(pack.at(mu))
-    except NumericalError as error:
-        raise RequestError(f"there is no solution: {error}") from None
+    with placed("there is no solution", NumericalError), at_parameter(mu):
+        return mu, solve_high_fidelity(pack.at(mu))
 
 
 def zero_rows_of(pack: ModelPack) -> Indices:
@@ -56,10 +53,8 @@ def zero_rows_of(pack: ModelPack) -> Indices:
 def _check(pack: ModelPack) -> float | None:
     """Check a pack beyond its shapes; returns the largest KKT residual of its reference solutions, if it has any."""
     if pack.V is not None:
-        try:
+        with placed("operators", NumericalError):
             _check_operators(pack, pack.V.matrix)
-        except NumericalError as error:
-            raise RequestError(f"operators: {error}") from None
     reference = pack.reference
     if reference is None:
         return None
@@ -92,11 +87,9 @@ def _check_operators(pack: ModelPack, X_V: Any) -> None:
     if all(matrix.nnz == 0 or not np.any(matrix.data) for matrix in B.arrays):
         raise RequestError("operators.B is zero: no constraint acts on any unknown")
     for name, member in pack.members.items():
-        try:
+        with placed(f"operators.{name}", NumericalError):
             for mu in listed if member.thetas else ():
                 member.sum.coefficients(mu)
-        except NumericalError as error:
-            raise RequestError(f"operators.{name}: {error}") from None
     # A zero row of B must not have a negative bound.
     for mu in listed:
         with at_parameter(mu):
@@ -149,11 +142,8 @@ class _Solution:
     @classmethod
     def from_pack(cls, pack: ModelPack, given: PackSolutions, k: int) -> _Solution:
         assert given.u is not None, "solutions are compared with operators"
-        try:
-            vi = pack.at(given.parameters[k])
-        except NumericalError as error:
-            raise RequestError(f"solutions: {error}") from None
-        return cls(vi, given.u[:, k], given.lam[:, k])
+        with placed("solutions", NumericalError):
+            return cls(pack.at(given.parameters[k]), given.u[:, k], given.lam[:, k])
 
     @property
     def residual(self) -> float:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 from annotated_types import Ge, Gt, MinLen
 from pydantic import AllowInfNan, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from vibench.errors import RequestError, fault_line
+from vibench.errors import RequestError, fault_line, placed
 from vibench.interfaces.affine import normal_names
 from vibench.packs.array_files import safe_path
 
@@ -193,16 +193,15 @@ def read_manifest(folder: Path) -> Manifest:
     # Before the schema: keys of another version would be faults of this one.
     if isinstance(version := content.get("format", 1), int) and version != 1:
         raise RequestError(f"{FILE}: format is {version}; this version of vibench reads format 1")
-    try:
-        manifest = Manifest.model_validate(content)
+    with placed(FILE):
+        try:
+            manifest = Manifest.model_validate(content)
+        except ValidationError as error:
+            raise RequestError(fault_line(error, Manifest)) from None
         _check_parameters(manifest.parameters)
         names = [output.name for output in manifest.outputs]
         if len(set(names)) < len(names):
             raise RequestError(f"outputs: two of them have the same name: {', '.join(names)}")
-    except ValidationError as error:
-        raise RequestError(f"{FILE}: {fault_line(error, Manifest)}") from None
-    except RequestError as error:
-        raise RequestError(f"{FILE}: {error}") from None
     return manifest
 
 
@@ -210,10 +209,8 @@ def _check_parameters(given: Parameters) -> None:
     for name in given.names:
         if not name.isidentifier():
             raise RequestError(f"parameters.names: '{name}' cannot stand in expressions; use letters, digits and _")
-    try:
+    with placed("parameters.names"):
         normal_names(given.names)
-    except RequestError as error:
-        raise RequestError(f"parameters.names: {error}") from None
     for key in ("units", "lower", "upper"):
         values = getattr(given, key)
         if values is not None and len(values) != len(given.names):

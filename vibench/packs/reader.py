@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
-from vibench.errors import NumericalError, RequestError
+from vibench.errors import NumericalError, RequestError, placed
 from vibench.files import file_digest
 from vibench.interfaces.absent_rows import without_infinities
 from vibench.interfaces.affine import Expression, normal_names
@@ -53,12 +53,10 @@ def pack_digest(path: str | Path) -> str:
 def _files(folder: Path, place: str, name: str, first: int) -> list[Path]:
     """The files of a name; for `each`, those that a {} in it numbers from the first one, as far as there are any."""
     numbered = "{}" in name and place.endswith(".each")
-    try:
+    with placed(place):
         files = [safe_path(folder, name.replace("{}", str(first)) if numbered else name)]
         while numbered and os.path.lexists(folder / (each := name.replace("{}", str(first + len(files))))):
             files.append(safe_path(folder, each))
-    except RequestError as error:
-        raise RequestError(f"{place}: {error}") from None
     return files
 
 
@@ -67,10 +65,8 @@ def naming(path: str | Path) -> Iterator[Path]:
     """The folder of a pack; errors raised in the block name it. A `RequestError` if it is no folder."""
     if not os.path.isdir(path):  # noqa: PTH112  methods of Path raise OSError for names too long for a file
         raise RequestError(f"pack '{path}': there is no such folder")
-    try:
+    with placed(f"pack '{path}'"):
         yield Path(path)
-    except RequestError as error:
-        raise RequestError(f"pack '{path}': {error}") from None
 
 
 class PackReader:
@@ -220,10 +216,8 @@ class PackReader:
 
     def _theta(self, term: schema.Term, what: str) -> Expression | TabulatedTheta:
         if term.table is None:
-            try:
+            with placed(f"{what}.theta"):
                 return Expression.parse(str(term.theta), self._names)
-            except RequestError as error:
-                raise RequestError(f"{what}.theta: {error}") from None
         return TabulatedTheta(self._listing, self._vector(term.table, f"{what}.table", len(self._listed)))
 
     def _columns(self, reference: str, what: str, rows: int, count: int | None, infinite: bool = False) -> Array:
@@ -262,10 +256,8 @@ class PackReader:
         return PackSolutions(mus, u, lam, given.tolerance)
 
     def _mesh(self, given: schema.Mesh, n: int, m: int) -> PackMesh:
-        try:
+        with placed("mesh.file"):
             points, triangles = read_mesh(safe_path(self._folder, given.file), self._files.left, 60)
-        except RequestError as error:
-            raise RequestError(f"mesh.file: {error}") from None
         points = points.T
         self._files.take(2 * (points.nbytes + triangles.nbytes))  # as they are read, and as they are kept
         corners = whole(triangles, f"mesh.file: the triangles of '{given.file}'", 0, points.shape[1] - 1)

@@ -38,8 +38,7 @@ def write_pack(
         lines += [f'{role} = "parameters.npz:{role}"' for role in ("training", "validation")] + [""]
         lines += _space_table(problem, part) + _operator_table(problem, listed, part)
         if solutions:
-            solver = HighFidelitySolver(problem)
-            exact = [solver.solve(mu) for mu in listed]
+            exact = list(map(HighFidelitySolver(problem).solve, listed))
             u, lam = (np.column_stack([getattr(one, name) for one in exact]) for name in ("u", "lam"))
             _save(part / "solutions.npz", {"u": u, "lam": lam})
             lines += ["[solutions]", 'u = "solutions.npz:u"', 'lam = "solutions.npz:lam"', ""]

@@ -10,7 +10,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
-from vibench.errors import RequestError
+from vibench.errors import RequestError, placed
 from vibench.files import read_regular
 from vibench.interfaces.strategies import Stop
 from vibench.model.bound_terms import CorrectionMode
@@ -78,10 +78,8 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
     samplings = [(PluginKind.SAMPLING, entry) for entries in sets for entry in entries]
     for kind, entry in (*((PluginKind.PROBLEM, entry) for entry in problems), *samplings):
         _anchor_options(kind, entry, path.absolute().parent)
-    try:
+    with placed(source):
         return Study.model_validate(content)
-    except RequestError as error:
-        raise RequestError(f"{source}: {error}") from None
 
 
 def _tables(entries: Any) -> list[dict[str, Any]]:

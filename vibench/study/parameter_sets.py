@@ -9,7 +9,7 @@ from typing import Literal, cast
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.errors import NumericalError, RequestError
+from vibench.errors import NumericalError, RequestError, placed
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import AdaptiveSampling, Sampling
 from vibench.interfaces.validation import training_parameters, validation_parameters
@@ -85,11 +85,8 @@ def is_available(*plugins: Plugin) -> bool:
 
 @lru_cache(maxsize=4)
 def _problem(plugin: Plugin) -> Problem:
-    try:
-        problem: Problem = plugin.create()
-    except NumericalError as error:
-        raise RequestError(f"problem '{plugin.name}': {error}") from None
-    return problem
+    with placed(f"problem '{plugin.name}'", NumericalError):
+        return cast("Problem", plugin.create())
 
 
 @lru_cache(maxsize=64)
