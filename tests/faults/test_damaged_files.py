@@ -241,12 +241,10 @@ def test_a_status_that_does_not_exist_is_refused(results: Path, main: Main) -> N
 
 
 WRONG = {
-    ("cells", "online_s", "'fast'"): "a number",
-    ("cells", "online_s", "x'00ff'"): "a number",
-    ("cells", "reason", "x'00ff'"): "a text",
-    ("cells", "versions", "'[1, 2]'"): "a JSON object",
+    ("cells", "online_s", "'fast'"): "a number", ("cells", "online_s", "x'00ff'"): "a number",
+    ("cells", "reason", "x'00ff'"): "a text", ("cells", "versions", "'[1, 2]'"): "a JSON object",
     ("thresholds", "meaning", "'sometimes'"): "one of from, until, never, at once, as fast, undecided",
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("command", ["show", "report", "figures", "compare"])

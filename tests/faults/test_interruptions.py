@@ -27,9 +27,7 @@ def waiting(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(("kill", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)], ids=["interrupted", "killed"])
-def test_a_run_that_was_stopped_goes_on_later(
-    kill: signal.Signals, code: int, plugins_folder: Path, vibench: Vibench, waiting: Path
-) -> None:
+def test_a_run_resumes(kill: signal.Signals, code: int, plugins_folder: Path, vibench: Vibench, waiting: Path) -> None:
     with forked(RUN, waiting, plugins_folder) as process:
         read_until(process, "[1/2] ok")
         os.killpg(process.pid, kill)  # the workers too, as a terminal does

@@ -18,14 +18,11 @@ from vibench.provenance import cores, solver_version
 from vibench.results.database import ResultsDatabase
 
 
-def test_more_jobs_than_a_machine_can_bear_are_refused(main: Main, tmp_path: Path) -> None:
+def test_too_many_jobs_or_too_few_files_are_said(main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     study = write_study(tmp_path, wire_study(problem=["obstacle"]))
     line = refused(main("run", study, "--jobs", "1000000000"), "jobs is 1000000000")
     assert f"expected at most {16 * cores()} worker processes" in line
     assert list(Path.cwd().iterdir()) == []
-
-
-def test_too_few_open_files_are_said_to_be_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, main: Main) -> None:
     with pytest.MonkeyPatch.context() as patch:
         unable = Mock(side_effect=sqlite3.OperationalError("unable to open database file"))
         patch.setattr("vibench.results.database.sqlite3.connect", unable)

@@ -124,7 +124,31 @@ def test_every_cell_has_a_row_with_a_reason_of_one_line_and_its_origin(cells: pd
         assert (cells[name] != "").all(), name
 
 
-def test_what_plugins_print_is_kept_out_of_the_way(run: Run) -> None:
+def test_tables_progress_and_logs_have_what_happened(run: Run) -> None:
+    for folder, printed in zip(run.folders, run.printed, strict=True):
+        counted = [(int(k), int(n)) for k, n in re.findall(r"^\[(\d+)/(\d+)\]", printed, re.MULTILINE)]
+        statuses = [row["status"] for row in rows(folder)]
+        count, fine = len(statuses), statuses.count("ok")
+        assert counted == sorted(counted)
+        assert len(set(counted)) == len(counted) > 5
+        assert {n for _, n in counted} == {count}
+        assert f"{count} cells, {fine} ok, {count - fine} not ok" in printed
+        for status in set(statuses) - {"ok"}:
+            assert re.search(rf"\b{status}: ", "".join(run.printed))  # ten reasons of a run have a line
+        assert len(pd.read_csv(folder / "tables" / "cells.csv")) == count
+        assert len((folder / "tables" / "summary.md").read_text(encoding="utf-8").splitlines()) == count + 2
+        assert len(pd.read_csv(folder / "tables" / "queries.csv")) == len(rows(folder, "queries"))
+    queries = pd.DataFrame(rows(run.folders[1], "queries"))
+    solvers = {*FINE["solver"], "raises", "nothing", "gives-up", "nan", "wrong"}
+    assert solvers <= set(queries["solver"])
+    assert set(queries.groupby("cell")["query"].apply(tuple)) == {(0, 1, 2)}
+    assert set(queries[queries["solver"] == "raises"]["status"]) == {"failed"}
+    assert queries["mu_1"].between(4.0, 8.0).all()
+    counts = [row["iterations"] for row in run.rows("queries") if row["solver"] == "counts"]
+    assert counts
+    assert set(counts) == {3}
+    known = [row for row in rows(run.folders[0], "histories") if row["quantity"] == "steps"]
+    assert [row["value"] for row in known if row["problem"] == "wire"] == [0, 1, 2]
     assert not any(words in printed for printed in run.printed for words in ("past Python", "the last words"))
     logs = [(folder / "workers.log").read_text() for folder in run.folders[:2]]
     said = (
@@ -134,14 +158,11 @@ def test_what_plugins_print_is_kept_out_of_the_way(run: Run) -> None:
     assert all("the last words" in log for log in logs)  # printed by what crashed right after
 
 
-def test_what_misbehaves_takes_nothing_else_along(cells: pd.DataFrame) -> None:
+def test_a_plugin_that_misbehaves_costs_its_cells_alone_and_is_named(cells: pd.DataFrame) -> None:
     fine = cells.loc[list(pd.MultiIndex.from_product(FINE.values()))]
     assert set(fine["status"]) == {"ok"}
     assert set(fine["queries_ok"]) == {3}
     assert set(fine["reason"]) == {""}
-
-
-def test_a_plugin_that_misbehaves_costs_its_cells(cells: pd.DataFrame) -> None:
     good = {"problem": "wire", "dual": "cpg", "primal": "decorrelated"}
     bad_plugins = {"problem": BAD_PROBLEMS, "dual": BAD_DUALS, "primal": BAD_PRIMALS, "solver": BAD_SOLVERS}
     for axis, of_axis in bad_plugins.items():
@@ -157,9 +178,6 @@ def test_a_plugin_that_misbehaves_costs_its_cells(cells: pd.DataFrame) -> None:
                 assert set(mine["queries_ok"]) == {0}
                 assert mine["online_s"].isna().all()
     assert set(cells.xs("ecos", level="solver")["status"]) == {"unavailable"}
-
-
-def test_reasons_name_the_command_that_checks_the_plugin(cells: pd.DataFrame) -> None:
     for problem, dual, primal, check in (
         ("wire-nan", "cpg", "decorrelated", "problem:wire-nan"),
         ("wire-indefinite", "cpg", "decorrelated", "problem:wire-indefinite"),
@@ -168,39 +186,6 @@ def test_reasons_name_the_command_that_checks_the_plugin(cells: pd.DataFrame) ->
         ("wire", "cpg", "enrichment-long", "primal:enrichment-bad --option=how=long"),
     ):
         assert cells.loc[(problem, dual, primal, "piqp"), "reason"].endswith(f"; run `vibench check {check}`")
-
-
-def test_queries_that_were_asked_have_rows_of_their_own(run: Run) -> None:
-    queries = pd.DataFrame(rows(run.folders[1], "queries"))
-    solvers = {*FINE["solver"], "raises", "nothing", "gives-up", "nan", "wrong"}
-    assert solvers <= set(queries["solver"])
-    assert set(queries.groupby("cell")["query"].apply(tuple)) == {(0, 1, 2)}
-    assert set(queries[queries["solver"] == "raises"]["status"]) == {"failed"}
-    assert queries["mu_1"].between(4.0, 8.0).all()
-
-
-def test_whole_numbers_are_stored_as_whole_numbers(run: Run) -> None:
-    counts = [row["iterations"] for row in run.rows("queries") if row["solver"] == "counts"]
-    assert counts
-    assert set(counts) == {3}
-    known = [row for row in rows(run.folders[0], "histories") if row["quantity"] == "steps"]
-    assert [row["value"] for row in known if row["problem"] == "wire"] == [0, 1, 2]
-
-
-def test_progress_the_end_and_the_tables_have_all_cells(run: Run) -> None:
-    for folder, printed in zip(run.folders, run.printed, strict=True):
-        counted = [(int(k), int(n)) for k, n in re.findall(r"^\[(\d+)/(\d+)\]", printed, re.MULTILINE)]
-        statuses = [row["status"] for row in rows(folder)]
-        count, fine = len(statuses), statuses.count("ok")
-        assert counted == sorted(counted)
-        assert len(set(counted)) == len(counted) > 5
-        assert {n for _, n in counted} == {count}
-        assert f"{count} cells, {fine} ok, {count - fine} not ok" in printed
-        for status in set(statuses) - {"ok"}:
-            assert re.search(rf"\b{status}: ", "".join(run.printed))  # ten reasons of a run have a line
-        assert len(pd.read_csv(folder / "tables" / "cells.csv")) == count
-        assert len((folder / "tables" / "summary.md").read_text(encoding="utf-8").splitlines()) == count + 2
-        assert len(pd.read_csv(folder / "tables" / "queries.csv")) == len(rows(folder, "queries"))
 
 
 def test_queries_that_went_well_before_the_solver_died_are_kept(vibench: Vibench, tmp_path: Path) -> None:

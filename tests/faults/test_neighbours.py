@@ -45,9 +45,7 @@ def test_a_package_that_meddles_with_its_process_costs_no_other(vibench: Vibench
     assert "does the solver remember answers?" in rough["timing_reason"]
 
 
-def test_a_name_that_two_packages_use_costs_the_cells_that_use_it(
-    vibench: Vibench, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_a_name_of_two_packages(vibench: Vibench, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     site = add(install(tmp_path / "site", fake_plugins, FAKES), tmp_path_factory, meddling.TAKEN)
     study = wire_study(dual=["cpg", "mcpg"], solvers=["piqp", "careful", "osqp", "counts"])
     found = {(row["dual"], row["solver"]): row for row in run_wire(vibench, tmp_path, study=study, plugins=site)[1]}

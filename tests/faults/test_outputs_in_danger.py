@@ -24,7 +24,14 @@ def run(tmp_path: Path) -> Path:
     return write_sample_run(tmp_path / "run").parent
 
 
-def test_a_site_killed_while_written_is_whole_or_not_there(run: Path, vibench: Vibench, tmp_path: Path) -> None:
+def test_sites_on_full_disks_or_killed_are_whole_or_not_there(run: Path, vibench: Vibench, tmp_path: Path) -> None:
+    for kib in (20, 150, 600):
+        done = vibench(tmp_path, "publish", str(run), str(tmp_path / "site"), "--no-figures", "--yes", file_kib=kib)
+        assert done.returncode == 2, done.stderr
+        assert done.stderr.startswith("vibench: ")
+        assert "cannot be written" in done.stderr
+        assert done.stderr.count("\n") == 1
+        assert {path.name for path in tmp_path.iterdir()} == {"run"}
     rng, site = random.Random(8), tmp_path / "site"
     arguments = ["publish", str(run), str(site), "--no-figures", "--yes"]
     start = time.monotonic()
@@ -61,16 +68,6 @@ def test_an_export_that_is_killed_is_whole_or_not_there(small_run: Run, vibench:
         assert made.exists() == (tmp_path / arguments[-1]).exists()
 
 
-def test_a_site_on_a_full_disk_is_one_line(run: Path, vibench: Vibench, tmp_path: Path) -> None:
-    for kib in (20, 150, 600):
-        done = vibench(tmp_path, "publish", str(run), str(tmp_path / "site"), "--no-figures", "--yes", file_kib=kib)
-        assert done.returncode == 2, done.stderr
-        assert done.stderr.startswith("vibench: ")
-        assert "cannot be written" in done.stderr
-        assert done.stderr.count("\n") == 1
-        assert {path.name for path in tmp_path.iterdir()} == {"run"}
-
-
 LOOPS = (
     "show loop", "publish --yes run loop", "publish --yes run loop/site", "run loop", "run study.toml --out loop/x",
     "pack loop", "export run loop/x", "export run 0 loop/m.npz", "bench --read loop", "run loop/study.toml",
@@ -104,7 +101,7 @@ def of_another_user(path: Path) -> Iterator[None]:
         path.chmod(0o755)
 
 
-def test_folders_of_others_are_named(run: Path, main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_odd_folders_and_clocks(run: Path, main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for line in ("show theirs", "publish --yes theirs theirs/site --no-figures", "report theirs --no-figures"):
         shutil.copytree(run, tmp_path / "theirs")
@@ -115,9 +112,6 @@ def test_folders_of_others_are_named(run: Path, main: Main, tmp_path: Path, monk
             code, out, err = main(*line.split())
         shutil.rmtree(tmp_path / "theirs")
         assert (code, out, err.count("\n")) == (2, "", 1), err
-
-
-def test_a_clock_that_jumps_changes_no_run(main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     jumps, undisturbed = random.Random(1), time.time
     monkeypatch.setattr(time, "time", lambda: undisturbed() + jumps.choice([-1e6, 0.0, 1e6]))
     coarse = {"name": "radial-obstacle", "options": {"resolution": "coarse"}}

@@ -66,9 +66,7 @@ def test_a_planted_artefact_runs_no_code(tmp_path: Path) -> None:
     (False, 0o700, False), (False, 0o755, False), (False, 0o775, True), (False, 0o777, True),
     (True, 0o770, False), (True, 0o777, True),
 ])  # fmt: skip
-def test_a_folder_that_others_may_write_is_refused(
-    named: bool, mode: int, refused: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_shared_folders(named: bool, mode: int, refused: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder that the user names may be shared with a group on purpose, and never with everybody."""
     monkeypatch.delenv("VIBENCH_CACHE", raising=False)
     monkeypatch.setattr(artefacts.platformdirs, "user_cache_dir", lambda name: str(tmp_path))
@@ -83,7 +81,16 @@ def test_a_folder_that_others_may_write_is_refused(
         usable_store()
 
 
-def test_a_cell_that_would_name_a_file_elsewhere_is_refused(run: Path, tmp_path: Path) -> None:
+def test_results_with_code_or_cells_that_name_files_elsewhere_are_refused(run: Path, tmp_path: Path) -> None:
+    for kind, planted in (
+        ("trigger", "CREATE TRIGGER t AFTER INSERT ON cells BEGIN DELETE FROM queries; END"),
+        ("view", "CREATE VIEW t AS SELECT load_extension('x')"),
+    ):
+        execute(run, planted)
+        for command in (show, write_report, partial(export, words=["set"])):
+            with pytest.raises(RequestError, match=f"is not a results file of vibench: it has a {kind}"):
+                command(str(run))
+        execute(run, f"DROP {kind} t")
     (cell,) = sqlite3.connect(run / FILE).execute("SELECT cell FROM cells LIMIT 1").fetchone()
     before = sorted(tmp_path.rglob("*"))
     for name in ("../../outside", "/tmp/outside", "", "0123456789ABCDEF", "0123456789abcde\n"):
@@ -96,20 +103,21 @@ def test_a_cell_that_would_name_a_file_elsewhere_is_refused(run: Path, tmp_path:
         assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_results_file_with_code_of_its_own_is_refused(run: Path) -> None:
-    for kind, planted in (
-        ("trigger", "CREATE TRIGGER t AFTER INSERT ON cells BEGIN DELETE FROM queries; END"),
-        ("view", "CREATE VIEW t AS SELECT load_extension('x')"),
-    ):
-        execute(run, planted)
-        for command in (show, write_report, partial(export, words=["set"])):
-            with pytest.raises(RequestError, match=f"is not a results file of vibench: it has a {kind}"):
-                command(str(run))
-        execute(run, f"DROP {kind} t")
-
-
-def test_a_damaged_page_is_found(run: Path) -> None:
-    """Most of the file is content; a page whose structure is broken makes every command say so in a line."""
+def test_reports_leave_results_paths_are_names_and_a_damaged_page_is_found(run: Path, tmp_path: Path) -> None:
+    before = (run / FILE).read_bytes()
+    for out in (run / FILE, run / ".." / run.name / FILE):
+        with pytest.raises(RequestError, match="is the results file itself"):
+            write_report(str(run), out, figures=False)
+    with pytest.raises(RequestError, match="cannot be written"):
+        write_report(str(run), run / "nowhere" / "report.html", figures=False)
+    assert (run / FILE).read_bytes() == before
+    for name in ("a b?mode=rwc", "100%", "#1", "ü//x"):
+        (tmp_path / name).mkdir(parents=True)
+        shutil.copy(run / FILE, tmp_path / name)
+        assert len(read_table(results_file(str(tmp_path / name)), "cells")) == 36
+    with pytest.raises(RequestError, match="no results in"):
+        show("//nowhere/run")  # the address of a host
+    # Most of the file is content; a page whose structure is broken makes every command say so in a line.
     content = bytearray((run / FILE).read_bytes())
     for start in range(4096 * 3, 4096 * 40, 4096):
         content[start : start + 8] = b"\xff" * 8
@@ -118,7 +126,7 @@ def test_a_damaged_page_is_found(run: Path) -> None:
         show(str(run))
 
 
-def test_a_link_in_place_of_a_lock_is_not_followed(tmp_path: Path) -> None:
+def test_links_in_place_of_locks_and_tables_are_not_followed(tmp_path: Path, run: Path) -> None:
     valuable = tmp_path / "valuable"
     valuable.write_text("kept")
     folder = tmp_path / "runs"
@@ -129,9 +137,6 @@ def test_a_link_in_place_of_a_lock_is_not_followed(tmp_path: Path) -> None:
     with pytest.raises(RequestError, match="is a symbolic link"), claimed(folder):
         pass
     assert valuable.read_text() == "kept"
-
-
-def test_links_in_place_of_tables_are_replaced_and_not_followed(run: Path, tmp_path: Path) -> None:
     valuable = tmp_path / "valuable"
     valuable.write_text("kept")
     folder = run / "tables"
@@ -143,16 +148,6 @@ def test_links_in_place_of_tables_are_replaced_and_not_followed(run: Path, tmp_p
     write_report(str(run), figures=False)
     assert valuable.read_text() == "kept"
     assert not (folder / "cells.csv").is_symlink()
-
-
-def test_a_report_does_not_replace_the_results(run: Path) -> None:
-    before = (run / FILE).read_bytes()
-    for out in (run / FILE, run / ".." / run.name / FILE):
-        with pytest.raises(RequestError, match="is the results file itself"):
-            write_report(str(run), out, figures=False)
-    with pytest.raises(RequestError, match="cannot be written"):
-        write_report(str(run), run / "nowhere" / "report.html", figures=False)
-    assert (run / FILE).read_bytes() == before
 
 
 PIPES = """
@@ -199,15 +194,6 @@ def test_pipes_of_others_are_refused_wherever_a_file_is_opened(run: Path) -> Non
         "'before.json' cannot be read as a file of pytest-benchmark (OSError: [Errno 22] it is no regular file)",
         "study file 'study.toml' is not a file",
     ]
-
-
-def test_paths_are_names_and_nothing_else(run: Path, tmp_path: Path) -> None:
-    for name in ("a b?mode=rwc", "100%", "#1", "ü//x"):
-        (tmp_path / name).mkdir(parents=True)
-        shutil.copy(run / FILE, tmp_path / name)
-        assert len(read_table(results_file(str(tmp_path / name)), "cells")) == 36
-    with pytest.raises(RequestError, match="no results in"):
-        show("//nowhere/run")  # the address of a host
 
 
 def test_only_figures_of_vibench_are_removed(tmp_path: Path) -> None:

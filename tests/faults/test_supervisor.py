@@ -64,19 +64,20 @@ def test_a_stage_that_goes_well_is_stored_and_tells_its_progress(run: Run, share
     assert found.value == "fine"
 
 
-def test_processes_of_tests_are_forked_whatever_seed_dask_leaves_in_the_environment(
-    watcher: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tests_fork_whatever_the_seed(watcher: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With new interpreters the suite would take the same steps, in much longer."""
     monkeypatch.setenv("PYTHONHASHSEED", "6640")
     monkeypatch.setattr(forking, "start_new_worker", None)
     assert isinstance(watcher.run(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0)), Done)
 
 
-def test_the_process_is_kept_from_one_stage_to_the_next(run: Run) -> None:
+def test_processes_are_kept_and_answer_once(run: Run) -> None:
     processes = {run(InItems(("fine",) * k)).value[0][1] for k in (1, 2, 3)}
     assert len(processes) == 1
     assert os.getpid() not in processes
+    for _ in range(3):
+        found = values(run(InItems(("fine", "fork", "fine"))))
+        assert len({process for _, process in found}) == 1
 
 
 @pytest.mark.parametrize("how", ["sleep", "hang"])
@@ -89,21 +90,30 @@ def test_an_item_beyond_its_limit_costs_itself(run: Run, how: str, monkeypatch: 
 
 
 @pytest.mark.usefixtures("new_workers")
-def test_an_item_that_kills_its_process_costs_itself(run: Run) -> None:
+def test_what_items_start_or_kill_ends_and_costs_themselves(watcher: Supervisor, tmp_path: Path, run: Run) -> None:
+    started = {kind: unique() for kind in ("child", "daemon")}
+    items = InItems(tuple(f"{kind} {seconds}" for kind, seconds in started.items()))
+    assert isinstance(watcher.run(Job(str(tmp_path), items, 1.0, 30.0, 8.0)), Done)
+    for seconds in started.values():
+        while not sleepers(seconds):  # a process that has just begun has no name yet
+            time.sleep(0.01)
+    watcher.close()
+    assert not any(map(sleepers, started.values()))
+    seconds = unique()
+    found = values(run(InItems((f"daemon {seconds}", "exit", "fine"))))
+    assert [isinstance(value, Failed) for _, value in found] == [False, True, False]
+    assert not sleepers(seconds)
     found = values(run(InItems(("exit", "fine", "segfault", "fine"))))
     for number, words in ((0, "exit code 5"), (2, "signal SIGSEGV")):
         assert found[number][1] == Failed(Status.CRASHED, f"the worker process died with {words}")
     assert found[1][1] != found[3][1]  # each death takes another process
 
 
-def test_what_an_item_raises_costs_itself_and_a_death_before_its_limit_begins(run: Run) -> None:
+def test_items_beyond_the_limit_of_the_cell_cost_themselves(run: Run) -> None:
     found = values(run(InItems(("interrupt", "fine", "fine"), unlimited=("", "exit", ""))))
     assert [isinstance(value, Failed) for _, value in found] == [True, True, False]
     assert found[0][1].status is Status.ERROR
     assert "KeyboardInterrupt" in found[0][1].reason
-
-
-def test_beyond_the_limit_of_the_cell_the_items_done_are_kept(run: Run) -> None:
     found = values(run(InItems(("fine", "fine", "sleep", "fine")), query=60.0, cell=2.0))
     assert [isinstance(value, Failed) for _, value in found] == [False, False, True, True]
     assert found[3][1] == Failed(Status.TIMEOUT, "stopped after cell_seconds = 2 s")
@@ -115,7 +125,7 @@ def test_beyond_the_limit_of_the_cell_the_items_done_are_kept(run: Run) -> None:
     assert {value.status for _, value in found[1:]} == {Status.TIMEOUT}
 
 
-def test_a_process_without_memory_is_replaced(run: Run) -> None:
+def test_memory_or_steps_that_are_not_of_an_item_cost_the_stage(run: Run) -> None:
     found = values(run(InItems(("fine", "hunger", "fine"))))
     assert found[1][1] == Failed(Status.ERROR, "out of memory: the limit is memory_gib = 8")
     assert found[0][1] != found[2][1]
@@ -123,26 +133,14 @@ def test_a_process_without_memory_is_replaced(run: Run) -> None:
     assert isinstance(starved, Failed)
     assert "out of memory" in starved.reason
     assert isinstance(run(Whole("fine")), Done)
-
-
-@pytest.mark.usefixtures("new_workers")
-def test_what_a_plugin_started_ends_with_its_process(watcher: Supervisor, tmp_path: Path) -> None:
-    started = {kind: unique() for kind in ("child", "daemon")}
-    items = InItems(tuple(f"{kind} {seconds}" for kind, seconds in started.items()))
-    assert isinstance(watcher.run(Job(str(tmp_path), items, 1.0, 30.0, 8.0)), Done)
-    for seconds in started.values():
-        while not sleepers(seconds):  # a process that has just begun has no name yet
-            time.sleep(0.01)
-    watcher.close()
-    assert not any(map(sleepers, started.values()))
-
-
-@pytest.mark.usefixtures("new_workers")
-def test_a_daemon_does_not_outlive_a_process_that_dies(run: Run) -> None:
-    seconds = unique()
-    found = values(run(InItems((f"daemon {seconds}", "exit", "fine"))))
-    assert [isinstance(value, Failed) for _, value in found] == [False, True, False]
-    assert not sleepers(seconds)
+    statuses = {"sleep": Status.TIMEOUT, "exit": Status.CRASHED, "interrupt": Status.ERROR}
+    for how, status in (*statuses.items(), ("hang", Status.TIMEOUT), ("segfault", Status.CRASHED)):
+        items = (InItems(("fine",), at_begin=how), InItems(("fine",), at_end=how)) if how in statuses else ()
+        for stage in (*items, Whole(how)):
+            found = run(stage, cell=0.5 if status is Status.TIMEOUT else 30.0)
+            assert isinstance(found, Failed)
+            assert found.status is status
+        assert isinstance(run(Whole("fine")), Done)  # the next one has a new process
 
 
 def unique() -> int:
@@ -171,17 +169,14 @@ def test_a_plugin_or_vibench_not_planned_with_is_refused(run: Run, watcher: Supe
     assert "vibench or one of the libraries was changed" in found.reason
 
 
-def test_a_suspended_run_is_not_late(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_suspended_runs_are_not_late_limits_begin_with_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     state = supervisor._JobState(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0))
     state.update(Begun())
     now = time.monotonic()
     monkeypatch.setattr(supervisor.time, "monotonic", lambda: now + 3600.0)
     state.tick(30.0)
     assert 0.0 < state.seconds <= 1.0
-
-
-def test_limits_begin_when_the_work_begins(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """None of the time counts in which a process starts and imports: here three times what the work may take."""
+    # None of the time counts in which a process starts and imports: here three times what the work may take.
     state = supervisor._JobState(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0))
     seconds = itertools.count(time.monotonic())
     monkeypatch.setattr(supervisor.time, "monotonic", lambda: next(seconds))
@@ -202,7 +197,11 @@ def test_a_process_not_begun_is_given_up(watcher: Supervisor, tmp_path: Path, mo
     assert found == Failed(Status.CRASHED, "no worker process began within 0.1 s")
 
 
-def test_a_talkative_job_can_be_stopped(watcher: Supervisor, tmp_path: Path) -> None:
+def test_talkative_jobs_stop_and_disks_are_not_the_fault_of_stages(watcher: Supervisor, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    found = watcher.run(Job(str(tmp_path / "file"), Whole("fine"), 1.0, 30.0, 8.0))
+    assert isinstance(found, Unstored)
+    assert "cannot be written" in found.reason
     job = Job(str(tmp_path), InItems(("moment",) * 2000), 60.0, 600.0, 8.0)
 
     def stop_at_the_first_item() -> None:
@@ -213,30 +212,6 @@ def test_a_talkative_job_can_be_stopped(watcher: Supervisor, tmp_path: Path) -> 
     threading.Thread(target=stop_at_the_first_item, daemon=True).start()
     with pytest.raises(StoppedError):  # long before its limits, which are ten minutes away
         watcher.run(job)
-
-
-def test_what_is_not_of_an_item_costs_the_cell_or_the_whole_stage(run: Run) -> None:
-    statuses = {"sleep": Status.TIMEOUT, "exit": Status.CRASHED, "interrupt": Status.ERROR}
-    for how, status in (*statuses.items(), ("hang", Status.TIMEOUT), ("segfault", Status.CRASHED)):
-        items = (InItems(("fine",), at_begin=how), InItems(("fine",), at_end=how)) if how in statuses else ()
-        for stage in (*items, Whole(how)):
-            found = run(stage, cell=0.5 if status is Status.TIMEOUT else 30.0)
-            assert isinstance(found, Failed)
-            assert found.status is status
-        assert isinstance(run(Whole("fine")), Done)  # the next one has a new process
-
-
-def test_a_process_that_forks_answers_once(run: Run) -> None:
-    for _ in range(3):
-        found = values(run(InItems(("fine", "fork", "fine"))))
-        assert len({process for _, process in found}) == 1
-
-
-def test_what_cannot_be_stored_is_not_the_fault_of_the_stage(watcher: Supervisor, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    found = watcher.run(Job(str(tmp_path / "file"), Whole("fine"), 1.0, 30.0, 8.0))
-    assert isinstance(found, Unstored)
-    assert "cannot be written" in found.reason
 
 
 def test_a_keeper_that_is_closed_stops_at_once_and_leaves_nobody(watcher: Supervisor, tmp_path: Path) -> None:

@@ -58,7 +58,7 @@ def by_strategies(run: Path, table: str) -> dict[tuple[str, str, str], list[dict
     return found
 
 
-def test_the_run_ends_with_a_row_for_every_cell(ended: tuple[Path, str]) -> None:
+def test_the_run_ends_with_a_row_for_every_cell_and_printable_names(ended: tuple[Path, str]) -> None:
     cells = {key: found for key, (found,) in by_strategies(ended[0] / "run", "cells").items()}
     cpg, own = printable(f"@{LABEL}"), printable(f"_{LABEL}")
     assert len(cells) == 30
@@ -92,9 +92,6 @@ def test_the_run_ends_with_a_row_for_every_cell(ended: tuple[Path, str]) -> None
         assert odd["solver_status"] == printable(" ".join(ODD.split()))
         assert plain["iterations"] > 0
         assert odd["error_u"] == pytest.approx(plain["error_u"], rel=1e-3)
-
-
-def test_histories_and_pictures_have_printable_names(ended: tuple[Path, str]) -> None:
     run = ended[0] / "run"
     known = {row["quantity"]: row["value"] for row in rows(run, "histories") if row["step"] == 0}
     quantity = printable(" ".join(ODD.split()))

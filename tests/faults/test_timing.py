@@ -29,16 +29,14 @@ def test_a_solver_that_dies_in_a_round_costs_that_round(
     assert (timed.count("dies-once"), timed.count("piqp")) == (ROUNDS - lost, ROUNDS)
 
 
-def test_a_cell_that_never_answers_leaves_the_seconds_of_the_others(vibench: Vibench, tmp_path: Path) -> None:
+def test_what_was_never_answered_or_timed_leaves_the_others_or_is_timed_next(vibench: Vibench, tmp_path: Path) -> None:
     study = wire_study(solvers=["dies", "raises", "piqp"], dual=["cone-raises", "cpg"])
-    found = {(row["dual"], row["solver"]): row for row in run_wire(vibench, tmp_path, study=study)[1]}
+    (tmp_path / "other").mkdir()
+    found = {(row["dual"], row["solver"]): row for row in run_wire(vibench, tmp_path / "other", study=study)[1]}
     assert len(found) == 6
     assert [key for key, row in found.items() if row["online_s"] is not None] == [("cpg", "piqp")]
     assert found["cpg", "piqp"]["timing_rounds"] == ROUNDS
-
-
-def test_what_was_answered_but_not_timed_is_timed_by_the_next_run(vibench: Vibench, tmp_path: Path) -> None:
-    """As after an interruption between the last answer and the first round; a study may ask for more rounds."""
+    # As after an interruption between the last answer and the first round; a study may ask for more rounds.
     folder = tmp_path / "runs" / "wire"
     run_wire(vibench, tmp_path, study=wire_study())
     execute(folder, "UPDATE cells SET timing_rounds = NULL, online_s = NULL", "DELETE FROM timings")

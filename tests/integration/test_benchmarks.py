@@ -71,7 +71,7 @@ def third_party(tmp_path_factory: pytest.TempPathFactory) -> Timed:
 PRIMALS = ("decorrelated", "offline-pga", "enrichment-counts")
 
 
-def test_a_problem_that_is_only_registered_is_timed_in_every_stage(third_party: Timed) -> None:
+def test_what_is_only_registered_is_timed_in_every_stage_beside_what_was_reached(third_party: Timed) -> None:
     stages = ("high_fidelity_solution", "high_fidelity_sweep", "pod", "separation")
     expected = {f"{stage}[wire]" for stage in stages} | {"cone[wire-mcpg]"}
     primals = ("decorrelated", "offline-pga-0.5", "offline-pga-0.1", "enrichment-counts")
@@ -84,9 +84,6 @@ def test_a_problem_that_is_only_registered_is_timed_in_every_stage(third_party: 
     assert (duals, solvers) == ({None, "mcpg"}, {None, "careful"})  # only chosen plugins are timed
     assert set(third_party.file["machine_info"]["vibench"]) == {"machine", "libraries", "code"}
     assert {entry["options"]["timer"] for entry in third_party.benchmarks.values()} == {"process_time"}
-
-
-def test_what_was_reached_is_beside_every_time(third_party: Timed) -> None:
     reached = {name: entry["extra_info"]["accuracy"] for name, entry in third_party.benchmarks.items()}
     assert all(figures and all(0.0 <= value < 2.0 for value in figures.values()) for figures in reached.values())
     assert reached["high_fidelity_sweep[wire]"].keys() == {"primal_residual", "dual_residual", "gap"}
@@ -95,9 +92,6 @@ def test_what_was_reached_is_beside_every_time(third_party: Timed) -> None:
     assert reached["cone[wire-mcpg]"]["projection_error"] <= 1e-2
     assert reached["enrichment[wire-decorrelated]"]["sigma"] > reached["enrichment[wire-offline-pga-0.1]"]["sigma"]
     assert reached["query[wire-offline-pga-0.1]"]["error_u"] < 1e-2
-
-
-def test_a_registered_solver_is_timed_on_reduced_programs(third_party: Timed) -> None:
     info = third_party.benchmarks["solver[wire-N5-R5-careful-1e-10]"]["extra_info"]
     assert info["status"] == "ok"
     assert max(info["accuracy"].values()) <= 1e-10
@@ -106,7 +100,7 @@ def test_a_registered_solver_is_timed_on_reduced_programs(third_party: Timed) ->
     assert "benchmarks left out: the snapshots of wire give N = " in third_party.err
 
 
-def test_what_cannot_be_made_fails_with_its_reason_and_is_not_timed(third_party: Timed) -> None:
+def test_failures_have_reasons_passes_are_put_together_and_tables_fit(third_party: Timed) -> None:
     assert third_party.code == 1
     for name, reason in (
         ("pod[wire-broken]", "no wire in stock"),
@@ -119,6 +113,21 @@ def test_what_cannot_be_made_fails_with_its_reason_and_is_not_timed(third_party:
         failed = (line for line in third_party.err.splitlines() if f" failed: {name}: " in line)
         assert any(reason in line for line in failed), name
         assert name not in third_party.benchmarks
+    several = {name: entry["extra_info"]["passes"] for name, entry in third_party.benchmarks.items()}
+    assert {len(passes) for passes in several.values()} <= {1, PASSES}
+    assert len(several["enrichment[wire-decorrelated]"]) == PASSES
+    for name, passes in several.items():
+        stats = third_party.benchmarks[name]["stats"]
+        assert sum(one["rounds"] for one in passes) == stats["rounds"] == len(stats["data"])
+        assert min(one["q1"] for one in passes) <= stats["median"] <= max(one["q3"] for one in passes)
+        assert stats["median"] == pytest.approx(statistics.median(stats["data"]))
+        assert all(one["calibration_s"] > 0.0 for one in passes)
+    lines = third_party.out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "POD" in lines
+    failed = sum(" failed: " in line for line in third_party.err.splitlines())
+    assert f"{len(third_party.benchmarks)} benchmarks, {failed} failed; times are CPU times" in lines[-1]
+    assert sum(line.startswith(("decorrelated", "offline-pga")) for line in lines) == 3 * 3
 
 
 @pytest.mark.long  # beside four busy processes the honest benchmark takes more than its three seconds, too
@@ -160,27 +169,6 @@ dual = [1e-2]
 """
 
 
-def test_what_is_not_slow_is_timed_in_passes_whose_rounds_are_put_together(third_party: Timed) -> None:
-    several = {name: entry["extra_info"]["passes"] for name, entry in third_party.benchmarks.items()}
-    assert {len(passes) for passes in several.values()} <= {1, PASSES}
-    assert len(several["enrichment[wire-decorrelated]"]) == PASSES
-    for name, passes in several.items():
-        stats = third_party.benchmarks[name]["stats"]
-        assert sum(one["rounds"] for one in passes) == stats["rounds"] == len(stats["data"])
-        assert min(one["q1"] for one in passes) <= stats["median"] <= max(one["q3"] for one in passes)
-        assert stats["median"] == pytest.approx(statistics.median(stats["data"]))
-        assert all(one["calibration_s"] > 0.0 for one in passes)
-
-
-def test_the_tables_fit_eighty_columns_and_have_every_benchmark(third_party: Timed) -> None:
-    lines = third_party.out.splitlines()
-    assert max(map(len, lines)) <= 80
-    assert "POD" in lines
-    failed = sum(" failed: " in line for line in third_party.err.splitlines())
-    assert f"{len(third_party.benchmarks)} benchmarks, {failed} failed; times are CPU times" in lines[-1]
-    assert sum(line.startswith(("decorrelated", "offline-pga")) for line in lines) == 3 * 3
-
-
 def test_plugins_are_chosen_by_the_names_of_lists(register: Register) -> None:
     assert benchmarks.chosen_plugins(["obstacle", "piqp", "dual:mcpg"]) == {
         "problem": ["obstacle"], "solver": ["piqp"], "dual": ["mcpg"],
@@ -196,16 +184,13 @@ def test_plugins_are_chosen_by_the_names_of_lists(register: Register) -> None:
         benchmarks.chosen_plugins(["same"])
 
 
-def test_a_wrong_request_is_refused_before_anything_is_timed(main: Main, tmp_path: Path) -> None:
+def test_wrong_requests_are_refused_in_a_line(main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     refused(main("bench", "obstacle", "--resolution", "huge"), "no problem has the resolution 'huge'")
     refused(main("bench", "obstacle", "--study", "quik"), "did you mean 'quick'")
     refused(main("bench", "obstacle", "--out", str(tmp_path / "no" / "file.json")), "is not a folder")
     refused(main("bench", "--read", str(tmp_path / "file.json")), "cannot be read")
     good = written(tmp_path / "good.json", entry("a", 1.0, SAME))
     refused(main("bench", "obstacle", "--read", good), "leave out the plugins")
-
-
-def test_without_pytest_benchmark_one_line_names_the_command(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "pytest_benchmark" else found(name))
     code, out, err = main("bench", "obstacle")

@@ -22,13 +22,10 @@ LAYERS = [
 ]
 
 
-def test_the_map_names_every_package_in_the_order_of_the_layers() -> None:
+def test_the_map_and_the_walk_name_packages_in_the_order_of_the_layers() -> None:
     package = Path(str(vibench.__file__)).parent
     assert set(PACKAGES) == {path.parent.name for path in package.glob("*/__init__.py")}
     assert [layer for layer in LAYERS if layer in PACKAGES] == PACKAGES
-
-
-def test_the_walk_from_a_study_to_a_row_leads_through_seven_modules_each_once_and_downwards() -> None:
     modules, places = [], []
     for name in WALK:
         parts = name.split(".")

@@ -137,15 +137,12 @@ def test_the_plugins_of_the_pages_run_through_a_benchmark(package: Path, vibench
     assert sum(row["flagged"] for row in rows(tmp_path / "runs" / "mine", "disagreements")) == 0
 
 
-def test_every_column_of_every_table_has_a_unit_and_a_meaning(reference: ModuleType) -> None:
+def test_columns_fields_and_tables_of_the_reference_are_complete(reference: ModuleType) -> None:
     everything = [column for of_table in schema.STORED.values() for column in of_table.values()]
     for column in [*everything, schema.column_of("queries", "mu_1")]:
         assert column.unit in reference.UNITS
         assert column.meaning.strip().endswith((".", "…"))
     assert {column.unit for name, column in schema.STORED["queries"].items() if name.endswith("_s")} == {"s"}
-
-
-def test_the_tables_for_reading_have_the_columns_that_are_described(reference: ModuleType) -> None:
     axes = ("formulation", "formulation_a", "formulation_b")
     several = {"accuracy": [1e-7, 1e-10], "training": ["own", "another"], "meaning": "undecided", "correction": "auto"}
     several |= {"certificate": "certified", **{name: ["mixed", "another"] for name in axes}}
@@ -158,18 +155,12 @@ def test_the_tables_for_reading_have_the_columns_that_are_described(reference: M
         headings = re.findall(r"^\| (?!column|---)([^|]+?) \|", reference.GENERATED[name](), re.MULTILINE)
         assert list(view(empty).columns) == headings
         assert len(headings) == len(set(headings)) > 10
-
-
-def test_every_field_of_a_study_file_is_described_and_in_the_reference(reference: ModuleType) -> None:
     page = reference.study_fields()
     for model in (Study, ToleranceTable, Entry, ProblemEntry, SamplingEntry, Limits):
         for name, field in model.model_fields.items():
             assert field.description, name
             line = rf"^\| `{name}` \| .+ \| .* \| {re.escape(field.description)} \|$"
             assert re.search(line, page, re.MULTILINE), name
-
-
-def test_the_reference_has_a_line_for_every_column_and_the_pages_have_all_its_tables(reference: ModuleType) -> None:
     for table, stored in schema.STORED.items():
         names = re.findall(r"^\| `([^`]+)` ", reference.GENERATED[table](), re.MULTILINE)
         assert names == [*stored, *(["mu_1, mu_2, …"] if table == "queries" else [])]
@@ -178,6 +169,23 @@ def test_the_reference_has_a_line_for_every_column_and_the_pages_have_all_its_ta
     assert len(reference.PLACE.findall(text)) == text.count("<!-- generated: ")
     study = (DOCS / "study.md").read_text(encoding="utf-8")
     assert reference.filled(study.replace("| `seed` |", "| `seeds` |")) == reference.filled(study)
+
+
+def test_the_api_reference_has_every_public_name_and_described_parameters_exist() -> None:
+    listed = re.findall(r"^::: vibench\.([\w.]+)$", (DOCS / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
+    grouped = [f"{group}.{name}" for group in vibench.GROUPS for name in getattr(vibench, group).__all__]
+    assert sorted(listed) == sorted([*(set(vibench.__all__) - set(vibench.GROUPS)), *grouped])
+    # Those of numpydoc sections are in the signature.
+    modules = [getattr(vibench, group) for group in vibench.GROUPS]
+    described = 0
+    for name, public in [(name, getattr(one, name)) for one in (vibench, *modules) for name in one.__all__]:
+        section = re.search(r"^Parameters\n-+\n(.*?)(?=^\w+\n-+$|\Z)", inspect.getdoc(public) or "", re.M | re.S)
+        if section and (inspect.isfunction(public) or inspect.isclass(public)):
+            heads = re.findall(r"^(\S.*)$", section[1], re.MULTILINE)
+            names = {one.strip() for head in heads for one in head.split(",")}
+            assert names <= set(inspect.signature(public).parameters), name
+            described += 1
+    assert described > 10
 
 
 LINKED = re.compile(r"\]\(([^)#\s]+\.md)")
@@ -248,7 +256,7 @@ BIBLIOGRAPHY = ENTRY.findall((DOCS / "bibliography.md").read_text(encoding="utf-
 CITED = re.compile(r"\b([A-Z][a-z][\w'’]+)(?:, [A-Z][\w'’]+)* and [A-Z][\w'’]+ \(?((?:19|20)\d\d)\b")
 
 
-def test_every_strategy_has_its_formula_source_and_snippet() -> None:
+def test_strategies_have_formulas_and_whatever_is_cited_is_in_the_bibliography() -> None:
     sections = re.split(r"^##+ (.+)$", METHODS.read_text(encoding="utf-8"), flags=re.MULTILINE)
     described = {name: text for title, text in pairwise(sections[1:]) for name in title.split(", ")}
     kinds = PluginKind.DUAL, PluginKind.FORMULATION, PluginKind.PRIMAL, PluginKind.SAMPLING
@@ -261,9 +269,6 @@ def test_every_strategy_has_its_formula_source_and_snippet() -> None:
         assert "```python" in text, name
         # a product of points, a list and a file need no source
         assert "](bibliography.md#" in text or name in {"grid", "random", "list", "file", "pod-dual"}, name
-
-
-def test_whatever_is_cited_is_in_the_bibliography_with_a_doi_where_there_is_one() -> None:
     known = {(name, year) for name, year, _ in BIBLIOGRAPHY}
     sources = [*PAGES, ROOT / "README.md"]
     for folder in ("vibench", "strategies", "problems"):
@@ -282,26 +287,6 @@ def test_whatever_is_cited_is_in_the_bibliography_with_a_doi_where_there_is_one(
         link = re.search(r"\[doi:(10\.\d{4,5}/[^\]]+)\]\(https://doi\.org/([^)]+)\)|\[arXiv:", text)
         assert link or name == "conover", text
         assert link is None or not link[1] or urllib.parse.unquote(link[2]) == link[1]
-
-
-def test_the_api_reference_has_every_public_name_once() -> None:
-    listed = re.findall(r"^::: vibench\.([\w.]+)$", (DOCS / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
-    grouped = [f"{group}.{name}" for group in vibench.GROUPS for name in getattr(vibench, group).__all__]
-    assert sorted(listed) == sorted([*(set(vibench.__all__) - set(vibench.GROUPS)), *grouped])
-
-
-def test_described_parameters_exist() -> None:
-    """Those of numpydoc sections are in the signature."""
-    modules = [getattr(vibench, group) for group in vibench.GROUPS]
-    described = 0
-    for name, public in [(name, getattr(one, name)) for one in (vibench, *modules) for name in one.__all__]:
-        section = re.search(r"^Parameters\n-+\n(.*?)(?=^\w+\n-+$|\Z)", inspect.getdoc(public) or "", re.M | re.S)
-        if section and (inspect.isfunction(public) or inspect.isclass(public)):
-            heads = re.findall(r"^(\S.*)$", section[1], re.MULTILINE)
-            names = {one.strip() for head in heads for one in head.split(",")}
-            assert names <= set(inspect.signature(public).parameters), name
-            described += 1
-    assert described > 10
 
 
 @pytest.fixture

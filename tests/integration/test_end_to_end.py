@@ -21,15 +21,12 @@ def queries(quick_run: Path, cells: pd.DataFrame) -> pd.DataFrame:
     return frame.assign(kind=frame["cell"].map(cells["enrichment_kind"]))
 
 
-def test_every_cell_of_the_quick_matrix_has_a_row(cells: pd.DataFrame) -> None:
+def test_every_cell_has_accurate_queries_that_keep_the_invariants(cells: pd.DataFrame, queries: pd.DataFrame) -> None:
     assert len(cells) == 2 * 2 * 3 * 3
     assert set(cells["problem"]) == {"obstacle", "hertz"}
     assert set(cells["primal"]) == {"decorrelated", "online-supremizers", "offline-pga"}
     assert cells[["problem", "dual", "primal", "primal_tol", "solver"]].duplicated().sum() == 0
     assert (cells["queries"] == 16).all()
-
-
-def test_every_ok_query_is_as_accurate_as_the_study_asks(queries: pd.DataFrame) -> None:
     ok = queries[queries["status"] == "ok"]
     assert len(ok) > 0.9 * len(queries)
     assert ok[["primal_residual", "dual_residual", "gap"]].max().max() <= 1e-7
@@ -40,9 +37,6 @@ def test_every_ok_query_is_as_accurate_as_the_study_asks(queries: pd.DataFrame) 
     spread = ok.groupby(keys, dropna=False)[["error_u", "beta_span"]].agg(lambda values: values.max() - values.min())
     assert spread["beta_span"].max() == 0.0
     assert spread["error_u"].max() < 3e-4
-
-
-def test_invariants_of_the_inf_sup_constants_hold_in_every_row(cells: pd.DataFrame, queries: pd.DataFrame) -> None:
     assert violations(queries, cells["enrichment_kind"]) == []
     for kind, prefix in (("per-parameter", "beta_full_"), ("none", "beta_plain_")):
         some = queries[queries["kind"] == kind]
@@ -55,7 +49,7 @@ def test_invariants_of_the_inf_sup_constants_hold_in_every_row(cells: pd.DataFra
     assert np.array_equal(vanishes, short.loc[queries["cell"]].to_numpy())
 
 
-def test_fixed_enrichments_keep_their_promise(queries: pd.DataFrame, quick_run: Path) -> None:
+def test_enrichments_and_cones_keep_their_promise(queries: pd.DataFrame, quick_run: Path, cells: pd.DataFrame) -> None:
     """Obstacle: all parameters share one supremizer space, so the bound of the training set holds everywhere."""
     fixed = queries[(queries["kind"] == "fixed") & (queries["problem"] == "obstacle")]
     bound = np.sqrt(1.0 - fixed["primal_tol"] ** 2)
@@ -70,9 +64,6 @@ def test_fixed_enrichments_keep_their_promise(queries: pd.DataFrame, quick_run: 
     assert len(own) == 2 * (125 + 81)
     bound = np.sqrt(1.0 - own.index.get_level_values("primal_tol").to_numpy() ** 2)
     assert np.all(own.to_numpy() >= bound * full.to_numpy() * (1.0 - 1e-9))
-
-
-def test_the_modified_cone_is_no_larger_and_better_conditioned(quick_run: Path, cells: pd.DataFrame) -> None:
     histories = read_table(quick_run / "results.sqlite", "histories")
     for problem in ("obstacle", "hertz"):
         sizes = cells[cells["problem"] == problem].groupby("dual")["R"].first()

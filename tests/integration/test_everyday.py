@@ -164,12 +164,8 @@ class TestEngineer:
     def test_the_script_answers_without_vibench(self, home: Path, exported: Path) -> None:
         model = vibench.open_run("mine").model(key(home, **CERTIFIED))
         mu = [3.0, 0.05]
-        code = (
-            "import json, sys; sys.modules['vibench'] = None\n"
-            "from reduced_model import Model\n"
-            f"one = Model('string.npz').solve({mu})\n"
-            "print(json.dumps([one.status, one.outputs]))"
-        )
+        code = "import json, sys; sys.modules['vibench'] = None\nfrom reduced_model import Model\n"
+        code += f"one = Model('string.npz').solve({mu})\nprint(json.dumps([one.status, one.outputs]))"
         done = subprocess.run([sys.executable, "-c", code], cwd=exported, capture_output=True, text=True, check=True)
         status, values = json.loads(done.stdout)
         assert status == "ok"

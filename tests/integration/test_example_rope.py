@@ -82,7 +82,7 @@ def test_the_package_is_found_through_its_entry_points_alone(python: Python, com
     assert [stem for stem, text in texts.items() for name in ("rope", OWN, FORMULATION) if mentions(name, text)] == []
 
 
-def test_every_cell_of_the_rope_has_row_and_line(cells: tuple[pd.DataFrame, pd.DataFrame, str], example: Path) -> None:
+def test_every_cell_has_row_and_line_is_stable(cells: tuple[pd.DataFrame, pd.DataFrame, str], example: Path) -> None:
     found, queries, printed = cells
     assert set(found["status"]) == {"ok"}
     (interpolated,) = found[found["formulation"] == FORMULATION].to_dict("records")
@@ -102,9 +102,6 @@ def test_every_cell_of_the_rope_has_row_and_line(cells: tuple[pd.DataFrame, pd.D
     compared = pd.read_csv(example.parent / "runs" / STUDY["name"] / "tables" / "thresholds.csv")
     pairs = set(zip(compared["primal_a"], compared["primal_b"], strict=True))
     assert {("online-supremizers", OWN), ("online-supremizers", "offline-pga")} <= pairs
-
-
-def test_fixed_enrichment_is_as_stable_as_that_at_every_query(cells: tuple[pd.DataFrame, pd.DataFrame, str]) -> None:
     found, queries, _ = cells
     rows = queries.merge(found[["cell", "primal", "assembly"]], on="cell", suffixes=("", "_of_cell"))
     rows = rows.sort_values(["assembly", "query"], ignore_index=True)

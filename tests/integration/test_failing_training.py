@@ -71,7 +71,7 @@ def test_a_reduction_skips_as_a_study(number: int) -> None:
     assert skipping.model.solve([1.4, 0.3]).status == "ok"
 
 
-def test_no_more_than_a_tenth_is_skipped_and_of_known_training_sets_alone() -> None:
+def test_no_more_than_a_tenth_is_skipped_and_such_cells_are_others() -> None:
     count = "2 of 15 training parameters have no solution, at most 1 may be skipped"
     with pytest.raises(NumericalError, match=rf"{count}; the first one: at mu = \[1.0, -1.0\]: ValueError"):
         reduction(Tangled(0, 2), "skip").snapshots  # noqa: B018
@@ -81,9 +81,6 @@ def test_no_more_than_a_tenth_is_skipped_and_of_known_training_sets_alone() -> N
         study("own", validation={"name": "sobol", "size": 4, "on_failure": "skip"})
     with pytest.raises(RequestError, match="chooses training parameters by what solutions know; it has none to skip"):
         study({"name": "greedy", "candidates": 10, "tolerance": 0.1, "on_failure": "skip"})
-
-
-def test_cells_of_sets_that_skip_are_others_and_their_definition_says_so() -> None:
     plain, skipping = (
         expand(study({"name": "own", "on_failure": choice}, problem=["obstacle"]))[0] for choice in ("stop", "skip")
     )

@@ -38,7 +38,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return run(asked, tmp_path_factory.mktemp("formulations"), jobs=1)
 
 
-def test_a_formulation_is_not_repeated_over_axes_that_it_does_not_have() -> None:
+def test_axes_that_a_formulation_does_not_have_are_neither_repeated_nor_needed() -> None:
     ways = {"assembly": ["full", "reduced"], "bounds": [True], "correction": ["none", "auto"]}
     cells = expand(study(formulation=["mixed", Program, Nearest], **ways))
     count = {label: sum(cell.formulation_label == label for cell in cells) for label in ("mixed", "Program", "Nearest")}
@@ -47,9 +47,6 @@ def test_a_formulation_is_not_repeated_over_axes_that_it_does_not_have() -> None
     assert (nearest.dual, nearest.primal, nearest.pod, nearest.cone, nearest.solver, nearest.accuracy) == (None,) * 6
     assert str(nearest) == "Wire · Nearest"
     assert {cell.assembly for cell in cells if cell.formulation_label == "Program"} == {"full", "reduced"}
-
-
-def test_axes_that_no_formulation_uses_need_not_be_given() -> None:
     tolerances: Any = [{"pod": [1e-3], "dual": [1e-2]}]
     content: Any = {"name": "one", "validation": 4, "problem": [Wire], "tolerances": tolerances}
     assert len(expand(Study(formulation=[Nearest], **content))) == 1
@@ -57,7 +54,25 @@ def test_axes_that_no_formulation_uses_need_not_be_given() -> None:
         Study(formulation=["mixed", Nearest], **content)
 
 
-def test_the_mixed_formulation_as_a_plugin_gives_its_numbers(found: Run) -> None:
+def test_all_are_judged_by_the_same_bounds_and_misbehaviour_costs_its_rows(found: Run) -> None:
+    queries = found.table("queries")
+    ok = queries[queries["status"] == "ok"]
+    assert set(ok["formulation"]) == {"mixed", "Program", "Nearest", *REASONS}
+    assert violations(queries, found.table("cells").set_index("cell")["enrichment_kind"]) == []
+    for error, bound in (("u_energy", "u_energy"), ("lambda_natural", "lambda_natural"), ("u", "u")):
+        assert (ok[f"error_{error}_absolute"] <= ok[f"bound_{bound}"] * (1.0 + 1e-9)).all()
+    (nearest,) = found.table("cells").query("formulation == 'Nearest'").to_dict("records")
+    assert (nearest["dual"], nearest["primal"], nearest["solver"]) == ("–", "–", "–")
+    assert (nearest["multiplier"], nearest["error_u_predicted_mean"]) == ("residual", 0.5)
+    assert np.isnan(nearest["beta_span_min"])
+    queries = found.table("queries").query("assembly == 'full'")
+    for how, (status, reason) in REASONS.items():
+        rows = queries[queries["formulation"] == how].set_index("query")
+        upper = rows["mu_1"] >= 6.0
+        assert 0 < upper.sum() < len(rows)
+        assert (rows.loc[~upper, "status"] == "ok").all()
+        assert set(rows.loc[upper, "status"]) == {status}
+        assert all(reason in text for text in rows.loc[upper, "reason"])
     queries = found.table("queries").set_index(["formulation", "assembly", "query"]).sort_index()
     own, other = queries.loc["mixed"], queries.loc["Program"]
     assert (own["status"] == "ok").all()
@@ -93,31 +108,7 @@ def test_a_new_formulation_with_programs_runs_as_the_mixed_one(tmp_path: Path) -
     assert (cells.loc["Coarse", "bound_online_violations"].dropna() == 0).all()
 
 
-def test_all_are_judged_by_the_same_bounds(found: Run) -> None:
-    queries = found.table("queries")
-    ok = queries[queries["status"] == "ok"]
-    assert set(ok["formulation"]) == {"mixed", "Program", "Nearest", *REASONS}
-    assert violations(queries, found.table("cells").set_index("cell")["enrichment_kind"]) == []
-    for error, bound in (("u_energy", "u_energy"), ("lambda_natural", "lambda_natural"), ("u", "u")):
-        assert (ok[f"error_{error}_absolute"] <= ok[f"bound_{bound}"] * (1.0 + 1e-9)).all()
-    (nearest,) = found.table("cells").query("formulation == 'Nearest'").to_dict("records")
-    assert (nearest["dual"], nearest["primal"], nearest["solver"]) == ("–", "–", "–")
-    assert (nearest["multiplier"], nearest["error_u_predicted_mean"]) == ("residual", 0.5)
-    assert np.isnan(nearest["beta_span_min"])
-
-
-def test_what_misbehaves_costs_its_own_rows(found: Run) -> None:
-    queries = found.table("queries").query("assembly == 'full'")
-    for how, (status, reason) in REASONS.items():
-        rows = queries[queries["formulation"] == how].set_index("query")
-        upper = rows["mu_1"] >= 6.0
-        assert 0 < upper.sum() < len(rows)
-        assert (rows.loc[~upper, "status"] == "ok").all()
-        assert set(rows.loc[upper, "status"]) == {status}
-        assert all(reason in text for text in rows.loc[upper, "reason"])
-
-
-def test_a_formulation_is_timed_in_the_rounds_with_all_of_it(found: Run) -> None:
+def test_formulations_are_timed_with_all_of_it_and_answer_again(found: Run) -> None:
     cells = found.table("cells").set_index(["formulation", "assembly"])
     for key in (("mixed", "full"), ("Program", "full"), ("Nearest", "full")):
         assert cells.loc[key, "timed_rounds"] == 2
@@ -131,9 +122,6 @@ def test_a_formulation_is_timed_in_the_rounds_with_all_of_it(found: Run) -> None
     known = cells.reset_index().groupby("formulation")["cell"].agg(set)
     assert {"Program", "Nearest"} <= set(others.groups)
     assert all(set(mine) <= known["mixed"] for _, mine in others)
-
-
-def test_a_recorded_formulation_answers_and_is_refused_where_it_makes_no_sense(found: Run) -> None:
     cells = found.table("cells").set_index("formulation")
     key, mixed = cells.loc["Nearest", "cell"], cells.loc["mixed", "cell"].iloc[0]
     again = open_run(found.path).model(key).solve([5.0])

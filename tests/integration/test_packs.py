@@ -95,15 +95,12 @@ def key(folder: Path) -> str:
     return str(rows(folder / "run")[0]["cell"])
 
 
-def test_what_results_say_of_a_pack_is_its_path_beside_the_study(made: Path, main: Main) -> None:
+def test_results_name_the_pack_beside_the_study_or_where_it_was_moved(made: Path, main: Main, tmp_path: Path) -> None:
     (row,) = rows(made / "run")
     assert row["problem_options"] == '{"path": "packs/cable"}'
     assert row["status"] == "ok"
     code, out, _ = main("run", str(made / "study.toml"), "--dry-run")  # of the copy
     assert (code, out.split()[0]) == (0, row["cell"])
-
-
-def test_a_pack_that_was_moved_and_renamed_is_where_the_user_says(made: Path, main: Main, tmp_path: Path) -> None:
     run, at = str(made / "run"), "packs/cable=../new/rope"
     (tmp_path / "new").mkdir()
     (made / "packs" / "cable").rename(tmp_path / "new" / "rope")

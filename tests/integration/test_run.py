@@ -62,7 +62,7 @@ def test_retry_redoes_what_was_not_ok(vibench: Vibench, again: Path) -> None:
     assert len(rows(again / "runs" / "wire", "queries")) == 9
 
 
-def test_fresh_starts_over_and_leaves_the_notes_somebody_made(vibench: Vibench, again: Path) -> None:
+def test_fresh_starts_over_and_keeps_notes_and_damaged_results(vibench: Vibench, again: Path) -> None:
     execute(again / "runs" / "wire", "UPDATE cells SET reason = 'old'")
     notes = [again / "runs" / "wire" / name for name in ("notes.txt", "tables/notes.txt", "figures/my-own.svg")]
     for note in notes:
@@ -73,6 +73,18 @@ def test_fresh_starts_over_and_leaves_the_notes_somebody_made(vibench: Vibench, 
     assert len(after) == 3
     assert "old" not in {row["reason"] for row in after}
     assert [note.read_text() for note in notes] == ["precious"] * 3
+    # It is kept; without --fresh it is refused in a line that says so.
+    path = again / "runs" / "wire" / FILE
+    path.write_bytes(b"\xff" * 5000)
+    refused = vibench(again, "run", "study.toml")
+    assert refused.returncode == 2
+    assert refused.stderr.count("\n") == 1
+    assert "or --fresh, which keeps it as results.sqlite.damaged" in refused.stderr
+    printed, after = run_wire(vibench, again, "--fresh")
+    assert f"is kept as 'runs/wire/{FILE}.damaged'" in printed.splitlines()[0]
+    assert "3 cells, 3 to run" in printed
+    assert len(after) == 3
+    assert path.with_name(f"{FILE}.damaged").read_bytes() == b"\xff" * 5000
 
 
 def test_a_cell_without_row_is_done_again(vibench: Vibench, again: Path, artefacts: Path) -> None:
@@ -147,25 +159,23 @@ def test_a_problem_that_fails_first_leaves_the_one_beside_it_alone(vibench: Vibe
     assert found == {(problem, primal): status for problem, status in statuses.items() for primal in study["primal"]}
 
 
-def test_a_plugin_whose_requirements_are_missing_is_unavailable(vibench: Vibench, tmp_path: Path) -> None:
+def test_plugins_whose_requirements_are_missing_are_unavailable(vibench: Vibench, tmp_path: Path) -> None:
     printed, after = run_wire(vibench, tmp_path, "--strict", study=wire_study(dual=["cone-needs", "cpg"]))
     found = {row["dual"]: row for row in after}
     assert {dual: row["status"] for dual, row in found.items()} == {"cone-needs": "unavailable", "cpg": "ok"}
     reason = "the dual strategy 'cone-needs' needs no-such-distribution, which is not installed"
     assert found["cone-needs"]["reason"] == f"{reason}: `pip install no-such-distribution`"
     assert printed.count(reason) == 2  # when the run begins, and among what is not ok
-
-
-def test_a_run_of_which_nothing_can_run_here_is_an_error(vibench: Vibench, tmp_path: Path) -> None:
-    study = write_study(tmp_path, wire_study(primal=["decorrelated", "online-supremizers"], solvers=["ecos"]))
-    done = vibench(tmp_path, "run", study, "--jobs", "1")
+    (folder := tmp_path / "other").mkdir()
+    study = write_study(folder, wire_study(primal=["decorrelated", "online-supremizers"], solvers=["ecos"]))
+    done = vibench(folder, "run", study, "--jobs", "1")
     assert done.returncode == 1
     # Where its distribution is installed the broken module is the reason.
     reason = done.stderr.removeprefix("vibench: no cell could run here: ").removesuffix("\n")
     assert re.fullmatch("the QP solver 'ecos' (is not installed: `pip install ecos`|cannot be imported: .+)", reason)
     first, results = done.stdout.splitlines()
     assert (first, results.split()[0]) == ("2 cells, 0 to run, 0 stages", "results:")
-    assert {row["reason"] for row in rows(tmp_path / "runs" / "wire")} == {reason}
+    assert {row["reason"] for row in rows(folder / "runs" / "wire")} == {reason}
 
 
 def test_edits_beside_numbers_run_none(plugins_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,9 +225,7 @@ def test_the_number_of_jobs_changes_no_result(vibench: Vibench, tmp_path: Path) 
     assert_same_numbers(tmp_path / "1", tmp_path / "2")
 
 
-def test_artefacts_are_shared_by_studies_and_seconds_only_on_their_machine(
-    vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_artefacts_are_shared_on_one_machine(vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VIBENCH_CACHE", str(tmp_path / "cache"))
     # high-fidelity solutions of both sets, and their constants at one; pictures; POD, cone, enrichment; assembly, exact
     # solutions; constraints twice; five inf-sup constants
@@ -263,18 +271,3 @@ def test_clean_shows_and_frees_artefacts(vibench: Vibench, tmp_path: Path, monke
         assert len(list(artefacts.glob("*.artefact"))) == left
     assert "MiB freed" in done.stdout
     assert (tmp_path / "runs" / "wire" / FILE).exists()
-
-
-def test_fresh_begins_anew_where_the_results_file_is_damaged(vibench: Vibench, again: Path) -> None:
-    """It is kept; without --fresh it is refused in a line that says so."""
-    path = again / "runs" / "wire" / FILE
-    path.write_bytes(b"\xff" * 5000)
-    refused = vibench(again, "run", "study.toml")
-    assert refused.returncode == 2
-    assert refused.stderr.count("\n") == 1
-    assert "or --fresh, which keeps it as results.sqlite.damaged" in refused.stderr
-    printed, after = run_wire(vibench, again, "--fresh")
-    assert f"is kept as 'runs/wire/{FILE}.damaged'" in printed.splitlines()[0]
-    assert "3 cells, 3 to run" in printed
-    assert len(after) == 3
-    assert path.with_name(f"{FILE}.damaged").read_bytes() == b"\xff" * 5000

@@ -42,7 +42,7 @@ def linked(page: Path) -> set[Path]:
     return {(page.parent / target).resolve() for target in targets if "://" not in target}
 
 
-def test_the_folder_is_light_every_file_is_on_a_page_and_every_link_resolves() -> None:
+def test_the_folder_is_light_and_pages_name_files_and_commands_that_exist() -> None:
     assert sum(path.stat().st_size for path in FILES) <= 10_000_000
     assert {path for path in FILES if path.suffix == ".py"} == {path for path in FILES if SCRIPTS in path.parents}
     pages = {*PAGES, ROOT / "README.md", *(ROOT / "docs").rglob("*.md")}
@@ -52,14 +52,6 @@ def test_the_folder_is_light_every_file_is_on_a_page_and_every_link_resolves() -
     assert [(page, path) for page, paths in targets.items() for path in paths if not path.exists()] == []
     overview = RESULTS / "README.md"
     assert {page for page in PAGES if page != overview} <= linked(overview)
-
-
-@pytest.fixture(autouse=True)
-def scripts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-
-
-def test_pages_and_scripts_name_the_commands_that_make_them() -> None:
     for path in sorted({*SCRIPTS.glob("*.py")} - {SCRIPTS / "page.py"}):
         script = importlib.import_module(path.stem)
         (command,) = re.findall(rf"python results/scripts/{path.name}((?: [^>\s]+)*)", script.__doc__ or "")
@@ -69,13 +61,18 @@ def test_pages_and_scripts_name_the_commands_that_make_them() -> None:
         assert f"`vibench run {name}` leaves the tables of all queries and histories under `runs/{name}/tables`" in text
 
 
+@pytest.fixture(autouse=True)
+def scripts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+
+
 def rows_of(study: str, **equal: str) -> Iterator[dict[str, str]]:
     """Cells of a committed study, with these texts in these columns."""
     with (RESULTS / study / "cells.csv").open(encoding="utf-8", newline="") as file:
         yield from (row for row in csv.DictReader(file) if all(row[name] == text for name, text in equal.items()))
 
 
-def test_the_table_of_the_readme_is_that_of_the_committed_cells() -> None:
+def test_the_tables_of_readme_and_conclusions_are_those_of_committed_cells() -> None:
     """Recomputed without the scripts: errors, gain over the next full solution, and from how many queries it pays."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     table = re.findall(r"^\| (.+?) \| (.+?) \| (.+?) \| (.+?) \| (.+?)(?:<!-- -->)? \|$", text, re.MULTILINE)
@@ -100,10 +97,7 @@ def test_the_table_of_the_readme_is_that_of_the_committed_cells() -> None:
             expected = (100 * u, 100 * error, full / online, pays)
             found = (float(cell.split(", ")[k].removesuffix(" %")) for cell in shown)
             assert [*found] == pytest.approx(expected, rel=0.06), (name, problem)
-
-
-def test_all_formulations_are_ranked_on_the_page_of_conclusions() -> None:
-    """Those without a solver compete, too: seconds of the fastest within 1.5 times the errors of `mixed`."""
+    # Those without a solver compete, too: seconds of the fastest within 1.5 times the errors of `mixed`.
     text = (ROOT / "docs" / "what-to-use.md").read_text(encoding="utf-8")
     every = list(rows_of("formulations", training="own"))
     ranked = text.split("## Which formulation?")[1].split("##")[0]
@@ -117,13 +111,10 @@ def test_all_formulations_are_ranked_on_the_page_of_conclusions() -> None:
         for problem, shown in zip(("obstacle", "hertz", "bearing", "american-put"), fastest.split(" | "), strict=True):
             usual = {"formulation": "mixed", "dual": "mcpg", "pod_tol": "0.001"}
             (mixed,) = rows_of("formulations", training="own", problem=problem, **usual)
-            near = [
-                1e3 * float(row["online_s"])
-                for row in every
-                if row["problem"] == problem
-                and row["formulation"] == name
-                and all(float(row[one]) <= 1.5 * float(mixed[one]) for one in ("error_u_mean", "error_lambda_mean"))
-            ]
+            mine = [row for row in every if (row["problem"], row["formulation"]) == (problem, name)]
+            for one in ("error_u_mean", "error_lambda_mean"):
+                mine = [row for row in mine if float(row[one]) <= 1.5 * float(mixed[one])]
+            near = [1e3 * float(row["online_s"]) for row in mine]
             assert shown == "–" if not near else float(shown) == pytest.approx(min(near), rel=0.06)
 
 
@@ -197,8 +188,25 @@ def test_results_and_their_hashes_are_published_by_one_command(tmp_path: Path, m
     assert len({read_table(path, "cells")["machine"].iloc[0] for path in published.values()}) == 2
 
 
-def test_numbers_at_logarithmic_axes_are_text() -> None:
-    """Figures show texts as they are: Matplotlib's own powers of ten would be its commands for them."""
+def test_pictures_have_plain_numbers_and_are_described_in_a_sentence(tmp_path: Path) -> None:
+    page = importlib.import_module("page")
+    figure = Sheet(1, 1).finish("Errors at δ = 0.5 of [all] models. More of it.")
+    file = page.write_figure(figure, tmp_path, "errors")
+    with Image.open(file) as picture:
+        assert picture.text["Description"] == "Errors at δ = 0.5 of [all] models. More of it."
+    assert page.alternative(figure, "errors") == "Errors at δ = 0.5 of (all) models."  # without labels at its axes
+    sheet = Sheet(1, 2)
+    for panel in sheet.panels:
+        panel.set(xlabel="seconds", ylabel="error [1]")
+        panel.plot([1.0, 2.0], [3.0, 4.0], label="a model")
+    sheet.figure.legend()
+    assert page.alternative(sheet.figure, "errors") == "2 panels show error (1) over seconds, for a model."
+    grid = Sheet(2, 2)
+    for place, panel in enumerate(grid.panels):  # a label for a row on its left, for a column below it
+        panel.set(xlabel="seconds" if place > 1 else "", ylabel=("error", "", "gain", "")[place])
+    shown = page.alternative(grid.figure, "errors")
+    assert shown == "4 panels show error over seconds; gain over seconds."
+    # Figures show texts as they are: Matplotlib's own powers of ten would be its commands for them.
     script, rows = importlib.import_module("scaling"), pd.read_csv(RESULTS / "scaling" / "rows.csv")
     with styled():
         figure = script.draw(rows[rows["over"] == "mesh"], "n")
@@ -241,26 +249,6 @@ def test_other_machines_are_compared_row_by_row(tmp_path: Path) -> None:
     assert verdicts[6:] == ["–", "2.00 (2.00–2.00)"]
 
 
-def test_a_smaller_picture_keeps_its_caption_and_is_described_in_a_sentence(tmp_path: Path) -> None:
-    page = importlib.import_module("page")
-    figure = Sheet(1, 1).finish("Errors at δ = 0.5 of [all] models. More of it.")
-    file = page.write_figure(figure, tmp_path, "errors")
-    with Image.open(file) as picture:
-        assert picture.text["Description"] == "Errors at δ = 0.5 of [all] models. More of it."
-    assert page.alternative(figure, "errors") == "Errors at δ = 0.5 of (all) models."  # without labels at its axes
-    sheet = Sheet(1, 2)
-    for panel in sheet.panels:
-        panel.set(xlabel="seconds", ylabel="error [1]")
-        panel.plot([1.0, 2.0], [3.0, 4.0], label="a model")
-    sheet.figure.legend()
-    assert page.alternative(sheet.figure, "errors") == "2 panels show error (1) over seconds, for a model."
-    grid = Sheet(2, 2)
-    for place, panel in enumerate(grid.panels):  # a label for a row on its left, for a column below it
-        panel.set(xlabel="seconds" if place > 1 else "", ylabel=("error", "", "gain", "")[place])
-    shown = page.alternative(grid.figure, "errors")
-    assert shown == "4 panels show error over seconds; gain over seconds."
-
-
 def test_citations_and_the_lock_file_agree_with_the_project() -> None:
     """Title, author, version and year on the page of the benchmark and in CITATION.cff."""
     entry = re.compile(r"^@software\{vibench,\n.*?^\}$", re.MULTILINE | re.DOTALL)
@@ -275,11 +263,8 @@ def test_citations_and_the_lock_file_agree_with_the_project() -> None:
     assert (deposit["title"], deposit["creators"][0]["name"]) == (fields["title"], fields["author"])
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert fields["version"] == project["version"]
-    locked = set(
-        re.findall(
-            r"^([\w.-]+)==\S+ \\\n +--hash=sha256:[0-9a-f]{64}$", (ROOT / "requirements.lock").read_text(), re.MULTILINE
-        )
-    )
+    text = (ROOT / "requirements.lock").read_text()
+    locked = set(re.findall(r"^([\w.-]+)==\S+ \\\n +--hash=sha256:[0-9a-f]{64}$", text, re.MULTILINE))
     extras = [line for name in ("solvers", "nmf", "hdf5", "mesh") for line in project["optional-dependencies"][name]]
     needed = {re.split(r"[^\w.-]", line)[0].lower() for line in [*project["dependencies"], *extras, "hatchling"]}
     assert needed - locked == set()

@@ -73,9 +73,7 @@ def test_values_are_completed_with_what_there_is_once(register: Register) -> Non
     assert completed("vibench run quick --problem ") == ["mine"]
 
 
-def test_studies_runs_and_cells_are_those_there(
-    quick_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_studies_runs_and_cells_are_there(quick_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("papers").mkdir()
     for name in ("paper-mine.toml", "paper-notes.txt", "papers/radial.toml"):
@@ -117,7 +115,7 @@ def test_the_installed_command_completes_for_bash(command: str, tmp_path: Path) 
         assert words != ["run", "paper-"] or all(word.startswith("paper-") for word in done.stdout.split())
 
 
-def test_overviews_have_options_and_whole_sentences_in_80_columns(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_overviews_fit_80_columns_and_help_ends_with_examples(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without importing any plugin."""
     for kind in ("problems", "primal", "dual", "sampling"):
         for plugin in registered(next(one for one in PluginKind if one.plural == kind)).values():
@@ -130,9 +128,6 @@ def test_overviews_have_options_and_whole_sentences_in_80_columns(main: Main, mo
     assert max(map(len, main("list")[1].splitlines())) <= 80
     lines = {line.split()[0]: line for line in main("--help")[1].splitlines() if line.startswith("  ")}
     assert [name for name in COMMANDS if lines[name].endswith("...")] == []
-
-
-def test_help_ends_with_examples_that_are_commands(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     for name in COMMANDS:
         code, out, _ = main(name, "--help")

@@ -90,7 +90,7 @@ def test_solvers_that_cannot_be_run(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "ImportError: built for another NumPy" in wrong.text
 
 
-def test_a_library_that_is_missing_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_libraries_that_are_missing_and_unsteady_machines_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     needed, known = doctor.required_distributions(), provenance.distribution_version
     assert needed["numpy"] == needed["qpsolvers"] == []
     assert (needed["daqp"], needed["cvxopt"]) == (["solvers"], ["solvers", "test"])
@@ -98,6 +98,18 @@ def test_a_library_that_is_missing_is_broken(monkeypatch: pytest.MonkeyPatch) ->
     found = by_subject(list(doctor.check_versions()))
     assert found["scipy"].health is Health.BROKEN
     assert f"numpy {importlib.metadata.version('numpy')}" in found["libraries"].text
+    monkeypatch.setattr(doctor, "Stopwatch", lambda: SimpleNamespace(seconds=lambda: Seconds(1.0, 1.0)))
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    for others, slowdown, doubts in (
+        (0.0, 1.0, []), (3.0, 1.0, ["other load"]), (0.0, 1.4, ["slowdown"]),
+        (3.0, 2.0, ["other load", "slowdown"]),
+    ):  # fmt: skip
+        monkeypatch.setattr(doctor, "_busy_seconds", iter([100.0, 101.0 + others]).__next__)
+        monkeypatch.setattr(doctor.Calibration, "slowdown", lambda _, slowdown=slowdown: slowdown)
+        found = by_subject(list(doctor.check_timings()))
+        assert [subject for subject in found if found[subject].health is Health.NOTE][:-1] == doubts
+        assert f"{others:.1f} of 2 cores" in found["other load"].text
+        assert ("can be trusted" in found["verdict"].text) is not bool(doubts)
 
 
 def test_every_plugin_that_does_not_load_has_a_line_with_the_reason(register: Register, tmp_path: Path) -> None:
@@ -133,9 +145,7 @@ def test_the_error_of_a_plugin_is_no_markup(main: Main, register: Register, monk
     assert r"ImportError: [/b] [red]:warning: \u001b[2J\ud800" in " ".join(out.split())
 
 
-def test_places_without_room_locks_or_permission_are_noticed(
-    main: Main, trials: dict[str, Trial], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_unusable_places(main: Main, trials: dict[str, Trial], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     Path("taken").touch()
     code, out, _ = main("doctor", "--out", "taken/below")
     assert code == 1
@@ -154,21 +164,6 @@ def test_places_without_room_locks_or_permission_are_noticed(
     found = by_subject(list(doctor.check_disk(tmp_path)))["runs"]
     assert found.health is Health.BROKEN
     assert "No locks available" in found.text
-
-
-def test_load_and_an_unsteady_calculation_are_doubts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "Stopwatch", lambda: SimpleNamespace(seconds=lambda: Seconds(1.0, 1.0)))
-    monkeypatch.setattr("os.cpu_count", lambda: 2)
-    for others, slowdown, doubts in (
-        (0.0, 1.0, []), (3.0, 1.0, ["other load"]), (0.0, 1.4, ["slowdown"]),
-        (3.0, 2.0, ["other load", "slowdown"]),
-    ):  # fmt: skip
-        monkeypatch.setattr(doctor, "_busy_seconds", iter([100.0, 101.0 + others]).__next__)
-        monkeypatch.setattr(doctor.Calibration, "slowdown", lambda _, slowdown=slowdown: slowdown)
-        found = by_subject(list(doctor.check_timings()))
-        assert [subject for subject in found if found[subject].health is Health.NOTE][:-1] == doubts
-        assert f"{others:.1f} of 2 cores" in found["other load"].text
-        assert ("can be trusted" in found["verdict"].text) is not bool(doubts)
 
 
 def test_the_machine_that_works_is_seen_to_work() -> None:

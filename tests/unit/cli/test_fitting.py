@@ -1,9 +1,9 @@
-"""Tables fit the terminal: nothing is cut, no number is wrapped, and what is left out is named."""
+"""Tables fit the terminal, and what is left out is named; text from others acts on nothing, and lines stay lines."""
 
 import contextlib
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.cells import cell_len
+from rich.console import Console
 from running import Main, refused
 
-from vibench.cli.console import new_console, print_frame
+from vibench.cli.console import echo, new_console, print_frame
 from vibench.results import formats, show
 from vibench.results.read import read_table, results_file
 from vibench.results.schema import STORED
+from vibench.text import print_line
 
 
 def printed(frame: pd.DataFrame, width: int, priority: Sequence[str] = (), **more: Any) -> list[str]:
@@ -64,34 +66,39 @@ def test_what_has_no_room_is_left_out_whole_and_named(rows: list[tuple[float, fl
     assert set(body) <= whole
 
 
-def test_columns_that_matter_least_go_first_and_long_texts_share_the_room() -> None:
+def test_rows_share_the_room_and_titles_have_what_they_share(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rich takes room from columns that need it, and cuts what is beyond the width."""
     frame = pd.DataFrame({name: [1.23456, 2.34567] for name in ("alpha", "bravo", "charlie")})
     lines = printed(frame.assign(bravo=[1, 2], charlie=[3, 4]), 13, ["charlie", "alpha", "bravo"])
     assert lines[1].split() == ["alpha", "charlie"]
     assert "bravo" in " ".join(lines[5:])
     words = " ".join(["alpha", "bravo", "charlie"] * 9)
-    frame = pd.DataFrame(
-        {"name": ["a" * 33, "b"], "value": [words, "2"], "unit": ["1", "s"], "meaning": [words, f"{words} delta"]}
-    )
+    frame = pd.DataFrame({"name": ["a" * 33, "b"], "value": [words, "2"], "unit": ["1", "s"]})
+    frame["meaning"] = [words, f"{words} delta"]
     lines = printed(frame, 80)
     assert max(map(cell_len, lines)) <= 80
     assert sum(line.count("charlie") for line in lines) == 27
+    frame = pd.DataFrame({"solver": ["piqp", "piqp"], "N": [8, 8], "k": [1, 2], "none": [None, None]})
+    assert printed(frame, 80)[:2] == ["table, solver piqp", "N  k"]
+    assert printed(frame, 80, axes=["N"])[0] == "table, solver piqp, N 8"
+    assert printed(frame, 80, every=True)[1].split() == ["solver", "N", "k", "none"]
+    assert printed(pd.DataFrame({"a": []}), 80) == ["table: no rows"]
+    frame = pd.DataFrame({"cell": ["be21"], "solver": ["piqp"], "δ": [None], "N": [8], "ok": ["4/4"]})
+    title, headings, _, row = printed(frame, 80, axes=["solver", "δ"])
+    assert (title, headings.split(), row.split()) == ("table, solver piqp", ["cell", "N", "ok"], ["be21", "8", "4/4"])
+    title, headings, *_ = printed(frame.drop(columns="δ"), 80)
+    assert (title, headings.split()) == ("table", ["cell", "solver", "N", "ok"])
+    for columns in ("0", "-5", "none", "", "²", "9" * 5000):
+        monkeypatch.setenv("COLUMNS", columns)
+        assert new_console().width == 10_000
 
 
-ALIKE = pd.DataFrame(
-    {
-        "cell": ["102e", "58e3", "0905"],
-        "problem": ["obstacle with a name", "obstacle with a name", "hertz"],
-        "primal": ["online-supremizers", "online-supremizers", "decorrelated"],
-        "δ": [0.5, 0.5, None],
-        "assembly": ["certified", "certified", "reduced"],
-        "correction": ["none", "feasible", "none"],
-        "error": [0.00123, 0.00456, 0.5],
-        "online [ms]": [1.25, 1.75, 12.5],
-        "N": [10, 10, 29],
-    }
-)
+ALIKE = pd.DataFrame({
+    "cell": ["102e", "58e3", "0905"], "problem": ["obstacle with a name", "obstacle with a name", "hertz"],
+    "primal": ["online-supremizers", "online-supremizers", "decorrelated"], "δ": [0.5, 0.5, None],
+    "assembly": ["certified", "certified", "reduced"], "correction": ["none", "feasible", "none"],
+    "error": [0.00123, 0.00456, 0.5], "online [ms]": [1.25, 1.75, 12.5], "N": [10, 10, 29],
+})  # fmt: skip
 AXES = ["problem", "primal", "δ", "assembly", "correction"]
 
 
@@ -108,34 +115,7 @@ def test_what_tells_rows_apart_is_not_left_out_nor_what_the_table_is_about(width
     assert headings == ["cell", *AXES, "error", "online", "[ms]", "N"]  # one column for every axis where there is room
 
 
-def test_values_that_rows_share_stand_in_the_title() -> None:
-    frame = pd.DataFrame({"solver": ["piqp", "piqp"], "N": [8, 8], "k": [1, 2], "none": [None, None]})
-    assert printed(frame, 80)[:2] == ["table, solver piqp", "N  k"]
-    assert printed(frame, 80, axes=["N"])[0] == "table, solver piqp, N 8"
-    assert printed(frame, 80, every=True)[1].split() == ["solver", "N", "k", "none"]
-    assert printed(pd.DataFrame({"a": []}), 80) == ["table: no rows"]
-    frame = pd.DataFrame({"cell": ["be21"], "solver": ["piqp"], "δ": [None], "N": [8], "ok": ["4/4"]})
-    title, headings, _, row = printed(frame, 80, axes=["solver", "δ"])
-    assert (title, headings.split(), row.split()) == ("table, solver piqp", ["cell", "N", "ok"], ["be21", "8", "4/4"])
-    title, headings, *_ = printed(frame.drop(columns="δ"), 80)
-    assert (title, headings.split()) == ("table", ["cell", "solver", "N", "ok"])
-
-
-def test_a_single_row_has_its_errors_and_seconds(main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    for asked in (("--limit", "1"), ("--table", "best", "--where", "problem = 'obstacle'")):
-        table = main("show", str(quick_run), *asked)[1].split("not shown")[0]
-        assert table.count("error") >= 2
-        assert all(f"[{unit}]" in table for unit in ("s", "ms"))
-
-
-def test_a_width_that_is_none_is_no_width(monkeypatch: pytest.MonkeyPatch) -> None:
-    for columns in ("0", "-5", "none", "", "²", "9" * 5000):
-        monkeypatch.setenv("COLUMNS", columns)
-        assert new_console().width == 10_000
-
-
-def test_columns_and_rows_are_those_asked_for_and_numbers_are_numbers(main: Main, quick_run: Path) -> None:
+def test_columns_and_rows_are_those_asked_for(main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run, cells = str(quick_run), read_table(results_file(str(quick_run)), "cells")
     _, out, _ = main("show", run, "--columns", "solver,online [ms],online_s", "--format", "csv")
     assert out.splitlines()[0] == "solver,online_s"  # by name or heading
@@ -156,9 +136,14 @@ def test_columns_and_rows_are_those_asked_for_and_numbers_are_numbers(main: Main
         for name in found.columns.intersection(source.columns):
             if source[name].dtype.kind in "if" and found[name].notna().any():
                 assert found[name].dtype.kind in "if", (table, name)
+    monkeypatch.setenv("COLUMNS", "80")
+    for asked in (("--limit", "1"), ("--table", "best", "--where", "problem = 'obstacle'")):
+        table = main("show", str(quick_run), *asked)[1].split("not shown")[0]
+        assert table.count("error") >= 2
+        assert all(f"[{unit}]" in table for unit in ("s", "ms"))
 
 
-def test_a_cell_has_all_its_columns(main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cell_has_all_columns_or_is_refused(main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     row = read_table(results_file(str(quick_run)), "cells").iloc[3]
     code, out, _ = main("show", str(quick_run), row["cell"][:6])
@@ -175,9 +160,6 @@ def test_a_cell_has_all_its_columns(main: Main, quick_run: Path, monkeypatch: py
     # a cell is not ignored where a condition has none of its rows
     no_rows = f"{quick_run.name}: summary: no rows\n"
     assert main("show", str(quick_run), row["cell"], "--where", "N > 1000")[:2] == (0, no_rows)
-
-
-def test_what_cannot_be_shown_is_refused(main: Main, quick_run: Path) -> None:
     cell = read_table(results_file(str(quick_run)), "cells")["cell"][0]
     of_rows = "--where selects rows of cells, of which the table is made; 'error_below' is a column of the table alone"
     without = "the table benefits has no rows of one cell; expected summary, best, cells, queries"
@@ -189,3 +171,37 @@ def test_what_cannot_be_shown_is_refused(main: Main, quick_run: Path) -> None:
         (["--sort", "solvr"], "did you mean 'solver'"),
     ):
         refused(main("show", str(quick_run), *asked), *words)
+
+
+def lines_of(action: Callable[[], object]) -> list[str]:
+    """The lines that an action prints."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        action()
+    return out.getvalue().split("\n")
+
+
+@given(*[st.text(st.characters())] * 3)
+def test_every_line_and_every_table_is_printable(one: str, other: str, text: str) -> None:
+    for lines, count in (
+        (lines_of(lambda: echo(one, other)), 3),
+        (lines_of(lambda: print_line(new_console(), one)), 2),
+    ):
+        assert len(lines) == count
+        assert all(line.isprintable() for line in lines)
+    frame = pd.DataFrame({"name": [text, "b"], "same": text, text: [1.0, None]})
+    assert all(line.isprintable() for line in lines_of(lambda: print_frame(frame, text)))
+
+
+def test_markup_is_text_and_lines_of_cells_stay_apart() -> None:
+    markup = ("[/b]", "[red]membrane[/red]", ":warning:", "[link=file:///]a[/link]", "[bold", r"\[x]", "`a` *b* <c>")
+    for text in markup:
+        assert lines_of(lambda: echo(text)) == [text, ""]  # noqa: B023
+        assert lines_of(lambda: print_line(new_console(), text)) == [text, ""]  # noqa: B023
+        assert lines_of(lambda: new_console().print(text)) == [text, ""]  # noqa: B023
+        frame = pd.DataFrame({"name": [text, "b"], text: ["x", "y"]})
+        assert "\n".join(lines_of(lambda: print_frame(frame, text))).count(text) == 3  # noqa: B023
+        out = io.StringIO()  # a terminal of any kind
+        print_line(Console(file=out, force_terminal=True, width=20), text)
+        assert out.getvalue() == f"{text}\n"
+    lines = lines_of(lambda: print_frame(pd.DataFrame({"options": ["one: int\ntwo: \x1b[2J", "b"]}), "plugins"))
+    assert [line.strip() for line in lines if ":" in line] == ["one: int", r"two: \u001b[2J"]

@@ -69,7 +69,7 @@ def test_a_wrong_request_is_refused_in_one_line(main: Main, quick_run: Path, tmp
         refused(main("run", path), path, *words)
 
 
-def test_taken_places_and_other_folders_are_refused_and_kept(main: Main) -> None:
+def test_taken_places_and_other_results_are_refused_and_kept(main: Main, quick_run: Path, tmp_path: Path) -> None:
     Path("taken").touch()
     refused(main("run", "--out", "taken"), "'taken'", "is a file")
     refused(main("run", "--out", "taken/below"), "taken/below", "cannot be written")
@@ -89,9 +89,6 @@ def test_taken_places_and_other_folders_are_refused_and_kept(main: Main) -> None
             refused(main("run", "--out", folder.name, *fresh), folder.name, FILE if content else "not empty")
         assert (folder / "notes.txt").read_text() == "precious"
         assert content is None or (folder / FILE).read_text() == content
-
-
-def test_results_of_another_study_are_refused_and_kept(main: Main, quick_run: Path, tmp_path: Path) -> None:
     shutil.copytree(quick_run, "other")
     for fresh in ([], ["--fresh"]):
         refused(main("run", write_study(tmp_path), "--out", "other", *fresh), "other", "study", "quick", "sample")
@@ -145,7 +142,7 @@ def test_a_problem_alone_is_run_with_the_usual_choices(main: Main, tmp_path: Pat
         assert said in err
 
 
-def test_a_dry_run_lists_the_matrix_and_does_nothing_else(main: Main, tmp_path: Path) -> None:
+def test_dry_runs_list_the_matrix_and_lists_their_plugins(main: Main, tmp_path: Path) -> None:
     labelled = write_study(tmp_path, changed(STUDY, "problem", 0, "label", to="a\n0 cells\x1b[2J"))
     for study, words in (("quick", ""), (labelled, r"a\n0 cells\u001b[2J · ")):
         code, out, err = main("run", study, "--dry-run")
@@ -157,9 +154,6 @@ def test_a_dry_run_lists_the_matrix_and_does_nothing_else(main: Main, tmp_path: 
         assert words or lines == [f"{cell.key}  {cell}" for cell in cells]
         assert last == f"{len(cells)} cells"
     assert list(Path.cwd().iterdir()) == []
-
-
-def test_lists_show_their_plugins_and_options(main: Main) -> None:
     code, out, err = main("list")
     assert (code, err) == (0, "")
     assert [name for kind in PluginKind for name in registered(kind) if name not in out] == []
@@ -187,9 +181,7 @@ def test_lists_show_their_plugins_and_options(main: Main) -> None:
             assert not any("not installed" in shown[name] for name in ("piqp", "proxqp", "osqp"))
 
 
-def test_interrupts_are_told_and_unforeseen_errors_not_hidden(
-    main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupts_are_told_and_errors_shown(main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vibench.report.figures.draw_all", Mock(side_effect=KeyboardInterrupt))
     code, out, _ = main("figures", str(quick_run), "--out", "pictures")
     assert code == 130
@@ -200,7 +192,7 @@ def test_interrupts_are_told_and_unforeseen_errors_not_hidden(
         main("run")
 
 
-def test_a_run_ends_with_whether_it_pays_and_says_where_things_are(main: Main, quick_run: Path) -> None:
+def test_runs_end_with_whether_they_pay_and_show_every_table_in_every_form(main: Main, quick_run: Path) -> None:
     printed, frame = (quick_run / "printed.txt").read_text(encoding="utf-8"), read_table(quick_run / FILE, "cells")
     assert f"{len(frame)} cells, all ok; no check of constants, bounds and solvers failed\n" in printed
     assert [f"\n{problem}: a full solution takes " in printed for problem in ("obstacle", "hertz")] == [True, True]
@@ -212,6 +204,26 @@ def test_a_run_ends_with_whether_it_pays_and_says_where_things_are(main: Main, q
     assert (code, err) == (0, "")
     assert sum(any(solver in line for solver in frame["solver"].unique()) for line in out.splitlines()) == len(frame)
     assert "…" not in out
+    for table in ("summary", "benefits", *TABLES):
+        code, out, err = main("show", str(quick_run), "--table", table, "--format", "csv")
+        assert (code, err) == (0, "")
+        rows = list(csv.DictReader(io.StringIO(out)))
+        source = {"summary": "cells", "benefits": "thresholds"}.get(table, table)
+        assert len(rows) == len(read_table(quick_run / FILE, source)) > 0
+        if table == source:
+            assert [name for name in rows[0] if not name.startswith("mu_")] == list(STORED[table])
+    for table in ("summary", "benefits", "cells"):
+        lines = main("show", str(quick_run), "--table", table, "--format", "markdown")[1].splitlines()
+        assert all(line.startswith("|") and line.endswith("|") for line in lines)
+        assert len({line.count("|") for line in lines}) == 1
+    for form in ("markdown", "latex", "json"):
+        out = main("show", str(quick_run), "--where", "solver = 'osqp'", "--format", form)[1]
+        assert "osqp" in out
+        assert "piqp" not in out
+    Path("runs").mkdir()
+    Path("runs/quick").symlink_to(quick_run)
+    lines = main("show", "quick", "--format", "csv")[1].splitlines()
+    assert len(lines) == 1 + len(read_table(quick_run / FILE, "cells"))
 
 
 @pytest.mark.parametrize("run", ["[/b]", "//x", "//x/y", "file:x", "a\x1b[2J\nb", "\udcff", "x?mode=rwc", ""])
@@ -233,7 +245,7 @@ def test_a_run_of_an_odd_name_is_shown(name: str, main: Main, quick_run: Path) -
         assert all(line.isprintable() for line in out.splitlines())
 
 
-def test_help_is_there_for_every_command_and_word(main: Main) -> None:
+def test_help_is_there_for_every_command_word_key_and_column(main: Main) -> None:
     _, out, err = main()
     assert [name for name in ("run", "list", "show") if f"\n  {name} " not in out + err] == []
     assert main("help", "show") == main("show", "--help")
@@ -254,9 +266,6 @@ def test_help_is_there_for_every_command_and_word(main: Main) -> None:
         assert any(one.startswith(line) for one in main("help", word)[1].splitlines()), word
     known = {word for words, _ in explained_words() for word in words}
     assert {*Status, *ChangeKind, *Meaning, *registered(PluginKind.DUAL), *TABLES} - known == set()
-
-
-def test_help_on_keys_and_columns_is_their_meaning(main: Main) -> None:
     code, out, _ = main("help", "training")
     assert code == 0
     meanings = [model.model_fields["training"].description for model in (Study, ProblemEntry)]
@@ -295,18 +304,7 @@ def test_former_commands_say_what_to_write_now_and_still_work(main: Main, quick_
     assert line.count("\n") == 1
 
 
-def test_sizes_of_problems_are_said_where_they_are_asked_for(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
-    known = registry.registered(PluginKind.PROBLEM)
-    few = {name: known[name] for name in ("radial-obstacle", "pack")}
-    monkeypatch.setattr(registry, "registered", lambda kind: few if kind is PluginKind.PROBLEM else {})
-    _, out, _ = main("list", "problems", "--sizes")
-    text, problem = " ".join(out.split()), known["radial-obstacle"].load()()
-    assert f"n = {problem.V.dim} unknowns, m = {problem.W.dim} constraints" in text
-    assert "its size depends on path" in text
-    refused(main("list", "solvers", "--sizes"), "--sizes is for `vibench list problems`")
-
-
-def test_options_replace_axes(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_options_replace_axes_and_sizes_are_said_where_asked_for(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
     listed: list[Any] = []
     monkeypatch.setattr("vibench.study.matrix.expand", lambda study: listed.append(expand(study)) or listed[-1])
     for options, look, values in (
@@ -319,26 +317,11 @@ def test_options_replace_axes(main: Main, monkeypatch: pytest.MonkeyPatch) -> No
     ):
         assert main("run", "quick", "--dry-run", *options.split())[0] == 0
         assert {look(cell) for cell in listed[-1]} == values
-
-
-def test_show_prints_every_table_in_every_form(main: Main, quick_run: Path) -> None:
-    for table in ("summary", "benefits", *TABLES):
-        code, out, err = main("show", str(quick_run), "--table", table, "--format", "csv")
-        assert (code, err) == (0, "")
-        rows = list(csv.DictReader(io.StringIO(out)))
-        source = {"summary": "cells", "benefits": "thresholds"}.get(table, table)
-        assert len(rows) == len(read_table(quick_run / FILE, source)) > 0
-        if table == source:
-            assert [name for name in rows[0] if not name.startswith("mu_")] == list(STORED[table])
-    for table in ("summary", "benefits", "cells"):
-        lines = main("show", str(quick_run), "--table", table, "--format", "markdown")[1].splitlines()
-        assert all(line.startswith("|") and line.endswith("|") for line in lines)
-        assert len({line.count("|") for line in lines}) == 1
-    for form in ("markdown", "latex", "json"):
-        out = main("show", str(quick_run), "--where", "solver = 'osqp'", "--format", form)[1]
-        assert "osqp" in out
-        assert "piqp" not in out
-    Path("runs").mkdir()
-    Path("runs/quick").symlink_to(quick_run)
-    lines = main("show", "quick", "--format", "csv")[1].splitlines()
-    assert len(lines) == 1 + len(read_table(quick_run / FILE, "cells"))
+    known = registry.registered(PluginKind.PROBLEM)
+    few = {name: known[name] for name in ("radial-obstacle", "pack")}
+    monkeypatch.setattr(registry, "registered", lambda kind: few if kind is PluginKind.PROBLEM else {})
+    _, out, _ = main("list", "problems", "--sizes")
+    text, problem = " ".join(out.split()), known["radial-obstacle"].load()()
+    assert f"n = {problem.V.dim} unknowns, m = {problem.W.dim} constraints" in text
+    assert "its size depends on path" in text
+    refused(main("list", "solvers", "--sizes"), "--sizes is for `vibench list problems`")

@@ -16,6 +16,8 @@ from vibench.results.database import ResultsDatabase
 from vibench.results.ranking import no_best_cell
 from vibench.results.sqlite import FILE
 
+Captured = pytest.CaptureFixture[str]
+
 
 def row(cell: str, reason: str, status: str = "inaccurate", **more: Any) -> dict[str, Any]:
     own = {"problem": "box", "dual": "cpg", "primal": "pga", "primal_tol": 0.5, "pod_tol": 1e-3, "dual_size": 4,
@@ -24,7 +26,7 @@ def row(cell: str, reason: str, status: str = "inaccurate", **more: Any) -> dict
     return cell_row(**own | {"pod_size": None, "cell": cell, "reason": reason, "status": status} | more)
 
 
-def test_every_reason_has_a_line_with_all_axes_and_a_missed_accuracy_a_remedy() -> None:
+def test_every_reason_has_a_line_and_what_to_do_next_is_a_command(capsys: Captured) -> None:
     """Reasons that differ in their numbers alone are one; there are never more lines than reasons that matter."""
     rows = [row(f"c{k}", f"{k} of 16 queries, first mu=({k}.5, -1e-0{k}): gap residual {k}.1e-07") for k in range(1, 9)]
     line, other = failures([row("c0", "broke"), *rows], "runs/a")
@@ -48,9 +50,23 @@ def test_every_reason_has_a_line_with_all_axes_and_a_missed_accuracy_a_remedy() 
     assert line.endswith("dual residual 3.5e-09; ok with proxqp, quadprog")
     (line,) = failures([missed, *others[2:]], "runs/a")
     assert line.endswith("dual residual 3.5e-09; `vibench replay runs/a c1` tries other solvers")
-
-
-Captured = pytest.CaptureFixture[str]
+    group: Any = typer.main.get_command(app)
+    next_steps(Path("a folder's"), all_ok=True)
+    next_steps(Path("a folder's"), all_ok=False)
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  vibench ")]
+    assert len(lines) == 4
+    for line in lines:
+        program, command, *arguments = shlex.split(line.strip().split("  ")[0])
+        assert program == "vibench"
+        context = group.get_command(None, command).make_context(command, arguments)
+        assert "a folder's" in (context.params.get("run"), *context.params.get("names", ()))
+    assert run_argument(Path("runs/quick")) == "quick"
+    assert run_argument(Path("other/quick")) == "other/quick"
+    for length in range(1, 27):  # fits 80 columns; a command alone may be longer: it stays one line to copy
+        next_steps(Path("r" * length), all_ok=False)
+        lines = capsys.readouterr().out.splitlines()
+        assert max(len(line) for line in lines if not line.endswith("\"status != 'ok'\"")) <= 80
+        assert [line.strip() for line in lines].count("what is not ok") == 1
 
 
 def end_of_run(folder: Path, rows: list[dict[str, Any]]) -> None:
@@ -93,23 +109,3 @@ def test_rows_that_differ_in_options_alone_say_which(tmp_path: Path, main: Main)
     assert "training greedy tolerance 0.01" in out
     _, out, _ = main("show", str(tmp_path / "run"), "--format", "csv", "--columns", "training")
     assert set(out.split()) == {"training", "greedy", "random", "x", "y"}
-
-
-def test_what_to_do_next_are_commands(capsys: Captured) -> None:
-    group: Any = typer.main.get_command(app)
-    next_steps(Path("a folder's"), all_ok=True)
-    next_steps(Path("a folder's"), all_ok=False)
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  vibench ")]
-    assert len(lines) == 4
-    for line in lines:
-        program, command, *arguments = shlex.split(line.strip().split("  ")[0])
-        assert program == "vibench"
-        context = group.get_command(None, command).make_context(command, arguments)
-        assert "a folder's" in (context.params.get("run"), *context.params.get("names", ()))
-    assert run_argument(Path("runs/quick")) == "quick"
-    assert run_argument(Path("other/quick")) == "other/quick"
-    for length in range(1, 27):  # fits 80 columns; a command alone may be longer: it stays one line to copy
-        next_steps(Path("r" * length), all_ok=False)
-        lines = capsys.readouterr().out.splitlines()
-        assert max(len(line) for line in lines if not line.endswith("\"status != 'ok'\"")) <= 80
-        assert [line.strip() for line in lines].count("what is not ok") == 1

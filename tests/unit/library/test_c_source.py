@@ -207,9 +207,7 @@ def test_expressions_are_exact_in_c_and_bounds_are_certified(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("problem", PROBLEMS)
-def test_a_c_source_has_bounds_pair_and_outputs_of_the_model(
-    problem: str, small_run: vibench.Run, tmp_path: Path, monkeypatch: Patch
-) -> None:
+def test_a_c_source_has_its_bounds(problem: str, small_run: vibench.Run, tmp_path: Path, monkeypatch: Patch) -> None:
     model = model_of(small_run, problem, "certified")
     rng, sizes = np.random.default_rng(0), (model.problem.V.dim, model.problem.W.dim)
     outputs = (

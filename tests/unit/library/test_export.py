@@ -241,7 +241,7 @@ def test_the_runtime_needs_numpy_and_one_solver_alone(run: vibench.Run, tmp_path
     assert done.stdout == "20\n"
 
 
-def test_solvers_give_the_same_answer(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_solvers_are_not_believed(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each of them is the one that is asked for, which its answer, polished to round-off, does not show."""
     model, called = model_of(run, "obstacle"), list[str]()
     one, other = per_file(model, tmp_path, "piqp"), per_file(model, tmp_path, "proxqp")
@@ -256,6 +256,16 @@ def test_solvers_give_the_same_answer(run: vibench.Run, tmp_path: Path, monkeypa
     assert called == ["piqp", "proxqp"] * 10
     with pytest.raises(ValueError, match="the solver is 'osqp', expected one of piqp, proxqp"):
         Exported(tmp_path / "model.npz", "osqp")
+    assert one.solve(mu).status == "ok"
+    for place in range(3):  # Python takes the larger of 0 and NaN for 0
+        found = np.where(np.arange(3) == place, np.nan, 0.0).tolist()
+        with monkeypatch.context() as patched:
+            patched.setattr(reduced_model, "residuals", lambda *_, found=found: tuple(found))
+            assert one.solve(mu).status == "inaccurate"
+    no_numbers = lambda A, f, B, g, _: (np.full(len(f), np.nan), np.full(len(g), np.inf))  # noqa: E731
+    monkeypatch.setitem(reduced_model.SOLVERS, "piqp", no_numbers)
+    monkeypatch.setattr(reduced_model, "_polished", lambda of, g, _: (np.zeros(len(of.A)), np.zeros(len(g))))
+    assert one.solve(mu).status == "inaccurate"
 
 
 def test_polishing_ends_where_changes_of_all_rows_at_once_cycle() -> None:
@@ -272,20 +282,6 @@ def test_polishing_ends_where_changes_of_all_rows_at_once_cycle() -> None:
         of, g = reduced_model._Matrices(A, B), g - B @ f  # of x − A⁻¹f
         found = reduced_model.residuals(of, 0.0 * f, g, *reduced_model._polished(of, g, np.ones(11, bool)), 0.0 * g)
         assert max(found) <= 1e-12
-
-
-def test_wrong_solvers_are_not_believed(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    exported = per_file(model_of(run, "radial-obstacle"), tmp_path)
-    assert exported.solve([0.17, 0.1]).status == "ok"
-    for place in range(3):  # Python takes the larger of 0 and NaN for 0
-        found = np.where(np.arange(3) == place, np.nan, 0.0).tolist()
-        with monkeypatch.context() as patched:
-            patched.setattr(reduced_model, "residuals", lambda *_, found=found: tuple(found))
-            assert exported.solve([0.17, 0.1]).status == "inaccurate"
-    no_numbers = lambda A, f, B, g, _: (np.full(len(f), np.nan), np.full(len(g), np.inf))  # noqa: E731
-    monkeypatch.setitem(reduced_model.SOLVERS, "piqp", no_numbers)
-    monkeypatch.setattr(reduced_model, "_polished", lambda of, g, _: (np.zeros(len(of.A)), np.zeros(len(g))))
-    assert exported.solve([0.17, 0.1]).status == "inaccurate"
 
 
 @pytest.mark.parametrize("primal", ["offline-pga", "online-supremizers"])
@@ -339,7 +335,7 @@ def test_what_a_file_says(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.
     assert Exported(tmp_path / "other.npz").about["source"]["licence"] == "CC-BY-4.0"
 
 
-def test_a_file_that_is_no_model_is_refused(tmp_path: Path) -> None:
+def test_files_that_are_no_models_or_damaged_are_refused(tmp_path: Path, run: vibench.Run) -> None:
     np.savez(tmp_path / "other.npz", format=np.array("something else"))
     np.savez(tmp_path / "objects.npz", format=np.array([{}], dtype=object))
     with pytest.raises(ValueError, match=r"other\.npz' is no vibench reduced model 1"):
@@ -349,9 +345,6 @@ def test_a_file_that_is_no_model_is_refused(tmp_path: Path) -> None:
     for other in (tmp_path, Path("/dev/zero")):
         with pytest.raises(ValueError, match="is no regular file"):
             Exported(other)
-
-
-def test_indices_that_lead_elsewhere_and_numbers_that_are_none_are_refused(run: vibench.Run, tmp_path: Path) -> None:
     per_file(model_of(run, "radial-obstacle"), tmp_path)
     with np.load(tmp_path / "model.npz") as data:
         arrays = dict(data)
@@ -369,7 +362,7 @@ def test_indices_that_lead_elsewhere_and_numbers_that_are_none_are_refused(run: 
             Exported(tmp_path / "other.npz")
 
 
-def test_what_is_not_exported_leaves_nothing_behind(run: vibench.Run, tmp_path: Path) -> None:
+def test_models_without_an_export_are_refused_and_nothing_is_left_behind(run: vibench.Run, tmp_path: Path) -> None:
     for present in ("old.npz", "taken.c"):
         (tmp_path / present).write_text("precious")
     for name, options, line in (
@@ -385,9 +378,6 @@ def test_what_is_not_exported_leaves_nothing_behind(run: vibench.Run, tmp_path: 
         assert "\n" not in str(caught.value)
         left = {file.name: file.read_text() for file in tmp_path.iterdir()}
         assert left == {"old.npz": "precious", "taken.c": "precious"}
-
-
-def test_an_approximation_is_offered_with_its_error(run: vibench.Run, tmp_path: Path) -> None:
     model = model_of(run, "obstacle")
     with pytest.raises(vibench.RequestError, match="exports this approximation") as caught:
         export_model(model, tmp_path / "model.npz", tolerance=1e-13, evaluations=200)
@@ -398,9 +388,7 @@ def test_an_approximation_is_offered_with_its_error(run: vibench.Run, tmp_path: 
     assert Exported(tmp_path / "model.npz").solve(mu).u == pytest.approx(model.solve(mu).u, abs=10.0 * offered)
 
 
-def test_models_without_an_export_are_refused(
-    run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_models_without_export_are_refused(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = model_of(run, "radial-obstacle")
     with pytest.raises(vibench.RequestError, match='export the same cell with assembly = "reduced"'):
         export_model(model_of(run, "obstacle", "online-supremizers", "full"), tmp_path / "model.npz")
@@ -415,9 +403,7 @@ def test_models_without_an_export_are_refused(
         export_model(model, tmp_path / "deep" / "model.npz")
 
 
-def test_a_constant_member_is_not_sampled_and_coefficients_are_evaluated_once(
-    run: vibench.Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_constant_members_are_not_sampled_coefficients_once(run: vibench.Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """Thousands of copies of a constant A of 281 unknowns took 6 GiB."""
     reduced, sampled, points = model_of(run, "radial-obstacle").reduced, [], []
     interpolate, coefficients = polynomials.interpolate_on_box, reduced.coefficients

@@ -67,7 +67,7 @@ def test_a_run_is_continued_and_followed(run: vibench.Run, capsys: pytest.Captur
     assert "2 cells, 0 to run" in capsys.readouterr().out
 
 
-def test_figures_and_findings(run: vibench.Run) -> None:
+def test_figures_and_findings_are_there_and_wrong_requests_one_line(run: vibench.Run) -> None:
     figure = run.figure("inf-sup", dual="cpg")
     assert isinstance(figure, matplotlib.figure.Figure)
     assert figure.axes
@@ -82,6 +82,20 @@ def test_figures_and_findings(run: vibench.Run) -> None:
     ):
         with pytest.raises(vibench.RequestError, match=line):
             run.figure(kind, **options)
+    for changes, line in (
+        ({"problem": ["radial-obstacel"]}, "did you mean 'radial-obstacle'"),
+        ({"validatoin": 3}, "no key is called 'validatoin'; did you mean 'validation'"),
+        ({"validation": 0}, "validation: .*(found 0)"),
+        ({"name": "../up"}, "name: letters, digits"),
+        ({"primal": ["offline-pga"]}, "gives nothing for 'offline-pga'"),
+    ):
+        with pytest.raises(vibench.RequestError, match=line) as caught:
+            vibench.Study(**SETTINGS | changes)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(vibench.RequestError, match="no table is called 'cell'; did you mean 'cells'"):
+        run.table("cell")
+    with pytest.raises(vibench.RequestError, match="jobs is -1"):
+        vibench.run(vibench.Study(**SETTINGS), jobs=-1)
 
 
 def test_progress_in_a_notebook_is_lines(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -106,23 +120,6 @@ def test_what_a_run_writes(run: vibench.Run, tmp_path: Path, monkeypatch: pytest
         page = run.report(tmp_path / "page.html", figures=shown).read_text(encoding="utf-8")
         assert "radial-obstacle" in page
         assert ("<img" in page) == shown
-
-
-def test_a_wrong_study_or_request_says_so_in_one_line(run: vibench.Run) -> None:
-    for changes, line in (
-        ({"problem": ["radial-obstacel"]}, "did you mean 'radial-obstacle'"),
-        ({"validatoin": 3}, "no key is called 'validatoin'; did you mean 'validation'"),
-        ({"validation": 0}, "validation: .*(found 0)"),
-        ({"name": "../up"}, "name: letters, digits"),
-        ({"primal": ["offline-pga"]}, "gives nothing for 'offline-pga'"),
-    ):
-        with pytest.raises(vibench.RequestError, match=line) as caught:
-            vibench.Study(**SETTINGS | changes)
-        assert "\n" not in str(caught.value)
-    with pytest.raises(vibench.RequestError, match="no table is called 'cell'; did you mean 'cells'"):
-        run.table("cell")
-    with pytest.raises(vibench.RequestError, match="jobs is -1"):
-        vibench.run(vibench.Study(**SETTINGS), jobs=-1)
 
 
 def test_ctrl_c_raises_and_the_next_call_continues(tmp_path: Path) -> None:

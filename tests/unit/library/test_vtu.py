@@ -53,7 +53,7 @@ def test_the_file_has_both_solutions_and_their_differences(name: str, tmp_path: 
         assert np.nanmax(np.abs(error)) > 0.0
 
 
-def test_hexahedra_and_facets_have_the_order_of_vtk(tmp_path: Path) -> None:
+def test_cells_have_the_order_of_vtk_and_keep_their_fields(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = create("problem", "hertz3d", SMALL["hertz3d"])
     zero = np.zeros(problem.V.dim), np.zeros(problem.W.dim)
     fields = problem.mesh_fields(problem.parameters.lower, *zero)
@@ -64,6 +64,13 @@ def test_hexahedra_and_facets_have_the_order_of_vtk(tmp_path: Path) -> None:
     square = fields.points[fields.cells["quad"]]
     sides = np.linalg.norm(square - np.roll(square, 1, axis=1), axis=2)
     assert np.allclose(sides, sides[0, 0])
+    model = model_of("obstacle")
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    cells = {"triangle": np.array([[0, 1, 2]], dtype=np.uint64), "tetra": np.arange(4)[None]}
+    stress = {"triangle": {"stress [Pa]": np.array([2.0])}, "tetra": {"stress [Pa]": np.array([3.0])}}
+    monkeypatch.setattr(type(model.problem), "mesh_fields", lambda *_: vibench.MeshFields(points, cells, {}, stress))
+    written = meshio.read(export_vtu(model, model.parameters.lower, tmp_path / "fields.vtu"))
+    assert [values.tolist() for values in written.cell_data["stress [Pa], reduced"]] == [[2.0], [3.0]]
 
 
 def test_requests_that_cannot_be_met_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,13 +95,3 @@ def test_requests_that_cannot_be_met_are_one_line(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     with pytest.raises(RequestError, match="needs meshio"):
         export_vtu(model, mu, tmp_path / "fields.vtu")
-
-
-def test_a_field_in_cells_of_two_types_keeps_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    model = model_of("obstacle")
-    points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    cells = {"triangle": np.array([[0, 1, 2]], dtype=np.uint64), "tetra": np.arange(4)[None]}
-    stress = {"triangle": {"stress [Pa]": np.array([2.0])}, "tetra": {"stress [Pa]": np.array([3.0])}}
-    monkeypatch.setattr(type(model.problem), "mesh_fields", lambda *_: vibench.MeshFields(points, cells, {}, stress))
-    written = meshio.read(export_vtu(model, model.parameters.lower, tmp_path / "fields.vtu"))
-    assert [values.tolist() for values in written.cell_data["stress [Pa], reduced"]] == [[2.0], [3.0]]

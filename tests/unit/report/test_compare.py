@@ -61,9 +61,7 @@ WORSE, BETTER, CHANGED = ChangeKind.WORSE, ChangeKind.BETTER, ChangeKind.CHANGED
         ("status = 'crashed'", "status", WORSE), ("", "cell", WORSE),
     ],
 )  # fmt: skip
-def test_a_change_of_one_cell_is_told_with_its_meaning(
-    change: str, what: str, verdict: ChangeKind, changed: Changed, steady: Path
-) -> None:
+def test_what_changed_in_a_cell(change: str, what: str, verdict: ChangeKind, changed: Changed, steady: Path) -> None:
     statement = f"UPDATE cells SET {change} WHERE {ONE}" if change else f"DELETE FROM cells WHERE {ONE}"
     found = compare([steady, changed(statement, *STEADY)], 1.25)
     (row,) = found.changes.to_dict("records")
@@ -71,7 +69,7 @@ def test_a_change_of_one_cell_is_told_with_its_meaning(
     assert (row["problem"], row["dual"], row["primal"], row["solver"]) == ("hertz", "mcpg", "offline-pga", "piqp")
 
 
-def test_errors_are_compared_on_the_queries_that_are_ok_in_both_runs(changed: Changed, quick_run: Path) -> None:
+def test_errors_are_compared_on_common_queries_and_times_on_one_machine(changed: Changed, quick_run: Path) -> None:
     """A run that fails in the hard queries is not better for it."""
     after = changed(
         f"UPDATE queries SET status = 'inaccurate' WHERE {ONE} AND query > 3",
@@ -88,11 +86,14 @@ def test_errors_are_compared_on_the_queries_that_are_ok_in_both_runs(changed: Ch
     )
     of_errors = set(compare([quick_run / FILE, worse], 1.25).changes["what"])
     assert of_errors == {"queries_ok", "error_u_mean", "error_u_max"}
+    version = f'versions = replace(versions, \'"protocol": "{PROTOCOL}"\', \'"protocol": "0"\')'
+    for other in ("machine = 'other'", version):
+        found = compare([quick_run / FILE, changed(f"UPDATE cells SET {other}, online_s = 9 * online_s")], 1.25)
+        assert found.changes.empty
+        assert any("different machines or protocols" in note for note in found.notes)
 
 
-def test_changes_within_the_limit_or_what_the_solvers_contributed_are_not_told(
-    changed: Changed, steady: Path, tmp_path: Path
-) -> None:
+def test_changes_within_the_limit_or_of_solvers_are_not_told(changed: Changed, steady: Path, tmp_path: Path) -> None:
     after = changed("UPDATE cells SET online_s = 1.2 * online_s, error_u_mean = 1.2 * error_u_mean", *STEADY)
     assert compare([steady, after], 1.25).changes.empty
     assert compare([steady, after], 1.1).regressions == 2 * 12
@@ -106,7 +107,7 @@ def test_changes_within_the_limit_or_what_the_solvers_contributed_are_not_told(
 ROUNDS = "UPDATE timings SET total_s = {} * (SELECT online_s FROM cells WHERE cells.cell = timings.cell)"
 
 
-def test_seconds_have_not_changed_where_the_rounds_do_not_tell(changed: Changed, tmp_path: Path) -> None:
+def test_seconds_have_changed_where_the_rounds_tell_by_their_interval(changed: Changed, tmp_path: Path) -> None:
     """Medians that differ by half, each of rounds as far apart: the interval of their ratio contains 1."""
     noisy = ROUNDS.format("(0.3 + 0.13 * round)")
     before = changed(noisy).rename(tmp_path / "a.sqlite")
@@ -118,9 +119,6 @@ def test_seconds_have_not_changed_where_the_rounds_do_not_tell(changed: Changed,
     for reason in ("UPDATE cells SET disturbed = 1", "DELETE FROM timings WHERE round >= 5"):
         columns = compare([before, changed(slower, *STEADY, reason)], 1.25).by_column.set_index("what")
         assert columns.loc["online_s", ChangeKind.UNDECIDED.value] == 12
-
-
-def test_a_ratio_of_seconds_has_the_interval_of_resampled_rounds(changed: Changed, tmp_path: Path) -> None:
     rounds = (ROUNDS.format("(0.95 + 0.01 * (round % 11))"), "UPDATE cells SET disturbed = 0")
     before = changed(*rounds).rename(tmp_path / "a.sqlite")
     after = changed("UPDATE cells SET online_s = 2 * online_s", *rounds)
@@ -131,9 +129,7 @@ def test_a_ratio_of_seconds_has_the_interval_of_resampled_rounds(changed: Change
     assert ((online["ratio_high"] < 2.2) & (online["ratio_high"] > 2.0)).all()
 
 
-def test_what_is_equal_round_off_new_or_there_again_is_no_regression(
-    changed: Changed, quick_run: Path, tmp_path: Path
-) -> None:
+def test_what_is_equal_round_off_or_new_is_no_regression(changed: Changed, quick_run: Path, tmp_path: Path) -> None:
     """Nor are columns without any value an obstacle."""
     empty = ("UPDATE thresholds SET primal_tol_b = NULL, dual_tol = NULL", "UPDATE cells SET primal_tol = NULL")
     for before, after, changes in (
@@ -147,14 +143,6 @@ def test_what_is_equal_round_off_new_or_there_again_is_no_regression(
         assert changes is None or (len(found.changes), found.regressions) == (changes, 0), before
     (row,) = found.changes.to_dict("records")
     assert (row["after"], row["verdict"]) == ("new", ChangeKind.CHANGED.value)
-
-
-def test_times_of_another_machine_or_version_of_the_benchmark_are_left_out(changed: Changed, quick_run: Path) -> None:
-    version = f'versions = replace(versions, \'"protocol": "{PROTOCOL}"\', \'"protocol": "0"\')'
-    for other in ("machine = 'other'", version):
-        found = compare([quick_run / FILE, changed(f"UPDATE cells SET {other}, online_s = 9 * online_s")], 1.25)
-        assert found.changes.empty
-        assert any("different machines or protocols" in note for note in found.notes)
 
 
 THRESHOLD = "WHERE solver = 'piqp' AND problem = 'obstacle' AND dual = 'mcpg' AND primal_a = 'high-fidelity'"
@@ -184,9 +172,7 @@ def test_a_break_even_is_worse_where_its_own_side_got_slower(changed: Changed, t
     assert (len(quicker.changes), quicker.regressions) == (3, 0)
 
 
-def test_the_command_ends_with_one_where_something_got_worse(
-    changed: Changed, steady: Path, quick_run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_strict_fails(changed: Changed, steady: Path, quick_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     after = changed(f"UPDATE cells SET online_s = 2 * online_s WHERE {ONE}", *STEADY)
     with pytest.raises(Exception, match="1") as ended:
         compare_runs([str(steady), str(after)], strict=True)
@@ -221,21 +207,7 @@ def three(changed: Changed, steady: Path, tmp_path: Path) -> list[Path]:
     return [steady, there, later]
 
 
-def test_seconds_of_many_runs_are_compared_with_the_first_run_of_the_same_machine(three: list[Path]) -> None:
-    found = compare(three, 1.25)
-    seconds = found.changes[found.changes["what"] == "online_s"].set_index(["run", "against"])
-    assert set(seconds.index) == {("later", "steady"), ("later", "server")}
-    assert len(seconds.loc[[("later", "steady")]]) == 5
-    assert seconds.loc[("later", "steady"), "ratio"].to_list() == pytest.approx([3.0] * 5)
-    (row,) = seconds.loc[[("later", "server")]].to_dict("records")
-    assert row["ratio"] == pytest.approx(3.0)
-    numbers = found.changes[~found.changes["what"].isin(["online_s", "offline_s"])]
-    assert set(numbers["against"]) == {"steady"}
-    assert "server: times and break-even of different machines or protocols are not compared" in found.notes
-    assert not any(note.startswith("later: times") for note in found.notes)
-
-
-def test_a_comparison_of_many_says_what_only_some_runs_have(three: list[Path]) -> None:
+def test_what_many_runs_have_and_pairs_of_them_say_is_told(three: list[Path]) -> None:
     found = compare(three, 1.25)
     runs = found.by_run.set_index("run")
     assert list(runs["cells"]) == [12, 12, 6]
@@ -251,16 +223,24 @@ def test_a_comparison_of_many_says_what_only_some_runs_have(three: list[Path]) -
     assert (values["server"] / values["steady"]).to_list() == pytest.approx([0.1] * 12)
     with pytest.raises(RequestError, match="did you mean 'online_s'"):
         found.values("online")
-
-
-def test_comparing_two_of_many_gives_what_comparing_these_two_gives(three: list[Path]) -> None:
-    """What `diff` lists of the first run and any other one is what `compare` lists of all, but for other machines."""
+    # What `diff` lists of the first run and any other one is what `compare` lists of all, but for other machines.
     everything = compare(three, 1.25).changes
     for path in three[1:]:
         alone = compare([three[0], path], 1.25).changes
         of_it = everything[(everything["run"] == path.stem) & (everything["against"] == "steady")]
         assert len(alone) > 0
         pd.testing.assert_frame_equal(alone, of_it.reset_index(drop=True))
+    found = compare(three, 1.25)
+    seconds = found.changes[found.changes["what"] == "online_s"].set_index(["run", "against"])
+    assert set(seconds.index) == {("later", "steady"), ("later", "server")}
+    assert len(seconds.loc[[("later", "steady")]]) == 5
+    assert seconds.loc[("later", "steady"), "ratio"].to_list() == pytest.approx([3.0] * 5)
+    (row,) = seconds.loc[[("later", "server")]].to_dict("records")
+    assert row["ratio"] == pytest.approx(3.0)
+    numbers = found.changes[~found.changes["what"].isin(["online_s", "offline_s"])]
+    assert set(numbers["against"]) == {"steady"}
+    assert "server: times and break-even of different machines or protocols are not compared" in found.notes
+    assert not any(note.startswith("later: times") for note in found.notes)
 
 
 def test_a_comparison_fits_the_terminal_and_what_it_is_about_is_shown(
@@ -315,9 +295,15 @@ def test_runs_of_folders_with_the_same_name_are_told_apart(tmp_path: Path) -> No
     assert run_names([paths[0], paths[0]]) == ["quick", "quick (2)"]
 
 
-@pytest.mark.parametrize(
-    ("one", "two", "opposite"),
-    [
+def threshold(meaning: str, gain: float, low: float, high: float) -> pd.DataFrame:
+    number = 9.0 if meaning == "from" else None
+    row = {"cell_a": "a", "cell_b": "b", "meaning": meaning, "gain": gain, "gain_low": low, "gain_high": high}
+    return pd.DataFrame([row | dict.fromkeys(NUMBERS, number)])
+
+
+def test_break_evens_contradict_each_other_where_at_most_one_is_right() -> None:
+    """Queries that are as fast in one run may be a little faster in another; a run that is undecided says nothing."""
+    for one, two, opposite in (
         (("from", 1.5, 1.4, 1.6), ("from", 1.3, 1.2, 1.39), False),
         (("from", 1.1, 1.01, 1.2), ("never", 0.9, 0.8, 0.99), True),
         (("from", 1.1, 1.01, 1.2), ("at once", 1.1, 1.01, 1.2), True),
@@ -325,19 +311,8 @@ def test_runs_of_folders_with_the_same_name_are_told_apart(tmp_path: Path) -> No
         (("from", 1.5, 1.4, 1.6), ("as fast", 1.0, 0.9, 1.1), True),
         (("never", 0.7, 0.6, 0.8), ("as fast", 1.0, 0.9, 1.1), True),
         (("as fast", 1.0, 0.9, 1.1), ("as fast", 0.98, 0.9, 1.05), False),
-    ],
-)
-def test_break_evens_contradict_each_other_where_at_most_one_is_right(
-    one: tuple[str, float, float, float], two: tuple[str, float, float, float], opposite: bool
-) -> None:
-    """Queries that are as fast in one run may be a little faster in another; a run that is undecided says nothing."""
-    runs = [
-        pd.DataFrame([{"cell_a": "a", "cell_b": "b", "meaning": meaning, "benefit_threshold": number}])
-        .assign(threshold_low=number, threshold_high=number, gain=gain, gain_low=low, gain_high=high)
-        for meaning, gain, low, high in (one, two)
-        for number in [9.0 if meaning == "from" else None]
-    ]  # fmt: skip
-    both = int(one[0] == two[0] == "from")
-    assert agreement(*runs) == agreement(*runs[::-1]) == (both, both, opposite, 1)
-    undecided = runs[1].assign(meaning="undecided", benefit_threshold=None)
-    assert agreement(runs[0], undecided) == (0, 0, 0, 0)
+    ):
+        runs, both = (threshold(*one), threshold(*two)), int(one[0] == two[0] == "from")
+        assert agreement(*runs) == agreement(*runs[::-1]) == (both, both, opposite, 1)
+        undecided = runs[1].assign(meaning="undecided", benefit_threshold=None)
+        assert agreement(runs[0], undecided) == (0, 0, 0, 0)

@@ -172,9 +172,7 @@ def test_every_figure_can_be_read(drawn: Drawn, folder: Path) -> None:
         assert len(captions[name]) > 60, name
 
 
-def test_projection_errors_are_those_of_the_histories_and_dual_strategies_have_orthogonality(
-    drawn: Drawn, results: Path
-) -> None:
+def test_convergence_and_constants_are_those_of_histories_and_queries(drawn: Drawn, results: Path) -> None:
     histories = read_table(results, "histories")
     for problem in problems():
         pod, cones, sigma, beta = drawn[f"{problem}-convergence"].axes
@@ -193,9 +191,6 @@ def test_projection_errors_are_those_of_the_histories_and_dual_strategies_have_o
         assert np.all(np.diff(data_of(sigma)[0]) <= 1e-12)
         assert data_of(sigma)[0][-1] <= 0.5
         assert data_of(beta)[0][-1] > 0.0
-
-
-def test_the_figures_of_a_cone_show_sigma_beta_and_the_high_fidelity_pair(drawn: Drawn, results: Path) -> None:
     queries = read_table(results, "queries")
     for problem in problems():
         for dual in read_study("quick").dual:
@@ -235,9 +230,7 @@ def test_a_logarithmic_panel_with_nothing_to_show_stays_empty(change: Change, dr
         assert 0.0 < low < high
 
 
-def test_cells_that_failed_stop_no_others_and_no_tolerance_has_no_name(
-    change: Change, draw: Draw, results: Path, tmp_path: Path
-) -> None:
+def test_cells_that_failed_stop_no_others(change: Change, draw: Draw, results: Path, tmp_path: Path) -> None:
     failed = "WHERE solver = 'osqp' OR primal = 'online-supremizers'"
     change(
         ONE_CONE,
@@ -288,13 +281,9 @@ def test_prescribed_sizes_are_drawn_too_and_two_pairs_of_tolerances_get_two_pane
 
 def test_entries_that_share_a_label_get_files_of_their_own(change: Change, draw: Draw) -> None:
     other = json.dumps({"resolution": 500})
-    change(
-        ONE_PAIR,
-        f"UPDATE queries SET problem_options = '{other}' WHERE solver = 'osqp'",
-        f"UPDATE cells SET problem_options = '{other}' WHERE solver = 'osqp'",
-        "INSERT INTO histories SELECT * FROM histories",
-        f"UPDATE histories SET problem_options = '{other}' WHERE rowid % 2 = 0",
-    )
+    named = f"SET problem_options = '{other}' WHERE"
+    change(ONE_PAIR, *(f"UPDATE {table} {named} solver = 'osqp'" for table in ("queries", "cells")))
+    change("INSERT INTO histories SELECT * FROM histories", f"UPDATE histories {named} rowid % 2 = 0")
     drawn = draw("convergence", "inf-sup")
     assert {f"obstacle-{k}-{kind}" for k in (1, 2) for kind in ("convergence", "mcpg-inf-sup")} <= set(drawn)
 
@@ -413,7 +402,19 @@ def test_a_profile_ends_at_the_share_that_was_solved(change: Change, draw: Draw)
     assert "The run has one solver, piqp: there is no performance profile to draw." in figure.caption
 
 
-def test_the_same_results_give_the_same_files(tables: Tables, tmp_path: Path) -> None:
+def test_long_figures_and_reports_show_what_matters_in_the_same_files(tables: Tables, tmp_path: Path) -> None:
+    data = tables["obstacle"].restrict_to_dual("mcpg")
+    pairs = pd.concat([data.queries.assign(pair=f"pair {k}") for k in range(8)])
+    figure = spaces.inf_sup(replace(data, queries=pairs))
+    assert figure is not None
+    assert len([axes for axes in figure.axes if axes.get_title()]) == 4
+    assert "The tables have the other 4 panels." in figure.caption
+    names = [one for one, *_ in tasks_of("obstacle", tables["obstacle"])]
+    assert len([one for one in names if one.endswith("inf-sup")]) == 1 < len(tables["obstacle"].duals)
+    assert {f"obstacle-{kind}" for kind, (_, of_dual) in KINDS.items() if not of_dual} <= {*names}
+    assert tables["hertz"].parameter == "radius µ [m]"
+    assert tables["obstacle"].parameter == ""
+    assert replace(tables["hertz"], pictures=()).parameter == "µ"
     data = tables["hertz"]
     for name, drawing in ((name, KINDS[name][0]) for name in ("solutions", "convergence")):
         files = []
@@ -456,40 +457,15 @@ def test_the_tightest_enrichment_is_the_one_that_went_farthest(results: Path) ->
 def test_a_caption_says_which_tolerances_are_left_out(change: Change, draw: Draw) -> None:
     """The loosest is shown; of two that are as loose up to round-off, the one with the larger δ."""
     again = "problem = 'obstacle' AND primal = 'offline-pga'"
-    change(
-        ONE_PAIR,
-        f"CREATE TABLE again AS SELECT * FROM queries WHERE {again}",
-        "UPDATE again SET primal_tol = 0.7, beta_span = beta_span * (1.0 + 1e-12)",
-        "INSERT INTO queries SELECT * FROM again",
-        "DROP TABLE again",
-    )
+    change(ONE_PAIR, f"CREATE TABLE again AS SELECT * FROM queries WHERE {again}")
+    change("UPDATE again SET primal_tol = 0.7, beta_span = beta_span * (1.0 + 1e-12)")
+    change("INSERT INTO queries SELECT * FROM again", "DROP TABLE again")
     figure = draw("inf-sup")["obstacle-mcpg-inf-sup"]
     assert "offline-pga, δ = 0.7" in figure.axes[0].get_legend_handles_labels()[1]
     assert "offline-pga is shown at δ = 0.7, its loosest; left out: 0.5." in figure.caption
 
 
-def test_a_long_figure_has_four_panels_and_says_what_it_leaves_out(tables: Tables) -> None:
-    data = tables["obstacle"].restrict_to_dual("mcpg")
-    pairs = pd.concat([data.queries.assign(pair=f"pair {k}") for k in range(8)])
-    figure = spaces.inf_sup(replace(data, queries=pairs))
-    assert figure is not None
-    assert len([axes for axes in figure.axes if axes.get_title()]) == 4
-    assert "The tables have the other 4 panels." in figure.caption
-
-
-def test_a_report_has_the_figures_of_the_leading_cone(tables: Tables) -> None:
-    names = [one for one, *_ in tasks_of("obstacle", tables["obstacle"])]
-    assert len([one for one in names if one.endswith("inf-sup")]) == 1 < len(tables["obstacle"].duals)
-    assert {f"obstacle-{kind}" for kind, (_, of_dual) in KINDS.items() if not of_dual} <= {*names}
-
-
-def test_a_problem_has_an_abscissa_of_its_own_only_with_one_parameter(tables: Tables) -> None:
-    assert tables["hertz"].parameter == "radius µ [m]"
-    assert tables["obstacle"].parameter == ""
-    assert replace(tables["hertz"], pictures=()).parameter == "µ"
-
-
-def test_panels_that_are_compared_share_their_axes_and_points_are_named(drawn: Drawn, results: Path) -> None:
+def test_panels_share_axes_and_ranges_and_points_are_named(drawn: Drawn, results: Path) -> None:
     span, cone = drawn["hertz-mcpg-inf-sup"].axes
     assert span.get_xlim() == cone.get_xlim()
     cpg_u, cpg_lambda, mcpg_u, mcpg_lambda = drawn["obstacle-work-precision"].axes
@@ -503,9 +479,6 @@ def test_panels_that_are_compared_share_their_axes_and_points_are_named(drawn: D
     size = f"({mine['N'].iloc[0]:.0f}, {mine['R'].iloc[0]:.0f}), δ = 0.5"
     axes = next(axes for axes in drawn["obstacle-work-precision"].axes if axes.get_title() == "mcpg")
     assert size in [text.get_text() for text in axes.texts]
-
-
-def test_solutions_have_one_range_of_values_and_the_boundary_of_the_contact(drawn: Drawn) -> None:
     fields = panels(drawn["obstacle-solutions"])
     for row in (fields[:3], fields[3:]):
         ranges = {axes.collections[0].get_clim() for axes in row}

@@ -37,15 +37,12 @@ def test_a_whole_run_is_called_whole_and_what_fell_short_is_counted(said: Said) 
     assert only(many, "cpg has 50 generators for 12 multipliers")
 
 
-def test_what_is_alarming_comes_first(said: Said) -> None:
+def test_what_is_alarming_comes_first_and_of_one_solver_no_agreement_is_told(said: Said) -> None:
     broken = "UPDATE queries SET beta_span = 9 WHERE query = 3 AND problem = 'hertz' AND solver = 'piqp'"
     violated, disagree, *_ = said(broken, "UPDATE disagreements SET flagged = 1")
     assert "of the inf-sup constants" in violated
     assert "violated" in violated
     assert disagree.startswith("Solvers disagree by more than the accuracy allows")
-
-
-def test_of_one_solver_no_agreement_is_told(said: Said) -> None:
     one = [f"DELETE FROM {table} WHERE solver != 'piqp'" for table in ("queries", "cells")]
     whole = said(*one, "DELETE FROM disagreements")
     assert whole[0].startswith("12 cells, 12 with every query ok")
@@ -53,7 +50,7 @@ def test_of_one_solver_no_agreement_is_told(said: Said) -> None:
     assert only(said("DELETE FROM disagreements"), "No two solvers were ok on the same reduced problem.")
 
 
-def test_zero_solutions_are_counted_and_measured_by_the_training_set(said: Said) -> None:
+def test_zero_solutions_declarations_and_disturbed_cells_are_counted(said: Said) -> None:
     mine = "problem = 'hertz' AND query IN (2, 5)"
     texts = said(
         f"UPDATE queries SET zero_lambda = 1, error_lambda = NULL, error_lambda_scaled = 1e-11 WHERE {mine}",
@@ -62,17 +59,11 @@ def test_zero_solutions_are_counted_and_measured_by_the_training_set(said: Said)
     assert "at most 0.25 of the largest" in only(texts, "λ of hertz is zero at 2 validation parameters")
     texts = said("UPDATE queries SET zero_lambda = 1, error_lambda = NULL", "UPDATE cells SET error_lambda_mean = NULL")
     assert not [text for text in texts if "nan" in text]
-
-
-def test_with_bounds_of_declarations_their_tests_are_counted(said: Said) -> None:
-    """With 16 random parameters a share of 0.17 of the box would be met at 95 %; 3/16 is above that."""
+    # With 16 random parameters a share of 0.17 of the box would be met at 95 %; 3/16 is above that.
     text = only(said("UPDATE cells SET certificate = 'certified' WHERE problem = 'hertz'"), "Declarations")
     assert text.startswith("Declarations of hertz agree with the assembly at all 16 validation parameters")
     assert text.endswith("one is false in at most 0.19 of the box, at 95 %.")
     assert not [text for text in said() if "Declarations" in text]
-
-
-def test_cells_are_called_disturbed_where_some_are(said: Said) -> None:
     calm = "UPDATE cells SET disturbed = 0"
     assert not [text for text in said(calm) if "disturbed" in text]
     texts = said(calm, "UPDATE cells SET disturbed = 1 WHERE rowid = 1")

@@ -31,7 +31,7 @@ def made(reported: Path) -> Path:
     return reported / "report.html"
 
 
-def test_it_needs_nothing_but_itself(made: Path) -> None:
+def test_it_needs_nothing_but_itself_and_says_what_headings_and_pictures_mean(made: Path) -> None:
     page = made.read_text(encoding="utf-8")
     links = Links(page)
     tables_of_cells = [target for target in links.targets if target.startswith("#summary?q=")]
@@ -41,6 +41,16 @@ def test_it_needs_nothing_but_itself(made: Path) -> None:
     assert all(target.startswith("#") and target[1:].split("?")[0] in links.ids for target in links.targets)
     assert "@import" not in page
     assert "url(" not in page.split("</style>")[0]
+    embedded = data(made.read_text(encoding="utf-8"), "table-data")
+    meant = {column["name"]: column["meaning"] for grid in embedded.values() for column in grid["columns"]}
+    assert {name for name, meaning in meant.items() if not meaning} == set()
+    assert meant["error λ"].startswith(f"{STORED['cells']['error_lambda_mean'].meaning} [1]")
+    page = made.read_text(encoding="utf-8")
+    (caption,) = re.findall(r"obstacle-total-cost: (.+?)</figcaption>", page)
+    (alternative,) = re.findall(r'<figure id="obstacle-total-cost".*?<img [^>]*alt="([^"]+)"', page, re.DOTALL)
+    assert len(alternative) > 40
+    assert caption.startswith(alternative)
+    assert caption != alternative
 
 
 def data(page: str, name: str) -> Any:
@@ -48,24 +58,7 @@ def data(page: str, name: str) -> Any:
     return json.loads(page.split(f'id="{name}">')[1].split("</script>", maxsplit=1)[0])
 
 
-def test_every_heading_says_what_it_means(made: Path) -> None:
-    embedded = data(made.read_text(encoding="utf-8"), "table-data")
-    meant = {column["name"]: column["meaning"] for grid in embedded.values() for column in grid["columns"]}
-    assert {name for name, meaning in meant.items() if not meaning} == set()
-    assert meant["error λ"].startswith(f"{STORED['cells']['error_lambda_mean'].meaning} [1]")
-
-
-def test_without_javascript_tables_have_their_first_rows(made: Path, reported: Path) -> None:
-    page = made.read_text(encoding="utf-8")
-    (table,) = re.findall(r'data-table="summary"></div>\n<noscript>(.*?)</noscript>', page, re.DOTALL)
-    cells = read_table(reported / FILE, "cells")
-    assert table.count("<tr>") == 1 + min(len(cells), 50)
-    assert "error λ</th>" in table
-    assert all(f"<td>{value:.3g}</td>" in table for value in cells["error_lambda_mean"][:50])
-    assert len(re.findall("<noscript>.*?<table>.*?</noscript>", page, re.DOTALL)) == page.count("data-table=")
-
-
-def test_findings_tables_and_facts_are_in_it(made: Path, reported: Path) -> None:
+def test_findings_tables_and_facts_are_in_it_and_first_rows_without_javascript(made: Path, reported: Path) -> None:
     page = made.read_text(encoding="utf-8")
     verdicts = [str(one) for one in Run(reported / FILE).verdict]
     assert len(verdicts) == 2
@@ -85,6 +78,13 @@ def test_findings_tables_and_facts_are_in_it(made: Path, reported: Path) -> None
         pytest.approx(error, rel=1e-5) for error in in_order(cells)["error_lambda_mean"]
     ]
     assert "None: every query of every cell is ok." in page
+    page = made.read_text(encoding="utf-8")
+    (table,) = re.findall(r'data-table="summary"></div>\n<noscript>(.*?)</noscript>', page, re.DOTALL)
+    cells = read_table(reported / FILE, "cells")
+    assert table.count("<tr>") == 1 + min(len(cells), 50)
+    assert "error λ</th>" in table
+    assert all(f"<td>{value:.3g}</td>" in table for value in cells["error_lambda_mean"][:50])
+    assert len(re.findall("<noscript>.*?<table>.*?</noscript>", page, re.DOTALL)) == page.count("data-table=")
 
 
 def test_without_pictures_all_else_is_in_it(made: Path, reported: Path, tmp_path: Path, main: Main) -> None:
@@ -101,7 +101,7 @@ def test_without_pictures_all_else_is_in_it(made: Path, reported: Path, tmp_path
     assert page.split('<section id="figures">')[0] == whole.split('<section id="figures">')[0]
 
 
-def test_every_failure_has_its_reason_and_nothing_is_markup(changed: Changed) -> None:
+def test_every_failure_has_its_reason_and_a_run_without_queries_a_report(changed: Changed) -> None:
     reason = "<script>alert(''the solver said & did nothing'')</script>"
     results = changed(
         FEW,
@@ -121,34 +121,6 @@ def test_every_failure_has_its_reason_and_nothing_is_markup(changed: Changed) ->
     assert "one of many" in str(embedded["failed-queries"])
     assert page.count("no picture of ") == 1
     assert "no picture of wire: no &lt;mesh&gt;" in page
-
-
-def test_a_label_is_no_markup_wherever_it_stands(changed: Changed) -> None:
-    """In tables, attributes, findings and facts, those that come from JSON included."""
-    plain = elements(html.page(changed(FEW), figures=False))
-    label = '</script><script>alert(1)</script><img src=x onerror=alert(1)>" onclick="x\x1b[31m\n\ud800'
-    known = json.dumps({"name": label, "seed": label})
-    axes = [
-        f"UPDATE {table} SET {axis} = '{brief(label)}'"
-        for table in ("cells", "queries", "histories", "thresholds", "disagreements")
-        for axis in ("problem", "dual", "primal", "solver")
-        if axis in STORED[table]
-    ]
-    results = changed(
-        FEW,
-        *axes,
-        f"UPDATE meta SET value = '{known}' WHERE key = 'study'",
-        f"UPDATE cells SET versions = '{known}', reason = 'a' || char(27) || char(7), status = 'failed'",
-    )
-    page = html.page(results, figures=False)
-    assert elements(page) <= plain | {"td.class", "p.class", "h3", "h3.id"}
-    assert page.count("<script") == page.count("</script") == 4
-    assert clean(page)
-    assert brief(label) in data(page, "table-data")["failed"]["columns"][1]["levels"]
-    assert escape(brief(label)) in page
-
-
-def test_a_run_without_any_query_has_a_report(changed: Changed) -> None:
     emptied = [f"DELETE FROM {name}" for name in ("queries", "thresholds", "disagreements", "histories", "pictures")]
     lost = "UPDATE cells SET status = 'unavailable', reason = 'not installed', queries_ok = 0, online_s = NULL"
     page = html.page(changed(*emptied, lost))
@@ -158,16 +130,25 @@ def test_a_run_without_any_query_has_a_report(changed: Changed) -> None:
     assert data(page, "plot-data") == {}
 
 
-def test_a_strategy_that_is_labelled_high_fidelity_is_no_high_fidelity_model(changed: Changed) -> None:
-    path = changed("UPDATE thresholds SET primal_a = 'high-fidelity'")
-    read = {name: read_table(path, name) for name in TABLES}
-    thresholds = read["thresholds"]
-    found = {grid.name: len(grid.frame) for grid in html._grids(read)}
-    assert found["enrichments"] == thresholds["cell_a"].notna().sum() > 0
-    assert found["model"] == thresholds["cell_a"].isna().sum() > 0
+def test_a_label_is_no_markup_wherever_it_stands(changed: Changed) -> None:
+    """In tables, attributes, findings and facts, those that come from JSON included."""
+    plain = elements(html.page(changed(FEW), figures=False))
+    label = '</script><script>alert(1)</script><img src=x onerror=alert(1)>" onclick="x\x1b[31m\n\ud800'
+    known = json.dumps({"name": label, "seed": label})
+    tables = ("cells", "queries", "histories", "thresholds", "disagreements")
+    axes = [(table, axis) for table in tables for axis in ("problem", "dual", "primal", "solver")]
+    axes = [f"UPDATE {table} SET {axis} = '{brief(label)}'" for table, axis in axes if axis in STORED[table]]
+    failed = f"UPDATE cells SET versions = '{known}', reason = 'a' || char(27) || char(7), status = 'failed'"
+    results = changed(FEW, *axes, f"UPDATE meta SET value = '{known}' WHERE key = 'study'", failed)
+    page = html.page(results, figures=False)
+    assert elements(page) <= plain | {"td.class", "p.class", "h3", "h3.id"}
+    assert page.count("<script") == page.count("</script") == 4
+    assert clean(page)
+    assert brief(label) in data(page, "table-data")["failed"]["columns"][1]["levels"]
+    assert escape(brief(label)) in page
 
 
-def test_a_large_study_has_pictures_of_the_cones_that_win(changed: Changed, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_are_of_winners_and_labels_no_models(changed: Changed, monkeypatch: pytest.MonkeyPatch) -> None:
     path = changed("UPDATE cells SET error_lambda_mean = 0.05, error_u_mean = 0.01")
     (hertz, _) = leaderboard(in_order(read_table(path, "cells")))
     (winner, *_) = hertz.bands[0].winners
@@ -175,6 +156,12 @@ def test_a_large_study_has_pictures_of_the_cones_that_win(changed: Changed, monk
     names = [task[0] for task in html.tasks_of(name, data)]
     assert [one for one in names if one.endswith("inf-sup")] == [f"hertz-{winner.cell['dual']}-inf-sup"]
     assert {"hertz-convergence", "hertz-total-cost"} <= {*names}
+    path = changed("UPDATE thresholds SET primal_a = 'high-fidelity'")
+    read = {name: read_table(path, name) for name in TABLES}
+    thresholds = read["thresholds"]
+    found = {grid.name: len(grid.frame) for grid in html._grids(read)}
+    assert found["enrichments"] == thresholds["cell_a"].notna().sum() > 0
+    assert found["model"] == thresholds["cell_a"].isna().sum() > 0
 
 
 def test_only_rows_of_a_disturbed_machine_are_marked_and_undecided_answers_are_shown(changed: Changed) -> None:
@@ -191,12 +178,3 @@ def test_only_rows_of_a_disturbed_machine_are_marked_and_undecided_answers_are_s
     assert embedded["summary"]["disturbed"] == list(keys.index[keys["disturbed"] == 1])
     assert len(embedded["summary"]["disturbed"]) == 2
     assert page.count("marks rows") == sum(bool(table["disturbed"]) for table in embedded.values())
-
-
-def test_a_picture_is_described_by_the_first_sentence_of_its_caption(made: Path) -> None:
-    page = made.read_text(encoding="utf-8")
-    (caption,) = re.findall(r"obstacle-total-cost: (.+?)</figcaption>", page)
-    (alternative,) = re.findall(r'<figure id="obstacle-total-cost".*?<img [^>]*alt="([^"]+)"', page, re.DOTALL)
-    assert len(alternative) > 40
-    assert caption.startswith(alternative)
-    assert caption != alternative

@@ -99,9 +99,7 @@ def choose(browser: Chrome, axis: str, value: str) -> None:
 
 
 @pytest.mark.parametrize(("width", "themes"), [(1280, ("light", "dark")), (390, ("dark", "light"))])
-def test_nothing_is_cut_or_wrapped_inside_a_number(
-    width: int, themes: tuple[str, str], browser: Chrome, made: Path
-) -> None:
+def test_nothing_is_cut_or_wrapped_in_numbers(width: int, themes: tuple[str, str], browser: Chrome, made: Path) -> None:
     """In the scheme in which the page is opened, and in the other one, to which it changes with the user."""
     look(browser, made, width=width, theme=themes[0])
     browser.execute_script("for (const figure of document.querySelectorAll('[data-plot]')) drawPlot(figure);")
@@ -126,9 +124,7 @@ def test_nothing_is_cut_or_wrapped_inside_a_number(
     awaited(browser, lambda b: b.execute_script("return [...document.images].every(image => image.naturalWidth > 100)"))
 
 
-def test_columns_that_matter_and_flags_are_seen_at_once_and_sort_in_both_themes(
-    browser: Chrome, made: Path, cells: pd.DataFrame
-) -> None:
+def test_columns_that_matter_and_flags_are_seen_and_sort(browser: Chrome, made: Path, cells: pd.DataFrame) -> None:
     """Rows of a disturbed machine are flagged; numbers are sorted as numbers, and missing ones come last."""
     look(browser, made)
     seen = browser.execute_script(
@@ -249,9 +245,7 @@ def show_plot(browser: Chrome, name: str) -> None:
     awaited(browser, lambda b: b.execute_script(ready, name))
 
 
-def test_hover_tells_the_cell_the_legend_hides_it_and_a_box_zooms(
-    browser: Chrome, made: Path, cells: pd.DataFrame
-) -> None:
+def test_hover_tells_cells_legends_hide_them_a_box_zooms(browser: Chrome, made: Path, cells: pd.DataFrame) -> None:
     name = "obstacle-work-precision"
     look(browser, made)
     show_plot(browser, name)

@@ -84,12 +84,19 @@ def test_a_site_names_neither_home_nor_user_nor_host(made: Path, main: Main, tmp
     assert (code, out.split()[0]) == (0, row["cell"])
 
 
-def test_damage_is_no_less_found_for_being_published(made: Path, main: Main, tmp_path: Path) -> None:
+def test_damage_is_found_and_runs_of_one_name_do_not_tell_their_folders(made: Path, main: Main, tmp_path: Path) -> None:
     shutil.copytree(made, tmp_path / "run")
     with sqlite3.connect(tmp_path / "run" / FILE) as db:
         db.execute("UPDATE queries SET error_u = 2 * error_u WHERE rowid = 1")
     db.close()
     refused(main("publish", "--yes", str(tmp_path / "run"), str(tmp_path / "site")), "is damaged")
+    shutil.copytree(made, tmp_path / "secret" / "run")
+    code, _, err = main(
+        "publish", "--yes", str(made), str(tmp_path / "secret" / "run"), str(tmp_path / "s"), "--no-figures"
+    )
+    assert (code, err) == (0, "")
+    assert sorted(path.name for path in (tmp_path / "s" / "runs").iterdir()) == ["run", "run-2"]
+    assert b"secret" not in (tmp_path / "s" / "index.html").read_bytes()
 
 
 def test_what_could_identify_somebody_is_said_before_a_site_is_written(made: Path, main: Main, tmp_path: Path) -> None:
@@ -108,13 +115,3 @@ def test_what_could_identify_somebody_is_said_before_a_site_is_written(made: Pat
     assert any(line.startswith("labels: ") and "the cone of somebody" in line for line in said)
     assert any('"packs/cable"' in line for line in said)
     assert "the user's name 'somebody', in a name or an option" in said
-
-
-def test_runs_of_one_name_do_not_tell_their_folders(made: Path, main: Main, tmp_path: Path) -> None:
-    shutil.copytree(made, tmp_path / "secret" / "run")
-    code, _, err = main(
-        "publish", "--yes", str(made), str(tmp_path / "secret" / "run"), str(tmp_path / "s"), "--no-figures"
-    )
-    assert (code, err) == (0, "")
-    assert sorted(path.name for path in (tmp_path / "s" / "runs").iterdir()) == ["run", "run-2"]
-    assert b"secret" not in (tmp_path / "s" / "index.html").read_bytes()

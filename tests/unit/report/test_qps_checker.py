@@ -20,9 +20,7 @@ from vibench.report.qps_checker import residuals
     share=st.sampled_from([0.0, 1e-7, 1.0]),
     unit=st.integers(-9, 9),
 )
-def test_its_residuals_are_those_of_the_verification(
-    seed: int, load: float, closed: float, share: float, unit: int
-) -> None:
+def test_residuals_are_those_of_verification(seed: int, load: float, closed: float, share: float, unit: int) -> None:
     """With a load, with one that is round-off, without; of solutions of any size, zero included."""
     rng = np.random.default_rng(seed)
     P, q, G = 10.0**unit * spd(5, rng), load * rng.standard_normal(5), rng.standard_normal((3, 5))

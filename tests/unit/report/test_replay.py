@@ -51,7 +51,7 @@ def key(run: Path, solver: str = "piqp") -> str:
     return str(cells[(cells["solver"] == solver) & (cells["primal"] == "offline-pga")]["cell"].iloc[0])
 
 
-def test_a_recorded_cell_solves_as_it_did(run: Path) -> None:
+def test_recorded_cells_are_solved_and_replayed_or_refused_in_a_line(run: Path, tmp_path: Path) -> None:
     recorded = recorded_cell(str(run), key(run))
     solutions = recorded.rows("solutions")
     assert sorted(solutions) == [0, 1, 2]
@@ -61,19 +61,6 @@ def test_a_recorded_cell_solves_as_it_did(run: Path) -> None:
         assert np.array_equal(again.x, x)
     model = vibench.open_run(run).model(key(run)[:8]).reduced
     assert model.fixed_basis.shape[1] == recorded.row["N"] + recorded.row["enrichment"]
-
-
-def test_stages_whose_artefacts_are_gone_are_run_again(run: Path, artefacts: Path) -> None:
-    for file in artefacts.glob("*stage-*"):
-        file.unlink()
-    before = recorded_cell(str(run), key(run)).rows("queries")[1]["primal_residual"]
-    recorded = recorded_cell(str(run), key(run))
-    x, alpha = (np.frombuffer(recorded.rows("solutions")[1][name]) for name in ("x", "alpha"))
-    again = verification.kkt_residuals(recorded.program(1), x, alpha).primal
-    assert again == pytest.approx(before, rel=1e-6, abs=1e-15)
-
-
-def test_replay_names_every_solver_and_keeps_the_program(run: Path, tmp_path: Path) -> None:
     recorded = recorded_cell(str(run), key(run, "osqp"))
     frame = replay.replay(recorded, 2, tmp_path / "program.npz").set_index("solver")
     assert frame.index[0] == "osqp (recorded)"
@@ -86,11 +73,31 @@ def test_replay_names_every_solver_and_keeps_the_program(run: Path, tmp_path: Pa
     program = qpsolvers.Problem.load(str(tmp_path / "program.npz"))
     assert np.array_equal(program.P, recorded.program(2).A)
     assert np.array_equal(program.q, -recorded.program(2).f)
+    recorded = recorded_cell(str(run), key(run))
+    assert len(recorded_cells(str(run))) == 8
+    other = RecordedCell(recorded.path, {**recorded.row, "code": "another"})
+    for request, said in (
+        (lambda: recorded_cell(str(run), "nothing"), r"0 cells of .* begin with 'nothing'"),
+        (lambda: recorded_cell(str(run), ""), "8 cells"),
+        (lambda: replay.replay(recorded, 3, tmp_path / "p.npz"), "no query 3; it has 0 to 2"),
+        (lambda: replay.replay(recorded, 0, tmp_path / "p.txt"), r"must end in \.npz"),
+        (lambda: other.model, "computed by other code"),
+    ):
+        with pytest.raises(RequestError, match=said):
+            request()
 
 
-def test_a_solver_that_ends_its_process_costs_its_own_line(
-    run: Path, tmp_path: Path, plugins_folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stages_whose_artefacts_are_gone_are_run_again(run: Path, artefacts: Path) -> None:
+    for file in artefacts.glob("*stage-*"):
+        file.unlink()
+    before = recorded_cell(str(run), key(run)).rows("queries")[1]["primal_residual"]
+    recorded = recorded_cell(str(run), key(run))
+    x, alpha = (np.frombuffer(recorded.rows("solutions")[1][name]) for name in ("x", "alpha"))
+    again = verification.kkt_residuals(recorded.program(1), x, alpha).primal
+    assert again == pytest.approx(before, rel=1e-6, abs=1e-15)
+
+
+def test_a_solver_that_dies(run: Path, tmp_path: Path, plugins_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(plugins_folder))
     registry.registered.cache_clear()
     monkeypatch.setattr(replay, "installed_solvers", lambda _: ["segfaults", "piqp"])
@@ -127,30 +134,10 @@ def test_the_exported_set_is_rechecked_by_a_script_that_knows_nothing_of_vibench
 
 
 @pytest.mark.parametrize(("kib", "arguments"), [(0, ["export"]), (3, ["export"]), (1, ["replay"]), (8, ["report"])])
-def test_on_a_full_disk_nothing_half_written_is_left(
-    kib: int, arguments: list[str], run: Path, vibench: Vibench, tmp_path: Path
-) -> None:
-    target = {
-        "export": ["set"],
-        "replay": [key(run), "--out", "one.npz"],
-        "report": ["--no-figures", "--out", "one.html"],
-    }
+def test_full_disks_leave_nothing(kib: int, arguments: list[str], run: Path, vibench: Vibench, tmp_path: Path) -> None:
+    target = {"replay": [key(run), "--out", "one.npz"], "report": ["--no-figures", "--out", "one.html"]}
+    target["export"] = ["set"]
     done = vibench(tmp_path, *arguments, str(run), *target[arguments[0]], file_kib=kib)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == f"vibench: '{target[arguments[0]][-1]}' cannot be written: File too large\n"
     assert list(tmp_path.iterdir()) == []
-
-
-def test_wrong_requests_are_one_line(run: Path, tmp_path: Path) -> None:
-    recorded = recorded_cell(str(run), key(run))
-    assert len(recorded_cells(str(run))) == 8
-    other = RecordedCell(recorded.path, {**recorded.row, "code": "another"})
-    for request, said in (
-        (lambda: recorded_cell(str(run), "nothing"), r"0 cells of .* begin with 'nothing'"),
-        (lambda: recorded_cell(str(run), ""), "8 cells"),
-        (lambda: replay.replay(recorded, 3, tmp_path / "p.npz"), "no query 3; it has 0 to 2"),
-        (lambda: replay.replay(recorded, 0, tmp_path / "p.txt"), r"must end in \.npz"),
-        (lambda: other.model, "computed by other code"),
-    ):
-        with pytest.raises(RequestError, match=said):
-            request()

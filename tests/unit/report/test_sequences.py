@@ -118,9 +118,7 @@ def examine(test_set: Any, run: Path, exported: Path) -> None:
         assert np.allclose(again.x, x, atol=1e-4 * np.abs(x).max())
 
 
-def test_an_exported_sequence_is_a_test_set_of_what_qpbenchmark_offers(
-    stand_in: None, loaded: Any, run: Path, exported: Path
-) -> None:
+def test_an_exported_sequence_is_a_set_of_qpbenchmark(stand_in: None, loaded: Any, run: Path, exported: Path) -> None:
     examine(loaded, run, exported)
     command = [sys.executable, "-I", str(exported / "check.py")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -139,15 +137,12 @@ def test_the_released_qpbenchmark_loads_and_solves_it(run: Path, exported: Path,
     sys.modules.pop("sequences", None)
 
 
-def test_every_query_of_a_path_starts_from_the_one_before(run: Path) -> None:
+def test_queries_of_a_path_start_from_those_before(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     queries = open_run(run).queries.sort_values("query")
     walked = queries[queries["solver"] == "proxqp"]["started_from"]
     assert np.isnan(walked.iloc[0])
     assert walked.tolist()[1:] == [0, 1, 2, 3]
     assert queries[queries["solver"] == "piqp"]["started_from"].isna().all()  # it cannot
-
-
-def test_a_run_without_paths_has_no_sequences(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ParameterSet, "is_ordered", False)
     with pytest.raises(RequestError, match="along an ordered validation set, such as that of random-walk"):
         replay.export(str(run), tmp_path / "set", sequence=True)

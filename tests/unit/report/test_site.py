@@ -33,17 +33,10 @@ CITATION = Citation("Tests & <trials>", ("Doe, Jane", "The {team}"), "10.5281/ze
 def three(quick_run: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Three runs of two machines, with one cone: as it was run, of another one with fewer cells, with failures."""
     base = tmp_path_factory.mktemp("runs")
-    changes = {
-        "here": (),
-        "server #1": (
-            "UPDATE cells SET machine = 'a server, 64 cores', online_s = 0.5 * online_s",
-            "DELETE FROM cells WHERE solver = 'osqp'",
-        ),
-        "later": (
-            "UPDATE cells SET status = 'failed', reason = 'why <not>', queries_ok = 0 WHERE problem = 'hertz'",
-            "UPDATE cells SET error_u_mean = 3 * error_u_mean",
-        ),
-    }
+    server = "UPDATE cells SET machine = 'a server, 64 cores', online_s = 0.5 * online_s"
+    failed = "UPDATE cells SET status = 'failed', reason = 'why <not>', queries_ok = 0 WHERE problem = 'hertz'"
+    later = (failed, "UPDATE cells SET error_u_mean = 3 * error_u_mean")
+    changes = {"here": (), "server #1": (server, "DELETE FROM cells WHERE solver = 'osqp'"), "later": later}
     for name, statements in changes.items():
         (base / name).mkdir()
         shutil.copy(quick_run / FILE, base / name / FILE)
@@ -92,7 +85,7 @@ OBSERVE = """
 """
 
 
-def test_a_browser_shows_every_page_without_an_error(site: Path, browser: Chrome) -> None:
+def test_a_browser_shows_every_page_and_filters_without_an_error(site: Path, browser: Chrome) -> None:
     pages = ("index.html", "leaderboard.html", "comparison.html", "runs/server-1/index.html")
     for page, width in product(pages, (1280, 500)):
         seen = observed(browser, site / page, OBSERVE, width=width)
@@ -100,6 +93,20 @@ def test_a_browser_shows_every_page_without_an_error(site: Path, browser: Chrome
         assert min(seen["rows"]) > 0, page
         local = [link for link in seen["links"] if not link.startswith("https://doi.org/")]
         assert all(link.startswith(site.as_uri()) for link in local), page
+    seen = observed(browser, site / "index.html", FILTER)
+    everything = ["here", "server #1", "later"]
+    assert (seen["start"], seen["said"]) == (everything, "3 of 3")
+    assert seen["osqp"] == ["here", "later"]
+    assert seen["both"] == seen["none"] == []
+    assert seen["machine"] == seen["text"] == ["server #1"]
+    assert seen["count"] == "0 of 3"
+    again = observed(browser, site / "index.html", FILTER, fragment=seen["hash"])
+    assert again["start"] == ["server #1"]  # the address keeps what was asked for
+    seen = observed(browser, site / "runs" / "later" / "index.html", FILTER.replace("SERVER", "proxqp OFFLINE"))
+    cells = read_table(site / "runs" / "later" / FILE, "cells")
+    chosen = cells[(cells["solver"] == "proxqp") & (cells["primal"] == "offline-pga")]
+    assert len(seen["start"]) == 18
+    assert sorted(seen["text"]) == sorted(key[:8] for key in chosen["cell"])
 
 
 FILTER = """
@@ -123,27 +130,7 @@ FILTER = """
 """
 
 
-def test_filters_of_the_list_of_runs_filter(site: Path, browser: Chrome) -> None:
-    seen = observed(browser, site / "index.html", FILTER)
-    everything = ["here", "server #1", "later"]
-    assert (seen["start"], seen["said"]) == (everything, "3 of 3")
-    assert seen["osqp"] == ["here", "later"]
-    assert seen["both"] == seen["none"] == []
-    assert seen["machine"] == seen["text"] == ["server #1"]
-    assert seen["count"] == "0 of 3"
-    again = observed(browser, site / "index.html", FILTER, fragment=seen["hash"])
-    assert again["start"] == ["server #1"]  # the address keeps what was asked for
-
-
-def test_filters_of_cells_filter(site: Path, browser: Chrome) -> None:
-    seen = observed(browser, site / "runs" / "later" / "index.html", FILTER.replace("SERVER", "proxqp OFFLINE"))
-    cells = read_table(site / "runs" / "later" / FILE, "cells")
-    chosen = cells[(cells["solver"] == "proxqp") & (cells["primal"] == "offline-pga")]
-    assert len(seen["start"]) == 18
-    assert sorted(seen["text"]) == sorted(key[:8] for key in chosen["cell"])
-
-
-def test_a_run_has_its_report_its_data_and_where_it_comes_from(site: Path, three: list[Path]) -> None:
+def test_runs_have_data_commands(site: Path, three: list[Path], main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
     own = site / "runs" / "server-1"
     assert (own / "report.html").read_text(encoding="utf-8") == REPORT
     for name in ("cells", "queries", "thresholds", "timings", "solutions", "pictures"):
@@ -156,23 +143,6 @@ def test_a_run_has_its_report_its_data_and_where_it_comes_from(site: Path, three
     assert (known["cells"], known["seed"], known["machines"]) == (12, 2022, ["a server, 64 cores"])
     assert known["versions"]["numpy"] in json.loads(row["versions"]).values()
     assert len(pd.read_csv(own / "tables" / "cells.csv")) == 12
-
-
-def test_every_row_has_the_command_that_makes_it_again(site: Path, main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
-    own = site / "runs" / "server-1"
-    page = (own / "index.html").read_text(encoding="utf-8")
-    commands = re.findall(r"<code>vibench (run results.sqlite --cell (\w+) --out again)</code>", page)
-    assert [key for _, key in commands] == list(in_order(read_table(own / FILE, "cells"))["cell"])
-    monkeypatch.chdir(own)
-    command, key = commands[5]
-    code, out, err = main(*command.split(), "--dry-run")
-    assert (code, err) == (0, "")
-    assert out.startswith(f"{key}  ")
-
-
-def test_requirements_are_the_versions_recorded_and_nothing_that_pip_would_act_on(
-    site: Path, three: list[Path]
-) -> None:
     text = (site / "runs" / "here" / "requirements.txt").read_text()
     versions = json.loads(read_table(three[0], "cells")["versions"].iloc[0])
     assert f"numpy=={versions['numpy']}\n" in text
@@ -185,9 +155,18 @@ def test_requirements_are_the_versions_recorded_and_nothing_that_pip_would_act_o
     assert not any("evil" in line or "passwd" in line for line in lines)
     assert any(line.startswith("# left out: 3 that") for line in lines)
     assert "osqp==1.0\n" in requirements({"osqp": "1.0"}, "")
+    own = site / "runs" / "server-1"
+    page = (own / "index.html").read_text(encoding="utf-8")
+    commands = re.findall(r"<code>vibench (run results.sqlite --cell (\w+) --out again)</code>", page)
+    assert [key for _, key in commands] == list(in_order(read_table(own / FILE, "cells"))["cell"])
+    monkeypatch.chdir(own)
+    command, key = commands[5]
+    code, out, err = main(*command.split(), "--dry-run")
+    assert (code, err) == (0, "")
+    assert out.startswith(f"{key}  ")
 
 
-def test_every_run_has_a_leaderboard_with_ties_and_links_its_cells(site: Path, three: list[Path]) -> None:
+def test_leaderboards_have_ties_and_runs_of_one_study_are_compared(site: Path, three: list[Path]) -> None:
     """Seconds of several runs are not compared: other work on the machine would win."""
     page = (site / "leaderboard.html").read_text(encoding="utf-8")
     sections = page.split("<section>")[1:]
@@ -205,9 +184,6 @@ def test_every_run_has_a_leaderboard_with_ties_and_links_its_cells(site: Path, t
         assert [int(text) for text in shown] == ties
         assert "<td>fastest query</td>" in section
         assert "<td>mixed</td>" in section
-
-
-def test_runs_of_one_study_are_compared(site: Path) -> None:
     page = (site / "comparison.html").read_text(encoding="utf-8")
     changes = pd.read_csv(site / "comparison-1.csv")
     assert {"server #1", "later"} == set(changes["run"])
@@ -258,9 +234,7 @@ def test_a_citation_is_valid_and_its_texts_are_data(site: Path) -> None:
             Citation("a", date=text)
 
 
-def test_a_label_is_no_markup_on_any_page(
-    site: Path, changed: Changed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_label_is_no_markup(site: Path, changed: Changed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(html, "page", lambda *_, **__: REPORT)
     label = "</script><script>alert(1)</script><img src=x onerror=alert(1)>' onclick='x"
     quoted = label.replace("'", "''") + "' || char(27) || '"
@@ -313,15 +287,12 @@ def test_a_file_that_somebody_changed_or_put_there_is_not_replaced(small: Path, 
     assert not (small / "runs" / "later").exists()
 
 
-def test_links_in_a_site_are_not_followed(small: Path, three: list[Path], tmp_path: Path) -> None:
+def test_links_and_lists_that_cannot_be_trusted_are_refused(small: Path, three: list[Path], tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (small / "runs" / "later").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(RequestError, match="later' is a symbolic link"):
         publish(three, small, CITATION)
     assert list((tmp_path / "elsewhere").iterdir()) == []
-
-
-def test_a_list_of_files_that_cannot_be_trusted_is_refused(small: Path, three: list[Path]) -> None:
     outside = ('{"files": {"../../outside": ["x"]}}', '{"files": {"/etc/hostname": []}}')
     for catalogue in ("", "[]", '{"files": 3}', *outside):
         folder.catalogue(small).write_text(catalogue)
@@ -329,7 +300,7 @@ def test_a_list_of_files_that_cannot_be_trusted_is_refused(small: Path, three: l
             publish(three[:1], small, CITATION)
 
 
-def test_a_folder_of_others_is_refused(three: list[Path], main: Main, tmp_path: Path) -> None:
+def test_a_command_writes_sites(three: list[Path], main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("all of it")
     refused(main("publish", "--yes", str(three[0]), str(tmp_path / "mine")), "mine", "not written by `vibench publish`")
@@ -338,11 +309,6 @@ def test_a_folder_of_others_is_refused(three: list[Path], main: Main, tmp_path: 
     refused(main("publish", "--yes", "nowhere", str(tmp_path / "new")), "no results in 'nowhere'")
     refused(main("publish", "--yes", str(three[0]), str(tmp_path / "new"), "--doi", "abc"), "no DOI")
     assert not (tmp_path / "new").exists()
-
-
-def test_the_command_writes_a_site(
-    three: list[Path], main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setattr(html, "page", lambda *_, **__: REPORT)
     arguments = ("--title", "Ours", "--author", "Doe, Jane", "--url", "https://example.org/", "--date", "2026-11-26")
     code, out, err = main("publish", "--yes", *map(str, three[:2]), str(tmp_path / "new" / "site"), *arguments)

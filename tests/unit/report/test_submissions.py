@@ -44,9 +44,24 @@ def again(script: ModuleType, site: Path, tmp_path_factory: pytest.TempPathFacto
     return script.published_again(site, tmp_path_factory.mktemp("again"))
 
 
-def test_of_a_good_site_nothing_is_wrong(script: ModuleType, site: Path, again: Path) -> None:
+def test_every_alteration_of_a_good_site_is_named(script: ModuleType, site: Path, again: Path, copied: Path) -> None:
     assert list(script.differences(site, again)) == []
     assert list(script.of_run(again / "runs" / "quick" / FILE)) == []
+    for name, alter in ALTERED.items():
+        text = (copied / name).read_bytes().decode("latin-1")
+        assert alter(text) != text, name
+        (copied / name).write_bytes(alter(text).encode("latin-1"))
+        changed = f"{name} is not what the results files give"
+        digests = "vibench-site.json has other digests than the files"
+        assert list(script.differences(copied, again)) == [changed, digests]
+        (copied / name).write_bytes(text.encode("latin-1"))
+    (copied / "publication.json").unlink()
+    (copied / "extra.js").touch()
+    (copied / "index.html").unlink()
+    (copied / "index.html").symlink_to("/etc/passwd")
+    assert {line.partition(" ")[0] for line in script.differences(copied, again)} == {
+        "publication.json", "extra.js", "index.html", "vibench-site.json",
+    }  # fmt: skip
 
 
 OF_RUN = "runs/quick/"
@@ -68,36 +83,21 @@ ALTERED = {
 }  # fmt: skip
 
 
-def test_every_alteration_of_a_file_is_named(script: ModuleType, copied: Path, again: Path) -> None:
-    for name, alter in ALTERED.items():
-        text = (copied / name).read_bytes().decode("latin-1")
-        assert alter(text) != text, name
-        (copied / name).write_bytes(alter(text).encode("latin-1"))
-        changed = f"{name} is not what the results files give"
-        assert list(script.differences(copied, again)) == [
-            changed,
-            "vibench-site.json has other digests than the files",
-        ]
-        (copied / name).write_bytes(text.encode("latin-1"))
-    (copied / "publication.json").unlink()
-    (copied / "extra.js").touch()
-    (copied / "index.html").unlink()
-    (copied / "index.html").symlink_to("/etc/passwd")
-    assert {line.partition(" ")[0] for line in script.differences(copied, again)} == {
-        "publication.json", "extra.js", "index.html", "vibench-site.json",
-    }  # fmt: skip
-
-
-def test_what_may_differ_is_not_named(script: ModuleType) -> None:
+def test_what_may_differ_is_not_named_and_other_protocols_are(script: ModuleType, quick_run: Path) -> None:
     pages, files = (script.MAY_DIFFER[name] for name in ("report.html", FILE))
     assert re.sub(pages, b"", b'<img src="data:image/webp;base64,aB+/=" width="9" height="8" a') == b'<img src="" a'
     header = bytes(range(1, 120))
     assert re.sub(files, b"", header) == header[:24] + header[28:40] + header[44:92] + header[100:]
+    cells, queries = (read_table(quick_run / FILE, name) for name in ("cells", "queries"))
+    earlier = cells.assign(versions=cells["versions"].str.replace(f'"protocol": "{PROTOCOL}"', '"protocol": "0"'))
+    assert any(f"protocol 0, expected {PROTOCOL}" in line for line in script.of_cells(earlier))
+    assert any("never timed" in line for line in script.of_cells(cells.assign(timing_rounds=0)))
+    kinds = cells.set_index("cell")["enrichment_kind"]
+    assert any("dual_residual" in line for line in script.of_queries(queries.assign(dual_residual=1.0), kinds))
+    assert list(script.of_queries(queries, kinds)) == []
 
 
-def test_what_cannot_be_published_again_is_one_line(
-    script: ModuleType, copied: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_not_published_is_a_line(script: ModuleType, copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, content, said in (
         (f"{OF_RUN}{FILE}", "nothing", "is not a results file of vibench"),
         ("publication.json", '{"vibench": "9"}', "published by vibench 9, expected"),
@@ -108,13 +108,3 @@ def test_what_cannot_be_published_again_is_one_line(
             script.main(str(copied))
         (line,) = capsys.readouterr().out.splitlines()
         assert said in line
-
-
-def test_another_protocol_and_residuals_above_the_accuracy_are_named(script: ModuleType, quick_run: Path) -> None:
-    cells, queries = (read_table(quick_run / FILE, name) for name in ("cells", "queries"))
-    earlier = cells.assign(versions=cells["versions"].str.replace(f'"protocol": "{PROTOCOL}"', '"protocol": "0"'))
-    assert any(f"protocol 0, expected {PROTOCOL}" in line for line in script.of_cells(earlier))
-    assert any("never timed" in line for line in script.of_cells(cells.assign(timing_rounds=0)))
-    kinds = cells.set_index("cell")["enrichment_kind"]
-    assert any("dual_residual" in line for line in script.of_queries(queries.assign(dual_residual=1.0), kinds))
-    assert list(script.of_queries(queries, kinds)) == []

@@ -108,7 +108,7 @@ def pairs(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
 EVERY = [cell("none", "none"), cell("varying", "per-parameter", online_s=0.5), cell("fixed", "fixed", offline_s=30.0)]
 
 
-def test_enrichments_are_compared_with_the_high_fidelity_model_and_every_pair_of_their_kinds() -> None:
+def test_enrichments_are_compared_with_the_high_fidelity_model_and_pairs_of_their_kinds() -> None:
     rows = [row for row in compared(EVERY) if row["primal_a"] == "high-fidelity"]
     assert [row["primal_b"] for row in rows] == ["none", "varying", "fixed"]
     for row in rows:
@@ -126,6 +126,14 @@ def test_enrichments_are_compared_with_the_high_fidelity_model_and_every_pair_of
     assert {(row["primal_a"], row["primal_tol_b"]) for row in rows} == {
         (name, tolerance) for name in ("v0", "v1") for tolerance in (0.5, 0.1, 0.01)
     }
+    fixed, unanswered = cell("fixed", "fixed"), [cell("varying", "per-parameter", online_s=None)]
+    assert pairs(compared([*unanswered, fixed, cell("fixed", "fixed", online_s=None)])) == [("high-fidelity", "fixed")]
+    assert compared([]) == []
+    rows = compared(EVERY)
+    keys = {one["primal"]: one["cell"] for one in EVERY}
+    assert all(row["cell_b"] == keys[row["primal_b"]] for row in rows)
+    assert {row["cell_a"] for row in rows} == {None, keys["varying"]}
+    assert all(set(row) == set(STORED["thresholds"]) for row in rows)
 
 
 SHARED: Mapping[str, Any] = {
@@ -134,10 +142,14 @@ SHARED: Mapping[str, Any] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("column", SHARED)
-def test_only_like_is_compared_with_like(column: str) -> None:
-    cells = [cell("varying", "per-parameter"), cell("fixed", "fixed", **{column: SHARED[column]})]
-    assert ("varying", "fixed") not in pairs(compared(cells))
+def test_only_like_is_compared_with_like_but_of_another_assembly() -> None:
+    for column, other in {**SHARED, "machine": "there"}.items():
+        cells = [cell("varying", "per-parameter", machine="here"), cell("fixed", "fixed", machine="here")]
+        assert ("varying", "fixed") in pairs(compared(cells))
+        assert ("varying", "fixed") not in pairs(compared([cells[0], cells[1] | {column: other}])), column
+    cells = [cell("varying", "per-parameter", assembly="full"), cell("fixed", "fixed", assembly="reduced")]
+    (row,) = [row for row in compared(cells) if row["primal_a"] == "varying"]
+    assert (row["assembly_a"], row["assembly_b"]) == ("full", "reduced")
 
 
 def of(formulation: str, **columns: Any) -> dict[str, Any]:
@@ -149,7 +161,7 @@ def of_formulations(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [row for row in rows if row["cell_a"] is not None and row["formulation_a"] != row["formulation_b"]]
 
 
-def test_formulations_are_compared_with_the_mixed_program_and_certified_queries_with_certified_ones() -> None:
+def test_formulations_are_compared_with_mixed_programs_of_any_group_and_certified_with_certified() -> None:
     cells = [cell("fixed", "fixed"), of("penalty", offline_s=12.0, online_s=0.05), of("local", online_s=0.2)]
     rows = of_formulations(compared(cells))
     assert [(row["formulation_a"], row["formulation_b"]) for row in rows] == [("mixed", "penalty"), ("mixed", "local")]
@@ -157,9 +169,20 @@ def test_formulations_are_compared_with_the_mixed_program_and_certified_queries_
     assert rows[0]["benefit_threshold"] == pytest.approx((12.0 - 10.0) / (0.1 - 0.05))
     assert [row["meaning"] for row in rows] == ["from", "never"]
     assert {row["formulation_a"] for row in compared(cells) if row["cell_a"] is None} == {"mixed"}
+    for column in ("problem", "training", "validation", "machine", "correction", "dual", "solver"):
+        assert not of_formulations(compared([cells[0], of("penalty", **{column: "other"})])), column
     cells = [cell("fixed", "fixed", assembly="reduced", bounds=bounds) for bounds in (0, 1)]
     rows = of_formulations(compared([*cells, of("penalty", assembly="reduced"), of("local", bounds=1)]))
     assert [(row["bounds_a"], row["formulation_b"]) for row in rows] == [(0, "penalty"), (1, "local")]
+    cells = [cell("fixed", "fixed"), cell("fixed", "none", formulation="f", online_s=0.05, offline_s=12.0) | NO_CONE]
+    timings = rounds(cells)
+    for row in timings:
+        if row["cell"] == cells[1]["cell"]:  # timed later, on a machine of half the speed
+            row |= {"block": f"later {row['block']}", "total_s": 2 * row["total_s"], "hf_s": 2 * row["hf_s"]}
+    (row,) = of_formulations(list(break_even_rows(cells, timings)))
+    assert row["gain"] == pytest.approx(2.0)
+    assert (row["online_a_s"], row["online_b_s"]) == (pytest.approx(0.1), pytest.approx(0.05))
+    assert row["benefit_threshold"] == pytest.approx((12.0 - 10.0) / (0.1 - 0.05))
 
 
 NO_CONE: Mapping[str, Any] = {"dual": "–", "dual_options": "{}", "dual_tol": None, "dual_size": None}
@@ -183,43 +206,6 @@ def test_a_formulation_is_compared_over_the_axes_that_it_lacks(axis: str) -> Non
     assert [row["primal_a"] for row in rows] == [one["primal"] for one in (*mixed, mixed[0])]
 
 
-@pytest.mark.parametrize("column", ["problem", "training", "validation", "machine", "correction", "dual", "solver"])
-def test_a_formulation_is_compared_with_nothing_unlike(column: str) -> None:
-    cells = [cell("fixed", "fixed"), of("penalty", **{column: "other"})]
-    assert not of_formulations(compared(cells))
-
-
-def test_formulations_are_compared_with_the_mixed_program_of_another_group_by_the_high_fidelity_model() -> None:
-    cells = [cell("fixed", "fixed"), cell("fixed", "none", formulation="f", online_s=0.05, offline_s=12.0) | NO_CONE]
-    timings = rounds(cells)
-    for row in timings:
-        if row["cell"] == cells[1]["cell"]:  # timed later, on a machine of half the speed
-            row |= {"block": f"later {row['block']}", "total_s": 2 * row["total_s"], "hf_s": 2 * row["hf_s"]}
-    (row,) = of_formulations(list(break_even_rows(cells, timings)))
-    assert row["gain"] == pytest.approx(2.0)
-    assert (row["online_a_s"], row["online_b_s"]) == (pytest.approx(0.1), pytest.approx(0.05))
-    assert row["benefit_threshold"] == pytest.approx((12.0 - 10.0) / (0.1 - 0.05))
-
-
-def test_another_assembly_may_be_compared_but_not_another_machine() -> None:
-    cells = [cell("varying", "per-parameter", assembly="full"), cell("fixed", "fixed", assembly="reduced")]
-    (row,) = [row for row in compared(cells) if row["primal_a"] == "varying"]
-    assert (row["assembly_a"], row["assembly_b"]) == ("full", "reduced")
-    cells = [cell("varying", "per-parameter", machine="here"), cell("fixed", "fixed", machine="there")]
-    assert ("varying", "fixed") not in pairs(compared(cells))
-
-
-def test_cells_without_an_answer_are_left_out_and_rows_fit_the_table() -> None:
-    fixed, unanswered = cell("fixed", "fixed"), [cell("varying", "per-parameter", online_s=None)]
-    assert pairs(compared([*unanswered, fixed, cell("fixed", "fixed", online_s=None)])) == [("high-fidelity", "fixed")]
-    assert compared([]) == []
-    rows = compared(EVERY)
-    keys = {one["primal"]: one["cell"] for one in EVERY}
-    assert all(row["cell_b"] == keys[row["primal_b"]] for row in rows)
-    assert {row["cell_a"] for row in rows} == {None, keys["varying"]}
-    assert all(set(row) == set(STORED["thresholds"]) for row in rows)
-
-
 def the_one(cells: list[dict[str, Any]], timings: list[dict[str, Any]]) -> dict[str, Any]:
     """The comparison of the two cells with each other."""
     (row,) = [row for row in break_even_rows(cells, timings) if row["primal_a"] != "high-fidelity"]
@@ -235,7 +221,7 @@ def noisy(a: float, b: float, noise: float, count: int = 24, **of_b: Any) -> dic
     return the_one(cells, timings)
 
 
-def test_a_difference_within_the_noise_is_undecided_or_offline_seconds_too_close() -> None:
+def test_differences_within_the_noise_or_of_one_block_are_undecided() -> None:
     """Both signs are possible: neither "from" nor "never" would repeat itself in another run."""
     row = noisy(0.100, 0.092, noise=0.4)
     assert (row["meaning"], row["benefit_threshold"], row["threshold_high"]) == ("undecided", None, None)
@@ -246,9 +232,9 @@ def test_a_difference_within_the_noise_is_undecided_or_offline_seconds_too_close
         assert (decided["meaning"], decided["rounds_missing"]) == (meaning, None)
     row = noisy(0.200, 0.100, noise=0.01, offline_low_s=4.0, offline_high_s=36.0)
     assert (row["meaning"], row["rounds_missing"]) == ("undecided", None)
-
-
-def test_the_formula_holds_for_the_printed_columns() -> None:
+    for count, meaning in ((1, "undecided"), (4, "undecided"), (8, "from")):  # a block has four rounds
+        row = noisy(0.2, 0.1, noise=0.0, count=count)
+        assert (row["meaning"], row["benefit_threshold"] is None) == (meaning, meaning == "undecided")
     row = noisy(0.200, 0.100, noise=0.05)
     dearer, faster = row["offline_b_s"] - row["offline_a_s"], row["online_a_s"] - row["online_b_s"]
     assert row["benefit_threshold"] == pytest.approx(dearer / faster)
@@ -257,7 +243,7 @@ def test_the_formula_holds_for_the_printed_columns() -> None:
     assert row["threshold_low"] < row["benefit_threshold"] < row["threshold_high"]
 
 
-def test_disturbances_of_rounds_and_differences_between_blocks_are_the_same_for_both_models() -> None:
+def test_rounds_that_both_have_are_compared_whatever_disturbs_them() -> None:
     """Rounds in which everything takes up to four times as long leave the ratio as exact as it is."""
     cells = [cell("varying", "per-parameter", online_s=0.2), cell("fixed", "fixed", online_s=0.100, offline_s=12.0)]
     timings = rounds(cells)
@@ -274,9 +260,16 @@ def test_disturbances_of_rounds_and_differences_between_blocks_are_the_same_for_
     row = the_one(cells, timings)
     assert (row["gain_low"], row["gain_high"]) == pytest.approx((1.01 / OTHER_RUNS, 1.01 * OTHER_RUNS), rel=1e-3)
     assert (row["meaning"], row["benefit_threshold"], row["threshold_low"]) == ("as fast", None, None)
+    # Whose comparisons are decided is timed no more; the machine may be another afterwards.
+    cells = [cell("varying", "per-parameter", online_s=0.2), cell("fixed", "fixed", online_s=0.1, offline_s=12.0)]
+    timings = [row for row in rounds(cells) if row["round"] < 8 or row["cell"] == cells[1]["cell"]]
+    for row in timings:
+        row["total_s"] *= 5.0 if row["round"] >= 8 else 1.0
+    row = the_one(cells, timings)
+    assert (row["online_a_s"], row["online_b_s"], row["gain"]) == pytest.approx((0.2, 0.1, 2.0))
 
 
-def test_what_another_run_may_reverse_is_as_fast_if_it_is_small() -> None:
+def test_what_another_run_may_reverse_is_as_fast_and_intervals_overlap() -> None:
     """A gain whose interval lies between 1/1.25 and 1.25 is decided: no number of queries is claimed."""
     for gain, noise, meaning in (
         (1.0, 1e-3, "as fast"), (1.08, 1e-3, "as fast"), (1 / 1.08, 1e-3, "as fast"), (1.15, 1e-3, "from"),
@@ -289,26 +282,17 @@ def test_what_another_run_may_reverse_is_as_fast_if_it_is_small() -> None:
         assert within or meaning != "as fast"
         exchanged = {"from": "never", "never": "from"}
         assert noisy(0.1, 0.1 * gain, noise)["meaning"] == exchanged.get(meaning, meaning)
+    one = BreakEven(115.0, Meaning.FROM, 100.0, 130.5)
+    for other, overlap in (
+        (BreakEven(120.0, Meaning.FROM, 110.0, 130.0), True), (BreakEven(140.0, Meaning.FROM, 131.0, 150.0), False),
+        (BreakEven(120.0, Meaning.UNTIL, 110.0, 130.0), False),
+        (BreakEven(None, Meaning.UNDECIDED, 110.0, None), False),
+    ):  # fmt: skip
+        assert one.overlaps(other) is overlap
+        assert other.overlaps(one) is overlap
 
 
-def test_only_blocks_that_both_have_are_compared() -> None:
-    """Whose comparisons are decided is timed no more; the machine may be another afterwards."""
-    cells = [cell("varying", "per-parameter", online_s=0.2), cell("fixed", "fixed", online_s=0.1, offline_s=12.0)]
-    timings = [row for row in rounds(cells) if row["round"] < 8 or row["cell"] == cells[1]["cell"]]
-    for row in timings:
-        row["total_s"] *= 5.0 if row["round"] >= 8 else 1.0
-    row = the_one(cells, timings)
-    assert (row["online_a_s"], row["online_b_s"], row["gain"]) == pytest.approx((0.2, 0.1, 2.0))
-
-
-@pytest.mark.parametrize(("count", "meaning"), [(1, "undecided"), (4, "undecided"), (8, "from")])
-def test_one_block_decides_nothing(count: int, meaning: str) -> None:
-    row = noisy(0.2, 0.1, noise=0.0, count=count)
-    assert row["meaning"] == meaning
-    assert (row["benefit_threshold"] is None) == (meaning == "undecided")
-
-
-def test_offline_seconds_are_as_uncertain_as_their_interval(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_offline_seconds_and_solutions_are_as_uncertain_as_they_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of those that both share nothing is uncertain."""
     cells = [cell("varying", "per-parameter", online_s=0.2), cell("fixed", "fixed", offline_s=12.0)]
     monkeypatch.setattr(paired_timing, "CONDITIONS", 0.0)
@@ -327,9 +311,6 @@ def test_offline_seconds_are_as_uncertain_as_their_interval(monkeypatch: pytest.
     row = the_one(alone, rounds(alone))
     assert row["meaning"] == "from"
     assert row["threshold_high"] == pytest.approx(row["threshold_low"], rel=0.3)
-
-
-def test_the_high_fidelity_model_is_as_uncertain_as_its_rounds() -> None:
     close = [cell("none", "none", online_s=1.7)]
     meanings = []
     for noise in (1e-4, 0.4):
@@ -338,14 +319,3 @@ def test_the_high_fidelity_model_is_as_uncertain_as_its_rounds() -> None:
             row["hf_s"] *= np.exp(noise * rng.standard_normal())
         meanings.append(next(break_even_rows(close, timings))["meaning"])
     assert meanings == ["from", "undecided"]
-
-
-def test_intervals_overlap_where_they_have_a_number_in_common() -> None:
-    one = BreakEven(115.0, Meaning.FROM, 100.0, 130.5)
-    for other, overlap in (
-        (BreakEven(120.0, Meaning.FROM, 110.0, 130.0), True), (BreakEven(140.0, Meaning.FROM, 131.0, 150.0), False),
-        (BreakEven(120.0, Meaning.UNTIL, 110.0, 130.0), False),
-        (BreakEven(None, Meaning.UNDECIDED, 110.0, None), False),
-    ):  # fmt: skip
-        assert one.overlaps(other) is overlap
-        assert other.overlaps(one) is overlap

@@ -137,7 +137,7 @@ def test_a_long_text_is_cut_and_json_is_not(journal: ResultsDatabase) -> None:
     assert len(row["reason"]) == 2 * LONGEST
 
 
-def test_a_name_that_looks_like_a_uri_is_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_like_uris_are_names_and_those_of_no_text_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("file:run", "file:run?mode=memory", "a%20b#c", ":memory:", "\udcff"):
         made = ResultsDatabase(Path(name), RECORDED)
@@ -146,9 +146,25 @@ def test_a_name_that_looks_like_a_uri_is_a_name(tmp_path: Path, monkeypatch: pyt
         assert read_meta(Path(name) / FILE)["schema"] == str(VERSION)
         assert (tmp_path / name / FILE).is_file()
     assert len(list(tmp_path.iterdir())) == 5
+    ResultsDatabase(tmp_path, RECORDED).close()
+    path = tmp_path / FILE
+    path.write_bytes(path.read_bytes().replace(b'"peak_memory_mib"', b'"\xa0eak_memory_mib"'))
+    assert "the columns of the table 'cells' are not those" in refusal(lambda: read_rows(path, "cells"))
+    assert "the columns of the table 'cells' are not those" in refusal(lambda: ResultsDatabase(tmp_path, RECORDED))
 
 
-def test_rewritten_cells_and_thresholds_replace_earlier_ones(journal: ResultsDatabase) -> None:
+def test_rewritten_cells_thresholds_and_histories_replace_earlier_ones(journal: ResultsDatabase) -> None:
+    history = {"artefact": "pod-1", "stage": "pod", "quantity": "error", "step": 0, "value": 1.0}
+    journal.write_histories([[history, history | {"step": 1, "value": 0.5}]])
+    journal.write_histories([[history | {"artefact": "pod-2", "pod_tol": 0.75}]])
+    # SQLite would take NumPy's integers for bytes
+    journal.write_histories([[history | {"value": np.int64(2)}]])
+    journal.write_cell(cell_row(N=np.int64(12)), query_rows(count=1, iterations=np.int32(7)))
+    assert (next(journal.rows("cells"))["N"], next(journal.rows("queries"))["iterations"]) == (12, 7)
+    with pytest.raises(sqlite3.Error):
+        journal.write_histories([[history | {"step": 1}, history | {"surprise": 1}]])
+    found = sorted((row["artefact"], row["step"], row["value"]) for row in journal.rows("histories"))
+    assert found == [("pod-1", 0, 2), ("pod-2", 0, 1.0)]
     journal.write_cell(cell_row("c1", status="error"), query_rows("c1", 4))
     journal.write_cell(cell_row("c2"), query_rows("c2", 2))
     journal.write_cell(cell_row("c1"), query_rows("c1", 1, gap=0.25))
@@ -161,32 +177,15 @@ def test_rewritten_cells_and_thresholds_replace_earlier_ones(journal: ResultsDat
     assert [row["benefit_threshold"] for row in journal.rows("thresholds")] == [4.0]
 
 
-def test_histories_replace_those_of_the_same_name_and_a_failing_write_leaves_them(journal: ResultsDatabase) -> None:
-    history = {"artefact": "pod-1", "stage": "pod", "quantity": "error", "step": 0, "value": 1.0}
-    journal.write_histories([[history, history | {"step": 1, "value": 0.5}]])
-    journal.write_histories([[history | {"artefact": "pod-2", "pod_tol": 0.75}]])
-    # SQLite would take NumPy's integers for bytes
-    journal.write_histories([[history | {"value": np.int64(2)}]])
-    journal.write_cell(cell_row(N=np.int64(12)), query_rows(count=1, iterations=np.int32(7)))
-    assert (next(journal.rows("cells"))["N"], next(journal.rows("queries"))["iterations"]) == (12, 7)
-    with pytest.raises(sqlite3.Error):
-        journal.write_histories([[history | {"step": 1}, history | {"surprise": 1}]])
-    found = sorted((row["artefact"], row["step"], row["value"]) for row in journal.rows("histories"))
-    assert found == [("pod-1", 0, 2), ("pod-2", 0, 1.0)]
-
-
-def test_results_of_another_study_or_schema_are_refused_and_left_as_they_were(
-    journal: ResultsDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_studies_are_refused(journal: ResultsDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = tmp_path / "run"
     journal.write_cell(cell_row(), query_rows())
     journal.close()
     before = (run / FILE).read_bytes()
     for key, value in (("name", "other"), ("seed", 2), ("validation", 5), ("accuracy", 1e-8)):
         line = refusal(lambda key=key, value=value: ResultsDatabase(run, RECORDED | {key: value}))
-        assert f"{run}" in line
-        assert "another study" in line
-        assert f"{key} {RECORDED[key]!r} instead of {value!r}" in line
+        for words in (f"{run}", "another study", f"{key} {RECORDED[key]!r} instead of {value!r}"):
+            assert words in line
     with monkeypatch.context() as patch:
         patch.setattr(module, "VERSION", VERSION + 1)
         line = refusal(lambda: ResultsDatabase(run, RECORDED))
@@ -213,14 +212,6 @@ def test_folders_and_files_that_cannot_be_made_are_refused(tmp_path: Path, monke
     line = refusal(lambda: ResultsDatabase(tmp_path / "run", RECORDED))
     assert "cannot be written" in line
     assert "locked" in line
-
-
-def test_a_name_of_a_column_that_is_no_text_is_damage(tmp_path: Path) -> None:
-    ResultsDatabase(tmp_path, RECORDED).close()
-    path = tmp_path / FILE
-    path.write_bytes(path.read_bytes().replace(b'"peak_memory_mib"', b'"\xa0eak_memory_mib"'))
-    assert "the columns of the table 'cells' are not those" in refusal(lambda: read_rows(path, "cells"))
-    assert "the columns of the table 'cells' are not those" in refusal(lambda: ResultsDatabase(tmp_path, RECORDED))
 
 
 def test_a_file_that_is_no_results_file_is_refused_unless_a_killed_run_left_it_empty(tmp_path: Path) -> None:
@@ -316,9 +307,7 @@ def without_privileges() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("ends", [("",), ("", "-wal"), ("", "-wal", "-shm")], ids=["alone", "log", "log and index"])
-def test_what_a_killed_run_left_is_read_in_a_folder_that_cannot_be_written(
-    ends: tuple[str, ...], database: ResultsDatabase, tmp_path: Path
-) -> None:
+def test_what_a_killed_run_left_is_readable(ends: tuple[str, ...], database: ResultsDatabase, tmp_path: Path) -> None:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as parent:
         folder = Path(parent) / "run"
         folder.mkdir()
@@ -336,7 +325,7 @@ def test_what_a_killed_run_left_is_read_in_a_folder_that_cannot_be_written(
         folder.chmod(0o755)
 
 
-def test_a_missing_file_is_not_made_and_that_of_another_application_not_damaged(tmp_path: Path) -> None:
+def test_files_that_are_missing_of_others_or_of_a_path_too_long_are_refused(tmp_path: Path) -> None:
     with pytest.raises(RequestError, match="unable to open"):
         read_meta(tmp_path / FILE)
     assert list(tmp_path.iterdir()) == []
@@ -345,17 +334,12 @@ def test_a_missing_file_is_not_made_and_that_of_another_application_not_damaged(
     with pytest.raises(RequestError) as caught:
         read_meta(tmp_path / FILE)
     assert not isinstance(caught.value, DamagedResultsError)
-
-
-def damage(path: Path) -> None:
-    """Overwrite the first page."""
-    with path.open("r+b") as file:
-        file.write(b"\xff" * 2000)
-
-
-def test_a_damaged_file_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match="has a path of 601 bytes, and SQLite opens none beyond 504"):
+        connect(Path(f"/{'d' * 600}/"), "ro")
+    (tmp_path / FILE).unlink()
     ResultsDatabase(tmp_path, STUDY).close()
-    damage(tmp_path / FILE)
+    with (tmp_path / FILE).open("r+b") as file:  # the first page is overwritten
+        file.write(b"\xff" * 2000)
     with pytest.raises(RequestError) as caught:
         ResultsDatabase(tmp_path, STUDY)
     assert "\n" not in str(caught.value)
@@ -375,18 +359,15 @@ def test_a_file_set_aside_takes_its_log_along(database: ResultsDatabase, tmp_pat
         assert list(anew.rows("cells")) == []
 
 
-def test_what_others_have_written_is_printable_when_it_is_read(journal: ResultsDatabase, tmp_path: Path) -> None:
+def test_text_is_printable_and_kept_once(journal: ResultsDatabase, tmp_path: Path) -> None:
     journal.write_cell(cell_row(), [])
     execute(tmp_path / "run", "UPDATE cells SET reason = CAST(x'411b5b324aff' AS TEXT), problem = 'a' || char(10)")
     with open_read_only(tmp_path / "run" / FILE) as db:
         assert db.execute("SELECT problem, reason FROM cells").fetchall() == [("a\\n", "A\\u001b[2J\ufffd")]
-
-
-def test_a_text_of_many_rows_is_kept_once_and_two_slashes_are_none(journal: ResultsDatabase, tmp_path: Path) -> None:
-    """The histories of a large study have tens of millions of texts, and hundreds that differ."""
+    # The histories of a large study have tens of millions of texts, and hundreds that differ.
     for key in ("one", "other"):
         journal.write_cell(cell_row(cell=key, reason="neither a letter nor a name"), [])
-    names, (one, other) = read_rows(tmp_path / "run" / FILE, "cells")
+    names, (_, one, other) = read_rows(tmp_path / "run" / FILE, "cells")
     reason = names.index("reason")
     assert one[reason] == "neither a letter nor a name"
     assert one[reason] is other[reason]
@@ -401,8 +382,3 @@ def test_other_columns_are_another_version() -> None:
     ]
     # the first digits of the digest of tables and columns, by version
     assert {VERSION: hashlib.sha256(repr(declared).encode()).hexdigest()[:4]} == {22: "6a41"}
-
-
-def test_a_path_that_sqlite_does_not_open_is_refused_with_its_length() -> None:
-    with pytest.raises(RequestError, match="has a path of 601 bytes, and SQLite opens none beyond 504"):
-        connect(Path(f"/{'d' * 600}/"), "ro")

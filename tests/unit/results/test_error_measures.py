@@ -79,13 +79,16 @@ BY_HAND = {
 }
 
 
-def test_break_even_is_beside_the_errors_of_an_output(path: Path) -> None:
+def test_break_even_is_beside_the_errors_of_an_output_and_of_sums(path: Path) -> None:
     found = vibench.open_run(path).break_even("output:contact force")
     numbers = found[["benefit_threshold", "error_a", "error_b"]].itertuples(index=False, name=None)
     rows = dict(zip(pairs_of(found), numbers, strict=True))
     assert rows.keys() == BY_HAND.keys()
     for pair, expected in BY_HAND.items():
         np.testing.assert_allclose(rows[pair], expected, rtol=1e-12)
+    columns = {name: column.meaning for table in STORED.values() for name, column in table.items()}
+    meanings = [columns[name] for name in columns if re.fullmatch(r"effectivity_(online_)?u(_energy)?(_median)?", name)]
+    assert ["of the sum with λ" in meaning for meaning in meanings] == [True] * 6
 
 
 def pairs_of(found: pd.DataFrame) -> list[tuple[str | None, str]]:
@@ -112,7 +115,7 @@ def test_only_models_that_are_accurate_enough_are_compared(path: Path, main: Mai
         assert {tuple(line.split(",")) for line in out.splitlines()[1:]} == shown
 
 
-def test_the_table_shows_selects_and_sorts_by_these_errors(path: Path, main: Main) -> None:
+def test_the_table_and_the_fastest_cells_are_those_of_the_measure(path: Path, main: Main) -> None:
     asked = ("show", str(path.parent), "--table", "benefits", "--error", "output:contact force")
     _, out, _ = main(*asked, "--format", "markdown")
     assert "error a" in out
@@ -121,9 +124,6 @@ def test_the_table_shows_selects_and_sorts_by_these_errors(path: Path, main: Mai
     assert main(*asked, *chosen) == (0, "primal_a,error_b\na,0.0002\nhigh-fidelity,0.0002\n", "")
     _, out, _ = main("show", str(path.parent), "--table", "benefits", "--format", "csv")
     assert "error_b" not in out
-
-
-def test_the_fastest_cells_are_those_of_the_measure(path: Path, main: Main) -> None:
     cells = pd.DataFrame([cell(name) for name in MODELS], columns=list(STORED["cells"]))
     outputs = pd.DataFrame([row for name in MODELS for row in outputs_of(name)])
     found = fastest(cells, errors_of(cells, outputs, "output:contact force"))
@@ -149,9 +149,3 @@ def test_no_measure_is_refused_and_a_pair_without_an_error_has_none(path: Path, 
     found = with_errors(thresholds, cells, pd.Series([np.nan, 0.5]))
     np.testing.assert_array_equal(found[["error_a", "error_b"]], [[0.0, 0.5], [np.nan, 0.5]])
     assert list(within(found, 0.5).index) == [0]
-
-
-def test_effectivities_of_u_are_described_as_those_of_a_sum_wherever_they_are_columns() -> None:
-    columns = {name: column.meaning for table in STORED.values() for name, column in table.items()}
-    meanings = [columns[name] for name in columns if re.fullmatch(r"effectivity_(online_)?u(_energy)?(_median)?", name)]
-    assert ["of the sum with λ" in meaning for meaning in meanings] == [True] * 6

@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import cells_of, row_of
 
-import vibench
+from vibench import open_run
 from vibench.errors import RequestError
 from vibench.results import formats, ranking
 from vibench.results.paired_timing import PairedTiming
@@ -31,24 +31,12 @@ def won(standings: Standings, criterion: Criterion) -> list[tuple[float, str]]:
     return [(error, str(winner.cell["cell"])) for error, winner in found if winner is not None]
 
 
-def test_the_fastest_query_is_named_for_every_band() -> None:
+def test_the_fastest_query_wins_its_band_or_the_high_fidelity_model_which_paces_machines() -> None:
     rows = row_of("a", 0.05, 0.1), row_of("b", 0.06, 0.2), row_of("c", 4e-3, 0.3), row_of("d", 3e-3, 0.25)
     (found,) = leaderboard(cells_of(*rows))
     assert won(found, Criterion.QUERY) == [(0.1, "a"), (0.01, "d")]
     assert [band.cells for band in found.bands] == [4, 2]
     assert won(found, Criterion.ERROR) == [(0.1, "d"), (0.01, "d")]
-
-
-def test_what_is_inexact_wins_nothing_and_what_is_unstable_is_marked() -> None:
-    """β over the span may vanish at a parameter although λ is unique in the queries: their errors are what counts."""
-    unstable = row_of("unstable", 1e-8, 1e-6, beta_span_min=1e-17, offline_s=1e-3)
-    inexact = row_of("inexact", 0.11, 1e-7, offline_s=1e-4)
-    (found,) = leaderboard(cells_of(row_of("right", 0.1, 0.4), unstable, inexact))
-    assert {name for criterion in Criterion for _, name in won(found, criterion)} == {"unstable"}
-    assert (found.cells, found.unstable, found.inexact, found.incomplete) == (3, 1, 1, 0)
-
-
-def test_the_high_fidelity_model_wins_where_no_query_is_faster_and_paces_every_machine() -> None:
     (found,) = leaderboard(cells_of(row_of("a", 0.05, 0.4, hf_s=0.5), row_of("b", 1e-3, 0.6, hf_s=0.5)))
     assert won(found, Criterion.QUERY) == [(0.1, "a"), (1e-3, "")]
     winner = found.bands[-1].winner(Criterion.QUERY)
@@ -56,34 +44,21 @@ def test_the_high_fidelity_model_wins_where_no_query_is_faster_and_paces_every_m
     assert (winner.cell["primal"], winner.value) == ("high-fidelity", pytest.approx(0.5))
     (found,) = leaderboard(cells_of(row_of("a", 0.05, 0.3, hf_s=1.0), row_of("b", 0.05, 0.2, hf_s=0.5)))
     assert won(found, Criterion.QUERY) == [(0.1, "a")]
+    rows = row_of("a", 0.05, 0.2), row_of("b", 0.05, 0.1, problem="bar"), row_of("c", 0.5, 0.1, problem="c")
+    found = leaderboard(cells_of(*rows))
+    assert [(one.problem, won(one, Criterion.QUERY)) for one in found] == [
+        ("box", [(0.1, "a")]), ("bar", [(0.1, "b")]), ("c", []),
+    ]  # fmt: skip
+    assert leaderboard(cells_of()) == ()
 
 
-def test_whose_interval_contains_no_difference_shares_the_place() -> None:
-    cells = cells_of(*(row_of(name, 0.05, online, hf_s=1.0) for name, online in (("a", 0.2), ("b", 0.201), ("c", 0.3))))
-    rng, timings = np.random.default_rng(0), []
-    for row in cells.to_dict("records"):
-        for k in range(12):
-            seconds = {"total_s": row["online_s"] * np.exp(0.02 * rng.standard_normal()), "hf_s": 1.0, "pace": 1.0}
-            timings.append({"cell": row["cell"], "block": str(k // 3)} | seconds)
-    (found,) = leaderboard(cells, PairedTiming(timings))
-    ties = {one.criterion: one.ties for one in found.bands[0].winners}
-    assert ties[Criterion.QUERY] == ("b",)
-    # errors are equal, and so are offline seconds, of which all phases are the same
-    assert ties[Criterion.ERROR] == ties[Criterion.OFFLINE] == ("b", "c")
-    (found,) = leaderboard(cells)
-    assert found.bands[0].winners[0].ties == ()  # nothing is known of the rounds
-
-
-def test_errors_that_differ_by_what_the_solver_makes_of_them_are_ties() -> None:
-    parts = {"solver_error_u_max": 1e-9, "solver_error_lambda_max": 1e-5}
-    rows = [row_of(name, error, 0.1, **parts) for name, error in (("a", 1.001e-2), ("b", 1e-2), ("c", 1.1e-2))]
-    (found,) = leaderboard(cells_of(*rows))
-    winner = found.bands[0].winner(Criterion.ERROR)
-    assert winner is not None
-    assert (winner.cell["cell"], winner.ties) == ("b", ("a",))
-
-
-def test_what_is_not_ok_or_too_loose_takes_no_part_and_constants_exclude_nobody() -> None:
+def test_what_wins_nothing_is_counted_and_constants_exclude_nobody() -> None:
+    """β over the span may vanish at a parameter although λ is unique in the queries: their errors are what counts."""
+    unstable = row_of("unstable", 1e-8, 1e-6, beta_span_min=1e-17, offline_s=1e-3)
+    inexact = row_of("inexact", 0.11, 1e-7, offline_s=1e-4)
+    (found,) = leaderboard(cells_of(row_of("right", 0.1, 0.4), unstable, inexact))
+    assert {name for criterion in Criterion for _, name in won(found, criterion)} == {"unstable"}
+    assert (found.cells, found.unstable, found.inexact, found.incomplete) == (3, 1, 1, 0)
     (found,) = leaderboard(
         cells_of(
             row_of("failed", 1e-9, 1e-9, status="inaccurate"), row_of("loose", 1e-3, 1e-9, solver_share_mean=0.5),
@@ -97,13 +72,26 @@ def test_what_is_not_ok_or_too_loose_takes_no_part_and_constants_exclude_nobody(
     assert won(found, Criterion.QUERY) == [(1e-3, "a")]
 
 
-def test_problems_are_apart_and_an_empty_table_has_none() -> None:
-    rows = row_of("a", 0.05, 0.2), row_of("b", 0.05, 0.1, problem="bar"), row_of("c", 0.5, 0.1, problem="c")
-    found = leaderboard(cells_of(*rows))
-    assert [(one.problem, won(one, Criterion.QUERY)) for one in found] == [
-        ("box", [(0.1, "a")]), ("bar", [(0.1, "b")]), ("c", []),
-    ]  # fmt: skip
-    assert leaderboard(cells_of()) == ()
+def test_differences_within_their_interval_or_the_work_of_solvers_are_ties() -> None:
+    cells = cells_of(*(row_of(name, 0.05, online, hf_s=1.0) for name, online in (("a", 0.2), ("b", 0.201), ("c", 0.3))))
+    rng, timings = np.random.default_rng(0), []
+    for row in cells.to_dict("records"):
+        for k in range(12):
+            seconds = {"total_s": row["online_s"] * np.exp(0.02 * rng.standard_normal()), "hf_s": 1.0, "pace": 1.0}
+            timings.append({"cell": row["cell"], "block": str(k // 3)} | seconds)
+    (found,) = leaderboard(cells, PairedTiming(timings))
+    ties = {one.criterion: one.ties for one in found.bands[0].winners}
+    assert ties[Criterion.QUERY] == ("b",)
+    # errors are equal, and so are offline seconds, of which all phases are the same
+    assert ties[Criterion.ERROR] == ties[Criterion.OFFLINE] == ("b", "c")
+    (found,) = leaderboard(cells)
+    assert found.bands[0].winners[0].ties == ()  # nothing is known of the rounds
+    parts = {"solver_error_u_max": 1e-9, "solver_error_lambda_max": 1e-5}
+    rows = [row_of(name, error, 0.1, **parts) for name, error in (("a", 1.001e-2), ("b", 1e-2), ("c", 1.1e-2))]
+    (found,) = leaderboard(cells_of(*rows))
+    winner = found.bands[0].winner(Criterion.ERROR)
+    assert winner is not None
+    assert (winner.cell["cell"], winner.ties) == ("b", ("a",))
 
 
 some = st.floats(1e-6, 0.49)
@@ -185,7 +173,7 @@ def raw(folder: Path) -> Raw:
 
 
 def test_the_winners_of_the_leaderboard_are_those_of_the_raw_rows(raw: Raw, folder: Path) -> None:
-    run = vibench.open_run(folder)
+    run = open_run(folder)
     checked = 0
     for standings in leaderboard(run.cells):
         mine = raw.problems()[standings.problem]
@@ -208,7 +196,7 @@ def test_the_winners_of_the_leaderboard_are_those_of_the_raw_rows(raw: Raw, fold
 
 @pytest.mark.parametrize("queries", [1, 100, 10**6])
 def test_the_cheapest_models_are_those_of_the_raw_rows(raw: Raw, folder: Path, queries: int) -> None:
-    found = vibench.open_run(folder).best(queries=queries, error=0.05)
+    found = open_run(folder).best(queries=queries, error=0.05)
     assert len(found) == len(raw.problems())
     for row in found.to_dict("records"):
         mine = [cell for cell in raw.cells if cell["problem"] == row["problem"] and raw.takes_part(cell)]
@@ -241,14 +229,11 @@ def timed(cells: pd.DataFrame, noise: float = 0.0) -> PairedTiming:
 
 def model(name: str, offline: float, online: float, error: float = 1e-3) -> dict[str, Any]:
     phases = {f"offline_{phase}_s": 0.0 for phase in ("snapshots", "pod", "cone", "enrichment", "assembly")}
-    seconds = dict.fromkeys(("offline_s", "offline_low_s", "offline_high_s"), offline) | {
-        "hf_setup_s": 0.0,
-        "hf_s": 1.0,
-    }
-    return row_of(name, error, online, machine="m", **phases, **seconds)
+    seconds = dict.fromkeys(("offline_s", "offline_low_s", "offline_high_s"), offline)
+    return row_of(name, error, online, machine="m", hf_setup_s=0.0, hf_s=1.0, **phases, **seconds)
 
 
-def test_the_lower_envelope_of_total_costs() -> None:
+def test_the_lower_envelope_of_total_costs_and_models_that_may_be_as_cheap() -> None:
     """Until 10 queries the high-fidelity model is the cheapest, from 12 on a, from 101 on b, at small errors."""
     cells = cells_of(model("a", 10.0, 0.1), model("b", 18.04, 0.02), model("c", 1.0, 0.01, error=0.05))
     for queries, cell, begin, end in ((5, "", 0, 11), (50, "a", 12, 100), (500, "b", 101, math.inf)):
@@ -257,9 +242,6 @@ def test_the_lower_envelope_of_total_costs() -> None:
         assert (row["probability"], row["ties"]) == (1.0, 0)
     rows = cheapest(cells, timed(cells), 500)
     assert list(zip(rows["error_below"], rows["cell"], strict=True)) == [(0.1, "c"), (1e-3, "b")]
-
-
-def test_models_that_may_be_as_cheap_are_ties_and_nothing_is_sure() -> None:
     cells = cells_of(model("a", 10.0, 0.1), model("b", 10.0, 0.1001), model("c", 30.0, 0.1))
     (row,) = cheapest(cells, timed(cells, 0.05), 1000, within=1e-2).to_dict("records")
     assert row["cell"] in ("a", "b")
@@ -267,7 +249,7 @@ def test_models_that_may_be_as_cheap_are_ties_and_nothing_is_sure() -> None:
     assert 0.3 < row["probability"] < 0.98
 
 
-def test_certified_errors_are_means_of_relative_bounds() -> None:
+def test_certified_errors_are_means_of_bounds_of_the_model_itself() -> None:
     both = {"status": "ok", "error_lambda_natural": 0.5, "error_lambda_natural_absolute": 1.0}
     both |= {"error_u_energy": 0.1, "error_u_energy_absolute": 1.0}
     rows = [
@@ -276,16 +258,12 @@ def test_certified_errors_are_means_of_relative_bounds() -> None:
         {"cell": "b", **both, "bound_online_u_energy": None, "bound_online_lambda_natural": None},
         {"cell": "c", **both, "bound_online_u_energy": 5.0, "bound_online_lambda_natural": 1.0},
     ]
-    found = ranking.certified_errors(
-        pd.DataFrame(rows).assign(certificate=["certified", "certified", "none", "refuted"])
-    )
+    frame = pd.DataFrame(rows).assign(certificate=["certified", "certified", "none", "refuted"])
+    found = ranking.certified_errors(frame)
     assert "c" not in found
     assert found["a"] == pytest.approx(0.6)  # of ‖u‖ = 10, beside 0.5 of ‖λ‖ = 2
     assert np.isnan(found["b"])
-
-
-def test_the_certified_error_is_that_of_the_model_whichever_of_its_cells_is_the_cheapest() -> None:
-    """Not of the same model with another solver or corrected, whose solutions are others."""
+    # Not of the same model with another solver or corrected, whose solutions are others.
     plain = model("reduced", 10.0, 0.1) | {"model": "m1"}
     certified = model("certified", 12.0, 0.2) | {"model": "m1"}
     others = [
@@ -301,17 +279,14 @@ def test_the_certified_error_is_that_of_the_model_whichever_of_its_cells_is_the_
     assert pd.isna(row["certified_error"])
 
 
-def test_what_cannot_be_asked_is_refused(quick_run: Path) -> None:
+def test_best_is_json_for_programs_and_refuses_what_cannot_be_asked(quick_run: Path, vibench: Any) -> None:
     for asked, message in (
         ({"queries": -1}, "queries of Run.best is -1, expected a positive"),
         ({"queries": 10, "error": 0.0}, "error of Run.best is 0.0, expected a positive"),
         ({"error": 0.1}, "--within is for tables of break-even points, and for the table best with --queries"),
     ):
         with pytest.raises(RequestError, match=message):
-            vibench.open_run(quick_run).best(**asked)  # type: ignore[arg-type]
-
-
-def test_best_is_json_for_programs(quick_run: Path, vibench: Any) -> None:
+            open_run(quick_run).best(**asked)  # type: ignore[arg-type]
     done = vibench(quick_run.parent, "show", str(quick_run), "--table", "best", "--queries", "1000", "--format", "json")
     assert {"total_s", "probability", "cell"} <= set(json.loads(done.stdout)[0])
 

@@ -57,12 +57,9 @@ def measured(
                         seconds[model, one, k] = np.exp(level + noise) * slow[model]
             pace = paired_timing.paces(seconds.reshape(-1, ROUNDS))
             high_fidelity = paired_timing.beside(seconds[1], pace)
-            rows += [
-                {"cell": f"{group}-{one}", "block": f"{group}/{block}", "pace": pace[k]}
-                | {"total_s": seconds[0, one, k], "hf_s": high_fidelity * pace[k]}
-                for one in range(CELLS)
-                for k in range(ROUNDS)
-            ]
+            for one, k in np.ndindex(CELLS, ROUNDS):
+                paced = {"cell": f"{group}-{one}", "block": f"{group}/{block}", "pace": pace[k]}
+                rows.append(paced | {"total_s": seconds[0, one, k], "hf_s": high_fidelity * pace[k]})
     return rows, {f"{g}-{c}": truth[g, c] for g in range(groups) for c in range(CELLS)}
 
 
@@ -150,14 +147,11 @@ def test_intervals_of_break_even_include_the_noise_of_offline_seconds(kind: str,
     assert 0.92 <= np.mean(inside) <= 0.985
 
 
-def test_a_pace_is_how_much_slower_a_round_is_and_nobody_alone_makes_it() -> None:
+def test_blocks_have_medians_at_the_pace_of_their_rounds_which_nobody_alone_makes() -> None:
     seconds = np.array([[1.0, 2.0, 1.0, 1.0], [3.0, 6.0, 3.0, 3.0], [2.0, 4.0, 2.0, 200.0], [5.0, 10.0, 5.0, 5.0]])
     assert paired_timing.paces(seconds) == pytest.approx([1.0, 2.0, 1.0, 1.0])
     seconds[1, 2] = np.nan  # a round that was lost
     assert paired_timing.paces(seconds) == pytest.approx([1.0, 2.0, 1.0, 1.0])
-
-
-def test_a_block_has_the_median_of_its_rounds_at_their_pace_and_that_of_their_ratios() -> None:
     rows = [
         {"block": "b", "total_s": total * pace, "hf_s": hf * pace if hf else None, "pace": pace}
         for total, hf, pace in ((1.0, 4.0, 1.0), (1.0, 4.0, 3.0), (1.0, None, 1.0), (90.0, 9.0, 1.0))
@@ -165,9 +159,6 @@ def test_a_block_has_the_median_of_its_rounds_at_their_pace_and_that_of_their_ra
     (block,) = paired_timing.blocks_of(rows).values()
     assert np.exp(block) == pytest.approx([1.0, 0.25])
     assert np.exp(block.online - block.ratio) == pytest.approx(4.0)
-
-
-def test_solutions_of_a_block_count_alike_beside_every_model() -> None:
     pace = np.array([1.0, 2.0, 1.0])
     seconds = np.array([[4.0, 8.0, 4.0], [9.0, 18.0, 900.0], [np.nan] * 3])
     assert paired_timing.beside(seconds, pace) == pytest.approx(6.0)

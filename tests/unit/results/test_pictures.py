@@ -30,7 +30,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[tuple[str, Picture]
     return tuple(base.value_of(store, made))
 
 
-def test_solutions_at_corners_and_middle_of_the_parameters_are_shown(drawn: tuple[tuple[str, Picture], ...]) -> None:
+def test_solutions_at_corners_and_middle_are_read(drawn: tuple[tuple[str, Picture], ...], tmp_path: Path) -> None:
     assert [title for title, _ in drawn] == [
         "scale = 0.8, centre_x = -0.05 m, centre_y = -0.05 m",
         "scale = 1, centre_x = 0 m, centre_y = 0 m",
@@ -40,9 +40,6 @@ def test_solutions_at_corners_and_middle_of_the_parameters_are_shown(drawn: tupl
     assert middle.values.min() < -0.02  # the membrane hangs
     assert middle.multiplier.max() > 0.0  # and rests on the obstacle
     assert np.all(middle.multiplier >= 0.0)
-
-
-def test_pictures_read_back_are_those_written(drawn: tuple[tuple[str, Picture], ...], tmp_path: Path) -> None:
     journal = ResultsDatabase(tmp_path, {"name": "some"})
     for _ in range(2):  # a second run writes in place of the first
         journal.replace("pictures", [KEYS | row for row in pictures.picture_rows(drawn)], **KEYS)
@@ -56,9 +53,6 @@ def test_pictures_read_back_are_those_written(drawn: tuple[tuple[str, Picture], 
         assert np.array_equal(one.picture.triangles, picture.triangles)
         for name in ("points", "values", "positions", "multiplier"):
             np.testing.assert_allclose(getattr(one.picture, name), getattr(picture, name), rtol=1e-6, atol=1e-12)
-
-
-def test_a_picture_that_could_not_be_made_has_its_reason(tmp_path: Path) -> None:
     journal = ResultsDatabase(tmp_path, {"name": "some"})
     journal.replace("pictures", [KEYS | {"reason": "the camera broke"}], **KEYS)
     journal.close()

@@ -31,7 +31,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_condition_selects_rows(file: Path) -> None:
+def test_conditions_select_rows_and_whatever_else_is_refused_in_one_line(file: Path) -> None:
     for condition, rows in (
         ("solver = 'piqp' and beta_span_min < 1e-3", [0]),
         ("solver = 'piqp'", [0, 2]),  # in the order of the rows, not of an index
@@ -43,9 +43,6 @@ def test_a_condition_selects_rows(file: Path) -> None:
         ("solver != 'a; -- \"' and N + 1 > 9", [1, 2, 3]),
     ):
         assert [k for k, found in enumerate(matching(file, "cells", condition, FRAME)) if found] == rows
-
-
-def test_whatever_else_is_refused_in_one_line_and_changes_nothing(file: Path) -> None:
     for condition in (
         "", "solver =", "N > 1; DROP TABLE cells", "1) UNION SELECT 1 FROM meta WHERE (1", "1) OR (1", "(1",
         "cell IN (SELECT key FROM meta)", "EXISTS (SELECT 1)", "(SELECT 1)", "randomblob(1000000000) > 1",

@@ -62,13 +62,10 @@ def run(tmp_path: Path) -> Path:
     return tmp_path / "runs" / "sample"
 
 
-def test_a_run_is_found_by_folder_by_file_and_by_name(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_are_found_or_refused(run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert (results_file(str(run)), results_file(str(run / FILE))) == (run / FILE, run / FILE)
     monkeypatch.chdir(run.parent.parent)
     assert results_file("sample").resolve() == run / FILE
-
-
-def test_no_results_file_of_this_schema_is_refused(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(RequestError, match=r"no results in '.*nothing'.*results\.sqlite"):
         results_file(str(tmp_path / "nothing"))
     (tmp_path / FILE).write_text("hello")
@@ -79,7 +76,7 @@ def test_no_results_file_of_this_schema_is_refused(run: Path, tmp_path: Path, mo
         results_file(str(run))
 
 
-def test_tables_are_read_with_all_their_columns_and_nothing_is_changed(run: Path) -> None:
+def test_tables_are_read_whole_and_exported_in_order_with_every_digit(run: Path, tmp_path: Path) -> None:
     before, names = (run / FILE).read_bytes(), sorted(path.name for path in run.iterdir())
     for table in TABLES:
         frame = read_table(run / FILE, table)
@@ -88,9 +85,6 @@ def test_tables_are_read_with_all_their_columns_and_nothing_is_changed(run: Path
     with pytest.raises(RequestError, match="cannot be read: no such table"):
         read_table(run / FILE, "cells; DELETE FROM cells")
     assert ((run / FILE).read_bytes(), sorted(path.name for path in run.iterdir())) == (before, names)
-
-
-def test_everything_is_exported_in_order_with_every_digit(run: Path, tmp_path: Path) -> None:
     files = export(run / FILE, tmp_path / "out" / "tables")
     names = [*(f"{table}.csv" for table in TABLES), "summary.md"]
     assert [path.name for path in files] == names
@@ -173,7 +167,7 @@ def rounds(cells: list[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def test_the_benefits_say_from_when_on_a_strategy_pays() -> None:
+def test_values_are_printed_with_three_digits_and_the_benefits_say_from_when_on_a_strategy_pays() -> None:
     a = CELL | {"cell": "a", "enrichment_kind": "per-parameter", "primal": "varying", "online_s": 0.004, "hf_s": 0.1}
     b = CELL | {"cell": "b", "enrichment_kind": "fixed", "primal": "fixed", "offline_s": 2.5, "hf_s": 0.1}
     frame = break_even_table(pd.DataFrame(break_even_rows([a, b], rounds([a, b])), columns=list(STORED["thresholds"])))
@@ -190,9 +184,6 @@ def test_the_benefits_say_from_when_on_a_strategy_pays() -> None:
     assert break_even_table(pd.DataFrame(columns=list(STORED["thresholds"]))).empty
     for columns in (STORED["cells"], STORED["queries"], STORED["histories"]):
         assert in_order(pd.DataFrame(columns=list(columns))).empty
-
-
-def test_values_are_printed_with_three_digits() -> None:
     for value, text in (
         (3, "3"), (3.0, "3"), (0.0, "0"), (0.123456, "0.123"), (1234567.0, "1.23e+06"), (1e-7, "1e-07"), (None, ""),
         (float("nan"), ""), (pd.NA, ""), (np.float64(2.5), "2.5"), (np.int64(4), "4"), ("word", "word"), ("", ""),
@@ -201,7 +192,7 @@ def test_values_are_printed_with_three_digits() -> None:
         assert cell_text(value) == text
 
 
-def test_csv_quotes_what_it_must_and_leaves_numbers_alone() -> None:
+def test_csv_quotes_what_it_must_leaves_numbers_alone_and_has_no_formulas() -> None:
     frame = pd.DataFrame({"name": ["a,b", 'c"d', "e\nf"], "value": [1.0 / 3.0, None, 1e-300]})
     header, *rows = csv.reader(io.StringIO(to_csv(frame)))
     assert header == ["name", "value"]
@@ -212,9 +203,14 @@ def test_csv_quotes_what_it_must_and_leaves_numbers_alone() -> None:
     _, *rows = csv.reader(io.StringIO(to_csv(pd.DataFrame(values))))
     assert [row for row, _ in rows] == ["-1.5", "inf", "-inf", ""]
     assert [row for _, row in rows] == ["-1.5", "+2", "-1e-7", "-inf"]
+    # As OWASP advises: spreadsheets take what begins with these characters for a formula, an apostrophe for text.
+    for text in ("=1+1", "+1+1", "-1+1", "@SUM(1)", "\n=1", "＝1+1", "=HYPERLINK(1)", "-2+cmd|a!A0"):
+        frame = pd.read_csv(io.StringIO(to_csv(pd.DataFrame({"name": [text], text: [f"a {text}"]}))))
+        assert list(frame.columns) == ["name", f"'{text}"]
+        assert frame.iloc[0].tolist() == [f"'{text}", f"a {text}"]
 
 
-def test_markdown_has_a_line_per_row_whatever_would_end_a_cell() -> None:
+def test_markdown_has_a_line_per_row_and_shows_text_as_it_is() -> None:
     lines = to_markdown(pd.DataFrame({"name": ["a", "007"], "value": [0.123456, None]})).splitlines()
     assert [[word.strip() for word in line.strip("|").split("|")] for line in lines if "--" not in line] == [
         ["name", "value"], ["a", "0.123"], ["007", ""],
@@ -223,9 +219,6 @@ def test_markdown_has_a_line_per_row_whatever_would_end_a_cell() -> None:
         lines = to_markdown(pd.DataFrame({"name": [text, "c"], "value": [1, 2]})).splitlines()
         assert len(lines) == 4
         assert {len(re.findall(r"(?<!\\)(?:\\\\)*\|", line)) for line in lines} == {3}
-
-
-def test_markdown_shows_text_as_it_is() -> None:
     for text, escaped in (
         ("<img src=x onerror=alert(1)>", "&lt;img src=x onerror=alert(1)&gt;"), ("`rm`", r"\`rm\`"),
         ("[a](javascript:b) [c][d] ![e](f)", r"[a\](javascript:b) [c\][d] ![e\](f)"),
@@ -246,14 +239,6 @@ def test_markdown_has_no_markup_of_others(text: str) -> None:
     assert not re.search(r"(?<!\\)(?:\\\\)*([`*]|\][(\[])", page)
 
 
-def test_csv_has_no_formulas() -> None:
-    """As OWASP advises: spreadsheets take what begins with these characters for a formula, an apostrophe for text."""
-    for text in ("=1+1", "+1+1", "-1+1", "@SUM(1)", "\n=1", "＝1+1", "=HYPERLINK(1)", "-2+cmd|a!A0"):
-        frame = pd.read_csv(io.StringIO(to_csv(pd.DataFrame({"name": [text], text: [f"a {text}"]}))))
-        assert list(frame.columns) == ["name", f"'{text}"]
-        assert frame.iloc[0].tolist() == [f"'{text}", f"a {text}"]
-
-
 @given(st.lists(st.text(st.characters()), max_size=5))
 def test_csv_read_again_has_the_same_texts(texts: list[str]) -> None:
     _, *rows = csv.reader(io.StringIO(to_csv(pd.DataFrame({"name": texts, "k": 1})), newline=""))
@@ -270,7 +255,7 @@ def test_json_is_printable_and_has_the_same_texts(text: str) -> None:
     assert json.loads(page) == [{"name": whole}]
 
 
-def test_latex_shows_text_as_it_is() -> None:
+def test_latex_shows_text_as_it_is_and_json_no_text_for_infinite_numbers() -> None:
     r"""A row that begins with [ or * would be an argument of \\ or \midrule before it."""
     page = to_latex(pd.DataFrame({"name": ["[2cm] a", "*b", r"\input{x}% <c> | 5 $ #_~^&"]}))
     assert page.splitlines()[5:8] == [
@@ -278,9 +263,6 @@ def test_latex_shows_text_as_it_is() -> None:
         r"\textbackslash{}input\{x\}\% \textless{}c\textgreater{} \textbar{} 5 \$ \#\_\textasciitilde{}"
         r"\textasciicircum{}\& \\",
     ]  # fmt: skip
-
-
-def test_json_has_no_text_in_place_of_an_infinite_number() -> None:
     values = [1.0 / 3.0, math.inf, -math.inf, None]
     page = to_json(pd.DataFrame({"bound": values, "text": ["inf", "Infinity", "NaN", ""]}))
     assert "Infinity," not in page.replace('"Infinity",', "")

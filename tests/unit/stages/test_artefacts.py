@@ -68,7 +68,7 @@ def test_what_is_put_is_got_by_another_process(tmp_path: Path, monkeypatch: pyte
     assert files(folder) == ["key.artefact"]
 
 
-def test_what_cannot_be_written_leaves_the_earlier_artefact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_artefacts_are_whole_or_earlier_ones_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(NumericalError, match=r"type builtins\.function cannot be stored"):
         Store(tmp_path).put("key", lambda: 0, TIME, ())
     assert files(tmp_path) == []
@@ -86,22 +86,19 @@ def test_what_cannot_be_written_leaves_the_earlier_artefact(tmp_path: Path, monk
     assert found is not None
     assert found.value == 1
     assert files(tmp_path) == ["key.artefact"]
-
-
-def test_an_artefact_is_not_seen_before_it_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A process that dies while it writes leaves no file under the key."""
+    # A process that dies while it writes leaves no file under the key.
 
     class Killed(BaseException):
         pass
 
     def die(*_: object, **__: object) -> None:
-        assert Store(tmp_path).get("key") is None
+        assert Store(tmp_path).get("other") is None
         raise Killed
 
     monkeypatch.setattr(module.os, "fsync", die)
     with pytest.raises(Killed):
-        Store(tmp_path).put("key", 1, TIME, ())
-    assert files(tmp_path) == []
+        Store(tmp_path).put("other", 1, TIME, ())
+    assert files(tmp_path) == ["key.artefact"]
 
 
 def flip_a_bit(path: Path) -> None:
@@ -198,7 +195,7 @@ def test_a_value_is_read_as_it_was_written(value: Any) -> None:
     assert_same(value, loads(dumps(value)))
 
 
-def test_arrays_are_stored_once_without_what_they_are_parts_of_and_read_only() -> None:
+def test_factors_coordinates_and_unsorted_indices_stay_and_arrays_are_stored_once() -> None:
     """What a process keeps for several stages no plugin may write into."""
     whole = np.arange(60_000.0).reshape(300, 200)
     content = dumps([whole[:2, ::3], whole[3]])
@@ -212,22 +209,6 @@ def test_arrays_are_stored_once_without_what_they_are_parts_of_and_read_only() -
     first, second = loads(dumps((one, one)))
     assert first is second
     assert len(dumps((one, one))) < 1.5 * len(dumps((one,)))
-
-
-@pytest.mark.parametrize(("kind", "box"), [*itertools.product(FORMATS, [0, 1])])
-def test_sparse_matrices_of_every_format(kind: str, box: int) -> None:
-    made = getattr(sp, f"{kind}_{('array', 'matrix')[box]}")
-    for entries in (np.diag([1.0, -0.0, 3.0])[:, :2], np.zeros((3, 0)), np.zeros((2, 2))):
-        matrix = made(entries)
-        found = loads(dumps(matrix))
-        assert (type(found), found.shape, found.dtype) == (type(matrix), matrix.shape, matrix.dtype)
-        np.testing.assert_array_equal(found.toarray(), entries)
-        for name in {"data", "indices", "indptr", "offsets"} & set(dir(matrix)) if kind not in ("lil", "dok") else ():
-            written = np.asarray(getattr(matrix, name))
-            assert_same(written, getattr(found, name), writeable=kind not in ("csr", "csc"))
-
-
-def test_factors_coordinates_and_unsorted_indices_stay_as_they_are() -> None:
     matrix = sp.csr_array((np.ones(3), np.array([2, 0, 1]), np.array([0, 2, 3])), shape=(2, 3))
     matrix.indices, matrix.indptr = matrix.indices.astype(np.int64), matrix.indptr.astype(np.int64)
     found = loads(dumps(matrix))
@@ -242,6 +223,19 @@ def test_factors_coordinates_and_unsorted_indices_stay_as_they_are() -> None:
     np.testing.assert_array_equal(loads(dumps(X)).whiten(np.ones(4)), X.whiten(np.ones(4)))
     factor = SparseCholesky(X.matrix)
     np.testing.assert_array_equal(loads(dumps(factor)).solve_factor(np.ones(4)), factor.solve_factor(np.ones(4)))
+
+
+@pytest.mark.parametrize(("kind", "box"), [*itertools.product(FORMATS, [0, 1])])
+def test_sparse_matrices_of_every_format(kind: str, box: int) -> None:
+    made = getattr(sp, f"{kind}_{('array', 'matrix')[box]}")
+    for entries in (np.diag([1.0, -0.0, 3.0])[:, :2], np.zeros((3, 0)), np.zeros((2, 2))):
+        matrix = made(entries)
+        found = loads(dumps(matrix))
+        assert (type(found), found.shape, found.dtype) == (type(matrix), matrix.shape, matrix.dtype)
+        np.testing.assert_array_equal(found.toarray(), entries)
+        for name in {"data", "indices", "indptr", "offsets"} & set(dir(matrix)) if kind not in ("lil", "dok") else ():
+            written = np.asarray(getattr(matrix, name))
+            assert_same(written, getattr(found, name), writeable=kind not in ("csr", "csc"))
 
 
 @storable
@@ -261,12 +255,22 @@ class Sample:
         return 2 * self.size
 
 
-def test_caches_are_not_stored() -> None:
+def test_caches_are_not_stored_and_what_no_class_of_the_list_has_is_named() -> None:
     sample = Sample(3, (1.0, math.inf))
     assert sample.doubled == 6
     found = loads(dumps(sample))
     assert found == sample
     assert set(vars(found)) == {field.name for field in fields(Sample)}
+    with pytest.raises(TypeError, match="two storable classes are called Sample"):
+        storable(type("Sample", (), {}))
+    for value, named in (
+        (lambda: 0, "builtins.function"), ({"at": [Stranger(1)]}, "Stranger"), (b"bytes", "builtins.bytes"),
+        ({1}, "builtins.set"), (np.array([None]), "object"), (np.array(["text"]), "<U4"), (1j, "builtins.complex"),
+        (np.array([1j]), "complex128"), (np.ma.masked_array([1.0]), "MaskedArray"),
+        (type("Sample", (), {})(), "Sample"),
+    ):  # fmt: skip
+        with pytest.raises(NumericalError, match=f"{named}.* cannot be stored"):
+            dumps(value)
 
 
 @dataclass
@@ -295,22 +299,14 @@ def csr(data: Any, indices: Any, indptr: Any, shape: list[Any]) -> bytes:
 HUGE = '{"a":{"dtype":"F64","shape":[%s],"data_offsets":[0,%s]}}'
 
 DAMAGED = {
-    "nothing": b"",
-    "no file of this format": b"\xff" * 64,
+    "nothing": b"", "no file of this format": b"\xff" * 64,
     "a huge array": header(HUGE % (10**12, 8 * 10**12), bytes(8)),
     "a huge array without entries": header(HUGE % ("4294967296,4294967296,4294967296", 0)),
-    "trailing bytes": dumps(1) + b"\0",
-    "cut off": dumps(np.arange(3.0))[:-1],
-    "no structure": crafted(b"", a=1.0),
+    "trailing bytes": dumps(1) + b"\0", "cut off": dumps(np.arange(3.0))[:-1], "no structure": crafted(b"", a=1.0),
     "another type of entries": header('{"structure":{"dtype":"BF16","shape":[1],"data_offsets":[0,2]}}', bytes(2)),
-    "no JSON": crafted("{"),
-    "no text": crafted(b"\xff"),
-    "NaN": crafted("NaN"),
-    "infinite": crafted("-Infinity"),
-    "a plain list": crafted("[1]"),
-    "an empty description": crafted("{}"),
-    "two sorts": crafted('{"list": [], "tuple": []}'),
-    "an unknown sort": crafted('{"module": "os"}'),
+    "no JSON": crafted("{"), "no text": crafted(b"\xff"), "NaN": crafted("NaN"), "infinite": crafted("-Infinity"),
+    "a plain list": crafted("[1]"), "an empty description": crafted("{}"),
+    "two sorts": crafted('{"list": [], "tuple": []}'), "an unknown sort": crafted('{"module": "os"}'),
     "an unknown class": crafted('{"object": ["Popen", {"args": "id"}]}'),
     "a class of Python": crafted('{"object": ["object", {}]}'),
     "a dataclass that is not on the list": crafted('{"object": ["Stranger", {"size": 1}]}'),
@@ -323,14 +319,10 @@ DAMAGED = {
     "an enumeration as an object": crafted('{"object": ["Kind", {}]}'),
     "state of another class": crafted('{"object": ["SparseCholesky", {"size": 1}]}'),
     "no factor": crafted('{"object": ["SparseCholesky", {"matrix": 1, "name": "X", "order": null, "dense": 0}]}'),
-    "an unknown array": crafted('{"array": "7"}'),
-    "an array that is the structure": crafted('{"array": "structure"}'),
-    "no key": crafted('{"dict": [[{"list": []}, 1]]}'),
-    "no pairs": crafted('{"dict": [1]}'),
-    "no float": crafted('{"float": "1e3"}'),
-    "a deep structure": crafted('{"list":[' * 100_000 + "]}" * 100_000),
-    "a structure that nobody closes": crafted('{"list":[' * 100_000),
-    "a number of many digits": crafted("9" * 100_000),
+    "an unknown array": crafted('{"array": "7"}'), "an array that is the structure": crafted('{"array": "structure"}'),
+    "no key": crafted('{"dict": [[{"list": []}, 1]]}'), "no pairs": crafted('{"dict": [1]}'),
+    "no float": crafted('{"float": "1e3"}'), "a deep structure": crafted('{"list":[' * 100_000 + "]}" * 100_000),
+    "a structure that nobody closes": crafted('{"list":[' * 100_000), "a number of many digits": crafted("9" * 100_000),
     "indices out of range": csr(np.ones(2), np.array([0, 10**6]), np.array([0, 1, 2]), [2, 2]),
     "negative indices": csr(np.ones(2), np.array([0, -5]), np.array([0, 1, 2]), [2, 2]),
     "pointers out of range": csr(np.ones(2), np.array([0, 1]), np.array([0, 10**9, 2]), [2, 2]),
@@ -338,7 +330,7 @@ DAMAGED = {
     "a huge matrix": csr(np.ones(1), np.array([0]), np.array([0, 1]), [10**15, 10**15]),
     "no shape": csr(np.ones(2), np.array([0, 1]), np.array([0, 1, 2]), ["2", 2]),
     "no sparse format": crafted('{"sparse": ["x", "os", true, [1, 1], []]}'),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("content", DAMAGED.values(), ids=DAMAGED)
@@ -356,16 +348,3 @@ def test_no_bit_makes_another_error(data: st.DataObject) -> None:
     content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
     with contextlib.suppress(DamagedArtefactError):
         loads(bytes(content))
-
-
-def test_what_no_class_of_the_list_has_is_named_when_it_is_written() -> None:
-    with pytest.raises(TypeError, match="two storable classes are called Sample"):
-        storable(type("Sample", (), {}))
-    for value, named in (
-        (lambda: 0, "builtins.function"), ({"at": [Stranger(1)]}, "Stranger"), (b"bytes", "builtins.bytes"),
-        ({1}, "builtins.set"), (np.array([None]), "object"), (np.array(["text"]), "<U4"), (1j, "builtins.complex"),
-        (np.array([1j]), "complex128"), (np.ma.masked_array([1.0]), "MaskedArray"),
-        (type("Sample", (), {})(), "Sample"),
-    ):  # fmt: skip
-        with pytest.raises(NumericalError, match=f"{named}.* cannot be stored"):
-            dumps(value)

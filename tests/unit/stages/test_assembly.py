@@ -56,24 +56,18 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
 def wire_store(register: Register, tmp_path: Path) -> SampleStore:
     """A store with cells in reduced and full assembly of two problems: neither declares anything, one is uneven."""
     register(
-        *(
-            ("vibench.problems", name, f"fake_plugins:{cls}")
-            for name, cls in (("wire", "Wire"), ("uneven", "UnevenWire"))
-        ),
+        ("vibench.problems", "wire", "fake_plugins:Wire"), ("vibench.problems", "uneven", "fake_plugins:UnevenWire"),
         ("vibench.dual_strategies", "mcpg", "vibench_strategies.mcpg:ModifiedCPG"),
         ("vibench.primal_strategies", "decorrelated", "vibench_strategies.decorrelated:Decorrelated"),
-    )
+    )  # fmt: skip
     return store_of(tmp_path, (wire(*kind) for kind in product((TOLERANCE, None), (WIRE, UNEVEN))))
 
 
 def wire(interpolation: float | None, problem: Plugin = WIRE) -> CellQueries:
     """A cell of few modes and generators."""
     found = cell(problem, "decorrelated", interpolation)
-    enrichment = replace(
-        found.built.enrichment,
-        pod=PODStage(problem, Stop(tolerance=1e-2)),
-        cone=replace(found.built.enrichment.cone, stop=Stop(tolerance=1e-2)),
-    )
+    pod, cone = PODStage(problem, Stop(tolerance=1e-2)), replace(found.built.enrichment.cone, stop=Stop(tolerance=1e-2))
+    enrichment = replace(found.built.enrichment, pod=pod, cone=cone)
     return replace(found, built=replace(found.built, enrichment=enrichment, pod=enrichment.pod, cone=enrichment.cone))
 
 
@@ -94,7 +88,7 @@ def test_rows_of_an_interpolated_problem(store: SampleStore) -> None:
     assert rows.cell["fallbacks"] == ""
 
 
-def test_what_interpolation_misses_is_measured_noted_and_not_compared(wire_store: SampleStore) -> None:
+def test_what_interpolation_misses_or_nothing_declares_is_measured_and_told(wire_store: SampleStore) -> None:
     one, other = (value_of(wire_store, wire(interpolation, UNEVEN)) for interpolation in (TOLERANCE, None))
     assert one.cell["interpolation_error"] < 1e-12  # the training set sees nothing of it
     assert one.cell["assembly_error_max"] > 0.01
@@ -107,9 +101,23 @@ def test_what_interpolation_misses_is_measured_noted_and_not_compared(wire_store
     assert one.cell["assembly_share_mean"] > 0.1
     cells = pd.DataFrame([dict.fromkeys(STORED["cells"]) | rows.cell for rows in (one, other)])
     assert too_loose(cells, "assembly").tolist() == [True, False]
+    why = "f depends on mu and the problem does not evaluate it entry by entry"
+    stage = wire(TOLERANCE)
+    members = value_of(wire_store, AffineDecomposition(WIRE, TOLERANCE))
+    assert [members[name].way for name in MEMBERS] == [
+        Evaluation.CONSTANT, Evaluation.FULL, Evaluation.CONSTANT, Evaluation.CONSTANT,
+    ]  # fmt: skip
+    rows, full = value_of(wire_store, stage), value_of(wire_store, wire(None))
+    assert rows.cell["status"] == "ok"
+    assert rows.cell["fallbacks"] == f"assembled in full: {why}"
+    assert full.cell["fallbacks"] == ""
+    assert isinstance(stage.built.model(wire_store).reduced, ReducedModel)
+    assert {name for name in rows.cell if name.startswith("terms_")} == {"terms_A", "terms_B", "terms_g"}
+    for one, other in zip(rows.queries, full.queries, strict=True):
+        assert (one["assembly_error"], one["form"], one["error_u"]) == (0.0, "primal", other["error_u"])
 
 
-def test_looser_tolerances_and_members_that_vary_show_in_columns_and_errors(store: SampleStore) -> None:
+def test_separations_serve_all_models_and_tolerances_and_varying_members_show_in_columns(store: SampleStore) -> None:
     """With contact, B and g have no terms: they are assembled on the contact. Of the radial problem g alone varies."""
     tight, loose = (value_of(store, CELLS[name]).cell for name in ("obstacle", "obstacle, loose"))
     assert loose["terms_A"] < tight["terms_A"]
@@ -132,6 +140,22 @@ def test_looser_tolerances_and_members_that_vary_show_in_columns_and_errors(stor
         rows = value_of(store, CELLS[name])
         assert rows.cell["status"] == "ok"
         assert {row["form"] for row in rows.queries} == {"primal" if name in primal else "dual"}, name
+    one, other = (CELLS[name].built.reduction for name in ("obstacle", "obstacle, fixed"))
+    assert one.key != other.key
+    assert one.decomposition.key == other.decomposition.key
+    assert one.decomposition.key != CELLS["obstacle, loose"].built.reduction.decomposition.key
+    assert one.decomposition.key != CELLS["hertz"].built.reduction.decomposition.key
+    assert one.decomposition.inputs() == ()
+    assert one.decomposition in CELLS["obstacle"].inputs()
+    assert CELLS["obstacle"].assembly.key != CELLS["obstacle, full"].assembly.key
+    for name in ("obstacle", "hertz", "radial"):
+        reduction = CELLS[name].built.reduction
+        spent = [store.get(stage.key).seconds.cpu for stage in (reduction.decomposition, reduction)]
+        assert min(spent) > 0.0
+        row = value_of(store, CELLS[name]).cell
+        assert row["offline_assembly_s"] == pytest.approx(sum(spent))
+        parts = ("snapshots", "pod", "cone", "enrichment", "assembly")
+        assert row["offline_s"] == pytest.approx(sum(row[f"offline_{part}_s"] for part in parts))
 
 
 @pytest.mark.parametrize("name", ["obstacle", "radial", "hertz", "hertz, per-parameter"])
@@ -156,39 +180,3 @@ def test_assembly_in_full_has_no_offline_part_and_no_error(store: SampleStore, n
     assert (rows.cell["offline_assembly_s"], rows.cell["assembly_share_mean"]) == (0.0, None)
     assert "interpolation_tol" not in rows.cell
     assert [row["assembly_error"] for row in rows.queries] == [0.0] * QUERIES
-
-
-def test_separations_serve_every_reduced_model_and_count_in_its_costs(store: SampleStore) -> None:
-    one, other = (CELLS[name].built.reduction for name in ("obstacle", "obstacle, fixed"))
-    assert one.key != other.key
-    assert one.decomposition.key == other.decomposition.key
-    assert one.decomposition.key != CELLS["obstacle, loose"].built.reduction.decomposition.key
-    assert one.decomposition.key != CELLS["hertz"].built.reduction.decomposition.key
-    assert one.decomposition.inputs() == ()
-    assert one.decomposition in CELLS["obstacle"].inputs()
-    assert CELLS["obstacle"].assembly.key != CELLS["obstacle, full"].assembly.key
-    for name in ("obstacle", "hertz", "radial"):
-        reduction = CELLS[name].built.reduction
-        spent = [store.get(stage.key).seconds.cpu for stage in (reduction.decomposition, reduction)]
-        assert min(spent) > 0.0
-        row = value_of(store, CELLS[name]).cell
-        assert row["offline_assembly_s"] == pytest.approx(sum(spent))
-        parts = ("snapshots", "pod", "cone", "enrichment", "assembly")
-        assert row["offline_s"] == pytest.approx(sum(row[f"offline_{part}_s"] for part in parts))
-
-
-def test_a_problem_that_declares_nothing_is_assembled_in_full_and_the_reason_is_told(wire_store: SampleStore) -> None:
-    why = "f depends on mu and the problem does not evaluate it entry by entry"
-    stage = wire(TOLERANCE)
-    members = value_of(wire_store, AffineDecomposition(WIRE, TOLERANCE))
-    assert [members[name].way for name in MEMBERS] == [
-        Evaluation.CONSTANT, Evaluation.FULL, Evaluation.CONSTANT, Evaluation.CONSTANT,
-    ]  # fmt: skip
-    rows, full = value_of(wire_store, stage), value_of(wire_store, wire(None))
-    assert rows.cell["status"] == "ok"
-    assert rows.cell["fallbacks"] == f"assembled in full: {why}"
-    assert full.cell["fallbacks"] == ""
-    assert isinstance(stage.built.model(wire_store).reduced, ReducedModel)
-    assert {name for name in rows.cell if name.startswith("terms_")} == {"terms_A", "terms_B", "terms_g"}
-    for one, other in zip(rows.queries, full.queries, strict=True):
-        assert (one["assembly_error"], one["form"], one["error_u"]) == (0.0, "primal", other["error_u"])

@@ -78,7 +78,7 @@ def test_a_crash_costs_its_query_alone(run: vibench.Run, tmp_path: Path, monkeyp
     assert set(queries.drop(heights.index[-1])["status"]) == {"ok"}
 
 
-def test_compilers_are_looked_for_by_name_or_missed_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compilers_are_found_by_name_missed_or_quoted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CC", "no-such-compiler -O2")
     other = [{"name": "radial-obstacle", "options": {"resolution": 140}}]  # whose formulation nobody has built
     study = small_study("without", other, formulation=["mixed", "compiled"], assembly=["reduced"], validation=1)
@@ -93,6 +93,14 @@ def test_compilers_are_looked_for_by_name_or_missed_in_a_line(tmp_path: Path, mo
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(UnsupportedError, match="none of cc, gcc, clang is on the PATH; install one, or name it in"):
         compiler()
+    for text, reason in (
+        ("echo 'model.c:1:1: error: no space' >&2; exit 3", r"compiler' failed \(3\): model.c:1:1: error: no space$"),
+        ("exit 1", r"failed \(1\): it says nothing$"),
+        ("exit 0", r"failed \(0\): it says nothing$"),  # and makes no file
+    ):
+        monkeypatch.setenv("CC", script(tmp_path, text))
+        with pytest.raises(UnsupportedError, match=reason):
+            small_model().program()
 
 
 def polynomial(value: np.ndarray, slope: float = 0.0) -> AffinePolynomial:
@@ -138,17 +146,6 @@ def test_programs_answer_say_what_they_cannot_and_are_repeated_near_by() -> None
         assert answer.x is not None
         assert answer.x[0] == pytest.approx(limit, rel=1e-14)
         assert seconds.cpu > 0.0
-
-
-def test_a_failing_compiler_is_quoted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for text, reason in (
-        ("echo 'model.c:1:1: error: no space' >&2; exit 3", r"compiler' failed \(3\): model.c:1:1: error: no space$"),
-        ("exit 1", r"failed \(1\): it says nothing$"),
-        ("exit 0", r"failed \(0\): it says nothing$"),  # and makes no file
-    ):
-        monkeypatch.setenv("CC", script(tmp_path, text))
-        with pytest.raises(UnsupportedError, match=reason):
-            small_model().program()
 
 
 def test_models_too_large_or_not_smooth_have_no_program(run: vibench.Run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,17 +58,11 @@ def test_keys_say_what_determines_a_stage_and_nothing_else() -> None:
     assert looser.built.enrichment.pod.key == one.built.enrichment.pod.key
     edited = replace(PROBLEM, code="edited")
     assert PODStage(edited, Stop(size=3)).key != PODStage(PROBLEM, Stop(size=3)).key
-    keys = {
-        PODStage(PROBLEM, Stop(size=3)).key,
-        PODStage(PROBLEM, Stop(size=4)).key,
-        *(c.key for c in solution_stages(PROBLEM, OWN_TRAINING)),
-    }
-    assert len(keys) == 2 + CHUNKS
+    pods = (PODStage(PROBLEM, Stop(size=size)) for size in (3, 4))
+    assert len({stage.key for stage in (*pods, *solution_stages(PROBLEM, OWN_TRAINING))}) == 2 + CHUNKS
 
 
-def test_chunks_make_up_the_whole_sweep_in_order_with_its_diagnostics(
-    store: SampleStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_chunks_make_up_the_sweep_in_order(store: SampleStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = gather(store, solution_stages(PROBLEM, OWN_TRAINING))
     problem = PROBLEM.create()
     assert np.array_equal(found.mu, problem.training_set())
@@ -142,7 +136,7 @@ def test_a_cell_of_a_nested_strategy_is_the_cell_built_alone(store: SampleStore,
             assert np.allclose(one.B, other.B, rtol=1e-10, atol=1e-13)
 
 
-def test_rows_of_a_cell(store: SampleStore) -> None:
+def test_rows_have_seconds_errors_and_proved_bounds(store: SampleStore) -> None:
     for primal, tolerance, kind in (
         ("decorrelated", None, "none"), ("online-supremizers", None, "per-parameter"), ("offline-pga", 0.5, "fixed"),
     ):  # fmt: skip
@@ -170,10 +164,42 @@ def test_rows_of_a_cell(store: SampleStore) -> None:
         for row in rows.queries:
             assert row["error_u"] < 0.05
             assert max(row["primal_residual"], row["dual_residual"], row["gap"]) <= 1e-8
+    rows = value_of(store, cell("offline-pga", 0.5))
+    for row in rows.queries:
+        assert (row["bound_note"], row["coercivity_proved"], row["continuity_proved"]) == ("", 1, 1)
+        terms = row["bound_rho"] ** 2 + row["bound_omega"] ** 2 + 2.0 * row["bound_kappa"]
+        assert row["bound_u_energy"] == pytest.approx(np.sqrt(terms))
+        assert row["bound_u"] == pytest.approx(row["bound_u_energy"] / np.sqrt(row["coercivity"]))
+        assert row["bound_lambda"] == pytest.approx(row["bound_lambda_natural"] / row["beta_energy"])
+        for name in ("u_energy", "u", "lambda_natural", "lambda"):
+            assert row[f"effectivity_{name}"] == row[f"bound_{name}"] / row[f"error_{name}_absolute"] >= 1.0
+        assert row["effectivity_hsw_u"] == row["bound_hsw_u"] / row["error_u_absolute"] >= 1.0
+        assert row["effectivity_hsw_lambda"] == row["bound_hsw_lambda"] / row["error_lambda_absolute"] >= 1.0
+    for name in ("u_energy", "hsw_lambda"):
+        middle = np.median([row[f"effectivity_{name}"] for row in rows.queries])
+        assert rows.cell[f"effectivity_{name}_median"] == middle
 
 
-def test_a_row_says_how_much_of_its_error_the_solver_makes(store: SampleStore) -> None:
-    """Exactly as much as separates it from the program solved to round-off; a tight accuracy leaves next to nothing."""
+def test_constants_are_of_every_parameter_and_solver_errors_of_every_row(store: SampleStore) -> None:
+    constants = ReferenceConstants(ConstraintMatrices(PROBLEM, VALIDATION)).gather(store)
+    mus = PROBLEM.create().validation_set(9, 3)
+    pairs = zip(constants, mus, strict=True)
+    scaled = [c.inf_sup.span / mu[0] ** 2 for c, mu in pairs if isinstance(c, Stability)]  # B = mu_1² times one matrix
+    assert np.allclose(scaled, scaled[0], rtol=1e-9)
+    assert scaled[0] > 0.0
+    problem = PROBLEM.create()
+    for c, mu in zip(constants, mus, strict=True):
+        assert isinstance(c, Stability)
+        vi = problem.assemble(mu)
+        values = scipy.linalg.eigh(vi.A.toarray(), problem.V.matrix.toarray(), eigvals_only=True)
+        assert c.coercivity.proved
+        assert 0.998 * values[0] <= c.coercivity.value <= values[0]
+        assert c.continuity.proved
+        assert values[-1] <= c.continuity.value <= 1.002 * values[-1]
+        compliance = vi.B @ np.linalg.solve(vi.A.toarray(), vi.B.toarray().T)
+        smallest = scipy.linalg.eigvalsh(compliance, problem.W.matrix.toarray())[0]
+        assert 0.998 * np.sqrt(smallest) <= c.energy_inf_sup.value <= np.sqrt(smallest)
+    # Exactly as much as separates it from the program solved to round-off; a tight accuracy leaves next to nothing.
     loose = replace(cell("offline-pga", 0.5, "osqp"), accuracy=1e-3).run(store).value
     tight = replace(cell("offline-pga", 0.5, "piqp"), accuracy=1e-10).run(store).value
     assert tight.cell["solver_share_max"] < 1e-3 < loose.cell["solver_share_max"]
@@ -223,47 +249,7 @@ def test_the_set_up_and_a_start_without_contact_set_are_no_part_of_the_seconds_o
     np.testing.assert_array_equal(found.value.u, alone.value.u)  # whatever was solved before
 
 
-def test_the_reference_constants_are_those_of_every_parameter(store: SampleStore) -> None:
-    constants = ReferenceConstants(ConstraintMatrices(PROBLEM, VALIDATION)).gather(store)
-    mus = PROBLEM.create().validation_set(9, 3)
-    pairs = zip(constants, mus, strict=True)
-    scaled = [c.inf_sup.span / mu[0] ** 2 for c, mu in pairs if isinstance(c, Stability)]  # B = mu_1² times one matrix
-    assert np.allclose(scaled, scaled[0], rtol=1e-9)
-    assert scaled[0] > 0.0
-    problem = PROBLEM.create()
-    for c, mu in zip(constants, mus, strict=True):
-        assert isinstance(c, Stability)
-        vi = problem.assemble(mu)
-        values = scipy.linalg.eigh(vi.A.toarray(), problem.V.matrix.toarray(), eigvals_only=True)
-        assert c.coercivity.proved
-        assert 0.998 * values[0] <= c.coercivity.value <= values[0]
-        assert c.continuity.proved
-        assert values[-1] <= c.continuity.value <= 1.002 * values[-1]
-        compliance = vi.B @ np.linalg.solve(vi.A.toarray(), vi.B.toarray().T)
-        smallest = scipy.linalg.eigvalsh(compliance, problem.W.matrix.toarray())[0]
-        assert 0.998 * np.sqrt(smallest) <= c.energy_inf_sup.value <= np.sqrt(smallest)
-
-
-def test_every_query_has_proved_bounds_of_the_errors_in_the_same_norms(store: SampleStore) -> None:
-    rows = value_of(store, cell("offline-pga", 0.5))
-    for row in rows.queries:
-        assert (row["bound_note"], row["coercivity_proved"], row["continuity_proved"]) == ("", 1, 1)
-        terms = row["bound_rho"] ** 2 + row["bound_omega"] ** 2 + 2.0 * row["bound_kappa"]
-        assert row["bound_u_energy"] == pytest.approx(np.sqrt(terms))
-        assert row["bound_u"] == pytest.approx(row["bound_u_energy"] / np.sqrt(row["coercivity"]))
-        assert row["bound_lambda"] == pytest.approx(row["bound_lambda_natural"] / row["beta_energy"])
-        for name in ("u_energy", "u", "lambda_natural", "lambda"):
-            assert row[f"effectivity_{name}"] == row[f"bound_{name}"] / row[f"error_{name}_absolute"] >= 1.0
-        assert row["effectivity_hsw_u"] == row["bound_hsw_u"] / row["error_u_absolute"] >= 1.0
-        assert row["effectivity_hsw_lambda"] == row["bound_hsw_lambda"] / row["error_lambda_absolute"] >= 1.0
-    for name in ("u_energy", "hsw_lambda"):
-        median = np.median([row[f"effectivity_{name}"] for row in rows.queries])
-        assert rows.cell[f"effectivity_{name}_median"] == median
-
-
-def test_slow_queries_missing_artefacts_and_failed_constants_are_named(
-    tmp_path: Path, store: SampleStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_slow_queries_and_losses_are_named(tmp_path: Path, store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
     stage = PODStage(PROBLEM, Stop(size=2))
     with pytest.raises(NumericalError, match=stage.key):
         value_of(SampleStore(tmp_path), stage)

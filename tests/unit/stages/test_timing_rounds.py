@@ -79,7 +79,7 @@ def test_every_round_has_every_cell_once_before_the_next_one_begins(rounds: int,
     assert sorted(places) == [(number, k) for number in range(rounds) for k in range(count)]
 
 
-def test_order_and_limit_of_a_stage_are_those_of_all_its_cells(tmp_path: Path) -> None:
+def test_rounds_visit_cells_in_other_orders_and_a_slow_machine_meets_all_alike(tmp_path: Path) -> None:
     """Whoever comes after a large model finds its own arrays out of the cache: not always the same one."""
     stage = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 12, 0)
     first = [stage.place(number * 6)[1] for number in range(12)]
@@ -87,10 +87,7 @@ def test_order_and_limit_of_a_stage_are_those_of_all_its_cells(tmp_path: Path) -
     later = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 4, 8)
     assert [later.place(number * 6)[1] for number in range(4)] == first[8:]
     assert (TimingRounds(CELLS, (EVERY,) * 4, 12, 0).weight, CELLS[0].weight) == (4, 1)
-
-
-def test_a_machine_that_slows_down_halfway_meets_all_alike() -> None:
-    """Cell after cell, the second of two equal ones would seem thrice as slow."""
+    # Cell after cell, the second of two equal ones would seem thrice as slow.
     stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 12, 0)
     spent = [1.0 if item < stage.items / 2 else 3.0 for item in range(stage.items)]
     items = [replace(steady(one), beside=Seconds(2.0 * one, 2.0 * one)) for one in spent]
@@ -169,7 +166,7 @@ class Given(MarginalSolutions):
 
 
 @pytest.mark.parametrize(("taken", "numbers"), [(0.01, [7, 5, 8]), (0.03, [7, 5]), (0.06, [7])])
-def test_solutions_come_before_amid_and_after_queries_until_enough(taken: float, numbers: list[int]) -> None:
+def test_solutions_come_amid_queries_until_enough_or_serve_all_cells(taken: float, numbers: list[int]) -> None:
     marginal, done = Given(taken), list[MarginalSolution]()
     beside = SolutionsBeside(marginal, [1.0] * 9)
     steps = list(beside.alternated([7, 3, 5, 8], done, 4, 1))
@@ -177,9 +174,6 @@ def test_solutions_come_before_amid_and_after_queries_until_enough(taken: float,
     assert [k for k, solution in steps if solution is not None] == numbers[:2]
     assert [number for number, *_ in marginal.asked] == numbers == [one.number for one in done]
     assert len(set(marginal.asked)) == len(marginal.asked)  # each is next to another parameter
-
-
-def test_long_solutions_serve_all_cells_of_a_round_and_stand_for_a_part() -> None:
     marginal = Given(2.0)
     beside, done = SolutionsBeside(marginal, [1.0] * 9), [list[MarginalSolution]() for _ in range(3)]
     for solutions, (at, cell) in zip(done, [(0, 0), (0, 1), (1, 1)], strict=True):
@@ -198,24 +192,13 @@ def test_long_solutions_serve_all_cells_of_a_round_and_stand_for_a_part() -> Non
     assert beside.seconds([done[1]], (1, 2, 3)) is None
 
 
-def test_rounds_begin_at_other_queries_in_later_blocks_and_for_other_cells(store: SampleStore) -> None:
+def test_rounds_begin_at_other_queries_with_their_matrices(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
     work = TimingRounds(CELLS[:2], (EVERY,) * 2, 1, 0).begin(store)
     assert isinstance(work, timing_rounds._Rounds)
     numbers = range(2 * timing_rounds.QUERY_SUBSETS)
     parts = parts_alike(work._beside.sweep, timing_rounds.QUERY_SUBSETS)
     assert {work._order(0, at, parts[at % timing_rounds.QUERY_SUBSETS])[0] for at in numbers} == set(EVERY)
     assert work._order(0, 0, (1, 4, 5)) != work._order(1, 0, (1, 4, 5))
-
-
-@given(st.lists(st.floats(0.1, 10.0), min_size=1, max_size=40))
-def test_parts_of_a_pass_have_all_queries_once_and_take_about_as_long(seconds: list[float]) -> None:
-    parts = parts_alike(np.array(seconds), 4)
-    assert sorted(k for part in parts for k in part) == list(range(len(seconds)))
-    sums = [sum(seconds[k] for k in part) for part in parts]
-    assert max(sums) - min(sums) <= 2.0 * max(seconds)
-
-
-def test_full_matrices_are_those_of_solutions(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[float] = []
     reduced: list[Any] = []
     plain, reduce = marginal_solutions.checked_assembly, ReducedModel.reduce
@@ -228,6 +211,14 @@ def test_full_matrices_are_those_of_solutions(store: SampleStore, monkeypatch: p
     assert len(calls) == 3 * (1 + 4 * (VALIDATION + 1))  # a warm-up, then every query and the last solution of a round
     assert len(set(calls)) == len(calls)
     assert len(reduced) == 3 * (1 + 4 * VALIDATION)  # none after the last query
+
+
+@given(st.lists(st.floats(0.1, 10.0), min_size=1, max_size=40))
+def test_parts_of_a_pass_have_all_queries_once_and_take_about_as_long(seconds: list[float]) -> None:
+    parts = parts_alike(np.array(seconds), 4)
+    assert sorted(k for part in parts for k in part) == list(range(len(seconds)))
+    sums = [sum(seconds[k] for k in part) for part in parts]
+    assert max(sums) - min(sums) <= 2.0 * max(seconds)
 
 
 def test_lost_rounds_are_told_and_rows_have_the_pace_of_their_block() -> None:
@@ -283,13 +274,10 @@ def test_certificates_are_a_part_of_queries_and_columns_are_means_medians_and_qu
     assert own["online_certify_s"] is None
     assert set(timing_rounds.seconds_of_cell([])) == set(own) - {"hf_s"}
     assert set(timing_rounds.seconds_of_cell([]).values()) == {None}
-
-
-@pytest.mark.parametrize(("wall", "slow", "disturbed"), [(1.0, 1.0, 0), (9.0, 1.0, 0), (1.0, 1.4, 1)])
-def test_a_slow_machine_marks_the_row_and_waiting_for_a_core_does_not(wall: float, slow: float, disturbed: int) -> None:
-    """CPU seconds stop while a process waits; what others do to the caches, the calibration shows."""
-    once = TimedRound({0: Seconds(1.0, wall)}, {0: Seconds(1.0, wall)}, slow)
-    assert timing_rounds.seconds_of_cell(as_rows(*[once] * 3))["disturbed"] == disturbed
+    # CPU seconds stop while a process waits; what others do to the caches, the calibration shows.
+    for wall, slow, disturbed in ((1.0, 1.0, 0), (9.0, 1.0, 0), (1.0, 1.4, 1)):
+        once = TimedRound({0: Seconds(1.0, wall)}, {0: Seconds(1.0, wall)}, slow)
+        assert timing_rounds.seconds_of_cell(as_rows(*[once] * 3))["disturbed"] == disturbed
 
 
 class Remembers:
@@ -310,9 +298,7 @@ class Remembers:
         return self.known[key]
 
 
-def test_a_solver_with_memory_meets_no_program_again_and_none_is_assembled_twice(
-    store: SampleStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_program_is_met_again_or_assembled_twice(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two cells of one problem and solver are in the rounds, whose programs are the same; a problem may cache, too."""
     solver, visited, plain = Remembers(), list[tuple[float, ...]](), HyperReducedModel.assemble
     monkeypatch.setattr(registry, "qp_solver", lambda name: {name: solver})
