@@ -176,9 +176,7 @@ class HighFidelitySolver:
 
 
 def solve_high_fidelity(
-    vi: VariationalInequality,
-    stiffness: CondensedStiffness | None = None,
-    start: Annotated[Mask, "m"] | None = None,
+    vi: VariationalInequality, stiffness: CondensedStiffness | None = None, start: Annotated[Mask, "m"] | None = None
 ) -> HighFidelitySolution:
     """Solve one variational inequality, with sparse A and B, to `ACCURACY`; see `HighFidelitySolver`.
 

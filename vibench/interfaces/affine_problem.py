@@ -30,15 +30,9 @@ class AffineProblem(Problem):
 
     @bordered
     def declare(
-        self,
-        *,
-        A: Declaration,
-        f: Declaration,
-        B: Declaration,
-        g: Declaration,
-        free: Annotated[Indices, "n"] | None = None,
-        dirichlet_lift: Declaration | None = None,
-    ) -> None:
+        self, *, A: Declaration, f: Declaration, B: Declaration, g: Declaration,
+        free: Annotated[Indices, "n"] | None = None, dirichlet_lift: Declaration | None = None,
+    ) -> None:  # fmt: skip
         """Declare the members.
 
         Each is a constant, sparse matrix or vector, or a list of pairs (θ_q, term_q). θ_q is a number, an expression in

@@ -53,14 +53,9 @@ def products(indices: Indices, unit: Array) -> Array:
 
 
 def interpolate_on_box(
-    evaluate: Evaluate,
-    lower: Array,
-    upper: Array,
-    tolerance: float,
-    budget: int,
-    terms: Mapping[str, Array] = MappingProxyType({}),
-    alike: Sequence[str] = (),
-) -> dict[str, AffinePolynomial]:
+    evaluate: Evaluate, lower: Array, upper: Array, tolerance: float, budget: int,
+    terms: Mapping[str, Array] = MappingProxyType({}), alike: Sequence[str] = (),
+) -> dict[str, AffinePolynomial]:  # fmt: skip
     """Tensor-product Chebyshev interpolation of arrays on a box (Trefethen 2013, chapters 3 and 8).
 
     Degrees differ by direction: along random lines, the arrays are interpolated with more and more points until the

@@ -86,15 +86,10 @@ class _Pair:
 
 
 def error_bounds(
-    V: InnerProduct,
-    vis: Sequence[VariationalInequality],
-    energies: Sequence[EnergyNorm],
-    constants: Sequence[tuple[Constant, Constant]],
-    u: Array,
-    lam: Array,
-    pressed: Mask | None = None,
+    V: InnerProduct, vis: Sequence[VariationalInequality], energies: Sequence[EnergyNorm],
+    constants: Sequence[tuple[Constant, Constant]], u: Array, lam: Array, pressed: Mask | None = None,
     residuals: Sequence[Array] | None = None,
-) -> list[ErrorBounds]:
+) -> list[ErrorBounds]:  # fmt: skip
     """Bounds (ii) of reduced u (n×P) and λ (m×P), column by column, from lower bounds of α and β_A at each parameter.
 
     `pressed` (m×P) are rows that multipliers press where these are known: ν is nearly λ, so that corrections of all
@@ -126,14 +121,9 @@ def error_bounds(
 
 
 def bound_errors_at(
-    V: InnerProduct,
-    vi: VariationalInequality,
-    energy: EnergyNorm,
-    alpha: Constant,
-    beta: Constant,
-    u: Array,
+    V: InnerProduct, vi: VariationalInequality, energy: EnergyNorm, alpha: Constant, beta: Constant, u: Array,
     lam: Array,
-) -> ErrorBounds:
+) -> ErrorBounds:  # fmt: skip
     """Bounds (ii) of one reduced u (n,) and λ (m,), from lower bounds of α and of β_A."""
     return error_bounds(V, [vi], [energy], [(alpha, beta)], u[:, None], lam[:, None])[0]
 

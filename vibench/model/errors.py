@@ -180,13 +180,9 @@ def zeros(problem: Problem, reference: ReferenceSolutions) -> tuple[Mask, Mask]:
 
 
 def errors(
-    problem: Problem,
-    vis: Sequence[VariationalInequality],
-    energies: Sequence[EnergyNorm],
-    reference: ReferenceSolutions,
-    u: Array,
-    lam: Array,
-) -> list[Errors]:
+    problem: Problem, vis: Sequence[VariationalInequality], energies: Sequence[EnergyNorm],
+    reference: ReferenceSolutions, u: Array, lam: Array,
+) -> list[Errors]:  # fmt: skip
     """Errors of reduced u (n×P) and λ (m×P), column by column at the parameters of `vis`."""
     V, W = problem.V, problem.W
     du, dlam = u - reference.u, lam - reference.lam
@@ -227,10 +223,7 @@ def output_scales(outputs: Sequence[Output], mus: Array, u: Array, lam: Array) -
 
 
 def output_errors(
-    outputs: Sequence[Output],
-    mus: Array,
-    reduced: tuple[Array, Array],
-    reference: ReferenceSolutions,
+    outputs: Sequence[Output], mus: Array, reduced: tuple[Array, Array], reference: ReferenceSolutions
 ) -> list[list[OutputErrors]]:
     """Every output at parameters (P×d), from reduced solutions (u, λ) as columns and from high-fidelity ones.
 

@@ -31,13 +31,9 @@ class HSWBounds:
 
 
 def hsw_bounds(
-    problem: Problem,
-    vis: Sequence[VariationalInequality],
-    constants: Sequence[Stability],
-    u: Array,
-    lam: Array,
+    problem: Problem, vis: Sequence[VariationalInequality], constants: Sequence[Stability], u: Array, lam: Array,
     residuals: Sequence[Array] | None = None,
-) -> list[HSWBounds | None]:
+) -> list[HSWBounds | None]:  # fmt: skip
     """Δ_u and Δ_λ of reduced u (n×P), λ (m×P), column by column at the parameters of `vis`; see above.
 
     Infinite where β_HF over the span is zero; `None` where λ is not in W⁺ and nothing is certified, and where rows are

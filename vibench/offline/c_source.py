@@ -66,13 +66,10 @@ def _in_c(node: ast.expr, names: Sequence[str]) -> str:
 
 
 def source(
-    members: Mapping[str, AffinePolynomial],
-    arrays: Mapping[str, Array],
-    about: Mapping[str, Any],
-    stem: str,
+    members: Mapping[str, AffinePolynomial], arrays: Mapping[str, Array], about: Mapping[str, Any], stem: str,
     thetas: Mapping[str, AffinePolynomial] = MappingProxyType({}),
     exact: Mapping[str, ExactMember] = MappingProxyType({}),
-) -> tuple[str, str]:
+) -> tuple[str, str]:  # fmt: skip
     """The C source of a model whose basis does not depend on the parameter, and its header."""
     # The names of its functions begin with `stem`. With the `thetas` of a certificate it has error bounds. Members that
     # are `exact` take the place of polynomials with their names.

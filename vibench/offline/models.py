@@ -207,13 +207,9 @@ class Model:
         return QuerySettings(self.accuracy, solver, start), solver
 
     def status_of(
-        self,
-        mu: Array,
-        answer: FormulationAnswer,
-        solver: CellSolver,
-        slackened: float,
+        self, mu: Array, answer: FormulationAnswer, solver: CellSolver, slackened: float,
         program: VariationalInequality | None = None,
-    ) -> QueryStatus:
+    ) -> QueryStatus:  # fmt: skip
         """The status of an answer of the formulation at mu (d,), found with this solver, or of its `program`.
 
         Residuals may be `slackened` times the accuracy.
@@ -286,14 +282,9 @@ class Model:
 
     @bordered
     def solve(
-        self,
-        mu: Parameters,
-        solver: str | None = None,
-        accuracy: Share | None = None,
-        tolerance: Positive | None = None,
-        corrected: bool | None = None,
-        of: Measure = "solution",
-    ) -> Solution:
+        self, mu: Parameters, solver: str | None = None, accuracy: Share | None = None,
+        tolerance: Positive | None = None, corrected: bool | None = None, of: Measure = "solution",
+    ) -> Solution:  # fmt: skip
         """Answer a query at a parameter, verify the answer, and bound its errors where the model has bounds.
 
         The formulation and the solver run in this process, without the limits of a study.
@@ -414,14 +405,10 @@ class Model:
 
     @bordered
     def solve_all(
-        self,
-        mus: Annotated[Sequence[Sequence[float]] | Array, Judged],
-        solver: str | None = None,
-        accuracy: Share | None = None,
-        tolerance: Positive | None = None,
-        corrected: bool | None = None,
+        self, mus: Annotated[Sequence[Sequence[float]] | Array, Judged], solver: str | None = None,
+        accuracy: Share | None = None, tolerance: Positive | None = None, corrected: bool | None = None,
         of: Measure = "solution",
-    ) -> pd.DataFrame:
+    ) -> pd.DataFrame:  # fmt: skip
         """A table of `solve` at parameters (P×d), a row for each: what a sample or an optimisation needs.
 
         Its columns are the parameters by name, status, reason and the worst residual; of a model with bounds these

@@ -33,15 +33,9 @@ class InaccurateError(RequestError):
 
 
 def member_polynomials(
-    reduced: AnyReducedModel,
-    tolerance: float,
-    evaluations: int,
-    *,
-    fixed: bool,
-    beside: Beside | None = None,
-    rotated: Mapping[str, Array] = {},
-    check: Callable[[VariationalInequality], None] | None = None,
-) -> tuple[AnyReducedModel, dict[str, AffinePolynomial]]:
+    reduced: AnyReducedModel, tolerance: float, evaluations: int, *, fixed: bool, beside: Beside | None = None,
+    rotated: Mapping[str, Array] = {}, check: Callable[[VariationalInequality], None] | None = None,
+) -> tuple[AnyReducedModel, dict[str, AffinePolynomial]]:  # fmt: skip
     """The model whose members are evaluated, see `declared_model`, and polynomials of the members."""
     # A is a packed upper triangle (row by row). With `fixed` a basis that depends on the parameter is refused. The
     # arrays of `beside` have polynomials, too. Those in `rotated` are the θ of A times a matrix, by name: one

@@ -269,7 +269,11 @@ class Reduction:
         for and it has no certificate, an `UnsupportedError` if the problem does not have what it needs, and a
         `NumericalError` if A is not symmetric.
         """
-        self._check_symmetric()
+        # Solutions of this phase would show an A that is not symmetric; projections are symmetrised, and hide it.
+        if "snapshots" not in self.__dict__ or "snapshots" in self.__dict__.get("_given", {}):
+            mus = self.parameters
+            for mu in mus[:1] if "A" in self.problem.constant else mus[[0, len(mus) // 2, -1]]:
+                check_symmetric(validation.checked_assembly(self.problem, mu).A, f"A at mu = {mu.tolist()}")
         formulation = self.formulation
         # The default is found by its declaration: the core knows no formulation by name.
         if formulation is None:
@@ -286,15 +290,6 @@ class Reduction:
         if not formulation.has_certificate:
             raise RequestError(f"{name} has no certificate: no bounds at online cost")
         return replace(made, certificate=made.online.certificate(self))
-
-    def _check_symmetric(self) -> None:
-        """Refuse an A that is not symmetric, where the phase has no solutions of its own that show it."""
-        if "snapshots" in self.__dict__ and "snapshots" not in self.__dict__.get("_given", {}):
-            return
-        # Projections are symmetrised, and would hide it.
-        mus = self.parameters
-        for mu in mus[:1] if "A" in self.problem.constant else mus[[0, len(mus) // 2, -1]]:
-            check_symmetric(validation.checked_assembly(self.problem, mu).A, f"A at mu = {mu.tolist()}")
 
     @cached_property
     def certificate(self) -> OnlineCertificate:

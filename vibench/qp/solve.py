@@ -80,13 +80,9 @@ DIRECT: Mapping[str, Callable[..., DirectSolution]] = {"piqp": _piqp, "daqp": _d
 
 
 def solve_qp(
-    program: VariationalInequality,
-    solver: str,
-    accuracy: Share,
-    extra: Mapping[str, QPSolver] | None = None,
-    factor: Annotated[Array, "n", "n"] | None = None,
-    start: QPSolution | None = None,
-) -> QPSolution:
+    program: VariationalInequality, solver: str, accuracy: Share, extra: Mapping[str, QPSolver] | None = None,
+    factor: Annotated[Array, "n", "n"] | None = None, start: QPSolution | None = None,
+) -> QPSolution:  # fmt: skip
     """Solve a quadratic program with a named solver.
 
     The data are scaled first (`Units`), every constraint row to unit norm and x and the objective by what drives them
@@ -162,14 +158,9 @@ def _unconstrained(program: VariationalInequality, factor: Array | None) -> QPSo
 
 
 def _solve_in(
-    units: Units,
-    program: VariationalInequality,
-    start: QPSolution | None,
-    solver: str,
-    accuracy: float,
-    extra: Mapping[str, QPSolver] | None,
-    bounds: bool = False,
-) -> QPSolution:
+    units: Units, program: VariationalInequality, start: QPSolution | None, solver: str, accuracy: float,
+    extra: Mapping[str, QPSolver] | None, bounds: bool = False,
+) -> QPSolution:  # fmt: skip
     """Solve a program in these units; an answer without x or without multipliers counts as none."""
     if not len(program.f):
         return QPSolution(np.zeros(0), np.zeros(len(program.g)), "nothing to solve: no unknowns")
@@ -209,13 +200,9 @@ def _report(answer: QPSolution, program: VariationalInequality) -> tuple[str, in
 
 
 def _solve_dual(
-    program: VariationalInequality,
-    solve: Callable[..., QPSolution],
-    factor: Array,
-    start: QPSolution | None,
-    rows: Array,
-    loaded: bool,
-) -> QPSolution:
+    program: VariationalInequality, solve: Callable[..., QPSolution], factor: Array, start: QPSolution | None,
+    rows: Array, loaded: bool,
+) -> QPSolution:  # fmt: skip
     """Solve a dense program with A = L Lᵀ through its dual, which has one unknown per constraint.
 
     The multipliers minimise ½ αᵀ(B A⁻¹Bᵀ)α − (B A⁻¹f − g)ᵀα over α ≥ 0; then x = A⁻¹(f − Bᵀα).

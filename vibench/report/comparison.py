@@ -61,15 +61,8 @@ class Comparison:
         axes = ["formulation", "dual", "primal", "solver"]
         found = [(run.name, one, one.best) for run in self.runs for one in run.verdicts]
         rows = [
-            (
-                name,
-                one.problem,
-                *(cell[axis] for axis in axes),
-                1e3 * one.full_s,
-                1e3 * cell["online_s"],
-                one.break_even,
-            )
-            for name, one, cell in found
+            (run, one.problem, *(cell[axis] for axis in axes), 1e3 * one.full_s, 1e3 * cell["online_s"], one.break_even)
+            for run, one, cell in found
             if cell and one.within
         ]
         return pd.DataFrame(rows, columns=["run", "problem", *axes, "full [ms]", "query [ms]", "pays"])

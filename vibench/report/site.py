@@ -24,7 +24,7 @@ from vibench.plugins.registry import default_formulation, registered
 from vibench.provenance import distribution_version
 from vibench.report import html
 from vibench.report.citation import Citation, requirements
-from vibench.report.comparison import Comparison, compare
+from vibench.report.comparison import compare
 from vibench.report.differences import ComparedRun, compared_runs, numbered
 from vibench.report.figures.data import way
 from vibench.report.identifying import cleaned, left
@@ -244,7 +244,12 @@ def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation, *, figur
         boards.append((run, leaderboard(in_order(read_table(run.run.path, "cells")), timings)))
     links = {run.run.name: f"runs/{run.folder}/index.html" for run in runs}
     _write_page(pages, site / "leaderboard.html", "leaderboard", "", boards=boards, links=links, way=html.way)
-    sections = [_section(site, number, *item) for number, item in enumerate(comparisons.items(), start=1)]
+    sections = []
+    for number, (study, made) in enumerate(comparisons.items(), start=1):
+        file, changes = f"comparison-{number}.csv", made.changes
+        _write(site / file, formats.to_csv(changes))
+        frames = {"runs": made.by_run, "cells by column": made.by_column, "changes": changes.head(500)}
+        sections.append({"study": study, "file": file, "notes": made.notes, "count": len(changes), "tables": frames})
     _write_page(pages, site / "comparison.html", "comparison", "", sections=sections, limit=limit)
     filters = {name: sorted({value for run in runs for value in run.values[name]}) for name in runs[0].values}
     _write_page(pages, site / "index.html", "index", "", runs=runs, filters=filters)
@@ -284,15 +289,6 @@ def _comparable(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, list[Publis
         comparable = [run for run in group if run.run.cells.keys() & first]
         if len(comparable) > 1:
             yield study, comparable
-
-
-def _section(site: Path, number: int, study: str, comparison: Comparison) -> dict[str, Any]:
-    """Section of the page of comparisons on the runs of one study; writes their changes to a file, too."""
-    file = f"comparison-{number}.csv"
-    _write(site / file, formats.to_csv(comparison.changes))
-    changes = comparison.changes.head(500)
-    frames = {"runs": comparison.by_run, "cells by column": comparison.by_column, "changes": changes}
-    return {"study": study, "file": file, "notes": comparison.notes, "count": len(comparison.changes), "tables": frames}
 
 
 def _write_page(pages: Environment, path: Path, name: str, root: str, **content: Any) -> None:

@@ -161,16 +161,12 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
         yield connection
 
 
-def refuse_pipes(path: Path) -> None:
-    """Refuse a pipe or a device, which may have no end, as a database and among the files beside it."""
+def connect(path: Path, mode: Literal["ro", "rwc"]) -> sqlite3.Connection:
+    """Open a database that is no pipe or device, to read it only or to create it where it is missing."""
+    # Those may have no end, also under the names of the files beside it.
     for beside in (f"{path}{end}" for end in ("", "-wal", "-shm", "-journal")):
         if os.path.exists(beside) and not os.path.isfile(beside):  # noqa: PTH110, PTH113
             raise RequestError(f"'{beside}' is no regular file; remove it")
-
-
-def connect(path: Path, mode: Literal["ro", "rwc"]) -> sqlite3.Connection:
-    """Open a database that is no pipe or device, to read it only or to create it where it is missing."""
-    refuse_pipes(path)
     # Another program may hold a lock for long; a minute is the longest wait.
     if (length := len(os.fsencode(path.absolute()))) > 504:
         raise RequestError(f"'{path}' has a path of {length} bytes, and SQLite opens none beyond 504: move its folder")

@@ -60,7 +60,13 @@ class Verdict:
             closest = f"No model is within {limit} for both u and λ; the closest is {self.model}, with {errors}"
             return f"{full}. {closest}. Smaller tolerances or more training would help."
         cost = f"a query of the best model within {limit} takes {_time(self.best['online_s'])}"
-        return f"{full}, {cost}: {self.model}, {_proof(self.best)}. {self._payment}{self._advice}."
+        certified = {"certified": "with proved error bounds", "verified": "with error bounds verified at samples"}
+        proof = certified.get(str(self.best["certificate"]), "without error bounds")
+        advice = "" if self.enriching is None else "; enriching V does not help here"
+        # Smaller factors are found where there are as many modes as generators, and change no decision.
+        if self.enriching is not None and self.enriching >= 1.5:
+            advice = f"; enriching V divides the error of λ by {self.enriching:.2g} here"
+        return f"{full}, {cost}: {self.model}, {proof}. {self._payment}{advice}."
 
     @property
     def model(self) -> str:
@@ -97,16 +103,6 @@ class Verdict:
             Meaning.UNDECIDED: "Whether it pays is undecided at this scatter of seconds",
         }[Meaning(row["meaning"])]
 
-    @property
-    def _advice(self) -> str:
-        """Whether enriching helps, the end of a sentence; empty where the run cannot say."""
-        if self.enriching is None:
-            return ""
-        # Smaller factors are found where there are as many modes as generators, and change no decision.
-        if self.enriching < 1.5:
-            return "; enriching V does not help here"
-        return f"; enriching V divides the error of λ by {self.enriching:.2g} here"
-
 
 def verdicts(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Iterator[Verdict]:
     """The verdict of every problem of a run, from its tables of cells and of thresholds."""
@@ -138,11 +134,6 @@ def _enriching(best: Row, cells: pd.DataFrame) -> float | None:
     of = {kind: alike.loc[alike["enrichment_kind"] == kind, "error_lambda_mean"] for kind in (Kind.NONE, Kind.FIXED)}
     plain, enriched = (float(values.min()) for values in of.values())
     return plain / enriched if enriched > 0.0 and not math.isnan(plain) else None
-
-
-def _proof(cell: Row) -> str:
-    certified = {"certified": "with proved error bounds", "verified": "with error bounds verified at samples"}
-    return certified.get(str(cell["certificate"]), "without error bounds")
 
 
 def _time(seconds: Any) -> str:

@@ -65,13 +65,9 @@ class ContactInfSup:
     """
 
     def __init__(
-        self,
-        schur: BlockDiagonal | SparseMatrix,
-        squares: Array,
-        lost: float,
-        extend: Callable[[Array], Array] = np.asarray,
-        inverse: Array | None = None,
-    ) -> None:
+        self, schur: BlockDiagonal | SparseMatrix, squares: Array, lost: float,
+        extend: Callable[[Array], Array] = np.asarray, inverse: Array | None = None,
+    ) -> None:  # fmt: skip
         self._schur, self._scale, self._lost, self._extend = schur, np.sqrt(squares), lost, extend
         self._inverse = inverse
         # The largest row sum of S⁻¹|Ŝ|S⁻¹ bounds its norm; inner products with Ŝ have so many terms.

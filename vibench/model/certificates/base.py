@@ -310,14 +310,10 @@ def _constant_constraint(
 
 
 def _interpolation_errors(
-    problem: Problem,
-    X: InnerProduct,
-    members: Mapping[str, AffineMember],
-    evaluate: Callable[[Array], Mapping[str, Array]],
-    rotation: Array | None,
-    terms: Sequence[SparseMatrix],
+    problem: Problem, X: InnerProduct, members: Mapping[str, AffineMember],
+    evaluate: Callable[[Array], Mapping[str, Array]], rotation: Array | None, terms: Sequence[SparseMatrix],
     leading: int,
-) -> tuple[float, float, float]:
+) -> tuple[float, float, float]:  # fmt: skip
     """Bounds of the errors of f̃, of Ã, and of Ã of its leading terms alone, from random parameters.
 
     Rotation and terms are those of a `CertificateBase`.

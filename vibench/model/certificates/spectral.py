@@ -243,13 +243,9 @@ class SpectralBounds:
 
 
 def spectral_bounds(
-    problem: Problem,
-    X: InnerProduct,
-    terms: list[SparseMatrix],
-    theta: Callable[[Array], Array],
-    missed: Callable[[Array], float],
-    ranges: TermRanges | None = None,
-) -> SpectralBounds:
+    problem: Problem, X: InnerProduct, terms: list[SparseMatrix], theta: Callable[[Array], Array],
+    missed: Callable[[Array], float], ranges: TermRanges | None = None,
+) -> SpectralBounds:  # fmt: skip
     """Bounds from the first terms A_q (n×n) of A, coefficients θ (Q,) of all as a function of mu, and ‖D(µ)‖."""
     box, leading = problem.parameters, np.eye(len(terms), len(theta(problem.parameters.lower)))
     grid = AnchorGrid.of(box, lambda mu: leading @ theta(mu), np.array([largest_quotient(term, X) for term in terms]))

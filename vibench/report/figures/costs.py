@@ -91,11 +91,12 @@ def total_cost(data: ProblemTables) -> CaptionedFigure | None:
     """Offline and online seconds against the number of queries; triangles mark where two models break even."""
     cells, queries = tables.best_solver(data.cells), np.geomspace(1.0, 1e6, 61)
     panels = []
-    for title, mine in tables.by_dimensions(cells):
+    for (dual, _), mine in cells.groupby(["dual", "pair"], sort=False):
         # The cells with the most vectors of every strategy and way: a line per tolerance would hide the crossings.
         added = mine.assign(added=mine["enrichment"].fillna(0))
         most = added.sort_values(["added", "primal_tol"], ascending=[False, True], kind="stable")
         models = most.drop_duplicates(["primal", "way"]).sort_index()
+        title = f"{dual}, {tables.dimensions(mine)}"
         groups = titled_parts(title, list(range(len(models))), "models", beside_reference=True)
         panels += [(part, models.iloc[places]) for part, places in groups]
     shown, part = tables.leading(panels, 4)

@@ -182,12 +182,6 @@ def dimensions(rows: pd.DataFrame) -> str:
     return "(N, R) = ({}, {})".format(*(f"{a}" if a == b else f"{a}–{b}" for a, b in zip(low, high, strict=True)))
 
 
-def by_dimensions(cells: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
-    """Cells by dual strategy and pair, with the title of each group."""
-    groups = cells.groupby(["dual", "pair"], sort=False)
-    return [(f"{dual}, {dimensions(group)}", group) for (dual, _), group in groups]
-
-
 def by_strategy(rows: pd.DataFrame) -> Iterator[tuple[str, Series, pd.DataFrame]]:
     """Rows by primal strategy and tolerance, with the label and the key in legends of each group."""
     for (primal, tolerance), group in rows.groupby(["primal", "primal_tol"], dropna=False):

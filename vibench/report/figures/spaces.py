@@ -82,7 +82,9 @@ def inf_sup(data: ProblemTables) -> CaptionedFigure | None:
     # Without the other columns: a run may have thousands of pairs, each with a copy of its rows.
     needed = ["pair", "query", "cell", "mu_1", "enrichment_kind", "primal", "primal_tol"]
     needed += [name for name in data.queries if name.startswith("beta_")]
-    constants = one_solver(data.queries[needed], ["pair"])
+    # Inf-sup constants depend on no solver, assembly or correction.
+    rows = data.queries[needed].drop_duplicates(["pair", "primal", "primal_tol", "query"])
+    constants = rows.iloc[np.argsort(rows.groupby(["pair"], sort=False).ngroup(), kind="stable")]
     shown, axis = loosest(constants), data.parameter
     panels, part = leading(list(_panels(data, shown)), 4)
     if not panels:
@@ -116,7 +118,13 @@ def loosest(constants: pd.DataFrame) -> pd.DataFrame:
     # Each pair weighs the same, whatever the size of its constants.
     means = compared.groupby(["primal", "primal_tol", "pair"])["beta_span"].mean().unstack()
     score = -(means / means.max()).mean(axis=1).astype(float)
-    return constants.loc[~fixed | constants.index.isin(at_best_tolerance(compared, score).index)]
+    scores = score.dropna().rename("score").reset_index()
+    top = scores.groupby("primal")["score"].transform("max")
+    # The largest tolerance of scores equal up to 1e-6: figures do not depend on the last digits of a run.
+    near = scores[scores["score"] >= top - 1e-6 * top.abs()]
+    tolerances = near.groupby("primal")["primal_tol"].max()
+    best = compared[compared["primal_tol"].isna() | (compared["primal_tol"] == compared["primal"].map(tolerances))]
+    return constants.loc[~fixed | constants.index.isin(best.index)]
 
 
 def _panels(data: ProblemTables, shown: pd.DataFrame) -> Iterator[tuple[str, list[Any], pd.DataFrame, pd.Series]]:
@@ -180,16 +188,6 @@ def _caption(data: ProblemTables, constants: pd.DataFrame, shown: pd.DataFrame, 
     return " ".join(text)
 
 
-def at_best_tolerance(rows: pd.DataFrame, score: pd.Series) -> pd.DataFrame:
-    """Rows of every primal strategy at the tolerance of its largest score by (primal, primal_tol), or without one."""
-    scores = score.dropna().rename("score").reset_index()
-    top = scores.groupby("primal")["score"].transform("max")
-    # The largest tolerance of scores equal up to 1e-6: figures do not depend on the last digits of a run.
-    near = scores[scores["score"] >= top - 1e-6 * top.abs()]
-    tolerances = near.groupby("primal")["primal_tol"].max()
-    return rows[rows["primal_tol"].isna() | (rows["primal_tol"] == rows["primal"].map(tolerances))]
-
-
 def common_tolerances(rows: pd.DataFrame) -> pd.DataFrame:
     """The rows at tolerances that a strategy has at every pair, where it has such ones."""
     pairs = rows.groupby(["primal", "primal_tol"])["pair"].nunique()
@@ -203,13 +201,6 @@ def longest(histories: pd.DataFrame, axis: str = "dual") -> Iterator[tuple[Any, 
     # It contains the others: bases are nested, so that a looser tolerance stops at an earlier step.
     for name, group in histories.groupby(axis, dropna=False):
         yield name, group[group["artefact"] == group.groupby("artefact")["step"].max().idxmax()]
-
-
-def one_solver(queries: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFrame:
-    """One row per strategy, tolerance, query and values on the `axes`, sorted by these."""
-    # Inf-sup constants depend on no solver, assembly or correction.
-    rows = queries.drop_duplicates([*axes, "primal", "primal_tol", "query"])
-    return rows.iloc[np.argsort(rows.groupby(list(axes), sort=False).ngroup(), kind="stable")] if axes else rows
 
 
 def some(values: Any) -> str:
